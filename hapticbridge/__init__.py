@@ -1,0 +1,1 @@
+"""Feel a MuJoCo scene through a haptic device, with a metered guarantee."""

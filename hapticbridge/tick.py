@@ -1,0 +1,80 @@
+"""One tick of the bridge as data: the record that is written, and the sample that is read.
+
+All fields are 8 bytes wide and little-endian, so a record is at once a NumPy structured scalar,
+a row of the shared-memory ring, and the payload of a message in the recording.
+"""
+
+from __future__ import annotations
+
+from enum import IntFlag
+
+import numpy as np
+
+
+class TickFlag(IntFlag):
+    """Bits of the record's ``flags``.
+
+    Attributes:
+        OVERRUN: The tick started after its deadline by a period or more; deadlines were skipped.
+        DROPPED_BEFORE: Records were lost between the previous record and this one (ring full).
+        FORCE_LIMITED: Force or torque was scaled down to the limit.
+        SLEW_LIMITED: The wrench changed faster than the slew limit allows.
+        RAMPING: The start ramp still scales the wrench.
+        CONTROLLER_ACTIVE: The passivity controller injected damping.
+        CONTACT: MuJoCo found at least one contact in the scene.
+        CLUTCH: The device moves without the handle.
+        STALE_SAMPLE: The device had nothing new since the previous tick.
+        TRIP: The guard stopped the run in this tick; the wrench sent is zero.
+    """
+
+    OVERRUN = 1
+    DROPPED_BEFORE = 2
+    FORCE_LIMITED = 4
+    SLEW_LIMITED = 8
+    RAMPING = 16
+    CONTROLLER_ACTIVE = 32
+    CONTACT = 64
+    CLUTCH = 128
+    STALE_SAMPLE = 256
+    TRIP = 512
+
+
+TICK_DTYPE = np.dtype(
+    [
+        ("tick", "<i8"),
+        ("deadline_ns", "<i8"),
+        ("wake_ns", "<i8"),
+        ("read_ns", "<i8"),
+        ("write_ns", "<i8"),
+        ("flags", "<i8"),
+        ("buttons", "<i8"),
+        ("contacts", "<i8"),
+        ("solver_iterations", "<i8"),
+        ("device_position", "<f8", 3),
+        ("device_quaternion", "<f8", 4),
+        ("handle_position", "<f8", 3),
+        ("handle_quaternion", "<f8", 4),
+        ("tool_position", "<f8", 3),
+        ("tool_quaternion", "<f8", 4),
+        ("wrench_on_tool", "<f8", 6),
+        ("wrench_on_device", "<f8", 6),
+        ("kinetic", "<f8"),
+        ("potential", "<f8"),
+        ("coupling_work", "<f8"),
+        ("actuator_work", "<f8"),
+        ("external_work", "<f8"),
+        ("environment_energy", "<f8"),
+        ("device_energy", "<f8"),
+        ("injected_damping", "<f8"),
+    ]
+)
+"""One record. Row k holds the sample read in tick k, the wrench computed from it, and the energies
+after the step. Positions in m, quaternions (w, x, y, z) with w >= 0, wrenches (force in N, torque
+in N m) in the world frame about the grip (``wrench_on_tool``) or in the device's frame
+(``wrench_on_device``), energies and cumulative works in J, ``injected_damping`` in N s/m."""
+
+CLOCK_FIELDS = ("deadline_ns", "wake_ns", "read_ns", "write_ns")
+"""Fields that depend on the clock, not on the input: two runs of one input may differ here."""
+
+SAMPLE_DTYPE = np.dtype([("position", "<f8", 3), ("quaternion", "<f8", 4), ("buttons", "<i8")])
+"""What a device reports: position in m and orientation in the device's frame, button bits."""
