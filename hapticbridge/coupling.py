@@ -1,0 +1,52 @@
+"""The virtual coupling: a spring and a damper between the handle and the tool."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+
+from hapticbridge.errors import CouplingError
+
+
+@dataclass(frozen=True, slots=True)
+class Coupling:
+    """Spring and damper that join the handle to the tool, in translation and in rotation.
+
+    The wrench on the tool at the end of tick k is
+
+        f_k = K (h_k − x_k) + (B / T) ((h_k − h_{k−1}) − (x_k − x_{k−1}))
+        τ_k = K_r φ_k + (B_r / T) (δφ_h − δφ_x),    φ_k = log(R_h R_xᵀ)
+
+    and the device receives −f_k, −τ_k. h is the handle's pose, x the grip's, R their orientations,
+    δφ the rotation vectors from the previous tick to this one, T the period in s; all in the world
+    frame. The rotational spring is convex for |φ| < π; beyond, it jumps.
+
+    Attributes:
+        stiffness: K in N/m, finite and > 0.
+        damping: B in N s/m, finite and >= 0.
+        rotational_stiffness: K_r in N m/rad, finite and >= 0.
+        rotational_damping: B_r in N m s/rad, finite and >= 0.
+
+    Raises:
+        CouplingError: A value is not finite or out of range.
+
+    References:
+        Brown & Colgate 1997, eq. (4) (backward difference).
+    """
+
+    stiffness: float
+    damping: float
+    rotational_stiffness: float
+    rotational_damping: float
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if not isinstance(value, int | float) or not math.isfinite(value):
+                raise CouplingError(
+                    f"coupling {field.name} is {value!r}; it must be a finite number"
+                )
+            if value < 0:
+                raise CouplingError(f"coupling {field.name} is {value:g}; it must be >= 0")
+        if self.stiffness == 0:
+            raise CouplingError("coupling stiffness is 0 N/m; it must be > 0")

@@ -1,0 +1,193 @@
+"""What a haptic device is to the bridge: a protocol of four calls, and a sheet of data."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from dataclasses import dataclass
+from numbers import Real
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticbridge.errors import DeviceError, choices
+
+
+def checked_number(name: str, value: object, unit: str, *, is_positive: bool = False) -> float:
+    """Returns a device's parameter as a float, or says what would be valid.
+
+    Args:
+        name: The parameter as the user knows it.
+        value: A real number, finite and >= 0 (> 0 with ``is_positive``).
+        unit: The parameter's unit, for the message.
+        is_positive: Whether zero is refused too.
+
+    Raises:
+        DeviceError: The value is no number, not finite, or out of range.
+    """
+    bound = "> 0" if is_positive else ">= 0"
+    message = f"{name} = {value!r}: must be a finite number {bound}" + (f" {unit}" if unit else "")
+    if isinstance(value, bool) or not isinstance(value, Real):
+        raise DeviceError(message)
+    number = float(value)
+    if not math.isfinite(number) or number < 0.0 or (is_positive and number == 0.0):
+        raise DeviceError(message)
+    return number
+
+
+def checked_period(period: float) -> float:
+    """Returns the loop's period in s, finite and > 0.
+
+    Raises:
+        DeviceError: It is not.
+    """
+    return checked_number("the loop's period", period, "s", is_positive=True)
+
+
+_UNITS = {
+    "mass": "kg",
+    "damping": "N s/m",
+    "rotational_inertia": "kg m²",
+    "rotational_damping": "N m s/rad",
+    "friction": "N",
+    "resolution": "m",
+    "force_limit": "N",
+    "torque_limit": "N m",
+    "speed_limit": "m/s",
+    "rate": "Hz",
+    "duration": "s",
+}
+_NEVER_UNKNOWN = ("force_limit", "torque_limit", "speed_limit")
+_POSITIVE = ("mass", "rotational_inertia", "rate")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DeviceInfo:
+    """A device's data sheet, as the guard uses it and the recording keeps it.
+
+    Attributes:
+        name: What it is called, not empty.
+        degrees_of_freedom: 3 (translation) or 6 (translation, then rotation).
+        mass: Inertia felt at the handle in kg, > 0; None where unknown.
+        damping: Physical damping b at the handle in N s/m, >= 0; None where unknown or where
+            the motion is prescribed. The bound b >= KT/2 + B is judged against it.
+        rotational_inertia: In kg m², > 0; None where unknown.
+        rotational_damping: In N m s/rad, >= 0; None where unknown.
+        friction: Coulomb friction per axis in N, >= 0; None where unknown.
+        resolution: Step of the reported position in m, >= 0 (0: none); None where unknown.
+        force_limit: Largest force in N that the device may be sent, by norm, >= 0.
+        torque_limit: Largest torque in N m, by norm, >= 0.
+        speed_limit: Fastest motion in m/s that the device can make, >= 0.
+        rate: The device's own rate in Hz, > 0; None where it follows the bridge.
+        is_prescribed: Whether its motion does not react to force.
+        is_real: Whether it moves a motor in somebody's hand.
+        duration: Time in s after which its motion ends by itself, >= 0; None where it does not.
+
+    Raises:
+        DeviceError: A value is of the wrong type, not finite, or out of range.
+    """
+
+    name: str
+    degrees_of_freedom: int
+    mass: float | None
+    damping: float | None
+    rotational_inertia: float | None
+    rotational_damping: float | None
+    friction: float | None
+    resolution: float | None
+    force_limit: float
+    torque_limit: float
+    speed_limit: float
+    rate: float | None
+    is_prescribed: bool
+    is_real: bool
+    duration: float | None
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.name, str) or not self.name:
+            raise DeviceError(f"device name = {self.name!r}: must be a text that is not empty")
+        if isinstance(self.degrees_of_freedom, bool) or self.degrees_of_freedom not in (3, 6):
+            raise DeviceError(
+                f"degrees_of_freedom = {self.degrees_of_freedom!r}: must be 3 (translation) "
+                "or 6 (translation and rotation)"
+            )
+        for name in ("is_prescribed", "is_real"):
+            if not isinstance(getattr(self, name), bool):
+                raise DeviceError(f"{name} = {getattr(self, name)!r}: must be true or false")
+        for name, unit in _UNITS.items():
+            value = getattr(self, name)
+            if value is None and name not in _NEVER_UNKNOWN:
+                continue
+            number = checked_number(name, value, unit, is_positive=name in _POSITIVE)
+            object.__setattr__(self, name, number)
+
+    def to_json(self) -> str:
+        """Returns the sheet as one JSON object: a key per attribute, null where unknown."""
+        return json.dumps(dataclasses.asdict(self), allow_nan=False)
+
+    @classmethod
+    def from_json(cls, text: str) -> DeviceInfo:
+        """Reads what ``to_json`` wrote.
+
+        Raises:
+            DeviceError: The text is not a JSON object with exactly these keys, or a value is
+                invalid.
+        """
+        try:
+            values = json.loads(text)
+        except (ValueError, RecursionError) as error:
+            raise DeviceError(f"device data is not JSON: {error}") from None
+        if not isinstance(values, dict):
+            raise DeviceError(f"device data is not a JSON object but {values!r:.60}")
+        names = {field.name for field in dataclasses.fields(cls)}
+        if unknown := values.keys() - names:
+            raise DeviceError(
+                f"device data holds {choices(unknown)}, which it does not know; "
+                f"it knows {choices(names)}"
+            )
+        if missing := names - values.keys():
+            raise DeviceError(f"device data lacks {choices(missing)}")
+        return cls(**values)
+
+
+class Device(Protocol):
+    """Where the handle's motion comes from and where the wrench goes.
+
+    The loop calls ``start`` once, then in each tick ``read`` and later ``write``; ``close`` ends.
+    The sample of tick k is the state at the time k · period. A wrench written in tick k acts from
+    then on until the next write.
+
+    Attributes:
+        info: The device's data sheet, complete before ``start``.
+    """
+
+    info: DeviceInfo
+
+    def start(self, period: float) -> None:
+        """Brings the device to its initial state, from which two runs are identical.
+
+        Args:
+            period: The loop's period in s, finite and > 0.
+
+        Raises:
+            DeviceError: The device cannot run at this period.
+        """
+
+    def read(self, sample: NDArray[np.void]) -> None:
+        """Fills in the newest sample.
+
+        Args:
+            sample: Shape (1,), ``SAMPLE_DTYPE``, filled in place.
+        """
+
+    def write(self, wrench: NDArray[np.float64]) -> None:
+        """Commands a wrench that is held until the next write.
+
+        Args:
+            wrench: Shape (6,): force in N, torque in N m, on the device, in the device's frame.
+        """
+
+    def close(self) -> None:
+        """Releases the device; may be called more than once."""

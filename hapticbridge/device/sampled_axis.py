@@ -1,0 +1,239 @@
+"""One axis of a device in a hand, moved exactly over a time in which its force is held.
+
+    M v' = F − s f_c − b v − b_h (v − ṗ) − k_h (x − p),        x' = v,    s = sign(v)
+
+with the inertia M of device and hand, the device's damping b, the hand's damping b_h and stiffness
+k_h towards a target p of constant velocity ṗ, and Coulomb friction f_c. The relative velocity
+r = v − ṗ obeys the homogeneous M r'' + (b + b_h) r' + k_h r = 0 with r'(0) = a, the acceleration at
+the start. So for any time h
+
+    x(h) = x + h ṗ + d_0 r + d_1 a,        v(h) = v − (k_h/M) d_1 r + c_1 a
+
+where d_0, d_1 and c_1 are elements of one matrix exponential, found once per run. Written as
+increments, nothing cancels where the axis is nearly at rest.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, TypeAlias
+
+import numpy as np
+import scipy.linalg
+from numpy.typing import NDArray
+
+from hapticbridge.errors import DeviceError
+from hapticbridge.jit import compiled
+
+Record: TypeAlias = Any
+"""A structured scalar inside compiled code, where fields are attributes; NumPy's type has none."""
+
+LEVELS = 41
+"""Friction looks for events in dyadic parts of the period, from T to T/2^40: 1e-15 s at 1 kHz."""
+_COARSEST_LEVEL = 10
+_MOST_PHASES = 64
+
+AXIS_DTYPE = np.dtype(
+    [
+        ("inertia", "<f8"),
+        ("damping", "<f8"),
+        ("hand_damping", "<f8"),
+        ("stiffness", "<f8"),
+        ("friction", "<f8"),
+        ("first_level", "<i8"),
+        ("steps", "<f8", (LEVELS, 5)),
+    ]
+)
+"""The law of motion of an axis: M, b, b_h, k_h and f_c in SI units, and per level i of time
+h = T/2^i the numbers h, d_0, d_1, −(k_h/M) d_1 and c_1. ``first_level``: the longest time in which
+the acceleration changes its sign at most once."""
+
+
+def sampled_axis(
+    period: float,
+    *,
+    inertia: float,
+    damping: float,
+    hand_damping: float,
+    stiffness: float,
+    friction: float,
+) -> NDArray[np.void]:
+    """Returns the law of motion of an axis for a period, as one ``AXIS_DTYPE`` scalar array.
+
+    Args:
+        period: T in s, > 0.
+        inertia: M in kg (or kg m²), > 0.
+        damping: b in N s/m (or N m s/rad), >= 0.
+        hand_damping: b_h, likewise.
+        stiffness: k_h in N/m (or N m/rad), >= 0.
+        friction: f_c in N (or N m), >= 0.
+
+    Raises:
+        DeviceError: With friction, the axis swings a thousand times within one period.
+    """
+    axis = np.zeros((), AXIS_DTYPE)
+    axis["inertia"] = inertia
+    axis["damping"] = damping
+    axis["hand_damping"] = hand_damping
+    axis["stiffness"] = stiffness
+    axis["friction"] = friction
+    times = period / 2.0 ** np.arange(LEVELS)
+    # (∫r/h, r, h r') over the time h as unit: elements of order one at every level
+    generator = np.zeros((LEVELS, 3, 3))
+    generator[:, 0, 1] = generator[:, 1, 2] = 1.0
+    generator[:, 2, 1] = -stiffness / inertia * times**2
+    generator[:, 2, 2] = -(damping + hand_damping) / inertia * times
+    transition = scipy.linalg.expm(generator)
+    steps = axis["steps"]
+    steps[:, 0] = times
+    steps[:, 1] = times * transition[:, 0, 1]
+    steps[:, 2] = times**2 * transition[:, 0, 2]
+    steps[:, 3] = -stiffness / inertia * steps[:, 2]
+    steps[:, 4] = times * transition[:, 1, 2]
+    decay = (damping + hand_damping) / (2.0 * inertia)
+    swing = math.sqrt(max(stiffness / inertia - decay * decay, 0.0))
+    # r' vanishes at most once within half a swing, π/swing; half of that is on the safe side
+    quarters = swing * period / (0.5 * math.pi)
+    first_level = max(0, math.ceil(math.log2(quarters))) if quarters > 0.0 else 0
+    if friction > 0.0 and first_level > _COARSEST_LEVEL:
+        raise DeviceError(
+            f"device and hand swing at {swing:.3g} rad/s, too fast for friction at a period of "
+            f"{period:g} s; at most {0.5 * math.pi * 2**_COARSEST_LEVEL / period:.3g} rad/s"
+        )
+    axis["first_level"] = first_level
+    return axis
+
+
+@compiled
+def moved(
+    axis: Record, level: int, relative_velocity: float, acceleration: float, drift: float
+) -> tuple[float, float]:
+    """Returns the increments of position and velocity over the time of a level, without friction.
+
+    Args:
+        axis: The law of motion, ``AXIS_DTYPE``.
+        level: 0 for the whole period, i for T/2^i.
+        relative_velocity: v − ṗ at the start.
+        acceleration: v' at the start.
+        drift: ṗ, the target's velocity.
+    """
+    step = axis.steps[level]
+    return (
+        step[0] * drift + step[1] * relative_velocity + step[2] * acceleration,
+        step[3] * relative_velocity + step[4] * acceleration,
+    )
+
+
+@compiled
+def acceleration_at(
+    axis: Record, force: float, stretch: float, velocity: float, drift: float
+) -> float:
+    """Returns v' for a force F (friction included), x − p, v and ṗ."""
+    return (
+        force
+        - axis.damping * velocity
+        - axis.hand_damping * (velocity - drift)
+        - axis.stiffness * stretch
+    ) / axis.inertia
+
+
+@compiled
+def _slide(
+    axis: Record,
+    units_left: int,
+    force: float,
+    stretch: float,
+    velocity: float,
+    drift: float,
+    direction: float,
+) -> tuple[int, float, float, float]:
+    """Slides in one direction until the velocity vanishes or the time is over.
+
+    A step is taken if the velocity keeps its sign at its end, and cannot have left and come back
+    within (the acceleration turns from against the motion to along it); else a step of half the
+    time is tried, which brackets the event down to T/2^40.
+
+    Returns:
+        The units of T/2^40 left, the distance travelled, the new stretch x − p, the new velocity.
+    """
+    travel = 0.0
+    friction = direction * axis.friction
+    level = axis.first_level
+    is_bracketed = False
+    while units_left > 0:
+        units = 1 << (LEVELS - 1 - level)
+        if units > units_left:
+            level += 1
+            continue
+        start = acceleration_at(axis, force - friction, stretch, velocity, drift)
+        if velocity == 0.0:
+            # at the very moment of breaking away rounding must not pull it back
+            start = direction * max(direction * start, 0.0)
+        dx, dv = moved(axis, level, velocity - drift, start, drift)
+        next_stretch = stretch + (dx - units * axis.steps[LEVELS - 1, 0] * drift)
+        next_velocity = velocity + dv
+        end = acceleration_at(axis, force - friction, next_stretch, next_velocity, drift)
+        is_stopped = not next_velocity * direction > 0.0
+        is_dip = direction * start < 0.0 and direction * end > 0.0
+        if is_stopped and level == LEVELS - 1:
+            return units_left, travel, stretch, 0.0
+        if (is_stopped or is_dip) and level < LEVELS - 1:
+            is_bracketed = True
+            level += 1
+            continue
+        units_left -= units
+        travel += dx
+        stretch = next_stretch
+        velocity = next_velocity
+        if is_bracketed:
+            if level < LEVELS - 1:
+                level += 1
+            else:
+                # the event was a dip that did not reach zero, and is behind
+                is_bracketed = False
+                level = axis.first_level
+    return units_left, travel, stretch, velocity
+
+
+@compiled
+def moved_with_friction(
+    axis: Record, force: float, stretch: float, velocity: float, drift: float
+) -> tuple[float, float]:
+    """Returns the increment of position and the new velocity after one period, with friction.
+
+    At rest the axis sticks while |F + b_h ṗ − k_h (x − p)| <= f_c; the moment at which the target
+    pulls it loose is found in closed form, the moment at which it comes to rest by bisection.
+
+    Args:
+        axis: The law of motion, ``AXIS_DTYPE``.
+        force: F in N, held.
+        stretch: x − p in m at the start.
+        velocity: v in m/s at the start.
+        drift: ṗ in m/s.
+    """
+    travel = 0.0
+    unit = axis.steps[LEVELS - 1, 0]
+    limit = axis.friction
+    units_left = 1 << (LEVELS - 1)
+    if not math.isfinite(force + stretch + velocity + drift):
+        return math.nan, math.nan
+    # more phases than a few cannot be within one period; the bound is there so that the loop ends
+    for _ in range(_MOST_PHASES):
+        if units_left == 0:
+            return travel, velocity
+        direction = math.copysign(1.0, velocity)
+        if velocity == 0.0:
+            pull = axis.inertia * acceleration_at(axis, force, stretch, 0.0, drift)
+            direction = math.copysign(1.0, pull)
+            if abs(pull) <= limit:
+                rate = axis.stiffness * drift
+                direction = math.copysign(1.0, rate)
+                wait = (direction * limit - pull) / rate / unit if rate != 0.0 else math.inf
+                units = units_left if wait >= units_left else math.ceil(wait)
+                stretch -= units * unit * drift
+                units_left -= units
+        units_left, dx, stretch, velocity = _slide(
+            axis, units_left, force, stretch, velocity, drift, direction
+        )
+        travel += dx
+    return travel, 0.0

@@ -1,0 +1,359 @@
+"""A simulated device in a simulated hand, exact at the sampling instants."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticbridge.device.base import DeviceInfo, checked_number, checked_period
+from hapticbridge.device.motion import Motion, lissajous, pose_at, read_motion
+from hapticbridge.device.sampled_axis import (
+    AXIS_DTYPE,
+    Record,
+    acceleration_at,
+    moved,
+    moved_with_friction,
+    sampled_axis,
+)
+from hapticbridge.errors import DeviceError
+from hapticbridge.jit import compiled
+from hapticbridge.pose import (
+    Quaternion,
+    Vector,
+    canonical,
+    product,
+    quaternion_exp,
+    quaternion_log,
+    rotation_between,
+    scaled,
+)
+from hapticbridge.tick import SAMPLE_DTYPE
+
+MAX_DELAY = 100
+"""Largest output delay in samples."""
+
+_STATE_DTYPE = np.dtype(
+    [
+        ("tick", "<i8"),
+        ("cursor", "<i8"),
+        ("period", "<f8"),
+        ("is_held", "<i8"),
+        ("position", "<f8", 3),
+        ("velocity", "<f8", 3),
+        ("quaternion", "<f8", 4),
+        ("angular_velocity", "<f8", 3),
+        ("target_position", "<f8", 3),
+        ("target_quaternion", "<f8", 4),
+        ("resolution", "<f8"),
+        ("rotational_resolution", "<f8"),
+        ("delay", "<i8"),
+        ("written", "<f8", 6),
+        ("on_the_way", "<f8", (MAX_DELAY + 1, 6)),
+        ("translation", AXIS_DTYPE),
+        ("rotation", AXIS_DTYPE),
+    ]
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Hand:
+    """A hand on the handle: inertia that moves with it, spring and damper to a moving target.
+
+    The defaults are one measured arm at a handle; the rotational values are a guess of the same
+    character (half a swing per second, well damped).
+
+    Attributes:
+        mass: In kg, >= 0, rigidly on the handle.
+        damping: In N s/m, >= 0, against the target's velocity.
+        stiffness: In N/m, >= 0.
+        rotational_inertia: In kg m², >= 0.
+        rotational_damping: In N m s/rad, >= 0.
+        rotational_stiffness: In N m/rad, >= 0.
+
+    Raises:
+        DeviceError: A value is not finite or negative.
+    """
+
+    mass: float = 0.55
+    damping: float = 6.5
+    stiffness: float = 135.0
+    rotational_inertia: float = 1e-3
+    rotational_damping: float = 0.02
+    rotational_stiffness: float = 1.0
+
+    def __post_init__(self) -> None:
+        units = {
+            "mass": "kg",
+            "damping": "N s/m",
+            "stiffness": "N/m",
+            "rotational_inertia": "kg m²",
+            "rotational_damping": "N m s/rad",
+            "rotational_stiffness": "N m/rad",
+        }
+        for field in dataclasses.fields(self):
+            value = checked_number(
+                f"hand {field.name}", getattr(self, field.name), units[field.name]
+            )
+            object.__setattr__(self, field.name, value)
+
+
+_DEFAULT_HAND = Hand()
+
+
+@compiled
+def _translate(s: Record, wrench: NDArray[np.float64], target: Vector) -> None:
+    """Moves the position by one period, each axis on its own."""
+    axis = s.translation
+    for i in range(3):
+        drift = (target[i] - s.target_position[i]) / s.period
+        stretch = s.position[i] - s.target_position[i]
+        velocity = s.velocity[i]
+        if axis.friction > 0.0:
+            travel, s.velocity[i] = moved_with_friction(axis, wrench[i], stretch, velocity, drift)
+        else:
+            acceleration = acceleration_at(axis, wrench[i], stretch, velocity, drift)
+            travel, gain = moved(axis, 0, velocity - drift, acceleration, drift)
+            s.velocity[i] += gain
+        s.position[i] += travel
+        s.target_position[i] = target[i]
+
+
+@compiled
+def _rotate(s: Record, wrench: NDArray[np.float64], target: Quaternion) -> None:
+    """Turns the orientation by one period, along the axes of the device's frame."""
+    axis = s.rotation
+    t = s.target_quaternion
+    old = (t[0], t[1], t[2], t[3])
+    q = (s.quaternion[0], s.quaternion[1], s.quaternion[2], s.quaternion[3])
+    drifts = scaled(1.0 / s.period, rotation_between(old, target))
+    stretches = rotation_between(old, q)
+    turn = [0.0, 0.0, 0.0]
+    for i in range(3):
+        velocity = s.angular_velocity[i]
+        acceleration = acceleration_at(axis, wrench[3 + i], stretches[i], velocity, drifts[i])
+        turn[i], gain = moved(axis, 0, velocity - drifts[i], acceleration, drifts[i])
+        s.angular_velocity[i] += gain
+    turned = canonical(product(quaternion_exp((turn[0], turn[1], turn[2])), q))
+    for i in range(4):
+        s.quaternion[i] = turned[i]
+        t[i] = target[i]
+
+
+@compiled
+def _next_sample(
+    states: NDArray[np.void], motion: NDArray[np.float64], samples: NDArray[np.void]
+) -> None:
+    """Moves device and hand by one period (not before the first sample) and reports the pose."""
+    s = states[0]
+    if s.tick > 0:
+        # the wrench written in tick k - 1 leaves the line of delay + 1 places in tick k + delay
+        line = s.delay + 1
+        entry = s.on_the_way[(s.tick - 1) % line]
+        for i in range(6):
+            entry[i] = s.written[i]
+        wrench = s.on_the_way[s.tick % line]
+        position, quaternion = (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)
+        if s.is_held == 1:
+            if motion.shape[0] > 0:
+                s.cursor, position, quaternion = pose_at(motion, s.tick * s.period, s.cursor)
+            else:
+                position, quaternion = lissajous(s.tick * s.period)
+        _translate(s, wrench, position)
+        _rotate(s, wrench, quaternion)
+    s.tick += 1
+    sample = samples[0]
+    sample.buttons = 0
+    for i in range(3):
+        sample.position[i] = _rounded(s.position[i], s.resolution)
+    q = (s.quaternion[0], s.quaternion[1], s.quaternion[2], s.quaternion[3])
+    if s.rotational_resolution > 0.0:
+        v = quaternion_log(q)
+        step = s.rotational_resolution
+        q = canonical(
+            quaternion_exp((_rounded(v[0], step), _rounded(v[1], step), _rounded(v[2], step)))
+        )
+    for i in range(4):
+        sample.quaternion[i] = q[i]
+
+
+@compiled
+def _rounded(value: float, step: float) -> float:
+    """Returns the nearest multiple of a step, the value itself where the step is zero."""
+    return step * np.round(value / step) if step > 0.0 else value
+
+
+class SimulatedDevice:
+    """Six-axis device with inertia and damping, held by a hand that follows a path.
+
+    Per axis of the device's frame, between two samples with a held force F,
+
+        (m_d + m_h) v' = F − f_c sign(v) − b v − b_h (v − ṗ) − k_h (x − p)
+
+    is solved exactly (``sampled_axis``), the target p moving linearly between its poses at the
+    samples; Euler at a twentieth of the period would shift the stability limit by 5 %. Friction
+    sticks and slips exactly within the period.
+
+    Rotation obeys the same law with the rotation vector e = log(R R_pᵀ) in the place of x − p and
+    R ← exp(δ) R. The inertia is isotropic, so there is no gyroscopic torque. Exact while rotation,
+    target and torque share one axis and the angle to the target stays below π. Otherwise e' = ω
+    within the period is approximate, to first order in the angle from the target, and so is the
+    composition of turns about changing axes, to third order in the period. At an angle of π the
+    hand's torque changes sides.
+
+    Wrenches are not clipped at the limits: those are for the guard that sends them.
+
+    Args:
+        mass: m_d in kg, > 0.
+        damping: b in N s/m, >= 0.
+        rotational_inertia: In kg m², > 0.
+        rotational_damping: In N m s/rad, >= 0.
+        hand: Who holds it; None: it is free, and the path is not used.
+        path: Where the hand wants to go, from its first pose and in the device's frame: a CSV
+            file (``read_motion``), a motion, or None for a slow Lissajous figure (``lissajous``).
+            After the end of a motion the hand stays at its last pose.
+        resolution: Step of the reported position in m, >= 0; 0 reports it as it is.
+        rotational_resolution: Step of the reported rotation vector's components in rad, >= 0.
+        friction: Coulomb friction f_c per axis of translation in N, >= 0.
+        delay: Whole samples, 0 to 100, from a write until the motors act on it.
+        force_limit: In N, >= 0, for the data sheet.
+        torque_limit: In N m, >= 0, for the data sheet.
+        speed_limit: In m/s, >= 0, for the data sheet.
+
+    Raises:
+        DeviceError: A value is out of range, or the path cannot be read.
+    """
+
+    def __init__(
+        self,
+        *,
+        mass: float = 0.1,
+        damping: float = 2.0,
+        rotational_inertia: float = 1e-4,
+        rotational_damping: float = 2e-3,
+        hand: Hand | None = _DEFAULT_HAND,
+        path: str | os.PathLike[str] | Motion | None = None,
+        resolution: float = 0.0,
+        rotational_resolution: float = 0.0,
+        friction: float = 0.0,
+        delay: int = 0,
+        force_limit: float = 10.0,
+        torque_limit: float = 0.5,
+        speed_limit: float = 5.0,
+    ) -> None:
+        if isinstance(delay, bool) or not isinstance(delay, int) or not 0 <= delay <= MAX_DELAY:
+            raise DeviceError(f"delay = {delay!r}: must be 0 to {MAX_DELAY} whole samples")
+        self._motion = np.empty((0, 8))
+        duration = None
+        if hand is not None and path is not None:
+            motion = path if isinstance(path, Motion) else read_motion(path)
+            self._motion = motion.relative().table
+            duration = motion.duration
+        self.info = DeviceInfo(
+            name="simulated",
+            degrees_of_freedom=6,
+            mass=checked_number("mass", mass, "kg", is_positive=True),
+            damping=checked_number("damping", damping, "N s/m"),
+            rotational_inertia=checked_number(
+                "rotational_inertia", rotational_inertia, "kg m²", is_positive=True
+            ),
+            rotational_damping=checked_number("rotational_damping", rotational_damping, "N m s/rad"),
+            friction=checked_number("friction", friction, "N"),
+            resolution=checked_number("resolution", resolution, "m"),
+            force_limit=force_limit,
+            torque_limit=torque_limit,
+            speed_limit=speed_limit,
+            rate=None,
+            is_prescribed=False,
+            is_real=False,
+            duration=duration,
+        )
+        self.hand = hand
+        self._rotational_resolution = checked_number(
+            "rotational_resolution", rotational_resolution, "rad"
+        )
+        self._delay = delay
+        self._states = np.zeros(1, _STATE_DTYPE)
+        self._written: NDArray[np.float64] = self._states["written"][0]
+        self._is_started = False
+
+    def start(self, period: float) -> None:
+        """Puts the device at rest at the origin, and compiles what the loop will call.
+
+        Args:
+            period: The loop's period in s, finite and > 0.
+
+        Raises:
+            DeviceError: The period is not, or is too long for a stiff hand with friction.
+        """
+        period = checked_period(period)
+        info, hand = self.info, self.hand
+        free = Hand(
+            mass=0.0,
+            damping=0.0,
+            stiffness=0.0,
+            rotational_inertia=0.0,
+            rotational_damping=0.0,
+            rotational_stiffness=0.0,
+        )
+        held = hand or free
+        state = np.zeros((), _STATE_DTYPE)
+        state["period"] = period
+        state["is_held"] = hand is not None
+        state["quaternion"][0] = state["target_quaternion"][0] = 1.0
+        state["resolution"] = info.resolution
+        state["rotational_resolution"] = self._rotational_resolution
+        state["delay"] = self._delay
+        state["translation"] = sampled_axis(
+            period,
+            inertia=info.mass + held.mass,
+            damping=info.damping,
+            hand_damping=held.damping,
+            stiffness=held.stiffness,
+            friction=info.friction,
+        )
+        state["rotation"] = sampled_axis(
+            period,
+            inertia=info.rotational_inertia + held.rotational_inertia,
+            damping=info.rotational_damping,
+            hand_damping=held.rotational_damping,
+            stiffness=held.rotational_stiffness,
+            friction=0.0,
+        )
+        self._states[0] = state
+        _next_sample(self._states, self._motion, np.zeros(1, SAMPLE_DTYPE))
+        self._states[0] = state
+        self._is_started = True
+
+    def read(self, sample: NDArray[np.void]) -> None:
+        """Moves on by one period (the first call does not) and reports the pose, no buttons.
+
+        Args:
+            sample: Shape (1,), ``SAMPLE_DTYPE``, filled in place.
+
+        Raises:
+            DeviceError: ``start`` has not been called.
+        """
+        if not self._is_started:
+            raise DeviceError("the simulated device is read before it was started")
+        _next_sample(self._states, self._motion, sample)
+
+    def write(self, wrench: NDArray[np.float64]) -> None:
+        """Holds a wrench on the handle until the next write, ``delay`` samples later.
+
+        Args:
+            wrench: Shape (6,): force in N, torque in N m, in the device's frame.
+        """
+        self._written[:] = wrench
+
+    def close(self) -> None:
+        """Does nothing: there is nothing to release."""
+
+    @property
+    def velocity(self) -> NDArray[np.float64]:
+        """Velocity in m/s and angular velocity in rad/s at the newest sample, shape (6,)."""
+        state = self._states[0]
+        return np.concatenate([state["velocity"], state["angular_velocity"]])

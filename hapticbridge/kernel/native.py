@@ -1,0 +1,152 @@
+"""MuJoCo's C library as the compiled tick sees it: functions by symbol, fields by address.
+
+This is the one place that uses MuJoCo's private ``_address`` and the layout of its structs. The
+layout is taken from the package's own description of them (``mujoco.introspect``) and checked
+against the Python bindings whenever a scene is bound, so another version of MuJoCo is either right
+or refused.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import llvmlite.binding
+import mujoco
+import numba
+import numpy as np
+from mujoco.introspect import ast_nodes, structs
+from numba.core import cgutils, types
+from numba.extending import intrinsic
+from numpy.typing import NDArray
+
+from hapticbridge.errors import SceneError
+from hapticbridge.jit import compiled
+
+
+def _library() -> Path:
+    folder = Path(mujoco.__file__).parent
+    for pattern in ("libmujoco.so.*", "libmujoco.*.dylib", "mujoco.dll"):
+        for path in folder.glob(pattern):
+            return path
+    raise SceneError(f"no MuJoCo library lies in {folder.name}/ of the installed package mujoco")
+
+
+# Makes the symbols known to the compiler's linker; the Python bindings use the same library file.
+llvmlite.binding.load_library_permanently(str(_library()))
+
+_ADDRESS = types.intp
+_ON_DATA = types.void(_ADDRESS, _ADDRESS)
+mj_step = types.ExternalFunction("mj_step", _ON_DATA)
+mj_kinematics = types.ExternalFunction("mj_kinematics", _ON_DATA)
+mj_fwd_kinematics = types.ExternalFunction("mj_fwdKinematics", _ON_DATA)
+mj_com_pos = types.ExternalFunction("mj_comPos", _ON_DATA)
+mj_make_m = types.ExternalFunction("mj_makeM", _ON_DATA)
+mj_energy_pos = types.ExternalFunction("mj_energyPos", _ON_DATA)
+mj_energy_vel = types.ExternalFunction("mj_energyVel", _ON_DATA)
+mj_rne_post_constraint = types.ExternalFunction("mj_rnePostConstraint", _ON_DATA)
+mj_apply_ft = types.ExternalFunction(
+    "mj_applyFT",
+    types.void(_ADDRESS, _ADDRESS, _ADDRESS, _ADDRESS, _ADDRESS, types.int32, _ADDRESS),
+)
+
+
+@intrinsic
+def _as_pointer(_typing: Any, _address: Any) -> Any:
+    def generate(_context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
+        return builder.inttoptr(arguments[0], cgutils.voidptr_t)
+
+    return types.voidptr(types.intp), generate
+
+
+@intrinsic
+def release_fence(_typing: Any) -> Any:
+    """Orders the record's bytes before the cursor that publishes them (release semantics)."""
+
+    def generate(context: Any, builder: Any, _signature: Any, _arguments: Any) -> Any:
+        builder.fence("release")
+        return context.get_dummy_value()
+
+    return types.void(), generate
+
+
+@compiled
+def floats(address: int, count: int) -> NDArray[np.float64]:
+    """Returns ``count`` doubles at an address, as a view."""
+    view: NDArray[np.float64] = numba.carray(_as_pointer(address), count, np.float64)
+    return view
+
+
+@compiled
+def ints(address: int, count: int) -> NDArray[np.int32]:
+    """Returns ``count`` 32-bit integers at an address, as a view."""
+    view: NDArray[np.int32] = numba.carray(_as_pointer(address), count, np.int32)
+    return view
+
+
+@compiled
+def pointer_at(address: int) -> int:
+    """Returns the pointer stored at an address (arrays in MuJoCo's arena move between steps)."""
+    return int(numba.carray(_as_pointer(address), 1, np.int64)[0])
+
+
+_SCALARS: dict[str, Any] = {
+    "int": ctypes.c_int,
+    "mjtNum": ctypes.c_double,
+    "mjtByte": ctypes.c_ubyte,
+    "mjtBool": ctypes.c_bool,
+    "mjtSize": ctypes.c_int64,
+    "size_t": ctypes.c_size_t,
+    "uintptr_t": ctypes.c_void_p,
+    "uint64_t": ctypes.c_uint64,
+}
+
+
+def _ctype(declared: Any) -> Any:
+    if isinstance(declared, ast_nodes.PointerType):
+        return ctypes.c_void_p
+    if isinstance(declared, ast_nodes.ArrayType):
+        inner = _ctype(declared.inner_type)
+        for extent in reversed(declared.extents):
+            inner = inner * extent
+        return inner
+    return _SCALARS.get(declared.name) or _struct(declared.name)
+
+
+@cache
+def _struct(name: str) -> Any:
+    fields = [(field.name, _ctype(field.type)) for field in structs.STRUCTS[name].fields]
+    return type(name, (ctypes.Structure,), {"_fields_": fields})
+
+
+def field_address(data: mujoco.MjData, name: str) -> int:
+    """Returns where a field of ``mjData`` lies in memory (for a pointer: of the pointer itself)."""
+    return int(data._address + getattr(_struct("mjData"), name).offset)
+
+
+def addresses(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[int, int]:
+    """Returns the addresses of model and data for the C functions.
+
+    Raises:
+        SceneError: The described layout of ``mjData`` is not that of the library, so the compiled
+            tick would read wrong memory.
+    """
+    view = _struct("mjData").from_address(data._address)
+    agrees = (
+        view.ncon == data.ncon
+        and view.nefc == data.nefc
+        and view.nisland == data.nisland
+        and view.time == data.time
+        and view.qvel == data.qvel.ctypes.data
+        and view.site_xpos == data.site_xpos.ctypes.data
+        and view.mocap_pos == data.mocap_pos.ctypes.data
+        and view.signature == data.signature
+    )
+    if not agrees:
+        raise SceneError(
+            f"MuJoCo {mujoco.__version__} lays out mjData differently from its own description; "
+            "install a version from constraints.txt"
+        )
+    return int(model._address), int(data._address)

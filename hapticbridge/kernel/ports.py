@@ -1,0 +1,201 @@
+"""Work that enters the environment in one MuJoCo step through ports other than the coupling.
+
+MuJoCo's ``discrete`` step solves M (v⁺ − v)/h = f(q, v) − … in the positions and Jacobians of its
+start, and moves by h v⁺. The work of a generalised force Q in that step is therefore h Q · v⁺, with
+the Q that the step really used: for a stiff servo that is its force at the end of the step, not
+``actuator_force``, which is the one at the start.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticbridge.jit import compiled
+from hapticbridge.kernel.native import (
+    floats,
+    ints,
+    mj_apply_ft,
+    mj_com_pos,
+    mj_energy_pos,
+    mj_fwd_kinematics,
+    mj_rne_post_constraint,
+    pointer_at,
+)
+from hapticbridge.pose import rotation_between
+
+
+@compiled
+def moment_dot(state: NDArray[np.void], output: int, vector_address: int) -> float:
+    """Returns one row of the actuator moment times a vector over the degrees of freedom."""
+    s = state[0]
+    nnz = ints(s.moment_rownnz, output + 1)[output]
+    adr = ints(s.moment_rowadr, output + 1)[output]
+    columns = ints(s.moment_colind, adr + nnz)
+    moment = floats(s.actuator_moment, adr + nnz)
+    vector = floats(vector_address, s.nv)
+    total = 0.0
+    for i in range(adr, adr + nnz):
+        total += moment[i] * vector[columns[i]]
+    return total
+
+
+@compiled
+def _actuator_work(state: NDArray[np.void]) -> float:
+    """Work of the scene's own actuators: h Σ (F − k h m·v − (h²k_p + h k_v) m·a) m·v⁺.
+
+    F is the force at the start, m the moment, a = (v⁺ − v)/h. The two corrections take F to the
+    end of the step; MuJoCo keeps them in ``efm_ak`` = h k_p and ``efm_as`` = h² k_p + h k_v for the
+    actuators in its effective metric. ``qfrc_actuator`` is used for the sum because it has the
+    limits of joints applied; the coupling's share is taken out again.
+    """
+    s = state[0]
+    h = s.timestep
+    qvel, force = floats(s.qvel, s.nv), floats(s.qfrc_actuator, s.nv)
+    power = 0.0
+    for i in range(s.nv):
+        power += force[i] * qvel[i]
+    first = s.coupling_output_adr
+    forces = floats(s.actuator_force, first + 6)
+    for output in range(first, first + 6):
+        power -= forces[output] * moment_dot(state, output, s.qvel)
+    count = ints(s.nefmA, 1)[0]
+    if count > 0:
+        ids = ints(pointer_at(s.efm_aid), count)
+        scales = floats(pointer_at(s.efm_as), count)
+        stiffnesses = floats(pointer_at(s.efm_ak), count)
+        for k in range(count):
+            actuator = ids[k]
+            if s.coupling_actuator_id <= actuator < s.coupling_actuator_id + 6:
+                continue
+            adr = ints(s.outadr, actuator + 1)[actuator]
+            num = ints(s.outnum, actuator + 1)[actuator]
+            for output in range(adr, adr + num):
+                end = moment_dot(state, output, s.qvel)
+                change = moment_dot(state, output, s.qacc)
+                power -= (stiffnesses[k] * (end - h * change) + scales[k] * change) * end
+    return h * power
+
+
+@compiled
+def _applied_work(state: NDArray[np.void]) -> float:
+    """Work of ``qfrc_applied``, ``xfrc_applied`` and passive gravity compensation."""
+    s = state[0]
+    nv = s.nv
+    qvel, applied = floats(s.qvel, nv), floats(s.qfrc_applied, nv)
+    power = 0.0
+    for i in range(nv):
+        power += applied[i] * qvel[i]
+    if s.has_gravity_compensation:
+        compensation, is_passive = (
+            floats(s.qfrc_gravcomp, nv),
+            floats(s.passive_gravcomp_dofs, nv),
+        )
+        for i in range(nv):
+            power += compensation[i] * is_passive[i] * qvel[i]
+    wrenches = floats(s.xfrc_applied, 6 * s.nbody)
+    for body in range(1, s.nbody):
+        is_loaded = False
+        for i in range(6 * body, 6 * body + 6):
+            is_loaded = is_loaded or wrenches[i] != 0.0
+        if is_loaded:
+            # positions are still those of the step's start, where MuJoCo applied the wrench
+            generalised = floats(s.scratch, nv)
+            generalised[:] = 0.0
+            force = s.xfrc_applied + 48 * body
+            mj_apply_ft(
+                s.model, s.data, force, force + 24, s.xipos + 24 * body, np.int32(body), s.scratch
+            )
+            for i in range(nv):
+                power += generalised[i] * qvel[i]
+    return s.timestep * power
+
+
+@compiled
+def note_moved_mocap_bodies(state: NDArray[np.void]) -> None:
+    """Before the step: finds the scene's mocap bodies that were moved, and their direct work.
+
+    Moving one changes at once the potential energy of what hangs on it (springs, weights): that
+    difference is work done by whoever moved it. What it does through contacts and equality
+    constraints is only known after the step (``meter_ports``).
+    """
+    s = state[0]
+    s.mocap_has_moved = 0
+    positions, quaternions = floats(s.mocap_pos, 3 * s.nmocap), floats(s.mocap_quat, 4 * s.nmocap)
+    previous = floats(s.mocap_previous, 7 * s.nmocap)
+    shift = floats(s.mocap_shift, 6 * s.nmocap)
+    for m in range(s.nmocap):
+        if m == s.handle_mocap_id:
+            continue
+        has_moved = False
+        for i in range(3):
+            shift[6 * m + i] = positions[3 * m + i] - previous[7 * m + i]
+            has_moved = has_moved or shift[6 * m + i] != 0.0
+        for i in range(4):
+            has_moved = has_moved or quaternions[4 * m + i] != previous[7 * m + 3 + i]
+        if has_moved:
+            p, q = 7 * m + 3, 4 * m
+            turn = rotation_between(
+                (previous[p], previous[p + 1], previous[p + 2], previous[p + 3]),
+                (quaternions[q], quaternions[q + 1], quaternions[q + 2], quaternions[q + 3]),
+            )
+            for i in range(3):
+                shift[6 * m + 3 + i] = turn[i]
+                previous[7 * m + i] = positions[3 * m + i]
+            for i in range(4):
+                previous[7 * m + 3 + i] = quaternions[4 * m + i]
+            s.mocap_has_moved = 1
+        else:
+            for i in range(3, 6):
+                shift[6 * m + i] = 0.0
+    if s.mocap_has_moved:
+        mj_fwd_kinematics(s.model, s.data)
+        mj_com_pos(s.model, s.data)
+        mj_energy_pos(s.model, s.data)
+        s.external_work += floats(s.energy, 2)[0] - s.potential
+
+
+@compiled
+def _mocap_work(state: NDArray[np.void]) -> float:
+    """Work of moved mocap bodies through contacts and equality constraints: −(F·δp + τ·δφ).
+
+    F and τ are the wrench of the constraints on the mocap body about its origin, at the step that
+    follows the move, as f_k goes with x_k − x_{k−1} in the coupling's port.
+    """
+    s = state[0]
+    mj_rne_post_constraint(s.model, s.data)
+    bodies, roots = ints(s.mocap_bodies, s.nmocap), ints(s.body_rootid, s.nbody)
+    wrenches, centres = floats(s.cfrc_ext, 6 * s.nbody), floats(s.subtree_com, 3 * s.nbody)
+    positions, shift = floats(s.mocap_pos, 3 * s.nmocap), floats(s.mocap_shift, 6 * s.nmocap)
+    work = 0.0
+    for m in range(s.nmocap):
+        if m == s.handle_mocap_id:
+            continue
+        body = bodies[m]
+        c, w, d = 3 * roots[body], 6 * body, 6 * m
+        rx = centres[c] - positions[3 * m]
+        ry = centres[c + 1] - positions[3 * m + 1]
+        rz = centres[c + 2] - positions[3 * m + 2]
+        fx, fy, fz = wrenches[w + 3], wrenches[w + 4], wrenches[w + 5]
+        tx = wrenches[w] + ry * fz - rz * fy
+        ty = wrenches[w + 1] + rz * fx - rx * fz
+        tz = wrenches[w + 2] + rx * fy - ry * fx
+        work -= fx * shift[d] + fy * shift[d + 1] + fz * shift[d + 2]
+        work -= tx * shift[d + 3] + ty * shift[d + 4] + tz * shift[d + 5]
+    return work
+
+
+@compiled
+def meter_ports(state: NDArray[np.void]) -> None:
+    """Adds the work of the step that just ended to the actuator and the external port.
+
+    Must run before kinematics are refreshed: moments, Jacobians and points of attack are those of
+    the step's start, as the step used them.
+    """
+    s = state[0]
+    if s.has_actuators:
+        s.actuator_work += _actuator_work(state)
+    s.external_work += _applied_work(state)
+    if s.mocap_has_moved:
+        s.external_work += _mocap_work(state)
+        s.mocap_has_moved = 0

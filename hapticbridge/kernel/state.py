@@ -1,0 +1,322 @@
+"""Everything a tick reads and writes, as one preallocated record.
+
+One structured array of one element crosses from Python into the compiled functions: unpacking a
+single array costs 0.1 µs, unpacking forty would cost more than MuJoCo's step.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticbridge.coupling import Coupling
+from hapticbridge.errors import HapticBridgeError
+from hapticbridge.kernel import native
+from hapticbridge.kernel.step import handle_pose, refresh_energies
+from hapticbridge.tick import TICK_DTYPE
+
+HANDLE = "handle"
+"""Name of the mocap body, and of its site, that the bridge adds to a scene."""
+
+COUPLING_ACTUATORS = tuple(
+    f"coupling_{kind}_{axis}" for kind in ("force", "torque") for axis in ("x", "y", "z")
+)
+"""Names of the six actuators that couple the grip to the handle, in the order of a wrench."""
+
+_POINTERS = (
+    "qvel",
+    "qacc",
+    "ctrl",
+    "mocap_pos",
+    "mocap_quat",
+    "site_xpos",
+    "site_xquat",
+    "energy",
+    "solver_niter",
+    "subtree_com",
+    "xipos",
+    "cfrc_ext",
+    "qfrc_actuator",
+    "qfrc_applied",
+    "qfrc_gravcomp",
+    "xfrc_applied",
+    "actuator_force",
+    "moment_rownnz",
+    "moment_rowadr",
+    "moment_colind",
+    "actuator_moment",
+    "outadr",
+    "outnum",
+    "ncon",
+    "nisland",
+    "nefmA",
+    "efm_aid",
+    "efm_as",
+    "efm_ak",
+    "passive_gravcomp_dofs",
+    "mocap_bodies",
+    "body_rootid",
+    "mocap_previous",
+    "mocap_shift",
+    "scratch",
+)
+
+_COUNTS = (
+    "nv",
+    "nbody",
+    "nmocap",
+    "substeps",
+    "handle_mocap_id",
+    "grip_site_id",
+    "coupling_actuator_id",
+    "coupling_output_adr",
+    "coupling_ctrl_adr",
+    "has_actuators",
+    "has_gravity_compensation",
+    "has_tendons_or_flexes",
+    "ramp_ticks",
+)
+
+_PARAMETERS = (
+    "period",
+    "timestep",
+    "stiffness",
+    "damping",
+    "rotational_stiffness",
+    "rotational_damping",
+    "scale",
+    "force_scale",
+    "force_limit",
+    "torque_limit",
+)
+
+_POSES = ("device", "handle", "tool")
+
+_RUNNING_COUNTS = ("tick", "flags", "mocap_has_moved", "first_unstrict", "first_active")
+
+_RUNNING = (
+    "kinetic",
+    "potential",
+    "start_energy",
+    "coupling_work",
+    "actuator_work",
+    "external_work",
+    "environment_energy",
+    "device_energy",
+    "throughput",
+    "slack",
+    "slack_share",
+    "peak_force",
+    "peak_torque",
+)
+
+STATE_DTYPE = np.dtype(
+    [("model", "<i8"), ("data", "<i8")]
+    + [(name, "<i8") for name in _POINTERS + _COUNTS]
+    + [(name, "<f8") for name in _PARAMETERS]
+    + [
+        ("axes", "<f8", 9),
+        ("axes_quaternion", "<f8", 4),
+        ("device_origin", "<f8", 7),
+        ("handle_origin", "<f8", 7),
+    ]
+    + [(f"{name}_position", "<f8", 3) for name in _POSES]
+    + [(f"{name}_quaternion", "<f8", 4) for name in _POSES]
+    + [("handle_step", "<f8", 3), ("handle_turn", "<f8", 3), ("wrench_on_device", "<f8", 6)]
+    + [(name, "<i8") for name in _RUNNING_COUNTS]
+    + [(name, "<f8") for name in _RUNNING]
+)
+"""Addresses, sizes, parameters, the previous tick's poses, and the energies so far. Poses are
+(x, y, z, qw, qx, qy, qz); ``axes`` is the row-major rotation from the device's frame to the
+scene's, ``axes_quaternion`` the same as a quaternion."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RunParameters:
+    """Everything beside scene and device motion that decides what a run computes.
+
+    Attributes:
+        grip: Name of the site on the tool.
+        period: T in s.
+        substeps: MuJoCo steps per tick, >= 1.
+        coupling: K and B.
+        scale: Handle motion per device motion, without unit.
+        force_scale: Further factor on the wrench, without unit (1 keeps power equal on both sides).
+        axes: Row-major rotation from the device's frame to the scene's.
+        force_limit: Largest force norm on the device in N.
+        torque_limit: Largest torque norm on the device in N m.
+        ramp_ticks: Ticks over which the wrench on the device rises to its full value.
+        device_origin: Device pose (x, y, z, qw, qx, qy, qz) that maps to ``handle_origin``.
+        handle_origin: Handle pose of the same form, in the scene.
+        device_start: Device pose of the same form before the first tick.
+
+    Raises:
+        HapticBridgeError: A value is out of range.
+    """
+
+    grip: str
+    period: float
+    substeps: int
+    coupling: Coupling
+    scale: float = 1.0
+    force_scale: float = 1.0
+    axes: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+    force_limit: float
+    torque_limit: float
+    ramp_ticks: int
+    device_origin: tuple[float, ...]
+    handle_origin: tuple[float, ...]
+    device_start: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        positive = ("period", "substeps", "scale", "force_scale", "force_limit", "torque_limit")
+        for name in positive:
+            value = getattr(self, name)
+            if not math.isfinite(value) or value <= 0:
+                raise HapticBridgeError(f"{name} is {value!r}; it must be finite and > 0")
+        if self.ramp_ticks < 0:
+            raise HapticBridgeError(f"ramp_ticks is {self.ramp_ticks}; it must be >= 0")
+        for name in ("device_origin", "handle_origin", "device_start"):
+            pose = getattr(self, name)
+            if len(pose) != 7 or not all(math.isfinite(value) for value in pose):
+                raise HapticBridgeError(f"{name} is {pose!r}; it must be 7 finite numbers")
+        rotation = np.asarray(self.axes, dtype=np.float64)
+        if rotation.shape != (9,) or not (
+            np.allclose(rotation.reshape(3, 3) @ rotation.reshape(3, 3).T, np.eye(3), atol=1e-6)
+            and np.linalg.det(rotation.reshape(3, 3)) > 0
+        ):
+            raise HapticBridgeError(
+                f"axes is {self.axes!r}; it must be the 9 numbers of a right-handed rotation "
+                "matrix, row by row"
+            )
+
+
+class Binding:
+    """The kernel's state bound to one model, its data and the parameters of one run.
+
+    Attributes:
+        state: One element of ``STATE_DTYPE``.
+        row: One element of ``TICK_DTYPE``, written by each tick.
+    """
+
+    def __init__(
+        self, model: mujoco.MjModel, data: mujoco.MjData, parameters: RunParameters
+    ) -> None:
+        """Binds and resets: the tool's present pose and energy are where the run starts.
+
+        Raises:
+            SceneError: MuJoCo's memory layout is not the one described (``native.addresses``).
+        """
+        self.state = np.zeros(1, STATE_DTYPE)
+        self.row = np.zeros(1, TICK_DTYPE)
+        self._model, self._data = model, data  # the addresses in the state point into them
+        self._owned = _bind_addresses(model, data, self.state)
+        self._fill_parameters(model, parameters)
+        self._start(model, data, parameters)
+
+    def _fill_parameters(self, model: mujoco.MjModel, parameters: RunParameters) -> None:
+        state = self.state
+        first = model.actuator(COUPLING_ACTUATORS[0]).id
+        state["handle_mocap_id"] = model.body_mocapid[model.body(HANDLE).id]
+        state["grip_site_id"] = model.site(parameters.grip).id
+        state["coupling_actuator_id"] = first
+        state["coupling_ctrl_adr"] = model.actuator_ctrladr[first]
+        state["coupling_output_adr"] = model.actuator_outadr[first]
+        state["has_actuators"] = model.nactuator > len(COUPLING_ACTUATORS) or bool(
+            np.any(model.jnt_actgravcomp)
+        )
+        for name in ("period", "substeps", "scale", "force_scale", "force_limit", "torque_limit"):
+            state[name] = getattr(parameters, name)
+        state["timestep"] = model.opt.timestep
+        state["ramp_ticks"] = parameters.ramp_ticks
+        coupling = parameters.coupling
+        for name in ("stiffness", "damping", "rotational_stiffness", "rotational_damping"):
+            state[name] = getattr(coupling, name)
+        state["axes"] = parameters.axes
+        quaternion = np.zeros(4)
+        mujoco.mju_mat2Quat(quaternion, np.asarray(parameters.axes, dtype=np.float64))
+        state["axes_quaternion"] = quaternion
+        state["device_origin"], state["handle_origin"] = (
+            parameters.device_origin,
+            parameters.handle_origin,
+        )
+
+    def _start(
+        self, model: mujoco.MjModel, data: mujoco.MjData, parameters: RunParameters
+    ) -> None:
+        state = self.state
+        mujoco.mj_kinematics(model, data)
+        grip = int(state["grip_site_id"][0])
+        orientation = data.site_xquat[grip]
+        state["tool_position"] = data.site_xpos[grip]
+        state["tool_quaternion"] = orientation if orientation[0] >= 0 else -orientation
+        device = parameters.device_start
+        x, y, z, qw, qx, qy, qz = device
+        handle, handle_orientation = handle_pose(self.state, (x, y, z), (qw, qx, qy, qz))
+        state["device_position"], state["device_quaternion"] = device[:3], device[3:]
+        state["handle_position"], state["handle_quaternion"] = handle, handle_orientation
+        mocap_previous = self._owned["mocap_previous"]
+        mocap_previous[: model.nmocap, :3] = data.mocap_pos
+        mocap_previous[: model.nmocap, 3:] = data.mocap_quat
+        state["first_unstrict"] = state["first_active"] = -1
+        refresh_energies(state)
+        state["start_energy"] = state["kinetic"] + state["potential"]
+
+
+def _bind_addresses(
+    model: mujoco.MjModel, data: mujoco.MjData, state: NDArray[np.void]
+) -> dict[str, NDArray[np.generic]]:
+    """Fills in the addresses and sizes that the tick needs of a model and its data.
+
+    Returns:
+        The arrays that must outlive the state, beside model and data themselves, by name.
+
+    Raises:
+        SceneError: See ``native.addresses``.
+    """
+    state["model"], state["data"] = native.addresses(model, data)
+    buffer_fields = (
+        "qvel qacc ctrl mocap_pos mocap_quat site_xpos site_xquat subtree_com xipos cfrc_ext "
+        "qfrc_actuator qfrc_applied qfrc_gravcomp xfrc_applied actuator_force moment_rownnz "
+        "moment_rowadr moment_colind actuator_moment energy solver_niter"
+    )
+    for name in buffer_fields.split():
+        state[name] = getattr(data, name).ctypes.data
+    for name in ("ncon", "nisland", "nefmA", "efm_aid", "efm_as", "efm_ak"):
+        state[name] = native.field_address(data, name)
+
+    # actgravcomp hands a joint's gravity compensation to its actuators; the rest is passive
+    passive = np.ascontiguousarray(
+        1.0 - model.jnt_actgravcomp[model.dof_jntid].astype(np.float64), dtype=np.float64
+    )
+    mocap_bodies = np.zeros(max(model.nmocap, 1), dtype=np.int32)
+    for body_id, mocap_id in enumerate(model.body_mocapid):
+        if mocap_id >= 0:
+            mocap_bodies[mocap_id] = body_id
+    scratch = np.zeros(max(model.nv, 1))
+    mocap_previous = np.zeros((max(model.nmocap, 1), 7))
+    mocap_shift = np.zeros((max(model.nmocap, 1), 6))
+    output_address = np.ascontiguousarray(model.actuator_outadr, dtype=np.int32)
+    output_count = np.ascontiguousarray(model.actuator_outnum, dtype=np.int32)
+    body_root = np.ascontiguousarray(model.body_rootid, dtype=np.int32)
+    owned: dict[str, NDArray[np.generic]] = {
+        "passive_gravcomp_dofs": passive,
+        "mocap_bodies": mocap_bodies,
+        "scratch": scratch,
+        "mocap_previous": mocap_previous,
+        "mocap_shift": mocap_shift,
+        "outadr": output_address,
+        "outnum": output_count,
+        "body_rootid": body_root,
+    }
+    for name, array in owned.items():
+        state[name] = array.ctypes.data
+
+    state["nv"], state["nbody"], state["nmocap"] = model.nv, model.nbody, model.nmocap
+    state["has_gravity_compensation"] = bool(np.any(model.body_gravcomp))
+    state["has_tendons_or_flexes"] = model.ntendon > 0 or model.nflex > 0
+    return owned

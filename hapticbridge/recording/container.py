@@ -1,0 +1,244 @@
+"""The MCAP container, read defensively: records, chunks, checksums, and what is damaged.
+
+The MCAP library's reader yields one message at a time (10 µs each) and stops at the first fault;
+here a chunk comes out as one block of bytes, and a fault becomes a sentence.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import zstandard
+from mcap.opcode import Opcode
+from mcap.writer import MCAP0_MAGIC as MAGIC
+
+MAX_CHUNK_SIZE = 1 << 28
+"""The largest chunk that is decompressed, in bytes; a damaged size must not exhaust memory."""
+
+_RECORD = struct.Struct("<BQ")
+_CHUNK = struct.Struct("<QQQI")
+_FOOTER = struct.Struct("<QQI")
+_FOOTER_SIZE = _RECORD.size + _FOOTER.size
+_BATCH = 64
+
+
+class DamageError(Exception):
+    """A record does not hold what its kind holds; never leaves this package."""
+
+
+@dataclass(frozen=True)
+class Block:
+    """Schema, channel and message records that belong together: a chunk, or loose ones.
+
+    Attributes:
+        label: How to name it in a sentence.
+        data: The records' bytes.
+    """
+
+    label: str
+    data: bytes
+
+
+class Fields:
+    """Reads the fields of one record in order.
+
+    Args:
+        data: The bytes that hold the record's body.
+        start: Where the body starts.
+        stop: Where it ends.
+    """
+
+    def __init__(self, data: bytes, start: int, stop: int) -> None:
+        self._data, self._position, self._stop = data, start, stop
+
+    @property
+    def is_at_end(self) -> bool:
+        """Whether nothing is left."""
+        return self._position >= self._stop
+
+    def raw(self, size: int) -> bytes:
+        """Returns the next bytes; raises DamageError where the record is shorter."""
+        start = self._position
+        if size > self._stop - start:
+            raise DamageError("it is shorter than its fields")
+        self._position = start + size
+        return self._data[start : start + size]
+
+    def number(self, size: int) -> int:
+        """Returns the next unsigned number of 2, 4 or 8 bytes."""
+        return int.from_bytes(self.raw(size), "little")
+
+    def text(self) -> str:
+        """Returns the next text."""
+        try:
+            return self.raw(self.number(4)).decode()
+        except UnicodeDecodeError as error:
+            raise DamageError("its text is not UTF-8") from error
+
+    def mapping(self) -> dict[str, str]:
+        """Returns the next map of texts."""
+        size = self.number(4)
+        inner = Fields(self._data, self._position, self._position + size)
+        self.raw(size)
+        entries: dict[str, str] = {}
+        while not inner.is_at_end:
+            key = inner.text()
+            if key in entries:
+                raise DamageError(f"it holds '{key}' twice")
+            entries[key] = inner.text()
+        return entries
+
+
+class Container:
+    """An MCAP file in memory.
+
+    Args:
+        data: The file's bytes, which start with the MCAP magic.
+
+    Attributes:
+        is_cut: The end of the file is missing.
+        problems: What is damaged, one sentence each; complete after ``records`` is exhausted.
+    """
+
+    def __init__(self, data: bytes) -> None:
+        self._data = data
+        self.problems: list[str] = []
+        self._summary, self._end = 0, len(data)
+        footer = len(data) - len(MAGIC) - _FOOTER_SIZE
+        self.is_cut = not (
+            footer >= len(MAGIC)
+            and data.endswith(MAGIC)
+            and _RECORD.unpack_from(data, footer) == (Opcode.FOOTER, _FOOTER.size)
+        )
+        self._chunks: list[int] = []
+        if not self.is_cut:
+            self._end = footer
+            self._read_footer(footer)
+
+    def _read_footer(self, footer: int) -> None:
+        start, _, crc = _FOOTER.unpack_from(self._data, footer + _RECORD.size)
+        if start == 0 and crc == 0:
+            return
+        covered = memoryview(self._data)[start : self._end + _FOOTER_SIZE - 4]
+        if not len(MAGIC) <= start <= footer or (crc and zlib.crc32(covered) != crc):
+            self.problems.append("the index at the end of the file is damaged (checksum)")
+        if len(MAGIC) <= start <= footer:
+            self._summary = start
+            for opcode, body, stop in self._walk(start, footer, []):
+                if opcode == Opcode.CHUNK_INDEX and stop - body >= 24:
+                    self._chunks.append(int.from_bytes(self._data[body + 16 : body + 24], "little"))
+            self._chunks.sort()
+
+    def summary(self) -> Block:
+        """Returns the schemas and channels that the end of the file repeats, if it does."""
+        pieces = [
+            self._data[body - _RECORD.size : stop]
+            for opcode, body, stop in self._walk(self._summary or self._end, self._end, [])
+            if opcode in (Opcode.SCHEMA, Opcode.CHANNEL)
+        ]
+        return Block("the index at the end of the file", b"".join(pieces))
+
+    def records(self) -> Iterator[Block | tuple[int, Fields]]:
+        """Yields blocks of messages and, as (opcode, fields), metadata and attachments, in order.
+
+        Chunks are decompressed and checked in threads, some ahead of the one that is yielded.
+        """
+        with ThreadPoolExecutor(2) as pool:
+            batch: list[tuple[int, int, int]] = []
+            count = 0
+            for opcode, body, stop in self._data_section():
+                if opcode == Opcode.CHUNK:
+                    count += 1
+                    batch.append((count, body, stop))
+                    if len(batch) < _BATCH:
+                        continue
+                yield from self._blocks(pool, batch)
+                batch = []
+                if opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE):
+                    start = body - _RECORD.size
+                    yield Block(f"the record at byte {start}", self._data[start:stop])
+                elif opcode in (Opcode.METADATA, Opcode.ATTACHMENT):
+                    yield opcode, Fields(self._data, body, stop)
+            yield from self._blocks(pool, batch)
+
+    def _blocks(
+        self, pool: ThreadPoolExecutor, batch: list[tuple[int, int, int]]
+    ) -> Iterator[Block]:
+        for (number, body, _), (data, fault) in zip(
+            batch, pool.map(self._unpack, batch), strict=True
+        ):
+            label = f"chunk {number} (at byte {body - _RECORD.size})"
+            if fault:
+                self.problems.append(f"{label} is damaged: {fault}")
+            if data is not None:
+                yield Block(label, data)
+
+    def _unpack(self, chunk: tuple[int, int, int]) -> tuple[bytes | None, str | None]:
+        _, body, stop = chunk
+        fields = Fields(self._data, body, stop)
+        try:
+            _, _, size, crc = _CHUNK.unpack(fields.raw(_CHUNK.size))
+            compression = fields.text()
+            packed = fields.raw(fields.number(8))
+        except DamageError as error:
+            return None, str(error)
+        if size > MAX_CHUNK_SIZE:
+            return None, f"its size of {size} bytes is beyond {MAX_CHUNK_SIZE}"
+        if compression == "zstd":
+            try:
+                # zstandard allocates what the frame's own header claims
+                if zstandard.frame_content_size(packed) not in (-1, size):
+                    return None, "its size does not match"
+                data = zstandard.ZstdDecompressor().decompress(packed, max_output_size=size)
+            except zstandard.ZstdError:
+                return None, "it does not decompress"
+        elif not compression:
+            data = packed
+        else:
+            return None, f"its compression '{compression}' is not one of 'zstd' and none"
+        if len(data) != size or zlib.crc32(data) != crc:
+            return data, "its checksum does not match"
+        return data, None
+
+    def _data_section(self) -> Iterator[tuple[int, int, int]]:
+        for opcode, body, stop in self._walk(len(MAGIC), self._end, self._chunks):
+            if opcode == Opcode.DATA_END:
+                crc = Fields(self._data, body, stop).number(4) if stop - body >= 4 else 0
+                covered = memoryview(self._data)[: body - _RECORD.size]
+                if crc and zlib.crc32(covered) != crc:
+                    self.problems.append("the data section's checksum does not match")
+                return
+            yield opcode, body, stop
+        if not self.is_cut:
+            self.problems.append("the mark at the end of the data section is missing")
+
+    def _walk(self, start: int, end: int, resume: list[int]) -> Iterator[tuple[int, int, int]]:
+        """Yields (opcode, start of body, end of body); after a fault goes on at ``resume``."""
+        position = start
+        while position < end:
+            stop = end + 1
+            opcode = 0
+            if position + _RECORD.size <= end:
+                opcode, length = _RECORD.unpack_from(self._data, position)
+                stop = position + _RECORD.size + length
+            if stop <= end and Opcode.HEADER <= opcode:
+                if Opcode.DATA_END < opcode < 0x80:
+                    self.problems.append(
+                        f"the record at byte {position} is of unknown kind {opcode}"
+                    )
+                yield opcode, position + _RECORD.size, stop
+                position = stop
+                continue
+            following = next((offset for offset in resume if position < offset < end), None)
+            # a machine that lost power may leave zeros behind the last whole record
+            is_cut_here = self.is_cut and (opcode != 0 or not any(self._data[position:]))
+            if not is_cut_here:
+                until = "the file's end" if following is None else f"byte {following}"
+                self.problems.append(f"nothing can be read from byte {position} to {until}")
+            if following is None:
+                return
+            position = following

@@ -1,0 +1,159 @@
+"""What a recording is, in bytes: names, schemas, payloads, and the digest over all of it.
+
+A recording is an MCAP file (https://mcap.dev/spec), zstd, chunks of 128 kB:
+
+- metadata record ``hapticbridge`` and the attachments first, before any chunk, so that a file that
+  was cut still has them;
+- topic ``/tick``, encoding ``cdr``, schema ``hapticbridge/msg/Tick`` (``ros2msg``): 4 header bytes
+  and one packed ``TICK_DTYPE`` record (every field is 8 bytes wide, so CDR adds no padding);
+- topic ``/event``, encoding ``json``: one object per event, with ``event`` (what happened) and
+  ``time_ns`` (since the start of the run);
+- metadata record ``hapticbridge.digest`` last, with ``sha256`` (see ``Digest``).
+
+The log time of a message is ``epoch_ns`` (in the metadata: Unix time of the run's start) plus the
+tick's ``deadline_ns`` or the event's ``time_ns``.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticbridge.tick import TICK_DTYPE
+
+TICK_TOPIC = "/tick"
+EVENT_TOPIC = "/event"
+TICK_ENCODING = "cdr"
+EVENT_ENCODING = "json"
+TICK_SCHEMA_NAME = "hapticbridge/msg/Tick"
+TICK_SCHEMA_ENCODING = "ros2msg"
+EVENT_SCHEMA_NAME = "hapticbridge.Event"
+EVENT_SCHEMA_ENCODING = "jsonschema"
+EVENT_SCHEMA = (
+    b'{"type": "object", "properties": {"event": {"type": "string"}, '
+    b'"time_ns": {"type": "integer"}}, "required": ["event", "time_ns"]}'
+)
+
+METADATA_NAME = "hapticbridge"
+DIGEST_NAME = "hapticbridge.digest"
+DIGEST_KEY = "sha256"
+EPOCH_KEY = "epoch_ns"
+
+CHUNK_SIZE = 128 * 1024
+"""Size in bytes, before compression, at which a chunk is finished: 0.3 s of ticks at 1 kHz, the
+most that is lost if the recorder is killed."""
+
+CDR_HEADER = b"\x00\x01\x00\x00"
+"""Little-endian CDR, no options; the record after it starts at alignment 0."""
+
+PAYLOAD_DTYPE = np.dtype([("cdr", "V4"), ("record", TICK_DTYPE)])
+"""Payload of a message on ``/tick``."""
+
+_ROS_TYPES = {"<i8": "int64", "<f8": "float64"}
+
+
+@dataclass(frozen=True)
+class Attachment:
+    """A file carried inside the recording.
+
+    Attributes:
+        name: Its name, unique in the recording.
+        media_type: Its MIME type.
+        data: Its bytes, as they are.
+    """
+
+    name: str
+    media_type: str
+    data: bytes
+
+
+def tick_schema() -> bytes:
+    """Returns the ROS 2 message definition of ``TICK_DTYPE``, one field per line."""
+    lines = []
+    for name in TICK_DTYPE.names or ():
+        field = TICK_DTYPE[name]
+        suffix = f"[{field.shape[0]}]" if field.shape else ""
+        lines.append(f"{_ROS_TYPES[field.base.str]}{suffix} {name}\n")
+    return "".join(lines).encode()
+
+
+def event_payload(event: Mapping[str, object], time_ns: int) -> bytes:
+    """Returns the JSON of an event.
+
+    What JSON cannot hold becomes text instead of an error (``"nan"``, ``"inf"``, the ``str`` of an
+    unknown object), because the event of a trip is about such a number and must arrive.
+
+    Args:
+        event: What happened; ``time_ns`` is added.
+        time_ns: When, in ns since the start of the run.
+    """
+    plain = _plain({**event, "time_ns": int(time_ns)})
+    return json.dumps(plain, separators=(",", ":"), allow_nan=False).encode()
+
+
+def _plain(value: object) -> object:
+    if isinstance(value, np.ndarray | np.generic):
+        value = value.tolist()
+    if value is None or isinstance(value, bool | int | str):
+        return value
+    if isinstance(value, float):
+        return value if math.isfinite(value) else str(value)
+    if isinstance(value, Mapping):
+        return {str(key): _plain(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(entry) for entry in value]
+    return str(value)
+
+
+class Digest:
+    """SHA-256 over everything that matters in a recording, whatever the container's layout.
+
+    It is the SHA-256 of ``hapticbridge digest 1``, a newline, and four SHA-256 of 32 bytes each:
+
+    1. metadata: for each key in sorted order, key and value;
+    2. attachments: for each name in sorted order, name, media type and data;
+    3. ticks: all records in order, packed, without their CDR headers and with nothing between;
+    4. events: each JSON payload in order.
+
+    In 1, 2 and 4 every piece (text as UTF-8) follows its length as 8 bytes, little-endian, so no
+    two different contents are hashed as the same bytes.
+    """
+
+    def __init__(self, metadata: Mapping[str, str], attachments: Iterable[Attachment]) -> None:
+        self._metadata = hashlib.sha256()
+        for key in sorted(metadata):
+            _add(self._metadata, key.encode())
+            _add(self._metadata, metadata[key].encode())
+        self._attachments = hashlib.sha256()
+        for attachment in sorted(attachments, key=lambda attachment: attachment.name):
+            _add(self._attachments, attachment.name.encode())
+            _add(self._attachments, attachment.media_type.encode())
+            _add(self._attachments, attachment.data)
+        self._ticks = hashlib.sha256()
+        self._events = hashlib.sha256()
+
+    def add_ticks(self, rows: NDArray[np.void]) -> None:
+        """Adds records, shape (n,), ``TICK_DTYPE``."""
+        self._ticks.update(np.ascontiguousarray(rows).view(np.uint8).data)
+
+    def add_event(self, payload: bytes) -> None:
+        """Adds one event's JSON."""
+        _add(self._events, payload)
+
+    def hexdigest(self) -> str:
+        """Returns the digest of what was added so far, as 64 hexadecimal digits."""
+        whole = hashlib.sha256(b"hapticbridge digest 1\n")
+        for part in (self._metadata, self._attachments, self._ticks, self._events):
+            whole.update(part.digest())
+        return whole.hexdigest()
+
+
+def _add(digest: hashlib._Hash, piece: bytes) -> None:
+    digest.update(len(piece).to_bytes(8, "little"))
+    digest.update(piece)

@@ -1,0 +1,213 @@
+"""Writes a recording (format: ``hapticbridge.recording.format``)."""
+
+from __future__ import annotations
+
+import os
+import stat
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import BinaryIO, cast
+
+import numpy as np
+from mcap.writer import CompressionType, Writer
+from numpy.typing import NDArray
+
+from hapticbridge.errors import RecordingError
+from hapticbridge.recording import format as layout
+from hapticbridge.recording.format import Attachment as Attachment
+
+
+class _Output:
+    """A file that hands each write to the operating system whole and at once.
+
+    The MCAP library writes a finished chunk in one call; a buffer in between would keep its end
+    until the next one, and a kill would lose it.
+    """
+
+    def __init__(self, path: Path, mode: str) -> None:
+        self._file = path.open(mode, buffering=0)
+        self._position = 0
+
+    def write(self, data: bytes) -> int:
+        view = memoryview(data)
+        while view:
+            written = cast(int, self._file.write(view))
+            view = view[written:]
+        self._position += len(data)
+        return len(data)
+
+    def tell(self) -> int:
+        return self._position
+
+    def flush(self) -> None:
+        """Nothing is held back."""
+
+    def sync(self) -> None:
+        if stat.S_ISREG(os.fstat(self._file.fileno()).st_mode):
+            os.fsync(self._file.fileno())
+
+    def close(self) -> None:
+        self._file.close()
+
+
+class RecordingWriter:
+    """Writes one recording; used by the recorder's process and by ``repair``.
+
+    Metadata and attachments are in the file when the constructor returns. Each finished chunk
+    reaches the operating system at once, so a kill loses the last unfinished chunk at most.
+
+    Args:
+        path: The file; it is overwritten unless ``exclusive``.
+        metadata: Names and values; ``epoch_ns`` is added.
+        attachments: Files to carry, with different names.
+        epoch_ns: Unix time of the run's start, in ns.
+        exclusive: Refuse a file that exists.
+
+    Raises:
+        RecordingError: The file cannot be written, or metadata or attachments are not writable.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        metadata: Mapping[str, str],
+        attachments: Sequence[Attachment],
+        epoch_ns: int,
+        *,
+        exclusive: bool = False,
+    ) -> None:
+        self.path = Path(path)
+        self._epoch = int(epoch_ns)
+        meta = {**metadata, layout.EPOCH_KEY: str(self._epoch)}
+        _check(meta, attachments)
+        self._digest = layout.Digest(meta, attachments)
+        self._sequence = 0
+        self._is_closed = False
+        try:
+            self._output = _Output(self.path, "xb" if exclusive else "wb")
+        except OSError as error:
+            raise self._refusal(error) from error
+        try:
+            self._start(meta, attachments)
+        except OSError as error:
+            raise self._failed(error) from error
+
+    def _start(self, meta: Mapping[str, str], attachments: Sequence[Attachment]) -> None:
+        self._mcap = Writer(
+            cast(BinaryIO, self._output),
+            chunk_size=layout.CHUNK_SIZE,
+            compression=CompressionType.ZSTD,
+            enable_crcs=True,
+            enable_data_crcs=True,
+        )
+        self._mcap.start(library="hapticbridge")
+        self._mcap.add_metadata(layout.METADATA_NAME, dict(meta))
+        for item in attachments:
+            self._mcap.add_attachment(
+                self._epoch, self._epoch, item.name, item.media_type, item.data
+            )
+        tick_schema = self._mcap.register_schema(
+            layout.TICK_SCHEMA_NAME, layout.TICK_SCHEMA_ENCODING, layout.tick_schema()
+        )
+        event_schema = self._mcap.register_schema(
+            layout.EVENT_SCHEMA_NAME, layout.EVENT_SCHEMA_ENCODING, layout.EVENT_SCHEMA
+        )
+        self._ticks = self._mcap.register_channel(
+            layout.TICK_TOPIC, layout.TICK_ENCODING, tick_schema
+        )
+        self._events = self._mcap.register_channel(
+            layout.EVENT_TOPIC, layout.EVENT_ENCODING, event_schema
+        )
+
+    def write_ticks(self, rows: NDArray[np.void]) -> None:
+        """Appends records.
+
+        Args:
+            rows: Shape (n,), ``TICK_DTYPE``.
+
+        Raises:
+            RecordingError: The file cannot be written; it ends with its last whole chunk.
+        """
+        payloads = np.empty(rows.size, layout.PAYLOAD_DTYPE)
+        payloads["cdr"] = np.void(layout.CDR_HEADER)
+        payloads["record"] = rows
+        packed, size = payloads.tobytes(), layout.PAYLOAD_DTYPE.itemsize
+        # a deadline before 1970 or beyond 2554 does not exist, but must not stop the recorder
+        times = (rows["deadline_ns"].astype(np.uint64) + np.uint64(self._epoch % 2**64)).tolist()
+        self._digest.add_ticks(rows)
+        try:
+            for index, time in enumerate(times):
+                self._mcap.add_message(
+                    self._ticks,
+                    time,
+                    packed[index * size : (index + 1) * size],
+                    time,
+                    (self._sequence + index) & 0xFFFFFFFF,
+                )
+        except OSError as error:
+            raise self._failed(error) from error
+        self._sequence += len(times)
+
+    def write_event(self, event: Mapping[str, object], time_ns: int) -> None:
+        """Appends an event.
+
+        Args:
+            event: What happened: ``event`` names it, the rest is its data.
+            time_ns: When, in ns since the start of the run.
+
+        Raises:
+            RecordingError: The file cannot be written; it ends with its last whole chunk.
+        """
+        payload = layout.event_payload(event, time_ns)
+        time = (self._epoch + int(time_ns)) % 2**64
+        self._digest.add_event(payload)
+        try:
+            self._mcap.add_message(self._events, time, payload, time)
+        except OSError as error:
+            raise self._failed(error) from error
+
+    def close(self) -> None:
+        """Finishes the file: last chunk, digest, index; on disk when it returns.
+
+        Raises:
+            RecordingError: The file cannot be written; it ends with its last whole chunk.
+        """
+        if self._is_closed:
+            return
+        self._is_closed = True
+        try:
+            self._mcap.flush()
+            digest = {layout.DIGEST_KEY: self._digest.hexdigest()}
+            self._mcap.add_metadata(layout.DIGEST_NAME, digest)
+            self._mcap.finish()
+            self._output.sync()
+        except OSError as error:
+            raise self._refusal(error) from error
+        finally:
+            self._output.close()
+
+    def _failed(self, error: OSError) -> RecordingError:
+        # nothing may follow a half-written chunk: the file is then one that was cut there
+        self._is_closed = True
+        self._output.close()
+        return self._refusal(error)
+
+    def _refusal(self, error: OSError) -> RecordingError:
+        return RecordingError(f"cannot write the recording {self.path}: {error.strerror or error}")
+
+
+def _check(metadata: Mapping[str, str], attachments: Sequence[Attachment]) -> None:
+    texts = [text for entry in metadata.items() for text in entry]
+    names = [attachment.name for attachment in attachments]
+    texts += names + [attachment.media_type for attachment in attachments]
+    for text in texts:
+        if not isinstance(text, str):
+            raise RecordingError(f"metadata of a recording must be text, not {text!r}")
+        try:
+            text.encode()
+        except UnicodeEncodeError as error:
+            raise RecordingError(
+                f"metadata of a recording must be valid Unicode, not {text!r}"
+            ) from error
+    if twice := {name for name in names if names.count(name) > 1}:
+        raise RecordingError(f"two attachments are named {sorted(twice)[0]!r}")

@@ -1,0 +1,7 @@
+"""MJCF scenes put behind a haptic device: loading, the handle and its coupling, checks."""
+
+from hapticbridge.scene.library import scene_names as scene_names
+from hapticbridge.scene.library import scene_path as scene_path
+from hapticbridge.scene.load import Scene as Scene
+from hapticbridge.scene.load import load_scene as load_scene
+from hapticbridge.scene.source import SourceFile as SourceFile

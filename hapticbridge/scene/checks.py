@@ -1,0 +1,167 @@
+"""What a scene must satisfy before a hand may feel it; each refusal is one sentence."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+
+from hapticbridge.errors import SceneError
+from hapticbridge.kernel.state import COUPLING_ACTUATORS
+
+MAXIMUM_START_PENETRATION = 1e-4
+"""How deep the tool may start inside something, in m. A start in penetration releases contact
+energy that nobody meters: 26 mJ within 15 ms were seen."""
+
+
+def check_options(spec: mujoco.MjSpec) -> list[str]:
+    """Refuses options that do not belong under a bridge; returns warnings.
+
+    Raises:
+        SceneError: An option excludes the coupling from the implicit step (PGS, noslip), carries
+            state that is not saved (ipc), or switches off actuators or the step itself.
+    """
+    option = spec.option
+    if option.solver == mujoco.mjtSolver.mjSOL_PGS:
+        raise SceneError(
+            "the scene asks for solver PGS, which leaves the coupling out of the implicit step; "
+            "use Newton"
+        )
+    if option.noslip_iterations > 0:
+        raise SceneError(
+            f"the scene asks for noslip_iterations={option.noslip_iterations}, which splits the "
+            "implicit step; set it to 0"
+        )
+    if option.enableflags & mujoco.mjtEnableBit.mjENBL_IPC:
+        raise SceneError(
+            "the scene enables flag ipc, whose state cannot be saved and simulated again; "
+            "disable it"
+        )
+    if option.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP:
+        raise SceneError(
+            "the scene enables flag sleep, under which a sleeping tool would not feel its "
+            "coupling; disable it"
+        )
+    if option.disableflags & mujoco.mjtDisableBit.mjDSBL_ACTUATION:
+        raise SceneError(
+            "the scene disables actuation, and the coupling is made of actuators; enable it"
+        )
+    if option.disableactuator:
+        groups = [str(g) for g in range(31) if option.disableactuator & (1 << g)]
+        raise SceneError(
+            f"the scene disables actuator groups ({', '.join(groups)}), which could switch the "
+            "coupling off; remove actuatorgroupdisable"
+        )
+    warnings = []
+    if option.integrator == mujoco.mjtIntegrator.mjINT_RK4:
+        warnings.append(
+            "the scene asks for integrator RK4; it runs under 'discrete', the only one that is "
+            "passive behind the coupling"
+        )
+    if np.any(np.asarray(option.wind)):
+        warnings.append(
+            "wind does work on the scene that no port meters; the environment may be called active"
+        )
+    return warnings
+
+
+def check_model(model: mujoco.MjModel, grip: str) -> list[str]:
+    """Refuses a compiled model that cannot be coupled; returns warnings.
+
+    Raises:
+        SceneError: Masses or inertias are not finite, the grip cannot move, a joint would cap the
+            coupling's force, or a coupling actuator is not as it was set.
+    """
+    for body_id in range(model.nbody):
+        mass, inertia = model.body_mass[body_id], model.body_inertia[body_id]
+        if not np.isfinite(mass) or not np.all(np.isfinite(inertia)):
+            raise SceneError(
+                f"body '{model.body(body_id).name}' has mass {mass:g} kg and inertia "
+                f"{inertia.tolist()} kg m²; all must be finite"
+            )
+    chain = _ancestors(model, int(model.site(grip).bodyid[0]))
+    if not any(model.body_dofnum[body_id] for body_id in chain):
+        body = model.body(chain[0]).name or "world"
+        raise SceneError(
+            f"grip '{grip}' sits on body '{body}', which cannot move; put it on a body with a "
+            "free joint or at the end of joints"
+        )
+    for body_id in chain:
+        first = model.body_jntadr[body_id]
+        for joint_id in range(first, first + model.body_jntnum[body_id]):
+            if model.jnt_actfrclimited[joint_id]:
+                raise SceneError(
+                    f"joint '{model.joint(joint_id).name}' limits actuator forces "
+                    "(actuatorfrcrange), which would cap the coupling; remove it and limit the "
+                    "actuator's own forcerange"
+                )
+    for name in COUPLING_ACTUATORS:
+        _check_coupling_actuator(model, name)
+    warnings = []
+    if np.any(model.geom_surfacevel):
+        warnings.append(
+            "a geom's surfacevel does work on the scene that no port meters; the environment may "
+            "be called active"
+        )
+    return warnings
+
+
+def _ancestors(model: mujoco.MjModel, body_id: int) -> list[int]:
+    chain = [body_id]
+    while chain[-1] != 0:
+        chain.append(int(model.body_parentid[chain[-1]]))
+    return chain
+
+
+def _check_coupling_actuator(model: mujoco.MjModel, name: str) -> None:
+    actuator_id = model.actuator(name).id
+    is_as_set = (
+        model.actuator_forcelimited[actuator_id] == 0
+        and model.actuator_ctrllimited[model.actuator_ctrladr[actuator_id]] == 0
+        and model.actuator_actlimited[actuator_id] == 0
+        and model.actuator_dyntype[actuator_id] == mujoco.mjtDyn.mjDYN_NONE
+        and model.actuator_delay[actuator_id] == 0
+        and model.actuator_damping[actuator_id] == 0
+        and model.actuator_armature[actuator_id] == 0
+        and model.actuator_plugin[actuator_id] == -1
+        and model.actuator_actnum[actuator_id] == 0
+        and np.sum(np.abs(model.actuator_gear[model.actuator_outadr[actuator_id]])) == 1
+    )
+    if not is_as_set:
+        raise SceneError(
+            f"a <default> of the scene reached the coupling's actuator '{name}'; move it into a "
+            "named class"
+        )
+
+
+def check_start(model: mujoco.MjModel, data: mujoco.MjData, grip: str) -> None:
+    """Refuses a start that is not finite or in which the tool is inside something.
+
+    Args:
+        model: The compiled scene.
+        data: Its state at the start, after ``mj_forward``.
+        grip: Name of the site on the tool.
+
+    Raises:
+        SceneError: Names the pair of geoms and the depth.
+    """
+    if not (np.all(np.isfinite(data.qpos)) and np.all(np.isfinite(data.qacc))):
+        raise SceneError("the scene's start is not finite; check keyframe 'home' and qpos0")
+    root = model.body_rootid[model.site(grip).bodyid[0]]
+    for contact in data.contact:
+        pair = [int(geom) for geom in contact.geom]
+        if contact.dist >= -MAXIMUM_START_PENETRATION or min(pair) < 0:
+            continue
+        if any(model.body_rootid[model.geom_bodyid[geom]] == root for geom in pair):
+            names = " and ".join(_geom_name(model, geom) for geom in pair)
+            raise SceneError(
+                f"the tool starts {-contact.dist * 1e3:.3g} mm inside something: {names} overlap; "
+                f"at most {MAXIMUM_START_PENETRATION * 1e3:g} mm are allowed"
+            )
+
+
+def _geom_name(model: mujoco.MjModel, geom_id: int) -> str:
+    name = model.geom(geom_id).name
+    if name:
+        return f"geom '{name}'"
+    body = model.body(model.geom_bodyid[geom_id]).name or "world"
+    return f"geom {geom_id} of body '{body}'"

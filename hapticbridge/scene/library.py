@@ -1,0 +1,49 @@
+"""The scenes that come with hapticbridge, by name."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+
+from hapticbridge.errors import SceneError, choices
+
+
+@cache
+def _folder() -> Path:
+    package = Path(__file__).resolve().parents[1]
+    installed = package / "models"  # where the wheel puts it
+    return installed if installed.is_dir() else package.parent / "models"
+
+
+def scene_names() -> tuple[str, ...]:
+    """Returns the names that ``load_scene`` knows, sorted."""
+    return tuple(sorted(path.parent.name for path in _folder().glob("*/*.xml") if _is_scene(path)))
+
+
+def _is_scene(path: Path) -> bool:
+    return path.stem == path.parent.name
+
+
+def scene_path(path_or_name: str | Path) -> Path:
+    """Returns the MJCF file that a path or a scene's name stands for.
+
+    Args:
+        path_or_name: A file, or one of ``scene_names()``. A name without a dot or a slash is never
+            taken for a file unless the file exists.
+
+    Raises:
+        SceneError: There is neither such a file nor such a name.
+    """
+    path = Path(path_or_name)
+    if path.is_file():
+        return path
+    if path.is_dir():
+        raise SceneError(f"scene '{path}' is a folder; name the MJCF file in it")
+    name = str(path_or_name)
+    if name in scene_names():
+        return _folder() / name / f"{name}.xml"
+    if path.suffix or len(path.parts) > 1:
+        raise SceneError(f"no scene file '{path}' exists")
+    raise SceneError(
+        f"no scene is called '{name}' and no such file exists; scenes: {choices(scene_names())}"
+    )

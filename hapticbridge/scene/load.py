@@ -1,0 +1,129 @@
+"""Loads an MJCF scene and puts a handle and a coupling into it."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from hapticbridge.coupling import Coupling
+from hapticbridge.errors import SceneError
+from hapticbridge.kernel.state import COUPLING_ACTUATORS, HANDLE
+from hapticbridge.scene.attach import attach_handle, set_options
+from hapticbridge.scene.checks import check_model, check_options, check_start
+from hapticbridge.scene.library import scene_path
+from hapticbridge.scene.source import SourceFile, collect_sources
+
+START_KEYFRAME = "home"
+
+
+@dataclass(slots=True)
+class Scene:
+    """A compiled scene with its handle, ready to be stepped.
+
+    Attributes:
+        path: The MJCF file.
+        grip: Name of the site on the tool.
+        model: MuJoCo's model, with the bridge's handle and coupling in it.
+        data: Its state.
+        sources: The original bytes of the file, its includes and its assets.
+    """
+
+    path: Path
+    grip: str
+    model: mujoco.MjModel
+    data: mujoco.MjData
+    sources: tuple[SourceFile, ...]
+
+    @property
+    def name(self) -> str:
+        """The file's name without its ending."""
+        return self.path.stem
+
+    def reset(self) -> None:
+        """Puts the scene to keyframe ``home`` if it has one, else ``qpos0``; handle at the grip."""
+        model, data = self.model, self.data
+        key = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_KEY, START_KEYFRAME)
+        if key >= 0:
+            mujoco.mj_resetDataKeyframe(model, data, key)
+        else:
+            mujoco.mj_resetData(model, data)
+        mujoco.mj_kinematics(model, data)
+        handle = model.body_mocapid[model.body(HANDLE).id]
+        data.mocap_pos[handle] = data.site(self.grip).xpos
+        data.mocap_quat[handle] = data.site_xquat[model.site(self.grip).id]
+        mujoco.mj_forward(model, data)
+
+    def grip_pose(self) -> tuple[float, ...]:
+        """Returns the grip's pose (x, y, z, qw, qx, qy, qz) in the world frame, in m."""
+        site_id = self.model.site(self.grip).id
+        position, quaternion = self.data.site_xpos[site_id], self.data.site_xquat[site_id]
+        sign = 1.0 if quaternion[0] >= 0 else -1.0
+        return tuple(float(value) for value in (*position, *(sign * quaternion)))
+
+    def set_timestep(self, period: float, substeps: int = 1) -> None:
+        """Sets MuJoCo's timestep to period / substeps, in s.
+
+        Raises:
+            SceneError: The period is not finite and positive, or there is no whole substep.
+        """
+        if not np.isfinite(period) or period <= 0:
+            raise SceneError(f"period is {period!r} s; it must be finite and > 0")
+        if substeps < 1:
+            raise SceneError(f"substeps is {substeps}; it must be 1 or more")
+        self.model.opt.timestep = period / substeps
+
+    def set_coupling(self, coupling: Coupling) -> None:
+        """Sets the gains of the coupling's actuators; needs no compilation."""
+        for axis, name in enumerate(COUPLING_ACTUATORS):
+            is_rotation = axis >= 3  # forces come first in a wrench
+            stiffness = coupling.rotational_stiffness if is_rotation else coupling.stiffness
+            damping = coupling.rotational_damping if is_rotation else coupling.damping
+            actuator_id = self.model.actuator(name).id
+            self.model.actuator_gainprm[actuator_id, 0] = damping
+            self.model.actuator_biasprm[actuator_id, 1] = -stiffness
+            self.model.actuator_biasprm[actuator_id, 2] = -damping
+
+
+def load_scene(path_or_name: str | Path, grip: str = "grip") -> Scene:
+    """Loads an MJCF file, or a scene by name, and puts a handle and a coupling into it.
+
+    The user's own actuators, equality constraints, keyframes and assets survive. The grip may sit
+    on a free body, on a body at the end of joints, or on one with a single slide joint.
+
+    Args:
+        path_or_name: An MJCF file, or one of ``scene_names()``.
+        grip: Name of the site on the tool.
+
+    Raises:
+        SceneError: The scene cannot be read, compiled or put behind a device; says why.
+
+    Warns:
+        UserWarning: The scene will run, but not quite as its file says.
+    """
+    path = scene_path(path_or_name)
+    try:
+        spec = mujoco.MjSpec.from_file(str(path))
+    except (ValueError, OSError) as error:
+        raise SceneError(f"cannot read scene '{path}': {_one_line(error)}") from None
+    concerns = check_options(spec)
+    attach_handle(spec, grip)
+    set_options(spec)
+    try:
+        model = spec.compile()
+    except (ValueError, OSError) as error:
+        raise SceneError(f"cannot compile scene '{path}': {_one_line(error)}") from None
+    concerns += check_model(model, grip)
+    scene = Scene(path, grip, model, mujoco.MjData(model), collect_sources(path))
+    scene.reset()
+    check_start(model, scene.data, grip)
+    for concern in concerns:
+        warnings.warn(f"scene '{path}': {concern}", UserWarning, stacklevel=2)
+    return scene
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split())
