@@ -1,1 +1,28 @@
-"""Feel a MuJoCo scene through a haptic device, with a metered guarantee."""
+"""Feel a MuJoCo scene through a haptic device, with a metered guarantee that it cannot kick back.
+
+with hapticbridge.Bridge("peg_in_hole", "simulated", recording="run.mcap") as bridge:
+    summary = bridge.run(duration=10.0)
+report = hapticbridge.audit("run.mcap")
+"""
+
+from hapticbridge import passivity as passivity
+from hapticbridge.audit import AuditReport as AuditReport
+from hapticbridge.audit import audit as audit
+from hapticbridge.bridge import Bridge as Bridge
+from hapticbridge.bridge import Summary as Summary
+from hapticbridge.clock import RealClock as RealClock
+from hapticbridge.clock import SimulatedClock as SimulatedClock
+from hapticbridge.coupling import Coupling as Coupling
+from hapticbridge.device import open_device as open_device
+from hapticbridge.errors import CouplingError as CouplingError
+from hapticbridge.errors import DeviceError as DeviceError
+from hapticbridge.errors import HapticBridgeError as HapticBridgeError
+from hapticbridge.errors import RecordingError as RecordingError
+from hapticbridge.errors import SafetyTrip as SafetyTrip
+from hapticbridge.errors import SceneError as SceneError
+from hapticbridge.guard import Limits as Limits
+from hapticbridge.recording import read_recording as read_recording
+from hapticbridge.recording import repair as repair
+from hapticbridge.scene import Scene as Scene
+from hapticbridge.scene import load_scene as load_scene
+from hapticbridge.scene import scene_names as scene_names

@@ -1,7 +1,7 @@
 """Time, injected: a real clock with absolute deadlines, and a simulated one.
 
-Both answer the same two calls, so the loop does not know which one drives it. Times are integer
-nanoseconds from an origin that the clock chooses at ``start``.
+Both answer the same calls, so the loop does not know which one drives it. Times are integer
+nanoseconds of running: zero at the first start, and a later start goes on where the last run ended.
 """
 
 from __future__ import annotations
@@ -27,18 +27,18 @@ class Clock(Protocol):
     is_lossless: bool
 
     def start(self, period_ns: int) -> None:
-        """Sets the origin of time and the tick's period in ns."""
+        """Starts or resumes time with the tick's period in ns; the next deadline is one away."""
 
     def wait(self) -> tuple[int, int, int]:
         """Waits for the next deadline.
 
         Returns:
-            The deadline and the time of waking, both in ns since the start, and how many deadlines
+            The deadline and the time of waking, both in ns of running, and how many deadlines
             were skipped because they had already passed by a period or more.
         """
 
     def now(self) -> int:
-        """Returns the time in ns since the start."""
+        """Returns the time in ns of running."""
 
 
 class RealClock:
@@ -51,11 +51,13 @@ class RealClock:
     name = "real"
     is_lossless = False
 
+    def __init__(self) -> None:
+        self._period = self._origin = self._deadline = 0
+
     def start(self, period_ns: int) -> None:
-        """Sets the origin to now; the first deadline is one period away."""
+        """Puts the last deadline to now (see ``Clock.start``)."""
         self._period = period_ns
-        self._origin = time.monotonic_ns()
-        self._deadline = 0
+        self._origin = time.monotonic_ns() - self._deadline
 
     def wait(self) -> tuple[int, int, int]:
         """Sleeps to shortly before the deadline, then spins (see ``Clock.wait``)."""
@@ -75,7 +77,7 @@ class RealClock:
         return deadline, now, skipped
 
     def now(self) -> int:
-        """Returns ns since the start."""
+        """Returns ns of running."""
         return time.monotonic_ns() - self._origin
 
 
@@ -85,10 +87,12 @@ class SimulatedClock:
     name = "simulated"
     is_lossless = True
 
+    def __init__(self) -> None:
+        self._period = self._now = 0
+
     def start(self, period_ns: int) -> None:
-        """Sets time to zero."""
+        """Takes the period; time stands still between runs."""
         self._period = period_ns
-        self._now = 0
 
     def wait(self) -> tuple[int, int, int]:
         """Advances by one period at once (see ``Clock.wait``)."""
@@ -96,5 +100,5 @@ class SimulatedClock:
         return self._now, self._now, 0
 
     def now(self) -> int:
-        """Returns ns since the start, a multiple of the period."""
+        """Returns ns of running, a multiple of the period."""
         return self._now

@@ -2,12 +2,33 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable
+from functools import cache
+from pathlib import Path
 from typing import TypeVar, cast
 
 import numba
+import platformdirs
 
 _Function = TypeVar("_Function", bound=Callable[..., object])
+
+
+@cache
+def _cache_folder() -> str:
+    """Returns where machine code is kept: one folder per state of all compiled sources.
+
+    numba looks only at the file of the function that it loads, but compiled functions inline each
+    other across files: with one folder for all, a change in one module would leave its old code in
+    the callers. ``NUMBA_CACHE_DIR`` moves the folder.
+    """
+    digest = hashlib.sha256()
+    for path in sorted(Path(__file__).parent.rglob("*.py")):
+        source = path.read_bytes()
+        if b"hapticbridge.jit import" in source:
+            digest.update(source)
+    base = numba.config.CACHE_DIR or platformdirs.user_cache_dir("hapticbridge", appauthor=False)
+    return str(Path(base) / digest.hexdigest()[:16])
 
 
 def compiled(function: _Function) -> _Function:
@@ -18,4 +39,9 @@ def compiled(function: _Function) -> _Function:
     Division by zero gives inf or nan as in NumPy instead of raising, because an exception cannot
     be raised in the middle of a tick; what is not finite trips the guard.
     """
-    return cast(_Function, numba.njit(cache=True, nogil=True, error_model="numpy")(function))
+    outside = numba.config.CACHE_DIR
+    numba.config.CACHE_DIR = _cache_folder()
+    try:
+        return cast(_Function, numba.njit(cache=True, nogil=True, error_model="numpy")(function))
+    finally:
+        numba.config.CACHE_DIR = outside

@@ -71,9 +71,13 @@ def product(a: Quaternion, b: Quaternion) -> Quaternion:
 
 @compiled
 def canonical(q: Quaternion) -> Quaternion:
-    """Returns the unit quaternion with w >= 0 of the same rotation (q and −q are one rotation)."""
-    length = math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
-    factor = 1.0 / length
+    """Returns the unit quaternion with w >= 0 of the same rotation (q and −q are one rotation).
+
+    Idempotent to the bit: what is of unit length to 1e-12 is not scaled again, or a recorded
+    quaternion that is read back would differ in its last digit.
+    """
+    square = q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]
+    factor = 1.0 / math.sqrt(square) if abs(square - 1.0) > 1e-12 else 1.0
     if q[0] < 0.0:
         factor = -factor
     return factor * q[0], factor * q[1], factor * q[2], factor * q[3]

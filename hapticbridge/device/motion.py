@@ -1,11 +1,8 @@
-"""A prescribed motion: poses over time, read from a CSV file and interpolated in a tick."""
+"""A prescribed motion: poses over time, interpolated within a tick."""
 
 from __future__ import annotations
 
 import math
-import os
-from pathlib import Path
-from typing import cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -27,6 +24,8 @@ TIME_AND_POSITION = ("t", "x", "y", "z")
 ORIENTATION = ("qw", "qx", "qy", "qz")
 NORM_TOLERANCE = 1e-3
 """How far a quaternion's norm may be from 1: room for four printed digits, not for a mistake."""
+LARGEST_NUMBER = 1e12
+"""No time in s and no position in m is beyond this; sums and differences stay finite."""
 
 
 class Motion:
@@ -44,7 +43,7 @@ class Motion:
 
         Args:
             times: Shape (n,), in s, n >= 2, finite and strictly increasing.
-            positions: Shape (n, 3), in m, finite.
+            positions: Shape (n, 3), in m, finite. Neither is beyond ±1e12.
             quaternions: Shape (n, 4), (w, x, y, z), of norm 1 within 1e-3; None: no rotation.
 
         Raises:
@@ -63,7 +62,7 @@ class Motion:
                 "be (n,), (n, 3) and (n, 4) with n >= 2"
             )
         table = np.column_stack(columns)
-        if fault := _first_fault(table):
+        if fault := first_fault(table):
             raise DeviceError(f"row {fault[0]} of the motion: {fault[1]}")
         table[:, 0] -= table[0, 0]
         _normalise(table)
@@ -83,129 +82,16 @@ class Motion:
         )
 
 
-def read_motion(path: str | os.PathLike[str]) -> Motion:
-    """Reads a motion from a CSV file.
-
-    The first line that is neither empty nor a comment (``#``) names the columns, in any order:
-    ``t,x,y,z`` in s and m, and either all or none of ``qw,qx,qy,qz``. Every further line is a row
-    of numbers; times strictly increase; the rate is free.
-
-    Args:
-        path: The file, UTF-8.
-
-    Returns:
-        The motion, its times counted from the first row.
-
-    Raises:
-        DeviceError: The file cannot be read, or a line is not as above; the message names it.
-    """
-    path = Path(path)
-    lines = _read_lines(path)
-    numbered = (
-        (number, line)
-        for number, line in enumerate(lines, start=1)
-        if line and not line.isspace() and not line.lstrip().startswith("#")
-    )
-    header = next(numbered, None)
-    if header is None:
-        raise DeviceError(f"{path}: the file is empty; a header t,x,y,z and two rows are needed")
-    names = _column_names(f"{path}, line {header[0]}", header[1])
-    width = len(names)
-    numbers: list[int] = []
-    rows: list[list[float]] = []
-    for number, line in numbered:
-        fields = line.split(",")
-        if len(fields) != width:
-            raise DeviceError(
-                f"{path}, line {number}: {len(fields)} fields where the header names "
-                f"{width} columns"
-            )
-        try:
-            row = [float(field) for field in fields]
-        except ValueError:
-            column = next(i for i, field in enumerate(fields) if not _is_number(field))
-            raise DeviceError(
-                f"{path}, line {number}: column '{names[column]}' holds "
-                f"{fields[column].strip()!r:.40}, which is not a number"
-            ) from None
-        rows.append(row)
-        numbers.append(number)
-    if len(rows) < 2:
-        last = numbers[-1] if numbers else header[0]
-        raise DeviceError(
-            f"{path}, line {last}: the file ends after {len(rows)} of at least two rows of numbers"
-        )
-    table = np.empty((len(rows), 8))
-    table[:, 4:] = (1.0, 0.0, 0.0, 0.0)
-    data = np.array(rows)
-    for column, name in enumerate(TIME_AND_POSITION + ORIENTATION):
-        if name in names:
-            table[:, column] = data[:, names.index(name)]
-    if fault := _first_fault(table):
-        raise DeviceError(f"{path}, line {numbers[fault[0]]}: {fault[1]}")
-    return Motion(table[:, 0], table[:, 1:4], table[:, 4:])
-
-
-def _read_lines(path: Path) -> list[str]:
-    """Reads a text file; lines end in any of the usual ways, a byte-order mark is dropped."""
-    try:
-        if not path.exists():
-            raise DeviceError(f"{path}: no such file")
-        if not path.is_file():
-            raise DeviceError(
-                f"{path}: is {'a directory' if path.is_dir() else 'not a regular file'}, "
-                "not a CSV file"
-            )
-        return path.read_text(encoding="utf-8-sig").split("\n")
-    except UnicodeDecodeError as error:
-        line = path.read_bytes()[: error.start].count(b"\n") + 1
-        raise DeviceError(f"{path}, line {line}: not UTF-8 text, so not a CSV file") from None
-    except (OSError, ValueError) as error:
-        reason = error.strerror if isinstance(error, OSError) else str(error)
-        raise DeviceError(f"{path}: cannot be read ({reason})") from None
-
-
-def _column_names(where: str, line: str) -> list[str]:
-    """Returns the columns that a header names, or says what is wrong with them."""
-    # some programs quote the names of columns, none quotes numbers
-    names = [field.strip().strip("\"'").strip().lower() for field in line.split(",")]
-    needed = "a header with the columns t,x,y,z and optionally qw,qx,qy,qz is needed"
-    if all(_is_number(name) for name in names):
-        raise DeviceError(f"{where}: numbers where {needed}")
-    known = TIME_AND_POSITION + ORIENTATION
-    if missing := [name for name in TIME_AND_POSITION if name not in names]:
-        raise DeviceError(f"{where}: column {', '.join(missing)} is missing; {needed}")
-    if unknown := [name for name in names if name not in known]:
-        raise DeviceError(f"{where}: unknown column {unknown[0]!r:.40}; {needed}")
-    if len(set(names)) < len(names):
-        twice = next(name for name in names if names.count(name) > 1)
-        raise DeviceError(f"{where}: column {twice} is there twice")
-    missing = [name for name in ORIENTATION if name not in names]
-    if 0 < len(missing) < len(ORIENTATION):
-        raise DeviceError(
-            f"{where}: column {', '.join(missing)} is missing; an orientation needs all of "
-            "qw,qx,qy,qz, or none of them"
-        )
-    return names
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
-
-
-def _first_fault(table: NDArray[np.float64]) -> tuple[int, str] | None:
+def first_fault(table: NDArray[np.float64]) -> tuple[int, str] | None:
     """Returns the first row that is no part of a motion, and why; None where all are."""
     faults: list[tuple[int, str]] = []
-    finite = np.isfinite(table)
-    if not finite.all():
-        row = int(np.argmin(finite.all(axis=1)))
-        column = int(np.argmin(finite[row]))
-        name = (TIME_AND_POSITION + ORIENTATION)[column]
-        faults.append((row, f"{name} = {table[row, column]} is not finite"))
+    is_good = np.abs(table) <= LARGEST_NUMBER
+    if not is_good.all():
+        row = int(np.argmin(is_good.all(axis=1)))
+        column = int(np.argmin(is_good[row]))
+        name, value = (TIME_AND_POSITION + ORIENTATION)[column], float(table[row, column])
+        fault = f"is beyond ±{LARGEST_NUMBER:g}" if np.isfinite(value) else "is not finite"
+        faults.append((row, f"{name} = {value:g} {fault}"))
         table = table[:row]
     times = table[:, 0]
     late = np.flatnonzero(~(times[1:] > times[:-1]))
@@ -218,8 +104,7 @@ def _first_fault(table: NDArray[np.float64]) -> tuple[int, str] | None:
                 "times must strictly increase",
             )
         )
-    with np.errstate(over="ignore"):  # a norm that overflows is inf, which is off too
-        norms = np.sqrt((table[:, 4:] ** 2).sum(axis=1))
+    norms = np.linalg.norm(table[:, 4:], axis=1)
     off = np.flatnonzero(~(np.abs(norms - 1.0) <= NORM_TOLERANCE))
     if off.size:
         row = int(off[0])
@@ -257,9 +142,7 @@ def _relative_rotations(quaternions: NDArray[np.float64]) -> NDArray[np.float64]
 
 
 @compiled
-def pose_at(
-    table: NDArray[np.float64], time: float, cursor: int
-) -> tuple[int, Vector, Quaternion]:
+def pose_at(table: NDArray[np.float64], time: float, cursor: int) -> tuple[int, Vector, Quaternion]:
     """Returns the pose of a motion at a time, interpolated linearly and by slerp.
 
     Args:
@@ -321,6 +204,6 @@ def lissajous(time: float) -> tuple[Vector, Quaternion]:
         math.sin(_FREQUENCIES[5] * phase),
     )
     return (
-        cast(Vector, scaled(LISSAJOUS_AMPLITUDE * ease, position)),
+        scaled(LISSAJOUS_AMPLITUDE * ease, position),
         quaternion_exp(scaled(LISSAJOUS_ROTATION * ease, rotation)),
     )

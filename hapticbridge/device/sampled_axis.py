@@ -45,7 +45,8 @@ AXIS_DTYPE = np.dtype(
     ]
 )
 """The law of motion of an axis: M, b, b_h, k_h and f_c in SI units, and per level i of time
-h = T/2^i the numbers h, d_0, d_1, −(k_h/M) d_1 and c_1. ``first_level``: the longest time in which
+h = T/2^i the numbers h, d_0, d_1, −(k_h/M) d_1 and c_1 (beyond i = 0 only with friction).
+``first_level``: the longest time in which
 the acceleration changes its sign at most once."""
 
 
@@ -77,14 +78,16 @@ def sampled_axis(
     axis["hand_damping"] = hand_damping
     axis["stiffness"] = stiffness
     axis["friction"] = friction
-    times = period / 2.0 ** np.arange(LEVELS)
+    # without friction only whole periods are stepped
+    levels = LEVELS if friction > 0.0 else 1
+    times = period / 2.0 ** np.arange(levels)
     # (∫r/h, r, h r') over the time h as unit: elements of order one at every level
-    generator = np.zeros((LEVELS, 3, 3))
+    generator = np.zeros((levels, 3, 3))
     generator[:, 0, 1] = generator[:, 1, 2] = 1.0
     generator[:, 2, 1] = -stiffness / inertia * times**2
     generator[:, 2, 2] = -(damping + hand_damping) / inertia * times
     transition = scipy.linalg.expm(generator)
-    steps = axis["steps"]
+    steps = axis["steps"][:levels]
     steps[:, 0] = times
     steps[:, 1] = times * transition[:, 0, 1]
     steps[:, 2] = times**2 * transition[:, 0, 2]
@@ -129,12 +132,9 @@ def acceleration_at(
     axis: Record, force: float, stretch: float, velocity: float, drift: float
 ) -> float:
     """Returns v' for a force F (friction included), x − p, v and ṗ."""
-    return (
-        force
-        - axis.damping * velocity
-        - axis.hand_damping * (velocity - drift)
-        - axis.stiffness * stretch
-    ) / axis.inertia
+    dampers = axis.damping * velocity + axis.hand_damping * (velocity - drift)
+    acceleration: float = (force - dampers - axis.stiffness * stretch) / axis.inertia
+    return acceleration
 
 
 @compiled

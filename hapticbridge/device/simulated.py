@@ -10,53 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.device.base import DeviceInfo, checked_number, checked_period
-from hapticbridge.device.motion import Motion, lissajous, pose_at, read_motion
-from hapticbridge.device.sampled_axis import (
-    AXIS_DTYPE,
-    Record,
-    acceleration_at,
-    moved,
-    moved_with_friction,
-    sampled_axis,
-)
+from hapticbridge.device.handheld import MAX_DELAY, STATE_DTYPE, next_sample
+from hapticbridge.device.motion import Motion
+from hapticbridge.device.motion_csv import read_motion
+from hapticbridge.device.sampled_axis import sampled_axis
 from hapticbridge.errors import DeviceError
-from hapticbridge.jit import compiled
-from hapticbridge.pose import (
-    Quaternion,
-    Vector,
-    canonical,
-    product,
-    quaternion_exp,
-    quaternion_log,
-    rotation_between,
-    scaled,
-)
 from hapticbridge.tick import SAMPLE_DTYPE
-
-MAX_DELAY = 100
-"""Largest output delay in samples."""
-
-_STATE_DTYPE = np.dtype(
-    [
-        ("tick", "<i8"),
-        ("cursor", "<i8"),
-        ("period", "<f8"),
-        ("is_held", "<i8"),
-        ("position", "<f8", 3),
-        ("velocity", "<f8", 3),
-        ("quaternion", "<f8", 4),
-        ("angular_velocity", "<f8", 3),
-        ("target_position", "<f8", 3),
-        ("target_quaternion", "<f8", 4),
-        ("resolution", "<f8"),
-        ("rotational_resolution", "<f8"),
-        ("delay", "<i8"),
-        ("written", "<f8", 6),
-        ("on_the_way", "<f8", (MAX_DELAY + 1, 6)),
-        ("translation", AXIS_DTYPE),
-        ("rotation", AXIS_DTYPE),
-    ]
-)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -102,88 +61,14 @@ class Hand:
 
 
 _DEFAULT_HAND = Hand()
-
-
-@compiled
-def _translate(s: Record, wrench: NDArray[np.float64], target: Vector) -> None:
-    """Moves the position by one period, each axis on its own."""
-    axis = s.translation
-    for i in range(3):
-        drift = (target[i] - s.target_position[i]) / s.period
-        stretch = s.position[i] - s.target_position[i]
-        velocity = s.velocity[i]
-        if axis.friction > 0.0:
-            travel, s.velocity[i] = moved_with_friction(axis, wrench[i], stretch, velocity, drift)
-        else:
-            acceleration = acceleration_at(axis, wrench[i], stretch, velocity, drift)
-            travel, gain = moved(axis, 0, velocity - drift, acceleration, drift)
-            s.velocity[i] += gain
-        s.position[i] += travel
-        s.target_position[i] = target[i]
-
-
-@compiled
-def _rotate(s: Record, wrench: NDArray[np.float64], target: Quaternion) -> None:
-    """Turns the orientation by one period, along the axes of the device's frame."""
-    axis = s.rotation
-    t = s.target_quaternion
-    old = (t[0], t[1], t[2], t[3])
-    q = (s.quaternion[0], s.quaternion[1], s.quaternion[2], s.quaternion[3])
-    drifts = scaled(1.0 / s.period, rotation_between(old, target))
-    stretches = rotation_between(old, q)
-    turn = [0.0, 0.0, 0.0]
-    for i in range(3):
-        velocity = s.angular_velocity[i]
-        acceleration = acceleration_at(axis, wrench[3 + i], stretches[i], velocity, drifts[i])
-        turn[i], gain = moved(axis, 0, velocity - drifts[i], acceleration, drifts[i])
-        s.angular_velocity[i] += gain
-    turned = canonical(product(quaternion_exp((turn[0], turn[1], turn[2])), q))
-    for i in range(4):
-        s.quaternion[i] = turned[i]
-        t[i] = target[i]
-
-
-@compiled
-def _next_sample(
-    states: NDArray[np.void], motion: NDArray[np.float64], samples: NDArray[np.void]
-) -> None:
-    """Moves device and hand by one period (not before the first sample) and reports the pose."""
-    s = states[0]
-    if s.tick > 0:
-        # the wrench written in tick k - 1 leaves the line of delay + 1 places in tick k + delay
-        line = s.delay + 1
-        entry = s.on_the_way[(s.tick - 1) % line]
-        for i in range(6):
-            entry[i] = s.written[i]
-        wrench = s.on_the_way[s.tick % line]
-        position, quaternion = (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)
-        if s.is_held == 1:
-            if motion.shape[0] > 0:
-                s.cursor, position, quaternion = pose_at(motion, s.tick * s.period, s.cursor)
-            else:
-                position, quaternion = lissajous(s.tick * s.period)
-        _translate(s, wrench, position)
-        _rotate(s, wrench, quaternion)
-    s.tick += 1
-    sample = samples[0]
-    sample.buttons = 0
-    for i in range(3):
-        sample.position[i] = _rounded(s.position[i], s.resolution)
-    q = (s.quaternion[0], s.quaternion[1], s.quaternion[2], s.quaternion[3])
-    if s.rotational_resolution > 0.0:
-        v = quaternion_log(q)
-        step = s.rotational_resolution
-        q = canonical(
-            quaternion_exp((_rounded(v[0], step), _rounded(v[1], step), _rounded(v[2], step)))
-        )
-    for i in range(4):
-        sample.quaternion[i] = q[i]
-
-
-@compiled
-def _rounded(value: float, step: float) -> float:
-    """Returns the nearest multiple of a step, the value itself where the step is zero."""
-    return step * np.round(value / step) if step > 0.0 else value
+_NO_HAND = Hand(
+    mass=0.0,
+    damping=0.0,
+    stiffness=0.0,
+    rotational_inertia=0.0,
+    rotational_damping=0.0,
+    rotational_stiffness=0.0,
+)
 
 
 class SimulatedDevice:
@@ -252,16 +137,21 @@ class SimulatedDevice:
             motion = path if isinstance(path, Motion) else read_motion(path)
             self._motion = motion.relative().table
             duration = motion.duration
+        mass = checked_number("mass", mass, "kg", is_positive=True)
+        damping = checked_number("damping", damping, "N s/m")
+        rotational_inertia = checked_number(
+            "rotational_inertia", rotational_inertia, "kg m²", is_positive=True
+        )
+        rotational_damping = checked_number("rotational_damping", rotational_damping, "N m s/rad")
+        friction = checked_number("friction", friction, "N")
         self.info = DeviceInfo(
             name="simulated",
             degrees_of_freedom=6,
-            mass=checked_number("mass", mass, "kg", is_positive=True),
-            damping=checked_number("damping", damping, "N s/m"),
-            rotational_inertia=checked_number(
-                "rotational_inertia", rotational_inertia, "kg m²", is_positive=True
-            ),
-            rotational_damping=checked_number("rotational_damping", rotational_damping, "N m s/rad"),
-            friction=checked_number("friction", friction, "N"),
+            mass=mass,
+            damping=damping,
+            rotational_inertia=rotational_inertia,
+            rotational_damping=rotational_damping,
+            friction=friction,
             resolution=checked_number("resolution", resolution, "m"),
             force_limit=force_limit,
             torque_limit=torque_limit,
@@ -271,12 +161,27 @@ class SimulatedDevice:
             is_real=False,
             duration=duration,
         )
+        holder = hand or _NO_HAND
+        self._translation = {
+            "inertia": mass + holder.mass,
+            "damping": damping,
+            "hand_damping": holder.damping,
+            "stiffness": holder.stiffness,
+            "friction": friction,
+        }
+        self._rotation = {
+            "inertia": rotational_inertia + holder.rotational_inertia,
+            "damping": rotational_damping,
+            "hand_damping": holder.rotational_damping,
+            "stiffness": holder.rotational_stiffness,
+            "friction": 0.0,
+        }
         self.hand = hand
         self._rotational_resolution = checked_number(
             "rotational_resolution", rotational_resolution, "rad"
         )
         self._delay = delay
-        self._states = np.zeros(1, _STATE_DTYPE)
+        self._states = np.zeros(1, STATE_DTYPE)
         self._written: NDArray[np.float64] = self._states["written"][0]
         self._is_started = False
 
@@ -290,42 +195,17 @@ class SimulatedDevice:
             DeviceError: The period is not, or is too long for a stiff hand with friction.
         """
         period = checked_period(period)
-        info, hand = self.info, self.hand
-        free = Hand(
-            mass=0.0,
-            damping=0.0,
-            stiffness=0.0,
-            rotational_inertia=0.0,
-            rotational_damping=0.0,
-            rotational_stiffness=0.0,
-        )
-        held = hand or free
-        state = np.zeros((), _STATE_DTYPE)
+        state = np.zeros((), STATE_DTYPE)
         state["period"] = period
-        state["is_held"] = hand is not None
+        state["is_held"] = self.hand is not None
         state["quaternion"][0] = state["target_quaternion"][0] = 1.0
-        state["resolution"] = info.resolution
+        state["resolution"] = self.info.resolution
         state["rotational_resolution"] = self._rotational_resolution
         state["delay"] = self._delay
-        state["translation"] = sampled_axis(
-            period,
-            inertia=info.mass + held.mass,
-            damping=info.damping,
-            hand_damping=held.damping,
-            stiffness=held.stiffness,
-            friction=info.friction,
-        )
-        state["rotation"] = sampled_axis(
-            period,
-            inertia=info.rotational_inertia + held.rotational_inertia,
-            damping=info.rotational_damping,
-            hand_damping=held.rotational_damping,
-            stiffness=held.rotational_stiffness,
-            friction=0.0,
-        )
+        state["translation"] = sampled_axis(period, **self._translation)
+        state["rotation"] = sampled_axis(period, **self._rotation)
         self._states[0] = state
-        _next_sample(self._states, self._motion, np.zeros(1, SAMPLE_DTYPE))
-        self._states[0] = state
+        next_sample(self._states.copy(), self._motion, np.zeros(1, SAMPLE_DTYPE))
         self._is_started = True
 
     def read(self, sample: NDArray[np.void]) -> None:
@@ -339,7 +219,7 @@ class SimulatedDevice:
         """
         if not self._is_started:
             raise DeviceError("the simulated device is read before it was started")
-        _next_sample(self._states, self._motion, sample)
+        next_sample(self._states, self._motion, sample)
 
     def write(self, wrench: NDArray[np.float64]) -> None:
         """Holds a wrench on the handle until the next write, ``delay`` samples later.

@@ -1,0 +1,1 @@
+"""The arithmetic of a tick, compiled, around MuJoCo's step."""

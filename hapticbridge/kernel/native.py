@@ -39,21 +39,21 @@ llvmlite.binding.load_library_permanently(str(_library()))
 
 _ADDRESS = types.intp
 _ON_DATA = types.void(_ADDRESS, _ADDRESS)
-mj_step = types.ExternalFunction("mj_step", _ON_DATA)
-mj_kinematics = types.ExternalFunction("mj_kinematics", _ON_DATA)
-mj_fwd_kinematics = types.ExternalFunction("mj_fwdKinematics", _ON_DATA)
-mj_com_pos = types.ExternalFunction("mj_comPos", _ON_DATA)
-mj_make_m = types.ExternalFunction("mj_makeM", _ON_DATA)
-mj_energy_pos = types.ExternalFunction("mj_energyPos", _ON_DATA)
-mj_energy_vel = types.ExternalFunction("mj_energyVel", _ON_DATA)
-mj_rne_post_constraint = types.ExternalFunction("mj_rnePostConstraint", _ON_DATA)
-mj_apply_ft = types.ExternalFunction(
+mj_step: Any = types.ExternalFunction("mj_step", _ON_DATA)
+mj_kinematics: Any = types.ExternalFunction("mj_kinematics", _ON_DATA)
+mj_fwd_kinematics: Any = types.ExternalFunction("mj_fwdKinematics", _ON_DATA)
+mj_com_pos: Any = types.ExternalFunction("mj_comPos", _ON_DATA)
+mj_make_m: Any = types.ExternalFunction("mj_makeM", _ON_DATA)
+mj_energy_pos: Any = types.ExternalFunction("mj_energyPos", _ON_DATA)
+mj_energy_vel: Any = types.ExternalFunction("mj_energyVel", _ON_DATA)
+mj_rne_post_constraint: Any = types.ExternalFunction("mj_rnePostConstraint", _ON_DATA)
+mj_apply_ft: Any = types.ExternalFunction(
     "mj_applyFT",
     types.void(_ADDRESS, _ADDRESS, _ADDRESS, _ADDRESS, _ADDRESS, types.int32, _ADDRESS),
 )
 
 
-@intrinsic
+@intrinsic  # type: ignore[untyped-decorator] # numba ships no types
 def _as_pointer(_typing: Any, _address: Any) -> Any:
     def generate(_context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
         return builder.inttoptr(arguments[0], cgutils.voidptr_t)
@@ -61,7 +61,7 @@ def _as_pointer(_typing: Any, _address: Any) -> Any:
     return types.voidptr(types.intp), generate
 
 
-@intrinsic
+@intrinsic  # type: ignore[untyped-decorator] # numba ships no types
 def release_fence(_typing: Any) -> Any:
     """Orders the record's bytes before the cursor that publishes them (release semantics)."""
 

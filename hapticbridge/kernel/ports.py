@@ -74,7 +74,7 @@ def _actuator_work(state: NDArray[np.void]) -> float:
                 end = moment_dot(state, output, s.qvel)
                 change = moment_dot(state, output, s.qacc)
                 power -= (stiffnesses[k] * (end - h * change) + scales[k] * change) * end
-    return h * power
+    return float(h * power)
 
 
 @compiled
@@ -108,7 +108,7 @@ def _applied_work(state: NDArray[np.void]) -> float:
             )
             for i in range(nv):
                 power += generalised[i] * qvel[i]
-    return s.timestep * power
+    return float(s.timestep * power)
 
 
 @compiled

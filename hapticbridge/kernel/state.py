@@ -145,7 +145,8 @@ class RunParameters:
         substeps: MuJoCo steps per tick, >= 1.
         coupling: K and B.
         scale: Handle motion per device motion, without unit.
-        force_scale: Further factor on the wrench, without unit (1 keeps power equal on both sides).
+        force_scale: Force on the device per force on the tool, without unit. Power is equal on both
+            sides where it equals ``scale``; torques return by force_scale / scale.
         axes: Row-major rotation from the device's frame to the scene's.
         force_limit: Largest force norm on the device in N.
         torque_limit: Largest torque norm on the device in N m.
@@ -245,9 +246,7 @@ class Binding:
             parameters.handle_origin,
         )
 
-    def _start(
-        self, model: mujoco.MjModel, data: mujoco.MjData, parameters: RunParameters
-    ) -> None:
+    def _start(self, model: mujoco.MjModel, data: mujoco.MjData, parameters: RunParameters) -> None:
         state = self.state
         mujoco.mj_kinematics(model, data)
         grip = int(state["grip_site_id"][0])

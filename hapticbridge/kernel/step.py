@@ -217,8 +217,8 @@ def _meter_coupling(
 ) -> None:
     """Adds this tick to the coupling's port and holds the environment against (14) and the slack.
 
-        E_k = S_k − S_{k−1} − (f_k·δx_k + τ_k·δφ_k) − actuators − external
-        slack_k = Σ ½ ‖δx_k‖²_{K + B/T} + ½ ‖δφ_k‖²_{K_r + B_r/T}
+    E_k = S_k − S_{k−1} − (f_k·δx_k + τ_k·δφ_k) − actuators − external
+    slack_k = Σ ½ ‖δx_k‖²_{K + B/T} + ½ ‖δφ_k‖²_{K_r + B_r/T}
     """
     s = state[0]
     work = dot(force, moved) + dot(torque, turned)
@@ -226,9 +226,7 @@ def _meter_coupling(
     s.throughput += abs(work)
     s.slack += 0.5 * (s.stiffness + s.damping / s.period) * dot(moved, moved)
     s.slack += (
-        0.5
-        * (s.rotational_stiffness + s.rotational_damping / s.period)
-        * dot(turned, turned)
+        0.5 * (s.rotational_stiffness + s.rotational_damping / s.period) * dot(turned, turned)
     )
     stored = (s.kinetic + s.potential) - s.start_energy
     s.environment_energy = stored - s.coupling_work - s.actuator_work - s.external_work
@@ -245,8 +243,8 @@ def _meter_coupling(
 def _render(state: NDArray[np.void], force: Vector, torque: Vector) -> None:
     """Turns the wrench on the tool into the one on the device: scale, limit by norm, start ramp."""
     s = state[0]
-    on_device = scaled(-s.force_scale * s.scale, _device_from_scene(s.axes, force))
-    torque_on_device = scaled(-s.force_scale, _device_from_scene(s.axes, torque))
+    on_device = scaled(-s.force_scale, _device_from_scene(s.axes, force))
+    torque_on_device = scaled(-s.force_scale / s.scale, _device_from_scene(s.axes, torque))
     on_device, is_limited = _limited(on_device, s.force_limit)
     torque_on_device, is_torque_limited = _limited(torque_on_device, s.torque_limit)
     if is_limited or is_torque_limited:

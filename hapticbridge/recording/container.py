@@ -8,13 +8,18 @@ from __future__ import annotations
 
 import struct
 import zlib
+from collections import deque
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import zstandard
 from mcap.opcode import Opcode
-from mcap.writer import MCAP0_MAGIC as MAGIC
+from mcap.writer import MCAP0_MAGIC
+
+MAGIC = MCAP0_MAGIC
+"""How an MCAP file starts and ends."""
 
 MAX_CHUNK_SIZE = 1 << 28
 """The largest chunk that is decompressed, in bytes; a damaged size must not exhaust memory."""
@@ -23,7 +28,7 @@ _RECORD = struct.Struct("<BQ")
 _CHUNK = struct.Struct("<QQQI")
 _FOOTER = struct.Struct("<QQI")
 _FOOTER_SIZE = _RECORD.size + _FOOTER.size
-_BATCH = 64
+_AHEAD = 64
 
 
 class DamageError(Exception):
@@ -37,10 +42,12 @@ class Block:
     Attributes:
         label: How to name it in a sentence.
         data: The records' bytes.
+        fault: What is wrong with it, or empty.
     """
 
     label: str
     data: bytes
+    fault: str = ""
 
 
 class Fields:
@@ -93,6 +100,9 @@ class Fields:
         return entries
 
 
+_Item: TypeAlias = Block | tuple[int, Fields]
+
+
 class Container:
     """An MCAP file in memory.
 
@@ -142,67 +152,57 @@ class Container:
         ]
         return Block("the index at the end of the file", b"".join(pieces))
 
-    def records(self) -> Iterator[Block | tuple[int, Fields]]:
+    def records(self) -> Iterator[_Item]:
         """Yields blocks of messages and, as (opcode, fields), metadata and attachments, in order.
 
         Chunks are decompressed and checked in threads, some ahead of the one that is yielded.
         """
         with ThreadPoolExecutor(2) as pool:
-            batch: list[tuple[int, int, int]] = []
+            ahead: deque[_Item | Future[Block]] = deque()
             count = 0
             for opcode, body, stop in self._data_section():
+                start = body - _RECORD.size
                 if opcode == Opcode.CHUNK:
                     count += 1
-                    batch.append((count, body, stop))
-                    if len(batch) < _BATCH:
-                        continue
-                yield from self._blocks(pool, batch)
-                batch = []
-                if opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE):
-                    start = body - _RECORD.size
-                    yield Block(f"the record at byte {start}", self._data[start:stop])
+                    label = f"chunk {count} (at byte {start})"
+                    ahead.append(pool.submit(self._unpack, label, body, stop))
+                elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE):
+                    ahead.append(Block(f"the record at byte {start}", self._data[start:stop]))
                 elif opcode in (Opcode.METADATA, Opcode.ATTACHMENT):
-                    yield opcode, Fields(self._data, body, stop)
-            yield from self._blocks(pool, batch)
+                    if opcode == Opcode.ATTACHMENT:
+                        self._check_attachment(body, stop)
+                    ahead.append((opcode, Fields(self._data, body, stop)))
+                if len(ahead) > _AHEAD:
+                    yield self._finished(ahead.popleft())
+            while ahead:
+                yield self._finished(ahead.popleft())
 
-    def _blocks(
-        self, pool: ThreadPoolExecutor, batch: list[tuple[int, int, int]]
-    ) -> Iterator[Block]:
-        for (number, body, _), (data, fault) in zip(
-            batch, pool.map(self._unpack, batch), strict=True
-        ):
-            label = f"chunk {number} (at byte {body - _RECORD.size})"
-            if fault:
-                self.problems.append(f"{label} is damaged: {fault}")
-            if data is not None:
-                yield Block(label, data)
+    def _check_attachment(self, body: int, stop: int) -> None:
+        crc = int.from_bytes(self._data[max(body, stop - 4) : stop], "little")
+        if crc and zlib.crc32(memoryview(self._data)[body : stop - 4]) != crc:
+            start = body - _RECORD.size
+            self.problems.append(
+                f"the attachment at byte {start} is damaged: its checksum does not match"
+            )
 
-    def _unpack(self, chunk: tuple[int, int, int]) -> tuple[bytes | None, str | None]:
-        _, body, stop = chunk
+    def _finished(self, item: _Item | Future[Block]) -> _Item:
+        if isinstance(item, Future):
+            item = item.result()
+        if isinstance(item, Block) and item.fault:
+            self.problems.append(f"{item.label} is damaged: {item.fault}")
+        return item
+
+    def _unpack(self, label: str, body: int, stop: int) -> Block:
         fields = Fields(self._data, body, stop)
         try:
             _, _, size, crc = _CHUNK.unpack(fields.raw(_CHUNK.size))
             compression = fields.text()
-            packed = fields.raw(fields.number(8))
+            data = _decompressed(compression, fields.raw(fields.number(8)), size)
         except DamageError as error:
-            return None, str(error)
-        if size > MAX_CHUNK_SIZE:
-            return None, f"its size of {size} bytes is beyond {MAX_CHUNK_SIZE}"
-        if compression == "zstd":
-            try:
-                # zstandard allocates what the frame's own header claims
-                if zstandard.frame_content_size(packed) not in (-1, size):
-                    return None, "its size does not match"
-                data = zstandard.ZstdDecompressor().decompress(packed, max_output_size=size)
-            except zstandard.ZstdError:
-                return None, "it does not decompress"
-        elif not compression:
-            data = packed
-        else:
-            return None, f"its compression '{compression}' is not one of 'zstd' and none"
+            return Block(label, b"", str(error))
         if len(data) != size or zlib.crc32(data) != crc:
-            return data, "its checksum does not match"
-        return data, None
+            return Block(label, data, "its checksum does not match")
+        return Block(label, data)
 
     def _data_section(self) -> Iterator[tuple[int, int, int]]:
         for opcode, body, stop in self._walk(len(MAGIC), self._end, self._chunks):
@@ -220,12 +220,11 @@ class Container:
         """Yields (opcode, start of body, end of body); after a fault goes on at ``resume``."""
         position = start
         while position < end:
-            stop = end + 1
-            opcode = 0
+            stop, opcode = end + 1, self._data[position]
             if position + _RECORD.size <= end:
-                opcode, length = _RECORD.unpack_from(self._data, position)
+                _, length = _RECORD.unpack_from(self._data, position)
                 stop = position + _RECORD.size + length
-            if stop <= end and Opcode.HEADER <= opcode:
+            if stop <= end and opcode >= Opcode.HEADER:
                 if Opcode.DATA_END < opcode < 0x80:
                     self.problems.append(
                         f"the record at byte {position} is of unknown kind {opcode}"
@@ -242,3 +241,19 @@ class Container:
             if following is None:
                 return
             position = following
+
+
+def _decompressed(compression: str, packed: bytes, size: int) -> bytes:
+    if size > MAX_CHUNK_SIZE:
+        raise DamageError(f"its size of {size} bytes is beyond {MAX_CHUNK_SIZE}")
+    if not compression:
+        return packed
+    if compression != "zstd":
+        raise DamageError(f"its compression '{compression}' is not one of 'zstd' and none")
+    try:
+        # zstandard allocates what the frame's own header claims
+        if zstandard.frame_content_size(packed) not in (-1, size):
+            raise DamageError("its size does not match")
+        return zstandard.ZstdDecompressor().decompress(packed, max_output_size=size)
+    except zstandard.ZstdError as error:
+        raise DamageError("it does not decompress") from error

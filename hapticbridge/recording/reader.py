@@ -247,7 +247,7 @@ def _read(path: Path) -> tuple[Recording, list[Attachment]]:
         is_cut=container.is_cut,
         digest=contents.digest,
         computed_digest=digest.hexdigest(),
-        problems=tuple(contents.problems),
+        problems=tuple(dict.fromkeys(contents.problems)),
     )
     return recording, contents.attachments
 

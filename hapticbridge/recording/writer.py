@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import stat
 from collections.abc import Mapping, Sequence
@@ -14,7 +15,9 @@ from numpy.typing import NDArray
 
 from hapticbridge.errors import RecordingError
 from hapticbridge.recording import format as layout
-from hapticbridge.recording.format import Attachment as Attachment
+from hapticbridge.recording.format import Attachment
+
+__all__ = ["Attachment", "RecordingWriter"]
 
 
 class _Output:
@@ -31,7 +34,7 @@ class _Output:
     def write(self, data: bytes) -> int:
         view = memoryview(data)
         while view:
-            written = cast(int, self._file.write(view))
+            written = self._file.write(view)
             view = view[written:]
         self._position += len(data)
         return len(data)
@@ -79,7 +82,7 @@ class RecordingWriter:
         self.path = Path(path)
         self._epoch = int(epoch_ns)
         meta = {**metadata, layout.EPOCH_KEY: str(self._epoch)}
-        _check(meta, attachments)
+        check_contents(meta, attachments)
         self._digest = layout.Digest(meta, attachments)
         self._sequence = 0
         self._is_closed = False
@@ -176,10 +179,10 @@ class RecordingWriter:
             return
         self._is_closed = True
         try:
-            self._mcap.flush()
+            self._mcap.flush()  # type: ignore[no-untyped-call]
             digest = {layout.DIGEST_KEY: self._digest.hexdigest()}
             self._mcap.add_metadata(layout.DIGEST_NAME, digest)
-            self._mcap.finish()
+            self._mcap.finish()  # type: ignore[no-untyped-call]
             self._output.sync()
         except OSError as error:
             raise self._refusal(error) from error
@@ -193,10 +196,18 @@ class RecordingWriter:
         return self._refusal(error)
 
     def _refusal(self, error: OSError) -> RecordingError:
-        return RecordingError(f"cannot write the recording {self.path}: {error.strerror or error}")
+        reason = error.strerror or str(error)
+        if error.errno == errno.ENOENT:
+            reason = f"the folder {self.path.parent} does not exist"
+        return RecordingError(f"cannot write the recording {self.path}: {reason}")
 
 
-def _check(metadata: Mapping[str, str], attachments: Sequence[Attachment]) -> None:
+def check_contents(metadata: Mapping[str, str], attachments: Sequence[Attachment]) -> None:
+    """Checks what a recording is to carry.
+
+    Raises:
+        RecordingError: A name or value is not Unicode text, or two attachments have one name.
+    """
     texts = [text for entry in metadata.items() for text in entry]
     names = [attachment.name for attachment in attachments]
     texts += names + [attachment.media_type for attachment in attachments]

@@ -54,11 +54,11 @@ def _walk(path: Path, root: Path, found: dict[str, Path]) -> None:
         return
     found[name] = path
     try:
-        tree = ElementTree.parse(path)
-    except (ElementTree.ParseError, UnicodeDecodeError):
+        element_root = ElementTree.fromstring(path.read_bytes())
+    except (ElementTree.ParseError, ValueError):
         return  # an asset, or XML that only MuJoCo's parser accepts
-    folders = _asset_folders(tree)
-    for element in tree.iter():
+    folders = _asset_folders(element_root)
+    for element in element_root.iter():
         for attribute in _FILE_ATTRIBUTES:
             reference = element.get(attribute)
             if reference is None:
@@ -74,8 +74,8 @@ def _walk(path: Path, root: Path, found: dict[str, Path]) -> None:
                     break
 
 
-def _asset_folders(tree: ElementTree.ElementTree) -> list[str]:
-    compiler = tree.iter("compiler")
+def _asset_folders(root: ElementTree.Element) -> list[str]:
+    compiler = root.iter("compiler")
     names = ("meshdir", "texturedir", "assetdir")
     return [value for element in compiler for name in names if (value := element.get(name))]
 

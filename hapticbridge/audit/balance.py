@@ -1,0 +1,175 @@
+"""A second opinion on a recording's physics: plain NumPy over the recorded poses and wrenches.
+
+Written apart from the kernel on purpose. It uses other formulas where there are any (rotation
+vectors by matrices of quaternion products over whole arrays), so that one mistake does not hide
+the other.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticbridge.kernel.state import RunParameters
+
+Array = NDArray[np.float64]
+
+
+def quaternion_product(a: Array, b: Array) -> Array:
+    """Returns a ⊗ b over arrays (…, 4), scalar first."""
+    scalar = a[..., :1] * b[..., :1] - np.sum(a[..., 1:] * b[..., 1:], axis=-1, keepdims=True)
+    vector = a[..., :1] * b[..., 1:] + b[..., :1] * a[..., 1:] + np.cross(a[..., 1:], b[..., 1:])
+    return np.concatenate([scalar, vector], axis=-1)
+
+
+def conjugate(q: Array) -> Array:
+    """Returns the inverse of unit quaternions (…, 4)."""
+    return np.asarray(q * np.array([1.0, -1.0, -1.0, -1.0]))
+
+
+def turn_between(a: Array, b: Array) -> Array:
+    """Returns the rotation vectors (…, 3) in the world frame that take a to b, in rad."""
+    q = quaternion_product(b, conjugate(a))
+    q = np.where(q[..., :1] < 0, -q, q)
+    sine = np.linalg.norm(q[..., 1:], axis=-1, keepdims=True)
+    angle = 2 * np.arctan2(sine, q[..., :1])
+    with np.errstate(invalid="ignore", divide="ignore"):
+        factor = np.where(sine > 0, angle / sine, 2.0)
+    return np.asarray(factor * q[..., 1:])
+
+
+def steps(values: Array, start: Array) -> Array:
+    """Returns v_k − v_{k−1} over rows, with v_{−1} = start."""
+    return np.diff(values, axis=0, prepend=start[None])
+
+
+def turns(values: Array, start: Array) -> Array:
+    """Returns the rotation vectors from each orientation's predecessor to it."""
+    return turn_between(np.concatenate([start[None], values[:-1]]), values)
+
+
+@dataclass(frozen=True, slots=True)
+class Balance:
+    """What the recorded poses and wrenches say by themselves.
+
+    Attributes:
+        wrench_on_tool: The coupling law at the recorded poses, (n, 6) in N and N m.
+        wrench_on_device: What the guard should have sent for the recorded wrench, (n, 6).
+        handle_position: Where the recorded device pose puts the handle, (n, 3) in m.
+        handle_turn: By how much the recorded handle is turned from where it should be, (n,) in rad.
+        coupling_work: Cumulative Σ f·δx + τ·δφ of the recorded wrench, (n,) in J.
+        throughput: Cumulative Σ |f·δx + τ·δφ|, (n,) in J.
+        device_energy: Cumulative energy given to the device by the recorded wrenches, (n,) in J.
+        device_throughput: The same with absolute values.
+        environment_energy: S_k − S_start − works, with ``coupling_work`` from here, (n,) in J.
+        slack: Σ ½‖δx‖²_{K+B/T} + ½‖δφ‖²_{K_r+B_r/T}, (n,) in J.
+    """
+
+    wrench_on_tool: Array
+    wrench_on_device: Array
+    handle_position: Array
+    handle_turn: Array
+    coupling_work: Array
+    throughput: Array
+    device_energy: Array
+    device_throughput: Array
+    environment_energy: Array
+    slack: Array
+
+    @classmethod
+    def of(
+        cls,
+        ticks: NDArray[np.void],
+        parameters: RunParameters,
+        handle_start: Array,
+        tool_start: Array,
+        start_energy: float,
+    ) -> Balance:
+        """Computes everything from records.
+
+        Args:
+            ticks: Records without gaps, ``TICK_DTYPE``.
+            parameters: The run's.
+            handle_start: Handle pose (7,) before the first tick.
+            tool_start: Tool pose (7,) before the first tick.
+            start_energy: Kinetic plus potential energy before the first tick, in J.
+        """
+        coupling, period = parameters.coupling, parameters.period
+        handle_step = steps(ticks["handle_position"], handle_start[:3])
+        tool_step = steps(ticks["tool_position"], tool_start[:3])
+        handle_turn = turns(ticks["handle_quaternion"], handle_start[3:])
+        tool_turn = turns(ticks["tool_quaternion"], tool_start[3:])
+        stretch = ticks["handle_position"] - ticks["tool_position"]
+        twist = turn_between(ticks["tool_quaternion"], ticks["handle_quaternion"])
+        force = coupling.stiffness * stretch + coupling.damping / period * (handle_step - tool_step)
+        torque = coupling.rotational_stiffness * twist + coupling.rotational_damping / period * (
+            handle_turn - tool_turn
+        )
+
+        recorded = ticks["wrench_on_tool"]
+        work = np.sum(recorded[:, :3] * tool_step, axis=1)
+        work += np.sum(recorded[:, 3:] * tool_turn, axis=1)
+        coupling_work = np.cumsum(work)
+
+        device_start = np.array(parameters.device_start)
+        sent = np.concatenate([np.zeros((1, 6)), ticks["wrench_on_device"][:-1]])
+        device_work = np.sum(
+            sent[:, :3] * steps(ticks["device_position"], device_start[:3]), axis=1
+        )
+        device_work += np.sum(
+            sent[:, 3:] * turns(ticks["device_quaternion"], device_start[3:]), axis=1
+        )
+
+        position, orientation = _handle(ticks, parameters)
+        stored = ticks["kinetic"] + ticks["potential"] - start_energy
+        linear = coupling.stiffness + coupling.damping / period
+        angular = coupling.rotational_stiffness + coupling.rotational_damping / period
+        slack = 0.5 * linear * np.sum(tool_step**2, axis=1)
+        slack += 0.5 * angular * np.sum(tool_turn**2, axis=1)
+        return cls(
+            wrench_on_tool=np.concatenate([force, torque], axis=1),
+            wrench_on_device=_guarded(ticks, parameters),
+            handle_position=position,
+            handle_turn=np.linalg.norm(
+                turn_between(orientation, ticks["handle_quaternion"]), axis=1
+            ),
+            coupling_work=coupling_work,
+            throughput=np.cumsum(np.abs(work)),
+            device_energy=np.cumsum(device_work),
+            device_throughput=np.cumsum(np.abs(device_work)),
+            environment_energy=stored
+            - coupling_work
+            - ticks["actuator_work"]
+            - ticks["external_work"],
+            slack=np.cumsum(slack),
+        )
+
+
+def _handle(ticks: NDArray[np.void], parameters: RunParameters) -> tuple[Array, Array]:
+    """Maps the recorded device poses into the scene (DESIGN: offset + scale · device)."""
+    axes = np.array(parameters.axes).reshape(3, 3)
+    origin, target = np.array(parameters.device_origin), np.array(parameters.handle_origin)
+    moved = (ticks["device_position"] - origin[:3]) @ axes.T
+    # a rotation vector turns with the axes: log(A R Aᵀ) = A log(R)
+    vector = turn_between(np.broadcast_to(origin[3:], (len(ticks), 4)), ticks["device_quaternion"])
+    vector = vector @ axes.T
+    angle = np.linalg.norm(vector, axis=1, keepdims=True)
+    turn = np.concatenate([np.cos(angle / 2), np.sinc(angle / (2 * np.pi)) / 2 * vector], axis=1)
+    orientation = quaternion_product(turn, np.broadcast_to(target[3:], (len(ticks), 4)))
+    return target[:3] + parameters.scale * moved, orientation
+
+
+def _guarded(ticks: NDArray[np.void], parameters: RunParameters) -> Array:
+    """Scales, limits and ramps the recorded wrench on the tool as the guard does."""
+    axes = np.array(parameters.axes).reshape(3, 3)
+    on_tool = ticks["wrench_on_tool"]
+    force = -parameters.force_scale * on_tool[:, :3] @ axes
+    torque = -parameters.force_scale / parameters.scale * on_tool[:, 3:] @ axes
+    limited = []
+    for vector, limit in ((force, parameters.force_limit), (torque, parameters.torque_limit)):
+        norm = np.linalg.norm(vector, axis=1, keepdims=True)
+        limited.append(vector * np.where(norm > limit, limit / np.maximum(norm, 1e-300), 1.0))
+    ramp = np.minimum((ticks["tick"] + 1.0) / (parameters.ramp_ticks + 1.0), 1.0)
+    return np.concatenate(limited, axis=1) * ramp[:, None]

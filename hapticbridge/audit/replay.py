@@ -1,0 +1,188 @@
+"""Simulates a recorded run again from what its recording holds, and compares every number."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import dataclass
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticbridge.errors import HapticBridgeError, RecordingError
+from hapticbridge.inputs import apply_writes
+from hapticbridge.kernel.state import COUPLING_ACTUATORS, Binding, RunParameters
+from hapticbridge.kernel.step import simulate
+from hapticbridge.provenance import (
+    MODEL_ATTACHMENT,
+    STATE_ATTACHMENT,
+    processor,
+    restore_state,
+    versions,
+)
+from hapticbridge.recording import Recording
+from hapticbridge.tick import CLOCK_FIELDS, SAMPLE_DTYPE, TICK_DTYPE, TickFlag
+
+DECISIVE = ("hapticbridge", "mujoco", "numba")
+"""Packages whose versions must match for a run to be repeated to the bit."""
+
+FOREIGN_TOLERANCE = 1e-9
+"""Allowed difference, relative to a field's largest value, where the processor differs: other
+vector instructions round differently. Larger would hide tampering, smaller would refuse honest
+recordings."""
+
+_TIMING = int(TickFlag.OVERRUN | TickFlag.DROPPED_BEFORE)
+
+
+@dataclass(frozen=True, slots=True)
+class Replay:
+    """Outcome of a re-simulation.
+
+    Attributes:
+        agreement: ``bit for bit``, ``within 1e-9 (other processor)``, ``disagrees``, or ``not
+            re-simulated: …`` with the reason.
+        tick: First tick at which it disagrees, or None.
+        field: The first field of that tick that disagrees.
+        difference: By how much.
+    """
+
+    agreement: str
+    tick: int | None = None
+    field: str = ""
+    difference: float = 0.0
+
+    @property
+    def disagrees(self) -> bool:
+        """Whether the recording is not what the scene does under the recorded motion."""
+        return self.tick is not None
+
+
+def replay(recording: Recording, parameters: RunParameters) -> Replay:
+    """Simulates the recorded device motion again and compares all fields but the clock's.
+
+    Raises:
+        RecordingError: The attachments contradict the metadata, so the file was changed.
+    """
+    reason = _obstacle(recording)
+    if reason:
+        return Replay(f"not re-simulated: {reason}")
+    model = _model(recording, parameters)
+    data = mujoco.MjData(model)
+    # an error inside the C symbol would end the process, so MuJoCo takes its first step in Python
+    restore_state(model, data, recording.attachments[STATE_ATTACHMENT])
+    mujoco.mj_step(model, data)
+    restore_state(model, data, recording.attachments[STATE_ATTACHMENT])
+    again = _simulated(recording, Binding(model, data, parameters), data)
+    return _compared(recording, again)
+
+
+def _obstacle(recording: Recording) -> str:
+    try:
+        recorded = json.loads(recording.meta.get("versions", ""))
+    except ValueError:
+        return "the metadata name no versions"
+    present = versions()
+    for name in DECISIVE:
+        if recorded.get(name) != present[name]:
+            return f"recorded with {name} {recorded.get(name)}, here is {present[name]}"
+    missing = [n for n in (MODEL_ATTACHMENT, STATE_ATTACHMENT) if n not in recording.attachments]
+    return f"the file has no attachment '{missing[0]}'" if missing else ""
+
+
+def _model(recording: Recording, parameters: RunParameters) -> mujoco.MjModel:
+    content = recording.attachments[MODEL_ATTACHMENT]
+    if hashlib.sha256(content).hexdigest() != recording.meta.get("scene_sha256"):
+        raise RecordingError("the attached model is not the one of scene_sha256")
+    try:
+        model = mujoco.MjModel.from_binary_path(
+            MODEL_ATTACHMENT, assets={MODEL_ATTACHMENT: content}
+        )
+    except ValueError as error:
+        raise RecordingError(f"the attached model cannot be loaded: {error}") from None
+    for name in (*COUPLING_ACTUATORS, parameters.grip):
+        kind = mujoco.mjtObj.mjOBJ_SITE if name == parameters.grip else mujoco.mjtObj.mjOBJ_ACTUATOR
+        if mujoco.mj_name2id(model, kind, name) < 0:
+            raise RecordingError(f"the attached model has no '{name}'")
+    coupling = parameters.coupling
+    for axis, name in enumerate(COUPLING_ACTUATORS):
+        actuator_id = model.actuator(name).id
+        stiffness = coupling.stiffness if axis < 3 else coupling.rotational_stiffness
+        damping = coupling.damping if axis < 3 else coupling.rotational_damping
+        bias, gain = model.actuator_biasprm[actuator_id], model.actuator_gainprm[actuator_id]
+        if (bias[1], bias[2], gain[0]) != (-stiffness, -damping, damping):
+            raise RecordingError(
+                f"the attached model's coupling has K = {-bias[1]:g}, B = {gain[0]:g} in {name}, "
+                f"the metadata say {stiffness:g}, {damping:g}"
+            )
+    if model.opt.timestep != parameters.period / parameters.substeps:
+        raise RecordingError(
+            f"the attached model's timestep is {model.opt.timestep!r} s, the metadata's period "
+            f"{parameters.period!r} s with {parameters.substeps} substeps"
+        )
+    return model
+
+
+def _simulated(recording: Recording, binding: Binding, data: mujoco.MjData) -> NDArray[np.void]:
+    ticks = recording.ticks
+    samples = np.zeros(len(ticks), SAMPLE_DTYPE)
+    samples["position"], samples["quaternion"] = (
+        ticks["device_position"],
+        ticks["device_quaternion"],
+    )
+    samples["buttons"] = ticks["buttons"]
+    rows = np.zeros(len(ticks), TICK_DTYPE)
+    inputs = [event for event in recording.events if event.get("event") == "input"]
+    done = 0
+    for event in [*inputs, None]:
+        end = len(ticks) if event is None else _input_tick(event, done, len(ticks))
+        count = simulate(binding.state, samples[done:end], binding.row, rows[done:end])
+        done += count
+        if done < end:
+            return rows[:done]
+        if event is not None:
+            try:
+                apply_writes(data, event.get("writes", []))
+            except (HapticBridgeError, TypeError, ValueError) as error:
+                raise RecordingError(f"event 'input' at tick {end} is damaged: {error}") from None
+    return rows
+
+
+def _input_tick(event: dict[str, Any], done: int, count: int) -> int:
+    tick = event.get("tick")
+    if not isinstance(tick, int) or tick < done:
+        raise RecordingError(f"event 'input' names tick {tick!r}, out of order")
+    return min(tick, count)
+
+
+def _compared(recording: Recording, again: NDArray[np.void]) -> Replay:
+    ticks = recording.ticks[: len(again)]
+    first: tuple[int, str, float] | None = None
+    largest = 0.0
+    for name in TICK_DTYPE.names or ():
+        if name in CLOCK_FIELDS:
+            continue
+        recorded, simulated = ticks[name], again[name]
+        if name == "flags":
+            recorded, simulated = recorded & ~_TIMING, simulated & ~_TIMING
+        unequal = (recorded != simulated).reshape(len(again), -1).any(axis=1)
+        if not unequal.any():
+            continue
+        difference = np.abs(recorded - simulated).reshape(len(again), -1).max(axis=1)
+        largest = max(largest, float(difference.max() / max(np.abs(simulated).max(), 1.0)))
+        tick = int(np.argmax(unequal))
+        if first is None or tick < first[0]:
+            first = (tick, name, float(difference[tick]))
+    if len(again) < len(recording.ticks) and first is None:
+        first = (len(again), "tool_position", float("nan"))
+        largest = float("inf")
+    if first is None:
+        return Replay("bit for bit")
+    try:
+        is_same_processor = json.loads(recording.meta["host"])["processor"] == processor()
+    except (KeyError, TypeError, ValueError):
+        is_same_processor = True
+    if not is_same_processor and largest <= FOREIGN_TOLERANCE:
+        return Replay("within 1e-9 (other processor)")
+    return Replay("disagrees", *first)

@@ -1,0 +1,344 @@
+"""Judges a recording: is it whole, is it what it says, and was the environment passive?"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticbridge.audit.balance import Balance
+from hapticbridge.audit.replay import replay
+from hapticbridge.certificate import Condition, device_conditions, is_certified
+from hapticbridge.device import DeviceInfo
+from hapticbridge.errors import HapticBridgeError, RecordingError
+from hapticbridge.kernel.state import RunParameters
+from hapticbridge.provenance import meta_float, meta_numbers, parameters_of
+from hapticbridge.recording import Recording, read_recording
+from hapticbridge.tick import TICK_DTYPE, TickFlag
+
+TOLERANCE = 1e-9
+"""Relative difference, and absolute one in SI units, between a recorded number and its second
+computation in NumPy. Rounding of 10⁵ summed works stays below it; a changed digit that matters does
+not. It is also the tolerance of (14) itself."""
+
+
+@dataclass(frozen=True, slots=True)
+class AuditReport:
+    """What an audit found.
+
+    Attributes:
+        path: The recording.
+        verdict: ``passive``, ``active`` or ``invalid``.
+        environment: ``strict`` (BC97 (14) held), ``within slack`` or ``active``; None if invalid.
+        certified: Whether the recorded device bears the coupling; None where its damping is
+            unknown or its motion is prescribed.
+        reason: The verdict in a sentence.
+        tick: First tick at fault, or None.
+        port: The port or field at fault.
+        joules: Energy at fault: created beyond what is allowed, or the mismatch.
+        slack_share: Largest share of the slack that was used, 0 if strict.
+        resimulation: ``bit for bit``, ``within 1e-9 (other processor)``, ``disagrees`` or ``not
+            re-simulated: …``.
+        is_cut: The file lacks its end; the verdict is on what it holds.
+        ticks: Number of records.
+        duration: Their number times the period, in s.
+        conditions: The device condition per kind of axis, as sentences.
+        energies: Energies at the end, in J.
+        events: How many events of each kind.
+    """
+
+    path: Path
+    verdict: Literal["passive", "active", "invalid"]
+    environment: Literal["strict", "within slack", "active"] | None
+    certified: bool | None
+    reason: str
+    tick: int | None = None
+    port: str = ""
+    joules: float = 0.0
+    slack_share: float = 0.0
+    resimulation: str = ""
+    is_cut: bool = False
+    ticks: int = 0
+    duration: float = 0.0
+    conditions: tuple[str, ...] = ()
+    energies: dict[str, float] = field(default_factory=dict)
+    events: dict[str, int] = field(default_factory=dict)
+
+    def to_json(self) -> str:
+        """Returns the report as one JSON object."""
+        return json.dumps(asdict(self) | {"path": str(self.path)}, indent=2)
+
+    @property
+    def exit_code(self) -> int:
+        """0 if passive and certified or the device is unknown, else 1."""
+        return 0 if self.verdict == "passive" and self.certified is not False else 1
+
+
+@dataclass(frozen=True, slots=True)
+class _Fault:
+    reason: str
+    tick: int | None = None
+    port: str = ""
+    joules: float = 0.0
+
+
+def audit(path: str | Path, *, strict: bool = False) -> AuditReport:
+    """Judges a recording from the file alone.
+
+    Structure (checksums, schema, contiguous ticks, finite numbers, digest), the wrench against the
+    coupling law, energies recomputed from poses and wrenches, the device condition, and, where the
+    versions match, a re-simulation that must agree bit for bit.
+
+    Args:
+        path: The recording.
+        strict: Accept only (14) itself, not the slack that the device condition leaves.
+
+    Raises:
+        RecordingError: The file is not a recording at all.
+    """
+    recording = read_recording(path)
+    facts: dict[str, Any] = {
+        "path": recording.path,
+        "is_cut": recording.is_cut,
+        "ticks": len(recording.ticks),
+        "events": _event_counts(recording),
+        "certified": None,
+    }
+    try:
+        parameters = parameters_of(recording.meta)
+        conditions = _conditions(recording, parameters)
+    except RecordingError as error:
+        return _invalid(facts, _Fault(str(error)))
+    facts["duration"] = len(recording.ticks) * parameters.period
+    facts["certified"] = is_certified(conditions)
+    facts["conditions"] = tuple(condition.sentence() for condition in conditions)
+    fault = _structure_fault(recording, parameters)
+    if fault:
+        return _invalid(facts, fault)
+    ticks = recording.ticks
+    try:
+        handle_start = np.array(meta_numbers(recording.meta, "handle_start", 7))
+        tool_start = np.array(meta_numbers(recording.meta, "tool_start", 7))
+        start_energy = meta_float(recording.meta, "start_kinetic") + meta_float(
+            recording.meta, "start_potential"
+        )
+        balance = Balance.of(ticks, parameters, handle_start, tool_start, start_energy)
+        facts["energies"] = _energies(ticks, balance)
+        fault = _physics_fault(ticks, balance)
+        if fault:
+            return _invalid(facts, fault)
+        outcome = replay(recording, parameters)
+    except RecordingError as error:
+        return _invalid(facts, _Fault(str(error)))
+    facts["resimulation"] = outcome.agreement
+    if outcome.disagrees:
+        reason = (
+            f"simulated again, tick {outcome.tick} differs in {outcome.field} by "
+            f"{outcome.difference:.3g}: the recording was changed"
+        )
+        return _invalid(facts, _Fault(reason, outcome.tick, outcome.field))
+    return _judged(facts, balance, strict=strict)
+
+
+def _event_counts(recording: Recording) -> dict[str, int]:
+    counts: dict[str, int] = {}
+    for event in recording.events:
+        name = str(event.get("event", "unnamed"))
+        counts[name] = counts.get(name, 0) + 1
+    return counts
+
+
+def _conditions(recording: Recording, parameters: RunParameters) -> tuple[Condition, ...]:
+    try:
+        info = DeviceInfo.from_json(recording.meta.get("device", ""))
+    except HapticBridgeError as error:
+        raise RecordingError(f"metadata 'device' cannot be read: {error}") from None
+    if info.is_prescribed:
+        return ()
+    return device_conditions(
+        info, parameters.coupling, parameters.period, parameters.scale, parameters.force_scale
+    )
+
+
+def _invalid(facts: dict[str, Any], fault: _Fault) -> AuditReport:
+    return AuditReport(
+        **facts,
+        verdict="invalid",
+        environment=None,
+        reason=fault.reason,
+        tick=fault.tick,
+        port=fault.port,
+        joules=fault.joules,
+    )
+
+
+def _structure_fault(recording: Recording, parameters: RunParameters) -> _Fault | None:
+    return (
+        _file_fault(recording)
+        or _number_fault(recording.ticks)
+        or _time_fault(recording.ticks, parameters)
+    )
+
+
+def _file_fault(recording: Recording) -> _Fault | None:
+    if recording.problems:
+        return _Fault("the file is damaged: " + "; ".join(recording.problems))
+    if not recording.is_cut:
+        if recording.digest is None:
+            return _Fault("the file has no digest although it is not cut")
+        if recording.digest != recording.computed_digest:
+            return _Fault("the file's content does not match its digest: it was changed")
+    return None if len(recording.ticks) else _Fault("the recording holds no tick")
+
+
+def _number_fault(ticks: NDArray[np.void]) -> _Fault | None:
+    for name in TICK_DTYPE.names or ():
+        finite = np.isfinite(ticks[name]).reshape(len(ticks), -1).all(axis=1)
+        if not finite.all():
+            tick = int(np.argmin(finite))
+            return _Fault(f"{name} of record {tick} is not finite", tick, name)
+    for name in ("device_quaternion", "handle_quaternion", "tool_quaternion"):
+        off = np.abs(np.linalg.norm(ticks[name], axis=1) - 1) > TOLERANCE
+        off |= ticks[name][:, 0] < 0
+        if off.any():
+            tick = int(np.argmax(off))
+            return _Fault(f"{name} of tick {tick} is not a unit quaternion", tick, name)
+    return None
+
+
+def _time_fault(ticks: NDArray[np.void], parameters: RunParameters) -> _Fault | None:
+    gap = np.flatnonzero(ticks["tick"] != np.arange(len(ticks)))
+    if gap.size:
+        at = int(gap[0])
+        before = int(ticks["tick"][at - 1]) if at else -1
+        return _Fault(
+            f"ticks are not contiguous: {before} is followed by {int(ticks['tick'][at])}, so the "
+            "energy in between is unknown",
+            at,
+            "tick",
+        )
+    period_ns = round(parameters.period * 1e9)
+    interval = np.diff(ticks["deadline_ns"])
+    has_skipped = (ticks["flags"][1:] & int(TickFlag.OVERRUN)) != 0
+    wrong = np.where(
+        has_skipped, (interval <= 0) | (interval % period_ns != 0), interval != period_ns
+    )
+    if wrong.any():
+        tick = int(np.argmax(wrong)) + 1
+        return _Fault(
+            f"deadlines of ticks {tick - 1} and {tick} are {int(interval[tick - 1])} ns apart, the "
+            f"period is {period_ns} ns",
+            tick,
+            "deadline_ns",
+        )
+    return None
+
+
+def _physics_fault(ticks: NDArray[np.void], balance: Balance) -> _Fault | None:
+    """Returns the earliest disagreement between the records and their second computation."""
+    vectors = (
+        ("handle_position", balance.handle_position, "m", "device pose and scale"),
+        ("wrench_on_tool", balance.wrench_on_tool, "N or N m", "coupling law and poses"),
+        ("wrench_on_device", balance.wrench_on_device, "N or N m", "wrench on the tool and limits"),
+    )
+    faults = []
+    for name, expected, unit, by in vectors:
+        difference = np.abs(ticks[name] - expected).max(axis=1)
+        allowed = TOLERANCE * (1 + np.abs(expected).max(axis=1))
+        faults.append(_first(name, difference, allowed, unit, by))
+    faults.append(
+        _first(
+            "handle_quaternion",
+            balance.handle_turn,
+            np.full(len(ticks), TOLERANCE),
+            "rad",
+            "device pose",
+        )
+    )
+    energies = (
+        ("coupling_work", balance.coupling_work, balance.throughput),
+        ("device_energy", balance.device_energy, balance.device_throughput),
+        ("environment_energy", balance.environment_energy, balance.throughput),
+    )
+    for name, joules, throughput in energies:
+        difference = np.abs(ticks[name] - joules)
+        scale = throughput + np.abs(ticks["potential"])
+        faults.append(
+            _first(name, difference, TOLERANCE * (1 + scale), "J", "recorded poses and wrenches")
+        )
+    is_off = (ticks["flags"] & int(TickFlag.CONTROLLER_ACTIVE)) == 0
+    damping = np.where(is_off, np.abs(ticks["injected_damping"]), 0.0)
+    faults.append(_first("injected_damping", damping, np.zeros(len(ticks)), "N s/m", "flags"))
+    found = [fault for fault in faults if fault is not None]
+    return min(found, key=lambda fault: fault.tick or 0) if found else None
+
+
+def _first(
+    name: str, difference: NDArray[np.float64], allowed: NDArray[np.float64], unit: str, by: str
+) -> _Fault | None:
+    wrong = difference > allowed
+    if not wrong.any():
+        return None
+    tick = int(np.argmax(wrong))
+    amount = float(difference[tick])
+    return _Fault(
+        f"{name} of tick {tick} is {amount:.3g} {unit} off what {by} give",
+        tick,
+        name,
+        amount if unit == "J" else 0.0,
+    )
+
+
+def _energies(ticks: NDArray[np.void], balance: Balance) -> dict[str, float]:
+    last = ticks[-1]
+    return {
+        "kinetic": float(last["kinetic"]),
+        "potential": float(last["potential"]),
+        "coupling_work": float(balance.coupling_work[-1]),
+        "actuator_work": float(last["actuator_work"]),
+        "external_work": float(last["external_work"]),
+        "environment_energy": float(balance.environment_energy[-1]),
+        "device_energy": float(balance.device_energy[-1]),
+        "slack": float(balance.slack[-1]),
+    }
+
+
+def _judged(facts: dict[str, Any], balance: Balance, *, strict: bool) -> AuditReport:
+    created = balance.environment_energy
+    rounding = TOLERANCE * (1 + balance.throughput)
+    unstrict = created > rounding
+    active = created > balance.slack + rounding
+    share = float(np.max(np.where(unstrict, created / (balance.slack + rounding), 0.0)))
+    lost = -float(created[-1])
+    if not unstrict.any():
+        reason = f"the environment never gave out more than it got ({lost:.3g} J dissipated)"
+        return AuditReport(**facts, verdict="passive", environment="strict", reason=reason)
+    if not active.any() and not strict:
+        reason = (
+            f"contact created energy at times, within the slack that the coupling leaves "
+            f"({share:.0%} of it used)"
+        )
+        return AuditReport(
+            **facts,
+            verdict="passive",
+            environment="within slack",
+            reason=reason,
+            slack_share=share,
+        )
+    tick = int(np.argmax(active if active.any() else unstrict))
+    excess = float(created[tick] - (balance.slack[tick] if active.any() else 0.0))
+    limit = "its slack" if active.any() else "(14), asked for strictly"
+    return AuditReport(
+        **facts,
+        verdict="active",
+        environment="active" if active.any() else "within slack",
+        reason=f"from tick {tick} the environment exceeds {limit} by {excess:.3g} J",
+        tick=tick,
+        port="environment",
+        joules=excess,
+        slack_share=share,
+    )

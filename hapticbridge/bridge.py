@@ -1,0 +1,434 @@
+"""The bridge: one pass of its loop is one tick, from the device's pose to the device's wrench.
+
+    device ──sample──▶ handle ──▶ scene stepped by MuJoCo ──▶ wrench, energies ──▶ device, recording
+
+``Bridge.run`` is the loop; the arithmetic before and after MuJoCo's step is in ``kernel.step``.
+"""
+
+from __future__ import annotations
+
+import signal
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType, TracebackType
+
+import mujoco
+import numpy as np
+from numpy.typing import ArrayLike
+
+from hapticbridge.certificate import default_coupling, device_conditions, is_certified
+from hapticbridge.clock import Clock, RealClock
+from hapticbridge.coupling import Coupling
+from hapticbridge.device import Device, open_device
+from hapticbridge.errors import HapticBridgeError, RecordingError, SafetyTrip
+from hapticbridge.guard import Limits, trip_reason
+from hapticbridge.inputs import Write, apply_writes, input_writes
+from hapticbridge.kernel.state import Binding, RunParameters
+from hapticbridge.kernel.step import OK, after_step, before_step, publish
+from hapticbridge.ledger import Ledger
+from hapticbridge.provenance import attachments, describe_run
+from hapticbridge.recording import TAIL, Recorder, Ring
+from hapticbridge.rendering import method_named, prepare
+from hapticbridge.scene import Scene, load_scene
+from hapticbridge.tick import SAMPLE_DTYPE, TickFlag
+
+RING_CAPACITY = 8192
+"""Records between loop and recorder. At 1 kHz the recorder may fall 8 s behind before one is lost;
+each costs 400 bytes."""
+
+NOBODY_READS = 1 << 62
+"""Tail of a ring without a recorder: it is never full and keeps the newest records."""
+
+RING_POLL = 1e-3
+"""How often a run in simulated time looks whether the recorder made room, in s."""
+
+_NO_FORCE = np.zeros(6)
+_STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+@dataclass(frozen=True, slots=True)
+class Summary:
+    """What a run was.
+
+    Attributes:
+        ticks: Ticks since the bridge was opened.
+        duration: Their number times the period, in s.
+        overruns: Deadlines that were missed by a period or more and skipped.
+        dropped: Records that the recorder did not get because it was too far behind.
+        peak_force: Largest norm of the force on the tool in N.
+        peak_torque: Largest norm of the torque on the tool in N m.
+        energies: Energies by name in J.
+        environment: ``strict``, ``within slack`` or ``active``.
+        slack_share: Largest share of the slack that was used.
+        is_certified: Whether b >= scale · force_scale · (KT/2 + B) holds for the device in
+            translation and rotation; None where its damping is unknown.
+        stopped_by: ``duration``, ``signal`` or ``caller``.
+        recording: The file, if one was written.
+    """
+
+    ticks: int
+    duration: float
+    overruns: int
+    dropped: int
+    peak_force: float
+    peak_torque: float
+    energies: dict[str, float]
+    environment: str
+    slack_share: float
+    is_certified: bool | None
+    stopped_by: str
+    recording: Path | None
+
+    @property
+    def verdict(self) -> str:
+        """``passive`` (strict or within slack) or ``active``."""
+        return "active" if self.environment == "active" else "passive"
+
+
+def device_for(scene: Scene, spec: str) -> Device:
+    """Opens a device for a scene; the simulated one's hand follows ``NAME.csv`` beside the scene.
+
+    Args:
+        scene: The scene that the device will move in.
+        spec: What ``open_device`` understands.
+
+    Raises:
+        DeviceError: See ``open_device``.
+    """
+    path = scene.path.with_suffix(".csv")
+    if spec.partition(":")[0] == "simulated" and path.is_file():
+        return open_device(spec, path=path)
+    return open_device(spec)
+
+
+class Bridge:
+    """Joins a device and a scene by a virtual coupling and runs the loop between them.
+
+    Use it as a context manager: entering prepares everything and compiles what must be compiled,
+    leaving commands zero force, closes the device and closes the recording.
+
+    Args:
+        scene: A loaded scene, a name, or a path to MJCF.
+        device: A device, or what ``open_device`` understands.
+        coupling: K and B; None chooses the stiffest safe one for the device's damping (80 % of the
+            bound, B = b/4; for a device of unknown damping, that of the default simulated one).
+        rate: Ticks per second, > 0.
+        substeps: MuJoCo steps per tick.
+        method: How the tool is rendered; see ``rendering.METHODS``.
+        recording: File to write (``.mcap``), or None.
+        clock: ``RealClock()`` by default; ``SimulatedClock()`` runs as fast as it goes.
+        scale: Handle motion per device motion.
+        force_scale: Force on the device per force on the tool; None takes ``scale``, which keeps
+            power equal on both sides.
+        axes: 3 × 3 rotation from the device's frame to the scene's.
+        absolute: Take the device's poses as poses in the scene instead of relative to its start.
+        limits: Limits on the wrench; None takes the device's own.
+        live: Draw a status line on stderr, from the recorder's process.
+
+    Raises:
+        HapticBridgeError: An argument is out of range; the message says which and what is valid.
+    """
+
+    def __init__(
+        self,
+        scene: Scene | str | Path,
+        device: Device | str = "simulated",
+        coupling: Coupling | None = None,
+        *,
+        rate: float = 1000.0,
+        substeps: int = 1,
+        method: str = "implicit",
+        recording: str | Path | None = None,
+        clock: Clock | None = None,
+        scale: float = 1.0,
+        force_scale: float | None = None,
+        axes: ArrayLike | None = None,
+        absolute: bool = False,
+        limits: Limits | None = None,
+        live: bool = False,
+    ) -> None:
+        if not np.isfinite(rate) or rate <= 0:
+            raise HapticBridgeError(f"rate is {rate!r} Hz; it must be finite and > 0")
+        self.scene = scene if isinstance(scene, Scene) else load_scene(scene)
+        self.device = device_for(self.scene, device) if isinstance(device, str) else device
+        self.period = 1.0 / rate
+        self._scales = scale, scale if force_scale is None else force_scale
+        self.coupling = coupling or default_coupling(self.device.info, self.period, *self._scales)
+        self._limits = limits or Limits(
+            force=self.device.info.force_limit, torque=self.device.info.torque_limit
+        )
+        self._method = method_named(method)
+        self._substeps = substeps
+        self._axes = tuple(np.asarray(np.eye(3) if axes is None else axes, float).ravel().tolist())
+        self._is_absolute = absolute
+        self._path = Path(recording) if recording is not None else None
+        self._is_live = live
+        self.clock = clock or RealClock()
+        self._inputs: deque[list[Write]] = deque()
+        self._recorder: Recorder | None = None
+        self._tick = self._overruns = self._dropped = 0
+        self._stopped_by = ""
+
+    def __enter__(self) -> Bridge:
+        try:
+            self._prepare()
+        except BaseException:
+            self.device.close()
+            raise
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        _traceback: TracebackType | None,
+    ) -> None:
+        try:
+            self.device.write(_NO_FORCE)
+        finally:
+            self.device.close()
+            self._close_recording(error)
+
+    def run(
+        self, duration: float | None = None, on_tick: Callable[[int], None] | None = None
+    ) -> Summary:
+        """Runs the loop.
+
+        Args:
+            duration: Time to run in s; None runs until the device's motion ends, or for ever
+                (Ctrl-C and SIGTERM stop cleanly).
+            on_tick: Called with the tick's number before it, for scripted inputs.
+
+        Returns:
+            What the run was; of all ticks so far, if ``run`` is called again.
+
+        Raises:
+            SafetyTrip: The guard stopped the run; zero force was commanded first.
+            DeviceError: The device failed; likewise.
+        """
+        state, row = self._binding.state, self._binding.row
+        model, data, substeps = self.scene.model, self.scene.data, range(self._substeps)
+        records, cursors = self._ring.rows, self._ring.cursors
+        sample, wrench = self._sample, row["wrench_on_device"][0]
+        device, clock, inputs = self.device, self.clock, self._inputs
+        last, code, lost = self._last_tick(duration), OK, 0
+        self._stopped_by = ""
+        with self._stopping_on_signals():
+            clock.start(round(self.period * 1e9))
+            try:
+                while self._tick != last and not self._stopped_by:
+                    deadline, wake, skipped = clock.wait()
+                    if on_tick is not None:
+                        on_tick(self._tick)
+                    if inputs:
+                        self._apply_inputs()
+                    device.read(sample)
+                    read = clock.now()
+                    for substep in substeps:
+                        code = before_step(state, sample, row, substep)
+                        if code != OK:
+                            break
+                        mujoco.mj_step(model, data)
+                        code = after_step(state, row, substep)
+                    if code != OK:
+                        break
+                    device.write(wrench)
+                    write = clock.now()
+                    flags = lost | (self._overrun(skipped) if skipped else 0)
+                    while not publish(row, records, cursors, deadline, wake, read, write, flags):
+                        lost = self._ring_is_full()
+                        if lost:
+                            break
+                    else:
+                        lost = 0
+                    self._tick += 1
+            finally:
+                device.write(_NO_FORCE)
+        if code != OK:
+            self._trip(trip_reason(code, self._tick))
+        self._stopped_by = self._stopped_by or "duration"
+        return self.summary()
+
+    def stop(self) -> None:
+        """Ends the run after the present tick; may be called from ``on_tick`` or a thread."""
+        self._stopped_by = "caller"
+
+    def set_input(
+        self,
+        *,
+        ctrl: Mapping[str, ArrayLike] | None = None,
+        mocap: Mapping[str, ArrayLike] | None = None,
+        joint_force: Mapping[str, ArrayLike] | None = None,
+        body_wrench: Mapping[str, ArrayLike] | None = None,
+    ) -> None:
+        """Changes inputs of the scene from the next tick on; recorded, so the run can be repeated.
+
+        Args:
+            ctrl: Control per actuator of the scene.
+            mocap: Pose (x, y, z[, qw, qx, qy, qz]) in m per mocap body of the scene.
+            joint_force: Generalised force per joint, in N or N m per degree of freedom.
+            body_wrench: (force, torque) in N and N m per body, world frame, at its centre of mass.
+
+        Raises:
+            SceneError: A name does not exist or has the wrong count of numbers.
+        """
+        self._inputs.append(
+            input_writes(
+                self.scene.model,
+                ctrl=ctrl,
+                mocap=mocap,
+                joint_force=joint_force,
+                body_wrench=body_wrench,
+            )
+        )
+
+    @property
+    def ledger(self) -> Ledger:
+        """Energies so far, per port."""
+        return Ledger.of(self._binding.state)
+
+    def summary(self) -> Summary:
+        """Returns what the run was so far."""
+        state, ledger = self._binding.state, self.ledger
+        conditions = device_conditions(self.device.info, self.coupling, self.period, *self._scales)
+        return Summary(
+            ticks=self._tick,
+            duration=self._tick * self.period,
+            overruns=self._overruns,
+            dropped=self._dropped,
+            peak_force=float(state["peak_force"][0]),
+            peak_torque=float(state["peak_torque"][0]),
+            energies=ledger.energies(),
+            environment=ledger.environment,
+            slack_share=ledger.slack_share,
+            is_certified=is_certified(conditions),
+            stopped_by=self._stopped_by,
+            recording=self._path,
+        )
+
+    def _prepare(self) -> None:
+        """Compiles the kernel, puts the scene to its start, and opens the recording."""
+        scene, clock, info = self.scene, self.clock, self.device.info
+        prepare(scene, self.coupling, self.period, self._substeps)
+        self._sample = np.zeros(1, SAMPLE_DTYPE)
+        self.device.start(self.period); self.device.read(self._sample); self.device.start(self.period)
+        parameters = self._parameters()
+        self._warm_up(parameters)
+        scene.reset()
+        self._binding = Binding(scene.model, scene.data, parameters)
+        if self._path is None and not self._is_live:
+            self._ring = Ring.local(RING_CAPACITY)
+            self._ring.cursors[TAIL] = NOBODY_READS
+            return
+        self._ring = Ring.shared(RING_CAPACITY)
+        meta = describe_run(
+            scene,
+            parameters,
+            self._binding,
+            method=self._method.name,
+            device=info,
+            clock=clock.name,
+        )
+        self._recorder = Recorder(
+            self._ring, self._path, meta, attachments(scene), live=self._is_live
+        )
+        self._recorder.wait_until_ready()
+        self._event("start")
+
+    def _parameters(self) -> RunParameters:
+        first = self._sample[0]
+        start = tuple(float(v) for v in (*first["position"], *first["quaternion"]))
+        grip = self.scene.grip_pose()
+        identity = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
+        return RunParameters(
+            grip=self.scene.grip,
+            period=self.period,
+            substeps=self._substeps,
+            coupling=self.coupling,
+            scale=self._scales[0],
+            force_scale=self._scales[1],
+            axes=self._axes,
+            force_limit=self._limits.force,
+            torque_limit=self._limits.torque,
+            ramp_ticks=self._limits.ramp_ticks(self.period),
+            device_origin=identity if self._is_absolute else start,
+            handle_origin=identity if self._is_absolute else grip,
+            device_start=start,
+        )
+
+    def _warm_up(self, parameters: RunParameters) -> None:
+        """Runs one tick of everything compiled, on the scene before it is reset."""
+        binding = Binding(self.scene.model, self.scene.data, parameters)
+        ring = Ring.local(1)
+        for substep in range(self._substeps):
+            before_step(binding.state, self._sample, binding.row, substep)
+            mujoco.mj_step(self.scene.model, self.scene.data)
+            after_step(binding.state, binding.row, substep)
+        publish(binding.row, ring.rows, ring.cursors, 0, 0, 0, 0, 0)
+
+    def _last_tick(self, duration: float | None) -> int:
+        if duration is None:
+            length = self.device.info.duration
+            return -1 if length is None else round(length / self.period) + 1
+        if not np.isfinite(duration) or duration <= 0:
+            raise HapticBridgeError(f"duration is {duration!r} s; it must be finite and > 0")
+        return self._tick + max(round(duration / self.period), 1)
+
+    def _apply_inputs(self) -> None:
+        while self._inputs:
+            writes = self._inputs.popleft()
+            apply_writes(self.scene.data, writes)
+            self._event("input", writes=writes)
+
+    def _overrun(self, skipped: int) -> int:
+        self._overruns += skipped
+        return int(TickFlag.OVERRUN)
+
+    def _ring_is_full(self) -> int:
+        """Waits for room where time is simulated; else counts the record as lost."""
+        recorder = self._recorder
+        if recorder is None or not recorder.is_alive():
+            raise RecordingError("the recorder ended in mid-run; the recording stops there")
+        if self.clock.is_lossless:
+            time.sleep(RING_POLL)
+            return 0
+        self._dropped += 1
+        return int(TickFlag.DROPPED_BEFORE)
+
+    def _trip(self, reason: str) -> None:
+        self._stopped_by = "trip"
+        self._event("trip", reason=reason)
+        raise SafetyTrip(reason, self._ring.latest(round(1.0 / self.period)))
+
+    def _event(self, event: str, **details: object) -> None:
+        if self._recorder is not None:
+            self._recorder.event({"event": event, "tick": self._tick, **details}, self.clock.now())
+
+    def _close_recording(self, error: BaseException | None) -> None:
+        if self._recorder is not None:
+            reason = self._stopped_by if error is None else f"{type(error).__name__}: {error}"
+            self._event("stop", reason=reason, overruns=self._overruns, dropped=self._dropped)
+            self._recorder.close()
+        self._ring.close()
+
+    @contextmanager
+    def _stopping_on_signals(self) -> Iterator[None]:
+        """Turns SIGINT and SIGTERM into a clean end of the run; only the main thread may do so."""
+
+        def stop(_number: int, _frame: FrameType | None) -> None:
+            self._stopped_by = "signal"
+
+        if threading.current_thread() is not threading.main_thread():
+            yield
+            return
+        previous = {number: signal.signal(number, stop) for number in _STOP_SIGNALS}
+        try:
+            yield
+        finally:
+            for number, handler in previous.items():
+                signal.signal(number, handler)

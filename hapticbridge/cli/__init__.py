@@ -1,0 +1,3 @@
+"""The command line: parses, calls, prints."""
+
+from hapticbridge.cli.main import main as main

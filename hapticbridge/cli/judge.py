@@ -1,0 +1,108 @@
+"""``hapticbridge audit`` and ``hapticbridge repair``."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from hapticbridge.audit import AuditReport, audit
+from hapticbridge.cli.terminal import err, out, quantity
+from hapticbridge.errors import RecordingError
+from hapticbridge.recording import read_recording, repair
+from hapticbridge.report import plot_recording, write_report
+
+_COLOURS = {"passive": "green", "active": "red", "invalid": "magenta"}
+
+
+@dataclass(frozen=True, slots=True)
+class Audit:
+    """Judge recorded runs offline: passive, active or invalid, and why.
+
+    Exit code 0 if all are passive and no device lacks damping, 1 if not, 2 if a file is no
+    recording. Example:
+
+        hapticbridge audit run.mcap --plot run.png
+    """
+
+    files: tyro.conf.Positional[tuple[Path, ...]]
+    """Recordings (.mcap)."""
+    strict: bool = False
+    """Accept only passivity itself, not the slack that the device's damping leaves."""
+    as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
+    """Print the reports as a JSON list."""
+    plot: Path | None = None
+    """Draw force, position and energies into this picture (.png, .svg or .pdf; one file only)."""
+    report: Path | None = None
+    """Write a self-contained HTML page (one file only)."""
+
+    def execute(self) -> int:
+        """Audits; returns the exit code."""
+        if not self.files:
+            raise RecordingError("audit needs at least one recording")
+        if len(self.files) > 1 and (self.plot or self.report):
+            raise RecordingError("--plot and --report take one recording at a time")
+        reports = []
+        for file in self.files:
+            with err.status(f"auditing {file} …"):
+                report = audit(file, strict=self.strict)
+            reports.append(report)
+            if not self.as_json:
+                _print_report(report)
+        if self.as_json:
+            out.print_json(json.dumps([json.loads(report.to_json()) for report in reports]))
+        with err.status("drawing …"):
+            if self.plot is not None:
+                plot_recording(read_recording(self.files[0]), self.plot)
+            if self.report is not None:
+                write_report(read_recording(self.files[0]), reports[0], self.report)
+        for written in (self.plot, self.report):
+            if written is not None:
+                err.print(f"wrote {written}")
+        return max(report.exit_code for report in reports)
+
+
+def _print_report(report: AuditReport) -> None:
+    colour = _COLOURS[report.verdict]
+    environment = f" ({report.environment})" if report.environment else ""
+    out.print(f"{report.path}: [bold {colour}]{report.verdict}[/]{environment}")
+    out.print(f"  {report.reason}")
+    if report.resimulation:
+        out.print(f"  simulated again: {report.resimulation}")
+    for condition in report.conditions:
+        out.print(f"  {condition}")
+    if not report.conditions:
+        out.print("  device condition b >= KT/2 + B: not applicable, the damping is not known")
+    if report.is_cut:
+        out.print(
+            "  the file is cut: the verdict is on what it holds; "
+            f"'hapticbridge repair {report.path} OUTPUT' makes it whole"
+        )
+    out.print(f"  {report.ticks} ticks, {report.duration:.3f} s", end="")
+    for name, joules in report.energies.items():
+        out.print(f", {name.replace('_', ' ')} {quantity(joules, 'J')}", end="")
+    out.print()
+
+
+@dataclass(frozen=True, slots=True)
+class Repair:
+    """Make a whole file of a recording that was cut by a crash.
+
+    Example:
+        hapticbridge repair cut.mcap whole.mcap
+    """
+
+    file: tyro.conf.Positional[Path]
+    """The cut recording; it is not changed."""
+    output: tyro.conf.Positional[Path]
+    """The file to write; it must not exist."""
+
+    def execute(self) -> int:
+        """Repairs; returns the exit code."""
+        with err.status(f"repairing {self.file} …"):
+            mended = repair(self.file, self.output)
+        out.print(f"wrote {self.output}: {len(mended.ticks)} ticks, {len(mended.events)} events")
+        return 0

@@ -1,0 +1,68 @@
+"""The entry point: which command, and what an error looks like."""
+
+from __future__ import annotations
+
+import sys
+import warnings
+from collections.abc import Sequence
+from typing import Annotated, TextIO
+
+import tyro
+from rich.markup import escape
+
+from hapticbridge.cli.judge import Audit, Repair
+from hapticbridge.cli.run import Run
+from hapticbridge.cli.scenes import Scenes
+from hapticbridge.cli.terminal import err
+from hapticbridge.errors import HapticBridgeError, SafetyTrip
+
+Command = (
+    Annotated[Run, tyro.conf.subcommand("run")]
+    | Annotated[Audit, tyro.conf.subcommand("audit")]
+    | Annotated[Scenes, tyro.conf.subcommand("scenes")]
+    | Annotated[Repair, tyro.conf.subcommand("repair")]
+)
+
+USAGE_ERROR, SAFETY_TRIP = 2, 3
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs ``hapticbridge``; returns the exit code.
+
+    0 done, 1 done with a negative verdict, 2 bad input or usage, 3 safety trip.
+    """
+    warnings.showwarning = _show_warning  # type: ignore[assignment] # parameter names differ
+    command = tyro.cli(
+        Command,
+        prog="hapticbridge",
+        description="Feel a MuJoCo scene through a haptic device.",
+        args=arguments,
+        config=(tyro.conf.OmitSubcommandPrefixes, tyro.conf.FlagCreatePairsOff),
+    )
+    try:
+        return int(command.execute())
+    except SafetyTrip as trip:
+        err.print(f"[red]safety trip:[/red] {escape(str(trip))}")
+        return SAFETY_TRIP
+    except HapticBridgeError as error:
+        err.print(f"[red]error:[/red] {escape(str(error))}")
+        return USAGE_ERROR
+    except KeyboardInterrupt:
+        err.print("interrupted")
+        return 130
+
+
+def _show_warning(
+    message: Warning | str,
+    category: type[Warning],
+    _filename: str,
+    _lineno: int,
+    _file: TextIO | None = None,
+    _line: str | None = None,
+) -> None:
+    if issubclass(category, UserWarning):
+        err.print(f"[yellow]warning:[/yellow] {escape(str(message))}")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

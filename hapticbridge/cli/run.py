@@ -1,0 +1,168 @@
+"""``hapticbridge run``."""
+
+from __future__ import annotations
+
+import json
+import math
+import shlex
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.table import Table
+
+from hapticbridge.bridge import Bridge, Summary, device_for
+from hapticbridge.certificate import default_coupling, device_conditions
+from hapticbridge.cli.terminal import err, out, quantity
+from hapticbridge.clock import RealClock, SimulatedClock
+from hapticbridge.coupling import Coupling
+from hapticbridge.device import DeviceInfo
+from hapticbridge.errors import HapticBridgeError, RecordingError
+from hapticbridge.guard import Limits
+from hapticbridge.rendering import IMPLICIT
+from hapticbridge.scene import load_scene
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """Put a scene behind a haptic device and feel it.
+
+    Ctrl-C stops cleanly: zero force first, then the recording is closed. Example:
+
+        hapticbridge run peg_in_hole --duration 8 --record run.mcap
+    """
+
+    scene: tyro.conf.Positional[str]
+    """An MJCF file, or a scene's name (see 'hapticbridge scenes')."""
+    grip: str = "grip"
+    """Site on the tool that the hand holds."""
+    device: str = "simulated"
+    """'simulated', 'simulated:damping=5,friction=0.1', or 'trajectory:FILE' (CSV or recording)."""
+    duration: float | None = None
+    """Seconds to run; by default until the device's motion ends, or until Ctrl-C."""
+    record: Path | None = None
+    """File to record to (.mcap)."""
+    overwrite: bool = False
+    """Replace the recording if the file exists."""
+    method: str = IMPLICIT.name
+    """How the tool is rendered."""
+    rate: float = 1000.0
+    """Ticks per second."""
+    substeps: int = 1
+    """MuJoCo steps per tick."""
+    fast: bool = False
+    """Simulated time: as fast as it goes, and the same in every run."""
+    stiffness: float | None = None
+    """Coupling stiffness K in N/m; by default the stiffest that is safe on the device."""
+    damping: float | None = None
+    """Coupling damping B in N s/m."""
+    rotational_stiffness: float | None = None
+    """Rotational coupling stiffness in N m/rad."""
+    rotational_damping: float | None = None
+    """Rotational coupling damping in N m s/rad."""
+    scale: float = 1.0
+    """Handle motion per device motion."""
+    force_scale: float | None = None
+    """Force on the device per force on the tool; by default equal to scale."""
+    axes: tuple[float, float, float, float, float, float, float, float, float] | None = None
+    """Rotation from the device's axes to the scene's: 9 numbers, row by row."""
+    absolute: bool = False
+    """Take the device's poses as poses in the scene instead of relative to its start."""
+    force_limit: float | None = None
+    """Largest force on the device in N; by default the device's own."""
+    torque_limit: float | None = None
+    """Largest torque on the device in N m; by default the device's own."""
+    ramp: float = 0.5
+    """Seconds over which the force rises at the start."""
+    as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
+    """Print the summary as JSON."""
+
+    def execute(self) -> int:
+        """Runs the bridge; returns the exit code."""
+        if self.record is not None and self.record.exists() and not self.overwrite:
+            raise RecordingError(f"'{self.record}' exists; choose another file or add --overwrite")
+        scene = load_scene(self.scene, self.grip)
+        device = device_for(scene, self.device)
+        scales = self.scale, self.scale if self.force_scale is None else self.force_scale
+        bridge = Bridge(
+            scene,
+            device,
+            self._coupling(device.info, scales),
+            rate=self.rate,
+            substeps=self.substeps,
+            method=self.method,
+            recording=self.record,
+            clock=SimulatedClock() if self.fast else RealClock(),
+            scale=scales[0],
+            force_scale=scales[1],
+            axes=self.axes,
+            absolute=self.absolute,
+            limits=Limits(
+                force=device.info.force_limit if self.force_limit is None else self.force_limit,
+                torque=(
+                    device.info.torque_limit if self.torque_limit is None else self.torque_limit
+                ),
+                ramp=self.ramp,
+            ),
+            live=not self.as_json,
+        )
+        if not self.as_json:
+            _announce(bridge, scales)
+        with ExitStack() as stack:
+            with err.status("preparing (the first run on a machine compiles for about 20 s) …"):
+                stack.enter_context(bridge)
+            summary = bridge.run(self.duration)
+        if self.as_json:
+            values = asdict(summary) | {"verdict": summary.verdict}
+            out.print_json(json.dumps(values | {"recording": str(self.record or "") or None}))
+        else:
+            _print_summary(summary)
+        is_good = summary.verdict == "passive" and summary.is_certified is not False
+        return 0 if is_good else 1
+
+    def _coupling(self, info: DeviceInfo, scales: tuple[float, float]) -> Coupling:
+        """Returns the default coupling with what the user asked for put in its place."""
+        if not math.isfinite(self.rate) or self.rate <= 0:
+            raise HapticBridgeError(f"rate is {self.rate!r} Hz; it must be finite and > 0")
+        asked = {field.name: getattr(self, field.name) for field in fields(Coupling)}
+        given = {name: value for name, value in asked.items() if value is not None}
+        return replace(default_coupling(info, 1.0 / self.rate, *scales), **given)
+
+
+def _announce(bridge: Bridge, scales: tuple[float, float]) -> None:
+    """Says what will be rendered, and whether the device bears it, before any force is on."""
+    coupling = bridge.coupling
+    err.print(
+        f"[bold]{bridge.scene.name}[/bold] on {bridge.device.info.name}: "
+        f"K = {coupling.stiffness:g} N/m, B = {coupling.damping:g} N s/m, "
+        f"K_r = {coupling.rotational_stiffness:g} N m/rad, "
+        f"B_r = {coupling.rotational_damping:g} N m s/rad, {1 / bridge.period:g} Hz"
+    )
+    conditions = device_conditions(bridge.device.info, coupling, bridge.period, *scales)
+    for condition in conditions:
+        if not condition.holds:
+            err.print(f"[yellow]warning:[/yellow] {condition.sentence()}")
+
+
+def _print_summary(summary: Summary) -> None:
+    table = Table(show_header=False, box=None, pad_edge=False)
+    table.add_row("ran", f"{summary.duration:.3f} s, {summary.ticks} ticks ({summary.stopped_by})")
+    table.add_row("overruns", f"{summary.overruns}, records dropped {summary.dropped}")
+    table.add_row(
+        "peak", f"{quantity(summary.peak_force, 'N')}, {quantity(summary.peak_torque, 'N m')}"
+    )
+    for name, joules in summary.energies.items():
+        table.add_row(name.replace("_", " "), quantity(joules, "J"))
+    out.print(table)
+    used = f", {summary.slack_share:.0%} of the slack used" if summary.slack_share else ""
+    out.print(f"environment [bold]{summary.verdict}[/bold] ({summary.environment}{used})")
+    certified = {
+        True: "device certified: b >= KT/2 + B",
+        False: "device not certified: b < KT/2 + B",
+        None: "device unknown: b >= KT/2 + B not checked",
+    }
+    out.print(certified[summary.is_certified])
+    if summary.recording is not None:
+        out.print(f"next: hapticbridge audit {shlex.quote(str(summary.recording))}")

@@ -1,0 +1,25 @@
+"""How the command line speaks: one console for results, one for everything else."""
+
+from __future__ import annotations
+
+import math
+
+from rich.console import Console
+
+out = Console(highlight=False, soft_wrap=True)
+"""Results, on stdout."""
+
+err = Console(stderr=True, highlight=False, soft_wrap=True)
+"""Progress, warnings and errors, on stderr, so that a pipe gets results alone."""
+
+_PREFIXES = ((1.0, ""), (1e-3, "m"), (1e-6, "µ"), (1e-9, "n"))
+
+
+def quantity(value: float, unit: str) -> str:
+    """Formats a number with an SI prefix and three digits: ``-3.41 mJ``, ``0 J``."""
+    if value == 0 or not math.isfinite(value):
+        return f"{value:g} {unit}"
+    for factor, prefix in _PREFIXES:
+        if abs(value) >= factor:
+            return f"{value / factor:.3g} {prefix}{unit}"
+    return f"{value:.2g} {unit}"

@@ -1,0 +1,11 @@
+"""Haptic devices: real, simulated and replayed, behind one protocol."""
+
+from hapticbridge.device.base import Device as Device
+from hapticbridge.device.base import DeviceInfo as DeviceInfo
+from hapticbridge.device.library import open_device as open_device
+from hapticbridge.device.motion import Motion as Motion
+from hapticbridge.device.motion_csv import read_motion as read_motion
+from hapticbridge.device.simulated import Hand as Hand
+from hapticbridge.device.simulated import SimulatedDevice as SimulatedDevice
+from hapticbridge.device.trajectory import ReplayDevice as ReplayDevice
+from hapticbridge.device.trajectory import TrajectoryDevice as TrajectoryDevice

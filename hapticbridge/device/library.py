@@ -1,0 +1,145 @@
+"""Devices by name, as the command line and scripts ask for them."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from hapticbridge.device.base import Device
+from hapticbridge.device.motion_csv import read_motion
+from hapticbridge.device.simulated import Hand, SimulatedDevice
+from hapticbridge.device.trajectory import ReplayDevice, TrajectoryDevice
+from hapticbridge.errors import DeviceError, choices
+
+_MCAP_MAGIC = b"\x89MCAP0\r\n"
+_HAND_PREFIX = "hand_"
+_HAND_OPTIONS = tuple(_HAND_PREFIX + name for name in inspect.signature(Hand).parameters)
+_SIMULATED_OPTIONS = (*inspect.signature(SimulatedDevice).parameters, *_HAND_OPTIONS)
+_LIMITS = ("force_limit", "torque_limit", "speed_limit")
+
+
+def open_device(spec: str, **options: object) -> Device:
+    """Opens a device by what a user would type.
+
+    Specifications are a name, or a name, a colon and what the device needs to know:
+
+    - ``simulated``, ``simulated:damping=5,friction=0.1``: a ``SimulatedDevice`` with these
+      parameters, numbers in SI units. ``hand_mass``, ``hand_damping``, ``hand_stiffness``,
+      ``hand_rotational_inertia``, ``hand_rotational_damping`` and ``hand_rotational_stiffness``
+      change its hand, ``hand=none`` lets it go. ``path=FILE`` comes last: all after it is the
+      file's name.
+    - ``trajectory:FILE``: follows a CSV file (``read_motion``) or repeats the device motion of a
+      recording. All after the colon is the file's name, commas and colons too.
+
+    Args:
+        spec: The specification.
+        **options: The same parameters from code. What the specification says goes first; a
+            trajectory takes ``force_limit`` (N), ``torque_limit`` (N m) and ``speed_limit`` (m/s).
+
+    Returns:
+        The device, not yet started.
+
+    Raises:
+        DeviceError: The name, an option or a value is not valid, or the file is not a motion.
+        RecordingError: The file is a recording that cannot be read.
+    """
+    name, _, rest = spec.partition(":")
+    if name not in _OPENERS:
+        raise DeviceError(f"unknown device '{name}'; there are {choices(_OPENERS)}")
+    return _OPENERS[name](rest, options)
+
+
+def _open_simulated(rest: str, options: Mapping[str, object]) -> Device:
+    parameters: dict[str, Any] = {**options, **_parsed(rest)}
+    _refuse_unknown("simulated", parameters, _SIMULATED_OPTIONS)
+    changes = {name: parameters.pop(name) for name in _HAND_OPTIONS if name in parameters}
+    if "hand" not in parameters:
+        parameters["hand"] = Hand(
+            **{name.removeprefix(_HAND_PREFIX): value for name, value in changes.items()}
+        )
+    elif changes:
+        raise DeviceError(f"hand and {choices(changes)} exclude each other")
+    if parameters["hand"] == "none":
+        parameters["hand"] = None
+    elif not isinstance(parameters["hand"], Hand | None):
+        raise DeviceError(
+            f"hand = {parameters['hand']!r}: must be 'none'; {choices(_HAND_OPTIONS)} change it"
+        )
+    return SimulatedDevice(**parameters)
+
+
+def _open_trajectory(rest: str, options: Mapping[str, object]) -> Device:
+    _refuse_unknown("trajectory", options, _LIMITS)
+    limits: dict[str, Any] = dict(options)
+    if not rest:
+        raise DeviceError("trajectory needs a file: 'trajectory:FILE', a CSV file or a recording")
+    path = Path(rest)
+    if not _is_recording(path):
+        return TrajectoryDevice(read_motion(path), **limits)
+    # devices stand left of recordings and know nothing of files' formats; only whoever asks for a
+    # recording by name needs the reader
+    from hapticbridge.recording import read_recording  # noqa: PLC0415
+
+    recording = read_recording(path)
+    try:
+        period = float(recording.meta["period_s"])
+    except (KeyError, ValueError):
+        raise DeviceError(f"{path}: the recording does not say its period (period_s)") from None
+    return ReplayDevice(recording.ticks, period, name=str(path), **limits)
+
+
+_OPENERS: dict[str, Callable[[str, Mapping[str, object]], Device]] = {
+    "simulated": _open_simulated,
+    "trajectory": _open_trajectory,
+}
+
+
+def _parsed(text: str) -> dict[str, object]:
+    """Reads ``name=value,name=value``; ``path`` takes the rest, ``hand`` is text, else numbers."""
+    values: dict[str, object] = {}
+    while text:
+        name, equals, text = text.partition("=")
+        name = name.strip()
+        if not equals:
+            raise DeviceError(f"'{name}' is no option; options are written name=value")
+        if name in values:
+            raise DeviceError(f"{name} is there twice")
+        if name == "path":
+            value, text = text, ""
+        else:
+            value, _, text = text.partition(",")
+        values[name] = _value(name, value.strip())
+    return values
+
+
+def _value(name: str, text: str) -> object:
+    if name in ("path", "hand") or name not in _SIMULATED_OPTIONS:
+        return text
+    try:
+        return int(text) if name == "delay" else float(text)
+    except ValueError:
+        kind = "a whole number" if name == "delay" else "a number"
+        raise DeviceError(f"{name} = '{text}': must be {kind}") from None
+
+
+def _refuse_unknown(device: str, options: Mapping[str, object], valid: tuple[str, ...]) -> None:
+    unknown = [name for name in options if name not in valid]
+    if unknown:
+        raise DeviceError(
+            f"unknown option '{unknown[0]}' of the {device} device; there are {choices(valid)}"
+        )
+
+
+def _is_recording(path: Path) -> bool:
+    """Tells a recording by its first bytes; by its name if it is too short for them."""
+    if path.suffix == ".mcap":
+        return True
+    try:
+        if not path.is_file():
+            return False
+        with path.open("rb") as file:
+            return file.read(len(_MCAP_MAGIC)) == _MCAP_MAGIC
+    except (OSError, ValueError):
+        return False  # whoever reads it as a motion says why it cannot be

@@ -1,0 +1,54 @@
+"""What stands between a computed wrench and a motor in somebody's hand."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from hapticbridge.errors import DeviceError
+from hapticbridge.kernel.step import BAD_SAMPLE
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Limits:
+    """Limits on the wrench that is sent, applied in this order after the scale.
+
+    Attributes:
+        force: Largest norm of the force in N, > 0; a longer one keeps its direction.
+        torque: Largest norm of the torque in N m, > 0.
+        ramp: Time in s over which the wrench rises linearly to its full value at the start, >= 0.
+
+    Raises:
+        DeviceError: A value is not finite or out of range.
+    """
+
+    force: float
+    torque: float
+    ramp: float = 0.5
+
+    def __post_init__(self) -> None:
+        for name, unit in (("force", "N"), ("torque", "N m")):
+            value = getattr(self, name)
+            if not math.isfinite(value) or value <= 0:
+                raise DeviceError(f"{name} limit is {value!r} {unit}; it must be finite and > 0")
+        if not math.isfinite(self.ramp) or self.ramp < 0:
+            raise DeviceError(f"start ramp is {self.ramp!r} s; it must be finite and >= 0")
+
+    def ramp_ticks(self, period: float) -> int:
+        """Returns the length of the ramp in ticks of ``period`` seconds."""
+        return round(self.ramp / period)
+
+
+def trip_reason(code: int, tick: int) -> str:
+    """Says why the kernel refused a tick.
+
+    Args:
+        code: What ``before_step`` or ``after_step`` returned, not ``OK``.
+        tick: The tick's number.
+    """
+    if code == BAD_SAMPLE:
+        return f"tick {tick}: the device's pose is not finite or not a rotation"
+    return (
+        f"tick {tick}: the simulation is no longer finite (force, pose or energy); the scene "
+        "diverged, so lower the stiffness or the period"
+    )

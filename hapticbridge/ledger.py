@@ -1,0 +1,81 @@
+"""What the kernel metered, in words: energy per port, and whether the environment is passive."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+Environment = Literal["strict", "within slack", "active"]
+
+
+@dataclass(frozen=True, slots=True)
+class Ledger:
+    """Energies of a run so far, all in J and cumulative since its start except the storage.
+
+    E_k = S_k − S_{k−1} − (works of all ports in tick k); the environment gave out no more than it
+    got while Σ E_k <= 0 (BC97 (14)), and the device stays safe while Σ E_k stays below the slack,
+    Σ ½‖δx_k‖²_{K+B/T} and its rotational counterpart.
+
+    Attributes:
+        kinetic: Kinetic energy now.
+        potential: Potential energy now: gravity and springs.
+        coupling_work: Work of the coupling on the tool, Σ f_k·δx_k + τ_k·δφ_k.
+        actuator_work: Work of the scene's own actuators.
+        external_work: Work of applied forces, gravity compensation and moved mocap bodies.
+        environment_energy: Σ E_k: what the simulation created (> 0) or dissipated (< 0).
+        device_energy: Energy given to the device by the wrenches that were sent.
+        slack: What Σ E_k may reach before the guarantee is lost.
+        slack_share: Largest share of the slack that was ever used, 0 if always strict.
+        first_unstrict: First tick at which (14) did not hold, or None.
+        first_active: First tick at which the slack was exceeded, or None.
+    """
+
+    kinetic: float
+    potential: float
+    coupling_work: float
+    actuator_work: float
+    external_work: float
+    environment_energy: float
+    device_energy: float
+    slack: float
+    slack_share: float
+    first_unstrict: int | None
+    first_active: int | None
+
+    @classmethod
+    def of(cls, state: NDArray[np.void]) -> Ledger:
+        """Reads the ledger out of the kernel's state (``STATE_DTYPE``, one element)."""
+        values = {name: float(state[name][0]) for name in _ENERGIES}
+        ticks = {name: int(state[name][0]) for name in ("first_unstrict", "first_active")}
+        return cls(
+            **values,
+            first_unstrict=ticks["first_unstrict"] if ticks["first_unstrict"] >= 0 else None,
+            first_active=ticks["first_active"] if ticks["first_active"] >= 0 else None,
+        )
+
+    @property
+    def environment(self) -> Environment:
+        """``strict`` if (14) held throughout, ``within slack`` or ``active``."""
+        if self.first_active is not None:
+            return "active"
+        return "strict" if self.first_unstrict is None else "within slack"
+
+    def energies(self) -> dict[str, float]:
+        """Returns the energies by name, in J."""
+        return {name: value for name, value in asdict(self).items() if name in _ENERGIES[:-1]}
+
+
+_ENERGIES = (
+    "kinetic",
+    "potential",
+    "coupling_work",
+    "actuator_work",
+    "external_work",
+    "environment_energy",
+    "device_energy",
+    "slack",
+    "slack_share",
+)

@@ -1,0 +1,207 @@
+"""What a recording says about its run, so that it can be judged and simulated again.
+
+Metadata are strings; numbers in them are written so that they read back to the same double.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import platform
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from importlib.metadata import version
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticbridge.coupling import Coupling
+from hapticbridge.device import DeviceInfo
+from hapticbridge.errors import HapticBridgeError, RecordingError
+from hapticbridge.kernel.state import Binding, RunParameters
+from hapticbridge.recording import Attachment
+from hapticbridge.rendering import method_named
+from hapticbridge.scene import Scene
+
+MODEL_ATTACHMENT = "model.mjb"
+STATE_ATTACHMENT = "start_state.f64"
+SOURCE_PREFIX = "scene/"
+
+_FLOATS = ("scale", "force_scale", "force_limit", "torque_limit")
+_POSES = ("device_origin", "handle_origin", "device_start")
+_GAINS = ("stiffness", "damping", "rotational_stiffness", "rotational_damping")
+_STATE = mujoco.mjtState.mjSTATE_INTEGRATION
+
+
+def versions() -> dict[str, str]:
+    """Returns the versions that decide whether a run can be repeated to the bit."""
+    packages = ("hapticbridge", "mujoco", "numba", "numpy", "scipy", "mcap")
+    found = {name: version(name) for name in packages}
+    return found | {"python": platform.python_version()}
+
+
+def processor() -> str:
+    """Returns the processor's model, where the system tells it."""
+    try:
+        with open("/proc/cpuinfo", encoding="utf-8") as lines:  # noqa: PTH123 - not a file to keep
+            for line in lines:
+                if line.startswith("model name"):
+                    return line.split(":", 1)[1].strip()
+    except OSError:
+        pass
+    return platform.processor() or platform.machine()
+
+
+def compiled_model(model: mujoco.MjModel) -> bytes:
+    """Returns the bytes of ``mj_saveModel``, the same in every compilation of one scene."""
+    buffer = np.zeros(mujoco.mj_sizeModel(model), dtype=np.uint8)
+    mujoco.mj_saveModel(model, None, buffer)
+    return buffer.tobytes()
+
+
+def start_state(model: mujoco.MjModel, data: mujoco.MjData) -> NDArray[np.float64]:
+    """Returns everything that MuJoCo's next step depends on."""
+    state = np.zeros(mujoco.mj_stateSize(model, _STATE))
+    mujoco.mj_getState(model, data, state, _STATE)
+    return state
+
+
+def restore_state(model: mujoco.MjModel, data: mujoco.MjData, state: bytes) -> None:
+    """Puts data to a start that ``start_state`` returned.
+
+    Raises:
+        RecordingError: The bytes are not a state of this model.
+    """
+    expected = 8 * mujoco.mj_stateSize(model, _STATE)
+    if len(state) != expected:
+        raise RecordingError(
+            f"attachment '{STATE_ATTACHMENT}' has {len(state)} bytes; the attached model needs "
+            f"{expected}"
+        )
+    mujoco.mj_resetData(model, data)
+    mujoco.mj_setState(model, data, np.frombuffer(state, dtype="<f8").astype(np.float64), _STATE)
+    mujoco.mj_forward(model, data)
+    # mj_forward solves once more and would leave another warm start than the run began with
+    mujoco.mj_setState(model, data, np.frombuffer(state, dtype="<f8").astype(np.float64), _STATE)
+
+
+def attachments(scene: Scene) -> list[Attachment]:
+    """Returns the scene's sources, its compiled model and its start, as the recording keeps them.
+
+    Call it after the scene was prepared and reset: gains and timestep are part of the model.
+    """
+    kept = [
+        Attachment(SOURCE_PREFIX + source.name, "application/octet-stream", source.data)
+        for source in scene.sources
+    ]
+    model = compiled_model(scene.model)
+    state = start_state(scene.model, scene.data).astype("<f8").tobytes()
+    kept.append(Attachment(MODEL_ATTACHMENT, "application/octet-stream", model))
+    kept.append(Attachment(STATE_ATTACHMENT, "application/octet-stream", state))
+    return kept
+
+
+def describe_run(
+    scene: Scene,
+    parameters: RunParameters,
+    binding: Binding,
+    *,
+    method: str,
+    device: DeviceInfo,
+    clock: str,
+) -> dict[str, str]:
+    """Returns the recording's metadata; see ``parameters_of`` for the way back."""
+    state = binding.state[0]
+    coupling = parameters.coupling
+    meta = {name: repr(float(getattr(parameters, name))) for name in _FLOATS}
+    meta |= {name: repr(float(getattr(coupling, name))) for name in _GAINS}
+    meta |= {name: json.dumps(getattr(parameters, name)) for name in (*_POSES, "axes")}
+    meta |= {
+        name: json.dumps([*state[f"{name[:-6]}_position"], *state[f"{name[:-6]}_quaternion"]])
+        for name in ("handle_start", "tool_start")
+    }
+    return meta | {
+        "period_s": repr(parameters.period),
+        "substeps": str(parameters.substeps),
+        "ramp_ticks": str(parameters.ramp_ticks),
+        "method": method,
+        "discretization": method_named(method).discretization,
+        "grip": parameters.grip,
+        "clock": clock,
+        "device": device.to_json(),
+        "scene": scene.name,
+        "scene_file": scene.path.name,
+        "scene_sha256": hashlib.sha256(compiled_model(scene.model)).hexdigest(),
+        "start_kinetic": repr(float(state["kinetic"])),
+        "start_potential": repr(float(state["potential"])),
+        "versions": json.dumps(versions(), sort_keys=True),
+        "host": json.dumps(
+            {"system": platform.system(), "machine": platform.machine(), "processor": processor()}
+        ),
+        "started": datetime.now(UTC).isoformat(timespec="seconds"),
+    }
+
+
+def meta_float(meta: Mapping[str, str], name: str) -> float:
+    """Returns a number of the metadata.
+
+    Raises:
+        RecordingError: It is missing, not a number or not finite.
+    """
+    try:
+        value = float(meta[name])
+    except KeyError:
+        raise RecordingError(f"the recording's metadata lack '{name}'") from None
+    except ValueError:
+        raise RecordingError(f"metadata '{name}' is {meta[name]!r}, not a number") from None
+    if not math.isfinite(value):
+        raise RecordingError(f"metadata '{name}' is {value}; it must be finite")
+    return value
+
+
+def meta_numbers(meta: Mapping[str, str], name: str, count: int) -> tuple[float, ...]:
+    """Returns a list of numbers of the metadata.
+
+    Raises:
+        RecordingError: It is missing, or not ``count`` finite numbers.
+    """
+    text = meta.get(name)
+    if text is None:
+        raise RecordingError(f"the recording's metadata lack '{name}'")
+    try:
+        values = tuple(float(value) for value in json.loads(text))
+    except (ValueError, TypeError):
+        values = ()
+    if len(values) != count or not all(math.isfinite(value) for value in values):
+        raise RecordingError(f"metadata '{name}' is {text!r}; it must be {count} finite numbers")
+    return values
+
+
+def parameters_of(meta: Mapping[str, str]) -> RunParameters:
+    """Returns the parameters of a recorded run.
+
+    Raises:
+        RecordingError: Something is missing or out of range.
+    """
+    try:
+        return RunParameters(
+            grip=meta.get("grip", ""),
+            period=meta_float(meta, "period_s"),
+            substeps=int(meta_float(meta, "substeps")),
+            coupling=Coupling(**{name: meta_float(meta, name) for name in _GAINS}),
+            ramp_ticks=int(meta_float(meta, "ramp_ticks")),
+            axes=meta_numbers(meta, "axes", 9),
+            scale=meta_float(meta, "scale"),
+            force_scale=meta_float(meta, "force_scale"),
+            force_limit=meta_float(meta, "force_limit"),
+            torque_limit=meta_float(meta, "torque_limit"),
+            device_origin=meta_numbers(meta, "device_origin", 7),
+            handle_origin=meta_numbers(meta, "handle_origin", 7),
+            device_start=meta_numbers(meta, "device_start", 7),
+        )
+    except RecordingError:
+        raise
+    except HapticBridgeError as error:
+        raise RecordingError(f"the recording's metadata are out of range: {error}") from None

@@ -1,0 +1,182 @@
+"""The recorder's process: drains the ring into the file, and outlives the bridge.
+
+Started by ``hapticbridge.recording.recorder``, which tells it what to do through its standard
+input: one line of JSON, the attachments' bytes, then one line per event, and ``{"close": true}``.
+It answers on standard output with ``ready``, ``closed`` or ``error``. If the input ends before it
+was told to close, the bridge died.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import sys
+import threading
+import time
+import traceback
+from pathlib import Path
+from queue import Empty, SimpleQueue
+from typing import IO, Any, NoReturn
+
+from hapticbridge.errors import RecordingError
+from hapticbridge.recording.format import Attachment
+from hapticbridge.recording.ring import Ring
+from hapticbridge.recording.writer import RecordingWriter
+
+POLL = 0.005
+"""Pause in s between looks into the ring: five records at 1 kHz."""
+
+BATCH = 4096
+"""Most records that are written between two looks at the input."""
+
+BUSY_BATCH = 256
+"""From this many records on, the next look follows without a pause."""
+
+
+class _Session:
+    """One run from the recorder's side."""
+
+    def __init__(self, configuration: dict[str, Any], attachments: list[Attachment]) -> None:
+        self.ring = Ring.attach(configuration["ring"])
+        self._parent = configuration["parent"]
+        self._writer = None
+        if configuration["path"] is not None:
+            self._writer = RecordingWriter(
+                configuration["path"],
+                configuration["metadata"],
+                attachments,
+                configuration["epoch_ns"],
+            )
+        self._live = None
+        if configuration["live"]:
+            # imported here, so that a run without a live line starts without it
+            from hapticbridge.recording.live import LiveLine  # noqa: PLC0415
+
+            self._live = LiveLine(sys.stderr)
+        self._last_time = 0
+        self._last_tick = -1
+
+    def run(self, inbox: SimpleQueue[dict[str, Any] | None]) -> None:
+        """Records until the bridge says close, or is gone."""
+        end = None
+        while end is None:
+            count = self._drain_once()
+            end = self._handle(inbox)
+            # a process that the bridge forked may hold the pipe open after the bridge's death
+            if end is None and os.getppid() != self._parent:
+                time.sleep(0.1)  # what is still in the pipe arrives
+                end = self._handle(inbox) or "died"
+            if end is None and count < BUSY_BATCH:
+                time.sleep(POLL)
+        while self._drain_once():
+            pass
+        if end == "died":
+            self.ring.unlink()
+            self._write_event({"event": "bridge_died", "tick": self._last_tick}, self._last_time)
+        if self._writer is not None:
+            self._writer.close()
+        if self._live is not None:
+            self._live.close()
+
+    def _drain_once(self) -> int:
+        rows = self.ring.take(BATCH)
+        if rows.size:
+            self._last_time = int(rows["deadline_ns"][-1])
+            self._last_tick = int(rows["tick"][-1])
+            if self._writer is not None:
+                self._writer.write_ticks(rows)
+        if self._live is not None:
+            self._live.update(rows)
+        return int(rows.size)
+
+    def _handle(self, inbox: SimpleQueue[dict[str, Any] | None]) -> str | None:
+        """Writes the events that arrived; returns how the run ended, if it did."""
+        while True:
+            try:
+                message = inbox.get_nowait()
+            except Empty:
+                return None
+            if message is None:
+                return "died"
+            if "close" in message:
+                return "closed"
+            self._write_event(message, message["time_ns"])
+
+    def _write_event(self, event: dict[str, Any], time_ns: int) -> None:
+        if self._writer is not None:
+            self._writer.write_event(event, time_ns)
+
+
+def _listen(stream: IO[bytes], inbox: SimpleQueue[dict[str, Any] | None]) -> None:
+    for line in stream:
+        # a line without its end is the last breath of a bridge that was killed while it wrote
+        if line.endswith(b"\n"):
+            inbox.put(json.loads(line))
+    inbox.put(None)
+
+
+def _answer(**answer: object) -> None:
+    with contextlib.suppress(OSError):  # the bridge died; the file matters more
+        os.write(sys.stdout.fileno(), json.dumps(answer).encode() + b"\n")
+
+
+def _configuration(stream: IO[bytes]) -> tuple[dict[str, Any], list[Attachment]] | None:
+    line = stream.readline()
+    if not line.endswith(b"\n"):
+        return None
+    configuration: dict[str, Any] = json.loads(line)
+    attachments = []
+    for name, media_type, size in configuration["attachments"]:
+        data = stream.read(size)
+        if len(data) < size:
+            return None
+        attachments.append(Attachment(name, media_type, data))
+    return configuration, attachments
+
+
+def _calm() -> None:
+    """Gives up what the process must not share with the loop: its signals and its priority."""
+    for name in ("SIGINT", "SIGTERM", "SIGHUP"):
+        if hasattr(signal, name):
+            signal.signal(getattr(signal, name), signal.SIG_IGN)
+    if sys.platform == "linux":
+        with contextlib.suppress(OSError):
+            os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+
+
+def main() -> int:
+    """Runs the recorder's process; returns its exit status."""
+    _calm()
+    stream = sys.stdin.buffer
+    given = _configuration(stream)
+    if given is None:
+        return 1  # the bridge died before the run began
+    configuration, attachments = given
+    try:
+        session = _Session(configuration, attachments)
+        _answer(ready=True)
+        inbox: SimpleQueue[dict[str, Any] | None] = SimpleQueue()
+        threading.Thread(target=_listen, args=(stream, inbox), daemon=True).start()
+        session.run(inbox)
+    except RecordingError as error:
+        _answer(error=str(error))
+        if os.getppid() != configuration["parent"]:
+            print(f"hapticbridge: {error}", file=sys.stderr)
+            Path(configuration["ring"]).unlink(missing_ok=True)
+        return 1
+    _answer(closed=True)
+    return 0
+
+
+def run() -> NoReturn:
+    """Runs the recorder's process and ends it."""
+    status = 1
+    try:
+        status = main()
+    except BaseException:
+        traceback.print_exc()
+    # at once: the listening thread may hold the lock of standard input, which an ordinary exit
+    # of the interpreter waits for
+    os._exit(status)

@@ -1,0 +1,244 @@
+"""Writes the scripted hand paths of the scenes: ``models/NAME/NAME.csv``.
+
+    python scripts/make_hand_paths.py [DIR]
+
+DIR is the folder that holds one folder per scene, by default the repository's ``models/``. Each
+file has the columns ``t,x,y,z,qw,qx,qy,qz`` in s and m, one row each 10 ms for 8 s, starts at zero
+and at the identity, and ends there at rest: position and orientation are meant relative to the
+handle's start. The files depend on nothing but this script (no clock, no global random state).
+
+A path is what a hand does when it reaches, holds and corrects:
+
+- **Reaching** is a sum of minimum-jerk movements, each with its own start and duration; two that
+  overlap blend into one curved movement without a stop (Flash & Hogan 1985; Flash & Henis 1991).
+- **Wander** is the slow drift of a held hand: 0.3 to 2 Hz, 0.06 mm and 1.5 mrad (RMS per axis).
+- **Tremor** is physiological tremor: 8 to 12 Hz, 0.02 mm and 0.3 mrad (RMS per axis), the order of
+  magnitude that is reported for a steady, healthy hand.
+
+Wander and tremor are sums of sines with random phases from a local seed, faded in and out.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array: TypeAlias = NDArray[np.float64]
+
+ROW_INTERVAL = 0.01
+"""Time between rows, in s. Readers interpolate linearly, so tremor needs ten rows a period."""
+
+DURATION = 8.0
+"""Length of every path, in s."""
+
+FADE = 0.5
+"""Wander and tremor grow over this time at the start and vanish over it at the end, in s."""
+
+WANDER_BAND = (0.3, 2.0, 0.06e-3, 1.5e-3)
+TREMOR_BAND = (8.0, 12.0, 0.02e-3, 0.3e-3)
+"""Lowest and highest frequency in Hz, RMS of each position axis in m, of each angle in rad."""
+
+SINES_PER_BAND = 8
+
+
+@dataclass(frozen=True, slots=True)
+class Reach:
+    """One minimum-jerk movement.
+
+    Attributes:
+        start: When it begins, in s.
+        duration: How long it takes, in s.
+        millimetres: By how much the position changes, in mm.
+        degrees: By how much the rotation vector changes, in degrees.
+    """
+
+    start: float
+    duration: float
+    millimetres: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    degrees: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class HandPath:
+    """How one scene's path is made.
+
+    Attributes:
+        motion: Returns position in m and rotation vector in rad, shape (n, 6), at times in s.
+        axes: Which of x, y, z and the rotation vector's three components the hand moves at all.
+        seed: Seeds wander and tremor.
+    """
+
+    motion: Callable[[Array], Array]
+    axes: tuple[int, int, int, int, int, int]
+    seed: int
+
+
+def minimum_jerk(phase: Array) -> Array:
+    """Returns the minimum-jerk profile 10 s³ − 15 s⁴ + 6 s⁵, 0 before s = 0 and 1 after s = 1."""
+    s = np.clip(phase, 0.0, 1.0)
+    return s**3 * (10.0 - 15.0 * s + 6.0 * s**2)
+
+
+def reaching(*reaches: Reach) -> Callable[[Array], Array]:
+    """Returns the motion that is the sum of the movements (see ``HandPath.motion``)."""
+
+    def motion(times: Array) -> Array:
+        total = np.zeros((len(times), 6))
+        for reach in reaches:
+            change = np.array([*reach.millimetres, *reach.degrees])
+            change *= np.array([1e-3] * 3 + [np.pi / 180.0] * 3)
+            total += np.outer(minimum_jerk((times - reach.start) / reach.duration), change)
+        return total
+
+    return motion
+
+
+def figure_eight(times: Array) -> Array:
+    """Returns two rounds of a lying eight, 80 by 40 mm, turning by up to 40 and 25 degrees."""
+    angle = 4.0 * np.pi * minimum_jerk((times - 0.3) / (DURATION - 0.6))
+    zero = np.zeros_like(angle)
+    millimetres = [40.0 * np.sin(angle), 20.0 * np.sin(2.0 * angle), 10.0 * np.sin(angle)]
+    degrees = [25.0 * np.sin(2.0 * angle), zero, 40.0 * np.sin(angle)]
+    return np.stack(
+        [1e-3 * column for column in millimetres] + [np.radians(column) for column in degrees],
+        axis=1,
+    )
+
+
+def unsteadiness(times: Array, seed: int) -> Array:
+    """Returns wander and tremor, shape (n, 6), in m and rad; zero at both ends."""
+    generator = np.random.default_rng(seed)
+    total = np.zeros((len(times), 6))
+    for lowest, highest, length, angle in (WANDER_BAND, TREMOR_BAND):
+        # n sines of amplitude a have the RMS a sqrt(n / 2)
+        amplitude = np.array([length] * 3 + [angle] * 3) * np.sqrt(2.0 / SINES_PER_BAND)
+        for axis in range(6):
+            frequencies = generator.uniform(lowest, highest, SINES_PER_BAND)
+            phases = generator.uniform(0.0, 2.0 * np.pi, SINES_PER_BAND)
+            sines = np.sin(2.0 * np.pi * np.outer(times, frequencies) + phases)
+            total[:, axis] += amplitude[axis] * sines.sum(axis=1)
+    fade = minimum_jerk(times / FADE) * minimum_jerk((DURATION - times) / FADE)
+    return total * fade[:, np.newaxis]
+
+
+def quaternions(rotation_vectors: Array) -> Array:
+    """Returns the unit quaternions (w, x, y, z) of rotation vectors below π, shape (n, 4)."""
+    half = 0.5 * np.linalg.norm(rotation_vectors, axis=1, keepdims=True)
+    # numpy's sinc(x) is sin(πx)/(πx)
+    return np.hstack([np.cos(half), 0.5 * np.sinc(half / np.pi) * rotation_vectors])
+
+
+def table(path: HandPath) -> Array:
+    """Returns the rows ``t, x, y, z, qw, qx, qy, qz`` of one path, shape (n, 8)."""
+    times: Array = ROW_INTERVAL * np.arange(round(DURATION / ROW_INTERVAL) + 1, dtype=np.float64)
+    pose = (path.motion(times) + unsteadiness(times, path.seed)) * np.array(path.axes)
+    return np.column_stack([times, pose[:, :3], quaternions(pose[:, 3:])])
+
+
+def write_csv(file: Path, rows: Array) -> None:
+    """Writes one path: 10 nm and 2e-10 in a quaternion are far below any device's resolution."""
+    # adding 0.0 turns a rounded −0 into 0
+    lines = [
+        f"{row[0]:.2f},"
+        + ",".join(f"{np.round(value, 8) + 0.0:.8f}" for value in row[1:4])
+        + ","
+        + ",".join(f"{np.round(value, 10) + 0.0:.10f}" for value in row[4:])
+        for row in rows
+    ]
+    file.write_text("\n".join(["t,x,y,z,qw,qx,qy,qz", *lines]) + "\n", encoding="utf-8")
+
+
+PATHS = {
+    # Touch the wall, which begins 10 mm away, press to 3 mm behind it (7 N at 2400 N/m), hold,
+    # let go, then tap three times.
+    "virtual_wall": HandPath(
+        reaching(
+            Reach(0.3, 1.0, (10.3, 0, 0)),
+            Reach(1.4, 0.8, (2.7, 0, 0)),
+            Reach(3.4, 0.8, (-8.0, 0, 0)),
+            Reach(4.4, 0.3, (6.5, 0, 0)),
+            Reach(4.75, 0.3, (-6.5, 0, 0)),
+            Reach(5.2, 0.25, (6.8, 0, 0)),
+            Reach(5.5, 0.25, (-6.8, 0, 0)),
+            Reach(5.9, 0.2, (7.0, 0, 0)),
+            Reach(6.15, 0.3, (-7.0, 0, 0)),
+            Reach(6.7, 0.9, (-5.0, 0, 0)),
+        ),
+        axes=(1, 1, 1, 0, 0, 0),
+        seed=1,
+    ),
+    "point_mass": HandPath(figure_eight, axes=(1, 1, 1, 1, 1, 1), seed=2),
+    # The paths of the pegs: come down tilted and off centre, so that one corner of the peg's end is
+    # the lowest and enters the hole whatever the error; push that corner against the hole's walls;
+    # go down a little; straighten; go down to 3 mm above the bottom; push against a wall; wiggle;
+    # press on the bottom; withdraw.
+    "planar_peg": HandPath(
+        reaching(
+            Reach(0.3, 1.0, (0.4, 0, -10.3), (0, 3.0, 0)),
+            Reach(1.5, 0.6, (1.6, 0, 0)),
+            Reach(2.1, 0.5, (0, 0, -1.5)),
+            Reach(2.6, 0.7, (-1.8, 0, 0), (0, -3.0, 0)),
+            Reach(3.3, 1.2, (-0.2, 0, -35.2)),
+            Reach(4.6, 0.5, (2.4, 0, 0)),
+            Reach(5.2, 0.4, (-4.4, 0, 0), (0, 2.5, 0)),
+            Reach(5.5, 0.4, (3.4, 0, 0), (0, -5.0, 0)),
+            Reach(5.8, 0.5, (-1.4, 0, 0), (0, 2.5, 0)),
+            Reach(6.1, 0.5, (0, 0, -4.5)),
+            Reach(6.7, 1.0, (0, 0, 51.5)),
+        ),
+        axes=(1, 0, 1, 0, 1, 0),
+        seed=3,
+    ),
+    "peg_in_hole": HandPath(
+        reaching(
+            Reach(0.3, 1.0, (0.4, -0.3, -9.6), (-2.5, 2.5, 1.0)),
+            Reach(1.5, 0.6, (1.6, 2.1, 0)),
+            Reach(2.1, 0.5, (0, 0, -1.5)),
+            Reach(2.6, 0.7, (-1.8, -1.6, 0), (2.5, -2.5, -1.0)),
+            Reach(3.3, 1.2, (-0.2, -0.2, -35.9)),
+            Reach(4.6, 0.5, (2.4, 0, 0)),
+            Reach(5.2, 0.4, (-2.4, -2.0, 0), (2.0, 0, 0)),
+            Reach(5.5, 0.4, (-1.5, 3.5, 0), (-2.0, 2.5, 2.0)),
+            Reach(5.8, 0.5, (1.5, -1.5, 0), (0, -2.5, -2.0)),
+            Reach(6.1, 0.5, (0, 0, -4.2)),
+            Reach(6.7, 1.0, (0, 0, 51.2)),
+        ),
+        axes=(1, 1, 1, 1, 1, 1),
+        seed=4,
+    ),
+}
+"""The path of every scene. Each reaching motion adds up to zero, so that the hand ends where it
+began."""
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Writes all paths; returns the exit code (2 if a scene's folder does not exist)."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n", maxsplit=1)[0])
+    parser.add_argument(
+        "directory",
+        type=Path,
+        nargs="?",
+        default=Path(__file__).resolve().parent.parent / "models",
+        help="folder that holds one folder per scene (default: the repository's models/)",
+    )
+    directory: Path = parser.parse_args(arguments).directory
+    for name, path in PATHS.items():
+        folder = directory / name
+        if not folder.is_dir():
+            print(
+                f"no folder '{folder}' for the scene's hand path; create it first", file=sys.stderr
+            )
+            return 2
+        write_csv(folder / f"{name}.csv", table(path))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,186 @@
+"""The scenes of models/: what their files promise, and what happens on their own hand paths."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+from model_runs import (
+    BOTTOMED_HEIGHT,
+    HOME_HEIGHT,
+    MODELS,
+    PEG_WEIGHT,
+    ROOT,
+    T,
+    path_of,
+    run_of_own_path,
+    scene_with_handle,
+    spec_of,
+)
+
+SCENES = ("virtual_wall", "point_mass", "planar_peg", "peg_in_hole")
+CONTACT_SCENES = ("virtual_wall", "planar_peg", "peg_in_hole")
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_scene_has_what_the_bridge_needs(name: str) -> None:
+    model = spec_of(name).compile()
+    assert model.key("home").id == 0
+    grip_body = model.site("grip").bodyid[0]
+    assert model.body_dofnum[grip_body] > 0
+    text = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_TEXT, "about")
+    start = model.text_adr[text]
+    sentence = bytes(model.text_data[start : start + model.text_size[text] - 1]).decode()
+    assert 20 < len(sentence) < 130
+    assert sentence.endswith(".")
+    assert all(model.geom(i).name for i in range(model.ngeom))
+    assert model.opt.timestep == T
+    assert model.opt.integrator == mujoco.mjtIntegrator.mjINT_DISCRETE
+    assert model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
+    assert model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_DIAGEXACT
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_solver_settings_are_written_in_the_file_not_left_to_defaults(name: str) -> None:
+    root = ET.parse(MODELS / name / f"{name}.xml").getroot()
+    option = root.find("option")
+    assert option is not None
+    assert {"timestep", "integrator", "cone", "gravity"} <= set(option.attrib)
+    model = spec_of(name).compile()
+    colliding = (model.geom_contype | model.geom_conaffinity) != 0
+    assert colliding.any() == (name in CONTACT_SCENES)
+    assert (model.geom_solref[colliding] == [0.002, 1.0]).all()
+    assert (model.geom_solimp[colliding] == [0.9, 0.95, 0.001, 0.5, 2.0]).all()
+    collision = root.find(".//default[@class='collision']/geom")
+    assert (collision is not None) == (name in CONTACT_SCENES)
+    if collision is not None:
+        assert {"condim", "solref", "solimp"} <= set(collision.attrib)
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_tool_starts_clear_of_everything_and_the_handle_at_its_grip(name: str) -> None:
+    _, data = scene_with_handle(name)
+    assert data.ncon == 0
+    assert np.array_equal(data.site("grip").xpos, data.site("handle").xpos)
+    assert np.array_equal(data.site("grip").xmat, data.site("handle").xmat)
+
+
+def test_peg_has_the_stated_size_mass_and_clearance() -> None:
+    model = spec_of("peg_in_hole").compile()
+    assert 2 * model.geom("peg").size == pytest.approx([0.02, 0.02, 0.06])
+    assert model.body("peg").mass[0] == pytest.approx(0.1)
+    for wall, axis, side in (("east", 0, -1), ("west", 0, 1), ("north", 1, -1), ("south", 1, 1)):
+        geom = model.geom(f"hole_{wall}")
+        face = geom.pos[axis] + side * geom.size[axis]
+        assert abs(face) - 0.01 == pytest.approx(0.0002, abs=1e-12)
+        assert geom.pos[2] + geom.size[2] == pytest.approx(0.0, abs=1e-12)
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_hand_path_starts_at_zero_and_ends_there_at_rest(name: str) -> None:
+    file = MODELS / name / f"{name}.csv"
+    assert file.read_text().startswith("t,x,y,z,qw,qx,qy,qz\n")
+    rows = path_of(name)
+    assert rows[-1, 0] == pytest.approx(8.0)
+    assert np.diff(rows[:, 0]) == pytest.approx(0.01)
+    for end in (rows[0], rows[-1]):
+        assert np.array_equal(end[1:], [0, 0, 0, 1, 0, 0, 0])
+    # the files hold ten digits of a quaternion
+    assert np.linalg.norm(rows[:, 4:], axis=1) == pytest.approx(1.0, abs=1e-9)
+    velocity = np.diff(rows[:, 1:4], axis=0) / 0.01
+    assert np.abs(velocity[[0, -1]]).max() < 1e-4
+    # a quick but ordinary hand: 0.3 m/s and 3 m/s²
+    assert np.linalg.norm(velocity, axis=1).max() < 0.3
+    assert np.linalg.norm(np.diff(velocity, axis=0), axis=1).max() / 0.01 < 3.0
+
+
+def test_the_script_makes_the_hand_paths_that_are_here(tmp_path: Path) -> None:
+    for name in SCENES:
+        (tmp_path / name).mkdir()
+    script = ROOT / "scripts" / "make_hand_paths.py"
+    subprocess.run([sys.executable, str(script), str(tmp_path)], check=True)
+    for name in SCENES:
+        made = np.loadtxt(tmp_path / name / f"{name}.csv", delimiter=",", skiprows=1)
+        # one unit of the last written digit: processors differ in the last bit of a sine
+        np.testing.assert_allclose(made, path_of(name), rtol=0, atol=1.1e-8)
+
+
+def test_the_script_refuses_a_folder_without_the_scenes(tmp_path: Path) -> None:
+    script = ROOT / "scripts" / "make_hand_paths.py"
+    done = subprocess.run(
+        [sys.executable, str(script), str(tmp_path)], check=False, capture_output=True, text=True
+    )
+    assert done.returncode == 2
+    assert str(tmp_path / "virtual_wall") in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_own_path_runs_finite_without_a_warning_and_below_ten_newtons(name: str) -> None:
+    run = run_of_own_path(name)
+    assert run.warnings == 0
+    assert np.isfinite(run.tool).all()
+    assert np.isfinite(run.gained).all()
+    assert np.linalg.norm(run.force, axis=1).max() < 10.0
+    # default limit of the simulated device
+    assert np.linalg.norm(run.torque, axis=1).max() < 0.5
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_own_path_creates_no_more_energy_than_the_slack(name: str) -> None:
+    run = run_of_own_path(name)
+    strict = 1e-9 + 1e-9 * run.work
+    assert (run.gained <= strict + run.slack).all()
+    if name not in CONTACT_SCENES:
+        assert (run.gained <= strict).all()
+    # it moved: a scene that stands still would pass the above
+    assert run.work[-1] > 1e-4
+
+
+def test_wall_is_pressed_with_seven_newtons_and_tapped_three_times() -> None:
+    run = run_of_own_path("virtual_wall")
+    touching = run.touched["wall"]
+    ticks = np.arange(len(touching))
+    held = (ticks > 2400) & (ticks < 3300)
+    assert touching[held].all()
+    assert ((run.force[held, 0] > 6.0) & (run.force[held, 0] < 9.0)).all()
+    # 7 N against 1.2e5 N/m
+    assert run.deepest[held] == pytest.approx(60e-6, rel=0.25)
+    assert run.tool[held, 0] == pytest.approx(0.01 + run.deepest[held], abs=1e-6)
+    # apart by more than 1 mm between taps
+    away = run.tool[4200:7000, 0] < 0.009
+    assert np.count_nonzero(~away[1:] & away[:-1]) == 3
+    assert touching[4200:7000].any()
+
+
+@pytest.mark.parametrize("name", ["planar_peg", "peg_in_hole"])
+def test_peg_goes_in_touches_bottom_and_walls_and_comes_out(name: str) -> None:
+    run = run_of_own_path(name)
+    height = run.tool[:, 2]
+    assert height.min() == pytest.approx(BOTTOMED_HEIGHT, abs=5e-5)
+    assert run.touched["hole_bottom"].any()
+    assert run.touched["hole_east"][4600:5300].any()
+    # pushed against the east wall with more than 4 N, the peg 0.2 mm off centre and no further
+    pushed = slice(5050, 5200)
+    assert (run.force[pushed, 0] > 4.0).all()
+    assert run.tool[pushed, 0].max() < 0.0002 + 60e-6
+    assert height[pushed].max() < 0.0
+    assert run.touched["hole_west"][5300:6200].any()
+    assert height[-1] == pytest.approx(HOME_HEIGHT, abs=1e-3)
+    if name == "peg_in_hole":
+        assert run.touched["hole_north"].any()
+        assert run.touched["hole_south"].any()
+        assert run.force[-1, 2] == pytest.approx(PEG_WEIGHT, abs=0.02)
+
+
+def test_point_mass_follows_the_figure_eight_and_turns() -> None:
+    run = run_of_own_path("point_mass")
+    assert np.ptp(run.tool[:, 0]) == pytest.approx(0.08, abs=2e-3)
+    assert np.ptp(run.tool[:, 1]) == pytest.approx(0.04, abs=2e-3)
+    assert np.degrees(run.rotation.magnitude()).max() > 35.0
+    assert not run.deepest.any()
