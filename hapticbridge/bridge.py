@@ -19,7 +19,7 @@ from types import FrameType, TracebackType
 
 import mujoco
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from hapticbridge.certificate import default_coupling, device_conditions, is_certified
 from hapticbridge.clock import Clock, RealClock
@@ -292,6 +292,10 @@ class Bridge:
         """Energies so far, per port."""
         return Ledger.of(self._binding.state)
 
+    def latest_records(self, count: int) -> NDArray[np.void]:
+        """Returns copies of the newest records (``TICK_DTYPE``), oldest first; at most 8 s."""
+        return self._ring.latest(count)
+
     def summary(self) -> Summary:
         """Returns what the run was so far."""
         state, ledger = self._binding.state, self.ledger
@@ -316,11 +320,13 @@ class Bridge:
         scene, clock, info = self.scene, self.clock, self.device.info
         prepare(scene, self.coupling, self.period, self._substeps)
         self._sample = np.zeros(1, SAMPLE_DTYPE)
-        self.device.start(self.period); self.device.read(self._sample); self.device.start(self.period)
-        parameters = self._parameters()
-        self._warm_up(parameters)
+        self.device.start(self.period)
+        self.device.read(self._sample)
+        self.device.start(self.period)
+        self.parameters = self._parameters()
+        self._warm_up()
         scene.reset()
-        self._binding = Binding(scene.model, scene.data, parameters)
+        self._binding = Binding(scene.model, scene.data, self.parameters)
         if self._path is None and not self._is_live:
             self._ring = Ring.local(RING_CAPACITY)
             self._ring.cursors[TAIL] = NOBODY_READS
@@ -328,7 +334,7 @@ class Bridge:
         self._ring = Ring.shared(RING_CAPACITY)
         meta = describe_run(
             scene,
-            parameters,
+            self.parameters,
             self._binding,
             method=self._method.name,
             device=info,
@@ -361,9 +367,9 @@ class Bridge:
             device_start=start,
         )
 
-    def _warm_up(self, parameters: RunParameters) -> None:
+    def _warm_up(self) -> None:
         """Runs one tick of everything compiled, on the scene before it is reset."""
-        binding = Binding(self.scene.model, self.scene.data, parameters)
+        binding = Binding(self.scene.model, self.scene.data, self.parameters)
         ring = Ring.local(1)
         for substep in range(self._substeps):
             before_step(binding.state, self._sample, binding.row, substep)

@@ -21,10 +21,10 @@ class Scenes:
 
     def execute(self) -> int:
         """Prints the table; returns the exit code."""
-        table = Table("scene", "bodies", "degrees of freedom", "about", box=None, pad_edge=False)
+        table = Table("scene", "moving bodies", "degrees of freedom", "about", box=None, pad_edge=False)
         for name in scene_names():
             model = load_scene(name).model
-            moving = int((model.body_weldid > 0).sum())
+            moving = int((model.body_dofnum > 0).sum())
             table.add_row(name, str(moving), str(model.nv), _about(model))
         out.print(table)
         return 0

@@ -1,0 +1,234 @@
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from hapticbridge.device import Device, DeviceInfo, Hand, ReplayDevice, SimulatedDevice, open_device
+from hapticbridge.errors import DeviceError
+from hapticbridge.tick import SAMPLE_DTYPE, TICK_DTYPE
+
+PERIOD = 1e-3
+TICKS = 300
+
+
+def written(path: Path) -> Path:
+    rng = np.random.default_rng(8)
+    quaternions = rng.normal(size=(40, 4))
+    quaternions /= np.linalg.norm(quaternions, axis=1)[:, None]
+    rows = np.column_stack([0.005 * np.arange(40), rng.normal(0.0, 0.02, (40, 3)), quaternions])
+    np.savetxt(path, rows, delimiter=",", header="t,x,y,z,qw,qx,qy,qz", comments="")
+    return path
+
+
+def replayed(_: Path) -> Device:
+    ticks = np.zeros(200, TICK_DTYPE)
+    ticks["tick"] = np.arange(200)
+    ticks["device_position"][:, 1] = np.linspace(0.0, 0.1, 200)
+    ticks["device_quaternion"][:, 0] = 1.0
+    return ReplayDevice(ticks, PERIOD)
+
+
+DEVICES: dict[str, Callable[[Path], Device]] = {
+    "simulated": lambda _: open_device("simulated"),
+    "free": lambda _: open_device("simulated:hand=none,damping=0"),
+    "rough": lambda _: open_device(
+        "simulated:friction=0.4,resolution=1e-5,rotational_resolution=1e-3,delay=3"
+    ),
+    "guided": lambda path: open_device("simulated", path=written(path / "hand.csv")),
+    "trajectory": lambda path: open_device(f"trajectory:{written(path / 'hand.csv')}"),
+    "replay": replayed,
+}
+
+
+@pytest.fixture(params=DEVICES, name="device")
+def _device(request: pytest.FixtureRequest, tmp_path: Path) -> Device:
+    return DEVICES[request.param](tmp_path)
+
+
+def run(device: Device, seed: int) -> NDArray[np.void]:
+    wrenches = np.random.default_rng(seed).normal(size=(TICKS, 6)) * ([5.0] * 3 + [0.1] * 3)
+    samples = np.zeros(TICKS, SAMPLE_DTYPE)
+    device.start(PERIOD)
+    for k in range(TICKS):
+        device.read(samples[k : k + 1])
+        device.write(wrenches[k])
+    return samples
+
+
+def test_samples_are_finite_poses_with_unit_quaternions(device: Device) -> None:
+    samples = run(device, 1)
+    assert np.isfinite(samples["position"]).all()
+    norms = np.linalg.norm(samples["quaternion"], axis=1)
+    np.testing.assert_allclose(norms, 1.0, atol=1e-12)
+    assert (samples["quaternion"][:, 0] >= 0.0).all()
+    assert np.ptp(samples["position"], axis=0).max() > 0.0
+
+
+def test_a_read_overwrites_the_whole_sample(device: Device) -> None:
+    clean, dirty = np.zeros(1, SAMPLE_DTYPE), np.full(1, -7, SAMPLE_DTYPE)
+    device.start(PERIOD)
+    device.read(clean)
+    device.start(PERIOD)
+    device.read(dirty)
+    assert clean.tobytes() == dirty.tobytes()
+
+
+def test_starting_again_repeats_the_run_to_the_bit(device: Device) -> None:
+    first = run(device, 2)
+    run(device, 3)
+    assert run(device, 2).tobytes() == first.tobytes()
+
+
+def test_force_moves_a_device_unless_its_motion_is_prescribed(device: Device) -> None:
+    is_same = run(device, 4).tobytes() == run(device, 5).tobytes()
+    assert is_same == device.info.is_prescribed
+
+
+def test_the_data_sheet_survives_json(device: Device) -> None:
+    text = device.info.to_json()
+    assert DeviceInfo.from_json(text) == device.info
+    assert set(json.loads(text)) == {f.name for f in dataclasses.fields(DeviceInfo)}
+
+
+def test_closing_twice_is_allowed(device: Device) -> None:
+    device.start(PERIOD)
+    device.close()
+    device.close()
+
+
+def test_an_impossible_period_and_a_read_before_the_start_are_refused(device: Device) -> None:
+    with pytest.raises(DeviceError, match="before it was started"):
+        device.read(np.zeros(1, SAMPLE_DTYPE))
+    for period in (0.0, -1e-3, math.nan, math.inf):
+        with pytest.raises(DeviceError, match=r"the loop's period = .*: must be a finite number"):
+            device.start(period)
+
+
+INFO = SimulatedDevice().info
+
+unknown_or_positive = st.none() | st.floats(1e-300, 1e300)
+at_least_zero = st.floats(0.0, 1e300)
+
+
+@given(
+    st.builds(
+        DeviceInfo,
+        name=st.text(min_size=1),
+        degrees_of_freedom=st.sampled_from([3, 6]),
+        mass=unknown_or_positive,
+        damping=st.none() | at_least_zero,
+        rotational_inertia=unknown_or_positive,
+        rotational_damping=st.none() | at_least_zero,
+        friction=st.none() | at_least_zero,
+        resolution=st.none() | at_least_zero,
+        force_limit=at_least_zero,
+        torque_limit=at_least_zero,
+        speed_limit=at_least_zero,
+        rate=unknown_or_positive,
+        is_prescribed=st.booleans(),
+        is_real=st.booleans(),
+        duration=st.none() | at_least_zero,
+    )
+)
+def test_any_data_sheet_survives_json(info: DeviceInfo) -> None:
+    assert DeviceInfo.from_json(info.to_json()) == info
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"name": ""}, "device name = ''"),
+        ({"name": 3}, "device name = 3"),
+        ({"degrees_of_freedom": 5}, "degrees_of_freedom = 5: must be 3"),
+        ({"degrees_of_freedom": True}, "degrees_of_freedom = True"),
+        ({"mass": 0.0}, "mass = 0.0: must be a finite number > 0 kg"),
+        ({"damping": -0.1}, "damping = -0.1: must be a finite number >= 0 N s/m"),
+        ({"damping": "2"}, "damping = '2'"),
+        ({"friction": True}, "friction = True"),
+        ({"force_limit": None}, "force_limit = None"),
+        ({"speed_limit": math.inf}, "speed_limit = inf"),
+        ({"rate": math.nan}, "rate = nan"),
+        ({"is_real": 1}, "is_real = 1: must be true or false"),
+    ],
+)
+def test_a_bad_data_sheet_is_refused(change: dict[str, object], words: str) -> None:
+    values: dict[str, object] = {**dataclasses.asdict(INFO), **change}
+    with pytest.raises(DeviceError) as error:
+        DeviceInfo(**values)  # type: ignore[arg-type]
+    assert words in str(error.value)
+    with pytest.raises(DeviceError):
+        DeviceInfo.from_json(json.dumps(values))
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("{", "is not JSON"),
+        ("[" * 100_000, "is not JSON"),
+        ("[1]", "is not a JSON object but [1]"),
+        ("{}", "lacks 'damping', 'degrees_of_freedom'"),
+        ('{"colour": "red"}', "holds 'colour', which it does not know; it knows 'damping'"),
+    ],
+)
+def test_text_that_is_no_data_sheet_is_refused(text: str, words: str) -> None:
+    with pytest.raises(DeviceError) as error:
+        DeviceInfo.from_json(text)
+    assert words in str(error.value)
+
+
+def test_options_reach_the_device_and_the_specification_goes_before_the_code(
+    tmp_path: Path,
+) -> None:
+    device = open_device(
+        "simulated: damping = 5, delay=2,hand_mass=0.3", damping=7.0, force_limit=3
+    )
+    assert isinstance(device, SimulatedDevice)
+    assert (device.info.damping, device.info.force_limit) == (5.0, 3.0)
+    assert device.hand == Hand(mass=0.3)
+    free = open_device("simulated:hand=none", path=written(tmp_path / "hand.csv"))
+    assert isinstance(free, SimulatedDevice)
+    assert free.hand is None
+    assert free.info.duration is None
+    file = written(tmp_path / "a,b=c:d.csv")
+    guided = open_device(f"simulated:friction=0.1,path={file}", hand=Hand(stiffness=50.0))
+    assert isinstance(guided, SimulatedDevice)
+    assert guided.info.duration == pytest.approx(0.195)
+    assert guided.hand == Hand(stiffness=50.0)
+    limited = open_device(f"trajectory:{file}", torque_limit=0.1)
+    assert limited.info.torque_limit == 0.1
+
+
+@pytest.mark.parametrize(
+    ("spec", "options", "words"),
+    [
+        ("falcn", {}, "unknown device 'falcn'; there are 'simulated', 'trajectory'"),
+        ("", {}, "unknown device ''"),
+        ("simulated:dampng=5", {}, "unknown option 'dampng' of the simulated device; there are 'd"),
+        ("simulated", {"colour": 1}, "unknown option 'colour'"),
+        ("simulated:damping", {}, "'damping' is no option; options are written name=value"),
+        ("simulated:damping=5,damping=6", {}, "damping is there twice"),
+        ("simulated:damping=much", {}, "damping = 'much': must be a number"),
+        ("simulated:damping=-5", {}, "damping = -5.0: must be a finite number >= 0 N s/m"),
+        ("simulated:mass=inf", {}, "mass = inf"),
+        ("simulated:delay=1.5", {}, "delay = '1.5': must be a whole number"),
+        ("simulated:hand_mass=-1", {}, "hand mass = -1.0"),
+        ("simulated:hand=left", {}, "hand = 'left': must be 'none'; 'hand_damping'"),
+        ("simulated:hand=none,hand_mass=1", {}, "hand and 'hand_mass' exclude each other"),
+        ("simulated:path=/no/such.csv", {}, "/no/such.csv: no such file"),
+        ("trajectory", {}, "trajectory needs a file: 'trajectory:FILE'"),
+        ("trajectory:a.csv", {"damping": 2}, "unknown option 'damping' of the trajectory device"),
+    ],
+)
+def test_bad_specifications_are_refused(spec: str, options: dict[str, object], words: str) -> None:
+    with pytest.raises(DeviceError) as error:
+        open_device(spec, **options)
+    assert words in str(error.value)

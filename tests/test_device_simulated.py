@@ -1,0 +1,448 @@
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from scipy.integrate import quad, solve_ivp
+from scipy.spatial.transform import Rotation
+
+from hapticbridge.device import Hand, Motion, SimulatedDevice
+from hapticbridge.device.motion import lissajous
+from hapticbridge.errors import DeviceError
+from hapticbridge.tick import SAMPLE_DTYPE
+
+Array = NDArray[np.float64]
+
+T = 2e-3
+STILL = Motion([0.0, 1.0], np.zeros((2, 3)))
+
+
+def run(
+    device: SimulatedDevice, wrenches: Array, period: float = T
+) -> tuple[NDArray[np.void], Array]:
+    """Samples and velocities at the ticks 0 to n; wrench k acts from tick k on."""
+    samples = np.zeros(len(wrenches) + 1, SAMPLE_DTYPE)
+    velocities = np.zeros((len(wrenches) + 1, 6))
+    device.start(period)
+    for k in range(len(samples)):
+        device.read(samples[k : k + 1])
+        velocities[k] = device.velocity
+        if k < len(wrenches):
+            device.write(wrenches[k])
+    return samples, velocities
+
+
+def along_x(forces: Array) -> Array:
+    wrenches = np.zeros((len(forces), 6))
+    wrenches[:, 0] = forces
+    return wrenches
+
+
+def turns(samples: NDArray[np.void]) -> Array:
+    """Rotation vectors, by SciPy (which puts w last)."""
+    vectors: Array = Rotation.from_quat(samples["quaternion"][:, [1, 2, 3, 0]]).as_rotvec()
+    return vectors
+
+
+def integrated(
+    law: Callable[[float, Array, Array, Array], Array],
+    start: Array,
+    inputs: Array,
+    targets: Array,
+    period: float,
+) -> Array:
+    """Integrates y' = law(t, y, input, target) tick by tick, to near the last digit."""
+    states = [start]
+    for k, held in enumerate(inputs):
+        before, after = targets[k], targets[k + 1]
+        drift = (after - before) / period
+
+        def slope(
+            t: float, y: Array, held: Array = held, p: Array = before, dp: Array = drift
+        ) -> Array:
+            return law(t, y, held, np.concatenate([p + t * dp, dp]))
+
+        solution = solve_ivp(
+            slope, (0.0, period), states[-1], method="DOP853", rtol=1e-11, atol=1e-15
+        )
+        states.append(solution.y[:, -1])
+    return np.array(states)
+
+
+@pytest.mark.parametrize("hand", [Hand(), None, Hand(mass=0.0, damping=0.0, stiffness=9000.0)])
+def test_translation_agrees_with_integration_of_its_law(hand: Hand | None) -> None:
+    rng = np.random.default_rng(1)
+    forces = rng.normal(0.0, 5.0, (25, 3))
+    rows = np.array([0.0, 0.011, 0.03, 0.06])
+    places = rng.normal(0.0, 0.02, (4, 3))
+    samples, velocities = run(
+        SimulatedDevice(hand=hand, path=Motion(rows, places)),
+        np.column_stack([forces, np.zeros((25, 3))]),
+    )
+    times = T * np.arange(26)
+    targets = np.column_stack(
+        [np.interp(times, rows, places[:, i] - places[0, i]) for i in (0, 1, 2)]
+    )
+    h = hand or Hand(mass=0.0, damping=0.0, stiffness=0.0)
+
+    def law(_: float, y: Array, force: Array, target: Array) -> Array:
+        x, v, p, dp = y[:3], y[3:], target[:3], target[3:]
+        push = force - 2.0 * v - h.damping * (v - dp) - h.stiffness * (x - p)
+        return np.concatenate([v, push / (0.1 + h.mass)])
+
+    expected = integrated(law, np.zeros(6), forces, targets, T)
+    # the integrator's own error is 1e-11 relative; positions are of the order of 1 cm
+    np.testing.assert_allclose(samples["position"], expected[:, :3], rtol=0, atol=2e-12)
+    np.testing.assert_allclose(velocities[:, :3], expected[:, 3:], rtol=0, atol=2e-10)
+
+
+@pytest.mark.parametrize("hand", [Hand(), None])
+def test_rotation_about_one_axis_agrees_with_integration_of_its_law(hand: Hand | None) -> None:
+    rng = np.random.default_rng(2)
+    axis = np.array([2.0, -1.0, 2.0]) / 3.0
+    torques = rng.normal(0.15 if hand is None else 1.4, 0.1, 40)
+    if hand is None:
+        torques *= 0.9
+    rows, angles = np.array([0.0, 0.03, 0.08]), np.array([0.0, 0.9, 0.4])
+    path = Motion(
+        rows,
+        np.zeros((3, 3)),
+        Rotation.from_rotvec(angles[:, None] * axis).as_quat()[:, [3, 0, 1, 2]],
+    )
+    wrenches = np.column_stack([np.zeros((40, 3)), torques[:, None] * axis])
+    samples, velocities = run(SimulatedDevice(hand=hand, path=path), wrenches)
+    h = hand or Hand(rotational_inertia=0.0, rotational_damping=0.0, rotational_stiffness=0.0)
+    targets = np.interp(T * np.arange(41), rows, angles)[:, None]
+
+    def law(_: float, y: Array, torque: Array, target: Array) -> Array:
+        push = torque - 2e-3 * y[1] - h.rotational_damping * (y[1] - target[1])
+        push = push - h.rotational_stiffness * (y[0] - target[0])
+        return np.array([y[1], float(push[0]) / (1e-4 + h.rotational_inertia)])
+
+    expected = integrated(law, np.zeros(2), torques[:, None], targets, T)
+    assert 1.0 < expected[:, 0].max() < 3.1  # far from small, and below π
+    np.testing.assert_allclose(turns(samples), expected[:, :1] * axis, rtol=0, atol=1e-11)
+    np.testing.assert_allclose(velocities[:, 3:], expected[:, 1:] * axis, rtol=0, atol=1e-9)
+
+
+def test_rotation_about_changing_axes_converges_to_its_law() -> None:
+    torque = np.array([0.06, -0.03, 0.05])
+    h = Hand()
+
+    def law(_: float, y: Array) -> Array:
+        q, w = y[:4], y[4:]
+        error = Rotation.from_quat(q).as_rotvec()
+        push = torque - np.cross([0, 0, 0.5], error) - 0.022 * w - h.rotational_stiffness * error
+        # q' = ½ ω ⊗ q, vector part first
+        vector = 0.5 * (q[3] * w + np.cross(w, q[:3]))
+        rate = np.array([*vector, -0.5 * w @ q[:3]])
+        return np.concatenate([rate, push / 1.1e-3])
+
+    end = solve_ivp(law, (0, 0.1), [0, 0, 0, 1, 0, 0, 0], method="DOP853", rtol=1e-10, atol=1e-12)
+    expected = Rotation.from_quat(end.y[:4, -1])
+
+    def error(ticks: int) -> float:
+        device = SimulatedDevice(path=STILL)
+        period = 0.1 / ticks
+        device.start(period)
+        sample = np.zeros(1, SAMPLE_DTYPE)
+        device.read(sample)
+        for _ in range(ticks):
+            held = torque - np.cross([0, 0, 0.5], turns(sample)[0])
+            device.write(np.concatenate([np.zeros(3), held]))
+            device.read(sample)
+        reached = Rotation.from_quat(sample["quaternion"][0, [1, 2, 3, 0]])
+        return float((reached * expected.inv()).magnitude())
+
+    coarse, fine = error(100), error(400)
+    # the torque itself is held here, which is of first order: four times finer, four times closer
+    assert fine < 2e-3
+    assert fine < coarse / 3.5
+
+
+def test_a_free_device_coasts_and_loses_what_its_damper_takes() -> None:
+    m, b = 0.1, 2.0
+    samples, velocities = run(
+        SimulatedDevice(hand=None), along_x(np.array([8.0] * 5 + [0.0] * 40)), period=5e-3
+    )
+    v0 = velocities[5, 0]
+    assert v0 > 1.0
+    for k in range(5, 46):
+        t = (k - 5) * 5e-3
+        lost = 0.5 * m * (v0**2 - velocities[k, 0] ** 2)
+        taken, _ = quad(lambda s: b * (v0 * math.exp(-b * s / m)) ** 2, 0.0, t, epsabs=1e-14)
+        assert lost == pytest.approx(taken, abs=1e-13)
+    assert samples["position"][45, 0] - samples["position"][5, 0] == pytest.approx(
+        m / b * (v0 - velocities[45, 0]), abs=1e-14
+    )
+
+
+@given(
+    period=st.floats(1e-3, 0.5),
+    kick=st.floats(0.5, 50.0),
+    friction=st.floats(0.05, 0.4),
+    damping=st.sampled_from([0.0, 0.3, 3.0]),
+)
+@settings(max_examples=40, deadline=None)
+def test_friction_stops_a_free_device_where_the_closed_form_says(
+    period: float, kick: float, friction: float, damping: float
+) -> None:
+    m = 0.1
+    device = SimulatedDevice(hand=None, mass=m, damping=damping, friction=friction)
+    sample = np.zeros(1, SAMPLE_DTYPE)
+    device.start(period)
+    device.read(sample)
+    device.write(along_x(np.array([kick]))[0])
+    device.read(sample)
+    x0, v0 = float(sample["position"][0, 0]), float(device.velocity[0])
+    device.write(np.zeros(6))
+    for _ in range(math.ceil(m * v0 / friction / period) + 1):
+        device.read(sample)
+    if damping == 0.0:
+        distance = m * v0**2 / (2.0 * friction)
+    else:
+        ratio = damping * v0 / friction
+        distance = m / damping * (v0 - friction / damping * math.log1p(ratio))
+    assert device.velocity[0] == 0.0
+    assert sample["position"][0, 0] - x0 == pytest.approx(distance, rel=1e-9, abs=1e-13)
+
+
+@given(share=st.floats(-1.0, 1.0))
+@settings(max_examples=30, deadline=None)
+def test_friction_holds_any_smaller_force(share: float) -> None:
+    samples, velocities = run(
+        SimulatedDevice(hand=None, friction=0.5), along_x(np.full(20, 0.5 * share))
+    )
+    assert not samples["position"].any()
+    assert not velocities.any()
+
+
+def test_friction_yields_to_a_larger_force() -> None:
+    samples, _ = run(
+        SimulatedDevice(hand=None, friction=0.5, damping=0.0), along_x(np.full(20, -0.75))
+    )
+    assert samples["position"][20, 0] == pytest.approx(-0.5 * 0.25 / 0.1 * (20 * T) ** 2, rel=1e-12)
+
+
+def stick_and_slip(
+    start: tuple[float, float], force: float, p: float, dp: float, *, period: float, friction: float
+) -> tuple[float, float]:
+    """One tick of the device in the default hand, by an ODE solver with events."""
+    x, v = start
+    m, b, h = 0.65, 2.0, Hand()
+    t, slip = 0.0, math.copysign(1.0, v) if v else 0.0
+
+    def pull(s: float, x: float) -> float:
+        return force + h.damping * dp - h.stiffness * (x - p - dp * s)
+
+    while t < period:
+        if slip == 0.0:
+            now = pull(t, x)
+            if abs(now) <= friction:
+                rate = h.stiffness * dp
+                loose = (math.copysign(friction, rate) - now) / rate if rate else math.inf
+                t += loose
+                slip = math.copysign(1.0, rate)
+                continue
+            slip = math.copysign(1.0, now)
+        sign = slip
+
+        def law(s: float, y: Array, sign: float = sign) -> list[float]:
+            return [y[1], (pull(s, y[0]) - (b + h.damping) * y[1] - sign * friction) / m]
+
+        def stops(_: float, y: Array) -> float:
+            return float(y[1])
+
+        stops.terminal, stops.direction = True, -sign  # type: ignore[attr-defined]
+        solution = solve_ivp(
+            law, (t, period), [x, v], method="DOP853", rtol=1e-11, atol=1e-14, events=stops
+        )
+        t, (x, v) = solution.t[-1], solution.y[:, -1]
+        if solution.status == 1:
+            v, slip = 0.0, 0.0
+    return x, v
+
+
+@pytest.mark.parametrize(("period", "amplitude"), [(0.004, 5e-4), (0.15, 1e-2)])
+def test_friction_in_a_moving_hand_agrees_with_event_detection(
+    period: float, amplitude: float
+) -> None:
+    ticks = 60
+    rng = np.random.default_rng(4)
+    forces = rng.normal(0.0, 0.4, ticks).round(1) * (rng.random(ticks) > 0.6)
+    times = period * np.arange(ticks + 1)
+    path = amplitude * np.sin(2 * np.pi * times / (20 * period)) ** 3
+    device = SimulatedDevice(
+        friction=0.3, path=Motion(times, np.column_stack([path, 0 * path, 0 * path]))
+    )
+    samples, velocities = run(device, along_x(forces), period)
+    expected = [(0.0, 0.0)]
+    for k in range(ticks):
+        drift = float(path[k + 1] - path[k]) / period
+        expected.append(
+            stick_and_slip(
+                expected[k],
+                float(forces[k]),
+                float(path[k]),
+                drift,
+                period=period,
+                friction=0.3,
+            )
+        )
+    stuck = velocities[:, 0] == 0.0
+    assert 5 < stuck.sum() < ticks - 5
+    # an ODE solver finds an event to about 1e-10 s
+    np.testing.assert_allclose(samples["position"][:, 0], np.array(expected)[:, 0], atol=1e-10)
+    np.testing.assert_allclose(velocities[:, 0], np.array(expected)[:, 1], atol=1e-8)
+
+
+def test_a_dip_of_the_velocity_below_zero_within_one_period_is_not_missed() -> None:
+    # friction brakes a device that the target's pull, growing all the while, later drags on: at
+    # both ends of the period it moves forward, in between it stood still
+    h = Hand(mass=0.0, damping=0.0, stiffness=200.0)
+    period, friction, v0 = 0.1, 1.0, 0.02
+    path = Motion([0.0, period, 2 * period], np.outer([0.0, 0.0, 0.1], [1.0, 0.0, 0.0]))
+    device = SimulatedDevice(hand=h, damping=0.0, friction=friction, path=path)
+    device.start(period)
+    sample = np.zeros(1, SAMPLE_DTYPE)
+    device.read(sample)
+    device.read(sample)
+    device._states["velocity"][0, 0] = v0
+    device.read(sample)
+
+    m, k, dp = 0.1, 200.0, 1.0
+    # stops at t0: m v' = -f - k x + k dp t
+    stop = solve_ivp(
+        lambda t, y: [y[1], (-friction - k * (y[0] - dp * t)) / m],
+        (0.0, period),
+        [0.0, v0],
+        method="DOP853",
+        rtol=1e-12,
+        atol=1e-15,
+        dense_output=True,
+    )
+    fine = np.linspace(0.0, period, 20001)
+    v = stop.sol(fine)[1]
+    assert v[-1] > 0.0 and v.min() < 0.0  # the trap: an end-to-end look sees no stop
+    x_stop = float(stop.sol(fine[np.argmax(v <= 0.0)])[0])
+    loose = (friction / k + x_stop) / dp
+    w = math.sqrt(k / m)
+    s = period - loose
+    # from rest at the limit of friction: r = v − dp swings freely from −dp
+    expected_v = dp * (1.0 - math.cos(w * s))
+    expected_x = x_stop + dp * (s - math.sin(w * s) / w)
+    assert device.velocity[0] == pytest.approx(expected_v, rel=1e-4)
+    assert sample["position"][0, 0] == pytest.approx(expected_x, rel=1e-4)
+
+
+def test_encoder_resolution_rounds_the_report_and_not_the_motion() -> None:
+    rng = np.random.default_rng(5)
+    wrenches = rng.normal(0.0, 1.0, (300, 6)) * [4, 4, 4, 0.05, 0.05, 0.05]
+    true, _ = run(SimulatedDevice(), wrenches)
+    seen, _ = run(SimulatedDevice(resolution=1e-4, rotational_resolution=2e-3), wrenches)
+    steps = seen["position"] / 1e-4
+    np.testing.assert_allclose(steps, np.round(steps), atol=1e-9)
+    assert np.abs(seen["position"] - true["position"]).max() <= 0.5e-4 * (1 + 1e-9)
+    steps = turns(seen) / 2e-3
+    np.testing.assert_allclose(steps, np.round(steps), atol=1e-9)
+    assert np.abs(turns(seen) - turns(true)).max() <= 1e-3 * (1 + 1e-9)
+    assert len(np.unique(seen["position"][:, 0])) > 10
+
+
+@pytest.mark.parametrize("delay", [1, 2, 7, 100])
+def test_delay_is_exactly_that_many_samples(delay: int) -> None:
+    wrenches = np.random.default_rng(6).normal(0.0, 1.0, (130, 6))
+    late, _ = run(SimulatedDevice(delay=delay), wrenches)
+    shifted = np.vstack([np.zeros((delay, 6)), wrenches])[: len(wrenches)]
+    expected, _ = run(SimulatedDevice(), shifted)
+    assert late.tobytes() == expected.tobytes()
+
+
+def test_a_wrench_holds_until_the_next_write() -> None:
+    once, every = SimulatedDevice(delay=2), SimulatedDevice(delay=2)
+    expected, _ = run(every, along_x(np.full(20, 3.0)))
+    samples = np.zeros(21, SAMPLE_DTYPE)
+    once.start(T)
+    for k in range(21):
+        once.read(samples[k : k + 1])
+        if k == 0:
+            wrench = along_x(np.array([3.0]))[0]
+            once.write(wrench)
+            wrench[:] = np.nan  # the caller's array is the caller's
+    assert samples.tobytes() == expected.tobytes()
+
+
+def test_the_hand_follows_its_path_from_the_first_pose_and_stays_at_its_end(tmp_path: Path) -> None:
+    file = tmp_path / "path.csv"
+    turn = [math.cos(0.2), 0.0, math.sin(0.2), 0.0]
+    start = [math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)]
+    end = (
+        Rotation.from_quat([0, turn[2], 0, turn[0]])
+        * Rotation.from_quat([0, 0, start[3], start[0]])
+    ).as_quat()
+    rows = [[5.0, 1.0, 2.0, 3.0, *start], [6.0, 1.02, 1.99, 3.0, end[3], *end[:3]]]
+    file.write_text(
+        "t,x,y,z,qw,qx,qy,qz\n" + "\n".join(",".join(f"{v!r}" for v in map(float, r)) for r in rows)
+    )
+    device = SimulatedDevice(path=file)
+    assert device.info.duration == 1.0
+    samples, velocities = run(device, np.zeros((2500, 6)))
+    assert not samples["position"][0].any()
+    # on the way the hand lags behind by (b/k) · speed, 2/135 s
+    np.testing.assert_allclose(
+        samples["position"][400], np.array([0.02, -0.01, 0.0]) * (0.8 - 2 / 135), atol=1e-5
+    )
+    np.testing.assert_allclose(samples["position"][2500], [0.02, -0.01, 0.0], atol=1e-12)
+    np.testing.assert_allclose(turns(samples)[2500], [0.0, 0.4, 0.0], atol=1e-9)
+    np.testing.assert_allclose(velocities[2500], 0.0, atol=1e-10)
+
+
+def test_the_default_path_is_slow_small_and_starts_at_rest() -> None:
+    poses = [lissajous(k * 1e-3) for k in range(60_000)]
+    positions = np.array([p for p, _ in poses])
+    angles = 2 * np.arccos(np.array([q[0] for _, q in poses]))
+    speed = np.linalg.norm(np.diff(positions, axis=0), axis=1) / 1e-3
+    assert not positions[0].any()
+    assert speed[0] < 1e-4
+    assert speed.max() <= 0.042
+    assert 0.0099 < np.abs(positions).max() <= 0.01
+    assert 0.1 < angles.max() <= 0.1 * math.sqrt(3)
+
+
+def test_a_force_that_is_not_finite_shows_in_the_sample() -> None:
+    for friction in (0.0, 0.1):
+        samples, _ = run(SimulatedDevice(friction=friction), along_x(np.array([0.0, math.nan])))
+        assert np.isfinite(samples["position"][1]).all()
+        assert np.isnan(samples["position"][2, 0])
+
+
+@pytest.mark.parametrize(
+    ("build", "words"),
+    [
+        (lambda: SimulatedDevice(mass=0.0), "mass = 0.0: must be a finite number > 0 kg"),
+        (lambda: SimulatedDevice(damping=-1.0), "damping = -1.0"),
+        (lambda: SimulatedDevice(friction=math.nan), "friction = nan"),
+        (lambda: SimulatedDevice(resolution=math.inf), "resolution = inf"),
+        (lambda: SimulatedDevice(force_limit=-2.0), "force_limit = -2.0"),
+        (lambda: SimulatedDevice(delay=101), "delay = 101: must be 0 to 100 whole samples"),
+        (lambda: SimulatedDevice(delay=1.5), "delay = 1.5"),  # type: ignore[arg-type]
+        (lambda: Hand(stiffness=-1.0), "hand stiffness = -1.0"),
+        (lambda: Hand(mass="heavy"), "hand mass = 'heavy'"),  # type: ignore[arg-type]
+        (lambda: SimulatedDevice().start(0.0), "the loop's period = 0.0"),
+        (lambda: SimulatedDevice().read(np.zeros(1, SAMPLE_DTYPE)), "before it was started"),
+        (
+            lambda: SimulatedDevice(friction=0.1, hand=Hand(mass=0, stiffness=1e12)).start(1e-2),
+            "too fast for friction",
+        ),
+    ],
+)
+def test_bad_parameters_are_refused(build: Callable[[], object], words: str) -> None:
+    with pytest.raises(DeviceError) as error:
+        build()
+    assert words in str(error.value)

@@ -1,0 +1,255 @@
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation, Slerp
+
+from hapticbridge.device import Motion, ReplayDevice, TrajectoryDevice, open_device, read_motion
+from hapticbridge.device.base import Device
+from hapticbridge.errors import DeviceError, RecordingError
+from hapticbridge.recording import RecordingWriter
+from hapticbridge.tick import SAMPLE_DTYPE, TICK_DTYPE
+
+Array = NDArray[np.float64]
+PERIOD = 1e-3
+
+
+def run(device: Device, ticks: int, period: float = PERIOD) -> NDArray[np.void]:
+    samples = np.zeros(ticks, SAMPLE_DTYPE)
+    device.start(period)
+    for k in range(ticks):
+        device.read(samples[k : k + 1])
+        device.write(np.full(6, 9.0))
+    return samples
+
+
+def rotations(quaternions: Array) -> Rotation:
+    return Rotation.from_quat(quaternions[:, [1, 2, 3, 0]])  # SciPy puts w last
+
+
+def recorded(count: int) -> NDArray[np.void]:
+    rng = np.random.default_rng(3)
+    ticks = np.zeros(count, TICK_DTYPE)
+    ticks["tick"] = np.arange(count)
+    ticks["device_position"] = rng.normal(0.0, 0.1, (count, 3))
+    quaternions = rng.normal(size=(count, 4))
+    quaternions[:, 0] = np.abs(quaternions[:, 0])
+    ticks["device_quaternion"] = quaternions / np.linalg.norm(quaternions, axis=1)[:, None]
+    ticks["buttons"] = rng.integers(0, 8, count)
+    return ticks
+
+
+@given(seed=st.integers(0, 10_000), period=st.floats(5e-4, 0.05))
+@settings(max_examples=40, deadline=None)
+def test_rows_are_interpolated_linearly_and_by_slerp(seed: int, period: float) -> None:
+    rng = np.random.default_rng(seed)
+    times = rng.uniform(-5.0, 5.0) + np.cumsum(rng.uniform(1e-3, 0.1, 8))
+    positions = rng.normal(size=(8, 3))
+    turned = Rotation.random(8, rng)
+    samples = run(
+        TrajectoryDevice(Motion(times, positions, turned.as_quat()[:, [3, 0, 1, 2]])), 60, period
+    )
+    asked = np.minimum(times[0] + period * np.arange(60), times[-1])
+    expected = np.column_stack([np.interp(asked, times, positions[:, i]) for i in range(3)])
+    np.testing.assert_allclose(samples["position"], expected, atol=1e-11)
+    difference = Slerp(times, turned)(asked).inv() * rotations(samples["quaternion"])
+    # a row of 1 ms amplifies the rounding of the times, 1e-15 s, to 1e-12 of a turn
+    assert difference.magnitude().max() < 1e-10
+
+
+def test_the_first_sample_is_the_first_row_and_the_last_row_holds(tmp_path: Path) -> None:
+    file = tmp_path / "hand.csv"
+    file.write_text("t,x,y,z\n10.5,1,2,3\n10.5035,1.5,2,2\n")
+    device = open_device(f"trajectory:{file}")
+    assert device.info.duration == pytest.approx(0.0035, abs=1e-12)
+    assert device.info.is_prescribed
+    assert device.info.damping is None
+    samples = run(device, 8)
+    assert samples["position"][0].tolist() == [1.0, 2.0, 3.0]
+    np.testing.assert_allclose(samples["position"][1], [1 + 0.5 / 3.5, 2.0, 3 - 1 / 3.5])
+    assert samples["position"][4:].tolist() == [[1.5, 2.0, 2.0]] * 4
+    assert samples["quaternion"].tolist() == [[1.0, 0.0, 0.0, 0.0]] * 8
+
+
+def test_columns_may_come_in_any_order_with_comments_and_any_line_ends(tmp_path: Path) -> None:
+    file = tmp_path / "a, b: c=1.csv"
+    text = (
+        "\ufeff# a hand at 2 Hz\r\n\r\n"
+        '"qz", "z","t",x,QW,y,qx,qy\r\n'
+        " 0, 3e0, 0, 1, -1.0004, 2, 0, 0\r\n"
+        "# half time\r\n"
+        "0.6,3,0.5,1,0.8,2,0,0\r\n"
+    )
+    file.write_bytes(text.encode())
+    table = read_motion(file).table
+    expected = np.array([[0, 1, 2, 3, 1, 0, 0, 0], [0.5, 1, 2, 3, 0.8, 0, 0, 0.6]])
+    np.testing.assert_allclose(table, expected, rtol=0, atol=1e-15)
+    assert run(open_device(f"trajectory:{file}"), 1)["position"].tolist() == [[1.0, 2.0, 3.0]]
+
+
+HEADER = "t,x,y,z\n"
+GOOD = HEADER + "0,0,0,0\n1,0,0,0\n"
+TURNED = "t,x,y,z,qw,qx,qy,qz\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "the file is empty; a header t,x,y,z and two rows are needed"),
+        ("# only this\n", "the file is empty"),
+        (HEADER, "line 1: the file ends after 0 of at least two rows"),
+        (HEADER + "0,1,2,3\n", "line 2: the file ends after 1 of at least two rows"),
+        ("t,x,z\n0,0,0\n1,0,0\n", "line 1: column y is missing; a header with the columns t,x,y,z"),
+        ("#\ntime,x,y,z\n", "line 2: column t is missing"),
+        ("t,x,y,z,w\n", "line 1: unknown column 'w'"),
+        ("t,x,y,z,x\n", "line 1: column x is there twice"),
+        ("t,x,y,z,qw,qx\n", "line 1: column qy, qz is missing; an orientation needs all"),
+        ("0,0,0,0\n1,0,0,0\n", "line 1: numbers where a header"),
+        (HEADER + "0,0,0,0\n\n1,0,zero,0\n", "line 4: column 'y' holds 'zero'"),
+        (HEADER + "0,0,0,0\n1,0,,0\n", "line 3: column 'y' holds ''"),
+        (HEADER + "0,0,0,0\n1,0,0,nan\n", "line 3: z = nan is not finite"),
+        (HEADER + "0,0,0,0\n1,-inf,0,0\n", "line 3: x = -inf is not finite"),
+        (HEADER + "0,0,0,0\n1,0,0,1e999\n", "line 3: z = inf is not finite"),
+        (HEADER + "0,0,0,0\n1,0,0,0\n#\n1,0,0,0\n", "line 5: time 1 s after 1 s; times must str"),
+        (HEADER + "0,0,0,0\n-1,0,0,0\n", "line 3: time -1 s after 0 s"),
+        (HEADER + "-1e308,0,0,0\n1e308,0,0,0\n", "line 2: t = -1e+308 is beyond ±1e+12"),
+        (TURNED + "0,0,0,0,1,0,0,0\n1,0,0,0,1,0.05,0,0\n", "line 3: quaternion of norm 1.00125"),
+        (TURNED + "0,0,0,0,0,0,0,0\n1,0,0,0,1,0,0,0\n", "line 2: quaternion of norm 0"),
+        (TURNED + "0,0,0,0,1e200,0,0,0\n1,0,0,0,1,0,0,0\n", "line 2: qw = 1e+200 is beyond"),
+        (GOOD + "2,0,0\n", "line 4: 3 fields where the header names 4 columns"),
+        (GOOD + "2,0,0,0,0\n", "line 4: 5 fields"),
+        # two faults: the earlier line is named
+        (HEADER + "0,0,0,0\n0,0,0,0\n1,0,nan,0\n", "line 3: time 0 s after 0 s"),
+    ],
+)
+def test_bad_files_are_refused_with_name_and_line(tmp_path: Path, text: str, words: str) -> None:
+    file = tmp_path / "hand.csv"
+    file.write_text(text)
+    with pytest.raises(DeviceError) as error:
+        open_device(f"trajectory:{file}")
+    assert str(file) in str(error.value)
+    assert words in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_what_is_no_readable_text_file_is_refused(tmp_path: Path) -> None:
+    binary = tmp_path / "hand.csv"
+    binary.write_bytes(b"t,x,y,z\n0,0,0,0\n1,\xff\xfe,0,0\n")
+    fifo = tmp_path / "pipe.csv"
+    os.mkfifo(fifo)
+    for path, words in [
+        (binary, "line 3: not UTF-8 text"),
+        (tmp_path / "no.csv", "no such file"),
+        (tmp_path, "is a directory"),
+        (fifo, "is not a regular file"),
+        (Path("a\0b"), "cannot be read (embedded null byte)"),
+        (tmp_path / ("n" * 300), "cannot be read (File name too long)"),
+    ]:
+        with pytest.raises(DeviceError) as error:
+            open_device(f"trajectory:{path}")
+        assert words in str(error.value)
+
+
+def test_a_file_without_permission_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "hand.csv"
+    file.write_text(GOOD)
+
+    def denied(*_: object, **__: object) -> str:
+        raise PermissionError(13, "Permission denied", str(file))
+
+    # root may read everything, so the refusal is acted
+    monkeypatch.setattr(Path, "read_text", denied)
+    with pytest.raises(DeviceError, match=r"hand\.csv: cannot be read \(Permission denied\)"):
+        read_motion(file)
+
+
+def test_arrays_that_are_no_motion_are_refused() -> None:
+    for times, positions, words in [
+        ([0.0], np.zeros((1, 3)), "n >= 2"),
+        ([0.0, 1.0], np.zeros((3, 3)), "must be (n,), (n, 3) and (n, 4)"),
+        ([0.0, 0.0], np.zeros((2, 3)), "row 1 of the motion: time 0 s after 0 s"),
+        ([0.0, 1.0], np.full((2, 3), np.nan), "row 0 of the motion: x = nan"),
+    ]:
+        with pytest.raises(DeviceError) as error:
+            Motion(times, positions)
+        assert words in str(error.value)
+
+
+def test_a_relative_motion_starts_at_the_origin_in_the_same_axes() -> None:
+    rng = np.random.default_rng(7)
+    turned = Rotation.random(5, rng)
+    motion = Motion(np.arange(5.0), rng.normal(size=(5, 3)), turned.as_quat()[:, [3, 0, 1, 2]])
+    relative = motion.relative().table
+    assert relative[0].tolist() == pytest.approx([0, 0, 0, 0, 1, 0, 0, 0])
+    np.testing.assert_allclose(relative[:, 1:4], motion.table[:, 1:4] - motion.table[0, 1:4])
+    difference = (turned * turned[0].inv()).inv() * rotations(relative[:, 4:])
+    assert difference.magnitude().max() < 1e-12
+
+
+def test_a_recording_is_replayed_sample_by_sample_with_its_buttons() -> None:
+    ticks = recorded(20)
+    device = ReplayDevice(ticks, PERIOD)
+    assert device.info.duration == pytest.approx(0.019)
+    assert device.info.rate == pytest.approx(1000.0)
+    assert device.info.is_prescribed
+    samples = run(device, 25)
+    for field, source in [
+        ("position", "device_position"),
+        ("quaternion", "device_quaternion"),
+        ("buttons", "buttons"),
+    ]:
+        assert samples[field][:20].tobytes() == ticks[source].tobytes()
+        assert samples[field][20:].tobytes() == ticks[source][[19] * 5].tobytes()
+
+
+def test_a_recording_is_opened_by_its_name_or_its_first_bytes(tmp_path: Path) -> None:
+    ticks = recorded(300)
+    for name in ("run.mcap", "run.txt"):
+        writer = RecordingWriter(tmp_path / name, {"period_s": "0.001"}, (), 0)
+        writer.write_ticks(ticks)
+        writer.close()
+        device = open_device(f"trajectory:{tmp_path / name}", force_limit=4)
+        assert device.info.force_limit == 4.0
+        samples = run(device, 300)
+        assert samples["position"].tobytes() == ticks["device_position"].tobytes()
+    writer = RecordingWriter(tmp_path / "old.mcap", {}, (), 0)
+    writer.write_ticks(ticks)
+    writer.close()
+    with pytest.raises(DeviceError, match=r"old\.mcap: the recording does not say its period"):
+        open_device(f"trajectory:{tmp_path / 'old.mcap'}")
+    with pytest.raises(RecordingError, match=r"none\.mcap"):
+        open_device(f"trajectory:{tmp_path / 'none.mcap'}")
+
+
+def test_a_recording_at_another_rate_is_refused_with_both() -> None:
+    device = ReplayDevice(recorded(20), 2e-3, name="old.mcap")
+    with pytest.raises(DeviceError, match=r"old\.mcap: was recorded at 500 Hz.* at 1000 Hz"):
+        device.start(PERIOD)
+    device.start(0.002 * (1 + 1e-15))
+
+
+def test_a_recording_that_is_no_motion_is_refused() -> None:
+    lost = recorded(20)
+    lost["tick"][7:] += 3
+    tripped = recorded(20)
+    tripped["device_position"][19, 1] = np.nan
+    unturned = recorded(20)
+    unturned["device_quaternion"][4] = 0.0
+    for ticks, words in [
+        (recorded(1), "holds 1 of at least two ticks"),
+        (lost, "tick 6 is followed by tick 10"),
+        (tripped, "pose at tick 19 is not finite"),
+        (unturned, "pose at tick 4"),
+    ]:
+        with pytest.raises(DeviceError) as error:
+            ReplayDevice(ticks, PERIOD, name="run.mcap")
+        assert words in str(error.value)
+        assert str(error.value).startswith("run.mcap: ")

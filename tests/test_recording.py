@@ -1,0 +1,531 @@
+from __future__ import annotations
+
+import io
+import json
+import shutil
+import struct
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.reader import NonSeekingReader, SeekingReader
+from mcap.writer import Writer
+from mcap_ros2.decoder import DecoderFactory
+from numpy.typing import NDArray
+
+from hapticbridge.errors import RecordingError
+from hapticbridge.recording import Attachment, RecordingWriter, read_recording, repair
+from hapticbridge.recording import format as layout
+from hapticbridge.tick import TICK_DTYPE
+
+EPOCH = 1_700_000_000_000_000_000
+META = {"period_s": "0.001", "device": '{"mass": 0.1}', "method": "implicit", "µ": "ü"}
+FILES = (
+    Attachment("scene.xml", "application/xml", b"<mujoco/>"),
+    Attachment("model.mjb", "application/octet-stream", bytes(range(256)) * 9),
+    Attachment("empty", "", b""),
+)
+
+
+def random_rows(count: int, seed: int = 0) -> NDArray[np.void]:
+    """Arbitrary bits in every field but tick and deadline."""
+    raw = np.random.default_rng(seed).bytes(count * TICK_DTYPE.itemsize)
+    rows = np.frombuffer(raw, TICK_DTYPE).copy()
+    rows["tick"] = np.arange(count)
+    rows["deadline_ns"] = (rows["tick"] + 1) * 1_000_000
+    return rows
+
+
+def write(
+    path: Path, rows: NDArray[np.void], *, batch: int = 100, events: bool = True, close: bool = True
+) -> RecordingWriter:
+    writer = RecordingWriter(path, META, FILES, EPOCH)
+    if events:
+        writer.write_event({"event": "start"}, 0)
+    for start in range(0, rows.size, batch):
+        writer.write_ticks(rows[start : start + batch])
+        if events:
+            writer.write_event({"event": "mark", "after": start}, start * 1_000_000)
+    if close:
+        writer.close()
+    return writer
+
+
+def same(a: NDArray[np.void], b: NDArray[np.void]) -> bool:
+    """Equal to the bit, NaN patterns too."""
+    return a.dtype == b.dtype and a.tobytes() == b.tobytes()
+
+
+@pytest.fixture(scope="module")
+def folder() -> Any:
+    with tempfile.TemporaryDirectory() as name:
+        yield Path(name)
+
+
+@pytest.fixture(scope="module")
+def whole(folder: Path) -> Path:
+    """A recording of several chunks with events between its records."""
+    path = folder / "whole.mcap"
+    write(path, random_rows(1500))
+    return path
+
+
+def chunk_ends(path: Path) -> list[tuple[int, int]]:
+    """End of each chunk record in the file, and the messages of all chunks up to it."""
+    with path.open("rb") as stream:
+        summary = SeekingReader(stream).get_summary()
+    assert summary is not None
+    return [
+        (index.chunk_start_offset + index.chunk_length, index.uncompressed_size)
+        for index in sorted(summary.chunk_indexes, key=lambda index: index.chunk_start_offset)
+    ]
+
+
+@given(
+    records=st.lists(
+        st.binary(min_size=TICK_DTYPE.itemsize, max_size=TICK_DTYPE.itemsize), max_size=5
+    ),
+    meta=st.dictionaries(
+        st.text(st.characters(codec="utf-8")), st.text(st.characters(codec="utf-8")), max_size=3
+    ),
+    data=st.binary(max_size=50),
+)
+@settings(max_examples=60, deadline=None)
+def test_any_record_metadata_and_attachment_survive_the_file(
+    records: list[bytes], meta: dict[str, str], data: bytes
+) -> None:
+    rows = np.frombuffer(b"".join(records), TICK_DTYPE)
+    with tempfile.TemporaryDirectory() as name:
+        path = Path(name) / "run.mcap"
+        writer = RecordingWriter(path, meta, [Attachment("file", "type", data)], EPOCH)
+        writer.write_ticks(rows)
+        writer.close()
+        recording = read_recording(path)
+    assert same(recording.ticks, rows)
+    assert recording.meta == {**meta, "epoch_ns": str(EPOCH)}
+    assert recording.attachments == {"file": data}
+    assert recording.digest == recording.computed_digest
+    assert not recording.is_cut
+    assert recording.problems == ()
+
+
+@pytest.mark.parametrize("batch", [1, 7, 300, 5000])
+def test_events_between_records_change_neither(tmp_path: Path, batch: int) -> None:
+    rows = random_rows(900)
+    write(tmp_path / "run.mcap", rows, batch=batch)
+    recording = read_recording(tmp_path / "run.mcap")
+    assert same(recording.ticks, rows)
+    assert recording.events[0] == {"event": "start", "time_ns": 0}
+    assert [event["after"] for event in recording.events[1:]] == list(range(0, 900, batch))
+    assert recording.digest == recording.computed_digest
+
+
+def test_library_decodes_the_same_numbers_with_valid_checksums(whole: Path) -> None:
+    rows = random_rows(1500)
+    with whole.open("rb") as stream:
+        reader = NonSeekingReader(stream, validate_crcs=True, decoder_factories=[DecoderFactory()])
+        decoded = [
+            (message, record)
+            for _, _, message, record in reader.iter_decoded_messages(topics=["/tick"])
+        ]
+    assert len(decoded) == 1500
+    for row, (message, record) in zip(rows, decoded, strict=True):
+        assert message.log_time == EPOCH + row["deadline_ns"]
+        for name in TICK_DTYPE.names or ():
+            np.testing.assert_array_equal(getattr(record, name), row[name])
+
+
+def test_library_reads_events_metadata_and_attachments_in_time_order(whole: Path) -> None:
+    with whole.open("rb") as stream:
+        reader = SeekingReader(stream, validate_crcs=True)
+        times = [message.log_time for _, _, message in reader.iter_messages()]
+        events = [json.loads(m.data) for _, _, m in reader.iter_messages(topics=["/event"])]
+        metadata = {record.name: record.metadata for record in reader.iter_metadata()}
+        attachments = {item.name: item.data for item in reader.iter_attachments()}
+    assert times == sorted(times)
+    assert events == read_recording(whole).events
+    assert metadata["hapticbridge"]["µ"] == "ü"
+    assert metadata["hapticbridge.digest"]["sha256"] == read_recording(whole).computed_digest
+    assert attachments == {item.name: item.data for item in FILES}
+
+
+def test_schema_lists_every_field_with_its_type() -> None:
+    lines = layout.tick_schema().decode().splitlines()
+    assert lines[0] == "int64 tick"
+    assert "float64[3] device_position" in lines
+    assert "float64[6] wrench_on_device" in lines
+    assert lines[-1] == "float64 injected_damping"
+    assert len(lines) == len(TICK_DTYPE.names or ())
+
+
+def test_event_of_a_trip_is_written_whatever_it_holds() -> None:
+    event = {
+        "event": "trip",
+        "force": float("nan"),
+        "pose": np.array([1.0, np.inf]),
+        "count": np.int64(3),
+        "is_hard": np.bool_(True),
+        "deep": {"tuple": (1, None)},
+        "object": Path("a"),
+    }
+    assert json.loads(layout.event_payload(event, 5)) == {
+        "event": "trip",
+        "force": "nan",
+        "pose": [1.0, "inf"],
+        "count": 3,
+        "is_hard": True,
+        "deep": {"tuple": [1, None]},
+        "object": "a",
+        "time_ns": 5,
+    }
+
+
+def rewritten(path: Path, output: Path, change: Callable[[str, Any], Any]) -> None:
+    """Copies a recording with the library, changed, checksums anew, the old digest kept."""
+    with path.open("rb") as source, output.open("wb") as target:
+        reader = SeekingReader(source)
+        summary = reader.get_summary()
+        assert summary is not None
+        writer = Writer(target)
+        writer.start()
+        for metadata in reader.iter_metadata():
+            if metadata.name == "hapticbridge":
+                writer.add_metadata(metadata.name, change("metadata", dict(metadata.metadata)))
+            else:
+                writer.add_metadata(metadata.name, metadata.metadata)
+        for item in reader.iter_attachments():
+            name, media_type, data = change(
+                "attachment", (item.name, item.media_type, bytearray(item.data))
+            )
+            writer.add_attachment(0, 0, name, media_type, bytes(data))
+        ids = {
+            channel.topic: writer.register_channel(
+                channel.topic,
+                channel.message_encoding,
+                writer.register_schema(
+                    summary.schemas[channel.schema_id].name,
+                    summary.schemas[channel.schema_id].encoding,
+                    summary.schemas[channel.schema_id].data,
+                ),
+            )
+            for channel in summary.channels.values()
+        }
+        ids["/foreign"] = writer.register_channel("/foreign", "json", 0)
+        for _, channel, message in reader.iter_messages(log_time_order=False):
+            data = change(channel.topic, bytearray(message.data))
+            writer.add_message(ids[channel.topic], message.log_time, bytes(data), message.log_time)
+            writer.add_message(ids["/foreign"], message.log_time, b"{}", message.log_time)
+        writer.finish()  # type: ignore[no-untyped-call]
+
+
+def test_rewriting_with_foreign_channels_keeps_the_digest(whole: Path, tmp_path: Path) -> None:
+    rewritten(whole, tmp_path / "run.mcap", lambda kind, content: content)
+    recording = read_recording(tmp_path / "run.mcap")
+    assert same(recording.ticks, random_rows(1500))
+    assert recording.digest == recording.computed_digest == read_recording(whole).digest
+    assert recording.problems == ()
+
+
+def first_call(kind: str, edit: Callable[[Any], Any]) -> Callable[[str, Any], Any]:
+    remaining = [True]
+
+    def change(found: str, content: Any) -> Any:
+        if found == kind and remaining:
+            remaining.clear()
+            return edit(content)
+        return content
+
+    return change
+
+
+def flipped(position: int) -> Callable[[Any], Any]:
+    def edit(data: bytearray) -> bytearray:
+        data[position] ^= 1
+        return data
+
+    return edit
+
+
+@pytest.mark.parametrize(
+    ("kind", "edit"),
+    [
+        ("metadata", lambda meta: {**meta, "period_s": "0.0010"}),
+        ("metadata", lambda meta: {**meta, "extra": ""}),
+        ("metadata", lambda meta: {k: v for k, v in meta.items() if k != "method"}),
+        ("metadata", lambda meta: {**meta, "method": meta["µ"], "µ": meta["method"]}),
+        ("attachment", lambda item: (item[0], item[1], item[2] + b" ")),
+        ("attachment", lambda item: (item[0] + "l", item[1], item[2])),
+        ("attachment", lambda item: (item[0], item[1] + "l", item[2])),
+        ("/event", lambda data: data.replace(b"start", b"stop!")),
+        *(("/tick", flipped(position)) for position in (4, 11, 77, 200, 403)),
+    ],
+)
+def test_digest_tells_any_change_although_all_checksums_are_right(
+    whole: Path, tmp_path: Path, kind: str, edit: Callable[[Any], Any]
+) -> None:
+    rewritten(whole, tmp_path / "run.mcap", first_call(kind, edit))
+    recording = read_recording(tmp_path / "run.mcap")
+    assert recording.problems == ()
+    assert recording.digest == read_recording(whole).digest
+    assert recording.digest != recording.computed_digest
+
+
+def test_record_that_is_not_one_is_a_problem(whole: Path, tmp_path: Path) -> None:
+    for edit in (lambda data: data + b"x", flipped(1)):
+        rewritten(whole, tmp_path / "run.mcap", first_call("/tick", edit))
+        recording = read_recording(tmp_path / "run.mcap")
+        assert len(recording.problems) == 1
+        assert "a message on /tick is not one record" in recording.problems[0]
+        assert same(recording.ticks, random_rows(1500)[1:])
+
+
+def test_cut_anywhere_reads_to_the_last_whole_chunk(whole: Path, tmp_path: Path) -> None:
+    data, rows = whole.read_bytes(), random_rows(1500)
+    ends = chunk_ends(whole)
+    assert len(ends) >= 4
+    path = tmp_path / "cut.mcap"
+    edges = [edge + step for edge, _ in ends for step in (-1, 0, 1)]
+    offsets = {*edges, *range(ends[0][0], len(data), 9973), *range(len(data) - 40, len(data))}
+    for offset in sorted(offset for offset in offsets if ends[0][0] <= offset < len(data)):
+        path.write_bytes(data[:offset])
+        recording = read_recording(path)
+        assert recording.is_cut
+        assert recording.problems == ()
+        assert recording.meta["method"] == "implicit"
+        assert recording.attachments["model.mjb"] == FILES[1].data
+        assert same(recording.ticks, rows[: recording.ticks.size])
+        # what the whole chunks hold, but for their events, schemas and the records' heads
+        held = sum(size for end, size in ends if end <= offset) // (TICK_DTYPE.itemsize + 35)
+        assert held - 20 <= recording.ticks.size <= held
+    path.write_bytes(data)
+    assert not read_recording(path).is_cut
+
+
+def test_cut_before_the_first_chunk_keeps_metadata_or_is_refused(
+    whole: Path, tmp_path: Path
+) -> None:
+    data = whole.read_bytes()
+    path = tmp_path / "cut.mcap"
+    kept = 0
+    for offset in (*range(0, 4000, 41), *range(4000, chunk_ends(whole)[0][0], 5003)):
+        path.write_bytes(data[:offset])
+        try:
+            recording = read_recording(path)
+        except RecordingError:
+            assert kept == 0
+            continue
+        kept += 1
+        assert recording.is_cut
+        assert recording.ticks.size == 0
+        assert recording.meta["epoch_ns"] == str(EPOCH)
+    assert kept
+
+
+def test_zeros_behind_the_last_whole_record_are_a_cut_and_no_damage(
+    whole: Path, tmp_path: Path
+) -> None:
+    path = tmp_path / "cut.mcap"
+    data = whole.read_bytes()
+    with whole.open("rb") as stream:
+        summary = SeekingReader(stream).get_summary()
+    assert summary is not None
+    third = sorted(index.chunk_start_offset for index in summary.chunk_indexes)[2]
+    path.write_bytes(data[:third] + bytes(5000))
+    recording = read_recording(path)
+    assert recording.is_cut
+    assert recording.problems == ()
+    path.write_bytes(data[:third] + bytes(50) + b"x" + bytes(50))
+    assert "nothing can be read from byte" in read_recording(path).problems[0]
+
+
+@given(data=st.data())
+@settings(max_examples=150, deadline=None)
+def test_no_damage_gives_anything_but_a_recording_or_its_error(
+    whole: Path, data: st.DataObject
+) -> None:
+    content = bytearray(whole.read_bytes())
+    size = len(content)
+    # the structure sits at both ends, so damage is drawn there as often as in the chunks
+    near = st.one_of(
+        st.integers(8, 4000), st.integers(size - 2500, size - 1), st.integers(8, size - 1)
+    )
+    for position in data.draw(st.lists(near, min_size=1, max_size=4, unique=True)):
+        content[position] ^= data.draw(st.integers(1, 255))
+    if data.draw(st.booleans()):
+        del content[data.draw(st.integers(9, size)) :]
+    with tempfile.TemporaryDirectory() as name:
+        path = Path(name) / "run.mcap"
+        path.write_bytes(content)
+        try:
+            recording = read_recording(path)
+        except RecordingError:
+            return
+    assert recording.is_cut or recording.problems or recording.digest != recording.computed_digest
+
+
+@given(content=st.binary(max_size=300))
+@settings(deadline=None)
+def test_arbitrary_bytes_behind_the_magic_never_crash(content: bytes) -> None:
+    with tempfile.TemporaryDirectory() as name:
+        path = Path(name) / "run.mcap"
+        path.write_bytes(b"\x89MCAP0\r\n" + content)
+        with pytest.raises(RecordingError):
+            read_recording(path)
+
+
+def test_damaged_chunk_is_named_and_the_others_are_kept(whole: Path, tmp_path: Path) -> None:
+    data = bytearray(whole.read_bytes())
+    end, _ = chunk_ends(whole)[1]
+    data[end - 5000] ^= 0x10
+    path = tmp_path / "run.mcap"
+    path.write_bytes(data)
+    recording = read_recording(path)
+    assert not recording.is_cut
+    assert any("chunk 2 (at byte " in problem for problem in recording.problems)
+    assert recording.ticks["tick"][-1] == 1499
+    assert recording.ticks["tick"][0] == 0
+    assert recording.digest != recording.computed_digest
+
+
+def test_damaged_length_loses_no_later_chunk(whole: Path, tmp_path: Path) -> None:
+    with whole.open("rb") as stream:
+        summary = SeekingReader(stream).get_summary()
+    assert summary is not None
+    second = sorted(index.chunk_start_offset for index in summary.chunk_indexes)[1]
+    data = bytearray(whole.read_bytes())
+    data[second + 7] ^= 0x40
+    path = tmp_path / "run.mcap"
+    path.write_bytes(data)
+    recording = read_recording(path)
+    ticks = recording.ticks["tick"]
+    assert f"nothing can be read from byte {second} to byte" in recording.problems[0]
+    assert (np.diff(ticks) == 1).sum() == ticks.size - 2
+    assert 1000 < ticks.size < 1300
+
+
+def test_chunk_that_claims_exabytes_is_refused_without_allocating(
+    whole: Path, tmp_path: Path
+) -> None:
+    with whole.open("rb") as stream:
+        summary = SeekingReader(stream).get_summary()
+    assert summary is not None
+    first = min(index.chunk_start_offset for index in summary.chunk_indexes)
+    data = bytearray(whole.read_bytes())
+    struct.pack_into("<Q", data, first + 9 + 16, 1 << 60)
+    path = tmp_path / "run.mcap"
+    path.write_bytes(data)
+    assert any("beyond" in problem for problem in read_recording(path).problems)
+
+
+def test_repair_keeps_all_that_is_left_and_makes_it_whole(whole: Path, tmp_path: Path) -> None:
+    cut, mended = tmp_path / "cut.mcap", tmp_path / "mended.mcap"
+    cut.write_bytes(whole.read_bytes()[: chunk_ends(whole)[2][0] + 100])
+    before = read_recording(cut)
+    after = repair(cut, mended)
+    assert not after.is_cut
+    assert after.problems == ()
+    assert after.digest == after.computed_digest
+    assert same(after.ticks, before.ticks)
+    assert after.meta == before.meta
+    assert after.attachments == before.attachments
+    assert after.events[:-1] == before.events
+    assert after.events[-1]["event"] == "repaired"
+    assert after.events[-1]["ticks"] == before.ticks.size
+    with mended.open("rb") as stream:
+        attachments = list(SeekingReader(stream, validate_crcs=True).iter_attachments())
+    assert [item.media_type for item in attachments] == [item.media_type for item in FILES]
+
+
+def test_repair_refuses_what_is_whole_and_what_exists(whole: Path, tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match="is not cut"):
+        repair(whole, tmp_path / "new.mcap")
+    assert not (tmp_path / "new.mcap").exists()
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(whole.read_bytes()[:-20])
+    before = cut.read_bytes()
+    with pytest.raises(RecordingError, match="exists"):
+        repair(cut, cut)
+    assert cut.read_bytes() == before
+
+
+def test_whole_chunks_reach_the_file_before_it_is_closed(tmp_path: Path) -> None:
+    path, copy = tmp_path / "run.mcap", tmp_path / "copy.mcap"
+    writer = write(path, random_rows(1000), batch=1000, events=False, close=False)
+    shutil.copy(path, copy)
+    writer.close()
+    recording = read_recording(copy)
+    assert recording.is_cut
+    lost = 1000 - recording.ticks.size
+    assert 0 <= lost * 435 <= layout.CHUNK_SIZE + 435
+    assert read_recording(path).ticks.size == 1000
+
+
+def test_recording_without_a_tick_is_whole(tmp_path: Path) -> None:
+    write(tmp_path / "run.mcap", random_rows(0), events=False)
+    recording = read_recording(tmp_path / "run.mcap")
+    assert recording.ticks.size == 0
+    assert not recording.is_cut
+    assert recording.digest == recording.computed_digest
+
+
+def mcap_with(topic: str, schema: str, text: bytes) -> bytes:
+    stream = io.BytesIO()
+    writer = Writer(stream)
+    writer.start()
+    channel = writer.register_channel(topic, "cdr", writer.register_schema(schema, "ros2msg", text))
+    writer.add_message(channel, 0, b"\x00\x01\x00\x00", 0)
+    writer.finish()  # type: ignore[no-untyped-call]
+    return stream.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("content", "reason"),
+    [
+        (b"", "is empty"),
+        (b"t,x,y,z\n0,0,0,0\n", "not an MCAP file"),
+        (mcap_with("/imu", "sensor_msgs/msg/Imu", b"int64 a"), "no topic /tick"),
+        (mcap_with("/tick", "other/msg/Tick", b"int64 a"), "has the schema 'other/msg/Tick'"),
+        (mcap_with("/tick", "hapticbridge/msg/Tick", b"int64 tick"), "has other fields"),
+    ],
+)
+def test_file_that_is_no_recording_is_refused_in_one_sentence(
+    tmp_path: Path, content: bytes, reason: str
+) -> None:
+    path = tmp_path / "run.mcap"
+    path.write_bytes(content)
+    with pytest.raises(RecordingError, match=reason) as refusal:
+        read_recording(path)
+    assert str(path) in str(refusal.value)
+    assert "\n" not in str(refusal.value)
+
+
+def test_path_that_cannot_be_read_is_refused(tmp_path: Path) -> None:
+    for path, reason in (
+        (tmp_path / "none.mcap", "No such file"),
+        (tmp_path, "it is a folder"),
+        (Path("/dev/null"), "not a regular file"),
+        (tmp_path / "a\0b", "null"),
+    ):
+        with pytest.raises(RecordingError, match=reason):
+            read_recording(path)
+
+
+def test_writer_refuses_what_it_cannot_write(tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match=r"the folder .* does not exist"):
+        RecordingWriter(tmp_path / "none" / "run.mcap", META, (), EPOCH)
+    with pytest.raises(RecordingError, match="Is a directory"):
+        RecordingWriter(tmp_path, META, (), EPOCH)
+    with pytest.raises(RecordingError, match="No space left"):
+        RecordingWriter("/dev/full", META, (), EPOCH)
+    with pytest.raises(RecordingError, match="two attachments are named 'empty'"):
+        RecordingWriter(tmp_path / "run.mcap", META, (*FILES, FILES[2]), EPOCH)
+    with pytest.raises(RecordingError, match="valid Unicode"):
+        RecordingWriter(tmp_path / "run.mcap", {"a": "\udc80"}, (), EPOCH)
+    with pytest.raises(RecordingError, match="must be text, not 3"):
+        RecordingWriter(tmp_path / "run.mcap", {"a": 3}, (), EPOCH)  # type: ignore[dict-item]
+    assert not (tmp_path / "run.mcap").exists()
