@@ -26,7 +26,6 @@ MODELS = ROOT / "models"
 T = 1e-3
 K, B = 2400.0, 0.5
 K_R, B_R = 2.4, 5e-4
-PEG_WEIGHT = 0.1 * 9.81
 
 # height of the peg's centre above the mouth of the hole, in m
 HOME_HEIGHT, BOTTOMED_HEIGHT = 0.04, -0.01
