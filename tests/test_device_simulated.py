@@ -302,6 +302,27 @@ def test_friction_in_a_moving_hand_agrees_with_event_detection(
     np.testing.assert_allclose(velocities[:, 0], np.array(expected)[:, 1], atol=1e-8)
 
 
+@given(friction=st.floats(0.01, 2.0), stiffness=st.floats(10.0, 300.0), speed=st.floats(1e-3, 1.0))
+@settings(max_examples=40, deadline=None)
+def test_a_pulling_hand_breaks_the_device_loose_when_the_closed_form_says(
+    friction: float, stiffness: float, speed: float
+) -> None:
+    period, m = 0.1, 0.1
+    hand = Hand(mass=0.0, damping=0.0, stiffness=stiffness)
+    path = Motion([0.0, period], np.outer([0.0, speed * period], [1.0, 0.0, 0.0]))
+    device = SimulatedDevice(mass=m, damping=0.0, friction=friction, hand=hand, path=path)
+    samples, velocities = run(device, np.zeros((1, 6)), period)
+    # from then on the distance to the spring's rest swings freely about the one that friction holds
+    time = max(period - friction / (stiffness * speed), 0.0)
+    w = math.sqrt(stiffness / m)
+    assert velocities[1, 0] == pytest.approx(
+        2.0 * speed * math.sin(0.5 * w * time) ** 2, rel=1e-9, abs=1e-13
+    )
+    assert samples["position"][1, 0] == pytest.approx(
+        speed * (time - math.sin(w * time) / w), rel=1e-9, abs=1e-13
+    )
+
+
 def test_a_dip_of_the_velocity_below_zero_within_one_period_is_not_missed() -> None:
     # friction brakes a device that the target's pull, growing all the while, later drags on: at
     # both ends of the period it moves forward, in between it stood still

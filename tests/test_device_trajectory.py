@@ -63,6 +63,15 @@ def test_rows_are_interpolated_linearly_and_by_slerp(seed: int, period: float) -
     assert difference.magnitude().max() < 1e-10
 
 
+def test_at_the_time_of_a_row_the_sample_is_that_row_to_the_bit() -> None:
+    rng = np.random.default_rng(9)
+    turned = Rotation.random(30, rng).as_quat()[:, [3, 0, 1, 2]]
+    motion = Motion(np.arange(30) * 0.5, rng.normal(size=(30, 3)), turned)
+    samples = run(TrajectoryDevice(motion), 59, 0.25)[::2]
+    assert samples["position"].tobytes() == motion.table[:, 1:4].tobytes()
+    assert samples["quaternion"].tobytes() == motion.table[:, 4:].tobytes()
+
+
 def test_the_first_sample_is_the_first_row_and_the_last_row_holds(tmp_path: Path) -> None:
     file = tmp_path / "hand.csv"
     file.write_text("t,x,y,z\n10.5,1,2,3\n10.5035,1.5,2,2\n")
