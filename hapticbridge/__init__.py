@@ -9,7 +9,6 @@ from hapticbridge import passivity as passivity
 from hapticbridge.audit import AuditReport as AuditReport
 from hapticbridge.audit import audit as audit
 from hapticbridge.bridge import Bridge as Bridge
-from hapticbridge.bridge import Summary as Summary
 from hapticbridge.clock import RealClock as RealClock
 from hapticbridge.clock import SimulatedClock as SimulatedClock
 from hapticbridge.coupling import Coupling as Coupling
@@ -26,3 +25,4 @@ from hapticbridge.recording import repair as repair
 from hapticbridge.scene import Scene as Scene
 from hapticbridge.scene import load_scene as load_scene
 from hapticbridge.scene import scene_names as scene_names
+from hapticbridge.summary import Summary as Summary

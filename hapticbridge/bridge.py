@@ -13,7 +13,6 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType, TracebackType
 
@@ -25,7 +24,7 @@ from hapticbridge.certificate import default_coupling, device_conditions, is_cer
 from hapticbridge.clock import Clock, RealClock
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Device, open_device
-from hapticbridge.errors import HapticBridgeError, RecordingError, SafetyTrip
+from hapticbridge.errors import DeviceError, HapticBridgeError, RecordingError, SafetyTrip
 from hapticbridge.guard import Limits, trip_reason
 from hapticbridge.inputs import Write, apply_writes, input_writes
 from hapticbridge.kernel.state import Binding, RunParameters
@@ -35,7 +34,8 @@ from hapticbridge.provenance import attachments, describe_run
 from hapticbridge.recording import TAIL, Recorder, Ring
 from hapticbridge.rendering import method_named, prepare
 from hapticbridge.scene import Scene, load_scene
-from hapticbridge.tick import SAMPLE_DTYPE, TickFlag
+from hapticbridge.summary import Summary
+from hapticbridge.tick import TickFlag
 
 RING_CAPACITY = 8192
 """Records between loop and recorder. At 1 kHz the recorder may fall 8 s behind before one is lost;
@@ -49,45 +49,6 @@ RING_POLL = 1e-3
 
 _NO_FORCE = np.zeros(6)
 _STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
-
-
-@dataclass(frozen=True, slots=True)
-class Summary:
-    """What a run was.
-
-    Attributes:
-        ticks: Ticks since the bridge was opened.
-        duration: Their number times the period, in s.
-        overruns: Deadlines that were missed by a period or more and skipped.
-        dropped: Records that the recorder did not get because it was too far behind.
-        peak_force: Largest norm of the force on the tool in N.
-        peak_torque: Largest norm of the torque on the tool in N m.
-        energies: Energies by name in J.
-        environment: ``strict``, ``within slack`` or ``active``.
-        slack_share: Largest share of the slack that was used.
-        is_certified: Whether b >= scale · force_scale · (KT/2 + B) holds for the device in
-            translation and rotation; None where its damping is unknown.
-        stopped_by: ``duration``, ``signal`` or ``caller``.
-        recording: The file, if one was written.
-    """
-
-    ticks: int
-    duration: float
-    overruns: int
-    dropped: int
-    peak_force: float
-    peak_torque: float
-    energies: dict[str, float]
-    environment: str
-    slack_share: float
-    is_certified: bool | None
-    stopped_by: str
-    recording: Path | None
-
-    @property
-    def verdict(self) -> str:
-        """``passive`` (strict or within slack) or ``active``."""
-        return "active" if self.environment == "active" else "passive"
 
 
 def device_for(scene: Scene, spec: str) -> Device:
@@ -319,14 +280,12 @@ class Bridge:
         """Compiles the kernel, puts the scene to its start, and opens the recording."""
         scene, clock, info = self.scene, self.clock, self.device.info
         prepare(scene, self.coupling, self.period, self._substeps)
-        self._sample = np.zeros(1, SAMPLE_DTYPE)
-        self.device.start(self.period)
-        self.device.read(self._sample)
-        self.device.start(self.period)
+        self._sample = self.device.start(self.period)
         self.parameters = self._parameters()
         self._warm_up()
         scene.reset()
         self._binding = Binding(scene.model, scene.data, self.parameters)
+        self._refuse_stretched_start()
         if self._path is None and not self._is_live:
             self._ring = Ring.local(RING_CAPACITY)
             self._ring.cursors[TAIL] = NOBODY_READS
@@ -366,6 +325,17 @@ class Bridge:
             handle_origin=identity if self._is_absolute else grip,
             device_start=start,
         )
+
+    def _refuse_stretched_start(self) -> None:
+        state = self._binding.state[0]
+        distance = float(np.linalg.norm(state["handle_position"] - state["tool_position"]))
+        force, limit = self.coupling.stiffness * distance, self._limits.force
+        if force > limit:
+            raise DeviceError(
+                f"the device's absolute pose puts the handle {1e3 * distance:.3g} mm from the "
+                f"grip, {force:.3g} N at the start; the limit is {limit:g} N: start nearer to "
+                f"{np.round(state['tool_position'], 4).tolist()} m or use relative poses"
+            )
 
     def _warm_up(self) -> None:
         """Runs one tick of everything compiled, on the scene before it is reset."""

@@ -11,9 +11,10 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
+from rich.markup import escape
 from rich.table import Table
 
-from hapticbridge.bridge import Bridge, Summary, device_for
+from hapticbridge.bridge import Bridge, device_for
 from hapticbridge.certificate import default_coupling, device_conditions
 from hapticbridge.cli.terminal import err, out, quantity
 from hapticbridge.clock import RealClock, SimulatedClock
@@ -23,6 +24,7 @@ from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.guard import Limits
 from hapticbridge.rendering import IMPLICIT
 from hapticbridge.scene import load_scene
+from hapticbridge.summary import Summary
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,6 +83,8 @@ class Run:
 
     def execute(self) -> int:
         """Runs the bridge; returns the exit code."""
+        if self.duration is not None and not 0 < self.duration < math.inf:
+            raise HapticBridgeError(f"duration is {self.duration!r} s; it must be finite and > 0")
         if self.record is not None and self.record.exists() and not self.overwrite:
             raise RecordingError(f"'{self.record}' exists; choose another file or add --overwrite")
         scene = load_scene(self.scene, self.grip)
@@ -135,7 +139,7 @@ def _announce(bridge: Bridge, scales: tuple[float, float]) -> None:
     """Says what will be rendered, and whether the device bears it, before any force is on."""
     coupling = bridge.coupling
     err.print(
-        f"[bold]{bridge.scene.name}[/bold] on {bridge.device.info.name}: "
+        f"[bold]{escape(bridge.scene.name)}[/bold] on {escape(bridge.device.info.name)}: "
         f"K = {coupling.stiffness:g} N/m, B = {coupling.damping:g} N s/m, "
         f"K_r = {coupling.rotational_stiffness:g} N m/rad, "
         f"B_r = {coupling.rotational_damping:g} N m s/rad, {1 / bridge.period:g} Hz"
@@ -165,4 +169,4 @@ def _print_summary(summary: Summary) -> None:
     }
     out.print(certified[summary.is_certified])
     if summary.recording is not None:
-        out.print(f"next: hapticbridge audit {shlex.quote(str(summary.recording))}")
+        out.print(f"next: hapticbridge audit {escape(shlex.quote(str(summary.recording)))}")

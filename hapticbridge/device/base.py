@@ -165,11 +165,14 @@ class Device(Protocol):
 
     info: DeviceInfo
 
-    def start(self, period: float) -> None:
+    def start(self, period: float) -> NDArray[np.void]:
         """Brings the device to its initial state, from which two runs are identical.
 
         Args:
             period: The loop's period in s, finite and > 0.
+
+        Returns:
+            The pose before the first tick, shape (1,), ``SAMPLE_DTYPE``.
 
         Raises:
             DeviceError: The device cannot run at this period.

@@ -30,7 +30,7 @@ Record: TypeAlias = Any
 
 LEVELS = 41
 """Friction looks for events in dyadic parts of the period, from T to T/2^40: 1e-15 s at 1 kHz."""
-_COARSEST_LEVEL = 10
+_COARSEST_LEVEL = 6
 _MOST_PHASES = 64
 
 AXIS_DTYPE = np.dtype(
@@ -70,7 +70,7 @@ def sampled_axis(
         friction: f_c in N (or N m), >= 0.
 
     Raises:
-        DeviceError: With friction, the axis swings a thousand times within one period.
+        DeviceError: With friction, the axis swings more than 16 times within one period.
     """
     axis = np.zeros((), AXIS_DTYPE)
     axis["inertia"] = inertia
@@ -159,7 +159,7 @@ def _slide(
     travel = 0.0
     friction = direction * axis.friction
     level = axis.first_level
-    is_bracketed = False
+    is_bracketed = is_past_dip = False
     while units_left > 0:
         units = 1 << (LEVELS - 1 - level)
         if units > units_left:
@@ -174,7 +174,7 @@ def _slide(
         next_velocity = velocity + dv
         end = acceleration_at(axis, force - friction, next_stretch, next_velocity, drift)
         is_stopped = not next_velocity * direction > 0.0
-        is_dip = direction * start < 0.0 and direction * end > 0.0
+        is_dip = not is_past_dip and direction * start < 0.0 and direction * end > 0.0
         if is_stopped and level == LEVELS - 1:
             return units_left, travel, stretch, 0.0
         if (is_stopped or is_dip) and level < LEVELS - 1:
@@ -185,11 +185,14 @@ def _slide(
         travel += dx
         stretch = next_stretch
         velocity = next_velocity
+        is_past_dip = False
         if is_bracketed:
             if level < LEVELS - 1:
                 level += 1
             else:
-                # the event was a dip that did not reach zero, and is behind
+                # The event was a dip that did not reach zero, and is behind. There is no other
+                # within half a swing; what rounding shows there must not be searched again.
+                is_past_dip = True
                 is_bracketed = False
                 level = axis.first_level
     return units_left, travel, stretch, velocity

@@ -185,11 +185,14 @@ class SimulatedDevice:
         self._written: NDArray[np.float64] = self._states["written"][0]
         self._is_started = False
 
-    def start(self, period: float) -> None:
+    def start(self, period: float) -> NDArray[np.void]:
         """Puts the device at rest at the origin, and compiles what the loop will call.
 
         Args:
             period: The loop's period in s, finite and > 0.
+
+        Returns:
+            The pose before the first tick, shape (1,), ``SAMPLE_DTYPE``.
 
         Raises:
             DeviceError: The period is not, or is too long for a stiff hand with friction.
@@ -205,8 +208,10 @@ class SimulatedDevice:
         state["translation"] = sampled_axis(period, **self._translation)
         state["rotation"] = sampled_axis(period, **self._rotation)
         self._states[0] = state
-        next_sample(self._states.copy(), self._motion, np.zeros(1, SAMPLE_DTYPE))
+        sample = np.zeros(1, SAMPLE_DTYPE)
+        next_sample(self._states.copy(), self._motion, sample)
         self._is_started = True
+        return sample
 
     def read(self, sample: NDArray[np.void]) -> None:
         """Moves on by one period (the first call does not) and reports the pose, no buttons.

@@ -96,18 +96,23 @@ class TrajectoryDevice:
         self._states = np.zeros(1, _STATE_DTYPE)
         self._is_started = False
 
-    def start(self, period: float) -> None:
+    def start(self, period: float) -> NDArray[np.void]:
         """Goes to the first row, and compiles what the loop will call.
 
         Args:
             period: The loop's period in s, finite and > 0.
 
+        Returns:
+            The pose before the first tick, shape (1,), ``SAMPLE_DTYPE``.
+
         Raises:
             DeviceError: The period is not.
         """
         self._states[0] = (0, 0, checked_period(period))
-        _next_sample(self._states.copy(), self._table, np.zeros(1, SAMPLE_DTYPE))
+        sample = np.zeros(1, SAMPLE_DTYPE)
+        _next_sample(self._states.copy(), self._table, sample)
         self._is_started = True
+        return sample
 
     def read(self, sample: NDArray[np.void]) -> None:
         """Reports the pose of this tick, no buttons.
@@ -190,11 +195,14 @@ class ReplayDevice:
         )
         self._tick = -1
 
-    def start(self, period: float) -> None:
+    def start(self, period: float) -> NDArray[np.void]:
         """Goes to the first row.
 
         Args:
             period: The loop's period in s: that of the recording.
+
+        Returns:
+            The pose before the first tick, shape (1,), ``SAMPLE_DTYPE``.
 
         Raises:
             DeviceError: It is another.
@@ -206,6 +214,7 @@ class ReplayDevice:
                 "must be the same"
             )
         self._tick = 0
+        return np.asarray(self._samples[:1].copy())
 
     def read(self, sample: NDArray[np.void]) -> None:
         """Reports the recorded sample of this tick.

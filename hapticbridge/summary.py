@@ -1,0 +1,45 @@
+"""What a run was, in one object."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+
+@dataclass(frozen=True, slots=True)
+class Summary:
+    """What a run was.
+
+    Attributes:
+        ticks: Ticks since the bridge was opened.
+        duration: Their number times the period, in s.
+        overruns: Deadlines that were missed by a period or more and skipped.
+        dropped: Records that the recorder did not get because it was too far behind.
+        peak_force: Largest norm of the force on the tool in N.
+        peak_torque: Largest norm of the torque on the tool in N m.
+        energies: Energies by name in J.
+        environment: ``strict``, ``within slack`` or ``active``.
+        slack_share: Largest share of the slack that was used.
+        is_certified: Whether b >= scale · force_scale · (KT/2 + B) holds for the device in
+            translation and rotation; None where its damping is unknown.
+        stopped_by: ``duration``, ``signal`` or ``caller``.
+        recording: The file, if one was written.
+    """
+
+    ticks: int
+    duration: float
+    overruns: int
+    dropped: int
+    peak_force: float
+    peak_torque: float
+    energies: dict[str, float]
+    environment: str
+    slack_share: float
+    is_certified: bool | None
+    stopped_by: str
+    recording: Path | None
+
+    @property
+    def verdict(self) -> str:
+        """``passive`` (strict or within slack) or ``active``."""
+        return "active" if self.environment == "active" else "passive"

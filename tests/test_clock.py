@@ -1,0 +1,90 @@
+"""Clocks: deadlines are multiples of the period, whatever happens in between."""
+
+from __future__ import annotations
+
+import time
+
+import pytest
+
+from hapticbridge.clock import RealClock, SimulatedClock
+
+PERIOD = 1_000_000
+
+
+class Wall:
+    """A wall clock that the test moves; sleeping moves it too."""
+
+    def __init__(self) -> None:
+        self.ns = 5_000_000_000
+        self.slept: list[float] = []
+
+    def monotonic_ns(self) -> int:
+        self.ns += 100  # reading takes time, so that a spin ends
+        return self.ns
+
+    def sleep(self, seconds: float) -> None:
+        self.slept.append(seconds)
+        self.ns += round(seconds * 1e9)
+
+
+@pytest.fixture
+def wall(monkeypatch: pytest.MonkeyPatch) -> Wall:
+    clock = Wall()
+    monkeypatch.setattr(time, "monotonic_ns", clock.monotonic_ns)
+    monkeypatch.setattr(time, "sleep", clock.sleep)
+    return clock
+
+
+def test_simulated_time_is_the_number_of_ticks() -> None:
+    clock = SimulatedClock()
+    clock.start(PERIOD)
+    assert [clock.wait() for _ in range(3)] == [(k * PERIOD, k * PERIOD, 0) for k in (1, 2, 3)]
+    clock.start(PERIOD)
+    assert clock.wait()[0] == 4 * PERIOD
+
+
+def test_real_deadlines_do_not_drift_when_each_tick_takes_time(wall: Wall) -> None:
+    clock = RealClock()
+    clock.start(PERIOD)
+    for k in range(1, 1000):
+        deadline, wake, skipped = clock.wait()
+        assert (deadline, skipped) == (k * PERIOD, 0)
+        assert deadline <= wake < deadline + 1000
+        wall.ns += 700_000
+
+
+def test_a_wait_sleeps_and_spins_only_at_the_end(wall: Wall) -> None:
+    clock = RealClock()
+    clock.start(PERIOD)
+    clock.wait()
+    assert wall.slept == [pytest.approx(850e-6, abs=1e-6)]
+
+
+def test_missed_deadlines_are_skipped_and_counted_not_caught_up(wall: Wall) -> None:
+    clock = RealClock()
+    clock.start(PERIOD)
+    clock.wait()
+    wall.ns += 5 * PERIOD + 300_000
+    deadline, wake, skipped = clock.wait()
+    assert (deadline, skipped) == (6 * PERIOD, 4)
+    assert wake - deadline == pytest.approx(300_000, abs=2000)
+    assert clock.wait()[0] == 7 * PERIOD
+
+
+def test_a_late_wake_within_a_period_skips_nothing(wall: Wall) -> None:
+    clock = RealClock()
+    clock.start(PERIOD)
+    clock.wait()
+    wall.ns += PERIOD + 400_000
+    deadline, wake, skipped = clock.wait()
+    assert (deadline, skipped) == (2 * PERIOD, 0)
+    assert wake > deadline + 300_000
+
+
+def test_time_stands_still_between_runs(wall: Wall) -> None:
+    clock = RealClock()
+    clock.start(PERIOD)
+    clock.wait()
+    wall.ns += 10_000_000_000
+    clock.start(PERIOD)
+    assert clock.wait()[0] == 2 * PERIOD

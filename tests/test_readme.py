@@ -1,0 +1,85 @@
+"""The README does what it says: its session, its code blocks, its files."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hapticbridge.cli import main
+from hapticbridge.cli.main import USAGE_ERROR
+
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+
+
+def blocks(language: str) -> list[str]:
+    """Returns the README's code blocks in a language."""
+    return re.findall(rf"```{language}\n(.*?)```", README, flags=re.DOTALL)
+
+
+@pytest.fixture
+def workplace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty folder with the files that the README's commands take for granted."""
+    monkeypatch.chdir(tmp_path)
+    shutil.copy(ROOT / "models/peg_in_hole/peg_in_hole.csv", "hand.csv")
+    scene = (ROOT / "models/point_mass/point_mass.xml").read_text(encoding="utf-8")
+    Path("my_tool.xml").write_text(scene.replace('name="grip"', 'name="tip"'), encoding="utf-8")
+    return tmp_path
+
+
+def test_session_prints_what_the_readme_shows(
+    workplace: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (session,) = blocks("console")
+    for exchange in session.split("$ hapticbridge ")[1:]:
+        command, _, shown = exchange.partition("\n")
+        assert main(shlex.split(command)) == 0
+        printed = [" ".join(line.split()) for line in capsys.readouterr().out.splitlines()]
+        for line in shown.splitlines():
+            words = " ".join(line.split())
+            if re.search(r"[µm]J|[µm]?N,", words):  # the last digit may depend on the processor
+                assert any(other.startswith(words.split()[0]) for other in printed), words
+            else:
+                assert words in printed
+    assert Path("run.png").stat().st_size > 10_000
+
+
+def test_python_block_runs(workplace: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (code,) = blocks("python")
+    names: dict[str, object] = {}
+    exec(compile(code, "README.md", "exec"), names)
+    assert "passive bit for bit" in capsys.readouterr().out
+    ticks = names["ticks"]
+    assert isinstance(ticks, np.ndarray)
+    assert len(ticks) == 10_000
+
+
+def test_shell_commands_are_valid(workplace: Path) -> None:
+    for line in "".join(blocks("sh")).splitlines():
+        words = shlex.split(line, comments=True)
+        if not words:
+            continue
+        if words[0] == "hapticbridge":
+            if words[1] == "repair":
+                assert main([*words[1:]]) == USAGE_ERROR  # nothing was cut
+            else:
+                is_run = words[1] == "run"
+                assert main(words[1:] + (["--fast", "--duration", "0.2"] if is_run else [])) == 0
+        else:
+            script = ROOT / words[0]
+            assert script.is_file()
+            assert script.stat().st_mode & 0o111
+
+
+def test_links_and_pictures_exist() -> None:
+    for target in re.findall(r"\]\(([^)#]+)\)", README):
+        assert (ROOT / target).is_file(), target
+
+
+def test_readme_is_short() -> None:
+    assert len(README.splitlines()) <= 150
