@@ -27,6 +27,7 @@ from hapticbridge.device import Device, open_device
 from hapticbridge.errors import DeviceError, HapticBridgeError, RecordingError, SafetyTrip
 from hapticbridge.guard import Limits, trip_reason
 from hapticbridge.inputs import Write, apply_writes, input_writes
+from hapticbridge.jit import direct
 from hapticbridge.kernel.state import Binding, RunParameters
 from hapticbridge.kernel.step import OK, after_step, before_step, publish
 from hapticbridge.ledger import Ledger
@@ -35,7 +36,7 @@ from hapticbridge.recording import TAIL, Recorder, Ring
 from hapticbridge.rendering import method_named, prepare
 from hapticbridge.scene import Scene, load_scene
 from hapticbridge.summary import Summary
-from hapticbridge.tick import TickFlag
+from hapticbridge.tick import SAMPLE_DTYPE, TickFlag
 
 RING_CAPACITY = 8192
 """Records between loop and recorder. At 1 kHz the recorder may fall 8 s behind before one is lost;
@@ -130,6 +131,7 @@ class Bridge:
         self._path = Path(recording) if recording is not None else None
         self._is_live = live
         self.clock = clock or RealClock()
+        self._sample = np.zeros(1, SAMPLE_DTYPE)
         self._inputs: deque[list[Write]] = deque()
         self._recorder: Recorder | None = None
         self._tick = self._overruns = self._dropped = 0
@@ -176,7 +178,8 @@ class Bridge:
         model, data, substeps = self.scene.model, self.scene.data, range(self._substeps)
         records, cursors = self._ring.rows, self._ring.cursors
         sample, wrench = self._sample, row["wrench_on_device"][0]
-        device, clock, inputs = self.device, self.clock, self._inputs
+        before, after, hand_over = self._before_step, self._after_step, self._publish
+        device, clock, inputs, step = self.device, self.clock, self._inputs, mujoco.mj_step
         last, code, lost = self._last_tick(duration), OK, 0
         self._stopped_by = ""
         with self._stopping_on_signals():
@@ -191,17 +194,17 @@ class Bridge:
                     device.read(sample)
                     read = clock.now()
                     for substep in substeps:
-                        code = before_step(state, sample, row, substep)
+                        code = before(state, sample, row, substep)
                         if code != OK:
                             break
-                        mujoco.mj_step(model, data)
-                        code = after_step(state, row, substep)
+                        step(model, data)
+                        code = after(state, row, substep)
                     if code != OK:
                         break
                     device.write(wrench)
                     write = clock.now()
                     flags = lost | (self._overrun(skipped) if skipped else 0)
-                    while not publish(row, records, cursors, deadline, wake, read, write, flags):
+                    while not hand_over(row, records, cursors, deadline, wake, read, write, flags):
                         lost = self._ring_is_full()
                         if lost:
                             break
@@ -280,17 +283,16 @@ class Bridge:
         """Compiles the kernel, puts the scene to its start, and opens the recording."""
         scene, clock, info = self.scene, self.clock, self.device.info
         prepare(scene, self.coupling, self.period, self._substeps)
-        self._sample = self.device.start(self.period)
+        self._sample[:] = self.device.start(self.period)
         self.parameters = self._parameters()
-        self._warm_up()
-        scene.reset()
         self._binding = Binding(scene.model, scene.data, self.parameters)
         self._refuse_stretched_start()
-        if self._path is None and not self._is_live:
-            self._ring = Ring.local(RING_CAPACITY)
+        is_read = self._path is not None or self._is_live
+        self._ring = Ring.shared(RING_CAPACITY) if is_read else Ring.local(RING_CAPACITY)
+        self._compile()
+        if not is_read:
             self._ring.cursors[TAIL] = NOBODY_READS
             return
-        self._ring = Ring.shared(RING_CAPACITY)
         meta = describe_run(
             scene,
             self.parameters,
@@ -337,15 +339,13 @@ class Bridge:
                 f"{np.round(state['tool_position'], 4).tolist()} m or use relative poses"
             )
 
-    def _warm_up(self) -> None:
-        """Runs one tick of everything compiled, on the scene before it is reset."""
-        binding = Binding(self.scene.model, self.scene.data, self.parameters)
-        ring = Ring.local(1)
-        for substep in range(self._substeps):
-            before_step(binding.state, self._sample, binding.row, substep)
-            mujoco.mj_step(self.scene.model, self.scene.data)
-            after_step(binding.state, binding.row, substep)
-        publish(binding.row, ring.rows, ring.cursors, 0, 0, 0, 0, 0)
+    def _compile(self) -> None:
+        """Gets the machine code of the tick ready, so that the first one is not late."""
+        state, row, sample = self._binding.state, self._binding.row, self._sample
+        rows, cursors = self._ring.rows, self._ring.cursors
+        self._before_step = direct(before_step, state, sample, row, 0)
+        self._after_step = direct(after_step, state, row, 0)
+        self._publish = direct(publish, row, rows, cursors, 0, 0, 0, 0, 0)
 
     def _last_tick(self, duration: float | None) -> int:
         if duration is None:

@@ -31,17 +31,45 @@ def _cache_folder() -> str:
     return str(Path(base) / digest.hexdigest()[:16])
 
 
+def _compiled(function: _Function, *, nogil: bool) -> _Function:
+    outside = numba.config.CACHE_DIR
+    numba.config.CACHE_DIR = _cache_folder()
+    try:
+        decorate = numba.njit(cache=True, nogil=nogil, error_model="numpy")
+        return cast(_Function, decorate(function))
+    finally:
+        numba.config.CACHE_DIR = outside
+
+
 def compiled(function: _Function) -> _Function:
-    """Compiles a function with numba: nopython, cached on disk, without the interpreter lock.
+    """Compiles a function with numba: nopython, cached on disk, holding the interpreter lock.
 
     Floating-point semantics stay IEEE (no ``fastmath``): the live loop, the sweeps and the audit's
     re-simulation inline the same functions into different callers and must agree to the bit.
     Division by zero gives inf or nan as in NumPy instead of raising, because an exception cannot
-    be raised in the middle of a tick; what is not finite trips the guard.
+    be raised in the middle of a tick; what is not finite trips the guard. The lock is held because
+    a tick that lets it go for a microsecond may wait milliseconds to get it back.
     """
-    outside = numba.config.CACHE_DIR
-    numba.config.CACHE_DIR = _cache_folder()
-    try:
-        return cast(_Function, numba.njit(cache=True, nogil=True, error_model="numpy")(function))
-    finally:
-        numba.config.CACHE_DIR = outside
+    return _compiled(function, nogil=False)
+
+
+def compiled_for_threads(function: _Function) -> _Function:
+    """As ``compiled``, but lets the interpreter lock go: for whole runs in several threads."""
+    return _compiled(function, nogil=True)
+
+
+def direct(function: _Function, *arguments: object) -> _Function:
+    """Returns a compiled function's machine code for arguments of these types.
+
+    Calling it skips the dispatcher, which looks at the types of all arguments in every call: with
+    three structured arrays that takes 0.6 µs, the call itself 0.2 µs. Compiles, or loads from the
+    cache, but does not call.
+
+    Args:
+        function: What ``compiled`` returned.
+        *arguments: Examples of the arguments; only their types matter. The result must never be
+            called with others: nothing checks them any more.
+    """
+    dispatcher = cast(numba.core.dispatcher.Dispatcher, function)
+    signature = tuple(numba.typeof(argument) for argument in arguments)
+    return cast(_Function, dispatcher.compile(signature))

@@ -15,6 +15,7 @@ from hapticbridge.device.motion import Motion
 from hapticbridge.device.motion_csv import read_motion
 from hapticbridge.device.sampled_axis import sampled_axis
 from hapticbridge.errors import DeviceError
+from hapticbridge.jit import direct
 from hapticbridge.tick import SAMPLE_DTYPE
 
 
@@ -209,7 +210,8 @@ class SimulatedDevice:
         state["rotation"] = sampled_axis(period, **self._rotation)
         self._states[0] = state
         sample = np.zeros(1, SAMPLE_DTYPE)
-        next_sample(self._states.copy(), self._motion, sample)
+        self._next_sample = direct(next_sample, self._states, self._motion, sample)
+        self._next_sample(self._states.copy(), self._motion, sample)
         self._is_started = True
         return sample
 
@@ -224,7 +226,7 @@ class SimulatedDevice:
         """
         if not self._is_started:
             raise DeviceError("the simulated device is read before it was started")
-        next_sample(self._states, self._motion, sample)
+        self._next_sample(self._states, self._motion, sample)
 
     def write(self, wrench: NDArray[np.float64]) -> None:
         """Holds a wrench on the handle until the next write, ``delay`` samples later.

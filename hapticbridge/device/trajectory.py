@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from hapticbridge.device.base import DeviceInfo, checked_period
 from hapticbridge.device.motion import NORM_TOLERANCE, Motion, pose_at
 from hapticbridge.errors import DeviceError
-from hapticbridge.jit import compiled
+from hapticbridge.jit import compiled, direct
 from hapticbridge.tick import SAMPLE_DTYPE
 
 _STATE_DTYPE = np.dtype([("tick", "<i8"), ("cursor", "<i8"), ("period", "<f8")])
@@ -110,7 +110,8 @@ class TrajectoryDevice:
         """
         self._states[0] = (0, 0, checked_period(period))
         sample = np.zeros(1, SAMPLE_DTYPE)
-        _next_sample(self._states.copy(), self._table, sample)
+        self._advance = direct(_next_sample, self._states, self._table, sample)
+        self._advance(self._states.copy(), self._table, sample)
         self._is_started = True
         return sample
 
@@ -125,7 +126,7 @@ class TrajectoryDevice:
         """
         if not self._is_started:
             raise DeviceError("the trajectory is read before it was started")
-        _next_sample(self._states, self._table, sample)
+        self._advance(self._states, self._table, sample)
 
     def write(self, wrench: NDArray[np.float64]) -> None:
         """Ignores the wrench: the motion is prescribed."""

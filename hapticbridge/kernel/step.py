@@ -11,7 +11,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.jit import compiled
+from hapticbridge.jit import compiled, compiled_for_threads
 from hapticbridge.kernel.native import (
     floats,
     ints,
@@ -354,7 +354,7 @@ def publish(
     return True
 
 
-@compiled
+@compiled_for_threads
 def simulate(
     state: NDArray[np.void],
     samples: NDArray[np.void],
