@@ -12,7 +12,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from types import FrameType, TracebackType
 
@@ -134,28 +134,33 @@ class Bridge:
         self._sample = np.zeros(1, SAMPLE_DTYPE)
         self._inputs: deque[list[Write]] = deque()
         self._recorder: Recorder | None = None
-        self._tick = self._overruns = self._dropped = 0
+        self._tick = self._overruns = self._skipped = self._dropped = 0
         self._stopped_by = ""
 
     def __enter__(self) -> Bridge:
-        try:
-            self._prepare()
-        except BaseException:
-            self.device.close()
-            raise
+        # released in reverse order, whatever one of them does: force, recording, ring, device
+        with ExitStack() as resources:
+            resources.callback(self.device.close)
+            self._prepare(resources)
+            resources.callback(self.device.write, _NO_FORCE)
+            self._resources = resources.pop_all()
         return self
 
     def __exit__(
         self,
         kind: type[BaseException] | None,
         error: BaseException | None,
-        _traceback: TracebackType | None,
+        traceback: TracebackType | None,
     ) -> None:
-        try:
-            self.device.write(_NO_FORCE)
-        finally:
-            self.device.close()
-            self._close_recording(error)
+        reason = self._stopped_by if error is None else f"{type(error).__name__}: {error}"
+        self._event(
+            "stop",
+            reason=reason,
+            overruns=self._overruns,
+            skipped=self._skipped,
+            dropped=self._dropped,
+        )
+        self._resources.__exit__(kind, error, traceback)
 
     def run(
         self, duration: float | None = None, on_tick: Callable[[int], None] | None = None
@@ -268,6 +273,7 @@ class Bridge:
             ticks=self._tick,
             duration=self._tick * self.period,
             overruns=self._overruns,
+            skipped=self._skipped,
             dropped=self._dropped,
             peak_force=float(state["peak_force"][0]),
             peak_torque=float(state["peak_torque"][0]),
@@ -279,7 +285,7 @@ class Bridge:
             recording=self._path,
         )
 
-    def _prepare(self) -> None:
+    def _prepare(self, resources: ExitStack) -> None:
         """Compiles the kernel, puts the scene to its start, and opens the recording."""
         scene, clock, info = self.scene, self.clock, self.device.info
         prepare(scene, self.coupling, self.period, self._substeps)
@@ -289,6 +295,7 @@ class Bridge:
         self._refuse_stretched_start()
         is_read = self._path is not None or self._is_live
         self._ring = Ring.shared(RING_CAPACITY) if is_read else Ring.local(RING_CAPACITY)
+        resources.callback(self._ring.close)
         self._compile()
         if not is_read:
             self._ring.cursors[TAIL] = NOBODY_READS
@@ -304,6 +311,7 @@ class Bridge:
         self._recorder = Recorder(
             self._ring, self._path, meta, attachments(scene), live=self._is_live
         )
+        resources.callback(self._recorder.close)
         self._recorder.wait_until_ready()
         self._event("start")
 
@@ -362,7 +370,8 @@ class Bridge:
             self._event("input", writes=writes)
 
     def _overrun(self, skipped: int) -> int:
-        self._overruns += skipped
+        self._overruns += 1
+        self._skipped += skipped
         return int(TickFlag.OVERRUN)
 
     def _ring_is_full(self) -> int:
@@ -384,13 +393,6 @@ class Bridge:
     def _event(self, event: str, **details: object) -> None:
         if self._recorder is not None:
             self._recorder.event({"event": event, "tick": self._tick, **details}, self.clock.now())
-
-    def _close_recording(self, error: BaseException | None) -> None:
-        if self._recorder is not None:
-            reason = self._stopped_by if error is None else f"{type(error).__name__}: {error}"
-            self._event("stop", reason=reason, overruns=self._overruns, dropped=self._dropped)
-            self._recorder.close()
-        self._ring.close()
 
     @contextmanager
     def _stopping_on_signals(self) -> Iterator[None]:

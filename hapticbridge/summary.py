@@ -13,7 +13,8 @@ class Summary:
     Attributes:
         ticks: Ticks since the bridge was opened.
         duration: Their number times the period, in s.
-        overruns: Deadlines that were missed by a period or more and skipped.
+        overruns: Ticks that started a period or more after their deadline.
+        skipped: Deadlines that were skipped for it.
         dropped: Records that the recorder did not get because it was too far behind.
         peak_force: Largest norm of the force on the tool in N.
         peak_torque: Largest norm of the torque on the tool in N m.
@@ -29,6 +30,7 @@ class Summary:
     ticks: int
     duration: float
     overruns: int
+    skipped: int
     dropped: int
     peak_force: float
     peak_torque: float

@@ -26,6 +26,10 @@ from hapticbridge.rendering import IMPLICIT
 from hapticbridge.scene import load_scene
 from hapticbridge.summary import Summary
 
+LOWEST_RATE, HIGHEST_RATE = 1.0, 1e6
+"""In Hz. Below one tick a second nothing can be felt; above 1 MHz no step of MuJoCo fits between two
+ticks, and the clock's nanoseconds become too coarse."""
+
 
 @dataclass(frozen=True, slots=True)
 class Run:
@@ -128,8 +132,10 @@ class Run:
 
     def _coupling(self, info: DeviceInfo, scales: tuple[float, float]) -> Coupling:
         """Returns the default coupling with what the user asked for put in its place."""
-        if not math.isfinite(self.rate) or self.rate <= 0:
-            raise HapticBridgeError(f"rate is {self.rate!r} Hz; it must be finite and > 0")
+        if not LOWEST_RATE <= self.rate <= HIGHEST_RATE:
+            raise HapticBridgeError(
+                f"rate is {self.rate!r} Hz; it must be {LOWEST_RATE:g} to {HIGHEST_RATE:g}"
+            )
         asked = {field.name: getattr(self, field.name) for field in fields(Coupling)}
         given = {name: value for name, value in asked.items() if value is not None}
         return replace(default_coupling(info, 1.0 / self.rate, *scales), **given)
@@ -153,7 +159,8 @@ def _announce(bridge: Bridge, scales: tuple[float, float]) -> None:
 def _print_summary(summary: Summary) -> None:
     table = Table(show_header=False, box=None, pad_edge=False)
     table.add_row("ran", f"{summary.duration:.3f} s, {summary.ticks} ticks ({summary.stopped_by})")
-    table.add_row("overruns", f"{summary.overruns}, records dropped {summary.dropped}")
+    skipped = f" ({summary.skipped} deadlines skipped)" if summary.skipped else ""
+    table.add_row("overruns", f"{summary.overruns}{skipped}, records dropped {summary.dropped}")
     table.add_row(
         "peak", f"{quantity(summary.peak_force, 'N')}, {quantity(summary.peak_torque, 'N m')}"
     )
