@@ -21,9 +21,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hapticbridge.certificate import default_coupling, device_conditions, is_certified
-from hapticbridge.clock import Clock, RealClock
+from hapticbridge.clock import Clock, RealClock, period_of
 from hapticbridge.coupling import Coupling
-from hapticbridge.device import Device, open_device
+from hapticbridge.device import Device, device_for
 from hapticbridge.errors import DeviceError, HapticBridgeError, RecordingError, SafetyTrip
 from hapticbridge.guard import Limits, trip_reason
 from hapticbridge.inputs import Write, apply_writes, input_writes
@@ -52,22 +52,6 @@ _NO_FORCE = np.zeros(6)
 _STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
-def device_for(scene: Scene, spec: str) -> Device:
-    """Opens a device for a scene; the simulated one's hand follows ``NAME.csv`` beside the scene.
-
-    Args:
-        scene: The scene that the device will move in.
-        spec: What ``open_device`` understands.
-
-    Raises:
-        DeviceError: See ``open_device``.
-    """
-    path = scene.path.with_suffix(".csv")
-    if spec.partition(":")[0] == "simulated" and path.is_file():
-        return open_device(spec, path=path)
-    return open_device(spec)
-
-
 class Bridge:
     """Joins a device and a scene by a virtual coupling and runs the loop between them.
 
@@ -79,7 +63,7 @@ class Bridge:
         device: A device, or what ``open_device`` understands.
         coupling: K and B; None chooses the stiffest safe one for the device's damping (80 % of the
             bound, B = b/4; for a device of unknown damping, that of the default simulated one).
-        rate: Ticks per second, > 0.
+        rate: Ticks per second, 1 to 1e6.
         substeps: MuJoCo steps per tick.
         method: How the tool is rendered; see ``rendering.METHODS``.
         recording: File to write (``.mcap``), or None.
@@ -114,11 +98,9 @@ class Bridge:
         limits: Limits | None = None,
         live: bool = False,
     ) -> None:
-        if not np.isfinite(rate) or rate <= 0:
-            raise HapticBridgeError(f"rate is {rate!r} Hz; it must be finite and > 0")
         self.scene = scene if isinstance(scene, Scene) else load_scene(scene)
         self.device = device_for(self.scene, device) if isinstance(device, str) else device
-        self.period = 1.0 / rate
+        self.period = period_of(rate)
         self._scales = scale, scale if force_scale is None else force_scale
         self.coupling = coupling or default_coupling(self.device.info, self.period, *self._scales)
         self._limits = limits or Limits(
@@ -135,6 +117,7 @@ class Bridge:
         self._inputs: deque[list[Write]] = deque()
         self._recorder: Recorder | None = None
         self._tick = self._overruns = self._skipped = self._dropped = 0
+        self._lost = 0  # flag of the next record if the one before it was lost
         self._stopped_by = ""
 
     def __enter__(self) -> Bridge:
@@ -185,7 +168,7 @@ class Bridge:
         sample, wrench = self._sample, row["wrench_on_device"][0]
         before, after, hand_over = self._before_step, self._after_step, self._publish
         device, clock, inputs, step = self.device, self.clock, self._inputs, mujoco.mj_step
-        last, code, lost = self._last_tick(duration), OK, 0
+        last, code = self._last_tick(duration), OK
         self._stopped_by = ""
         with self._stopping_on_signals():
             clock.start(round(self.period * 1e9))
@@ -208,13 +191,13 @@ class Bridge:
                         break
                     device.write(wrench)
                     write = clock.now()
-                    flags = lost | (self._overrun(skipped) if skipped else 0)
+                    flags = self._lost | (self._overrun(skipped) if skipped else 0)
                     while not hand_over(row, records, cursors, deadline, wake, read, write, flags):
-                        lost = self._ring_is_full()
-                        if lost:
+                        self._lost = self._ring_is_full()
+                        if self._lost:
                             break
                     else:
-                        lost = 0
+                        self._lost = 0
                     self._tick += 1
             finally:
                 device.write(_NO_FORCE)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo
+from hapticbridge.errors import CouplingError
 from hapticbridge.passivity import minimum_damping, stiffest_coupling
 
 UNKNOWN_DAMPING, UNKNOWN_ROTATIONAL_DAMPING = 2.0, 2e-3
@@ -84,7 +86,13 @@ def default_coupling(
         period: T in s.
         scale: Handle motion per device motion.
         force_scale: Force on the device per force on the tool.
+
+    Raises:
+        CouplingError: A scale is not finite and positive, or so is the period.
     """
+    for name, value in (("scale", scale), ("force_scale", force_scale)):
+        if not math.isfinite(value) or value <= 0:
+            raise CouplingError(f"{name} is {value!r}; it must be finite and > 0")
     rotational = info.rotational_damping or UNKNOWN_ROTATIONAL_DAMPING
     return stiffest_coupling(
         (info.damping or UNKNOWN_DAMPING) / (scale * force_scale),

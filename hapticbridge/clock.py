@@ -9,10 +9,29 @@ from __future__ import annotations
 import time
 from typing import Protocol
 
+from hapticbridge.errors import HapticBridgeError
+
 SPIN_NS = 150_000
 """The end of each wait is spun instead of slept, in ns. A sleeping thread wakes some 50 to 100 µs
 late on an ordinary kernel; longer spins cost processor time and, under SCHED_FIFO, are throttled
 by the kernel for 50 ms in each second."""
+
+LOWEST_RATE, HIGHEST_RATE = 1.0, 1e6
+"""In Hz. Below one tick a second nothing can be felt; above 1 MHz no step of MuJoCo fits between
+two ticks, and the clock's nanoseconds become too coarse."""
+
+
+def period_of(rate: float) -> float:
+    """Returns the period in s of a rate in Hz.
+
+    Raises:
+        HapticBridgeError: The rate is not 1 Hz to 1 MHz.
+    """
+    if not LOWEST_RATE <= rate <= HIGHEST_RATE:
+        raise HapticBridgeError(
+            f"rate is {rate!r} Hz; it must be {LOWEST_RATE:g} to {HIGHEST_RATE:g}"
+        )
+    return 1.0 / rate
 
 
 class Clock(Protocol):

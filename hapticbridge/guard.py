@@ -8,6 +8,9 @@ from dataclasses import dataclass
 from hapticbridge.errors import DeviceError
 from hapticbridge.kernel.step import BAD_SAMPLE
 
+LONGEST_RAMP = 60.0
+"""In s. Nobody waits longer for a force to come up; a larger number is a mistake in the unit."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Limits:
@@ -16,7 +19,7 @@ class Limits:
     Attributes:
         force: Largest norm of the force in N, > 0; a longer one keeps its direction.
         torque: Largest norm of the torque in N m, > 0.
-        ramp: Time in s over which the wrench rises linearly to its full value at the start, >= 0.
+        ramp: Time in s over which the wrench rises linearly at the start, 0 to 60.
 
     Raises:
         DeviceError: A value is not finite or out of range.
@@ -31,8 +34,8 @@ class Limits:
             value = getattr(self, name)
             if not math.isfinite(value) or value <= 0:
                 raise DeviceError(f"{name} limit is {value!r} {unit}; it must be finite and > 0")
-        if not math.isfinite(self.ramp) or self.ramp < 0:
-            raise DeviceError(f"start ramp is {self.ramp!r} s; it must be finite and >= 0")
+        if not 0 <= self.ramp <= LONGEST_RAMP:
+            raise DeviceError(f"start ramp is {self.ramp!r} s; it must be 0 to {LONGEST_RAMP:g}")
 
     def ramp_ticks(self, period: float) -> int:
         """Returns the length of the ramp in ticks of ``period`` seconds."""

@@ -32,6 +32,11 @@ SOURCE_PREFIX = "scene/"
 _FLOATS = ("scale", "force_scale", "force_limit", "torque_limit")
 _POSES = ("device_origin", "handle_origin", "device_start")
 _GAINS = ("stiffness", "damping", "rotational_stiffness", "rotational_damping")
+STARTS = {"handle_start": 7, "tool_start": 7, "start_kinetic": 1, "start_potential": 1}
+"""What the ledger counts from, with its count of numbers: poses in m, energies in J."""
+
+_STORED = {"start_kinetic": "kinetic", "start_potential": "potential"}
+_MOST_TICKS = 2**31
 _STATE = mujoco.mjtState.mjSTATE_INTEGRATION
 
 
@@ -103,6 +108,15 @@ def attachments(scene: Scene) -> list[Attachment]:
     return kept
 
 
+def start_of(state: NDArray[np.void], name: str) -> list[float]:
+    """Returns one of ``STARTS`` from the kernel's state, as long as no tick has run."""
+    if name in _STORED:
+        return [float(state[_STORED[name]][0])]
+    body = name.removesuffix("_start")
+    pose = (*state[f"{body}_position"][0], *state[f"{body}_quaternion"][0])
+    return [float(value) for value in pose]
+
+
 def describe_run(
     scene: Scene,
     parameters: RunParameters,
@@ -113,15 +127,13 @@ def describe_run(
     clock: str,
 ) -> dict[str, str]:
     """Returns the recording's metadata; see ``parameters_of`` for the way back."""
-    state = binding.state[0]
     coupling = parameters.coupling
     meta = {name: repr(float(getattr(parameters, name))) for name in _FLOATS}
     meta |= {name: repr(float(getattr(coupling, name))) for name in _GAINS}
     meta |= {name: json.dumps(getattr(parameters, name)) for name in (*_POSES, "axes")}
-    meta |= {
-        name: json.dumps([*state[f"{name[:-6]}_position"], *state[f"{name[:-6]}_quaternion"]])
-        for name in ("handle_start", "tool_start")
-    }
+    for name, count in STARTS.items():
+        start = start_of(binding.state, name)
+        meta[name] = json.dumps(start if count > 1 else start[0])
     return meta | {
         "period_s": repr(parameters.period),
         "substeps": str(parameters.substeps),
@@ -134,8 +146,6 @@ def describe_run(
         "scene": scene.name,
         "scene_file": scene.path.name,
         "scene_sha256": hashlib.sha256(compiled_model(scene.model)).hexdigest(),
-        "start_kinetic": repr(float(state["kinetic"])),
-        "start_potential": repr(float(state["potential"])),
         "versions": json.dumps(versions(), sort_keys=True),
         "host": json.dumps(
             {"system": platform.system(), "machine": platform.machine(), "processor": processor()}
@@ -155,7 +165,7 @@ def meta_float(meta: Mapping[str, str], name: str) -> float:
     except KeyError:
         raise RecordingError(f"the recording's metadata lack '{name}'") from None
     except ValueError:
-        raise RecordingError(f"metadata '{name}' is {meta[name]!r}, not a number") from None
+        raise RecordingError(f"metadata '{name}' is {meta[name]!r:.80}, not a number") from None
     if not math.isfinite(value):
         raise RecordingError(f"metadata '{name}' is {value}; it must be finite")
     return value
@@ -172,11 +182,36 @@ def meta_numbers(meta: Mapping[str, str], name: str, count: int) -> tuple[float,
         raise RecordingError(f"the recording's metadata lack '{name}'")
     try:
         values = tuple(float(value) for value in json.loads(text))
-    except (ValueError, TypeError):
+    except (ValueError, TypeError, OverflowError, RecursionError):
         values = ()
     if len(values) != count or not all(math.isfinite(value) for value in values):
-        raise RecordingError(f"metadata '{name}' is {text!r}; it must be {count} finite numbers")
+        raise RecordingError(
+            f"metadata '{name}' is {text!r:.80}; it must be {count} finite numbers"
+        )
     return values
+
+
+def meta_start(meta: Mapping[str, str], name: str) -> list[float]:
+    """Returns one of ``STARTS`` from the metadata.
+
+    Raises:
+        RecordingError: It is missing, or not as many finite numbers.
+    """
+    if STARTS[name] == 1:
+        return [meta_float(meta, name)]
+    return list(meta_numbers(meta, name, STARTS[name]))
+
+
+def meta_count(meta: Mapping[str, str], name: str) -> int:
+    """Returns a count of the metadata.
+
+    Raises:
+        RecordingError: It is missing, not a whole number, or out of range.
+    """
+    value = meta_float(meta, name)
+    if not value.is_integer() or not 0 <= value < _MOST_TICKS:
+        raise RecordingError(f"metadata '{name}' is {value:g}; it must be a whole number >= 0")
+    return int(value)
 
 
 def parameters_of(meta: Mapping[str, str]) -> RunParameters:
@@ -189,9 +224,9 @@ def parameters_of(meta: Mapping[str, str]) -> RunParameters:
         return RunParameters(
             grip=meta.get("grip", ""),
             period=meta_float(meta, "period_s"),
-            substeps=int(meta_float(meta, "substeps")),
+            substeps=meta_count(meta, "substeps"),
             coupling=Coupling(**{name: meta_float(meta, name) for name in _GAINS}),
-            ramp_ticks=int(meta_float(meta, "ramp_ticks")),
+            ramp_ticks=meta_count(meta, "ramp_ticks"),
             axes=meta_numbers(meta, "axes", 9),
             scale=meta_float(meta, "scale"),
             force_scale=meta_float(meta, "force_scale"),

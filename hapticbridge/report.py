@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import io
 import json
+import warnings
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jinja2 import Environment, PackageLoader, select_autoescape
@@ -15,14 +17,70 @@ from numpy.typing import NDArray
 
 from hapticbridge.audit import AuditReport
 from hapticbridge.errors import RecordingError
+from hapticbridge.provenance import parameters_of
 from hapticbridge.recording import Recording
 
 BINS = 1500
 """Points per curve at most; each is drawn as its least and greatest value in a bin, so that no peak
 is lost. More makes a page larger without showing more at its width."""
 
+ENDINGS = (".pdf", ".png", ".svg")
+"""What a picture's name may end in."""
+
 _AXES = ("x", "y", "z")
 _COLOURS = ("#b3261e", "#2e7d32", "#1a5fb4")
+
+DRAWABLE = 1e9
+"""Newtons, metres and joules beyond this are no physics; the picture's axes would not bear them."""
+
+_ENERGIES = (
+    ("coupling_work", "work of the coupling"),
+    ("environment_energy", "created (+) or dissipated (−)"),
+    ("device_energy", "given to the device"),
+    ("kinetic", "kinetic"),
+)
+_DRAWN = (
+    "wrench_on_tool",
+    "tool_position",
+    "handle_position",
+    *(name for name, _ in _ENERGIES),
+)
+
+MOST_EVENTS = 200
+"""Events that a page lists; a run with scripted inputs has one per tick."""
+
+FACTS = {
+    "scene": "",
+    "method": "",
+    "started": "",
+    "clock": "",
+    "period_s": "s",
+    "substeps": "",
+    "stiffness": "N/m",
+    "damping": "N s/m",
+    "rotational_stiffness": "N m/rad",
+    "rotational_damping": "N m s/rad",
+    "scale": "",
+    "force_scale": "",
+    "force_limit": "N",
+    "torque_limit": "N m",
+    "ramp_ticks": "",
+    "scene_sha256": "",
+}
+"""Metadata that a page shows, with their units."""
+
+DEVICE_FACTS = {
+    "name": "",
+    "degrees_of_freedom": "",
+    "mass": "kg",
+    "damping": "N s/m",
+    "rotational_inertia": "kg m²",
+    "rotational_damping": "N m s/rad",
+    "friction": "N",
+    "resolution": "m",
+    "rate": "Hz",
+}
+"""What a page shows of the device's data sheet, with units."""
 
 
 def _decimated(
@@ -44,15 +102,20 @@ def draw_recording(recording: Recording) -> Figure:
     """Draws force, position and energies over time.
 
     Raises:
-        RecordingError: The recording holds no tick or does not say its period.
+        RecordingError: The recording holds no tick, a number that cannot be drawn, or no
+            parameters of a run.
     """
-    ticks = recording.ticks
-    if not len(ticks) or "period_s" not in recording.meta:
+    ticks, meta = recording.ticks, recording.meta
+    if not len(ticks):
         raise RecordingError(f"'{recording.path}' holds nothing to draw")
-    time = ticks["tick"] * float(recording.meta["period_s"])
+    parameters = parameters_of(meta)
+    if not all((np.abs(ticks[name]) < DRAWABLE).all() for name in _DRAWN):
+        raise RecordingError(f"'{recording.path}' holds numbers that cannot be drawn")
+    time = ticks["tick"] * parameters.period
     figure = Figure(figsize=(8, 8), layout="constrained")
     FigureCanvasAgg(figure)
     force_axes, position_axes, energy_axes = figure.subplots(3, 1, sharex=True)
+    position_axes.plot([], [], color="grey", ls=":", lw=1, label="handle")
     for i, (axis, colour) in enumerate(zip(_AXES, _COLOURS, strict=True)):
         force_axes.plot(*_decimated(time, ticks["wrench_on_tool"][:, i]), color=colour, label=axis)
         start = ticks["tool_position"][0, i]
@@ -60,28 +123,45 @@ def draw_recording(recording: Recording) -> Figure:
         handle = 1e3 * (ticks["handle_position"][:, i] - start)
         position_axes.plot(*_decimated(time, tool), color=colour, label=f"tool {axis}")
         position_axes.plot(*_decimated(time, handle), color=colour, ls=":", lw=1)
-    for name, label in (
-        ("coupling_work", "work of the coupling"),
-        ("environment_energy", "created (+) or dissipated (−)"),
-        ("device_energy", "given to the device"),
-        ("kinetic", "kinetic"),
-    ):
+    for name, label in _ENERGIES:
         energy_axes.plot(*_decimated(time, 1e3 * ticks[name]), label=label)
     force_axes.set_ylabel("force on the tool (N)")
-    position_axes.set_ylabel("tool, handle dotted (mm)")
+    position_axes.set_ylabel("way from the start (mm)")
     energy_axes.set_ylabel("energy (mJ)")
     energy_axes.set_xlabel("time (s)")
-    meta = recording.meta
-    force_axes.set_title(
-        f"{meta.get('scene', '')}: {meta.get('method', '')}, "
-        f"K = {float(meta.get('stiffness', 'nan')):g} N/m, "
-        f"B = {float(meta.get('damping', 'nan')):g} N s/m, "
-        f"{1 / float(meta['period_s']):g} Hz"
+    coupling = parameters.coupling
+    title = (
+        f"{meta.get('scene', '')}: {meta.get('method', '')}, K = {coupling.stiffness:g} N/m, "
+        f"B = {coupling.damping:g} N s/m, {1 / parameters.period:g} Hz"
     )
+    # a control code would make a broken SVG
+    title = "".join(letter if letter.isprintable() else "�" for letter in title)
+    figure.suptitle(title, fontsize="medium", parse_math=False)
     for axes in (force_axes, position_axes, energy_axes):
         axes.grid(alpha=0.3)
-        axes.legend(loc="upper right", fontsize="small", ncols=4)
+        axes.margins(x=0.01)
+        # above the curves, not on them
+        axes.legend(
+            loc="lower right", bbox_to_anchor=(1, 1), fontsize="small", ncols=4, frameon=False
+        )
     return figure
+
+
+def check_ending(path: Path) -> None:
+    """Checks that a picture's name says what it is.
+
+    Raises:
+        RecordingError: It does not.
+    """
+    if path.suffix.lower() not in ENDINGS:
+        raise RecordingError(f"'{path}' does not end like a picture; endings: {', '.join(ENDINGS)}")
+
+
+def _save(figure: Figure, target: Path | io.StringIO, **options: Any) -> None:
+    with warnings.catch_warnings():
+        # a scene's name in letters that the font lacks is drawn as boxes, which is no news
+        warnings.filterwarnings("ignore", message="Glyph", category=UserWarning)
+        figure.savefig(target, **options)
 
 
 def plot_recording(recording: Recording, path: Path) -> None:
@@ -90,16 +170,34 @@ def plot_recording(recording: Recording, path: Path) -> None:
     Raises:
         RecordingError: The file's ending is no picture format, or it cannot be written.
     """
+    check_ending(path)
     figure = draw_recording(recording)
-    formats = figure.canvas.get_supported_filetypes()
-    if path.suffix.lstrip(".") not in formats:
-        raise RecordingError(
-            f"'{path}' does not end like a picture; endings: {', '.join(sorted(formats))}"
-        )
     try:
-        figure.savefig(path, dpi=100)
+        _save(figure, path, dpi=100)
     except OSError as error:
         raise RecordingError(f"cannot write '{path}': {error.strerror}") from None
+
+
+def _picture(recording: Recording) -> str:
+    """Returns the curves as inline SVG, or nothing where they cannot be drawn."""
+    buffer = io.StringIO()
+    try:
+        figure = draw_recording(recording)
+    except RecordingError:
+        return ""
+    # no metadata: a page needs none of matplotlib's own
+    unwanted = dict.fromkeys(("Creator", "Date", "Format", "Type"))
+    _save(figure, buffer, format="svg", metadata=unwanted)
+    text = buffer.getvalue()
+    return text[text.index("<svg") :]
+
+
+def _mapping(text: str) -> dict[str, object]:
+    """Returns a JSON object of the metadata; an empty one where it is damaged."""
+    try:
+        return dict(json.loads(text))
+    except (ValueError, TypeError, RecursionError):
+        return {}
 
 
 def write_report(recording: Recording, report: AuditReport, path: Path) -> None:
@@ -108,22 +206,19 @@ def write_report(recording: Recording, report: AuditReport, path: Path) -> None:
     Raises:
         RecordingError: The page cannot be written.
     """
-    picture = ""
-    if len(recording.ticks) and report.verdict != "invalid":
-        buffer = io.StringIO()
-        draw_recording(recording).savefig(buffer, format="svg")
-        picture = buffer.getvalue()
-        picture = picture[picture.index("<svg") :]
     environment = Environment(
         loader=PackageLoader("hapticbridge", "templates"), autoescape=select_autoescape()
     )
     page = environment.get_template("report.html").render(
         report=asdict(report),
         meta=recording.meta,
-        device=json.loads(recording.meta.get("device", "{}")),
-        versions=json.loads(recording.meta.get("versions", "{}")),
-        events=recording.events,
-        picture=picture,
+        facts=FACTS,
+        device=_mapping(recording.meta.get("device", "")),
+        device_facts=DEVICE_FACTS,
+        versions=_mapping(recording.meta.get("versions", "")),
+        events=recording.events[:MOST_EVENTS],
+        more_events=max(len(recording.events) - MOST_EVENTS, 0),
+        picture=_picture(recording),
     )
     try:
         path.write_text(page, encoding="utf-8")

@@ -17,9 +17,12 @@ from hapticbridge.kernel.state import COUPLING_ACTUATORS, Binding, RunParameters
 from hapticbridge.kernel.step import simulate
 from hapticbridge.provenance import (
     MODEL_ATTACHMENT,
+    STARTS,
     STATE_ATTACHMENT,
+    meta_start,
     processor,
     restore_state,
+    start_of,
     versions,
 )
 from hapticbridge.recording import Recording
@@ -74,19 +77,20 @@ def replay(recording: Recording, parameters: RunParameters) -> Replay:
     restore_state(model, data, recording.attachments[STATE_ATTACHMENT])
     mujoco.mj_step(model, data)
     restore_state(model, data, recording.attachments[STATE_ATTACHMENT])
-    again = _simulated(recording, Binding(model, data, parameters), data)
-    return _compared(recording, again)
+    binding = Binding(model, data, parameters)
+    _check_start(recording, binding.state)
+    return _compared(recording, _simulated(recording, binding, data))
 
 
 def _obstacle(recording: Recording) -> str:
     try:
-        recorded = json.loads(recording.meta.get("versions", ""))
-    except ValueError:
+        recorded = dict(json.loads(recording.meta.get("versions", "")))
+    except (ValueError, TypeError, RecursionError):
         return "the metadata name no versions"
     present = versions()
     for name in DECISIVE:
         if recorded.get(name) != present[name]:
-            return f"recorded with {name} {recorded.get(name)}, here is {present[name]}"
+            return f"recorded with {name} {recorded.get(name, 'unknown')}, here is {present[name]}"
     missing = [n for n in (MODEL_ATTACHMENT, STATE_ATTACHMENT) if n not in recording.attachments]
     return f"the file has no attachment '{missing[0]}'" if missing else ""
 
@@ -110,11 +114,12 @@ def _model(recording: Recording, parameters: RunParameters) -> mujoco.MjModel:
         actuator_id = model.actuator(name).id
         stiffness = coupling.stiffness if axis < 3 else coupling.rotational_stiffness
         damping = coupling.damping if axis < 3 else coupling.rotational_damping
-        bias, gain = model.actuator_biasprm[actuator_id], model.actuator_gainprm[actuator_id]
-        if (bias[1], bias[2], gain[0]) != (-stiffness, -damping, damping):
+        bias = model.actuator_biasprm[actuator_id].tolist()
+        gain = float(model.actuator_gainprm[actuator_id, 0])
+        if (bias[1], bias[2], gain) != (-stiffness, -damping, damping):
             raise RecordingError(
-                f"the attached model's coupling has K = {-bias[1]:g}, B = {gain[0]:g} in {name}, "
-                f"the metadata say {stiffness:g}, {damping:g}"
+                f"the attached model's coupling has K = {-bias[1]!r}, B = {gain!r} in {name}, "
+                f"the metadata say {stiffness!r}, {damping!r}"
             )
     if model.opt.timestep != parameters.period / parameters.substeps:
         raise RecordingError(
@@ -122,6 +127,26 @@ def _model(recording: Recording, parameters: RunParameters) -> mujoco.MjModel:
             f"{parameters.period!r} s with {parameters.substeps} substeps"
         )
     return model
+
+
+def _check_start(recording: Recording, state: NDArray[np.void]) -> None:
+    """Refuses metadata that do not repeat the start of the attached scene."""
+    for name in STARTS:
+        recorded = meta_start(recording.meta, name)
+        present = start_of(state, name)
+        if not np.allclose(recorded, present, rtol=FOREIGN_TOLERANCE, atol=FOREIGN_TOLERANCE) or (
+            _is_same_processor(recording) and recorded != present
+        ):
+            raise RecordingError(
+                f"metadata '{name}' is {recorded}, the attached scene starts with {present}"
+            )
+
+
+def _is_same_processor(recording: Recording) -> bool:
+    try:
+        return bool(json.loads(recording.meta["host"])["processor"] == processor())
+    except (KeyError, TypeError, ValueError, RecursionError):
+        return True
 
 
 def _simulated(recording: Recording, binding: Binding, data: mujoco.MjData) -> NDArray[np.void]:
@@ -179,10 +204,6 @@ def _compared(recording: Recording, again: NDArray[np.void]) -> Replay:
         largest = float("inf")
     if first is None:
         return Replay("bit for bit")
-    try:
-        is_same_processor = json.loads(recording.meta["host"])["processor"] == processor()
-    except (KeyError, TypeError, ValueError):
-        is_same_processor = True
-    if not is_same_processor and largest <= FOREIGN_TOLERANCE:
+    if not _is_same_processor(recording) and largest <= FOREIGN_TOLERANCE:
         return Replay("within 1e-9 (other processor)")
     return Replay("disagrees", *first)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -16,7 +17,7 @@ from hapticbridge.certificate import Condition, device_conditions, is_certified
 from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.kernel.state import RunParameters
-from hapticbridge.provenance import meta_float, meta_numbers, parameters_of
+from hapticbridge.provenance import STARTS, meta_start, parameters_of
 from hapticbridge.recording import Recording, read_recording
 from hapticbridge.tick import TICK_DTYPE, TickFlag
 
@@ -69,13 +70,19 @@ class AuditReport:
     events: dict[str, int] = field(default_factory=dict)
 
     def to_json(self) -> str:
-        """Returns the report as one JSON object."""
-        return json.dumps(asdict(self) | {"path": str(self.path)}, indent=2)
+        """Returns the report as one JSON object; a number that is not finite becomes null."""
+        values = asdict(self) | {"path": str(self.path), "joules": _finite(self.joules)}
+        values["energies"] = {name: _finite(value) for name, value in self.energies.items()}
+        return json.dumps(values, indent=2, allow_nan=False)
 
     @property
     def exit_code(self) -> int:
         """0 if passive and certified or the device is unknown, else 1."""
         return 0 if self.verdict == "passive" and self.certified is not False else 1
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,6 +93,7 @@ class _Fault:
     joules: float = 0.0
 
 
+@np.errstate(all="ignore")  # numbers of a damaged file overflow; what comes out is then a fault
 def audit(path: str | Path, *, strict: bool = False) -> AuditReport:
     """Judges a recording from the file alone.
 
@@ -121,12 +129,14 @@ def audit(path: str | Path, *, strict: bool = False) -> AuditReport:
         return _invalid(facts, fault)
     ticks = recording.ticks
     try:
-        handle_start = np.array(meta_numbers(recording.meta, "handle_start", 7))
-        tool_start = np.array(meta_numbers(recording.meta, "tool_start", 7))
-        start_energy = meta_float(recording.meta, "start_kinetic") + meta_float(
-            recording.meta, "start_potential"
+        starts = {name: meta_start(recording.meta, name) for name in STARTS}
+        balance = Balance.of(
+            ticks,
+            parameters,
+            np.array(starts["handle_start"]),
+            np.array(starts["tool_start"]),
+            starts["start_kinetic"][0] + starts["start_potential"][0],
         )
-        balance = Balance.of(ticks, parameters, handle_start, tool_start, start_energy)
         facts["energies"] = _energies(ticks, balance)
         fault = _physics_fault(ticks, balance)
         if fault:
@@ -181,6 +191,7 @@ def _structure_fault(recording: Recording, parameters: RunParameters) -> _Fault 
         _file_fault(recording)
         or _number_fault(recording.ticks)
         or _time_fault(recording.ticks, parameters)
+        or _flag_fault(recording.ticks, parameters)
     )
 
 
@@ -221,20 +232,36 @@ def _time_fault(ticks: NDArray[np.void], parameters: RunParameters) -> _Fault | 
             at,
             "tick",
         )
-    period_ns = round(parameters.period * 1e9)
-    interval = np.diff(ticks["deadline_ns"])
-    has_skipped = (ticks["flags"][1:] & int(TickFlag.OVERRUN)) != 0
-    wrong = np.where(
-        has_skipped, (interval <= 0) | (interval % period_ns != 0), interval != period_ns
-    )
+    period_ns = round(min(parameters.period * 1e9, 2.0**62))
+    interval = np.diff(ticks["deadline_ns"], prepend=0)
+    has_skipped = (ticks["flags"] & int(TickFlag.OVERRUN)) != 0
+    is_multiple = (interval > period_ns) & (interval % max(period_ns, 1) == 0)
+    wrong = np.where(has_skipped, ~is_multiple, interval != period_ns)
     if wrong.any():
-        tick = int(np.argmax(wrong)) + 1
+        tick = int(np.argmax(wrong))
+        claim = "an overrun is flagged and " if has_skipped[tick] else ""
         return _Fault(
-            f"deadlines of ticks {tick - 1} and {tick} are {int(interval[tick - 1])} ns apart, the "
-            f"period is {period_ns} ns",
+            f"{claim}tick {tick} is due {int(interval[tick])} ns after the one before, the period "
+            f"is {period_ns} ns",
             tick,
             "deadline_ns",
         )
+    return None
+
+
+def _flag_fault(ticks: NDArray[np.void], parameters: RunParameters) -> _Fault | None:
+    """Holds those flags that other fields repeat against them."""
+    expected = {
+        TickFlag.DROPPED_BEFORE: np.zeros(len(ticks), bool),  # the ticks are contiguous
+        TickFlag.RAMPING: ticks["tick"] < parameters.ramp_ticks,
+        TickFlag.CONTACT: ticks["contacts"] > 0,
+    }
+    for flag, is_due in expected.items():
+        wrong = ((ticks["flags"] & int(flag)) != 0) != is_due
+        if wrong.any():
+            tick = int(np.argmax(wrong))
+            name = (flag.name or "").lower()
+            return _Fault(f"flag '{name}' of tick {tick} contradicts the record", tick, "flags")
     return None
 
 
@@ -280,7 +307,7 @@ def _physics_fault(ticks: NDArray[np.void], balance: Balance) -> _Fault | None:
 def _first(
     name: str, difference: NDArray[np.float64], allowed: NDArray[np.float64], unit: str, by: str
 ) -> _Fault | None:
-    wrong = difference > allowed
+    wrong = ~(difference <= allowed)  # also where a sum overflowed to NaN
     if not wrong.any():
         return None
     tick = int(np.argmax(wrong))
@@ -319,7 +346,7 @@ def _judged(facts: dict[str, Any], balance: Balance, *, strict: bool) -> AuditRe
         return AuditReport(**facts, verdict="passive", environment="strict", reason=reason)
     if not active.any() and not strict:
         reason = (
-            f"contact created energy at times, within the slack that the coupling leaves "
+            f"energy was created at times, within the slack that the coupling leaves "
             f"({share:.0%} of it used)"
         )
         return AuditReport(

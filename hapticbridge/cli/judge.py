@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -10,11 +11,12 @@ from typing import Annotated
 import tyro
 
 from hapticbridge.audit import AuditReport, audit
-from hapticbridge.cli.terminal import err, out, quantity
+from hapticbridge.cli.terminal import err, out, plain, print_error, quantity
 from hapticbridge.errors import RecordingError
 from hapticbridge.recording import read_recording, repair
-from hapticbridge.report import plot_recording, write_report
+from hapticbridge.report import check_ending, plot_recording, write_report
 
+_USUAL_EVENTS = ("start", "stop", "input")
 _COLOURS = {"passive": "green", "active": "red", "invalid": "magenta"}
 
 
@@ -45,42 +47,62 @@ class Audit:
             raise RecordingError("audit needs at least one recording")
         if len(self.files) > 1 and (self.plot or self.report):
             raise RecordingError("--plot and --report take one recording at a time")
-        reports = []
+        if self.plot is not None:
+            check_ending(self.plot)
+        reports, unreadable = [], 0
         for file in self.files:
-            with err.status(f"auditing {file} …"):
-                report = audit(file, strict=self.strict)
+            try:
+                with err.status(f"auditing {plain(str(file))} …"):
+                    report = audit(file, strict=self.strict)
+            except RecordingError as error:
+                if len(self.files) == 1:
+                    raise
+                print_error(error)  # one bad file must not hide what the others are
+                unreadable = 2
+                continue
             reports.append(report)
             if not self.as_json:
                 _print_report(report)
         if self.as_json:
             out.print_json(json.dumps([json.loads(report.to_json()) for report in reports]))
+        if self.plot is not None or self.report is not None:
+            self._draw(reports[0])
+        return max(unreadable, *(report.exit_code for report in reports), 0)
+
+    def _draw(self, report: AuditReport) -> None:
+        recording = read_recording(report.path)
         with err.status("drawing …"):
             if self.plot is not None:
-                plot_recording(read_recording(self.files[0]), self.plot)
+                plot_recording(recording, self.plot)
             if self.report is not None:
-                write_report(read_recording(self.files[0]), reports[0], self.report)
+                write_report(recording, report, self.report)
         for written in (self.plot, self.report):
             if written is not None:
-                err.print(f"wrote {written}")
-        return max(report.exit_code for report in reports)
+                err.print(f"wrote {plain(str(written))}")
 
 
 def _print_report(report: AuditReport) -> None:
     colour = _COLOURS[report.verdict]
     environment = f" ({report.environment})" if report.environment else ""
-    out.print(f"{report.path}: [bold {colour}]{report.verdict}[/]{environment}")
-    out.print(f"  {report.reason}")
-    if report.resimulation:
+    out.print(f"{plain(str(report.path))}: [bold {colour}]{report.verdict}[/]{environment}")
+    out.print(f"  {plain(report.reason)}")
+    if report.resimulation.startswith("not"):
+        out.print(f"  [yellow]{plain(report.resimulation)}[/]")
+    elif report.resimulation:
         out.print(f"  simulated again: {report.resimulation}")
     for condition in report.conditions:
-        out.print(f"  {condition}")
+        out.print(f"  {plain(condition)}")
     if not report.conditions:
         out.print("  device condition b >= KT/2 + B: not applicable, the damping is not known")
     if report.is_cut:
         out.print(
             "  the file is cut: the verdict is on what it holds; "
-            f"'hapticbridge repair {report.path} OUTPUT' makes it whole"
+            f"'hapticbridge repair {plain(shlex.quote(str(report.path)))} OUTPUT' makes it whole"
         )
+    told = {name: count for name, count in report.events.items() if name not in _USUAL_EVENTS}
+    if told:
+        listed = ", ".join(f"{name} ({count})" for name, count in told.items())
+        out.print(f"  events: {plain(listed)}")
     out.print(f"  {report.ticks} ticks, {report.duration:.3f} s", end="")
     for name, joules in report.energies.items():
         out.print(f", {name.replace('_', ' ')} {quantity(joules, 'J')}", end="")
@@ -91,7 +113,8 @@ def _print_report(report: AuditReport) -> None:
 class Repair:
     """Make a whole file of a recording that was cut by a crash.
 
-    Example:
+    All whole chunks are kept, and an event says what was done. Example:
+
         hapticbridge repair cut.mcap whole.mcap
     """
 
@@ -102,7 +125,8 @@ class Repair:
 
     def execute(self) -> int:
         """Repairs; returns the exit code."""
-        with err.status(f"repairing {self.file} …"):
+        with err.status(f"repairing {plain(str(self.file))} …"):
             mended = repair(self.file, self.output)
-        out.print(f"wrote {self.output}: {len(mended.ticks)} ticks, {len(mended.events)} events")
+        found = f"{len(mended.ticks)} ticks, {len(mended.events)} events"
+        out.print(f"wrote {plain(str(self.output))}: {found}")
         return 0

@@ -13,7 +13,7 @@ from rich.markup import escape
 from hapticbridge.cli.judge import Audit, Repair
 from hapticbridge.cli.run import Run
 from hapticbridge.cli.scenes import Scenes
-from hapticbridge.cli.terminal import err
+from hapticbridge.cli.terminal import err, print_error
 from hapticbridge.errors import HapticBridgeError, SafetyTrip
 
 Command = (
@@ -31,21 +31,26 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     0 done, 1 done with a negative verdict, 2 bad input or usage, 3 safety trip.
     """
-    warnings.showwarning = _show_warning  # type: ignore[assignment] # parameter names differ
     command = tyro.cli(
         Command,
         prog="hapticbridge",
         description="Feel a MuJoCo scene through a haptic device.",
         args=arguments,
-        config=(tyro.conf.OmitSubcommandPrefixes, tyro.conf.FlagCreatePairsOff),
+        config=(
+            tyro.conf.OmitSubcommandPrefixes,
+            tyro.conf.FlagCreatePairsOff,
+            tyro.conf.DisallowNone,
+        ),
     )
     try:
-        return int(command.execute())
+        with warnings.catch_warnings():
+            warnings.showwarning = _show_warning  # type: ignore[assignment] # names differ
+            return int(command.execute())
     except SafetyTrip as trip:
         err.print(f"[red]safety trip:[/red] {escape(str(trip))}")
         return SAFETY_TRIP
     except HapticBridgeError as error:
-        err.print(f"[red]error:[/red] {escape(str(error))}")
+        print_error(error)
         return USAGE_ERROR
     except KeyboardInterrupt:
         err.print("interrupted")

@@ -14,21 +14,17 @@ import tyro
 from rich.markup import escape
 from rich.table import Table
 
-from hapticbridge.bridge import Bridge, device_for
+from hapticbridge.bridge import Bridge
 from hapticbridge.certificate import default_coupling, device_conditions
 from hapticbridge.cli.terminal import err, out, quantity
-from hapticbridge.clock import RealClock, SimulatedClock
+from hapticbridge.clock import RealClock, SimulatedClock, period_of
 from hapticbridge.coupling import Coupling
-from hapticbridge.device import DeviceInfo
+from hapticbridge.device import DeviceInfo, device_for
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.guard import Limits
 from hapticbridge.rendering import IMPLICIT
 from hapticbridge.scene import load_scene
 from hapticbridge.summary import Summary
-
-LOWEST_RATE, HIGHEST_RATE = 1.0, 1e6
-"""In Hz. Below one tick a second nothing can be felt; above 1 MHz no step of MuJoCo fits between two
-ticks, and the clock's nanoseconds become too coarse."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,13 +128,9 @@ class Run:
 
     def _coupling(self, info: DeviceInfo, scales: tuple[float, float]) -> Coupling:
         """Returns the default coupling with what the user asked for put in its place."""
-        if not LOWEST_RATE <= self.rate <= HIGHEST_RATE:
-            raise HapticBridgeError(
-                f"rate is {self.rate!r} Hz; it must be {LOWEST_RATE:g} to {HIGHEST_RATE:g}"
-            )
         asked = {field.name: getattr(self, field.name) for field in fields(Coupling)}
         given = {name: value for name, value in asked.items() if value is not None}
-        return replace(default_coupling(info, 1.0 / self.rate, *scales), **given)
+        return replace(default_coupling(info, period_of(self.rate), *scales), **given)
 
 
 def _announce(bridge: Bridge, scales: tuple[float, float]) -> None:

@@ -15,13 +15,16 @@ from hapticbridge.scene import load_scene, scene_names
 class Scenes:
     """List the scenes that come with hapticbridge.
 
-    Example:
+    Any of them, or any MJCF file, can be given to 'hapticbridge run'. Example:
+
         hapticbridge scenes
     """
 
     def execute(self) -> int:
         """Prints the table; returns the exit code."""
-        table = Table("scene", "moving bodies", "degrees of freedom", "about", box=None, pad_edge=False)
+        table = Table(
+            "scene", "moving bodies", "degrees of freedom", "about", box=None, pad_edge=False
+        )
         for name in scene_names():
             model = load_scene(name).model
             moving = int((model.body_dofnum > 0).sum())

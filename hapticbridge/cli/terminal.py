@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 from rich.console import Console
+from rich.markup import escape
 
 out = Console(highlight=False, soft_wrap=True)
 """Results, on stdout."""
@@ -13,6 +14,19 @@ err = Console(stderr=True, highlight=False, soft_wrap=True)
 """Progress, warnings and errors, on stderr, so that a pipe gets results alone."""
 
 _PREFIXES = ((1.0, ""), (1e-3, "m"), (1e-6, "µ"), (1e-9, "n"))
+
+
+def plain(text: str) -> str:
+    """Returns text from a file or a user as it can be printed.
+
+    What it holds is taken neither as the console's markup nor as control codes of the terminal.
+    """
+    return escape("".join(letter if letter.isprintable() else "�" for letter in text))
+
+
+def print_error(error: Exception) -> None:
+    """Prints what went wrong on stderr, in one line."""
+    err.print(f"[red]error:[/red] {plain(' '.join(str(error).splitlines()))}")
 
 
 def quantity(value: float, unit: str) -> str:

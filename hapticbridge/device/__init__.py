@@ -2,6 +2,7 @@
 
 from hapticbridge.device.base import Device as Device
 from hapticbridge.device.base import DeviceInfo as DeviceInfo
+from hapticbridge.device.library import device_for as device_for
 from hapticbridge.device.library import open_device as open_device
 from hapticbridge.device.motion import Motion as Motion
 from hapticbridge.device.motion_csv import read_motion as read_motion

@@ -12,6 +12,7 @@ from hapticbridge.device.motion_csv import read_motion
 from hapticbridge.device.simulated import Hand, SimulatedDevice
 from hapticbridge.device.trajectory import ReplayDevice, TrajectoryDevice
 from hapticbridge.errors import DeviceError, choices
+from hapticbridge.scene import Scene
 
 _MCAP_MAGIC = b"\x89MCAP0\r\n"
 _HAND_PREFIX = "hand_"
@@ -49,6 +50,22 @@ def open_device(spec: str, **options: object) -> Device:
     if name not in _OPENERS:
         raise DeviceError(f"unknown device '{name}'; there are {choices(_OPENERS)}")
     return _OPENERS[name](rest, options)
+
+
+def device_for(scene: Scene, spec: str) -> Device:
+    """Opens a device for a scene; the simulated one's hand follows ``NAME.csv`` beside the scene.
+
+    Args:
+        scene: The scene that the device will move in.
+        spec: What ``open_device`` understands.
+
+    Raises:
+        DeviceError: See ``open_device``.
+    """
+    path = scene.path.with_suffix(".csv")
+    if spec.partition(":")[0] == "simulated" and path.is_file():
+        return open_device(spec, path=path)
+    return open_device(spec)
 
 
 def _open_simulated(rest: str, options: Mapping[str, object]) -> Device:

@@ -1,0 +1,161 @@
+"""Recordings to audit: honest runs, and the same files with something changed and signed anew."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticbridge.bridge import Bridge
+from hapticbridge.clock import SimulatedClock
+from hapticbridge.coupling import Coupling
+from hapticbridge.device import Device, DeviceInfo
+from hapticbridge.guard import Limits
+from hapticbridge.provenance import MODEL_ATTACHMENT
+from hapticbridge.recording import Attachment, Recording, RecordingWriter
+from hapticbridge.scene import Scene
+from hapticbridge.summary import Summary
+from hapticbridge.tick import SAMPLE_DTYPE, TICK_DTYPE
+
+COUPLING = Coupling(
+    stiffness=2400.0, damping=0.5, rotational_stiffness=2.4, rotational_damping=5e-4
+)
+
+FLOAT_FIELDS = tuple(name for name in TICK_DTYPE.names or () if TICK_DTYPE[name].base.kind == "f")
+
+COMPONENTS = tuple(
+    (name, index)
+    for name in FLOAT_FIELDS
+    for index in range(int(np.prod(TICK_DTYPE[name].shape, dtype=int)))
+)
+"""Every floating-point number of a record: field and index in it."""
+
+TAP = """t,x,y,z,qw,qx,qy,qz
+0,0,0,0,1,0,0,0
+0.05,0.0003,0.0002,-0.009,0.9999,0.0141,0,0
+0.10,0.0006,0.0001,-0.0125,0.9998,0.0141,0.0141,0
+0.15,0.0012,-0.0004,-0.0105,1,0,0,0
+0.20,0.0014,0.0003,-0.0130,0.9998,0,0.0141,0.0141
+"""
+"""A hand that taps the mouth of the hole in every direction, off centre and tilted."""
+
+
+def recorded(
+    path: Path,
+    scene: str | Path | Scene = "peg_in_hole",
+    device: str | Device = "simulated",
+    coupling: Coupling | None = None,
+    *,
+    duration: float | None = None,
+    on_tick: Callable[[Bridge, int], None] | None = None,
+    **options: Any,
+) -> Summary:
+    """Runs a bridge in simulated time into a file."""
+    options.setdefault("clock", SimulatedClock())
+    options.setdefault("limits", Limits(force=10.0, torque=0.5, ramp=0.05))
+    with Bridge(scene, device, coupling, recording=path, **options) as bridge:
+        return bridge.run(duration, on_tick and (lambda tick: on_tick(bridge, tick)))
+
+
+def tapped(folder: Path, name: str = "tap.mcap", **options: Any) -> Path:
+    """Records a short run of the peg in contact; every number of its records is at work."""
+    motion = folder / "tap.csv"
+    motion.write_text(TAP)
+    recorded(folder / name, device=f"trajectory:{motion}", **options)
+    return folder / name
+
+
+def rewritten(
+    recording: Recording,
+    path: Path,
+    *,
+    ticks: NDArray[np.void] | None = None,
+    meta: Mapping[str, str] | None = None,
+    events: Sequence[Mapping[str, object]] | None = None,
+    attachments: Mapping[str, bytes] | None = None,
+) -> Path:
+    """Writes a recording with parts changed, and a digest that fits them."""
+    files = {**recording.attachments, **(attachments or {})}
+    writer = RecordingWriter(
+        path,
+        {**recording.meta, **(meta or {})},
+        [Attachment(name, "application/octet-stream", data) for name, data in files.items()],
+        int(recording.meta["epoch_ns"]),
+    )
+    writer.write_ticks(recording.ticks if ticks is None else ticks)
+    for event in recording.events if events is None else events:
+        time = event["time_ns"]
+        writer.write_event(event, time if isinstance(time, int) else 0)
+    writer.close()
+    return path
+
+
+def without_model(recording: Recording) -> Recording:
+    """Leaves out what a re-simulation needs."""
+    files = {name: data for name, data in recording.attachments.items() if name != MODEL_ATTACHMENT}
+    return Recording(**{**vars(recording), "attachments": files})
+
+
+class ScriptedDevice:
+    """A device whose poses come from a function of the tick, and which keeps what it is sent."""
+
+    def __init__(
+        self,
+        pose: Callable[[int], Sequence[float]],
+        *,
+        on_write: Callable[[int], None] | None = None,
+        on_close: Callable[[], None] | None = None,
+    ) -> None:
+        self.info = DeviceInfo(
+            name="scripted",
+            degrees_of_freedom=6,
+            mass=0.1,
+            damping=2.0,
+            rotational_inertia=1e-4,
+            rotational_damping=2e-3,
+            friction=None,
+            resolution=None,
+            force_limit=10.0,
+            torque_limit=0.5,
+            speed_limit=5.0,
+            rate=None,
+            is_prescribed=False,
+            is_real=False,
+            duration=None,
+        )
+        self.writes: list[NDArray[np.float64]] = []
+        self.is_closed = False
+        self._pose = pose
+        self._on_write = on_write
+        self._on_close = on_close
+        self._tick = 0
+
+    def start(self, period: float) -> NDArray[np.void]:
+        self._tick = 0
+        sample = np.zeros(1, SAMPLE_DTYPE)
+        self._report(sample, 0)
+        return sample
+
+    def read(self, sample: NDArray[np.void]) -> None:
+        tick = self._tick
+        self._tick += 1
+        self._report(sample, tick)
+
+    def write(self, wrench: NDArray[np.float64]) -> None:
+        self.writes.append(wrench.copy())
+        if self._on_write is not None:
+            self._on_write(len(self.writes))
+
+    def close(self) -> None:
+        self.is_closed = True
+        if self._on_close is not None:
+            self._on_close()
+
+    def _report(self, sample: NDArray[np.void], tick: int) -> None:
+        pose = self._pose(tick)
+        sample["position"][0] = pose[:3]
+        sample["quaternion"][0] = pose[3:]
+        sample["buttons"] = 0
