@@ -87,9 +87,13 @@ def _index(kind: str, name: str, valid: list[str], everything: list[str]) -> int
 
 def _numbers(what: str, value: ArrayLike, counts: tuple[int, ...]) -> list[float]:
     array = np.atleast_1d(np.asarray(value, dtype=np.float64)).ravel()
-    if array.size not in counts or not np.all(np.isfinite(array)):
+    # MuJoCo takes a larger control for a failure and ignores all, the coupling's included
+    if array.size not in counts or not np.all(np.abs(array) <= mujoco.mjMAXVAL):
         expected = " or ".join(str(count) for count in counts)
-        raise SceneError(f"{what} is {array.tolist()}; it must be {expected} finite numbers")
+        raise SceneError(
+            f"{what} is {array.tolist()}; it must be {expected} finite numbers up to "
+            f"{mujoco.mjMAXVAL:g}"
+        )
     return [float(number) for number in array]
 
 

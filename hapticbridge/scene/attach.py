@@ -14,6 +14,9 @@ import numpy as np
 from hapticbridge.errors import SceneError, choices
 from hapticbridge.kernel.state import COUPLING_ACTUATORS, HANDLE
 
+_PREFIX = "hapticbridge_"
+"""Keeps the default class that comes along with the handle apart from the scene's classes."""
+
 
 def attach_handle(spec: mujoco.MjSpec, grip: str) -> None:
     """Adds the mocap body ``handle`` with its site, and the six coupling actuators.
@@ -35,8 +38,12 @@ def attach_handle(spec: mujoco.MjSpec, grip: str) -> None:
     for name in COUPLING_ACTUATORS:
         _refuse_taken("actuator", name, [actuator.name for actuator in spec.actuators])
 
-    body = spec.worldbody.add_body(name=HANDLE, mocap=True, pos=[0, 0, 0], quat=[1, 0, 0, 0])
-    body.add_site(name=HANDLE, pos=[0, 0, 0], quat=[1, 0, 0, 0])
+    # made apart: a <default> of the scene would turn its site, boundmass would give it weight
+    apart = mujoco.MjSpec()
+    made = apart.worldbody.add_body(name=HANDLE, mocap=True)
+    made.add_site(name=HANDLE)
+    body = spec.worldbody.add_frame().attach_body(made, _PREFIX, "")
+    body.name = body.sites[0].name = HANDLE
     for axis, name in enumerate(COUPLING_ACTUATORS):
         _add_coupling_actuator(spec, name, axis, grip)
 
@@ -44,8 +51,7 @@ def attach_handle(spec: mujoco.MjSpec, grip: str) -> None:
 def _refuse_taken(kind: str, name: str, taken: list[str]) -> None:
     if name in taken:
         raise SceneError(
-            f"the scene already has a {kind} called '{name}', a name that the bridge adds; "
-            "rename yours"
+            f"the scene already has {kind} '{name}', a name that the bridge adds; rename yours"
         )
 
 
@@ -70,6 +76,26 @@ def _add_coupling_actuator(spec: mujoco.MjSpec, name: str, axis: int, grip: str)
     for field in ("nsample", "interp", "group", "ctrlspec"):
         setattr(actuator, field, 0)
     actuator.damping = np.zeros(3)
+
+
+def seat_handle(model: mujoco.MjModel, grip: str) -> None:
+    """Puts the handle at the grip, in ``qpos0`` and in every keyframe of a compiled model.
+
+    Args:
+        model: A scene with the handle; changed in place.
+        grip: Name of the site on the tool.
+    """
+    data = mujoco.MjData(model)
+    body_id, site_id = model.body(HANDLE).id, model.site(grip).id
+    mocap_id = int(model.body_mocapid[body_id])
+    mujoco.mj_kinematics(model, data)
+    model.body_pos[body_id] = data.site_xpos[site_id]
+    model.body_quat[body_id] = data.site_xquat[site_id]
+    for key in range(model.nkey):
+        mujoco.mj_resetDataKeyframe(model, data, key)
+        mujoco.mj_kinematics(model, data)
+        model.key_mpos[key].reshape(-1, 3)[mocap_id] = data.site_xpos[site_id]
+        model.key_mquat[key].reshape(-1, 4)[mocap_id] = data.site_xquat[site_id]
 
 
 def set_options(spec: mujoco.MjSpec) -> None:

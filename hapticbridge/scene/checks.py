@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterable
+
 import mujoco
 import numpy as np
 
 from hapticbridge.errors import SceneError
 from hapticbridge.kernel.state import COUPLING_ACTUATORS
+from hapticbridge.scene.source import SourceFile, read_elements
 
 MAXIMUM_START_PENETRATION = 1e-4
 """How deep the tool may start inside something, in m. A start in penetration releases contact
@@ -64,6 +68,37 @@ def check_options(spec: mujoco.MjSpec) -> list[str]:
     return warnings
 
 
+_MASSES = ("mass", "density", "diaginertia", "fullinertia")
+
+
+def check_numbers(sources: Iterable[SourceFile]) -> None:
+    """Refuses masses and inertias that are not finite where they are written.
+
+    MuJoCo takes ``mass="nan"`` for a mass that was not given, and computes one.
+
+    Raises:
+        SceneError: Names the file, the line, the element and the value.
+    """
+    for source in sources:
+        if not source.name.lower().endswith(".xml"):
+            continue
+        for element in read_elements(source.data):
+            for attribute in _MASSES:
+                value = element.attributes.get(attribute, "")
+                if not all(_is_finite(word) for word in value.split()):
+                    raise SceneError(
+                        f"{source.name}, line {element.line}: {attribute} of <{element.tag}> is "
+                        f"'{value}'; masses and inertias must be finite"
+                    )
+
+
+def _is_finite(word: str) -> bool:
+    try:
+        return math.isfinite(float(word))
+    except ValueError:
+        return True  # MuJoCo says better what is wrong with it
+
+
 def check_model(model: mujoco.MjModel, grip: str) -> list[str]:
     """Refuses a compiled model that cannot be coupled; returns warnings.
 
@@ -75,22 +110,22 @@ def check_model(model: mujoco.MjModel, grip: str) -> list[str]:
         mass, inertia = model.body_mass[body_id], model.body_inertia[body_id]
         if not np.isfinite(mass) or not np.all(np.isfinite(inertia)):
             raise SceneError(
-                f"body '{model.body(body_id).name}' has mass {mass:g} kg and inertia "
+                f"{_body_name(model, body_id)} has mass {mass:g} kg and inertia "
                 f"{inertia.tolist()} kg m²; all must be finite"
             )
     chain = _ancestors(model, int(model.site(grip).bodyid[0]))
     if not any(model.body_dofnum[body_id] for body_id in chain):
-        body = model.body(chain[0]).name or "world"
         raise SceneError(
-            f"grip '{grip}' sits on body '{body}', which cannot move; put it on a body with a "
-            "free joint or at the end of joints"
+            f"grip '{grip}' sits on {_body_name(model, chain[0])}, which cannot move; put it on a "
+            "body with a free joint or at the end of joints"
         )
     for body_id in chain:
         first = model.body_jntadr[body_id]
         for joint_id in range(first, first + model.body_jntnum[body_id]):
             if model.jnt_actfrclimited[joint_id]:
+                name = model.joint(joint_id).name or str(joint_id)
                 raise SceneError(
-                    f"joint '{model.joint(joint_id).name}' limits actuator forces "
+                    f"joint '{name}' of {_body_name(model, body_id)} limits actuator forces "
                     "(actuatorfrcrange), which would cap the coupling; remove it and limit the "
                     "actuator's own forcerange"
                 )
@@ -144,24 +179,36 @@ def check_start(model: mujoco.MjModel, data: mujoco.MjData, grip: str) -> None:
     Raises:
         SceneError: Names the pair of geoms and the depth.
     """
-    if not (np.all(np.isfinite(data.qpos)) and np.all(np.isfinite(data.qacc))):
-        raise SceneError("the scene's start is not finite; check keyframe 'home' and qpos0")
+    for name in ("qpos", "qvel", "act", "ctrl", "mocap_pos", "mocap_quat", "qacc"):
+        if not np.all(np.abs(getattr(data, name)) <= mujoco.mjMAXVAL):
+            raise SceneError(
+                f"the scene's start is not finite, or beyond {mujoco.mjMAXVAL:g}, in {name}; check "
+                "keyframe 'home' and qpos0"
+            )
     root = model.body_rootid[model.site(grip).bodyid[0]]
     for contact in data.contact:
-        pair = [int(geom) for geom in contact.geom]
-        if contact.dist >= -MAXIMUM_START_PENETRATION or min(pair) < 0:
+        if contact.dist >= -MAXIMUM_START_PENETRATION:
             continue
-        if any(model.body_rootid[model.geom_bodyid[geom]] == root for geom in pair):
-            names = " and ".join(_geom_name(model, geom) for geom in pair)
+        pair = [
+            (int(geom), int(flex)) for geom, flex in zip(contact.geom, contact.flex, strict=True)
+        ]
+        roots = [model.body_rootid[model.geom_bodyid[geom]] for geom, _ in pair if geom >= 0]
+        if root in roots:
+            names = " and ".join(_side_name(model, geom, flex) for geom, flex in pair)
             raise SceneError(
                 f"the tool starts {-contact.dist * 1e3:.3g} mm inside something: {names} overlap; "
                 f"at most {MAXIMUM_START_PENETRATION * 1e3:g} mm are allowed"
             )
 
 
-def _geom_name(model: mujoco.MjModel, geom_id: int) -> str:
+def _side_name(model: mujoco.MjModel, geom_id: int, flex_id: int) -> str:
+    if geom_id < 0:
+        return f"flex '{mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_FLEX, flex_id) or flex_id}'"
     name = model.geom(geom_id).name
     if name:
         return f"geom '{name}'"
-    body = model.body(model.geom_bodyid[geom_id]).name or "world"
-    return f"geom {geom_id} of body '{body}'"
+    return f"geom {geom_id} of {_body_name(model, int(model.geom_bodyid[geom_id]))}"
+
+
+def _body_name(model: mujoco.MjModel, body_id: int) -> str:
+    return f"body '{model.body(body_id).name or body_id}'" if body_id else "the world"

@@ -34,9 +34,16 @@ def scene_path(path_or_name: str | Path) -> Path:
     Raises:
         SceneError: There is neither such a file nor such a name.
     """
+    if not str(path_or_name):
+        raise SceneError(
+            f"the scene's name is empty; give an MJCF file or one of: {choices(scene_names())}"
+        )
     path = Path(path_or_name)
-    if path.is_file():
-        return path
+    try:
+        if path.is_file():
+            return path
+    except OSError as error:
+        raise SceneError(f"cannot read scene '{path!s:.80}': {error.strerror}") from None
     if path.is_dir():
         raise SceneError(f"scene '{path}' is a folder; name the MJCF file in it")
     name = str(path_or_name)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,8 +14,8 @@ import numpy as np
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import SceneError
 from hapticbridge.kernel.state import COUPLING_ACTUATORS, HANDLE
-from hapticbridge.scene.attach import attach_handle, set_options
-from hapticbridge.scene.checks import check_model, check_options, check_start
+from hapticbridge.scene.attach import attach_handle, seat_handle, set_options
+from hapticbridge.scene.checks import check_model, check_numbers, check_options, check_start
 from hapticbridge.scene.library import scene_path
 from hapticbridge.scene.source import SourceFile, collect_sources
 
@@ -51,6 +53,7 @@ class Scene:
             mujoco.mj_resetDataKeyframe(model, data, key)
         else:
             mujoco.mj_resetData(model, data)
+        # the model has it there too, unless its start was changed since it was loaded
         mujoco.mj_kinematics(model, data)
         handle = model.body_mocapid[model.body(HANDLE).id]
         data.mocap_pos[handle] = data.site(self.grip).xpos
@@ -107,23 +110,47 @@ def load_scene(path_or_name: str | Path, grip: str = "grip") -> Scene:
     path = scene_path(path_or_name)
     try:
         spec = mujoco.MjSpec.from_file(str(path))
+        sources = collect_sources(path)
     except (ValueError, OSError) as error:
-        raise SceneError(f"cannot read scene '{path}': {_one_line(error)}") from None
+        raise SceneError(f"cannot read scene '{path}': {_sentence(error)}") from None
     concerns = check_options(spec)
+    check_numbers(sources)
     attach_handle(spec, grip)
     set_options(spec)
     try:
         model = spec.compile()
-    except (ValueError, OSError) as error:
-        raise SceneError(f"cannot compile scene '{path}': {_one_line(error)}") from None
-    concerns += check_model(model, grip)
-    scene = Scene(path, grip, model, mujoco.MjData(model), collect_sources(path))
-    scene.reset()
+        concerns += check_model(model, grip)
+        seat_handle(model, grip)
+        scene = Scene(path, grip, model, mujoco.MjData(model), sources)
+        scene.reset()
+    except (ValueError, OSError, MemoryError, mujoco.FatalError) as error:
+        raise SceneError(f"cannot compile scene '{path}': {_sentence(error)}") from None
     check_start(model, scene.data, grip)
     for concern in concerns:
         warnings.warn(f"scene '{path}': {concern}", UserWarning, stacklevel=2)
     return scene
 
 
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split())
+def _malformed(match: re.Match[str]) -> str:
+    fault, line, element = match[1].replace("_", " ").lower(), match[2], match[3]
+    where = f" '{element}'" if element else ""
+    return f"line {line} is not well-formed XML ({fault}{where})"
+
+
+_WORDING: tuple[tuple[str, str | Callable[[re.Match[str]], str]], ...] = (
+    (r".*XML_ERROR_(\w+) .*?Line number=(\d+)(?:: XMLElement name=([^\s']+))?.*", _malformed),
+    (r"((XML )?Error|ParseXML): ", ""),
+    (r",? Element name '(.*?)', id (\d+)(, line \d+)?", r" (element '\1', id \2\3)"),
+    (r" Element '(.*?)', line 0", r" (element '\1' of an included file)"),
+    (r" Element '(.*?)', line (\d+)", r" (element '\1', line \2)"),
+    (r"could not find decoder.*", "its name must end in .xml"),
+    (r"(engine error: Could not allocate memory)", r"\1; ask for less in <size>"),
+)
+"""How MuJoCo words an error, and how it reads as part of a sentence."""
+
+
+def _sentence(error: Exception) -> str:
+    text = " ".join(str(error).split())
+    for pattern, wording in _WORDING:
+        text = re.sub(pattern, wording, text)
+    return text or type(error).__name__

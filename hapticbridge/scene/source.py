@@ -1,16 +1,17 @@
 """The original bytes of a scene: its XML, what it includes, and the assets it names.
 
 A recording keeps them, because what MuJoCo writes back is not what was read: ``to_xml`` rounds
-numbers to 6 digits and ``to_zip`` leaves assets out.
+numbers to 6 digits and ``to_zip`` leaves assets out. Its list of dependencies
+(``mju_getXMLDependencies``) has no order and looks for height fields in the wrong folder.
 """
 
 from __future__ import annotations
 
-import os
-from collections.abc import Iterator
+import re
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from html import unescape
 from pathlib import Path
-from xml.etree import ElementTree
 
 _FILE_ATTRIBUTES = (
     "file",
@@ -20,7 +21,14 @@ _FILE_ATTRIBUTES = (
     "filedown",
     "filefront",
     "fileback",
+    "filename",  # URDF
 )
+
+# MuJoCo's parser accepts more than well-formed XML ("--" in a comment, a bare "&"), and so must
+# whoever looks for the files that it read.
+_NOT_AN_ELEMENT = re.compile(r"<!--.*?-->|<\?.*?\?>|<![A-Z].*?>", re.DOTALL)
+_ELEMENT = re.compile(r"<([A-Za-z_][\w.:-]*)((?:\s+[\w.:-]+\s*=\s*(?:\"[^\"]*\"|'[^']*'))*)\s*/?>")
+_ATTRIBUTE = re.compile(r"([\w.:-]+)\s*=\s*(?:\"([^\"]*)\"|'([^']*)')")
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,7 +36,8 @@ class SourceFile:
     """One file of a scene.
 
     Attributes:
-        name: Path relative to the folder of the scene's main file, with forward slashes.
+        name: Path relative to the deepest folder that holds all files of the scene, with forward
+            slashes; that is the folder of the main file if nothing lies outside it.
         data: The file's bytes.
     """
 
@@ -36,54 +45,130 @@ class SourceFile:
     data: bytes
 
 
-def collect_sources(path: Path) -> tuple[SourceFile, ...]:
-    """Returns the main file and everything it refers to that can be found beside it.
+@dataclass(frozen=True, slots=True)
+class Element:
+    """One element of an XML file.
 
-    MuJoCo has already compiled the scene when this runs, so what cannot be found here (a file in a
-    search path of MuJoCo's own) is left out instead of refused.
+    Attributes:
+        tag: Its name.
+        attributes: Their values by name.
+        line: Where it starts, counted from 1.
     """
-    root = path.parent
-    found: dict[str, Path] = {}
-    _walk(path, root, found)
-    return tuple(SourceFile(name, file.read_bytes()) for name, file in found.items())
+
+    tag: str
+    attributes: dict[str, str]
+    line: int
 
 
-def _walk(path: Path, root: Path, found: dict[str, Path]) -> None:
-    name = Path(os.path.relpath(path, root)).as_posix()
-    if name in found or not path.is_file():
+def collect_sources(path: Path) -> tuple[SourceFile, ...]:
+    """Returns the main file, first, and everything it refers to that can be found.
+
+    MuJoCo has already read the scene when this runs, so what cannot be found here (a file in a
+    search path of MuJoCo's own) is left out instead of refused. Written into an empty folder under
+    their names, the files compile to the same model.
+    """
+    found: dict[Path, Path] = {}
+    _find_files(path, found)
+    root = path.absolute().parent
+    while not all(file.is_relative_to(root) for file in found) and root != root.parent:
+        root = root.parent
+    names = (file.relative_to(root if file.is_relative_to(root) else file.anchor) for file in found)
+    return tuple(
+        SourceFile(name.as_posix(), file.read_bytes())
+        for name, file in zip(names, found.values(), strict=True)
+    )
+
+
+def read_elements(data: bytes) -> Iterator[Element]:
+    """Yields the elements of an XML file in order; what is not an element is passed over."""
+    text = data.decode("utf-8-sig", errors="replace")
+    text = _NOT_AN_ELEMENT.sub(lambda match: "\n" * match[0].count("\n"), text)
+    line, end = 1, 0
+    for match in _ELEMENT.finditer(text):
+        line, end = line + text.count("\n", end, match.start()), match.start()
+        attributes = {
+            name: unescape(double or single)
+            for name, double, single in _ATTRIBUTE.findall(match[2])
+        }
+        yield Element(match[1], attributes, line)
+
+
+def _find_files(path: Path, found: dict[Path, Path]) -> None:
+    """Adds a model's file, its includes, its assets and the models that it attaches."""
+    if _key(path) in found:
         return
-    found[name] = path
-    try:
-        element_root = ElementTree.fromstring(path.read_bytes())
-    except (ElementTree.ParseError, ValueError):
-        return  # an asset, or XML that only MuJoCo's parser accepts
-    folders = _asset_folders(element_root)
-    for element in element_root.iter():
+    found[_key(path)] = path
+    elements = list(_expanded(path, path.parent, {path}))
+    folders = _asset_folders([element for element, _ in elements])
+    for element, namer in elements:
         for attribute in _FILE_ATTRIBUTES:
-            reference = element.get(attribute)
+            reference = element.attributes.get(attribute)
             if reference is None:
                 continue
-            for candidate in _candidates(reference, path.parent, root, folders):
-                if candidate.is_file():
-                    is_xml = element.tag in {"include", "model"}
-                    if is_xml:
-                        _walk(candidate, root, found)
-                    else:
-                        key = Path(os.path.relpath(candidate, root)).as_posix()
-                        found.setdefault(key, candidate)
-                    break
+            homes = path.parent, namer.parent
+            file = _existing(_candidates(reference, element.tag, homes, folders))
+            if file is None:
+                continue
+            if element.tag == "model":
+                _find_files(file, found)
+            else:
+                found.setdefault(_key(file), file)
 
 
-def _asset_folders(root: ElementTree.Element) -> list[str]:
-    compiler = root.iter("compiler")
-    names = ("meshdir", "texturedir", "assetdir")
-    return [value for element in compiler for name in names if (value := element.get(name))]
+def _key(path: Path) -> Path:
+    """Returns the path without ``..``, which would lead out of a folder of copies."""
+    parts: list[str] = []
+    for part in path.absolute().parts:
+        if part == "..":
+            del parts[-1:]
+        else:
+            parts.append(part)
+    return Path(*parts)
 
 
-def _candidates(reference: str, folder: Path, root: Path, assets: list[str]) -> Iterator[Path]:
-    for base in dict.fromkeys((folder, root)):
-        for asset_folder in assets:
-            yield base / asset_folder / reference
-            yield base / asset_folder / Path(reference).name  # compiler strippath
-        yield base / reference
-        yield base / Path(reference).name
+def _expanded(path: Path, folder: Path, seen: set[Path]) -> Iterator[tuple[Element, Path]]:
+    """Yields the elements of an MJCF file and of its includes, each with the file it stands in."""
+    for element in read_elements(path.read_bytes()):
+        yield element, path
+        if element.tag == "include" and "file" in element.attributes:
+            included = _existing(_beside(element.attributes["file"], (folder, path.parent)))
+            if included is not None and included not in seen:
+                seen.add(included)
+                yield from _expanded(included, folder, seen)
+
+
+def _asset_folders(elements: list[Element]) -> dict[str, str]:
+    """Returns the compiler's folders, of which the last one set holds for the whole model."""
+    folders = {"meshdir": "", "texturedir": "", "strippath": "false"}
+    for element in elements:
+        if element.tag == "compiler":
+            shared = element.attributes.get("assetdir")
+            if shared is not None:
+                folders["meshdir"] = folders["texturedir"] = shared
+            folders |= {n: v for n, v in element.attributes.items() if n in folders}
+    return folders
+
+
+def _candidates(
+    reference: str, tag: str, homes: tuple[Path, Path], folders: dict[str, str]
+) -> Iterator[Path]:
+    """Yields where MuJoCo looks for an asset, in its order."""
+    if tag in {"include", "model"}:
+        yield from _beside(reference, homes)
+        return
+    folder = folders["texturedir" if tag == "texture" else "meshdir"]
+    is_stripped = folders["strippath"] == "true"
+    name = reference.replace("\\", "/").rsplit("/", 1)[-1] if is_stripped else reference
+    yield from _beside(f"{folder}/{name}" if folder else name, homes[:1])
+    yield from _beside(name, homes)
+
+
+def _beside(reference: str, homes: Sequence[Path]) -> Iterator[Path]:
+    """Yields a file relative to the model's folder, then to that of the file that names it."""
+    for name in dict.fromkeys((reference, reference.replace("\\", "/"))):
+        for home in homes:
+            yield home / name
+
+
+def _existing(candidates: Iterator[Path]) -> Path | None:
+    return next((path for path in candidates if path.is_file()), None)

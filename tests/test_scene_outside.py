@@ -1,0 +1,264 @@
+"""Scenes from outside models/, from the file to the verdict: what a user would do, and see."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from outside_scenes import (
+    BALL_JOINT_TOOL,
+    DRAWER,
+    DRAWER_FRICTION,
+    DRAWER_LENGTH,
+    PIN_DEPTH,
+    PIN_GAP,
+    PIN_PRELOAD,
+    PIN_STIFFNESS,
+    SHOULDER,
+    SPRING_PIN,
+    hand_file,
+    scene_file,
+)
+from scipy.spatial.transform import Rotation
+
+import hapticbridge as hb
+
+Array = NDArray[np.float64]
+Stops = list[tuple[float, tuple[float, float, float]]]
+
+K = 2400.0  # of the coupling that a trajectory gets, in N/m
+
+
+@dataclass
+class Outcome:
+    """A recorded run and its audit.
+
+    Attributes:
+        model: The scene's model.
+        qpos: Positions before each tick.
+        ticks: The records as they lie in the file.
+        report: The audit's.
+    """
+
+    model: mujoco.MjModel
+    qpos: Array
+    ticks: NDArray[np.void]
+    report: hb.AuditReport
+
+
+def outcome(folder: Path, text: str, grip: str, stops: Stops) -> Outcome:
+    path, hand = scene_file(folder, text), hand_file(folder, stops)
+    scene = hb.load_scene(path, grip=grip)
+    recording, qpos = folder / "run.mcap", []
+    with hb.Bridge(
+        scene, f"trajectory:{hand}", clock=hb.SimulatedClock(), recording=recording
+    ) as bridge:
+        summary = bridge.run(on_tick=lambda _tick: qpos.append(scene.data.qpos.copy()))
+    assert summary.ticks == round(sum(seconds for seconds, _ in stops) * 1000) + 1
+    report = hb.audit(recording)
+    assert report.resimulation == "bit for bit", report.reason
+    assert report.verdict == "passive", report.reason
+    assert report.environment == summary.environment
+    assert report.certified is None
+    return Outcome(scene.model, np.array(qpos), hb.read_recording(recording).ticks, report)
+
+
+@pytest.fixture(scope="module")
+def pointer(tmp_path_factory: pytest.TempPathFactory) -> Outcome:
+    stops: Stops = [
+        (0.5, (-0.05, 0.03, 0.02)),
+        (0.5, (-0.05, 0.03, 0.02)),
+        (0.5, (-0.02, -0.05, 0.05)),
+        (0.5, (-0.02, -0.05, 0.05)),
+        (0.8, (0.0, 0.0, 0.0)),
+        (0.2, (0.0, 0.0, 0.0)),
+    ]
+    return outcome(tmp_path_factory.mktemp("pointer"), BALL_JOINT_TOOL, "tip", stops)
+
+
+@pytest.fixture(scope="module")
+def pin(tmp_path_factory: pytest.TempPathFactory) -> Outcome:
+    depth = -(PIN_GAP + 0.005)
+    stops: Stops = [
+        (0.8, (0.0, 0.0, depth)),
+        (0.6, (0.0, 0.0, depth)),
+        (0.8, (0.0, 0.0, 0.0)),
+        (0.8, (0.0, 0.0, -(PIN_GAP + PIN_DEPTH + 0.003))),
+        (0.4, (0.0, 0.0, -(PIN_GAP + PIN_DEPTH + 0.003))),
+    ]
+    return outcome(tmp_path_factory.mktemp("pin"), SPRING_PIN, "stylus", stops)
+
+
+@pytest.fixture(scope="module")
+def drawer(tmp_path_factory: pytest.TempPathFactory) -> Outcome:
+    stops: Stops = [
+        (1.0, (0.1, 0.0, 0.0)),
+        (0.4, (0.1, 0.0, 0.0)),
+        (0.8, (0.125, 0.004, -0.002)),
+        (0.4, (0.125, 0.004, -0.002)),
+        (0.8, (-0.005, 0.0, 0.0)),
+    ]
+    return outcome(tmp_path_factory.mktemp("drawer"), DRAWER, "knob", stops)
+
+
+def test_tool_on_a_ball_joint_is_strict_and_its_moments_about_the_joint_balance(
+    pointer: Outcome,
+) -> None:
+    assert pointer.report.environment == "strict"
+    data = mujoco.MjData(pointer.model)
+    for tick in (980, 1980, 2980):
+        row = pointer.ticks[tick]
+        data.qpos[:] = pointer.qpos[tick]
+        mujoco.mj_forward(pointer.model, data)
+        weight = sum(
+            np.cross(data.xipos[i] - SHOULDER, [0, 0, -9.81 * pointer.model.body_mass[i]])
+            for i in (1, 2)
+        )
+        wrench = row["wrench_on_tool"]
+        hand = np.cross(row["tool_position"] - SHOULDER, wrench[:3]) + wrench[3:]
+        # at rest after 0.4 s of damping; the moments themselves are 0.1 N m
+        assert np.linalg.norm(weight) > 0.05
+        assert hand + weight == pytest.approx(np.zeros(3), abs=2e-4)
+
+
+def test_tip_on_a_ball_joint_follows_the_hand_as_far_as_its_links_reach(pointer: Outcome) -> None:
+    ticks = pointer.ticks
+    assert np.ptp(ticks["handle_position"], axis=0) == pytest.approx([0.05, 0.08, 0.05], abs=1e-9)
+    gap = np.linalg.norm(ticks["tool_position"] - ticks["handle_position"], axis=1)
+    assert gap.max() < 0.01
+    force = np.linalg.norm(ticks["wrench_on_tool"][:, :3], axis=1)
+    assert force.max() < K * 0.01
+    # the links keep their lengths: the elbow stays 0.15 m from the shoulder
+    elbow = ticks["tool_position"] - 0.08 * down(ticks)
+    assert np.linalg.norm(elbow - SHOULDER, axis=1) == pytest.approx(0.15, abs=1e-9)
+
+
+def down(ticks: NDArray[np.void]) -> Array:
+    """Direction of the beak; the grip's own frame is turned by 30 degrees against it."""
+    grip = Rotation.from_quat(ticks["tool_quaternion"], scalar_first=True)
+    beak = grip * Rotation.from_euler("y", 30, degrees=True).inv()
+    return np.asarray(beak.apply([0, 0, -1]))
+
+
+def test_pin_gives_way_by_what_its_spring_says_and_comes_back(pin: Outcome) -> None:
+    travel = pin.qpos[:, 0]
+    # the upper stop is soft: it holds the preload 13 µm further up
+    assert np.abs(travel[:300]).max() < 50e-6
+    assert pin.ticks["contacts"][:300].max() == 0
+    pressed = 1390
+    force = -pin.ticks["wrench_on_tool"][pressed, 2]
+    # spring at rest: preload + k · travel, and the coupling's own stretch of force / K
+    assert force == pytest.approx(PIN_PRELOAD - PIN_STIFFNESS * travel[pressed], rel=1e-4)
+    # beyond that, the contact of so light a pin gives way by 36 µm
+    assert -travel[pressed] == pytest.approx(0.005 - force / K, abs=60e-6)
+    assert travel[2100] == pytest.approx(0.0, abs=60e-6)
+    assert pin.ticks["contacts"][2190] == 0
+    # pushed beyond its stop it holds the hand: contact, spring and stop carry 3 mm · K
+    assert travel[-1] == pytest.approx(-PIN_DEPTH, abs=0.2e-3)
+    last = pin.ticks[-1]
+    assert -last["wrench_on_tool"][2] == pytest.approx(0.003 * K, rel=0.1)
+
+
+def test_pin_run_stays_within_slack_and_meters_the_springs_energy(pin: Outcome) -> None:
+    assert pin.report.environment in {"strict", "within slack"}
+    assert pin.ticks["contacts"].max() >= 1
+    pressed = pin.ticks[1390]
+    rest = PIN_PRELOAD / PIN_STIFFNESS
+
+    def stored(q: float) -> float:
+        return 0.5 * PIN_STIFFNESS * (rest - q) ** 2
+
+    assert pin.ticks["potential"][0] == pytest.approx(stored(pin.qpos[1, 0]), rel=1e-9)
+    assert pressed["potential"] == pytest.approx(stored(pin.qpos[1391, 0]), rel=1e-9)
+
+
+def test_drawer_opens_against_its_friction_and_ends_at_its_stops(drawer: Outcome) -> None:
+    assert drawer.report.environment in {"strict", "within slack"}
+    opening = drawer.qpos[:, 0]
+    assert opening[1390] == pytest.approx(0.1, abs=DRAWER_FRICTION / K + 1e-5)
+    force = drawer.ticks["wrench_on_tool"]
+    # in mid-motion, without acceleration; frictionloss is soft by a few per cent
+    assert force[500, 0] == pytest.approx(DRAWER_FRICTION, rel=0.05)
+    assert opening[2590] == pytest.approx(DRAWER_LENGTH, abs=50e-6)
+    assert force[2590] == pytest.approx(
+        [0.005 * K, 0.004 * K, -0.002 * K, 0, 0, 0], rel=0.01, abs=1e-9
+    )
+    assert opening[-1] == pytest.approx(0.0, abs=3e-3)
+    assert opening.max() < DRAWER_LENGTH + 50e-6
+
+
+def test_work_on_the_drawer_is_its_friction_times_its_way(drawer: Outcome) -> None:
+    way = np.abs(np.diff(drawer.qpos[:, 0])).sum()
+    assert way > 0.22
+    assert drawer.ticks["coupling_work"][-1] == pytest.approx(DRAWER_FRICTION * way, rel=0.03)
+    assert drawer.ticks["external_work"][-1] == 0
+    assert drawer.ticks["actuator_work"][-1] == 0
+
+
+def test_handle_starts_in_the_frame_of_a_turned_grip_off_the_centre_of_mass(
+    pointer: Outcome, drawer: Outcome
+) -> None:
+    for run, grip in ((pointer, "tip"), (drawer, "knob")):
+        data = mujoco.MjData(run.model)
+        mujoco.mj_forward(run.model, data)
+        quaternion = data.site_xquat[run.model.site(grip).id]
+        first = run.ticks[0]
+        assert first["handle_position"] == pytest.approx(data.site(grip).xpos, abs=1e-9)
+        assert first["handle_quaternion"] == pytest.approx(quaternion, abs=1e-9)
+        # the first millisecond of free fall; a handle 0.1 mm off would pull with 0.24 N
+        assert np.linalg.norm(first["wrench_on_tool"]) < 0.05
+
+
+@pytest.mark.parametrize("grip", ["tip", "stylus", "knob"])
+def test_same_hand_twice_gives_the_same_bytes(tmp_path: Path, grip: str) -> None:
+    text = {"tip": BALL_JOINT_TOOL, "stylus": SPRING_PIN, "knob": DRAWER}[grip]
+    stops: Stops = [(0.3, (0.004, 0.002, -0.012))]
+    first, second = (
+        outcome(tmp_path / name, text, grip, stops).ticks.copy() for name in ("a", "b")
+    )
+    for name in first.dtype.names or ():
+        if not name.endswith("_ns"):
+            assert np.array_equal(first[name], second[name]), name
+
+
+def test_command_line_runs_and_judges_a_scene_of_the_users_own(tmp_path: Path) -> None:
+    folder = tmp_path / "Meine Szenen – größer"
+    scene_file(folder, DRAWER, "Schublade 1.xml")
+    hand_file(folder, [(0.3, (0.02, 0.0, 0.0))])
+    run = subprocess.run(
+        [
+            *(sys.executable, "-m", "hapticbridge.cli.main", "run", "Schublade 1.xml"),
+            *("--grip", "knob", "--device", "trajectory:hand.csv", "--fast"),
+            *("--duration", "0.5", "--record", "lauf 1.mcap"),
+        ],
+        cwd=folder,
+        check=False,
+        capture_output=True,
+        text=True,
+    )
+    assert run.returncode == 0, run.stderr
+    assert "passive" in run.stdout
+    report = hb.audit(folder / "lauf 1.mcap")
+    assert (report.verdict, report.resimulation) == ("passive", "bit for bit")
+    sources = hb.read_recording(folder / "lauf 1.mcap").attachments
+    assert sources["scene/Schublade 1.xml"] == DRAWER.encode()
+
+
+def test_command_line_names_the_sites_where_the_grip_is_not_one(tmp_path: Path) -> None:
+    path = scene_file(tmp_path, DRAWER)
+    run = subprocess.run(
+        [sys.executable, "-m", "hapticbridge.cli.main", "run", str(path), "--fast"],
+        check=False,
+        capture_output=True,
+        text=True,
+    )
+    assert run.returncode == 2
+    assert "no site 'grip'" in run.stderr
+    assert "'knob'" in run.stderr
+    assert "Traceback" not in run.stderr
