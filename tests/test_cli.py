@@ -599,3 +599,25 @@ def test_repair_is_what_the_library_does(cut_file: Path, tmp_path: Path) -> None
     repair(cut_file, tmp_path / "b.mcap")
     a, b = (read_recording(tmp_path / name).computed_digest for name in ("a.mcap", "b.mcap"))
     assert a == b
+
+
+def test_a_diverging_scene_trips_and_leaves_no_log_beside_the_user(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("wild.xml").write_text(
+        """<mujoco>
+          <worldbody>
+            <body><freejoint/><geom size=".02" mass=".05"/><site name="grip"/></body>
+            <body pos="1 0 0"><joint name="j" type="slide"/><geom size=".01" mass="1"/></body>
+          </worldbody>
+          <actuator>
+            <general joint="j" biastype="affine" gainprm="0" biasprm="1 1e8 0"/>
+          </actuator>
+        </mujoco>""",
+        encoding="utf-8",
+    )
+    assert main(["run", "wild.xml", "--fast", "--duration", "0.1"]) == 3
+    told = capsys.readouterr().err
+    assert "safety trip" in told
+    assert not list(tmp_path.glob("*LOG*"))

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import Annotated, TextIO
 
+import mujoco
 import tyro
 from rich.markup import escape
 
@@ -43,8 +45,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         ),
     )
     try:
-        with warnings.catch_warnings():
-            warnings.showwarning = _show_warning  # type: ignore[assignment] # names differ
+        with _warnings_in_a_sentence():
             return int(command.execute())
     except SafetyTrip as trip:
         err.print(f"[red]safety trip:[/red] {escape(str(trip))}")
@@ -55,6 +56,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         err.print("interrupted")
         return 130
+
+
+@contextmanager
+def _warnings_in_a_sentence() -> Iterator[None]:
+    """Prints Python's and MuJoCo's warnings; MuJoCo would write MUJOCO_LOG.TXT beside the user."""
+    before = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(_tell)
+    try:
+        with warnings.catch_warnings():
+            warnings.showwarning = _show_warning  # type: ignore[assignment] # names differ
+            yield
+    finally:
+        mujoco.set_mju_user_warning(before)
+
+
+def _tell(message: str) -> None:
+    err.print(f"[yellow]MuJoCo warns:[/yellow] {escape(message)}")
 
 
 def _show_warning(
