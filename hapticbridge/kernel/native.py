@@ -46,7 +46,7 @@ mj_com_pos: Any = types.ExternalFunction("mj_comPos", _ON_DATA)
 mj_make_m: Any = types.ExternalFunction("mj_makeM", _ON_DATA)
 mj_energy_pos: Any = types.ExternalFunction("mj_energyPos", _ON_DATA)
 mj_energy_vel: Any = types.ExternalFunction("mj_energyVel", _ON_DATA)
-mj_rne_post_constraint: Any = types.ExternalFunction("mj_rnePostConstraint", _ON_DATA)
+mj_make_constraint: Any = types.ExternalFunction("mj_makeConstraint", _ON_DATA)
 mj_apply_ft: Any = types.ExternalFunction(
     "mj_applyFT",
     types.void(_ADDRESS, _ADDRESS, _ADDRESS, _ADDRESS, _ADDRESS, types.int32, _ADDRESS),
@@ -112,7 +112,14 @@ def _ctype(declared: Any) -> Any:
         for extent in reversed(declared.extents):
             inner = inner * extent
         return inner
-    return _SCALARS.get(declared.name) or _struct(declared.name)
+    if declared.name in _SCALARS:
+        return _SCALARS[declared.name]
+    if declared.name in structs.STRUCTS:
+        return _struct(declared.name)
+    raise SceneError(
+        f"MuJoCo {mujoco.__version__} uses a type '{declared.name}' whose size is unknown here; "
+        "install a version from constraints.txt"
+    )
 
 
 @cache
@@ -124,6 +131,14 @@ def _struct(name: str) -> Any:
 def field_address(data: mujoco.MjData, name: str) -> int:
     """Returns where a field of ``mjData`` lies in memory (for a pointer: of the pointer itself)."""
     return int(data._address + getattr(_struct("mjData"), name).offset)
+
+
+def contact_layout() -> dict[str, int]:
+    """Returns the size of ``mjContact`` and the offsets of what a tick reads of it, in bytes."""
+    contact = _struct("mjContact")
+    fields = {"point": "pos", "frame": "frame", "geoms": "geom", "dim": "dim", "row": "efc_address"}
+    offsets = {name: int(getattr(contact, field).offset) for name, field in fields.items()}
+    return {"size": ctypes.sizeof(contact), **offsets}
 
 
 def addresses(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[int, int]:

@@ -37,9 +37,8 @@ _POINTERS = (
     "site_xquat",
     "energy",
     "solver_niter",
-    "subtree_com",
     "xipos",
-    "cfrc_ext",
+    "ten_length",
     "qfrc_actuator",
     "qfrc_applied",
     "qfrc_gravcomp",
@@ -57,18 +56,37 @@ _POINTERS = (
     "efm_aid",
     "efm_as",
     "efm_ak",
+    "ne",
+    "nefc",
+    "efc_type",
+    "efc_id",
+    "efc_pos",
+    "efc_force",
+    "contact",
     "passive_gravcomp_dofs",
-    "mocap_bodies",
-    "body_rootid",
+    "geom_bodyid",
+    "body_mocap",
+    "tendon_range",
     "mocap_previous",
     "mocap_shift",
+    "equality_before",
+    "tendon_before",
     "scratch",
 )
 
 _COUNTS = (
     "nv",
     "nbody",
+    "ngeom",
     "nmocap",
+    "ntendon",
+    "equality_capacity",
+    "contact_size",
+    "contact_point",
+    "contact_frame",
+    "contact_geoms",
+    "contact_dim",
+    "contact_row",
     "substeps",
     "handle_mocap_id",
     "grip_site_id",
@@ -96,7 +114,14 @@ _PARAMETERS = (
 
 _POSES = ("device", "handle", "tool")
 
-_RUNNING_COUNTS = ("tick", "flags", "mocap_has_moved", "first_unstrict", "first_active")
+_RUNNING_COUNTS = (
+    "tick",
+    "flags",
+    "mocap_has_moved",
+    "equality_rows",
+    "first_unstrict",
+    "first_active",
+)
 
 _RUNNING = (
     "kinetic",
@@ -279,43 +304,47 @@ def _bind_addresses(
     """
     state["model"], state["data"] = native.addresses(model, data)
     buffer_fields = (
-        "qvel qacc ctrl mocap_pos mocap_quat site_xpos site_xquat subtree_com xipos cfrc_ext "
+        "qvel qacc ctrl mocap_pos mocap_quat site_xpos site_xquat xipos ten_length "
         "qfrc_actuator qfrc_applied qfrc_gravcomp xfrc_applied actuator_force moment_rownnz "
         "moment_rowadr moment_colind actuator_moment energy solver_niter"
     )
     for name in buffer_fields.split():
         state[name] = getattr(data, name).ctypes.data
-    for name in ("ncon", "nisland", "nefmA", "efm_aid", "efm_as", "efm_ak"):
+    struct_fields = (
+        "ncon nisland nefmA efm_aid efm_as efm_ak ne nefc efc_type efc_id efc_pos efc_force contact"
+    )
+    for name in struct_fields.split():
         state[name] = native.field_address(data, name)
 
     # actgravcomp hands a joint's gravity compensation to its actuators; the rest is passive
     passive = np.ascontiguousarray(
         1.0 - model.jnt_actgravcomp[model.dof_jntid].astype(np.float64), dtype=np.float64
     )
-    mocap_bodies = np.zeros(max(model.nmocap, 1), dtype=np.int32)
-    for body_id, mocap_id in enumerate(model.body_mocapid):
-        if mocap_id >= 0:
-            mocap_bodies[mocap_id] = body_id
-    scratch = np.zeros(max(model.nv, 1))
-    mocap_previous = np.zeros((max(model.nmocap, 1), 7))
-    mocap_shift = np.zeros((max(model.nmocap, 1), 6))
-    output_address = np.ascontiguousarray(model.actuator_outadr, dtype=np.int32)
-    output_count = np.ascontiguousarray(model.actuator_outnum, dtype=np.int32)
-    body_root = np.ascontiguousarray(model.body_rootid, dtype=np.int32)
+    # what is fixed to a mocap body, or jointed to it, moves with it
+    body_mocap = np.ascontiguousarray(model.body_mocapid[model.body_rootid], dtype=np.int32)
+    # flexes may take more rows than 6 an equality, as many as they have now
+    equality_capacity = max(6 * model.neq, data.ne)
     owned: dict[str, NDArray[np.generic]] = {
         "passive_gravcomp_dofs": passive,
-        "mocap_bodies": mocap_bodies,
-        "scratch": scratch,
-        "mocap_previous": mocap_previous,
-        "mocap_shift": mocap_shift,
-        "outadr": output_address,
-        "outnum": output_count,
-        "body_rootid": body_root,
+        "body_mocap": body_mocap,
+        "geom_bodyid": np.ascontiguousarray(model.geom_bodyid, dtype=np.int32),
+        "tendon_range": np.ascontiguousarray(model.tendon_range, dtype=np.float64),
+        "scratch": np.zeros(max(model.nv, 1)),
+        "mocap_previous": np.zeros((max(model.nmocap, 1), 7)),
+        "mocap_shift": np.zeros((max(model.nmocap, 1), 6)),
+        "equality_before": np.zeros(max(equality_capacity, 1)),
+        "tendon_before": np.zeros(max(model.ntendon, 1)),
+        "outadr": np.ascontiguousarray(model.actuator_outadr, dtype=np.int32),
+        "outnum": np.ascontiguousarray(model.actuator_outnum, dtype=np.int32),
     }
     for name, array in owned.items():
         state[name] = array.ctypes.data
 
-    state["nv"], state["nbody"], state["nmocap"] = model.nv, model.nbody, model.nmocap
+    for name in ("nv", "nbody", "ngeom", "nmocap", "ntendon"):
+        state[name] = getattr(model, name)
+    state["equality_capacity"] = equality_capacity
+    for name, value in native.contact_layout().items():
+        state[f"contact_{name}"] = value
     state["has_gravity_compensation"] = bool(np.any(model.body_gravcomp))
     state["has_tendons_or_flexes"] = model.ntendon > 0 or model.nflex > 0
     return owned

@@ -134,10 +134,10 @@ def before_step(
     if substep == 0:
         position = vector_of(sample[0].position)
         given = quaternion_of(sample[0].quaternion)
-        total = dot(position, position)
+        square = 0.0
         for i in range(4):
-            total += given[i] * given[i]
-        if not math.isfinite(total) or not total - dot(position, position) > 0.25:
+            square += given[i] * given[i]
+        if not math.isfinite(dot(position, position) + square) or square <= 0.25:
             return BAD_SAMPLE
         quaternion = canonical(given)
 

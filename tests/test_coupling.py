@@ -1,0 +1,250 @@
+"""The coupling: its parameters, its law at the recorded poses, and that the scene obeys it."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+
+import mujoco
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from kernel_runs import (
+    DEFAULT,
+    FREE_BALL,
+    Array,
+    Run,
+    T,
+    bind,
+    coupling_work,
+    fast,
+    live,
+    load,
+    mjcf,
+    run_of,
+    samples_of,
+    sines,
+    turns,
+    wrench_law,
+)
+from scipy.spatial.transform import Rotation
+
+from hapticbridge.coupling import Coupling
+from hapticbridge.errors import CouplingError
+from hapticbridge.kernel.step import after_step, before_step
+from hapticbridge.tick import TICK_DTYPE
+
+MASS = 0.1
+STIFF = Coupling(2000.0, 2.0, 2.0, 2e-3)
+
+TILTED_BOX = mjcf("""
+    <body name="tool" pos="0.1 0.2 0.3" quat="0.8 0.6 0 0"><freejoint/>
+      <geom type="box" size="0.02 0.03 0.04" mass="0.2"/>
+      <site name="grip" pos="0.02 -0.01 0.03" quat="0.6 0 0.8 0"/>
+    </body>""")
+
+
+def _implicit_euler(handle: Array, coupling: Coupling, mass: float) -> tuple[Array, Array]:
+    """THEORY's first row with the coupling solved for the end of the step, from rest at 0."""
+    stiffness, damping = coupling.stiffness, coupling.damping
+    effective = mass + T * damping + T**2 * stiffness
+    x, v, before = np.zeros(3), np.zeros(3), np.zeros(3)
+    positions, forces = [], []
+    for h in handle:
+        # m (v' − v) = T f,  f = K (h − x − T v') + B ((h − before)/T − v')
+        pull = T * (stiffness * (h - x) + damping * (h - before) / T)
+        v = (mass * v + pull) / effective
+        forces.append(stiffness * (h - x - T * v) + damping * ((h - before) / T - v))
+        x, before = x + T * v, h
+        positions.append(x)
+    return np.array(positions), np.array(forces)
+
+
+def _step_energies(run: Run) -> Array:
+    """E_k of a scene with no port but the coupling, from the records."""
+    return np.asarray(np.diff(run.stored(), prepend=0.0) - coupling_work(run))
+
+
+@pytest.mark.parametrize("coupling", [DEFAULT, STIFF, Coupling(20000.0, 0.0, 0.0, 0.0)])
+def test_free_mass_follows_the_implicit_euler_recursion(coupling: Coupling) -> None:
+    handle = sines(2000, 0.01, 3.0)
+    run = fast(FREE_BALL, samples_of(handle), coupling)
+    position, force = _implicit_euler(handle, coupling, MASS)
+    assert np.abs(run.ticks["tool_position"] - position).max() <= 1e-12
+    assert np.abs(run.ticks["wrench_on_tool"][:, :3] - force).max() <= 1e-9
+    assert np.abs(force).max() > 0.01  # and there is a force to compare
+
+
+def test_free_mass_creates_no_energy_in_any_single_tick() -> None:
+    run = fast(FREE_BALL, samples_of(sines(2000, 0.01, 3.0)), STIFF)
+    energies = _step_energies(run)
+    assert energies.max() <= 1e-12
+    # −½ m (v_k − v_{k−1})², exactly
+    speeds = run.tool_steps() / T
+    change = np.diff(speeds, axis=0, prepend=np.zeros((1, 3)))
+    # velocities recovered by a difference of positions over T carry 1e-17 m / 1e-3 s
+    assert energies == pytest.approx(-0.5 * MASS * np.sum(change**2, axis=1), abs=1e-13)
+
+
+def test_the_same_coupling_as_a_held_force_creates_energy() -> None:
+    """The method that fails: f_k written before the step, Euler: E = +½ m (v_{k+1} − v_k)²."""
+    model = mujoco.MjModel.from_xml_string(FREE_BALL)
+    model.opt.timestep, model.opt.integrator = T, mujoco.mjtIntegrator.mjINT_EULER
+    data = mujoco.MjData(model)
+    rest = np.zeros(3)
+    x, came_from, h, v, created = rest, rest, rest, rest, []
+    for target in sines(2000, 0.01, 3.0):
+        force = STIFF.stiffness * (target - x) + STIFF.damping * ((target - h) / T - v)
+        data.xfrc_applied[1, :3] = force
+        mujoco.mj_step(model, data)
+        after = data.qvel[:3].copy()
+        # f_k goes with the motion that led to it: S_{k+1} − S_k − f_k·(x_k − x_{k−1})
+        created.append(0.5 * MASS * (after @ after - v @ v) - force @ (x - came_from))
+        assert created[-1] == pytest.approx(0.5 * MASS * np.sum((after - v) ** 2), abs=1e-12)
+        x, came_from, h, v = data.qpos[:3].copy(), x, target, after
+    assert np.sum(created) > 1e-3
+    implicit = fast(FREE_BALL, samples_of(sines(2000, 0.01, 3.0)), STIFF)
+    assert implicit.ledger.environment_energy < 0
+
+
+@pytest.mark.parametrize("substeps", [1, 4])
+@pytest.mark.parametrize("scene", [FREE_BALL, TILTED_BOX])
+def test_recorded_wrench_is_the_coupling_law_at_the_recorded_poses(
+    scene: str, substeps: int
+) -> None:
+    turning = Rotation.from_rotvec(sines(1500, 1.0, 1.0))
+    run = fast(scene, samples_of(sines(1500), turning), substeps=substeps)
+    law = wrench_law(run)
+    # products of 1e3 N/m and 1e-16 m, of 1 N m/rad and 1e-16 rad
+    assert run.ticks["wrench_on_tool"] == pytest.approx(law, abs=1e-11)
+    assert (np.abs(law).max(axis=0) > 1e-3).all()  # in every direction
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    st.floats(10, 2e4),
+    st.floats(0, 10),
+    st.floats(0, 10),
+    st.floats(0, 0.01),
+    st.floats(0.1, 1.4),
+    st.sampled_from([1, 2, 5]),
+)
+def test_wrench_law_holds_for_any_coupling(
+    stiffness: float,
+    damping: float,
+    rotational_stiffness: float,
+    rotational_damping: float,
+    angle: float,
+    substeps: int,
+) -> None:
+    coupling = Coupling(stiffness, damping, rotational_stiffness, rotational_damping)
+    turning = Rotation.from_rotvec(sines(60, angle, 4.0))
+    samples = samples_of(sines(60, 0.01, 10.0), turning)
+    run = fast(TILTED_BOX, samples, coupling, substeps=substeps)
+    assert run.ticks["wrench_on_tool"] == pytest.approx(wrench_law(run), rel=1e-9, abs=1e-11)
+    assert run.ledger.coupling_work == pytest.approx(coupling_work(run).sum(), rel=1e-9, abs=1e-15)
+
+
+def _with_world_frame_control(run: Run, samples: np.ndarray) -> Run:
+    """Overwrites the control by the handle's velocity in the world frame, the obvious mistake."""
+    state, row, data = run.binding.state, run.binding.row, run.scene.data
+    first = int(state["coupling_ctrl_adr"][0])
+    run.ticks = np.zeros(len(samples), TICK_DTYPE)
+    steps = np.diff(samples["position"], axis=0, prepend=np.zeros((1, 3)))
+    for k in range(len(samples)):
+        before_step(state, samples[k : k + 1], row, 0)
+        data.ctrl[first : first + 3] = steps[k] / T
+        mujoco.mj_step(run.scene.model, data)
+        after_step(state, row, 0)
+        run.ticks[k] = row[0]
+    return run
+
+
+def test_mujoco_applies_the_recorded_force_also_where_the_handle_is_turned() -> None:
+    """Newton's law is the witness: m (v_k − v_{k−1})/T is what the step really applied."""
+    angle = np.minimum(np.arange(2000) / 500, 1.0)  # to 1 rad, and held
+    turning = Rotation.from_rotvec(angle[:, None] * np.array([[0.0, 0.0, 1.0]]))
+    samples = samples_of(sines(2000, 0.02, 3.0), turning)
+
+    def applied(run: Run) -> Array:
+        speeds = run.tool_steps() / T
+        return np.asarray(MASS * np.diff(speeds, axis=0, prepend=np.zeros((1, 3))) / T)
+
+    good = fast(FREE_BALL, samples, STIFF)
+    # positions to 1e-17 m, differenced twice over T = 1 ms, times 0.1 kg
+    assert good.ticks["wrench_on_tool"][:, :3] == pytest.approx(applied(good), abs=1e-11)
+
+    scene = load(FREE_BALL)
+    bad = _with_world_frame_control(run_of(scene, *bind(scene, STIFF)), samples)
+    assert np.abs(bad.ticks["wrench_on_tool"][:, :3] - applied(bad)).max() > 0.5
+    assert bad.ledger.environment_energy < 10 * good.ledger.environment_energy < 0
+
+
+def test_applied_torque_is_the_recorded_one_to_first_order_in_the_period() -> None:
+    inertia = 0.4 * MASS * 0.015**2
+
+    def mismatch(period: float) -> float:
+        count = round(0.5 / period)
+        turning = Rotation.from_rotvec(sines(count, 0.5, 2.0, period))
+        speeds: list[Array] = []
+        run = live(
+            FREE_BALL,
+            samples_of(np.zeros((count, 3)), turning),
+            period=period,
+            after_tick=lambda _k, data: speeds.append(
+                Rotation.from_quat(data.qpos[3:7], scalar_first=True).apply(data.qvel[3:6])
+            ),
+        )
+        change = np.diff(np.array(speeds), axis=0, prepend=np.zeros((1, 3)))
+        torque = run.ticks["wrench_on_tool"][:, 3:]
+        return float(np.abs(inertia * change / period - torque).max() / np.abs(torque).max())
+
+    coarse, fine = mismatch(1e-3), mismatch(0.25e-3)
+    assert coarse < 0.01
+    assert fine < coarse / 2
+
+
+@pytest.mark.parametrize("substeps", [1, 4])
+def test_timestep_is_the_period_over_the_substeps(substeps: int) -> None:
+    run = live(FREE_BALL, samples_of(sines(10)), substeps=substeps)
+    assert run.scene.model.opt.timestep == T / substeps
+    assert run.scene.data.time == pytest.approx(10 * T, rel=1e-12)
+
+
+def test_handle_moves_uniformly_over_the_substeps_and_arrives_in_the_last() -> None:
+    scene = load(FREE_BALL)
+    binding, parameters = bind(scene, substeps=4)
+    run = run_of(scene, binding, parameters)
+    turn = Rotation.from_rotvec([[0.0, 0.4, 0.0]])
+    samples = samples_of(np.array([[0.004, 0.0, 0.0]]), turn)
+    positions, quaternions = [run.handle_start[:3]], [run.handle_start[3:]]
+    for substep in range(4):
+        before_step(binding.state, samples, binding.row, substep)
+        positions.append(scene.data.mocap_pos[0].copy())
+        quaternions.append(scene.data.mocap_quat[0].copy())
+    steps = np.diff(positions, axis=0)
+    assert steps == pytest.approx(np.tile([0.001, 0.0, 0.0], (4, 1)), abs=1e-15)
+    vectors = turns(np.array(quaternions[1:]), np.array(quaternions[0]))
+    assert vectors == pytest.approx(np.tile([0.0, 0.1, 0.0], (4, 1)), abs=1e-15)
+
+
+def test_a_coupling_under_substeps_is_within_slack() -> None:
+    # within a tick MuJoCo's wrench varies and the recorded one does not, so (14) itself may fail
+    turning = Rotation.from_rotvec(sines(1500, 1.0, 1.0))
+    run = fast(FREE_BALL, samples_of(sines(1500), turning), substeps=4)
+    assert run.ledger.environment != "active"
+    assert run.ledger.slack_share < 0.2
+
+
+@pytest.mark.parametrize("name", [field.name for field in fields(Coupling)])
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -1.0, "1", None])
+def test_invalid_gains_are_refused_by_name(name: str, value: object) -> None:
+    values: dict[str, object] = {field.name: 1.0 for field in fields(Coupling)}
+    with pytest.raises(CouplingError, match=f"coupling {name} is"):
+        Coupling(**{**values, name: value})  # type: ignore[arg-type]
+
+
+def test_only_the_stiffness_must_not_be_zero() -> None:
+    assert Coupling(1.0, 0.0, 0.0, 0.0).damping == 0.0
+    with pytest.raises(CouplingError, match="stiffness is 0"):
+        Coupling(0.0, 1.0, 1.0, 1.0)
