@@ -45,7 +45,7 @@ TILTED_BOX = mjcf("""
 
 
 def _implicit_euler(handle: Array, coupling: Coupling, mass: float) -> tuple[Array, Array]:
-    """THEORY's first row with the coupling solved for the end of the step, from rest at 0."""
+    """Implicit Euler with the coupling solved for the end of the step, from rest at 0."""
     stiffness, damping = coupling.stiffness, coupling.damping
     effective = mass + T * damping + T**2 * stiffness
     x, v, before = np.zeros(3), np.zeros(3), np.zeros(3)

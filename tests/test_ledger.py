@@ -796,7 +796,7 @@ def test_pure_translation_never_creates_energy_in_any_tick(
 
 
 def test_spinning_tool_behind_a_coupling_of_translation_alone_is_seen_to_create_energy() -> None:
-    """THEORY: the gyroscopic and Coriolis terms are explicit; the ledger must not hide it."""
+    """Gyroscopic and Coriolis terms are explicit under `discrete`; the ledger must not hide it."""
     world = """
         <body name="tool"><freejoint/>
           <geom type="box" size="0.01 0.03 0.04" mass="0.1"/><site name="grip"/>
@@ -884,7 +884,7 @@ def test_power_is_equal_on_both_sides_of_workspace_scale_and_axes(scale: float) 
 
 
 def test_device_gets_what_the_coupling_gave_less_what_spring_damper_and_hold_take() -> None:
-    """THEORY §2's identity, with b = 0: it joins device_energy and coupling_work exactly."""
+    """Algebra of spring, damper and hold joins device_energy and coupling_work exactly."""
     run = fast(FREE_BALL, samples_of(sines(1500, 0.01, 3.0)), Coupling(2400.0, 0.5, 0.0, 0.0))
     stiffness, damping = 2400.0, 0.5 / T
     d, dx = run.handle_steps(), run.tool_steps()
