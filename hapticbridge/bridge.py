@@ -25,10 +25,10 @@ from hapticbridge.clock import Clock, RealClock, period_of
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Device, device_for
 from hapticbridge.errors import DeviceError, HapticBridgeError, RecordingError, SafetyTrip
-from hapticbridge.guard import Limits, trip_reason
+from hapticbridge.guard import Limits, limits_for, trip_reason
 from hapticbridge.inputs import Write, apply_writes, input_writes
 from hapticbridge.jit import direct
-from hapticbridge.kernel.state import Binding, RunParameters
+from hapticbridge.kernel.state import Binding, RunParameters, rotation_numbers
 from hapticbridge.kernel.step import OK, after_step, before_step, publish
 from hapticbridge.ledger import Ledger
 from hapticbridge.provenance import attachments, describe_run
@@ -38,9 +38,9 @@ from hapticbridge.scene import Scene, load_scene
 from hapticbridge.summary import Summary
 from hapticbridge.tick import SAMPLE_DTYPE, TickFlag
 
-RING_CAPACITY = 8192
-"""Records between loop and recorder. At 1 kHz the recorder may fall 8 s behind before one is lost;
-each costs 400 bytes."""
+RING_SECONDS, MOST_RECORDS = 8.0, 1 << 16
+"""How far the recorder may fall behind before a record is lost, in s and in records of 400 bytes;
+a trip hands the last second of them to whoever catches it."""
 
 NOBODY_READS = 1 << 62
 """Tail of a ring without a recorder: it is never full and keeps the newest records."""
@@ -64,16 +64,17 @@ class Bridge:
         coupling: K and B; None chooses the stiffest safe one for the device's damping (80 % of the
             bound, B = b/4; for a device of unknown damping, that of the default simulated one).
         rate: Ticks per second, 1 to 1e6.
-        substeps: MuJoCo steps per tick.
+        substeps: MuJoCo steps per tick, 1 to 100. With more than one the coupling is not implicit
+            over the whole tick, and even a free tool may use slack: the meter tells.
         method: How the tool is rendered; see ``rendering.METHODS``.
-        recording: File to write (``.mcap``), or None.
+        recording: File to write (``.mcap``), or None; an existing file is replaced.
         clock: ``RealClock()`` by default; ``SimulatedClock()`` runs as fast as it goes.
         scale: Handle motion per device motion.
         force_scale: Force on the device per force on the tool; None takes ``scale``, which keeps
             power equal on both sides.
         axes: 3 × 3 rotation from the device's frame to the scene's.
         absolute: Take the device's poses as poses in the scene instead of relative to its start.
-        limits: Limits on the wrench; None takes the device's own.
+        limits: Limits on the wrench, within the device's own; None takes these.
         live: Draw a status line on stderr, from the recorder's process.
 
     Raises:
@@ -103,12 +104,10 @@ class Bridge:
         self.period = period_of(rate)
         self._scales = scale, scale if force_scale is None else force_scale
         self.coupling = coupling or default_coupling(self.device.info, self.period, *self._scales)
-        self._limits = limits or Limits(
-            force=self.device.info.force_limit, torque=self.device.info.torque_limit
-        )
+        self._limits = limits_for(self.device.info, limits)
         self._method = method_named(method)
         self._substeps = substeps
-        self._axes = tuple(np.asarray(np.eye(3) if axes is None else axes, float).ravel().tolist())
+        self._axes = rotation_numbers(np.eye(3) if axes is None else axes)
         self._is_absolute = absolute
         self._path = Path(recording) if recording is not None else None
         self._is_live = live
@@ -119,6 +118,7 @@ class Bridge:
         self._tick = self._overruns = self._skipped = self._dropped = 0
         self._lost = 0  # flag of the next record if the one before it was lost
         self._stopped_by = ""
+        self._is_open = False
 
     def __enter__(self) -> Bridge:
         # released in reverse order, whatever one of them does: force, recording, ring, device
@@ -127,6 +127,7 @@ class Bridge:
             self._prepare(resources)
             resources.callback(self.device.write, _NO_FORCE)
             self._resources = resources.pop_all()
+        self._is_open = True
         return self
 
     def __exit__(
@@ -135,6 +136,7 @@ class Bridge:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
+        self._is_open = False
         reason = self._stopped_by if error is None else f"{type(error).__name__}: {error}"
         self._event(
             "stop",
@@ -148,7 +150,7 @@ class Bridge:
     def run(
         self, duration: float | None = None, on_tick: Callable[[int], None] | None = None
     ) -> Summary:
-        """Runs the loop.
+        """Runs the loop. Called again, it goes on: the force rises from zero as at the start.
 
         Args:
             duration: Time to run in s; None runs until the device's motion ends, or for ever
@@ -161,26 +163,29 @@ class Bridge:
         Raises:
             SafetyTrip: The guard stopped the run; zero force was commanded first.
             DeviceError: The device failed; likewise.
+            HapticBridgeError: The bridge is not open, or the duration is out of range.
         """
+        last, code = self._last_tick(duration), OK
+        self._resume()
         state, row = self._binding.state, self._binding.row
         model, data, substeps = self.scene.model, self.scene.data, range(self._substeps)
         records, cursors = self._ring.rows, self._ring.cursors
         sample, wrench = self._sample, row["wrench_on_device"][0]
         before, after, hand_over = self._before_step, self._after_step, self._publish
-        device, clock, inputs, step = self.device, self.clock, self._inputs, mujoco.mj_step
-        last, code = self._last_tick(duration), OK
-        self._stopped_by = ""
+        read_device, write_device = self.device.read, self.device.write
+        clock, wait, now = self.clock, self.clock.wait, self.clock.now
+        inputs, step = self._inputs, mujoco.mj_step
         with self._stopping_on_signals():
             clock.start(round(self.period * 1e9))
             try:
                 while self._tick != last and not self._stopped_by:
-                    deadline, wake, skipped = clock.wait()
+                    deadline, wake, skipped = wait()
                     if on_tick is not None:
                         on_tick(self._tick)
                     if inputs:
                         self._apply_inputs()
-                    device.read(sample)
-                    read = clock.now()
+                    read_device(sample)
+                    read = now()
                     for substep in substeps:
                         code = before(state, sample, row, substep)
                         if code != OK:
@@ -189,8 +194,8 @@ class Bridge:
                         code = after(state, row, substep)
                     if code != OK:
                         break
-                    device.write(wrench)
-                    write = clock.now()
+                    write_device(wrench)
+                    write = now()
                     flags = self._lost | (self._overrun(skipped) if skipped else 0)
                     while not hand_over(row, records, cursors, deadline, wake, read, write, flags):
                         self._lost = self._ring_is_full()
@@ -200,7 +205,7 @@ class Bridge:
                         self._lost = 0
                     self._tick += 1
             finally:
-                device.write(_NO_FORCE)
+                write_device(_NO_FORCE)
         if code != OK:
             self._trip(trip_reason(code, self._tick))
         self._stopped_by = self._stopped_by or "duration"
@@ -219,6 +224,9 @@ class Bridge:
         body_wrench: Mapping[str, ArrayLike] | None = None,
     ) -> None:
         """Changes inputs of the scene from the next tick on; recorded, so the run can be repeated.
+
+        Move mocap bodies slowly: MuJoCo damps their welds and contacts against rest, so a fast
+        move can create energy, and the environment is then called active.
 
         Args:
             ctrl: Control per actuator of the scene.
@@ -245,7 +253,7 @@ class Bridge:
         return Ledger.of(self._binding.state)
 
     def latest_records(self, count: int) -> NDArray[np.void]:
-        """Returns copies of the newest records (``TICK_DTYPE``), oldest first; at most 8 s."""
+        """Returns copies of the newest records (``TICK_DTYPE``), oldest first."""
         return self._ring.latest(count)
 
     def summary(self) -> Summary:
@@ -270,6 +278,10 @@ class Bridge:
 
     def _prepare(self, resources: ExitStack) -> None:
         """Compiles the kernel, puts the scene to its start, and opens the recording."""
+        if self._tick or self._is_open:
+            raise HapticBridgeError("a bridge is entered once; make a new one for another run")
+        self.scene.claim()
+        resources.callback(self.scene.release)
         scene, clock, info = self.scene, self.clock, self.device.info
         prepare(scene, self.coupling, self.period, self._substeps)
         self._sample[:] = self.device.start(self.period)
@@ -277,7 +289,8 @@ class Bridge:
         self._binding = Binding(scene.model, scene.data, self.parameters)
         self._refuse_stretched_start()
         is_read = self._path is not None or self._is_live
-        self._ring = Ring.shared(RING_CAPACITY) if is_read else Ring.local(RING_CAPACITY)
+        capacity = min(round(RING_SECONDS / self.period), MOST_RECORDS)
+        self._ring = Ring.shared(capacity) if is_read else Ring.local(capacity)
         resources.callback(self._ring.close)
         self._compile()
         if not is_read:
@@ -341,10 +354,19 @@ class Bridge:
     def _last_tick(self, duration: float | None) -> int:
         if duration is None:
             length = self.device.info.duration
-            return -1 if length is None else round(length / self.period) + 1
+            return -1 if length is None else max(self._tick, round(length / self.period) + 1)
         if not np.isfinite(duration) or duration <= 0:
             raise HapticBridgeError(f"duration is {duration!r} s; it must be finite and > 0")
         return self._tick + max(round(duration / self.period), 1)
+
+    def _resume(self) -> None:
+        """Starts the ramp; between two runs zero was commanded and the device may have moved."""
+        if not self._is_open:
+            raise HapticBridgeError("the bridge is not open; use 'with Bridge(...) as bridge:'")
+        self._stopped_by = ""
+        if self._tick:
+            self._binding.resume()
+            self._event("resume")
 
     def _apply_inputs(self) -> None:
         while self._inputs:
@@ -362,7 +384,7 @@ class Bridge:
         recorder = self._recorder
         if recorder is None or not recorder.is_alive():
             raise RecordingError("the recorder ended in mid-run; the recording stops there")
-        if self.clock.is_lossless:
+        if self.clock.is_lossless and not self._stopped_by:
             time.sleep(RING_POLL)
             return 0
         self._dropped += 1

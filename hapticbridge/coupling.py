@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
+from numbers import Real
 
 from hapticbridge.errors import CouplingError
 
@@ -42,7 +43,8 @@ class Coupling:
     def __post_init__(self) -> None:
         for field in fields(self):
             value = getattr(self, field.name)
-            if not isinstance(value, int | float) or not math.isfinite(value):
+            is_number = isinstance(value, Real) and not isinstance(value, bool)
+            if not is_number or not math.isfinite(value):
                 raise CouplingError(
                     f"coupling {field.name} is {value!r}; it must be a finite number"
                 )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import DeviceError
 from hapticbridge.kernel.step import BAD_SAMPLE
 
@@ -40,6 +41,25 @@ class Limits:
     def ramp_ticks(self, period: float) -> int:
         """Returns the length of the ramp in ticks of ``period`` seconds."""
         return round(self.ramp / period)
+
+
+def limits_for(info: DeviceInfo, limits: Limits | None) -> Limits:
+    """Returns the limits of a run: those asked for, or the device's own.
+
+    Raises:
+        DeviceError: More is asked for than the device bears. One whose motion is prescribed feels
+            nothing, so any limit is accepted for it.
+    """
+    if limits is None:
+        return Limits(force=info.force_limit, torque=info.torque_limit)
+    own = {"force": (info.force_limit, "N"), "torque": (info.torque_limit, "N m")}
+    for name, (most, unit) in own.items():
+        asked = getattr(limits, name)
+        if asked > most and not info.is_prescribed:
+            raise DeviceError(
+                f"{name} limit is {asked:g} {unit}; the device '{info.name}' bears {most:g} {unit}"
+            )
+    return limits
 
 
 def trip_reason(code: int, tick: int) -> str:

@@ -24,7 +24,8 @@ class TickFlag(IntFlag):
         CONTACT: MuJoCo found at least one contact in the scene.
         CLUTCH: The device moves without the handle.
         STALE_SAMPLE: The device had nothing new since the previous tick.
-        TRIP: The guard stopped the run in this tick; the wrench sent is zero.
+        TRIP: The guard stopped the run in this tick; the wrench sent is zero. A tick that is not
+            finite is not recorded at all; the event ``trip`` names it.
     """
 
     OVERRUN = 1

@@ -108,6 +108,7 @@ class ScriptedDevice:
         *,
         on_write: Callable[[int], None] | None = None,
         on_close: Callable[[], None] | None = None,
+        strength: float = 10.0,
     ) -> None:
         self.info = DeviceInfo(
             name="scripted",
@@ -118,8 +119,8 @@ class ScriptedDevice:
             rotational_damping=2e-3,
             friction=None,
             resolution=None,
-            force_limit=10.0,
-            torque_limit=0.5,
+            force_limit=strength,
+            torque_limit=0.05 * strength,
             speed_limit=5.0,
             rate=None,
             is_prescribed=False,

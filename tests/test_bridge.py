@@ -1,7 +1,9 @@
 from __future__ import annotations
 
+import json
 import os
 import signal
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -22,6 +24,7 @@ from hapticbridge.device import open_device
 from hapticbridge.errors import DeviceError, HapticBridgeError, SafetyTrip, SceneError
 from hapticbridge.guard import Limits
 from hapticbridge.recording import Recorder, Ring, read_recording
+from hapticbridge.scene import Scene, load_scene
 from hapticbridge.tick import CLOCK_FIELDS, TICK_DTYPE, TickFlag
 
 PATIENCE = 30.0
@@ -58,7 +61,9 @@ def sway(tick: int) -> tuple[float, ...]:
     return (0.01 * np.sin(0.02 * tick), 0.004 * np.sin(0.03 * tick), 0, w, x, y, z)
 
 
-def fast(scene: str | Path = "point_mass", device: Any = "simulated", **options: Any) -> Bridge:
+def fast(
+    scene: str | Path | Scene = "point_mass", device: Any = "simulated", **options: Any
+) -> Bridge:
     return Bridge(scene, device, options.pop("coupling", None), clock=SimulatedClock(), **options)
 
 
@@ -147,11 +152,11 @@ def test_relative_poses_start_at_the_grip_and_absolute_ones_are_the_handle() -> 
 
 def test_scales_and_axes_map_motion_in_and_wrench_out() -> None:
     turn = Rotation.from_rotvec([0.3, -0.5, 1.1])
-    limits = Limits(force=1e3, torque=1e3, ramp=0.0)
+    limits = Limits(force=1e3, torque=50, ramp=0.0)
     scale, force_scale = 2.5, 0.4
     with fast(
         "point_mass",
-        ScriptedDevice(sway),
+        ScriptedDevice(sway, strength=1e3),
         scale=scale,
         force_scale=force_scale,
         axes=turn.as_matrix(),
@@ -176,8 +181,8 @@ def test_scales_and_axes_map_motion_in_and_wrench_out() -> None:
 
 
 def test_equal_scales_keep_power_equal_on_both_sides() -> None:
-    limits = Limits(force=1e3, torque=1e3, ramp=0.0)
-    with fast("point_mass", ScriptedDevice(sway), scale=3.0, limits=limits) as bridge:
+    limits = Limits(force=1e3, torque=50, ramp=0.0)
+    with fast("point_mass", ScriptedDevice(sway, strength=1e3), scale=3.0, limits=limits) as bridge:
         bridge.run(0.2)
         rows = bridge.latest_records(200)
     sent, held = rows["wrench_on_device"], rows["wrench_on_tool"]
@@ -477,7 +482,7 @@ class SlowClock(SimulatedClock):
         skipped = self._stalls.get(self._count, 0)
         self._count += 1
         self._now += (1 + skipped) * self._period
-        return self._now, self._now + 1234, skipped
+        return self._now, self._now, skipped
 
 
 def test_overruns_are_flagged_counted_and_pass_the_audit(tmp_path: Path) -> None:
@@ -498,7 +503,7 @@ def test_full_ring_drops_rows_in_real_time_and_the_audit_calls_the_gap(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "run.mcap"
-    monkeypatch.setattr(bridge_module, "RING_CAPACITY", 64)
+    monkeypatch.setattr(bridge_module, "RING_SECONDS", 0.064)
     rings: list[Ring] = []
     shared = Ring.shared
 
@@ -535,7 +540,7 @@ def test_full_ring_drops_rows_in_real_time_and_the_audit_calls_the_gap(
 def test_full_ring_loses_nothing_in_simulated_time(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(bridge_module, "RING_CAPACITY", 8)
+    monkeypatch.setattr(bridge_module, "RING_SECONDS", 0.008)
     summary = recorded(tmp_path / "run.mcap", "point_mass", duration=0.3)
     assert summary.dropped == 0
     assert audit(tmp_path / "run.mcap").ticks == 300
@@ -598,3 +603,117 @@ def test_open_device_and_spec_are_the_same_to_a_bridge(motion: str) -> None:
         a, b = by_spec.latest_records(500), by_hand.latest_records(500)
     assert a.dtype == TICK_DTYPE
     assert a.tobytes() == b.tobytes()
+
+
+# --- misuse, and what must not be taken silently
+
+
+def test_axes_written_with_six_digits_are_a_rotation_to_the_last_one(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    c = 0.707107
+    summary = recorded(path, "point_mass", axes=[c, -c, 0, c, c, 0, 0, 0, 1], duration=2.0)
+    assert summary.environment == "strict"
+    assert audit(path).verdict == "passive"
+    axes = np.array(json.loads(read_recording(path).meta["axes"])).reshape(3, 3)
+    np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    "axes",
+    [[1, 0, 0, 0, 1, 0, 0, 0, -1], [1, 0.1, 0, 0, 1, 0, 0, 0, 1], [1, 0, 0], "xyz", [np.nan] * 9],
+    ids=["mirror", "shear", "too few", "text", "nan"],
+)
+def test_axes_that_are_no_rotation_are_refused(axes: Any) -> None:
+    with pytest.raises(HapticBridgeError, match="right-handed rotation"):
+        fast(axes=axes)
+
+
+def test_limits_beyond_the_devices_own_are_refused_unless_nobody_feels_them(motion: str) -> None:
+    with pytest.raises(DeviceError, match="is 11 N; the device 'simulated' bears 10 N"):
+        fast(limits=Limits(force=11, torque=0.5))
+    with pytest.raises(DeviceError, match="torque limit"):
+        fast(limits=Limits(force=10, torque=0.6))
+    fast(device=motion, limits=Limits(force=1000, torque=100))
+
+
+def test_second_run_raises_the_force_from_zero_again_and_is_simulated_again(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    device = ScriptedDevice(lambda tick: (0.0125 * (tick > 10), 0, 0, 1, 0, 0, 0))
+    with fast("virtual_wall", device, recording=path, coupling=None) as bridge:
+        bridge.run(0.6)
+        bridge.run(0.6)
+    rows = read_recording(path).ticks
+    before, first = np.linalg.norm(rows["wrench_on_device"][[599, 600]], axis=1)
+    assert before > 1.0
+    ramping = np.flatnonzero(rows["flags"] & TickFlag.RAMPING)
+    assert ramping.tolist() == [*range(500), *range(600, 1100)]
+    assert first == pytest.approx(before / 501, rel=0.1)
+    report = audit(path)
+    assert (report.verdict, report.resimulation) == ("passive", "bit for bit")
+    assert report.events["resume"] == 1
+
+
+def test_run_after_the_motion_ended_returns_at_once(motion: str) -> None:
+    with fast("point_mass", motion) as bridge:
+        bridge.run(9.0)
+        assert bridge.run().ticks == 9000
+
+
+def test_bridge_that_is_not_open_does_not_run_and_none_opens_twice() -> None:
+    bridge = fast()
+    with pytest.raises(HapticBridgeError, match="not open"):
+        bridge.run(0.1)
+    with bridge:
+        bridge.run(0.01)
+    with pytest.raises(HapticBridgeError, match="not open"):
+        bridge.run(0.1)
+    with pytest.raises(HapticBridgeError, match="entered once"), bridge:
+        pass
+
+
+def test_two_bridges_cannot_move_the_tool_of_one_scene() -> None:
+    scene = load_scene("point_mass")
+    with fast(scene), pytest.raises(SceneError, match="in use"), fast(scene):
+        pass
+    with fast(scene) as bridge:
+        bridge.run(0.01)
+
+
+@pytest.mark.parametrize("substeps", [2.5, 101])
+def test_substeps_are_a_whole_number_within_reason(substeps: Any) -> None:
+    with pytest.raises(HapticBridgeError, match="substeps"), fast(substeps=substeps):
+        pass
+
+
+def test_a_free_mass_uses_slack_with_substeps_and_none_without() -> None:
+    """What the documentation of ``substeps`` warns of, seen."""
+
+    def shake(tick: int) -> tuple[float, ...]:
+        t = 1e-3 * tick
+        x = 3e-3 * np.sin(2 * np.pi * 60 * t) + 2e-3 * np.sin(2 * np.pi * 97 * t)
+        return (x, 0, 0, 1, 0, 0, 0)
+
+    environments = {}
+    for substeps in (1, 8):
+        device = ScriptedDevice(shake)
+        with fast("point_mass", device, substeps=substeps) as bridge:
+            environments[substeps] = bridge.run(1.0).environment
+    assert environments[1] == "strict"
+    assert environments[8] != "strict"
+
+
+def test_a_stop_ends_a_run_whose_recorder_stalls(tmp_path: Path) -> None:
+    with fast("point_mass", recording=tmp_path / "run.mcap") as bridge:
+        recorder = bridge._recorder
+        assert isinstance(recorder, Recorder)
+        pid = recorder._process.pid
+        os.kill(pid, signal.SIGSTOP)
+        timer = threading.Timer(1.0, bridge.stop)
+        timer.start()
+        try:
+            summary = bridge.run(1000.0)
+        finally:
+            timer.cancel()
+            os.kill(pid, signal.SIGCONT)
+    assert summary.stopped_by == "caller"
+    assert summary.ticks < 100_000

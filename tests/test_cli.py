@@ -9,6 +9,7 @@ from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 import pytest
 from audit_cases import TAP, recorded, rewritten, tapped
@@ -621,3 +622,8 @@ def test_a_diverging_scene_trips_and_leaves_no_log_beside_the_user(
     told = capsys.readouterr().err
     assert "safety trip" in told
     assert not list(tmp_path.glob("*LOG*"))
+
+
+def test_version_names_the_package_and_mujoco(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--version"]) == 0
+    assert f"MuJoCo {mujoco.mj_versionString()}" in capsys.readouterr().out

@@ -529,3 +529,15 @@ def test_writer_refuses_what_it_cannot_write(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match="must be text, not 3"):
         RecordingWriter(tmp_path / "run.mcap", {"a": 3}, (), EPOCH)  # type: ignore[dict-item]
     assert not (tmp_path / "run.mcap").exists()
+
+
+def test_a_file_that_is_being_recorded_to_is_not_taken_over(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    writer = RecordingWriter(path, {}, (), 0)
+    writer.write_ticks(np.zeros(5, TICK_DTYPE))
+    with pytest.raises(RecordingError, match="another bridge is recording to it"):
+        RecordingWriter(path, {}, (), 0)
+    writer.close()
+    assert len(read_recording(path).ticks) == 5
+    RecordingWriter(path, {}, (), 0).close()
+    assert len(read_recording(path).ticks) == 0

@@ -86,6 +86,7 @@ class Balance:
         handle_start: Array,
         tool_start: Array,
         start_energy: float,
+        resumed: Array,
     ) -> Balance:
         """Computes everything from records.
 
@@ -95,6 +96,7 @@ class Balance:
             handle_start: Handle pose (7,) before the first tick.
             tool_start: Tool pose (7,) before the first tick.
             start_energy: Kinetic plus potential energy before the first tick, in J.
+            resumed: Ticks at which the run went on after a pause without force.
         """
         coupling, period = parameters.coupling, parameters.period
         handle_step = steps(ticks["handle_position"], handle_start[:3])
@@ -115,6 +117,7 @@ class Balance:
 
         device_start = np.array(parameters.device_start)
         sent = np.concatenate([np.zeros((1, 6)), ticks["wrench_on_device"][:-1]])
+        sent[np.isin(ticks["tick"], resumed)] = 0.0
         device_work = np.sum(
             sent[:, :3] * steps(ticks["device_position"], device_start[:3]), axis=1
         )
@@ -130,7 +133,7 @@ class Balance:
         slack += 0.5 * angular * np.sum(tool_turn**2, axis=1)
         return cls(
             wrench_on_tool=np.concatenate([force, torque], axis=1),
-            wrench_on_device=_guarded(ticks, parameters),
+            wrench_on_device=_guarded(ticks, parameters, resumed),
             handle_position=position,
             handle_turn=np.linalg.norm(
                 turn_between(orientation, ticks["handle_quaternion"]), axis=1
@@ -148,7 +151,7 @@ class Balance:
 
 
 def _handle(ticks: NDArray[np.void], parameters: RunParameters) -> tuple[Array, Array]:
-    """Maps the recorded device poses into the scene (DESIGN: offset + scale · device)."""
+    """Maps the recorded device poses into the scene (h = h_0 + scale · A (p − p_0))."""
     axes = np.array(parameters.axes).reshape(3, 3)
     origin, target = np.array(parameters.device_origin), np.array(parameters.handle_origin)
     moved = (ticks["device_position"] - origin[:3]) @ axes.T
@@ -161,7 +164,13 @@ def _handle(ticks: NDArray[np.void], parameters: RunParameters) -> tuple[Array, 
     return target[:3] + parameters.scale * moved, orientation
 
 
-def _guarded(ticks: NDArray[np.void], parameters: RunParameters) -> Array:
+def since_start(ticks: NDArray[np.void], resumed: Array) -> Array:
+    """Returns how many ticks ago the force began to rise, at the start or after a pause."""
+    starts = np.concatenate([[0.0], np.sort(resumed)])
+    return np.asarray(ticks["tick"] - starts[np.searchsorted(starts, ticks["tick"], "right") - 1])
+
+
+def _guarded(ticks: NDArray[np.void], parameters: RunParameters, resumed: Array) -> Array:
     """Scales, limits and ramps the recorded wrench on the tool as the guard does."""
     axes = np.array(parameters.axes).reshape(3, 3)
     on_tool = ticks["wrench_on_tool"]
@@ -171,5 +180,5 @@ def _guarded(ticks: NDArray[np.void], parameters: RunParameters) -> Array:
     for vector, limit in ((force, parameters.force_limit), (torque, parameters.torque_limit)):
         norm = np.linalg.norm(vector, axis=1, keepdims=True)
         limited.append(vector * np.where(norm > limit, limit / np.maximum(norm, 1e-300), 1.0))
-    ramp = np.minimum((ticks["tick"] + 1.0) / (parameters.ramp_ticks + 1.0), 1.0)
+    ramp = np.minimum((since_start(ticks, resumed) + 1.0) / (parameters.ramp_ticks + 1.0), 1.0)
     return np.concatenate(limited, axis=1) * ramp[:, None]

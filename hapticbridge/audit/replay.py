@@ -158,27 +158,36 @@ def _simulated(recording: Recording, binding: Binding, data: mujoco.MjData) -> N
     )
     samples["buttons"] = ticks["buttons"]
     rows = np.zeros(len(ticks), TICK_DTYPE)
-    inputs = [event for event in recording.events if event.get("event") == "input"]
+    changes = [event for event in recording.events if event.get("event") in ("input", "resume")]
     done = 0
-    for event in [*inputs, None]:
-        end = len(ticks) if event is None else _input_tick(event, done, len(ticks))
+    for event in [*changes, None]:
+        end = len(ticks) if event is None else _tick_of(event, done, len(ticks))
         count = simulate(binding.state, samples[done:end], binding.row, rows[done:end])
         done += count
         if done < end:
             return rows[:done]
         if event is not None:
-            try:
-                apply_writes(data, event.get("writes", []))
-            except (HapticBridgeError, TypeError, ValueError) as error:
-                raise RecordingError(f"event 'input' at tick {end} is damaged: {error}") from None
+            _apply(event, binding, data)
     return rows
 
 
-def _input_tick(event: dict[str, Any], done: int, count: int) -> int:
+def _tick_of(event: dict[str, Any], done: int, count: int) -> int:
     tick = event.get("tick")
     if not isinstance(tick, int) or tick < done:
-        raise RecordingError(f"event 'input' names tick {tick!r}, out of order")
+        raise RecordingError(f"event '{event['event']}' names tick {tick!r}, out of order")
     return min(tick, count)
+
+
+def _apply(event: dict[str, Any], binding: Binding, data: mujoco.MjData) -> None:
+    if event["event"] == "resume":
+        binding.resume()
+        return
+    try:
+        apply_writes(data, event.get("writes", []))
+    except (HapticBridgeError, TypeError, ValueError) as error:
+        raise RecordingError(
+            f"event 'input' at tick {event.get('tick')} is damaged: {error}"
+        ) from None
 
 
 def _compared(recording: Recording, again: NDArray[np.void]) -> Replay:

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.audit.balance import Balance
+from hapticbridge.audit.balance import Balance, since_start
 from hapticbridge.audit.replay import replay
 from hapticbridge.certificate import Condition, device_conditions, is_certified
 from hapticbridge.device import DeviceInfo
@@ -19,7 +19,7 @@ from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.kernel.state import RunParameters
 from hapticbridge.provenance import STARTS, meta_start, parameters_of
 from hapticbridge.recording import Recording, read_recording
-from hapticbridge.tick import TICK_DTYPE, TickFlag
+from hapticbridge.tick import CLOCK_FIELDS, TICK_DTYPE, TickFlag
 
 TOLERANCE = 1e-9
 """Relative difference, and absolute one in SI units, between a recorded number and its second
@@ -124,7 +124,8 @@ def audit(path: str | Path, *, strict: bool = False) -> AuditReport:
     facts["duration"] = len(recording.ticks) * parameters.period
     facts["certified"] = is_certified(conditions)
     facts["conditions"] = tuple(condition.sentence() for condition in conditions)
-    fault = _structure_fault(recording, parameters)
+    resumed = np.array([float(e["tick"]) for e in recording.events if _is_resume(e)])
+    fault = _structure_fault(recording, parameters, resumed)
     if fault:
         return _invalid(facts, fault)
     ticks = recording.ticks
@@ -136,6 +137,7 @@ def audit(path: str | Path, *, strict: bool = False) -> AuditReport:
             np.array(starts["handle_start"]),
             np.array(starts["tool_start"]),
             starts["start_kinetic"][0] + starts["start_potential"][0],
+            resumed,
         )
         facts["energies"] = _energies(ticks, balance)
         fault = _physics_fault(ticks, balance)
@@ -148,10 +150,18 @@ def audit(path: str | Path, *, strict: bool = False) -> AuditReport:
     if outcome.disagrees:
         reason = (
             f"simulated again, tick {outcome.tick} differs in {outcome.field} by "
-            f"{outcome.difference:.3g}: the recording was changed"
+            f"{outcome.difference:.3g}: the recording was changed, or in mid-run the scene, other "
+            "than by set_input"
         )
         return _invalid(facts, _Fault(reason, outcome.tick, outcome.field))
-    return _judged(facts, balance, strict=strict)
+    report = _judged(facts, balance, strict=strict)
+    trips = [event.get("tick") for event in recording.events if event.get("event") == "trip"]
+    tripped = f"; the guard tripped at tick {trips[0]}" if trips else ""
+    return replace(report, reason=report.reason + tripped)
+
+
+def _is_resume(event: dict[str, Any]) -> bool:
+    return event.get("event") == "resume" and isinstance(event.get("tick"), int)
 
 
 def _event_counts(recording: Recording) -> dict[str, int]:
@@ -186,12 +196,14 @@ def _invalid(facts: dict[str, Any], fault: _Fault) -> AuditReport:
     )
 
 
-def _structure_fault(recording: Recording, parameters: RunParameters) -> _Fault | None:
+def _structure_fault(
+    recording: Recording, parameters: RunParameters, resumed: NDArray[np.float64]
+) -> _Fault | None:
     return (
         _file_fault(recording)
         or _number_fault(recording.ticks)
         or _time_fault(recording.ticks, parameters)
-        or _flag_fault(recording.ticks, parameters)
+        or _flag_fault(recording.ticks, parameters, resumed)
     )
 
 
@@ -203,7 +215,15 @@ def _file_fault(recording: Recording) -> _Fault | None:
             return _Fault("the file has no digest although it is not cut")
         if recording.digest != recording.computed_digest:
             return _Fault("the file's content does not match its digest: it was changed")
-    return None if len(recording.ticks) else _Fault("the recording holds no tick")
+    if not len(recording.ticks):
+        return _Fault("the recording holds no tick")
+    last = int(recording.ticks["tick"][-1])
+    for event in recording.events:
+        if event.get("event") == "stop" and event.get("tick") != last + 1:
+            return _Fault(
+                f"the run stopped before tick {event.get('tick')}, the last record is of {last}"
+            )
+    return None
 
 
 def _number_fault(ticks: NDArray[np.void]) -> _Fault | None:
@@ -246,14 +266,21 @@ def _time_fault(ticks: NDArray[np.void], parameters: RunParameters) -> _Fault | 
             tick,
             "deadline_ns",
         )
+    times = np.stack([ticks[name] for name in CLOCK_FIELDS], axis=1)
+    backwards = (np.diff(times, axis=1) < 0).any(axis=1)
+    if backwards.any():
+        tick = int(np.argmax(backwards))
+        return _Fault(f"times of tick {tick} run backwards", tick, "wake_ns")
     return None
 
 
-def _flag_fault(ticks: NDArray[np.void], parameters: RunParameters) -> _Fault | None:
+def _flag_fault(
+    ticks: NDArray[np.void], parameters: RunParameters, resumed: NDArray[np.float64]
+) -> _Fault | None:
     """Holds those flags that other fields repeat against them."""
     expected = {
         TickFlag.DROPPED_BEFORE: np.zeros(len(ticks), bool),  # the ticks are contiguous
-        TickFlag.RAMPING: ticks["tick"] < parameters.ramp_ticks,
+        TickFlag.RAMPING: since_start(ticks, resumed) < parameters.ramp_ticks,
         TickFlag.CONTACT: ticks["contacts"] > 0,
     }
     for flag, is_due in expected.items():

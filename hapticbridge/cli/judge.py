@@ -93,7 +93,10 @@ def _print_report(report: AuditReport) -> None:
     for condition in report.conditions:
         out.print(f"  {plain(condition)}")
     if not report.conditions:
-        out.print("  device condition b >= KT/2 + B: not applicable, the damping is not known")
+        out.print(
+            "  device condition b >= KT/2 + B: not applicable, the motion is prescribed or the "
+            "damping unknown"
+        )
     if report.is_cut:
         out.print(
             "  the file is cut: the verdict is on what it holds; "
@@ -103,10 +106,12 @@ def _print_report(report: AuditReport) -> None:
     if told:
         listed = ", ".join(f"{name} ({count})" for name, count in told.items())
         out.print(f"  events: {plain(listed)}")
-    out.print(f"  {report.ticks} ticks, {report.duration:.3f} s", end="")
-    for name, joules in report.energies.items():
-        out.print(f", {name.replace('_', ' ')} {quantity(joules, 'J')}", end="")
-    out.print()
+    out.print(f"  {report.ticks} ticks, {report.duration:.3f} s")
+    energies = [
+        f"{name.replace('_', ' ')} {quantity(e, 'J')}" for name, e in report.energies.items() if e
+    ]
+    if energies:
+        out.print(f"  {', '.join(energies)}")
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,6 +6,7 @@ import sys
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from importlib.metadata import version
 from typing import Annotated, TextIO
 
 import mujoco
@@ -15,7 +16,7 @@ from rich.markup import escape
 from hapticbridge.cli.judge import Audit, Repair
 from hapticbridge.cli.run import Run
 from hapticbridge.cli.scenes import Scenes
-from hapticbridge.cli.terminal import err, print_error
+from hapticbridge.cli.terminal import err, out, print_error
 from hapticbridge.errors import HapticBridgeError, SafetyTrip
 
 Command = (
@@ -33,6 +34,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     0 done, 1 done with a negative verdict, 2 bad input or usage, 3 safety trip.
     """
+    if (sys.argv[1:] if arguments is None else list(arguments)) == ["--version"]:
+        out.print(f"hapticbridge {version('hapticbridge')}, MuJoCo {mujoco.mj_versionString()}")
+        return 0
     command = tyro.cli(
         Command,
         prog="hapticbridge",
@@ -85,7 +89,3 @@ def _show_warning(
 ) -> None:
     if issubclass(category, UserWarning):
         err.print(f"[yellow]warning:[/yellow] {escape(str(message))}")
-
-
-if __name__ == "__main__":
-    sys.exit(main())

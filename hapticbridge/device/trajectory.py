@@ -71,7 +71,7 @@ class TrajectoryDevice:
         motion: Poses over time (``read_motion`` reads them from a CSV file).
         force_limit: In N, >= 0, for the data sheet: what the recorded wrench is limited to.
         torque_limit: In N m, >= 0, likewise.
-        speed_limit: In m/s, >= 0: faster motion is a jump, and the guard trips on it.
+        speed_limit: In m/s, >= 0, for the data sheet.
 
     Raises:
         DeviceError: A limit is out of range.
@@ -147,7 +147,7 @@ class ReplayDevice:
         name: What the recording is called in messages.
         force_limit: In N, >= 0, for the data sheet: what the recorded wrench is limited to.
         torque_limit: In N m, >= 0, likewise.
-        speed_limit: In m/s, >= 0: faster motion is a jump, and the guard trips on it.
+        speed_limit: In m/s, >= 0, for the data sheet.
 
     Raises:
         DeviceError: There are fewer than two rows, rows are missing in between, a pose is not

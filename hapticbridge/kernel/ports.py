@@ -182,6 +182,11 @@ def _mocap_work(state: NDArray[np.void]) -> float:
     equality's error, a tendon's length, a contact's distance. Rows without a residual (friction,
     also that of contacts) take no work from the move: to MuJoCo a mocap body has no velocity, so it
     drags nothing along.
+
+    For the same reason the damper of such a row acts against rest, not against the mocap body. A
+    slow move is exact (a lift costs m g h), but a fast one through a weld or a contact lags, and
+    what the row then gives to the scene beyond λ δr is counted as created: the environment may be
+    called active, and rightly, because MuJoCo's constraint is.
     """
     s = state[0]
     force = floats(pointer_at(s.efc_force), ints(s.nefc, 1)[0])

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import HapticBridgeError
@@ -21,6 +21,9 @@ from hapticbridge.tick import TICK_DTYPE
 
 HANDLE = "handle"
 """Name of the mocap body, and of its site, that the bridge adds to a scene."""
+
+MOST_SUBSTEPS = 100
+"""MuJoCo steps per tick at most; more would not fit into any period that can be felt."""
 
 COUPLING_ACTUATORS = tuple(
     f"coupling_{kind}_{axis}" for kind in ("force", "torque") for axis in ("x", "y", "z")
@@ -116,6 +119,7 @@ _POSES = ("device", "handle", "tool")
 
 _RUNNING_COUNTS = (
     "tick",
+    "ramp_start",
     "flags",
     "mocap_has_moved",
     "equality_rows",
@@ -210,15 +214,48 @@ class RunParameters:
             pose = getattr(self, name)
             if len(pose) != 7 or not all(math.isfinite(value) for value in pose):
                 raise HapticBridgeError(f"{name} is {pose!r}; it must be 7 finite numbers")
+            if abs(math.hypot(*pose[3:]) - 1) > 1e-9:
+                raise HapticBridgeError(f"{name} is {pose!r}; its quaternion must have norm 1")
+        if not isinstance(self.substeps, int) or self.substeps > MOST_SUBSTEPS:
+            raise HapticBridgeError(
+                f"substeps is {self.substeps!r}; it must be a whole number, 1 to {MOST_SUBSTEPS}"
+            )
         rotation = np.asarray(self.axes, dtype=np.float64)
         if rotation.shape != (9,) or not (
-            np.allclose(rotation.reshape(3, 3) @ rotation.reshape(3, 3).T, np.eye(3), atol=1e-6)
+            np.allclose(rotation.reshape(3, 3) @ rotation.reshape(3, 3).T, np.eye(3), atol=1e-12)
             and np.linalg.det(rotation.reshape(3, 3)) > 0
         ):
             raise HapticBridgeError(
                 f"axes is {self.axes!r}; it must be the 9 numbers of a right-handed rotation "
                 "matrix, row by row"
             )
+
+
+def rotation_numbers(matrix: ArrayLike) -> tuple[float, ...]:
+    """Returns the 9 numbers, row by row, of the rotation nearest to a matrix.
+
+    Axes are written with few digits (0.707107); the polar factor makes them a rotation to the last
+    one, so that positions, orientations and forces turn by the same.
+
+    Args:
+        matrix: 3 × 3, or 9 numbers; orthogonal to 1e-5 and right-handed.
+
+    Raises:
+        HapticBridgeError: It is not.
+    """
+    try:
+        given = np.asarray(matrix, dtype=np.float64)
+    except (TypeError, ValueError):
+        given = np.zeros(0)
+    if given.size == 9 and np.all(np.isfinite(given)):
+        square = given.reshape(3, 3)
+        if np.abs(square @ square.T - np.eye(3)).max() < 1e-5 and np.linalg.det(square) > 0:
+            left, _, right = np.linalg.svd(square)
+            return tuple((left @ right).ravel().tolist())
+    raise HapticBridgeError(
+        f"axes is {matrix!r}; it must be the 9 numbers of a right-handed rotation matrix, "
+        "row by row"
+    )
 
 
 class Binding:
@@ -243,6 +280,11 @@ class Binding:
         self._owned = _bind_addresses(model, data, self.state)
         self._fill_parameters(model, parameters)
         self._start(model, data, parameters)
+
+    def resume(self) -> None:
+        """Starts the ramp again at the next tick, after a pause in which zero was commanded."""
+        self.state["ramp_start"] = self.state["tick"]
+        self.state["wrench_on_device"] = 0.0
 
     def _fill_parameters(self, model: mujoco.MjModel, parameters: RunParameters) -> None:
         state = self.state

@@ -249,9 +249,10 @@ def _render(state: NDArray[np.void], force: Vector, torque: Vector) -> None:
     torque_on_device, is_torque_limited = _limited(torque_on_device, s.torque_limit)
     if is_limited or is_torque_limited:
         s.flags |= FORCE_LIMITED
-    if s.tick < s.ramp_ticks:
+    since_start = s.tick - s.ramp_start
+    if since_start < s.ramp_ticks:
         s.flags |= RAMPING
-        ramp = (s.tick + 1.0) / (s.ramp_ticks + 1.0)
+        ramp = (since_start + 1.0) / (s.ramp_ticks + 1.0)
         on_device, torque_on_device = scaled(ramp, on_device), scaled(ramp, torque_on_device)
     _store_vector(s.wrench_on_device[0:3], on_device)
     _store_vector(s.wrench_on_device[3:6], torque_on_device)

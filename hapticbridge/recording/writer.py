@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import stat
+import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import BinaryIO, cast
@@ -17,6 +18,9 @@ from hapticbridge.errors import RecordingError
 from hapticbridge.recording import format as layout
 from hapticbridge.recording.format import Attachment
 
+if sys.platform != "win32":
+    import fcntl
+
 __all__ = ["Attachment", "RecordingWriter"]
 
 
@@ -28,7 +32,18 @@ class _Output:
     """
 
     def __init__(self, path: Path, mode: str) -> None:
-        self._file = path.open(mode, buffering=0)
+        # not truncated before it is locked: another bridge may be recording to the same file
+        flags = os.O_WRONLY | os.O_CREAT | getattr(os, "O_BINARY", 0)
+        flags |= os.O_EXCL if "x" in mode else 0
+        self._file = os.fdopen(os.open(path, flags, 0o666), "wb", buffering=0)
+        try:
+            if sys.platform != "win32":
+                fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if stat.S_ISREG(os.fstat(self._file.fileno()).st_mode):
+                self._file.truncate(0)
+        except BlockingIOError as error:
+            self._file.close()
+            raise OSError(errno.EBUSY, "another bridge is recording to it") from error
         self._position = 0
 
     def write(self, data: bytes) -> int:

@@ -40,6 +40,22 @@ class Scene:
     data: mujoco.MjData
     sources: tuple[SourceFile, ...]
 
+    _is_claimed: bool = False
+
+    def claim(self) -> None:
+        """Reserves the scene for one bridge: two would move the same tool.
+
+        Raises:
+            SceneError: Another bridge has it.
+        """
+        if self._is_claimed:
+            raise SceneError(f"scene '{self.name}' is in use by another bridge; load it again")
+        self._is_claimed = True
+
+    def release(self) -> None:
+        """Lets another bridge have the scene."""
+        self._is_claimed = False
+
     @property
     def name(self) -> str:
         """The file's name without its ending."""

@@ -1,0 +1,71 @@
+"""The architecture as the README states it: imports go one way."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).parents[1] / "hapticbridge"
+
+ORDER = (
+    ("errors", "jit", "tick", "pose", "clock"),
+    ("coupling", "kernel", "passivity"),
+    ("scene",),
+    ("rendering",),
+    ("ledger", "inputs", "device"),
+    ("guard", "recording", "certificate"),
+    ("provenance", "summary"),
+    ("bridge", "audit"),
+    ("report",),
+    ("cli",),
+)
+RANK = {name: rank for rank, names in enumerate(ORDER) for name in names}
+
+# devices are opened by name, and one of them is a recording; the import stands in the function
+LAZY = {("device", "recording")}
+
+FILES = [path for path in PACKAGE.rglob("*.py") if path.parent != PACKAGE or path.stem[0] != "_"]
+
+
+def concept(path: Path) -> str:
+    """Returns the module or package directly below hapticbridge that a file belongs to."""
+    return path.relative_to(PACKAGE).parts[0].removesuffix(".py")
+
+
+def imports_of(path: Path) -> set[str]:
+    """Returns the other concepts that a file imports."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    modules = [node.module or "" for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)]
+    mine = {module.split(".")[1] for module in modules if module.startswith("hapticbridge.")}
+    return mine - {concept(path)} - {other for here, other in LAZY if here == concept(path)}
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(PACKAGE)))
+def test_imports_go_one_way(path: Path) -> None:
+    for other in imports_of(path):
+        assert RANK[other] <= RANK[concept(path)], f"{other} stands to the right of {path.name}"
+
+
+def test_concepts_do_not_import_each_other_in_a_circle() -> None:
+    edges: dict[str, set[str]] = {}
+    for path in FILES:
+        edges.setdefault(concept(path), set()).update(imports_of(path))
+
+    def visit(name: str, trail: tuple[str, ...]) -> None:
+        assert name not in trail, " imports ".join((*trail, name))
+        for other in edges[name]:
+            visit(other, (*trail, name))
+
+    for name in edges:
+        visit(name, ())
+
+
+def test_the_audit_never_imports_the_bridge() -> None:
+    for path in (PACKAGE / "audit").glob("*.py"):
+        assert "bridge" not in imports_of(path)
+
+
+def test_every_concept_has_its_place() -> None:
+    assert {concept(path) for path in FILES} == set(RANK)
