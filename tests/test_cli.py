@@ -474,7 +474,7 @@ HOSTILE = "--><script>alert('x')</script>[/b] ${y} $\\frac$ & \x1b[31m"
 @pytest.fixture
 def hostile(tmp_path: Path, run_file: Path) -> Recording:
     recording = read_recording(run_file)
-    meta = dict.fromkeys(("scene", "method", "started", "clock"), HOSTILE)
+    meta = dict.fromkeys(("scene", "started", "clock"), HOSTILE)
     meta["versions"] = json.dumps({"mujoco": HOSTILE})
     event = {"event": HOSTILE, "reason": HOSTILE, "tick": HOSTILE, "time_ns": 0}
     path = rewritten(

@@ -233,7 +233,7 @@ def test_command_line_runs_and_judges_a_scene_of_the_users_own(tmp_path: Path) -
     hand_file(folder, [(0.3, (0.02, 0.0, 0.0))])
     run = subprocess.run(
         [
-            *(sys.executable, "-m", "hapticbridge.cli.main", "run", "Schublade 1.xml"),
+            *(sys.executable, "-m", "hapticbridge", "run", "Schublade 1.xml"),
             *("--grip", "knob", "--device", "trajectory:hand.csv", "--fast"),
             *("--duration", "0.5", "--record", "lauf 1.mcap"),
         ],
@@ -253,7 +253,7 @@ def test_command_line_runs_and_judges_a_scene_of_the_users_own(tmp_path: Path) -
 def test_command_line_names_the_sites_where_the_grip_is_not_one(tmp_path: Path) -> None:
     path = scene_file(tmp_path, DRAWER)
     run = subprocess.run(
-        [sys.executable, "-m", "hapticbridge.cli.main", "run", str(path), "--fast"],
+        [sys.executable, "-m", "hapticbridge", "run", str(path), "--fast"],
         check=False,
         capture_output=True,
         text=True,

@@ -11,20 +11,18 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.audit.balance import Balance, since_start
+from hapticbridge.audit.balance import Balance
 from hapticbridge.audit.replay import replay
+from hapticbridge.audit.structure import TOLERANCE, Fault, structure_fault
 from hapticbridge.certificate import Condition, device_conditions, is_certified
 from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import HapticBridgeError, RecordingError
+from hapticbridge.guard import Limits, limits_for
 from hapticbridge.kernel.state import RunParameters
 from hapticbridge.provenance import STARTS, meta_start, parameters_of
 from hapticbridge.recording import Recording, read_recording
-from hapticbridge.tick import CLOCK_FIELDS, TICK_DTYPE, TickFlag
-
-TOLERANCE = 1e-9
-"""Relative difference, and absolute one in SI units, between a recorded number and its second
-computation in NumPy. Rounding of 10⁵ summed works stays below it; a changed digit that matters does
-not. It is also the tolerance of (14) itself."""
+from hapticbridge.rendering import method_named
+from hapticbridge.tick import TickFlag
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,14 +83,6 @@ def _finite(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
-@dataclass(frozen=True, slots=True)
-class _Fault:
-    reason: str
-    tick: int | None = None
-    port: str = ""
-    joules: float = 0.0
-
-
 @np.errstate(all="ignore")  # numbers of a damaged file overflow; what comes out is then a fault
 def audit(path: str | Path, *, strict: bool = False) -> AuditReport:
     """Judges a recording from the file alone.
@@ -120,12 +110,12 @@ def audit(path: str | Path, *, strict: bool = False) -> AuditReport:
         parameters = parameters_of(recording.meta)
         conditions = _conditions(recording, parameters)
     except RecordingError as error:
-        return _invalid(facts, _Fault(str(error)))
+        return _invalid(facts, Fault(str(error)))
     facts["duration"] = len(recording.ticks) * parameters.period
     facts["certified"] = is_certified(conditions)
     facts["conditions"] = tuple(condition.sentence() for condition in conditions)
     resumed = np.array([float(e["tick"]) for e in recording.events if _is_resume(e)])
-    fault = _structure_fault(recording, parameters, resumed)
+    fault = structure_fault(recording, parameters, resumed)
     if fault:
         return _invalid(facts, fault)
     ticks = recording.ticks
@@ -145,7 +135,7 @@ def audit(path: str | Path, *, strict: bool = False) -> AuditReport:
             return _invalid(facts, fault)
         outcome = replay(recording, parameters)
     except RecordingError as error:
-        return _invalid(facts, _Fault(str(error)))
+        return _invalid(facts, Fault(str(error)))
     facts["resimulation"] = outcome.agreement
     if outcome.disagrees:
         reason = (
@@ -153,7 +143,7 @@ def audit(path: str | Path, *, strict: bool = False) -> AuditReport:
             f"{outcome.difference:.3g}: the recording was changed, or in mid-run the scene, other "
             "than by set_input"
         )
-        return _invalid(facts, _Fault(reason, outcome.tick, outcome.field))
+        return _invalid(facts, Fault(reason, outcome.tick, outcome.field))
     report = _judged(facts, balance, strict=strict)
     trips = [event.get("tick") for event in recording.events if event.get("event") == "trip"]
     tripped = f"; the guard tripped at tick {trips[0]}" if trips else ""
@@ -175,8 +165,12 @@ def _event_counts(recording: Recording) -> dict[str, int]:
 def _conditions(recording: Recording, parameters: RunParameters) -> tuple[Condition, ...]:
     try:
         info = DeviceInfo.from_json(recording.meta.get("device", ""))
+        limits_for(info, Limits(force=parameters.force_limit, torque=parameters.torque_limit))
+        method = method_named(recording.meta.get("method", ""))
     except HapticBridgeError as error:
-        raise RecordingError(f"metadata 'device' cannot be read: {error}") from None
+        raise RecordingError(f"the metadata do not describe a run: {error}") from None
+    if recording.meta.get("discretization") != method.discretization:
+        raise RecordingError(f"metadata 'discretization' is not that of method '{method.name}'")
     if info.is_prescribed:
         return ()
     return device_conditions(
@@ -184,7 +178,7 @@ def _conditions(recording: Recording, parameters: RunParameters) -> tuple[Condit
     )
 
 
-def _invalid(facts: dict[str, Any], fault: _Fault) -> AuditReport:
+def _invalid(facts: dict[str, Any], fault: Fault) -> AuditReport:
     return AuditReport(
         **facts,
         verdict="invalid",
@@ -196,103 +190,7 @@ def _invalid(facts: dict[str, Any], fault: _Fault) -> AuditReport:
     )
 
 
-def _structure_fault(
-    recording: Recording, parameters: RunParameters, resumed: NDArray[np.float64]
-) -> _Fault | None:
-    return (
-        _file_fault(recording)
-        or _number_fault(recording.ticks)
-        or _time_fault(recording.ticks, parameters)
-        or _flag_fault(recording.ticks, parameters, resumed)
-    )
-
-
-def _file_fault(recording: Recording) -> _Fault | None:
-    if recording.problems:
-        return _Fault("the file is damaged: " + "; ".join(recording.problems))
-    if not recording.is_cut:
-        if recording.digest is None:
-            return _Fault("the file has no digest although it is not cut")
-        if recording.digest != recording.computed_digest:
-            return _Fault("the file's content does not match its digest: it was changed")
-    if not len(recording.ticks):
-        return _Fault("the recording holds no tick")
-    last = int(recording.ticks["tick"][-1])
-    for event in recording.events:
-        if event.get("event") == "stop" and event.get("tick") != last + 1:
-            return _Fault(
-                f"the run stopped before tick {event.get('tick')}, the last record is of {last}"
-            )
-    return None
-
-
-def _number_fault(ticks: NDArray[np.void]) -> _Fault | None:
-    for name in TICK_DTYPE.names or ():
-        finite = np.isfinite(ticks[name]).reshape(len(ticks), -1).all(axis=1)
-        if not finite.all():
-            tick = int(np.argmin(finite))
-            return _Fault(f"{name} of record {tick} is not finite", tick, name)
-    for name in ("device_quaternion", "handle_quaternion", "tool_quaternion"):
-        off = np.abs(np.linalg.norm(ticks[name], axis=1) - 1) > TOLERANCE
-        off |= ticks[name][:, 0] < 0
-        if off.any():
-            tick = int(np.argmax(off))
-            return _Fault(f"{name} of tick {tick} is not a unit quaternion", tick, name)
-    return None
-
-
-def _time_fault(ticks: NDArray[np.void], parameters: RunParameters) -> _Fault | None:
-    gap = np.flatnonzero(ticks["tick"] != np.arange(len(ticks)))
-    if gap.size:
-        at = int(gap[0])
-        before = int(ticks["tick"][at - 1]) if at else -1
-        return _Fault(
-            f"ticks are not contiguous: {before} is followed by {int(ticks['tick'][at])}, so the "
-            "energy in between is unknown",
-            at,
-            "tick",
-        )
-    period_ns = round(min(parameters.period * 1e9, 2.0**62))
-    interval = np.diff(ticks["deadline_ns"], prepend=0)
-    has_skipped = (ticks["flags"] & int(TickFlag.OVERRUN)) != 0
-    is_multiple = (interval > period_ns) & (interval % max(period_ns, 1) == 0)
-    wrong = np.where(has_skipped, ~is_multiple, interval != period_ns)
-    if wrong.any():
-        tick = int(np.argmax(wrong))
-        claim = "an overrun is flagged and " if has_skipped[tick] else ""
-        return _Fault(
-            f"{claim}tick {tick} is due {int(interval[tick])} ns after the one before, the period "
-            f"is {period_ns} ns",
-            tick,
-            "deadline_ns",
-        )
-    times = np.stack([ticks[name] for name in CLOCK_FIELDS], axis=1)
-    backwards = (np.diff(times, axis=1) < 0).any(axis=1)
-    if backwards.any():
-        tick = int(np.argmax(backwards))
-        return _Fault(f"times of tick {tick} run backwards", tick, "wake_ns")
-    return None
-
-
-def _flag_fault(
-    ticks: NDArray[np.void], parameters: RunParameters, resumed: NDArray[np.float64]
-) -> _Fault | None:
-    """Holds those flags that other fields repeat against them."""
-    expected = {
-        TickFlag.DROPPED_BEFORE: np.zeros(len(ticks), bool),  # the ticks are contiguous
-        TickFlag.RAMPING: since_start(ticks, resumed) < parameters.ramp_ticks,
-        TickFlag.CONTACT: ticks["contacts"] > 0,
-    }
-    for flag, is_due in expected.items():
-        wrong = ((ticks["flags"] & int(flag)) != 0) != is_due
-        if wrong.any():
-            tick = int(np.argmax(wrong))
-            name = (flag.name or "").lower()
-            return _Fault(f"flag '{name}' of tick {tick} contradicts the record", tick, "flags")
-    return None
-
-
-def _physics_fault(ticks: NDArray[np.void], balance: Balance) -> _Fault | None:
+def _physics_fault(ticks: NDArray[np.void], balance: Balance) -> Fault | None:
     """Returns the earliest disagreement between the records and their second computation."""
     vectors = (
         ("handle_position", balance.handle_position, "m", "device pose and scale"),
@@ -333,13 +231,13 @@ def _physics_fault(ticks: NDArray[np.void], balance: Balance) -> _Fault | None:
 
 def _first(
     name: str, difference: NDArray[np.float64], allowed: NDArray[np.float64], unit: str, by: str
-) -> _Fault | None:
+) -> Fault | None:
     wrong = ~(difference <= allowed)  # also where a sum overflowed to NaN
     if not wrong.any():
         return None
     tick = int(np.argmax(wrong))
     amount = float(difference[tick])
-    return _Fault(
+    return Fault(
         f"{name} of tick {tick} is {amount:.3g} {unit} off what {by} give",
         tick,
         name,
