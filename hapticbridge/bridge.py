@@ -7,14 +7,12 @@
 
 from __future__ import annotations
 
-import signal
-import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
 from pathlib import Path
-from types import FrameType, TracebackType
+from types import TracebackType
 
 import mujoco
 import numpy as np
@@ -35,6 +33,7 @@ from hapticbridge.provenance import attachments, describe_run
 from hapticbridge.recording import TAIL, Recorder, Ring
 from hapticbridge.rendering import method_named, prepare
 from hapticbridge.scene import Scene, load_scene
+from hapticbridge.signals import stopping_on_signals
 from hapticbridge.summary import Summary
 from hapticbridge.tick import SAMPLE_DTYPE, TickFlag
 
@@ -49,7 +48,6 @@ RING_POLL = 1e-3
 """How often a run in simulated time looks whether the recorder made room, in s."""
 
 _NO_FORCE = np.zeros(6)
-_STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 class Bridge:
@@ -175,7 +173,7 @@ class Bridge:
         read_device, write_device = self.device.read, self.device.write
         clock, wait, now = self.clock, self.clock.wait, self.clock.now
         inputs, step = self._inputs, mujoco.mj_step
-        with self._stopping_on_signals():
+        with stopping_on_signals(self._stop_on_signal):
             clock.start(round(self.period * 1e9))
             try:
                 while self._tick != last and not self._stopped_by:
@@ -214,6 +212,9 @@ class Bridge:
     def stop(self) -> None:
         """Ends the run after the present tick; may be called from ``on_tick`` or a thread."""
         self._stopped_by = "caller"
+
+    def _stop_on_signal(self) -> None:
+        self._stopped_by = "signal"
 
     def set_input(
         self,
@@ -398,20 +399,3 @@ class Bridge:
     def _event(self, event: str, **details: object) -> None:
         if self._recorder is not None:
             self._recorder.event({"event": event, "tick": self._tick, **details}, self.clock.now())
-
-    @contextmanager
-    def _stopping_on_signals(self) -> Iterator[None]:
-        """Turns SIGINT and SIGTERM into a clean end of the run; only the main thread may do so."""
-
-        def stop(_number: int, _frame: FrameType | None) -> None:
-            self._stopped_by = "signal"
-
-        if threading.current_thread() is not threading.main_thread():
-            yield
-            return
-        previous = {number: signal.signal(number, stop) for number in _STOP_SIGNALS}
-        try:
-            yield
-        finally:
-            for number, handler in previous.items():
-                signal.signal(number, handler)

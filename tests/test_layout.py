@@ -10,7 +10,7 @@ import pytest
 PACKAGE = Path(__file__).parents[1] / "hapticbridge"
 
 ORDER = (
-    ("errors", "jit", "tick", "pose", "clock"),
+    ("errors", "jit", "tick", "pose", "clock", "signals"),
     ("coupling", "kernel", "passivity"),
     ("scene",),
     ("rendering",),
