@@ -923,3 +923,20 @@ def test_flag_that_is_not_refused_leaves_a_free_tools_run_as_it_was(
     got = ticks(scene_file(tmp_path, mjcf(option, body=GRIPPED)), hand)
     for name in ("tool_position", "tool_quaternion", "wrench_on_tool", "environment_energy"):
         assert np.array_equal(got[name], expected[name]), name
+
+
+def test_compiled_model_does_not_depend_on_the_folder_or_tell_it(tmp_path: Path) -> None:
+    compiled = []
+    for folder in (tmp_path / "a", tmp_path / "elsewhere" / "b"):
+        (folder / "meshes").mkdir(parents=True)
+        (folder / "meshes" / "t.obj").write_text(
+            "v 0 0 0\nv .1 0 0\nv 0 .1 0\nv 0 0 .1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+        )
+        (folder / "s.xml").write_text(
+            """<mujoco><compiler meshdir="meshes"/><asset><mesh name="t" file="t.obj"/></asset>
+            <worldbody><body><freejoint/><geom type="mesh" mesh="t" mass=".1"/><site name="grip"/>
+            </body></worldbody></mujoco>"""
+        )
+        compiled.append(compiled_model(load_scene(folder / "s.xml").model))
+    assert compiled[0] == compiled[1]
+    assert str(tmp_path).encode() not in compiled[0]

@@ -53,7 +53,7 @@ class Run:
     rate: float = 1000.0
     """Ticks per second."""
     substeps: int = 1
-    """MuJoCo steps per tick."""
+    """MuJoCo steps per tick; with more than one even a free tool may use slack."""
     fast: bool = False
     """Simulated time: as fast as it goes, and the same in every run."""
     stiffness: float | None = None

@@ -134,7 +134,7 @@ def load_scene(path_or_name: str | Path, grip: str = "grip") -> Scene:
     attach_handle(spec, grip)
     set_options(spec)
     try:
-        model = spec.compile()
+        model = _compiled(spec, sources)
         concerns += check_model(model, grip)
         seat_handle(model, grip)
         scene = Scene(path, grip, model, mujoco.MjData(model), sources)
@@ -145,6 +145,25 @@ def load_scene(path_or_name: str | Path, grip: str = "grip") -> Scene:
     for concern in concerns:
         warnings.warn(f"scene '{path}': {concern}", UserWarning, stacklevel=2)
     return scene
+
+
+def _compiled(spec: mujoco.MjSpec, sources: tuple[SourceFile, ...]) -> mujoco.MjModel:
+    """Compiles a scene from the bytes of its files instead of from their places.
+
+    A compiled model names the files of its meshes and textures; with their places it would differ
+    from folder to folder, and a recording would tell where its user keeps what. Files outside the
+    scene's own folder, and whatever MuJoCo finds only by itself, are taken from where they are.
+    """
+    main, *assets = sources
+    if not assets or "/" in main.name:
+        return spec.compile()
+    portable = spec.copy()
+    portable.modelfiledir = ""
+    portable.assets = {source.name: source.data for source in assets}
+    try:
+        return portable.compile()
+    except ValueError:
+        return spec.compile()
 
 
 def _malformed(match: re.Match[str]) -> str:
