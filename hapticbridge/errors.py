@@ -26,6 +26,10 @@ class CouplingError(HapticBridgeError):
     """A virtual coupling's parameters are out of range."""
 
 
+class MechanicsError(HapticBridgeError):
+    """A body, motion or impact of the reference mechanics is out of range."""
+
+
 class DeviceError(HapticBridgeError):
     """A device cannot be opened, read or written, or its input file is bad."""
 

@@ -11,7 +11,7 @@ PACKAGE = Path(__file__).parents[1] / "hapticbridge"
 
 ORDER = (
     ("errors", "jit", "tick", "pose", "clock", "signals"),
-    ("coupling", "kernel", "passivity"),
+    ("coupling", "kernel", "mechanics", "passivity"),
     ("scene",),
     ("rendering",),
     ("ledger", "inputs", "device"),
