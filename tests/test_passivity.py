@@ -106,4 +106,4 @@ def test_coupling_damping_out_of_range_is_refused(value: float) -> None:
 
 def test_unknown_axis_is_refused_with_the_choices() -> None:
     with pytest.raises(CouplingError, match="choose 'translation' or 'rotation'"):
-        minimum_damping(Coupling(1, 0, 0, 0), T, axis="x")  # type: ignore[arg-type]
+        minimum_damping(Coupling(1, 0, 0, 0), T, axis="x")  # type: ignore[call-overload]

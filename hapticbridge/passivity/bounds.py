@@ -1,12 +1,25 @@
-"""Closed-form conditions between a coupling, the sampling period and the device's damping."""
+"""Conditions between a coupling, the sampling period and the device's damping."""
 
 from __future__ import annotations
 
-import math
-from typing import Literal
+from typing import overload
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import CouplingError
+from hapticbridge.passivity.grid import (
+    Axis,
+    CouplingGrid,
+    checked,
+    plain,
+    scalar,
+    spring_and_damper,
+    together,
+)
+from hapticbridge.passivity.spectrum import Discretization, checked_delay, coupling_transfer
+from hapticbridge.passivity.wall import wall_supremum
 
 STIFFNESS_MARGIN = 0.8
 """Share of the largest passive stiffness that a default coupling uses, without unit. The rest pays
@@ -18,48 +31,117 @@ DAMPING_SHARE = 0.25
 More damps the tool better against the handle and leaves less stiffness: K ∝ b − B."""
 
 
-def _positive(name: str, value: float, unit: str) -> float:
-    if not math.isfinite(value) or value <= 0:
-        raise CouplingError(f"{name} is {value!r} {unit}; it must be finite and > 0")
-    return value
-
-
+@overload
 def minimum_damping(
     coupling: Coupling,
     period: float,
     *,
-    axis: Literal["translation", "rotation"] = "translation",
-) -> float:
+    discretization: Discretization = ...,
+    delay: int = ...,
+    filter_time: float = ...,
+    axis: Axis = ...,
+) -> float: ...
+
+
+@overload
+def minimum_damping(
+    coupling: CouplingGrid,
+    period: float,
+    *,
+    discretization: Discretization = ...,
+    delay: int = ...,
+    filter_time: float = ...,
+    axis: Axis = ...,
+) -> float | NDArray[np.float64]: ...
+
+
+def minimum_damping(
+    coupling: Coupling | CouplingGrid,
+    period: float,
+    *,
+    discretization: Discretization = "backward",
+    delay: int = 0,
+    filter_time: float = 0.0,
+    axis: Axis = "translation",
+) -> float | NDArray[np.float64]:
     """Returns the damping that a device needs so that this coupling is passive on it.
 
-        b > K T / 2 + B
+        backward     b > K T/2 + B                     low-passed: K T/2 + B T/(T + 2τ)
+        tustin       b > K T/2 for B = 0, else inf     low-passed: K T/2 + B T/(2τ)
 
-    Necessary, and sufficient for any passive hand and any environment that is discrete-time
-    passive (14), whatever it consists of.
+    Without a delay this is necessary, and sufficient for any passive hand and any environment that
+    is discrete-time passive (14), whatever it consists of (for the low-passed ones: any linear
+    hand and environment).
+
+    With a delay of d samples it is the bound against a **wall** (the tool does not move):
+
+        b > (K T/2) sin((2d + 1)θ/2)/sin(θ/2) − B cos((d + 1)θ)  for all θ;  B = 0: K (T/2 + d T)
+
+    The damper may help there. For a *general* environment behind a delayed coupling no damping
+    suffices (``damping_spectrum_of`` of C z⁻ᵈ shows it): no bound can be promised.
 
     Args:
-        coupling: K, B and their rotational counterparts.
+        coupling: K, B and their rotational counterparts; a ``CouplingGrid`` for many at once.
         period: T in s, finite and > 0: how long the device holds a wrench.
+        discretization: Of the damper.
+        delay: d, whole samples from position to force.
+        filter_time: τ in s, >= 0, of a first-order low-pass behind the damper, discretised alike.
         axis: Which pair of K and B is asked for.
 
     Returns:
-        The bound on b in N s/m (rotation: N m s/rad).
+        The bound on b in N s/m (rotation: N m s/rad), shaped like the coupling; inf where no
+        damping suffices, as for Tustin's damper without low-pass at any delay (its gain at
+        Nyquist is infinite).
 
     Raises:
-        CouplingError: The period is not finite or not positive, or the axis is unknown.
+        CouplingError: An argument is out of range, or the axis or discretization is unknown.
 
     References:
-        Brown & Colgate 1997, eq. (6).
+        Brown & Colgate 1997, eqs. (6), (7); Colgate & Schenkel 1997 (wall).
     """
-    _positive("period", period, "s")
-    if axis == "translation":
-        return coupling.stiffness * period / 2 + coupling.damping
-    if axis == "rotation":
-        return coupling.rotational_stiffness * period / 2 + coupling.rotational_damping
-    raise CouplingError(f"axis is {axis!r}; choose 'translation' or 'rotation'")
+    period = scalar("period", period, "s", positive=True)
+    filter_time = scalar("filter time", filter_time, "s")
+    delay = checked_delay(delay)
+    stiffness, damping = spring_and_damper(coupling, axis)
+    if discretization not in {"backward", "tustin"}:
+        raise CouplingError(f"discretization is {discretization!r}; choose 'backward' or 'tustin'")
+    unbounded = discretization == "tustin" and filter_time == 0
+    if delay:
+        # without low-pass, Tustin is only asked where B = 0, and is the backward difference there
+        scheme: Discretization = "backward" if unbounded else discretization
+
+        def transfer(
+            k: NDArray[np.float64], b: NDArray[np.float64], theta: NDArray[np.float64]
+        ) -> NDArray[np.complex128]:
+            return coupling_transfer(k, b, period, theta, scheme, filter_time)
+
+        needed = wall_supremum(transfer, stiffness, damping, period, delay, filter_time)
+    else:
+        if unbounded:
+            share = 1.0
+        elif discretization == "tustin":
+            share = period / (2 * filter_time)
+        else:
+            share = period / (period + 2 * filter_time)
+        needed = stiffness * period / 2 + damping * share
+    if unbounded:
+        needed = np.where(damping > 0, np.inf, needed)
+    return plain(np.asarray(needed))
 
 
-def maximum_stiffness(device_damping: float, period: float, damping: float = 0.0) -> float:
+@overload
+def maximum_stiffness(device_damping: float, period: float, damping: float = 0.0) -> float: ...
+
+
+@overload
+def maximum_stiffness(
+    device_damping: ArrayLike, period: ArrayLike, damping: ArrayLike = 0.0
+) -> float | NDArray[np.float64]: ...
+
+
+def maximum_stiffness(
+    device_damping: ArrayLike, period: ArrayLike, damping: ArrayLike = 0.0
+) -> float | NDArray[np.float64]:
     """Returns the largest passive stiffness, K = 2 (b − B) / T.
 
     Args:
@@ -68,7 +150,7 @@ def maximum_stiffness(device_damping: float, period: float, damping: float = 0.0
         damping: B in N s/m, finite, 0 <= B < b.
 
     Returns:
-        K in N/m; a coupling must stay below it.
+        K in N/m, of the shape that the arguments broadcast to; a coupling must stay below it.
 
     Raises:
         CouplingError: An argument is out of range; B >= b leaves no stiffness at all.
@@ -76,16 +158,18 @@ def maximum_stiffness(device_damping: float, period: float, damping: float = 0.0
     References:
         Brown & Colgate 1997, eq. (6) solved for K.
     """
-    _positive("device damping", device_damping, "N s/m")
-    _positive("period", period, "s")
-    if not math.isfinite(damping) or damping < 0:
-        raise CouplingError(f"coupling damping is {damping!r} N s/m; it must be finite and >= 0")
-    if damping >= device_damping:
+    available, step, spent = together(
+        checked("device damping", device_damping, "N s/m", positive=True),
+        checked("period", period, "s", positive=True),
+        checked("coupling damping", damping, "N s/m"),
+    )
+    if (spent >= available).any():
+        worst = np.argmax(spent - available)
         raise CouplingError(
-            f"coupling damping {damping:g} N s/m is not below the device's {device_damping:g} "
-            "N s/m, so no stiffness is passive"
+            f"coupling damping {spent.flat[worst]:g} N s/m is not below the device's "
+            f"{available.flat[worst]:g} N s/m, so no stiffness is passive"
         )
-    return 2 * (device_damping - damping) / period
+    return plain(2 * (available - spent) / step)
 
 
 def stiffest_coupling(damping: float, rotational_damping: float, period: float) -> Coupling:
@@ -101,8 +185,9 @@ def stiffest_coupling(damping: float, rotational_damping: float, period: float) 
     Raises:
         CouplingError: An argument is not finite or not positive.
     """
-    translation = DAMPING_SHARE * _positive("device damping", damping, "N s/m")
-    rotation = DAMPING_SHARE * _positive("device damping", rotational_damping, "N m s/rad")
+    damping = scalar("device damping", damping, "N s/m", positive=True)
+    rotational_damping = scalar("device damping", rotational_damping, "N m s/rad", positive=True)
+    translation, rotation = DAMPING_SHARE * damping, DAMPING_SHARE * rotational_damping
     return Coupling(
         stiffness=STIFFNESS_MARGIN * maximum_stiffness(damping, period, translation),
         damping=translation,
