@@ -22,8 +22,8 @@ from hapticbridge.certificate import default_coupling, device_conditions, is_cer
 from hapticbridge.clock import Clock, RealClock, period_of
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Device, device_for
-from hapticbridge.errors import DeviceError, HapticBridgeError, RecordingError, SafetyTrip
-from hapticbridge.guard import Limits, limits_for, trip_reason
+from hapticbridge.errors import HapticBridgeError, RecordingError, SafetyTrip
+from hapticbridge.guard import Limits, limits_for, refuse_stretched_start, trip_reason
 from hapticbridge.inputs import Write, apply_writes, input_writes
 from hapticbridge.jit import direct
 from hapticbridge.kernel.state import Binding, RunParameters, rotation_numbers
@@ -288,7 +288,7 @@ class Bridge:
         self._sample[:] = self.device.start(self.period)
         self.parameters = self._parameters()
         self._binding = Binding(scene.model, scene.data, self.parameters)
-        self._refuse_stretched_start()
+        refuse_stretched_start(self._binding.state, self._limits)
         is_read = self._path is not None or self._is_live
         capacity = min(round(RING_SECONDS / self.period), MOST_RECORDS)
         self._ring = Ring.shared(capacity) if is_read else Ring.local(capacity)
@@ -332,17 +332,6 @@ class Bridge:
             handle_origin=identity if self._is_absolute else grip,
             device_start=start,
         )
-
-    def _refuse_stretched_start(self) -> None:
-        state = self._binding.state[0]
-        distance = float(np.linalg.norm(state["handle_position"] - state["tool_position"]))
-        force, limit = self.coupling.stiffness * distance, self._limits.force
-        if force > limit:
-            raise DeviceError(
-                f"the device's absolute pose puts the handle {1e3 * distance:.3g} mm from the "
-                f"grip, {force:.3g} N at the start; the limit is {limit:g} N: start nearer to "
-                f"{np.round(state['tool_position'], 4).tolist()} m or use relative poses"
-            )
 
     def _compile(self) -> None:
         """Gets the machine code of the tick ready, so that the first one is not late."""

@@ -5,6 +5,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import numpy as np
+from numpy.typing import NDArray
+
 from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import DeviceError
 from hapticbridge.kernel.step import BAD_SAMPLE
@@ -60,6 +63,27 @@ def limits_for(info: DeviceInfo, limits: Limits | None) -> Limits:
                 f"{name} limit is {asked:g} {unit}; the device '{info.name}' bears {most:g} {unit}"
             )
     return limits
+
+
+def refuse_stretched_start(state: NDArray[np.void], limits: Limits) -> None:
+    """Refuses a start at which the coupling would already pull with more than the force limit.
+
+    Args:
+        state: The kernel's state (``STATE_DTYPE``, one element) before the first tick.
+        limits: Of the run.
+
+    Raises:
+        DeviceError: Says how far the handle is from the grip, and where the grip is.
+    """
+    s = state[0]
+    distance = float(np.linalg.norm(s["handle_position"] - s["tool_position"]))
+    force = float(s["stiffness"]) * distance
+    if force > limits.force:
+        raise DeviceError(
+            f"the device's absolute pose puts the handle {1e3 * distance:.3g} mm from the grip, "
+            f"{force:.3g} N at the start; the limit is {limits.force:g} N: start nearer to "
+            f"{np.round(s['tool_position'], 4).tolist()} m or use relative poses"
+        )
 
 
 def trip_reason(code: int, tick: int) -> str:

@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from hapticbridge.audit import AuditReport
+from hapticbridge.device import DATA_SHEET_UNITS
 from hapticbridge.errors import RecordingError
 from hapticbridge.provenance import parameters_of
 from hapticbridge.recording import Recording
@@ -69,17 +70,7 @@ FACTS = {
 }
 """Metadata that a page shows, with their units."""
 
-DEVICE_FACTS = {
-    "name": "",
-    "degrees_of_freedom": "",
-    "mass": "kg",
-    "damping": "N s/m",
-    "rotational_inertia": "kg m²",
-    "rotational_damping": "N m s/rad",
-    "friction": "N",
-    "resolution": "m",
-    "rate": "Hz",
-}
+DEVICE_FACTS = {"name": "", "degrees_of_freedom": ""} | DATA_SHEET_UNITS
 """What a page shows of the device's data sheet, with units."""
 
 

@@ -717,3 +717,19 @@ def test_a_stop_ends_a_run_whose_recorder_stalls(tmp_path: Path) -> None:
             os.kill(pid, signal.SIGCONT)
     assert summary.stopped_by == "caller"
     assert summary.ticks < 100_000
+
+
+@pytest.mark.parametrize(("distance", "is_refused"), [(0.0041, False), (0.0042, True)])
+def test_absolute_start_that_would_pull_beyond_the_limit_is_refused(
+    distance: float, is_refused: bool
+) -> None:
+    """At 2400 N/m the device's 10 N are reached 4.17 mm from the grip."""
+    device = ScriptedDevice(lambda _tick: (distance, 0, 0, 1, 0, 0, 0))
+    bridge = fast("point_mass", device, absolute=True)
+    if not is_refused:
+        with bridge:
+            bridge.run(0.01)
+        return
+    with pytest.raises(DeviceError, match="puts the handle"), bridge:
+        pass
+    assert device.is_closed

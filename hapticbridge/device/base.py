@@ -46,7 +46,7 @@ def checked_period(period: float) -> float:
     return checked_number("the loop's period", period, "s", is_positive=True)
 
 
-_UNITS = {
+DATA_SHEET_UNITS = {
     "mass": "kg",
     "damping": "N s/m",
     "rotational_inertia": "kg m²",
@@ -59,6 +59,8 @@ _UNITS = {
     "rate": "Hz",
     "duration": "s",
 }
+"""SI units of the numbers in a device's data sheet."""
+
 _NEVER_UNKNOWN = ("force_limit", "torque_limit", "speed_limit")
 _POSITIVE = ("mass", "rotational_inertia", "rate")
 
@@ -116,7 +118,7 @@ class DeviceInfo:
         for name in ("is_prescribed", "is_real"):
             if not isinstance(getattr(self, name), bool):
                 raise DeviceError(f"{name} = {getattr(self, name)!r}: must be true or false")
-        for name, unit in _UNITS.items():
+        for name, unit in DATA_SHEET_UNITS.items():
             value = getattr(self, name)
             if value is None and name not in _NEVER_UNKNOWN:
                 continue
