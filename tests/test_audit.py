@@ -666,3 +666,9 @@ def test_bridge_and_audit_agree_on_the_verdict_of_a_run_that_is_continued(tmp_pa
         summary = bridge.run(0.1)
     report = audit(path)
     assert (report.verdict, report.ticks) == (summary.verdict, 200)
+
+
+def test_records_that_are_missing_before_the_stop_are_noticed(tap: Recording, folder: Path) -> None:
+    report = verdict_of(tap, folder, ticks=tap.ticks[:-10])
+    assert report.verdict == "invalid"
+    assert "the last record is of" in report.reason

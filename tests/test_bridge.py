@@ -638,7 +638,10 @@ def test_limits_beyond_the_devices_own_are_refused_unless_nobody_feels_them(moti
 
 def test_second_run_raises_the_force_from_zero_again_and_is_simulated_again(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
-    device = ScriptedDevice(lambda tick: (0.0125 * (tick > 10), 0, 0, 1, 0, 0, 0))
+    # it moves also between the runs, where no force acts and so no work is done
+    device = ScriptedDevice(
+        lambda tick: (0.0125 * (tick > 10) + 5e-5 * np.sin(0.5 * tick), 0, 0, 1, 0, 0, 0)
+    )
     with fast("virtual_wall", device, recording=path, coupling=None) as bridge:
         bridge.run(0.6)
         bridge.run(0.6)
