@@ -5,6 +5,7 @@ with hapticbridge.Bridge("peg_in_hole", "simulated", recording="run.mcap") as br
 report = hapticbridge.audit("run.mcap")
 """
 
+from hapticbridge import mechanics as mechanics
 from hapticbridge import passivity as passivity
 from hapticbridge.audit import AuditReport as AuditReport
 from hapticbridge.audit import audit as audit

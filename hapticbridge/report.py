@@ -2,31 +2,25 @@
 
 from __future__ import annotations
 
-import io
 import json
-import warnings
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jinja2 import Environment, PackageLoader, select_autoescape
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from hapticbridge.audit import AuditReport
 from hapticbridge.device import DATA_SHEET_UNITS
 from hapticbridge.errors import RecordingError
+from hapticbridge.picture import inline_svg, new_figure, write_picture
 from hapticbridge.provenance import parameters_of
 from hapticbridge.recording import Recording
 
 BINS = 1500
 """Points per curve at most; each is drawn as its least and greatest value in a bin, so that no peak
 is lost. More makes a page larger without showing more at its width."""
-
-ENDINGS = (".pdf", ".png", ".svg")
-"""What a picture's name may end in."""
 
 _AXES = ("x", "y", "z")
 _COLOURS = ("#b3261e", "#2e7d32", "#1a5fb4")
@@ -103,8 +97,7 @@ def draw_recording(recording: Recording) -> Figure:
     if not all((np.abs(ticks[name]) < DRAWABLE).all() for name in _DRAWN):
         raise RecordingError(f"'{recording.path}' holds numbers that cannot be drawn")
     time = ticks["tick"] * parameters.period
-    figure = Figure(figsize=(8, 8), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(8, 8)
     force_axes, position_axes, energy_axes = figure.subplots(3, 1, sharex=True)
     position_axes.plot([], [], color="grey", ls=":", lw=1, label="handle")
     for i, (axis, colour) in enumerate(zip(_AXES, _COLOURS, strict=True)):
@@ -138,49 +131,23 @@ def draw_recording(recording: Recording) -> Figure:
     return figure
 
 
-def check_ending(path: Path) -> None:
-    """Checks that a picture's name says what it is.
-
-    Raises:
-        RecordingError: It does not.
-    """
-    if path.suffix.lower() not in ENDINGS:
-        raise RecordingError(f"'{path}' does not end like a picture; endings: {', '.join(ENDINGS)}")
-
-
-def _save(figure: Figure, target: Path | io.StringIO, **options: Any) -> None:
-    with warnings.catch_warnings():
-        # a scene's name in letters that the font lacks is drawn as boxes, which is no news
-        warnings.filterwarnings("ignore", message="Glyph", category=UserWarning)
-        figure.savefig(target, **options)
-
-
 def plot_recording(recording: Recording, path: Path) -> None:
     """Writes ``draw_recording`` to a picture.
 
     Raises:
-        RecordingError: The file's ending is no picture format, or it cannot be written.
+        RecordingError: The recording cannot be drawn.
+        HapticBridgeError: The file's ending is no picture format, or it cannot be written.
     """
-    check_ending(path)
-    figure = draw_recording(recording)
-    try:
-        _save(figure, path, dpi=100)
-    except OSError as error:
-        raise RecordingError(f"cannot write '{path}': {error.strerror}") from None
+    write_picture(draw_recording(recording), path)
 
 
 def _picture(recording: Recording) -> str:
     """Returns the curves as inline SVG, or nothing where they cannot be drawn."""
-    buffer = io.StringIO()
     try:
         figure = draw_recording(recording)
     except RecordingError:
         return ""
-    # no metadata: a page needs none of matplotlib's own
-    unwanted = dict.fromkeys(("Creator", "Date", "Format", "Type"))
-    _save(figure, buffer, format="svg", metadata=unwanted)
-    text = buffer.getvalue()
-    return text[text.index("<svg") :]
+    return inline_svg(figure)
 
 
 def _mapping(text: str) -> dict[str, object]:

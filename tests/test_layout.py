@@ -10,7 +10,7 @@ import pytest
 PACKAGE = Path(__file__).parents[1] / "hapticbridge"
 
 ORDER = (
-    ("errors", "jit", "tick", "pose", "clock", "signals"),
+    ("errors", "jit", "tick", "pose", "clock", "signals", "picture"),
     ("coupling", "kernel", "mechanics", "passivity"),
     ("scene",),
     ("rendering",),
@@ -18,7 +18,7 @@ ORDER = (
     ("guard", "recording", "certificate"),
     ("provenance", "summary"),
     ("bridge", "audit"),
-    ("report",),
+    ("report", "study"),
     ("cli",),
 )
 RANK = {name: rank for rank, names in enumerate(ORDER) for name in names}

@@ -13,8 +13,9 @@ import tyro
 from hapticbridge.audit import AuditReport, audit
 from hapticbridge.cli.terminal import err, out, plain, print_error, quantity
 from hapticbridge.errors import RecordingError
+from hapticbridge.picture import check_ending
 from hapticbridge.recording import read_recording, repair
-from hapticbridge.report import check_ending, plot_recording, write_report
+from hapticbridge.report import plot_recording, write_report
 
 _USUAL_EVENTS = ("start", "stop", "input")
 _COLOURS = {"passive": "green", "active": "red", "invalid": "magenta"}

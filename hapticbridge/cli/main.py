@@ -17,6 +17,7 @@ from hapticbridge.cli.judge import Audit, Repair
 from hapticbridge.cli.run import Run
 from hapticbridge.cli.scenes import Scenes
 from hapticbridge.cli.terminal import err, out, print_error
+from hapticbridge.cli.theory import Bound, Zwidth
 from hapticbridge.errors import HapticBridgeError, SafetyTrip
 
 Command = (
@@ -24,6 +25,8 @@ Command = (
     | Annotated[Audit, tyro.conf.subcommand("audit")]
     | Annotated[Scenes, tyro.conf.subcommand("scenes")]
     | Annotated[Repair, tyro.conf.subcommand("repair")]
+    | Annotated[Zwidth, tyro.conf.subcommand("zwidth")]
+    | Annotated[Bound, tyro.conf.subcommand("bound")]
 )
 
 USAGE_ERROR, SAFETY_TRIP = 2, 3

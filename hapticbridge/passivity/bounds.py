@@ -17,8 +17,9 @@ from hapticbridge.passivity.grid import (
     scalar,
     spring_and_damper,
     together,
+    whole,
 )
-from hapticbridge.passivity.spectrum import Discretization, checked_delay, coupling_transfer
+from hapticbridge.passivity.spectrum import Discretization, coupling_transfer
 from hapticbridge.passivity.wall import wall_supremum
 
 STIFFNESS_MARGIN = 0.8
@@ -101,7 +102,7 @@ def minimum_damping(
     """
     period = scalar("period", period, "s", positive=True)
     filter_time = scalar("filter time", filter_time, "s")
-    delay = checked_delay(delay)
+    delay = whole("delay", delay)
     stiffness, damping = spring_and_damper(coupling, axis)
     if discretization not in {"backward", "tustin"}:
         raise CouplingError(f"discretization is {discretization!r}; choose 'backward' or 'tustin'")

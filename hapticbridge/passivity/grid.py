@@ -55,6 +55,17 @@ def scalar(name: str, value: float, unit: str = "", *, positive: bool = False) -
     return float(array)
 
 
+def whole(name: str, value: int, least: int = 0) -> int:
+    """Returns a number of samples.
+
+    Raises:
+        CouplingError: It is not a whole number, or less than the least that is valid.
+    """
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
+        raise CouplingError(f"{name} is {value!r}; it must be a whole number of samples >= {least}")
+    return int(value)
+
+
 def together(*arrays: NDArray[np.float64]) -> list[NDArray[np.float64]]:
     """Broadcasts arrays to one shape.
 

@@ -23,6 +23,7 @@ from hapticbridge.passivity.grid import (
     plain,
     scalar,
     spring_and_damper,
+    whole,
 )
 
 Discretization = Literal["backward", "tustin"]
@@ -33,17 +34,6 @@ Transfer = Callable[[NDArray[np.complex128]], Any]
 
 _NYQUIST_ROUNDING = 1e-12
 """Relative excess over π/T that is taken for rounding of a grid, without unit."""
-
-
-def checked_delay(delay: int) -> int:
-    """Returns a delay in whole samples.
-
-    Raises:
-        CouplingError: It is not a whole number, or negative.
-    """
-    if isinstance(delay, bool) or not isinstance(delay, int | np.integer) or delay < 0:
-        raise CouplingError(f"delay is {delay!r}; it must be a whole number of samples >= 0")
-    return int(delay)
 
 
 def angles(frequency: ArrayLike, period: float) -> NDArray[np.float64]:
@@ -173,7 +163,7 @@ def damping_spectrum(
     """
     period = scalar("period", period, "s", positive=True)
     filter_time = scalar("filter time", filter_time, "s")
-    delay = checked_delay(delay)
+    delay = whole("delay", delay)
     theta = angles(frequency, period)
     stiffness, damping = (
         value.reshape(value.shape + (1,) * theta.ndim)

@@ -1,0 +1,250 @@
+"""``hapticbridge zwidth`` and ``hapticbridge bound``."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from matplotlib.figure import Figure
+from rich.table import Table
+
+from hapticbridge.cli.terminal import err, out, plain
+from hapticbridge.clock import period_of
+from hapticbridge.coupling import Coupling
+from hapticbridge.errors import CouplingError
+from hapticbridge.passivity import ZWidth, maximum_stiffness, z_width
+from hapticbridge.picture import check_ending, write_picture
+from hapticbridge.study.theory import Alternative, alternatives, draw_alternatives, draw_z_width
+
+DEFAULT_RATE = 1000.0
+"""Hz; what 'hapticbridge run' takes by itself, so that it need not be told."""
+
+
+def _next_command(stiffness: float, damping: float, rate: float) -> str:
+    command = f"hapticbridge run SCENE --stiffness {stiffness:.6g} --damping {damping:.6g}"
+    return command if rate == DEFAULT_RATE else f"{command} --rate {rate:.6g}"
+
+
+def _write(figure: Figure, path: Path) -> None:
+    with err.status("drawing …"):
+        write_picture(figure, path)
+    err.print(f"wrote {plain(str(path))}")
+
+
+@dataclass(frozen=True, slots=True)
+class Zwidth:
+    """Which stiffness and damping a device can show at a rate, and which to use.
+
+    Every line that limits it is named, with the command that uses the coupling. Example:
+        hapticbridge zwidth --damping 2 --mass 0.1 --friction 0.05 --resolution 1e-5 --plot out.png
+    """
+
+    damping: float
+    """Physical damping b of the device in N s/m."""
+    mass: float | None = None
+    """Mass of the device in kg; with it the line of a device that nobody holds is drawn too."""
+    friction: float | None = None
+    """Coulomb friction of the device in N."""
+    resolution: float = 0.0
+    """Step of the device's position in m; 0 where it is exact."""
+    rate: float = DEFAULT_RATE
+    """Ticks per second."""
+    delay: int = 0
+    """Whole ticks from position to force, beyond the hold."""
+    filter_time: float = 0.0
+    """Time constant in s of a first-order low-pass behind the coupling's damper."""
+    plot: Path | None = None
+    """Draw the region into this picture (.png, .svg or .pdf)."""
+    as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
+    """Print the lines, the limit and the corner as JSON."""
+
+    def execute(self) -> int:
+        """Computes and prints; returns the exit code."""
+        if self.plot is not None:
+            check_ending(self.plot)
+        period = period_of(self.rate)
+        with err.status("computing …"):
+            z = z_width(
+                self.damping,
+                period,
+                mass=self.mass,
+                friction=self.friction,
+                resolution=self.resolution,
+                delay=self.delay,
+                filter_time=self.filter_time,
+            )
+        # the run command has no low-pass to offer, and without it this corner is not passive
+        corner = z.corner
+        command = _next_command(corner.stiffness, corner.damping, self.rate)
+        told = None if z.filter_time else command
+        if self.as_json:
+            out.print_json(json.dumps(_z_width_facts(z, told)))
+        else:
+            _print_z_width(z, told)
+        if self.plot is not None:
+            _write(draw_z_width(z), self.plot)
+        return 0
+
+
+def _z_width_facts(z: ZWidth, command: str | None) -> dict[str, object]:
+    return {
+        "lines": [
+            {
+                "name": line.name,
+                "reason": line.reason,
+                "required": line.is_required,
+                "largest_damping": line.largest_damping,
+                "stiffness": line.stiffness.tolist(),
+            }
+            for line in z.lines
+        ],
+        "damping": z.damping.tolist(),
+        "limit": z.limit.tolist(),
+        "limited_by": list(z.limited_by),
+        "corner": {
+            "stiffness": z.corner.stiffness,
+            "damping": z.corner.damping,
+            "limited_by": z.corner_limited_by,
+        },
+        "notes": list(z.notes),
+        "next": command,
+    }
+
+
+def _print_z_width(z: ZWidth, command: str | None) -> None:
+    table = Table("line", "K at B = 0", "B at K = 0", "because", box=None, pad_edge=False)
+    for line in z.lines:
+        stiffness = f"{line.stiffness[0]:.5g} N/m"
+        reason = line.reason if line.is_required else f"not kept: {line.reason}"
+        table.add_row(line.name, stiffness, f"{line.largest_damping:.4g} N s/m", reason)
+    out.print(table)
+    reason = next(line.reason for line in z.lines if line.name == z.corner_limited_by)
+    out.print(f"limited by: {z.corner_limited_by} ({reason})")
+    for note in z.notes:
+        out.print(f"note: {note}")
+    corner = z.corner
+    out.print(
+        f"use K = {corner.stiffness:.4g} N/m, B = {corner.damping:.3g} N s/m "
+        "(80 % of the limit at a quarter of its damping)"
+    )
+    if command is None:
+        out.print(
+            "'hapticbridge run' has no low-pass: leave --filter-time out for a run's coupling"
+        )
+    else:
+        out.print(f"next: {plain(command)}")
+
+
+@dataclass(frozen=True, slots=True)
+class Bound:
+    """The damping that a coupling needs from its device, and what each alternative would need.
+
+    Exit code 1 if --device-damping is given and does not suffice. Example:
+
+        hapticbridge bound --stiffness 2000 --damping 1 --rate 1000
+    """
+
+    stiffness: float
+    """Coupling stiffness K in N/m."""
+    damping: float = 0.0
+    """Coupling damping B in N s/m."""
+    rate: float = DEFAULT_RATE
+    """Ticks per second."""
+    filter_time: float | None = None
+    """Time constant in s of the low-pass among the alternatives; by default one period."""
+    device_damping: float | None = None
+    """Physical damping b of the device in N s/m: does it suffice?"""
+    plot: Path | None = None
+    """Draw the damping needed over frequency into this picture (.png, .svg or .pdf)."""
+    as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
+    """Print it as JSON; null where no damping suffices."""
+
+    def execute(self) -> int:
+        """Computes and prints; returns the exit code."""
+        if self.plot is not None:
+            check_ending(self.plot)
+        b = self.device_damping
+        if b is not None and not 0 < b < math.inf:
+            raise CouplingError(f"device damping is {b!r} N s/m; it must be finite and > 0")
+        period = period_of(self.rate)
+        coupling = Coupling(self.stiffness, self.damping, 0.0, 0.0)
+        filter_time = period if self.filter_time is None else self.filter_time
+        ways = alternatives(coupling, period, filter_time)
+        holds = b is None or b >= ways[0].needed
+        if self.as_json:
+            out.print_json(json.dumps(self._facts(ways, period)))
+        else:
+            self._print(ways, period)
+        if self.plot is not None:
+            title = f"K = {self.stiffness:g} N/m, B = {self.damping:g} N s/m at {self.rate:g} Hz"
+            _write(draw_alternatives(ways, title, b), self.plot)
+        return 0 if holds else 1
+
+    def _facts(self, ways: tuple[Alternative, ...], period: float) -> dict[str, object]:
+        b = self.device_damping
+        return {
+            "needed": ways[0].needed,
+            "frequency_hz": _hertz(ways[0]),
+            "holds": None if b is None else b >= ways[0].needed,
+            "largest_stiffness": self._largest_stiffness(period),
+            "alternatives": [
+                {
+                    "name": way.name,
+                    "needed": way.needed if math.isfinite(way.needed) else None,
+                    "frequency_hz": _hertz(way),
+                }
+                for way in ways
+            ],
+        }
+
+    def _largest_stiffness(self, period: float) -> float | None:
+        """Returns the largest K beside this B; None without a device, 0 where B is too much."""
+        if self.device_damping is None:
+            return None
+        if self.damping >= self.device_damping:
+            return 0.0
+        return maximum_stiffness(self.device_damping, period, self.damping)
+
+    def _print(self, ways: tuple[Alternative, ...], period: float) -> None:
+        b = self.device_damping
+        table = Table("", "damping needed", "most at", box=None, pad_edge=False)
+        if b is not None:
+            table.add_column("holds")
+        for way in ways:
+            amount = f"{way.needed:.4g} N s/m" if math.isfinite(way.needed) else "none suffices"
+            verdict = [] if b is None else ["yes" if b >= way.needed else "no"]
+            table.add_row(way.name, amount, _where(way), *verdict)
+        out.print(table)
+        if b is None:
+            return
+        needed, largest = ways[0].needed, self._largest_stiffness(period)
+        if b >= needed:
+            out.print(f"device damping {b:g} >= {needed:.4g} N s/m: passive in any hand")
+            out.print(f"at B = {self.damping:g} N s/m it bears up to K = {largest:.4g} N/m")
+            out.print(f"next: {plain(_next_command(self.stiffness, self.damping, self.rate))}")
+            return
+        out.print(f"device damping {b:g} < {needed:.4g} N s/m: [red]not passive in any hand[/]")
+        if largest:
+            rate = self.stiffness / (2 * (b - self.damping))
+            out.print(f"  lower the stiffness to {largest:.4g} N/m, or")
+            out.print(f"  raise the rate to {rate:.4g} Hz, or")
+        spare = b - self.stiffness * period / 2
+        if spare > 0:
+            out.print(f"  lower the coupling's damping to {spare:.4g} N s/m, or")
+        elif not largest:
+            out.print(f"  lower the coupling's damping below {b:g} N s/m and the stiffness, or")
+        out.print(f"  take a device with {needed:.4g} N s/m")
+
+
+def _hertz(way: Alternative) -> float | None:
+    return None if way.frequency is None else way.frequency / (2 * math.pi)
+
+
+def _where(way: Alternative) -> str:
+    if (hertz := _hertz(way)) is None:
+        return "every frequency" if math.isfinite(way.needed) else "-"
+    return f"{hertz:.4g} Hz" if hertz else "low frequency"

@@ -1,0 +1,207 @@
+"""Stability of a device that nobody holds, against a wall behind the coupling.
+
+In units of the period and the device's mass, x = b T/m, κ = K T²/m, β = B T/m, ν = τ/T, d samples
+of delay, an exact zero-order hold gives the closed loop
+
+    p(z) = (z − 1)(z − e^{−x}) z^d F(z) + [φ₂ (z − e^{−x}) + φ₁²] [κ F(z) + β (z − 1)]
+    F(z) = (1 + ν) z − ν,    φ₁ = (1 − e^{−x})/x,    φ₂ = (1 − φ₁)/x
+
+and it is stable where all roots of p lie inside the unit circle.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hapticbridge.passivity.grid import checked, plain, scalar, together, whole
+
+_Array = NDArray[np.float64]
+
+FIRST_SHARE = 1e-6
+"""Where the search starts, as a share of (b + B)/T in stiffness or of b + m/T in damping, without
+unit. A limit below it is returned as 0. Smaller only takes longer: no device is that soft."""
+
+SMALL = 1e-2
+"""b T/m below which φ₂ is summed as a series, without unit; five terms leave 1e-14 there, while
+the closed form loses that many digits to cancellation below it."""
+
+BISECTIONS = 46
+"""Halvings of an octave: 2^-46 = 1e-14."""
+
+OCTAVES = 200
+"""Doublings after which the search gives up, far beyond every limit."""
+
+
+def _plant(x: _Array) -> tuple[_Array, _Array, _Array]:
+    """Returns e^{−x}, φ₁ and φ₂ of a damped mass under an exact hold."""
+    safe = np.where(x > 0, x, 1.0)
+    first = np.where(x > 0, -np.expm1(-safe) / safe, 1.0)
+    series = 1 / 2 - x / 6 * (1 - x / 4 * (1 - x / 5 * (1 - x / 6)))
+    return np.exp(-x), first, np.where(x < SMALL, series, (1 - first) / safe)
+
+
+def _product(first: list[_Array], second: list[_Array]) -> list[_Array]:
+    """Multiplies polynomials given by coefficient arrays, highest power first."""
+    result = [np.zeros_like(first[0]) for _ in range(len(first) + len(second) - 1)]
+    for i, left in enumerate(first):
+        for j, right in enumerate(second):
+            result[i + j] = result[i + j] + left * right
+    return result
+
+
+def _is_stable(coefficients: list[_Array]) -> NDArray[np.bool_]:
+    """Returns whether all roots lie inside the unit circle."""
+    degree = len(coefficients) - 1
+    companion = np.zeros((*coefficients[0].shape, degree, degree))
+    companion[..., range(1, degree), range(degree - 1)] = 1
+    companion[..., 0, :] = -np.stack(coefficients[1:], -1) / coefficients[0][..., None]
+    stable: NDArray[np.bool_] = np.abs(np.linalg.eigvals(companion)).max(axis=-1) < 1
+    return stable
+
+
+def _first_unstable(stable_at: Callable[[_Array], NDArray[np.bool_]], start: _Array) -> _Array:
+    """Returns the value up to which all values from the start on are stable; 0 where none is."""
+    low, high = np.zeros_like(start), start
+    growing = stable_at(start)
+    for _ in range(OCTAVES):
+        if not growing.any():
+            break
+        low = np.where(growing, high, low)
+        high = np.where(growing, 2 * high, high)
+        growing = growing & stable_at(high)
+    found = low > 0
+    for _ in range(BISECTIONS):
+        middle = (low + high) / 2
+        stable = stable_at(middle) & found
+        low, high = np.where(stable, middle, low), np.where(stable, high, middle)
+    return np.where(found, low, 0.0)
+
+
+def _loop(
+    device_damping: _Array, mass: _Array, damping: _Array, period: float, delay: int, lag: float
+) -> Callable[[_Array], list[_Array]]:
+    """Returns p(z) for a stiffness κ, with its trivial zero z = 1 divided out for κ = 0."""
+    x, beta = device_damping * period / mass, damping * period / mass
+    decay, first, second = _plant(x)
+    one, zero = np.ones_like(x), np.zeros_like(x)
+    filtering = [(1 + lag) * one, -lag * one]
+    plant = [second, first**2 - second * decay]
+    still = [*_product([one, -decay], filtering), *[zero] * delay]
+    with_damper = _sum(still, [beta * value for value in plant])
+    spring = _product(plant, filtering)
+    moving = _product([one, -one], with_damper)
+
+    def polynomial(kappa: _Array) -> list[_Array]:
+        if not kappa.any():
+            return with_damper
+        return _sum(moving, [kappa * value for value in spring])
+
+    return polynomial
+
+
+def _sum(long: list[_Array], short: list[_Array]) -> list[_Array]:
+    """Adds two polynomials, the second of a lower degree."""
+    head = len(long) - len(short)
+    return [*long[:head], *(a + b for a, b in zip(long[head:], short, strict=True))]
+
+
+def free_device_stiffness(
+    device_damping: ArrayLike,
+    period: float,
+    mass: ArrayLike,
+    damping: ArrayLike = 0.0,
+    *,
+    delay: int = 0,
+    filter_time: float = 0.0,
+) -> float | NDArray[np.float64]:
+    """Returns the stiffness up to which a free device stays stable against a wall.
+
+    The device is a mass with viscous damping, m_d v' = −b v − f, in nobody's hand, and f is the
+    force of the coupling, held for a period (exact zero-order hold), against a wall (the tool does
+    not move). No friction, no quantisation. It is a *stability* limit of this one loop: a hand that
+    stores energy can lower it down to ``maximum_stiffness``, and with a little damping of its
+    own it raises it. The damper helps it, until about m_d/T.
+
+    The boundary is exact to 1e-6 for b T/m_d > 1e-6; a heavier device has its roots so near to 1
+    that double precision no longer tells its damping.
+
+    Args:
+        device_damping: b in N s/m, finite and >= 0.
+        period: T in s, finite and > 0.
+        mass: m_d in kg, finite and > 0.
+        damping: B in N s/m, finite and >= 0.
+        delay: d, whole samples from position to force.
+        filter_time: τ in s, >= 0, of a first-order low-pass behind the damper (backward).
+
+    Returns:
+        K in N/m, of the shape that the arguments broadcast to: every smaller one is stable too; 0
+        where none is (as for b = B = 0).
+
+    Raises:
+        CouplingError: An argument is out of range or mis-shaped.
+
+    References:
+        Gil, Avello, Rubio, Flórez 2004, Stability analysis of a 1 DOF haptic interface using the
+        Routh-Hurwitz criterion (the same loop without a low-pass).
+    """
+    period = scalar("period", period, "s", positive=True)
+    lag = scalar("filter time", filter_time, "s") / period
+    b, masses, dampings = together(
+        checked("device damping", device_damping, "N s/m"),
+        checked("mass", mass, "kg", positive=True),
+        checked("coupling damping", damping, "N s/m"),
+    )
+    polynomial = _loop(b, masses, dampings, period, whole("delay", delay), lag)
+    available = (b + dampings) * period / masses
+    start = FIRST_SHARE * np.where(available > 0, available, 1.0)
+    kappa = _first_unstable(lambda value: _is_stable(polynomial(value)), start)
+    stiffness = np.where(available > 0, kappa, 0.0) * masses / period**2
+    return plain(np.asarray(stiffness))
+
+
+def free_device_damping(
+    device_damping: ArrayLike,
+    period: float,
+    mass: ArrayLike,
+    *,
+    delay: int = 0,
+    filter_time: float = 0.0,
+) -> float | NDArray[np.float64]:
+    """Returns the coupling damping up to which a free device is stable with a soft spring.
+
+    Where ``free_device_stiffness`` falls to 0: the limit of K → 0.
+
+    Args:
+        device_damping: b in N s/m, finite and >= 0.
+        period: T in s, finite and > 0.
+        mass: m_d in kg, finite and > 0.
+        delay: d, whole samples from position to force.
+        filter_time: τ in s, >= 0, of a first-order low-pass behind the damper (backward).
+
+    Returns:
+        B in N s/m, of the shape that the arguments broadcast to.
+
+    Raises:
+        CouplingError: An argument is out of range or mis-shaped.
+
+    References:
+        As ``free_device_stiffness``.
+    """
+    period = scalar("period", period, "s", positive=True)
+    lag = scalar("filter time", filter_time, "s") / period
+    samples = whole("delay", delay)
+    b, masses = together(
+        checked("device damping", device_damping, "N s/m"),
+        checked("mass", mass, "kg", positive=True),
+    )
+    zero = np.zeros_like(b)
+
+    def stable_at(beta: _Array) -> NDArray[np.bool_]:
+        loop = _loop(b, masses, beta * masses / period, period, samples, lag)
+        return _is_stable(loop(zero))
+
+    beta = _first_unstable(stable_at, FIRST_SHARE * (1 + b * period / masses))
+    return plain(np.asarray(beta * masses / period))

@@ -1,0 +1,251 @@
+"""Device, hand, coupling and tool in the time domain: the bounds' independent witness."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import optimize
+
+from hapticbridge.coupling import Coupling
+from hapticbridge.errors import CouplingError
+from hapticbridge.jit import compiled
+from hapticbridge.passivity.grid import scalar, whole
+from hapticbridge.passivity.spectrum import (
+    Discretization,
+    angles,
+    coupling_transfer,
+    needed_for_fixed_environment,
+)
+from hapticbridge.passivity.virtual_mass import Integrator, force_delay
+from hapticbridge.passivity.worst_hand import WorstHand
+
+_Array = NDArray[np.float64]
+
+KICK = 1e-3
+"""First displacement of the handle in m. The loop is linear, so it only scales what follows."""
+
+HUGE = 1e100
+"""Force in N at which a run has diverged beyond doubt and ends."""
+
+GRID_POINTS = 2000
+"""Angles, even in θ and even in log θ, from which the search for the worst frequency starts."""
+
+LOWEST_ANGLE = 1e-2
+"""θ in rad below which no worst hand is looked for: it would be a mass of 2 b T/θ², whose loop, for
+a share δ of the damping missing, grows as slowly as δ θ²/4 a sample. A supremum at θ → 0 is missed
+by a share of (d² + d) θ²/6: 0.05 % at a delay of 5 samples."""
+
+FLATNESS = 1e-12
+"""Relative difference between values of a spectrum that counts as rounding, without unit."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LoopMotion:
+    """What a loop did at the samples 0 … N − 1; fewer where it diverged.
+
+    Attributes:
+        force: f_k on the tool in N.
+        handle: h_k in m.
+        tool: x_k in m.
+    """
+
+    force: _Array
+    handle: _Array
+    tool: _Array
+
+
+@dataclass(frozen=True, slots=True)
+class SampledLoop:
+    """A coupling between a device with its hand and a wall, or a point mass.
+
+        f_k = K e_k + g_k,    e_k = h_k − x_k,    g_k = a g_{k−1} + c (e_k − e_{k−1})
+        backward:  a = τ/(T + τ),            c = B/(T + τ)
+        tustin:    a = (τ − T/2)/(τ + T/2),  c = B/(τ + T/2)
+
+    The device gets −f_{k−d}, held for a period. The mass moves by one of
+
+        implicit        v_k = v_{k−1} + (T/m) f_k       x_k = x_{k−1} + T v_k
+        semi_implicit   v_{k+1} = v_k + (T/m) f_k       x_{k+1} = x_k + T v_{k+1}
+        explicit        v_k = v_{k−1} + (T/m) f_{k−1}   x_k = x_{k−1} + T v_{k−1}
+
+    Attributes:
+        coupling: K and B in translation.
+        period: T in s, finite and > 0.
+        mass: m in kg, finite and > 0; None for a wall, x = 0.
+        integrator: Of the mass.
+        discretization: Of the damper.
+        delay: d, whole samples from the coupling's force to the device.
+        filter_time: τ in s of a first-order low-pass behind the damper, >= 0.
+
+    Raises:
+        CouplingError: A value is out of range or unknown.
+
+    References:
+        Brown & Colgate 1997, eqs. (4), (5), (15), (17).
+    """
+
+    coupling: Coupling
+    period: float
+    mass: float | None = None
+    integrator: Integrator = "implicit"
+    discretization: Discretization = "backward"
+    delay: int = 0
+    filter_time: float = 0.0
+
+    def __post_init__(self) -> None:
+        scalar("period", self.period, "s", positive=True)
+        scalar("filter time", self.filter_time, "s")
+        if self.mass is not None:
+            scalar("mass", self.mass, "kg", positive=True)
+        whole("delay", self.delay)
+        force_delay(self.integrator)
+        if self.discretization not in {"backward", "tustin"}:
+            raise CouplingError(
+                f"discretization is {self.discretization!r}; choose 'backward' or 'tustin'"
+            )
+
+    def response(self, frequency: ArrayLike) -> NDArray[np.complex128]:
+        """Returns what the device feels, H = C e^{−jdθ} / (1 − λ C e^{j(1−n)θ}).
+
+        λ = T²/(4 m sin²(θ/2)), 0 for a wall; n = 0, 1, 2 samples from force to position.
+
+        Args:
+            frequency: ω in rad/s, 0 < ω <= π/T, any shape.
+
+        Returns:
+            Force per displacement of the handle in N/m, shaped like the frequency.
+
+        Raises:
+            CouplingError: A frequency is out of range.
+        """
+        theta = angles(frequency, self.period)
+        transfer = coupling_transfer(
+            np.asarray(self.coupling.stiffness),
+            np.asarray(self.coupling.damping),
+            self.period,
+            theta,
+            self.discretization,
+            self.filter_time,
+        )
+        if self.mass is not None:
+            share = self.period**2 / (4 * self.mass * np.sin(theta / 2) ** 2)
+            lead = np.exp(1j * (1 - force_delay(self.integrator)) * theta)
+            transfer = transfer / (1 - share * transfer * lead)
+        return np.asarray(transfer * np.exp(-1j * self.delay * theta), dtype=np.complex128)
+
+    def damping_spectrum(self, frequency: ArrayLike) -> _Array:
+        """Returns the device damping that this loop needs at each frequency, for any hand.
+
+            b(ω) = (T/2) Re{(1 − e^{−jωT}) H} / (1 − cos ωT)
+
+        Args:
+            frequency: ω in rad/s, 0 < ω <= π/T, any shape.
+
+        Returns:
+            b in N s/m; the supremum is needed, provided that the tool is stable behind a handle
+            held still (``minimum_mass``).
+
+        Raises:
+            CouplingError: A frequency is out of range.
+
+        References:
+            Colgate & Schenkel 1997.
+        """
+        theta = angles(frequency, self.period)
+        return needed_for_fixed_environment(self.response(frequency), self.period, theta)
+
+    def worst_frequency(self) -> float:
+        """Returns ω in rad/s at which ``damping_spectrum`` is largest, >= 0.01/T.
+
+        Where it is flat, as for a plain spring on a wall, the highest of equals is taken, because
+        there a loop grows fastest.
+        """
+        even = np.linspace(LOWEST_ANGLE, np.pi, GRID_POINTS)
+        theta = np.union1d(even, np.geomspace(LOWEST_ANGLE, np.pi, GRID_POINTS))
+        needed = self.damping_spectrum(theta / self.period)
+        most = needed.max()
+        best = int(np.flatnonzero(needed >= most - FLATNESS * abs(most))[-1])
+        if best in {0, theta.size - 1}:
+            return float(theta[best] / self.period)
+        found = optimize.minimize_scalar(
+            lambda angle: -float(self.damping_spectrum(angle / self.period)),
+            bounds=(theta[best - 1], theta[best + 1]),
+            method="bounded",
+            options={"xatol": 1e-12},
+        )
+        return float(found.x / self.period)
+
+    def simulate(self, hand: WorstHand | None, samples: int) -> LoopMotion:
+        """Runs the loop from a handle displaced by 1 mm.
+
+        Args:
+            hand: Device and hand, of the loop's period; None holds the handle still.
+            samples: How many, >= 1. A run that exceeds 1e100 N ends there.
+
+        Raises:
+            CouplingError: The periods differ, or samples is no whole number >= 1.
+        """
+        if hand is not None and hand.period != self.period:
+            raise CouplingError(
+                f"the hand's period is {hand.period:g} s, the loop's {self.period:g} s"
+            )
+        force, handle, tool = np.zeros((3, whole("run", samples, least=1)))
+        step = self.period if self.discretization == "backward" else self.period / 2
+        done = _run(
+            self.coupling.stiffness,
+            self.coupling.damping / (step + self.filter_time),
+            (self.filter_time - (self.period - step)) / (step + self.filter_time),
+            0.0 if self.mass is None else 1 / self.mass,
+            force_delay(self.integrator),
+            self.delay,
+            self.period,
+            *((0.0, 0.0, 0.0) if hand is None else hand.recursion()),
+            force,
+            handle,
+            tool,
+        )
+        return LoopMotion(force[:done], handle[:done], tool[:done])
+
+
+@compiled
+def _run(
+    stiffness: float,
+    c: float,
+    a: float,
+    inverse_mass: float,
+    integrator: int,
+    delay: int,
+    period: float,
+    p: float,
+    q: float,
+    r: float,
+    force: _Array,
+    handle: _Array,
+    tool: _Array,
+) -> int:
+    """Fills the arrays; returns how many samples it took."""
+    h, x, v, stretch, damper, f = KICK, 0.0, 0.0, 0.0, 0.0, 0.0
+    held_before, device_velocity = 0.0, 0.0
+    step_compliance = period * period * inverse_mass if integrator == 0 else 0.0
+    for k in range(force.size):
+        if k > 0:
+            x += period * v
+        if integrator == 2:
+            v += period * inverse_mass * f
+        f = (stiffness + c) * (h - x) - c * stretch + a * damper
+        f /= 1 + (stiffness + c) * step_compliance
+        if integrator != 2:
+            v += period * inverse_mass * f
+        x += step_compliance * f
+        stretch = h - x
+        damper = f - stiffness * stretch
+        force[k], handle[k], tool[k] = f, h, x
+        if not abs(f) < HUGE:
+            return k + 1 if k + 1 < force.size else k
+        held = -force[k - delay] if k >= delay else 0.0
+        device_velocity = p * device_velocity + q * held + r * held_before
+        held_before = held
+        h += period * device_velocity
+    return int(force.size)

@@ -1,0 +1,121 @@
+"""A lossless transmission line in place of the spring and damper: does it buy stiffness?
+
+The waves p = (F + Z v)/2 run to the tool and q = (F − Z v)/2 back to the device; from end to end
+they need one sample, n = 2 there and back. Two ways to end the line at the device:
+
+    software    v_k = (h_k − h_{k−1})/T, and F_k = Z v_k + 2 q_k is sent to the device
+    device      v_k = (h_{k+1} − h_k)/T, and F_k = 2 q_k: the physical damping b is the end
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hapticbridge.errors import CouplingError
+from hapticbridge.passivity.grid import checked, plain, scalar, whole
+from hapticbridge.passivity.spectrum import angles
+
+Termination = Literal["software", "device"]
+"""What ends the line at the device."""
+
+
+def _checked(termination: Termination, round_trip: int) -> int:
+    if termination not in {"software", "device"}:
+        raise CouplingError(f"termination is {termination!r}; choose 'software' or 'device'")
+    return whole("round trip", round_trip, least=1)
+
+
+def transmission_line_spectrum(
+    impedance: ArrayLike,
+    period: float,
+    frequency: ArrayLike,
+    *,
+    terminated_by: Termination = "device",
+    round_trip: int = 2,
+) -> NDArray[np.float64]:
+    """Returns the device damping that a line in front of a wall needs at each frequency.
+
+        software    H = (Z/T)(1 − z⁻¹)(1 + z⁻ⁿ)/(1 − z⁻ⁿ)     b(θ) = Z sin θ cot(nθ/2)
+        device      H = (2Z/T)(1 − z⁻¹) z^{1−n}/(1 − z⁻ⁿ)     b(θ) = Z
+
+    With n = 2 the first is Z cos θ.
+
+    Ended by the device, the line is a wave port that counts the hand's work exactly, because the
+    force is held and v is the mean velocity of the hold: with b >= Z it is passive for any hand and
+    any discrete-time passive environment behind it. Ended in software it delays, and like a delayed
+    coupling no damping suffices for every passive environment; the spectrum is that of a wall.
+
+    Args:
+        impedance: Z in N s/m, finite and > 0, shape S.
+        period: T in s, finite and > 0.
+        frequency: ω in rad/s, 0 < ω <= π/T, shape F.
+        terminated_by: What ends the line at the device.
+        round_trip: n, whole samples there and back, >= 1; 2 for one sample each way. In software
+            the supremum is 2 Z for n = 1, Z for n = 2, and infinite for more.
+
+    Returns:
+        b in N s/m, shape S + F; may be negative in software.
+
+    Raises:
+        CouplingError: An argument is out of range or unknown.
+
+    References:
+        Brown & Colgate 1997, section 6 (named as future work); Niemeyer & Slotine 1991 (waves);
+        Colgate & Schenkel 1997 (the bound).
+    """
+    period = scalar("period", period, "s", positive=True)
+    theta = angles(frequency, period)
+    trip = _checked(terminated_by, round_trip)
+    z = checked("impedance", impedance, "N s/m", positive=True)
+    z = z.reshape(z.shape + (1,) * theta.ndim)
+    if terminated_by == "device":
+        return np.asarray(z * np.ones_like(theta))
+    # sin θ / tan(nθ/2) where θ is a multiple of 2π/n: a pole, or at Nyquist with even n a limit
+    phase = trip * theta / 2
+    turns = np.rint(phase / np.pi)
+    is_pole = np.abs(phase - turns * np.pi) < 1e-12
+    with np.errstate(divide="ignore"):
+        share = np.sin(theta) / np.tan(phase)
+    at_pole = np.where(theta == np.pi, -2 / trip, np.inf)
+    return np.asarray(z * np.where(is_pole, at_pole, share))
+
+
+def transmission_line_stiffness(
+    device_damping: ArrayLike,
+    period: float,
+    *,
+    terminated_by: Termination = "device",
+    round_trip: int = 2,
+) -> float | NDArray[np.float64]:
+    """Returns the static stiffness of the stiffest line that a device bears in front of a wall.
+
+        K = 2 Z/(n T)  with  Z = b  (software, n = 1: Z = b/2; n > 2: none, 0)
+
+    With one sample each way that is b/T, **half** of what the spring and damper reach, 2 b/T. Only
+    a line that returns within one sample, which is a plain spring, reaches as much: the line buys
+    no stiffness.
+
+    Args:
+        device_damping: b in N s/m, finite and > 0.
+        period: T in s, finite and > 0.
+        terminated_by: What ends the line at the device.
+        round_trip: n, whole samples there and back, >= 1.
+
+    Returns:
+        K in N/m, shaped like the damping.
+
+    Raises:
+        CouplingError: An argument is out of range or unknown.
+
+    References:
+        Brown & Colgate 1997, section 6 (future work).
+    """
+    period = scalar("period", period, "s", positive=True)
+    trip = _checked(terminated_by, round_trip)
+    impedance = checked("device damping", device_damping, "N s/m", positive=True)
+    if terminated_by == "software":
+        impedance = impedance * {1: 0.5, 2: 1.0}.get(trip, 0.0)
+    return plain(np.asarray(2 * impedance / (trip * period)))

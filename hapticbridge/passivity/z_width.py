@@ -1,0 +1,249 @@
+"""Z-width: which stiffness and damping a device can show, and what limits it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticbridge.coupling import Coupling
+from hapticbridge.passivity.bounds import DAMPING_SHARE, STIFFNESS_MARGIN, minimum_damping
+from hapticbridge.passivity.free_device import free_device_damping, free_device_stiffness
+from hapticbridge.passivity.grid import CouplingGrid, scalar, whole
+
+_Array = NDArray[np.float64]
+
+ANY_HAND = "passive for any hand"
+WALL = "passive against a wall"
+NO_LIMIT_CYCLES = "free of limit cycles"
+WITHOUT_HAND = "stable without a hand"
+
+LEAST_FRICTION_SHARE = 0.1
+"""Share of the device's damping that friction must allow, f_c T/Δ >= share · b, to be counted as a
+limit, without unit. Below it a coupling free of limit cycles would be softer than a tenth of the
+passive one, and the result tells of limit cycles instead. Our choice; larger tolerates more."""
+
+MARGIN_OF_RANGE = 1.25
+"""How far B reaches beyond what passivity allows, without unit; more shows more of what is not."""
+
+SECANTS, SETTLED = 60, 1e-13
+"""Most secant steps towards the line against a wall (about ten are taken), and the relative step in
+K at which they end: what the bound itself resolves. Both without unit."""
+
+SOFT = 1e-12
+"""Stiffness, as a share of B/T or b/T, that stands for K → 0, without unit."""
+
+
+_CYCLES = "limit cycles, which stay bounded as long as K < 2b/T"
+_DELAYED = "with a delay the bound is that of a wall; in general none can be promised, meter it"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LimitLine:
+    """One line in the plane of K and B; below it, its name is true.
+
+    Attributes:
+        name: What holds below the line.
+        reason: The condition, in one line.
+        stiffness: Largest K in N/m at each B of the result, >= 0.
+        largest_damping: B in N s/m at which K has fallen to 0.
+        is_required: Whether it bounds the region to use; else it is shown for information.
+    """
+
+    name: str
+    reason: str
+    stiffness: _Array
+    largest_damping: float
+    is_required: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ZWidth:
+    """The region of couplings that a device can show: 0 < K < limit(B).
+
+    Attributes:
+        damping: B in N s/m, ascending from 0, shape (n,).
+        lines: All lines, each of the shape of ``damping``.
+        limit: Least K in N/m over the lines that are required, shape (n,).
+        limited_by: Name of that line at each B.
+        corner: The coupling to use (translation; its rotational part is 0): B is a quarter of what
+            the limit allows at K → 0, K is 80 % of the limit there.
+        corner_limited_by: Name of the line above the corner.
+        notes: What the lines leave open, in sentences.
+        device_damping: b in N s/m.
+        period: T in s.
+        delay: d in samples.
+        filter_time: τ in s.
+    """
+
+    damping: _Array
+    lines: tuple[LimitLine, ...]
+    limit: _Array
+    limited_by: tuple[str, ...]
+    corner: Coupling
+    corner_limited_by: str
+    notes: tuple[str, ...]
+    device_damping: float
+    period: float
+    delay: int
+    filter_time: float
+
+
+@dataclass(frozen=True, slots=True)
+class _Loop:
+    """What all lines depend on."""
+
+    b: float
+    period: float
+    delay: int
+    filter_time: float
+
+    @property
+    def share(self) -> float:
+        """How much of B the low-pass leaves to be paid for, without a delay."""
+        return self.period / (self.period + 2 * self.filter_time)
+
+    def passive(self, damping: _Array) -> _Array:
+        """Returns the largest K for any hand; with a delay against a wall."""
+        if self.delay == 0:
+            return np.maximum(0.0, 2 * (self.b - self.share * damping) / self.period)
+        # minimum_damping is convex in K, so secants from above never step past the line; they start
+        # beyond it, because at ω → 0 the wall alone asks for (d + ½) K T − B
+        soft = SOFT * self.b / self.period
+        before, last = ((self.b + damping) / (self.period * self.delay) * x for x in (1.1, 1.0))
+        needed_before = self._needed(before, damping)
+        for _ in range(SECANTS):
+            needed = self._needed(last, damping)
+            rise, step = needed_before - needed, before - last
+            following = last - (needed - self.b) * step / np.where(rise > 0, rise, np.inf)
+            before, needed_before = last, needed
+            last = np.clip(following, soft, last)
+            if (before - last <= SETTLED * before).all():
+                break
+        return np.where(last > 2 * soft, last, 0.0)
+
+    def passive_damping(self) -> float:
+        """Returns the B at which ``passive`` has fallen to 0."""
+        if self.delay == 0:
+            return self.b / self.share
+        return float(self.b / self._needed(np.full(1, SOFT / self.period), np.ones(1))[0])
+
+    def _needed(self, stiffness: _Array, damping: _Array) -> _Array:
+        pairs, tau = CouplingGrid(stiffness, damping), self.filter_time
+        return np.asarray(minimum_damping(pairs, self.period, delay=self.delay, filter_time=tau))
+
+
+def z_width(
+    device_damping: float,
+    period: float,
+    *,
+    mass: float | None = None,
+    friction: float | None = None,
+    resolution: float = 0.0,
+    delay: int = 0,
+    filter_time: float = 0.0,
+    points: int = 101,
+) -> ZWidth:
+    """Returns the couplings (K, B) that a device can show, and which to use.
+
+        passive for any hand     K = 2(b − B T/(T + 2τ))/T              d = 0
+        passive against a wall   minimum_damping(K, B, delay=d) = b     d >= 1
+        free of limit cycles     K = 2(f_c/Δ − B/T)                     Δ > 0
+        stable without a hand    ``free_device_stiffness``              m_d given
+
+    Without a delay the first line is sufficient for any passive hand and any environment that is
+    discrete-time passive. **With a delay no bound holds for a general environment**: the line is
+    that of a wall, necessary but not sufficient, and the energy meter must decide. The friction
+    line is that of a loop without delay and without low-pass (which makes the damper's jumps
+    smaller). It is required only where f_c T/Δ reaches ``LEAST_FRICTION_SHARE`` of b; else limit
+    cycles are to be expected, which stay bounded while β = b/(K T) > ½, that is everywhere below
+    the first line, and the note says so. The line without a hand lies above the first one.
+
+    Args:
+        device_damping: b in N s/m, finite and > 0.
+        period: T in s, finite and > 0.
+        mass: m_d in kg, finite and > 0; None leaves its line out.
+        friction: f_c in N, finite and >= 0; None: unknown.
+        resolution: Δ in m, finite and >= 0; 0: positions are exact.
+        delay: d, whole samples from position to force.
+        filter_time: τ in s, >= 0, of a first-order low-pass behind the damper.
+        points: How many values of B, >= 2.
+
+    Raises:
+        CouplingError: An argument is out of range.
+
+    References:
+        Brown & Colgate 1997, eq. (6); Colgate & Schenkel 1997 (wall); Abbott & Okamura 2005
+        (friction); Diolaiti et al. 2006 (limit cycles); Colgate & Brown 1994 (Z-width).
+    """
+    loop = _Loop(
+        scalar("device damping", device_damping, "N s/m", positive=True),
+        scalar("period", period, "s", positive=True),
+        whole("delay", delay),
+        scalar("filter time", filter_time, "s"),
+    )
+    count = whole("points", points, least=2)
+    quantum = scalar("resolution", resolution, "m")
+    allowed, of_friction = _friction(friction, quantum, loop)
+    passive_damping = loop.passive_damping()
+    is_kept = (allowed or 0.0) >= LEAST_FRICTION_SHARE * loop.b
+    available = min(passive_damping, allowed) if allowed and is_kept else passive_damping
+    grid = np.linspace(0.0, MARGIN_OF_RANGE * passive_damping, count)
+    # the corner's B rides along at the end of the arrays
+    damping = np.append(grid, DAMPING_SHARE * available)
+
+    lines = [_passive_line(loop, damping, passive_damping)]
+    if allowed is not None:
+        stiffness = np.maximum(0.0, 2 * (allowed - damping) / loop.period)
+        because = "f_c >= K Δ/2 + B Δ/T"
+        lines.append(LimitLine(NO_LIMIT_CYCLES, because, stiffness, allowed, is_kept))
+    if mass is not None:
+        lines.append(_free_line(loop, scalar("mass", mass, "kg", positive=True), damping))
+    # where several are 0, the one that was so first limits
+    required = [line for line in lines if line.is_required]
+    required.sort(key=lambda line: line.largest_damping)
+    rows = np.stack([line.stiffness for line in required])
+    least, limit = rows.argmin(axis=0), rows.min(axis=0)
+    return ZWidth(
+        damping=grid,
+        lines=tuple(replace(line, stiffness=line.stiffness[:-1]) for line in lines),
+        limit=limit[:-1],
+        limited_by=tuple(required[index].name for index in least[:-1]),
+        corner=Coupling(STIFFNESS_MARGIN * float(limit[-1]), float(damping[-1]), 0.0, 0.0),
+        corner_limited_by=required[least[-1]].name,
+        notes=tuple(note for note in (_DELAYED if delay else "", of_friction) if note),
+        device_damping=loop.b,
+        period=period,
+        delay=delay,
+        filter_time=filter_time,
+    )
+
+
+def _passive_line(loop: _Loop, damping: _Array, largest: float) -> LimitLine:
+    name, reason = ANY_HAND, "b > K T/2 + B T/(T + 2τ)" if loop.filter_time else "b > K T/2 + B"
+    if loop.delay:
+        name, reason = WALL, "at the worst frequency"
+    return LimitLine(name, reason, loop.passive(damping), largest, is_required=True)
+
+
+def _free_line(loop: _Loop, mass: float, damping: _Array) -> LimitLine:
+    b, period, late, tau = loop.b, loop.period, loop.delay, loop.filter_time
+    stiffness = free_device_stiffness(b, period, mass, damping, delay=late, filter_time=tau)
+    largest = free_device_damping(b, period, mass, delay=late, filter_time=tau)
+    reason = f"{mass:g} kg let go against a wall"
+    return LimitLine(WITHOUT_HAND, reason, np.asarray(stiffness), float(largest), is_required=True)
+
+
+def _friction(friction: float | None, quantum: float, loop: _Loop) -> tuple[float | None, str]:
+    """Returns f_c T/Δ, what friction allows of B (None: no such line), and what to say of it."""
+    known = None if friction is None else scalar("friction", friction, "N")
+    if quantum == 0:
+        return None, ""
+    if known is None:
+        return None, f"the friction is not known: the position's steps may cause {_CYCLES}"
+    allowed = known * loop.period / quantum
+    if allowed < LEAST_FRICTION_SHARE * loop.b:
+        steps = f"steps of {quantum:g} m"
+        return allowed, f"friction of {known:g} N is too low for {steps}: expect {_CYCLES}"
+    return allowed, "the friction line is that of a loop without delay" if loop.delay else ""

@@ -1,0 +1,81 @@
+"""What every picture shares: its name, its canvas, how it is written."""
+
+from __future__ import annotations
+
+import io
+import warnings
+from pathlib import Path
+from typing import Any
+
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from hapticbridge.errors import HapticBridgeError
+
+ENDINGS = (".pdf", ".png", ".svg")
+"""What a picture's name may end in."""
+
+DOTS_PER_INCH = 100
+"""Resolution of a written picture in 1/inch: a figure 8 inches wide is legible at 800 pixels. More
+makes files larger."""
+
+
+def check_ending(path: Path) -> None:
+    """Checks that a picture's name says what it is, before anything is computed for it.
+
+    Args:
+        path: The file to be written.
+
+    Raises:
+        HapticBridgeError: The name ends in none of ``ENDINGS``.
+    """
+    if path.suffix.lower() not in ENDINGS:
+        raise HapticBridgeError(
+            f"'{path}' does not end like a picture; endings: {', '.join(ENDINGS)}"
+        )
+
+
+def new_figure(width: float, height: float) -> Figure:
+    """Returns an empty figure that needs no display.
+
+    Args:
+        width: In inches.
+        height: In inches.
+    """
+    figure = Figure(figsize=(width, height), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def _save(figure: Figure, target: Path | io.StringIO, **options: Any) -> None:
+    with warnings.catch_warnings():
+        # a name in letters that the font lacks is drawn as boxes, which is no news
+        warnings.filterwarnings("ignore", message="Glyph", category=UserWarning)
+        figure.savefig(target, **options)
+
+
+def write_picture(figure: Figure, path: Path) -> None:
+    """Writes a figure in the format that the file's name says.
+
+    Args:
+        figure: What to write.
+        path: Its ending is one of ``ENDINGS``.
+
+    Raises:
+        HapticBridgeError: The ending is no picture format, or the file cannot be written.
+    """
+    check_ending(path)
+    try:
+        _save(figure, path, dpi=DOTS_PER_INCH)
+    except OSError as error:
+        raise HapticBridgeError(f"cannot write '{path}': {error.strerror}") from None
+
+
+def inline_svg(figure: Figure) -> str:
+    """Returns a figure as an ``<svg>`` element for a page."""
+    buffer = io.StringIO()
+    # no metadata: a page needs none of matplotlib's own
+    unwanted = dict.fromkeys(("Creator", "Date", "Format", "Type"))
+    _save(figure, buffer, format="svg", metadata=unwanted)
+    text = buffer.getvalue()
+    return text[text.index("<svg") :]

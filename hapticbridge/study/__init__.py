@@ -1,0 +1,1 @@
+"""Studies: theory and runs, swept, drawn and written down."""

@@ -1,0 +1,201 @@
+"""The theory in pictures: what a device can show, and what a coupling needs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from hapticbridge.coupling import Coupling
+from hapticbridge.passivity import (
+    ZWidth,
+    damping_spectrum,
+    minimum_damping,
+    transmission_line_spectrum,
+    worst_frequency,
+)
+from hapticbridge.passivity.spectrum import Discretization
+from hapticbridge.picture import new_figure
+
+_Array = NDArray[np.float64]
+
+POINTS = 400
+"""Frequencies per spectrum, over three decades up to Nyquist; more only makes pictures larger."""
+
+HIGHEST_SHOWN = 4.0
+"""Where a line or spectrum is cut off, in units of what the picture is about (the largest stiffness
+of the region, the damping needed); more shows more of what lies far outside and flattens the rest.
+"""
+
+_COLOURS = ("#1a5fb4", "#b3261e", "#2e7d32", "#8e44ad", "#c77700", "#5f6368")
+_STYLES = ("-", "--", "-.", ":", (0, (5, 1)), (0, (1, 1)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Alternative:
+    """One way to realise the same stiffness and damping, and what it asks of the device.
+
+    Attributes:
+        name: What is different.
+        needed: Device damping in N s/m; inf where none suffices.
+        frequency: Where it is needed, in rad/s: 0.0 at low frequency; None where there is no single
+            one (needed alike at all of them, or not at all a matter of one frequency).
+        spectrum: Frequencies in rad/s and the damping needed there; None where none is drawn.
+    """
+
+    name: str
+    needed: float
+    frequency: float | None
+    spectrum: tuple[_Array, _Array] | None
+
+
+def alternatives(coupling: Coupling, period: float, filter_time: float) -> tuple[Alternative, ...]:
+    """Returns what a coupling needs as it is, and what each way around the bound would need.
+
+    In this order: as asked (backward difference); half the period; a first-order low-pass behind
+    the damper; Tustin's damper; one sample of delay against a wall, and for any environment; a
+    lossless transmission line of the same static stiffness, of impedance Z = K T and one sample
+    each way, ended by the device.
+
+    Args:
+        coupling: K and B; the translation counts.
+        period: T in s, finite and > 0.
+        filter_time: τ in s of the low-pass, >= 0.
+
+    Raises:
+        CouplingError: An argument is out of range.
+
+    References:
+        Brown & Colgate 1997, eqs. (2), (6), (7) and section 6; Colgate & Schenkel 1997 (wall).
+    """
+
+    def way(
+        name: str,
+        step: float = period,
+        scheme: Discretization = "backward",
+        delay: int = 0,
+        low_pass: float = 0.0,
+    ) -> Alternative:
+        needed = minimum_damping(
+            coupling, step, discretization=scheme, delay=delay, filter_time=low_pass
+        )
+        frequency = _frequencies(step)
+        spectrum = damping_spectrum(
+            coupling, step, frequency, discretization=scheme, delay=delay, filter_time=low_pass
+        )
+        worst = worst_frequency(
+            coupling, step, discretization=scheme, delay=delay, filter_time=low_pass
+        )
+        return Alternative(name, needed, float(worst), (frequency, spectrum))
+
+    asked = way("as asked (backward difference)")
+    frequency = _frequencies(period)
+    line = transmission_line_spectrum(coupling.stiffness * period, period, frequency)
+    return (
+        asked,
+        way("half the period", step=period / 2),
+        way(f"low-pass of {1e3 * filter_time:g} ms on the damper", low_pass=filter_time),
+        way("Tustin's damper", scheme="tustin"),
+        way("one sample of delay, against a wall", delay=1),
+        # the phase of (1 − z⁻¹)z/C passes through π on its way to Nyquist, whatever K and B
+        Alternative("one sample of delay, any environment", float("inf"), None, None),
+        Alternative(
+            "lossless line of that stiffness",
+            float(line.max()),
+            None,
+            (frequency, line),
+        ),
+    )
+
+
+def _frequencies(period: float) -> _Array:
+    frequency = np.geomspace(1e-3, 1, POINTS) * np.pi / period
+    frequency[-1] = np.pi / period
+    return frequency
+
+
+def draw_alternatives(
+    ways: tuple[Alternative, ...], title: str, device_damping: float | None = None
+) -> Figure:
+    """Draws the damping that each way needs over frequency.
+
+    Args:
+        ways: From ``alternatives``; the first one sets the scale.
+        title: Above the picture.
+        device_damping: b in N s/m, drawn as a level if it is given.
+    """
+    figure = new_figure(8, 5.5)
+    axes = figure.subplots()
+    drawn = [(way.name, *way.spectrum) for way in ways if way.spectrum is not None]
+    for i, (name, frequency, needed) in enumerate(drawn):
+        axes.semilogx(
+            frequency / (2 * np.pi),
+            np.where(np.isfinite(needed), needed, np.nan),
+            color=_COLOURS[i % len(_COLOURS)],
+            ls=_STYLES[i % len(_STYLES)],
+            lw=2.2 if i == 0 else 1.5,
+            label=name,
+        )
+    scale = max(ways[0].needed, device_damping or 0.0)
+    if device_damping is not None:
+        axes.axhline(device_damping, color="black", lw=1, label="the device's damping b")
+    lowest = min(needed.min() for _, _, needed in drawn)
+    axes.set_ylim(max(min(0.0, lowest), -scale), HIGHEST_SHOWN / 2 * scale)
+    axes.xaxis.set_major_formatter("{x:g}")
+    axes.set_xlabel("frequency (Hz)")
+    axes.set_ylabel("device damping needed (N s/m)")
+    axes.grid(alpha=0.3, which="both")
+    figure.suptitle(title, fontsize="medium", parse_math=False)
+    figure.legend(loc="outside lower center", fontsize="small", ncols=2, frameon=False)
+    return figure
+
+
+def draw_z_width(z: ZWidth) -> Figure:
+    """Draws the couplings that a device can show: region, limiting lines, corner to use.
+
+    Args:
+        z: From ``z_width``.
+    """
+    figure = new_figure(8, 5.5)
+    axes = figure.subplots()
+    axes.fill_between(z.damping, z.limit, color="#1a5fb4", alpha=0.15, lw=0, label="can be shown")
+    for i, line in enumerate(z.lines):
+        remark = "" if line.is_required else ", not kept"
+        # to its end, not along the axis beyond
+        inside = z.damping < line.largest_damping
+        ends = not inside.all()
+        axes.plot(
+            np.append(z.damping[inside], [line.largest_damping] * ends),
+            np.append(line.stiffness[inside], [0.0] * ends),
+            color=_COLOURS[i],
+            ls=_STYLES[i],
+            lw=2,
+            label=f"{line.name}{remark}: {line.reason}",
+        )
+    corner = z.corner
+    axes.plot(corner.damping, corner.stiffness, "o", color="black", ms=7, label="to be used")
+    axes.annotate(
+        f"K = {corner.stiffness:.4g} N/m\nB = {corner.damping:.3g} N s/m",
+        (corner.damping, corner.stiffness),
+        xytext=(0, -10),
+        textcoords="offset points",
+        ha="center",
+        va="top",
+        fontsize="small",
+    )
+    region = float(z.limit.max())
+    highest = max(float(line.stiffness.max()) for line in z.lines)
+    axes.set_ylim(0, min(1.08 * highest, HIGHEST_SHOWN * region))
+    axes.set_xlim(0, z.damping[-1])
+    axes.set_xlabel("coupling damping B (N s/m)")
+    axes.set_ylabel("coupling stiffness K (N/m)")
+    axes.grid(alpha=0.3)
+    facts = [f"b = {z.device_damping:g} N s/m", f"{1 / z.period:g} Hz"]
+    facts += [f"delay of {1e3 * z.delay * z.period:g} ms"] * bool(z.delay)
+    facts += [f"low-pass of {1e3 * z.filter_time:g} ms"] * bool(z.filter_time)
+    title = f"What a device can show: {', '.join(facts)}"
+    figure.suptitle(title, fontsize="medium", parse_math=False)
+    figure.legend(loc="outside lower center", fontsize="small", ncols=1, frameon=False)
+    return figure

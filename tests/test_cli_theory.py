@@ -1,0 +1,172 @@
+"""``hapticbridge zwidth`` and ``hapticbridge bound`` as a user meets them."""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from hapticbridge.cli import main
+
+ZWIDTH = "zwidth --damping 2 --mass 0.1 --friction 0.05 --resolution 1e-5 --rate 1000"
+BOUND = "bound --stiffness 2000 --damping 1 --rate 1000"
+
+
+class Told:
+    """What one call of the command line said."""
+
+    def __init__(self, command: str, capsys: pytest.CaptureFixture[str]) -> None:
+        self.code = main(shlex.split(command))
+        self.out, self.err = capsys.readouterr()
+        self.words = " ".join(self.out.split())
+
+    def json(self) -> Any:
+        """Returns what was printed, which must be JSON without inf and nan."""
+        return json.loads(self.out, parse_constant=pytest.fail)
+
+
+def test_zwidth_names_lines_limit_corner_and_next_command(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    told = Told(ZWIDTH, capsys)
+    assert told.code == 0
+    assert "passive for any hand 4000 N/m 2 N s/m b > K T/2 + B" in told.words
+    assert "free of limit cycles 10000 N/m 5 N s/m" in told.words
+    assert "stable without a hand 4013.4 N/m" in told.words
+    assert "limited by: passive for any hand" in told.out
+    assert "use K = 2400 N/m, B = 0.5 N s/m" in told.out
+    assert told.out.endswith("next: hapticbridge run SCENE --stiffness 2400 --damping 0.5\n")
+
+
+def test_next_command_of_zwidth_runs_and_is_certified(capsys: pytest.CaptureFixture[str]) -> None:
+    command = Told(f"{ZWIDTH} --rate 2000 --delay 1 --json", capsys).json()["next"]
+    assert "--rate 2000" in command
+    command = command.replace("SCENE", "point_mass").removeprefix("hapticbridge ")
+    told = Told(f"{command} --fast --duration 0.05 --json", capsys)
+    assert told.code == 0
+    assert told.json()["is_certified"] is True
+
+
+def test_zwidth_as_json_holds_the_whole_region(capsys: pytest.CaptureFixture[str]) -> None:
+    facts = Told(f"{ZWIDTH} --json", capsys).json()
+    assert facts["corner"]["stiffness"] == pytest.approx(2400, rel=1e-12)
+    assert facts["corner"]["limited_by"] == "passive for any hand"
+    lengths = {len(line["stiffness"]) for line in facts["lines"]}
+    assert lengths == {len(facts["damping"])} == {len(facts["limit"])}
+    assert [line["required"] for line in facts["lines"]] == [True, True, True]
+
+
+def test_zwidth_tells_of_limit_cycles_delay_and_low_pass(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    told = Told("zwidth --damping 2 --friction 0 --resolution 1e-5 --delay 1", capsys)
+    assert "passive against a wall" in told.out
+    assert "not kept" in told.out
+    assert "expect limit cycles" in told.out
+    assert "none can be promised" in told.out
+    told = Told("zwidth --damping 2 --filter-time 0.001", capsys)
+    assert "next:" not in told.out
+    assert "leave --filter-time out" in told.out
+
+
+def test_bound_shows_every_alternative(capsys: pytest.CaptureFixture[str]) -> None:
+    told = Told(BOUND, capsys)
+    assert told.code == 0
+    for row in (
+        r"as asked \(backward difference\) 2 N s/m 500 Hz",
+        r"half the period 1\.5 N s/m 1000 Hz",
+        r"low-pass of 1 ms on the damper 1\.333 N s/m 500 Hz",
+        r"Tustin's damper none suffices 500 Hz",
+        r"one sample of delay, against a wall 2\.5 N s/m 166\.7 Hz",
+        r"one sample of delay, any environment none suffices -",
+        r"lossless line of that stiffness 2 N s/m every frequency",
+    ):
+        assert re.search(row, told.words)
+
+
+def test_bound_judges_a_device(capsys: pytest.CaptureFixture[str]) -> None:
+    told = Told(f"{BOUND} --device-damping 1.5", capsys)
+    assert told.code == 1
+    assert "device damping 1.5 < 2 N s/m" in told.out
+    for change in ("1000 N/m", "2000 Hz", "0.5 N s/m", "a device with 2 N s/m"):
+        assert change in told.out
+    told = Told(f"{BOUND} --device-damping 2.5", capsys)
+    assert told.code == 0
+    assert "up to K = 3000 N/m" in told.out
+    assert "next: hapticbridge run SCENE --stiffness 2000 --damping 1\n" in told.out
+
+
+@pytest.mark.parametrize("damping", [0.5, 1.0])
+def test_no_rate_helps_where_the_damper_alone_is_too_much(
+    damping: float, capsys: pytest.CaptureFixture[str]
+) -> None:
+    told = Told(f"{BOUND} --device-damping {damping}", capsys)
+    assert told.code == 1
+    assert "raise the rate" not in told.out
+    assert "lower the coupling's damping below" in told.out
+
+
+@pytest.mark.parametrize(("device", "code", "holds"), [("", 0, None), ("1.5", 1, False)])
+def test_bound_as_json_is_valid_and_null_where_none_suffices(
+    device: str, code: int, holds: bool | None, capsys: pytest.CaptureFixture[str]
+) -> None:
+    told = Told(f"{BOUND} --json" + (f" --device-damping {device}" if device else ""), capsys)
+    facts = told.json()
+    assert told.code == code
+    assert facts["holds"] is holds
+    assert facts["largest_stiffness"] == (1000 if device else None)
+    assert facts["frequency_hz"] == pytest.approx(500)
+    assert [way["needed"] is None for way in facts["alternatives"]] == [
+        *(False, False, False, True, False, True, False)
+    ]
+
+
+@pytest.mark.parametrize("command", [ZWIDTH, f"{BOUND} --device-damping 2"])
+def test_picture_is_written_where_it_is_wanted(
+    command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    told = Told(f"{command} --plot {tmp_path}/out.png", capsys)
+    assert told.code == 0
+    assert f"wrote {tmp_path}/out.png" in told.err
+    assert (tmp_path / "out.png").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize(
+    ("command", "sentence"),
+    [
+        ("zwidth --damping 0", "device damping is 0.0 N s/m"),
+        ("zwidth --damping nan", "device damping is nan"),
+        ("zwidth --damping 2 --mass -1", "mass is -1.0 kg"),
+        ("zwidth --damping 2 --delay -1", "delay is -1"),
+        ("zwidth --damping 2 --rate 0", "rate is 0.0 Hz"),
+        ("zwidth --damping 2 --plot x.gif", "does not end like a picture"),
+        ("bound --stiffness -1", "stiffness is -1"),
+        ("bound --stiffness inf", "stiffness is inf"),
+        ("bound --stiffness 1 --rate nan", "rate is nan Hz"),
+        ("bound --stiffness 1 --filter-time -1", "filter time is -1.0 s"),
+        ("bound --stiffness 1 --device-damping 0", "device damping is 0.0 N s/m"),
+        ("bound --stiffness 1 --plot x", "does not end like a picture"),
+        ("bound --stiffness 1 --plot /nowhere/x.png", "cannot write '/nowhere/x.png'"),
+    ],
+)
+def test_bad_values_are_refused_in_a_sentence(
+    command: str, sentence: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    told = Told(command, capsys)
+    assert told.code == 2
+    assert sentence in told.err
+    assert "Traceback" not in told.err
+
+
+@pytest.mark.parametrize("command", ["zwidth", "bound"])
+def test_help_holds_an_example(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main([command, "--help"])
+    assert stop.value.code == 0
+    out = capsys.readouterr().out
+    assert f"hapticbridge {command}" in out.split("usage:")[1].partition("\n")[2]
+    assert "{None}" not in out

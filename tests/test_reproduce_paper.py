@@ -1,0 +1,251 @@
+"""The walk through Brown & Colgate 1997: its page, its checks, and that a wrong number shows."""
+
+from __future__ import annotations
+
+import runpy
+from collections.abc import Callable
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hapticbridge.errors import HapticBridgeError
+from hapticbridge.passivity import stability_limit
+from hapticbridge.study.paper import (
+    damper,
+    direct,
+    discrete_passivity,
+    explicit_euler,
+    impact,
+    implicit_euler,
+    transmission_line,
+    virtual_mass,
+    worst_hand,
+)
+from hapticbridge.study.paper.check import Check, Relation
+from hapticbridge.study.paper.page import PAGE, number, prepared_folder
+from hapticbridge.study.paper.walk import STEPS
+
+SCRIPT = Path(__file__).parents[1] / "scripts" / "reproduce_paper"
+EQUATIONS = (1, 2, 4, 5, 6, 7, 11, 13, 14, 15, 16, 17, 18, 19)
+
+
+def script() -> dict[str, Any]:
+    return runpy.run_path(str(SCRIPT))
+
+
+def run(folder: Path) -> int:
+    return int(script()["main"]([str(folder)]))
+
+
+class Elements(HTMLParser):
+    """Every element with its attributes, and how deep the open ones are nested at the end."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.found: list[tuple[str, dict[str, str | None]]] = []
+        self.open: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.found.append((tag, dict(attrs)))
+        if tag not in {"meta", "br", "img", "link"}:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.found.append((tag, dict(attrs)))
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+
+@pytest.fixture(scope="module")
+def walk(tmp_path_factory: pytest.TempPathFactory) -> tuple[int, Path]:
+    folder = tmp_path_factory.mktemp("walk") / "made" / "on the way"
+    return run(folder), folder
+
+
+def test_every_number_is_reproduced(walk: tuple[int, Path]) -> None:
+    code, folder = walk
+    page = (folder / PAGE).read_text(encoding="utf-8")
+    assert code == 0
+    assert "all pass" in page
+    assert "FAIL" not in page
+
+
+def test_page_walks_through_every_equation_with_its_picture(walk: tuple[int, Path]) -> None:
+    page = (walk[1] / PAGE).read_text(encoding="utf-8")
+    headings = " ".join(line for line in page.splitlines() if line.startswith("<h2>"))
+    for equation in EQUATIONS:
+        assert f"({equation})" in headings
+        assert f"<td>({equation})</td>" in page, "no check"
+    for other in ("§4", "worst hand", "future work"):
+        assert other in headings
+    assert page.count("<figure><svg") == len(STEPS)
+    assert len(list(walk[1].glob("*.png"))) == len(STEPS)
+
+
+def test_page_is_well_formed_and_needs_nothing_else(walk: tuple[int, Path]) -> None:
+    elements = Elements()
+    elements.feed((walk[1] / PAGE).read_text(encoding="utf-8"))
+    assert elements.open == []
+    for tag, attributes in elements.found:
+        assert tag not in {"script", "link", "img", "iframe", "object"}
+        assert "src" not in attributes
+        # matplotlib's clip paths and glyphs refer to the page itself
+        for name in ("href", "xlink:href"):
+            assert (attributes.get(name) or "#").startswith("#")
+
+
+def test_each_picture_keeps_its_own_definitions(walk: tuple[int, Path]) -> None:
+    elements = Elements()
+    elements.feed((walk[1] / PAGE).read_text(encoding="utf-8"))
+    clips = [a["id"] for tag, a in elements.found if tag == "clippath"]
+    assert len(clips) == len(set(clips)), "one picture would be cut by another's frame"
+
+
+def scaled(function: Callable[..., Any], factor: float) -> Callable[..., Any]:
+    return lambda *arguments, **options: factor * np.asarray(function(*arguments, **options))
+
+
+def with_scheme(function: Callable[..., Any], scheme: str) -> Callable[..., Any]:
+    return lambda mass, force, period, _, **options: function(
+        mass, force, period, scheme, **options
+    )
+
+
+@pytest.mark.parametrize(
+    ("module", "name", "broken", "equation"),
+    [
+        (direct, "maximum_stiffness", lambda f: scaled(f, 1.001), "(1)"),
+        (damper, "damping_spectrum", lambda f: scaled(f, 1 + 1e-8), "(6)"),
+        (damper, "wall_limit", lambda f: scaled(f, 1.003), "(6)"),
+        (discrete_passivity, "integrate_particle", lambda f: with_scheme(f, "explicit"), "(13)"),
+        (implicit_euler, "MASS", lambda m: 1.01 * m, "(16)"),
+        (explicit_euler, "MASS", lambda m: 1.01 * m, "(18)"),
+        (virtual_mass, "_in_mujoco", lambda f: scaled(f, 1.003), "(19)"),
+        (virtual_mass, "environment_minimum_damping", lambda f: scaled(f, 1.0001), "(19)"),
+        (impact, "RESTITUTION", lambda e: e + 1e-6, "§4"),
+        (worst_hand, "minimum_damping", lambda f: scaled(f, 1.002), "worst hand"),
+        (transmission_line, "transmission_line_stiffness", lambda f: scaled(f, 1.001), "future"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_a_wrong_number_is_reported(
+    module: Any,
+    name: str,
+    broken: Callable[[Any], Any],
+    equation: str,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(module, name, broken(getattr(module, name)))
+    # one mass of the table is enough
+    monkeypatch.setattr(virtual_mass, "KEPT", {0.05: virtual_mass.KEPT[0.05]})
+    failed = [check for check in module_section(module).checks if not check.has_passed]
+    assert failed
+    assert any(check.equation.startswith(equation) for check in failed)
+
+
+def module_section(module: Any) -> Any:
+    return module.backward_difference() if module is damper else module.section()
+
+
+def test_script_fails_and_names_what_failed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(direct, "stability_limit", scaled(stability_limit, 1.01))
+    names = script()
+    monkeypatch.setitem(names["computed"].__globals__, "STEPS", (STEPS[0],))
+    assert names["main"]([str(tmp_path)]) == 1
+    printed = capsys.readouterr().out
+    assert "fails (1) b_θ" in printed
+    assert "time-domain loop" in printed
+    assert "4 checks, 1 fail" in printed
+    assert "FAIL" in (tmp_path / PAGE).read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("place", ["file", "file/below"])
+def test_a_folder_that_cannot_be_one_is_refused_in_a_sentence(
+    tmp_path: Path, place: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "file").write_text("kept", encoding="utf-8")
+    assert run(tmp_path / place) == 2
+    printed = capsys.readouterr()
+    assert printed.err.startswith("error: ")
+    assert printed.err.count("\n") == 1
+    assert printed.out == ""
+    assert (tmp_path / "file").read_text(encoding="utf-8") == "kept"
+
+
+def test_a_folder_without_permission_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(**_: Any) -> None:
+        raise PermissionError(13, "Permission denied")
+
+    # permissions do not hold for root, who runs tests in containers
+    monkeypatch.setattr("hapticbridge.study.paper.page.tempfile.TemporaryFile", refuse)
+    with pytest.raises(HapticBridgeError, match=r"cannot write into .*: Permission denied"):
+        prepared_folder(tmp_path)
+
+
+def test_ctrl_c_ends_without_traceback_or_page(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupted() -> None:
+        raise KeyboardInterrupt
+
+    names = script()
+    monkeypatch.setitem(names["computed"].__globals__, "STEPS", (("first", interrupted),))
+    assert names["main"]([str(tmp_path)]) == 130
+    assert "stopped" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def check_of(expected: float, got: float, relation: Relation, tolerance: float = 1e-9) -> Check:
+    return Check(
+        equation="(6)", quantity="b", route="none", expected=expected, got=got,
+        tolerance=tolerance, relation=relation,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("expected", "got", "relation", "deviation"),
+    [
+        (2.0, 2.5, "equals", 0.25),
+        (-2.0, -2.5, "equals", 0.25),
+        (0.0, -3.0, "equals", 3.0),
+        (2.0, 2.5, "at most", 0.25),
+        (2.0, 1.0, "at most", 0.0),
+        (-2.0, -1.0, "at most", 0.5),
+        (2.0, 1.0, "at least", 0.5),
+        (-2.0, -1.0, "at least", 0.0),
+        (np.inf, np.inf, "equals", 0.0),
+        (np.inf, 1.0, "equals", np.inf),
+        (1.0, np.inf, "equals", np.inf),
+        (np.inf, 1.0, "at least", np.inf),
+    ],
+)
+def test_deviation_is_relative_and_one_sided_for_bounds(
+    expected: float, got: float, relation: Relation, deviation: float
+) -> None:
+    check = check_of(expected, got, relation)
+    assert check.deviation == deviation
+    assert check.has_passed == (deviation == 0)
+
+
+@given(st.sampled_from(["equals", "at most", "at least"]), st.floats(allow_nan=False))
+def test_nothing_that_is_no_number_passes(relation: Relation, expected: float) -> None:
+    assert not check_of(expected, np.nan, relation, tolerance=np.inf).has_passed
+
+
+@given(st.floats(allow_nan=False, allow_infinity=False))
+def test_a_number_equals_itself_at_no_tolerance(value: float) -> None:
+    assert check_of(value, value, "equals", tolerance=0.0).has_passed
+
+
+def test_numbers_are_written_for_readers() -> None:
+    assert [number(v) for v in (np.inf, -np.inf, -0.5, 1e-7)] == ["∞", "−∞", "−0.5", "1e−07"]

@@ -1,0 +1,121 @@
+"""What the pictures of the theory show, and the table of alternatives."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hapticbridge.coupling import Coupling
+from hapticbridge.errors import CouplingError, HapticBridgeError
+from hapticbridge.passivity import damping_spectrum_of, z_width
+from hapticbridge.picture import ENDINGS, check_ending, inline_svg, new_figure, write_picture
+from hapticbridge.study.theory import alternatives, draw_alternatives, draw_z_width
+
+T = 1e-3
+
+
+@given(st.floats(1, 1e5), st.floats(1e-3, 50))
+@settings(max_examples=30, deadline=None)
+def test_alternatives_follow_their_closed_forms(stiffness: float, damping: float) -> None:
+    asked, half, low_pass, tustin, wall, anywhere, line = alternatives(
+        Coupling(stiffness, damping, 0, 0), T, 2 * T
+    )
+    a = stiffness * T / 2
+    assert asked.needed == pytest.approx(a + damping, rel=1e-12)
+    assert half.needed == pytest.approx(a / 2 + damping, rel=1e-12)
+    assert low_pass.needed == pytest.approx(a + damping / 5, rel=1e-12)
+    assert tustin.needed == np.inf
+    assert anywhere.needed == np.inf
+    assert line.needed == pytest.approx(2 * a, rel=1e-12)
+    if a < 2 * damping:
+        assert wall.needed == pytest.approx(a + a**2 / (2 * damping) + damping, rel=1e-9)
+    else:
+        assert wall.needed == pytest.approx(3 * a - damping, rel=1e-9)
+
+
+@given(st.floats(1, 1e5), st.floats(0, 50))
+@settings(max_examples=30)
+def test_no_damping_suffices_behind_one_sample_of_delay(stiffness: float, damping: float) -> None:
+    frequency = np.linspace(1, np.pi / T, 200)
+    needed = damping_spectrum_of(
+        lambda z: (stiffness + damping / T * (1 - 1 / z)) / z, T, frequency
+    )
+    assert np.isinf(needed).any()
+
+
+def test_each_spectrum_reaches_what_its_alternative_needs() -> None:
+    for way in alternatives(Coupling(2000, 1, 0, 0), T, T):
+        if way.spectrum is None:
+            assert way.frequency is None
+            continue
+        frequency, needed = way.spectrum
+        assert needed.max() == pytest.approx(way.needed, rel=1e-3)
+        if way.frequency is not None:
+            nearest = frequency[np.nanargmax(needed)]
+            assert nearest == pytest.approx(way.frequency, rel=2e-2)
+
+
+def test_bad_couplings_are_refused() -> None:
+    with pytest.raises(CouplingError, match="filter time is"):
+        alternatives(Coupling(2000, 1, 0, 0), T, -1)
+    with pytest.raises(CouplingError, match="period is"):
+        alternatives(Coupling(2000, 1, 0, 0), 0, T)
+
+
+def test_z_width_picture_names_every_line_and_the_corner() -> None:
+    z = z_width(2, T, mass=0.1, friction=0.0, resolution=1e-5, delay=1)
+    figure = draw_z_width(z)
+    (axes,) = figure.axes
+    labels = axes.get_legend_handles_labels()[1]
+    for line in z.lines:
+        assert any(label.startswith(line.name) for label in labels)
+    assert any("not kept" in label for label in labels)
+    assert "N/m" in axes.get_ylabel()
+    assert "N s/m" in axes.get_xlabel()
+    assert axes.texts[0].get_text() == f"K = {z.corner.stiffness:.4g} N/m\nB = 0.5 N s/m"
+    drawn = next(line for line in axes.lines if str(line.get_label()).startswith(z.lines[0].name))
+    values = np.asarray(drawn.get_ydata(), dtype=float)
+    np.testing.assert_allclose(values[:80], z.lines[0].stiffness[:80])
+    assert values[-1] == 0  # it ends where it reaches 0
+    assert np.asarray(drawn.get_xdata(), dtype=float)[-1] == pytest.approx(2, rel=1e-9)
+    assert figure.get_suptitle().endswith("b = 2 N s/m, 1000 Hz, delay of 1 ms")
+
+
+def test_bound_picture_shows_every_way_and_the_device() -> None:
+    ways = alternatives(Coupling(2000, 1, 0, 0), T, T)
+    (axes,) = draw_alternatives(ways, "title", 1.5).axes
+    labels = axes.get_legend_handles_labels()[1]
+    assert labels == [way.name for way in ways if way.spectrum] + ["the device's damping b"]
+    assert "Hz" in axes.get_xlabel()
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_picture_is_written_in_the_format_that_it_is_named_after(
+    ending: str, tmp_path: Path
+) -> None:
+    path = tmp_path / f"picture{ending}"
+    write_picture(draw_z_width(z_width(2, T)), path)
+    first = {".pdf": b"%PDF", ".png": b"\x89PNG", ".svg": b"<?xml"}[ending]
+    assert path.read_bytes().startswith(first)
+
+
+def test_picture_that_cannot_be_written_is_refused_in_a_sentence(tmp_path: Path) -> None:
+    figure = new_figure(4, 3)
+    with pytest.raises(HapticBridgeError, match=r"does not end like a picture; endings: \.pdf"):
+        check_ending(Path("x.jpeg"))
+    with pytest.raises(HapticBridgeError, match="does not end like a picture"):
+        write_picture(figure, tmp_path / "x")
+    with pytest.raises(HapticBridgeError, match=r"cannot write '.*x\.png': No such file"):
+        write_picture(figure, tmp_path / "no" / "x.png")
+
+
+def test_letters_that_the_font_lacks_are_no_warning_and_svg_stands_alone() -> None:
+    figure = new_figure(4, 3)
+    figure.suptitle("\U0001f9f2")
+    text = inline_svg(figure)
+    assert text.startswith("<svg")
+    assert "<dc:date" not in text
