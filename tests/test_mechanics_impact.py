@@ -230,7 +230,7 @@ def test_a_jam_goes_on_until_the_slip_is_over() -> None:
     [
         ({"restitution": 1.01}, r"restitution is 1.01 \(no unit\); it must be in \[0, 1\]"),
         ({"restitution": -0.1}, r"in \[0, 1\]"),
-        ({"friction": -0.1}, r"friction is -0.1 \(no unit\); it must be >= 0"),
+        ({"friction": -0.1}, r"friction is -0.1 \(no unit\); it must be finite and >= 0"),
         ({"friction": np.inf}, "friction is inf .* finite"),
         ({"velocity": [0.0, 0.5]}, "normal velocity is 0.5 m/s; it must be < 0"),
         ({"velocity": [0.0, 0.0]}, "normal velocity is 0 m/s"),
@@ -249,7 +249,7 @@ def test_impossible_impacts_are_refused_in_a_sentence(
 
 
 def test_impossible_bodies_are_refused_in_a_sentence() -> None:
-    with pytest.raises(MechanicsError, match="mass is 0 kg; it must be > 0"):
+    with pytest.raises(MechanicsError, match="mass is 0 kg; it must be finite and > 0"):
         ImpactBody(0, 1, [0, 0])
     with pytest.raises(MechanicsError, match="inertia is -1 kg m²"):
         ImpactBody(1, -1, [0, 0])

@@ -1,52 +1,35 @@
-"""What an argument of the reference mechanics may be, refused in one sentence otherwise."""
+"""The checks of the reference mechanics' arguments: each returns what is valid, or raises."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from hapticbridge.arguments import Arguments, Array
 from hapticbridge.errors import MechanicsError, choices
 
-Array = NDArray[np.float64]
+_ARGUMENTS = Arguments(MechanicsError)
 
 
 def finite(name: str, value: ArrayLike, unit: str) -> Array:
-    """Returns the value as an array of doubles.
-
-    Raises:
-        MechanicsError: It is not numeric, or not all of it is finite.
-    """
-    try:
-        array = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise MechanicsError(f"{name} is {value!r}; it must be numbers in {unit}") from None
-    _demand(np.isfinite(array), name, array, unit, "finite")
-    return array
+    """Returns numbers as an array, all finite, or raises MechanicsError."""
+    return _ARGUMENTS.numbers(name, value, unit)
 
 
 def positive(name: str, value: ArrayLike, unit: str) -> Array:
-    """Returns the value as an array of doubles, all finite and > 0, or raises MechanicsError."""
-    array = finite(name, value, unit)
-    _demand(array > 0, name, array, unit, "> 0")
-    return array
+    """Returns numbers as an array, all finite and > 0, or raises MechanicsError."""
+    return _ARGUMENTS.numbers(name, value, unit, least=0, is_open=True)
 
 
 def within(name: str, value: ArrayLike, unit: str, low: float, high: float) -> Array:
-    """Returns the value as an array, all of it in [low, high], or raises MechanicsError."""
-    array = finite(name, value, unit)
-    limits = f">= {low:g}" if high == np.inf else f"in [{low:g}, {high:g}]"
-    _demand((array >= low) & (array <= high), name, array, unit, limits)
-    return array
+    """Returns numbers as an array, all finite and in [low, high], or raises MechanicsError."""
+    return _ARGUMENTS.numbers(name, value, unit, least=low, most=high)
 
 
 def step(period: float) -> float:
     """Returns the period T in s, one finite number > 0, or raises MechanicsError."""
-    array = positive("period", period, "s")
-    if array.ndim:
-        raise MechanicsError(f"period has shape {array.shape}; it must be one number in s")
-    return float(array)
+    return _ARGUMENTS.number("period", period, "s", least=0, is_open=True)
 
 
 def chosen(name: str, value: str, valid: Iterable[str]) -> str:
@@ -58,21 +41,5 @@ def chosen(name: str, value: str, valid: Iterable[str]) -> str:
 
 
 def common_shape(**arrays: Array) -> tuple[int, ...]:
-    """Returns the shape to which the arrays broadcast together.
-
-    Raises:
-        MechanicsError: They do not.
-    """
-    try:
-        return np.broadcast_shapes(*(array.shape for array in arrays.values()))
-    except ValueError:
-        shapes = ", ".join(f"{name} {array.shape}" for name, array in arrays.items())
-        raise MechanicsError(f"shapes do not broadcast together: {shapes}") from None
-
-
-def _demand(
-    is_valid: NDArray[np.bool_] | np.bool_, name: str, array: Array, unit: str, limits: str
-) -> None:
-    if not np.all(is_valid):
-        culprit = array[~np.asarray(is_valid)].flat[0]
-        raise MechanicsError(f"{name} is {culprit:g} {unit}; it must be {limits}")
+    """Returns the shape to which the arrays broadcast together, or raises MechanicsError."""
+    return _ARGUMENTS.shape(**arrays)

@@ -8,9 +8,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hapticbridge.arguments import Array
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import MechanicsError
-from hapticbridge.mechanics.arguments import Array, chosen, common_shape, finite, positive, step
+from hapticbridge.mechanics.arguments import chosen, common_shape, finite, positive, step
 
 CoupledScheme = Literal["held", "implicit", "compensated", "midpoint"]
 COUPLED_SCHEMES = ("held", "implicit", "compensated", "midpoint")

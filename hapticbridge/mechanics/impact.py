@@ -9,8 +9,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hapticbridge.arguments import Array
 from hapticbridge.errors import MechanicsError
-from hapticbridge.mechanics.arguments import Array, chosen, common_shape, finite, positive, within
+from hapticbridge.mechanics.arguments import chosen, common_shape, finite, positive, within
 from hapticbridge.mechanics.normal_path import NormalPath
 
 Law = Literal["newton", "poisson", "stronge"]

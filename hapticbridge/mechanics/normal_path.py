@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hapticbridge.mechanics.arguments import Array
+from hapticbridge.arguments import Array
 
 
 @dataclass(frozen=True, slots=True)

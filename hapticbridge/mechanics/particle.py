@@ -8,8 +8,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
+from hapticbridge.arguments import Array
 from hapticbridge.errors import MechanicsError
-from hapticbridge.mechanics.arguments import Array, chosen, common_shape, finite, positive, step
+from hapticbridge.mechanics.arguments import chosen, common_shape, finite, positive, step
 
 Scheme = Literal["explicit", "semi_implicit", "implicit", "midpoint"]
 SCHEMES = ("explicit", "semi_implicit", "implicit", "midpoint")

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from hapticbridge.arguments import Array
 from hapticbridge.errors import MechanicsError
 from hapticbridge.jit import compiled
-from hapticbridge.mechanics.arguments import Array, chosen, common_shape, finite, positive, step
+from hapticbridge.mechanics.arguments import chosen, common_shape, finite, positive, step
 from hapticbridge.mechanics.particle import SCHEMES, Scheme
 from hapticbridge.pose import Quaternion, Vector, cross, norm, product, quaternion_exp, scaled
 

@@ -160,9 +160,9 @@ def maximum_stiffness(
         Brown & Colgate 1997, eq. (6) solved for K.
     """
     available, step, spent = together(
-        checked("device damping", device_damping, "N s/m", positive=True),
-        checked("period", period, "s", positive=True),
-        checked("coupling damping", damping, "N s/m"),
+        device_damping=checked("device damping", device_damping, "N s/m", positive=True),
+        period=checked("period", period, "s", positive=True),
+        coupling_damping=checked("coupling damping", damping, "N s/m"),
     )
     if (spent >= available).any():
         worst = np.argmax(spent - available)

@@ -37,7 +37,7 @@ def coupled_stability_limit(
     period = scalar("period", period, "s", positive=True)
     delay = scalar("delay", delay, "samples")
     available, own = together(
-        checked("device damping", device_damping, "N s/m"),
-        checked("coupling damping", damping, "N s/m"),
+        device_damping=checked("device damping", device_damping, "N s/m"),
+        coupling_damping=checked("coupling damping", damping, "N s/m"),
     )
     return plain((available + own) / (period * (0.5 + delay)))

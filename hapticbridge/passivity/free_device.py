@@ -150,9 +150,9 @@ def free_device_stiffness(
     period = scalar("period", period, "s", positive=True)
     lag = scalar("filter time", filter_time, "s") / period
     b, masses, dampings = together(
-        checked("device damping", device_damping, "N s/m"),
-        checked("mass", mass, "kg", positive=True),
-        checked("coupling damping", damping, "N s/m"),
+        device_damping=checked("device damping", device_damping, "N s/m"),
+        mass=checked("mass", mass, "kg", positive=True),
+        coupling_damping=checked("coupling damping", damping, "N s/m"),
     )
     polynomial = _loop(b, masses, dampings, period, whole("delay", delay), lag)
     available = (b + dampings) * period / masses
@@ -194,8 +194,8 @@ def free_device_damping(
     lag = scalar("filter time", filter_time, "s") / period
     samples = whole("delay", delay)
     b, masses = together(
-        checked("device damping", device_damping, "N s/m"),
-        checked("mass", mass, "kg", positive=True),
+        device_damping=checked("device damping", device_damping, "N s/m"),
+        mass=checked("mass", mass, "kg", positive=True),
     )
     zero = np.zeros_like(b)
 

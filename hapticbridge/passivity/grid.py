@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hapticbridge.arguments import Arguments
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import CouplingError
 
@@ -15,44 +16,19 @@ Axis = Literal["translation", "rotation"]
 """Which pair of K and B a bound is about."""
 
 
+_ARGUMENTS = Arguments(CouplingError)
+
+
 def checked(
     name: str, value: ArrayLike, unit: str = "", *, positive: bool = False
 ) -> NDArray[np.float64]:
-    """Returns finite, non-negative numbers as an array.
-
-    Args:
-        name: What the numbers are, for the message.
-        value: Any shape.
-        unit: For the message.
-        positive: Whether 0 is out of range too.
-
-    Raises:
-        CouplingError: A value is not a finite number, negative, or 0 where that is out of range.
-    """
-    limit = "> 0" if positive else ">= 0"
-    try:
-        array = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise CouplingError(f"{name} is {value!r}; it must be a number or an array") from error
-    good = (array > 0 if positive else array >= 0) & (array < np.inf)
-    if array.size == 0:
-        raise CouplingError(f"{name} is an empty array; it must hold at least one number")
-    if not good.all():
-        first = float(array[~good][0]) if array.ndim else float(array)
-        raise CouplingError(f"{name} is {first!r} {unit}; it must be finite and {limit}")
-    return array
+    """Returns numbers as an array, all finite and >= 0 (> 0 if positive), or CouplingError."""
+    return _ARGUMENTS.numbers(name, value, unit, least=0, is_open=positive)
 
 
 def scalar(name: str, value: float, unit: str = "", *, positive: bool = False) -> float:
-    """Returns one finite, non-negative number; arrays are refused.
-
-    Raises:
-        CouplingError: As for ``checked``, or the value has more than one element.
-    """
-    array = checked(name, value, unit, positive=positive)
-    if array.ndim:
-        raise CouplingError(f"{name} has shape {array.shape}; it must be one number")
-    return float(array)
+    """Returns one number, finite and >= 0 (> 0 if positive), or raises CouplingError."""
+    return _ARGUMENTS.number(name, value, unit, least=0, is_open=positive)
 
 
 def whole(name: str, value: int, least: int = 0) -> int:
@@ -66,17 +42,10 @@ def whole(name: str, value: int, least: int = 0) -> int:
     return int(value)
 
 
-def together(*arrays: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-    """Broadcasts arrays to one shape.
-
-    Raises:
-        CouplingError: The shapes do not fit together.
-    """
-    try:
-        return list(np.broadcast_arrays(*arrays))
-    except ValueError as error:
-        shapes = ", ".join(str(array.shape) for array in arrays)
-        raise CouplingError(f"shapes {shapes} do not broadcast to one shape") from error
+def together(**arrays: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+    """Broadcasts arrays to one shape, or raises CouplingError."""
+    shape = _ARGUMENTS.shape(**arrays)
+    return [np.broadcast_to(array, shape) for array in arrays.values()]
 
 
 def plain(array: NDArray[np.float64]) -> float | NDArray[np.float64]:
@@ -108,15 +77,15 @@ class CouplingGrid:
     rotational_damping: ArrayLike = 0.0
 
     def __post_init__(self) -> None:
-        arrays = []
+        arrays = {}
         for field in fields(self):
             name = f"coupling {field.name}"
             value = getattr(self, field.name)
             array = checked(name, value, positive=field.name == "stiffness").copy()
             array.flags.writeable = False
             object.__setattr__(self, field.name, array)
-            arrays.append(array)
-        together(*arrays)
+            arrays[field.name] = array
+        together(**arrays)
 
 
 def spring_and_damper(
@@ -133,5 +102,6 @@ def spring_and_damper(
         pair = (coupling.rotational_stiffness, coupling.rotational_damping)
     else:
         raise CouplingError(f"axis is {axis!r}; choose 'translation' or 'rotation'")
-    stiffness, damping = together(*(np.asarray(value, dtype=np.float64) for value in pair))
+    stiffness, damping = (np.asarray(value, dtype=np.float64) for value in pair)
+    stiffness, damping = together(stiffness=stiffness, damping=damping)
     return stiffness, damping

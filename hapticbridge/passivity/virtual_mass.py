@@ -190,7 +190,8 @@ def environment_minimum_damping(
     period = scalar("period", period, "s", positive=True)
     delay = force_delay(integrator)
     masses = checked("mass", mass, "kg", positive=True)
-    k, damping, masses = together(*spring_and_damper(coupling), masses)
+    k, damping = spring_and_damper(coupling)
+    k, damping, masses = together(coupling_stiffness=k, coupling_damping=damping, mass=masses)
     stable = masses > _smallest_stable_mass(k, damping, period, delay)
     if delay == 1:
         stable &= damping > 0
