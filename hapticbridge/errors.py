@@ -30,6 +30,10 @@ class MechanicsError(HapticBridgeError):
     """A body, motion or impact of the reference mechanics is out of range."""
 
 
+class StudyError(HapticBridgeError):
+    """A sweep, a map or a closed loop cannot be run as asked."""
+
+
 class DeviceError(HapticBridgeError):
     """A device cannot be opened, read or written, or its input file is bad."""
 
