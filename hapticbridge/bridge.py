@@ -14,24 +14,34 @@ from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
 
-import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hapticbridge.certificate import default_coupling, device_conditions, is_certified
+from hapticbridge.certificate import (
+    condition_sentences,
+    default_coupling,
+    is_run_certified,
+    run_conditions,
+)
 from hapticbridge.clock import Clock, RealClock, period_of
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Device, device_for
-from hapticbridge.errors import HapticBridgeError, RecordingError, SafetyTrip
+from hapticbridge.errors import HapticBridgeError, RecordingError, SafetyTrip, SceneError
 from hapticbridge.guard import Limits, limits_for, refuse_stretched_start, trip_reason
 from hapticbridge.inputs import Write, apply_writes, input_writes
 from hapticbridge.jit import direct
 from hapticbridge.kernel.state import Binding, RunParameters, rotation_numbers
-from hapticbridge.kernel.step import OK, after_step, before_step, publish
+from hapticbridge.kernel.step import HELD, OK, after_step, before_step, publish
 from hapticbridge.ledger import Ledger
 from hapticbridge.provenance import attachments, describe_run
 from hapticbridge.recording import TAIL, Recorder, Ring
-from hapticbridge.rendering import method_named, prepare
+from hapticbridge.rendering import (
+    Method,
+    contact_stiffness_of,
+    method_named,
+    prepare,
+    refuse_unknowing,
+)
 from hapticbridge.scene import Scene, load_scene
 from hapticbridge.signals import stopping_on_signals
 from hapticbridge.summary import Summary
@@ -62,9 +72,11 @@ class Bridge:
         coupling: K and B; None chooses the stiffest safe one for the device's damping (80 % of the
             bound, B = b/4; for a device of unknown damping, that of the default simulated one).
         rate: Ticks per second, 1 to 1e6.
-        substeps: MuJoCo steps per tick, 1 to 100. With more than one the coupling is not implicit
-            over the whole tick, and even a free tool may use slack: the meter tells.
+        substeps: MuJoCo steps per tick, 1 to 100. With more than one the mean of their wrenches
+            is sent, and the device needs another damping: ``certificate.needed_damping``.
         method: How the tool is rendered; see ``rendering.METHODS``.
+        contact_stiffness: K_c in N/m of method ``direct``; None takes the coupling's stiffness.
+        i_know: Accept a method other than ``implicit`` on a real device.
         recording: File to write (``.mcap``), or None; an existing file is replaced.
         clock: ``RealClock()`` by default; ``SimulatedClock()`` runs as fast as it goes.
         scale: Handle motion per device motion.
@@ -88,6 +100,8 @@ class Bridge:
         rate: float = 1000.0,
         substeps: int = 1,
         method: str = "implicit",
+        contact_stiffness: float | None = None,
+        i_know: bool = False,
         recording: str | Path | None = None,
         clock: Clock | None = None,
         scale: float = 1.0,
@@ -104,6 +118,10 @@ class Bridge:
         self.coupling = coupling or default_coupling(self.device.info, self.period, *self._scales)
         self._limits = limits_for(self.device.info, limits)
         self._method = method_named(method)
+        refuse_unknowing(self._method, is_real=self.device.info.is_real, i_know=i_know)
+        self._contact_stiffness = contact_stiffness_of(
+            self._method, self.coupling, contact_stiffness
+        )
         self._substeps = substeps
         self._axes = rotation_numbers(np.eye(3) if axes is None else axes)
         self._is_absolute = absolute
@@ -172,7 +190,7 @@ class Bridge:
         before, after, hand_over = self._before_step, self._after_step, self._publish
         read_device, write_device = self.device.read, self.device.write
         clock, wait, now = self.clock, self.clock.wait, self.clock.now
-        inputs, step = self._inputs, mujoco.mj_step
+        inputs, step = self._inputs, self._method.step
         with stopping_on_signals(self._stop_on_signal):
             clock.start(round(self.period * 1e9))
             try:
@@ -238,6 +256,10 @@ class Bridge:
         Raises:
             SceneError: A name does not exist or has the wrong count of numbers.
         """
+        if not self._method.meters_inputs:
+            raise SceneError(
+                f"method '{self._method.name}' cannot meter the work of inputs; use 'implicit'"
+            )
         self._inputs.append(
             input_writes(
                 self.scene.model,
@@ -247,6 +269,16 @@ class Bridge:
                 body_wrench=body_wrench,
             )
         )
+
+    @property
+    def method(self) -> Method:
+        """How the tool is rendered."""
+        return self._method
+
+    @property
+    def laws(self) -> int:
+        """How often per tick the wrench on the tool is computed."""
+        return 1 if self._method.scheme == HELD else self._substeps
 
     @property
     def ledger(self) -> Ledger:
@@ -260,7 +292,8 @@ class Bridge:
     def summary(self) -> Summary:
         """Returns what the run was so far."""
         state, ledger = self._binding.state, self.ledger
-        conditions = device_conditions(self.device.info, self.coupling, self.period, *self._scales)
+        info, method = self.device.info, self._method
+        conditions = run_conditions(info, self.parameters, method)
         return Summary(
             ticks=self._tick,
             duration=self._tick * self.period,
@@ -272,7 +305,13 @@ class Bridge:
             energies=ledger.energies(),
             environment=ledger.environment,
             slack_share=ledger.slack_share,
-            is_certified=is_certified(conditions),
+            method=method.name,
+            about=method.about,
+            hazard=method.hazard,
+            felt=self.parameters.felt,
+            fault=ledger.fault,
+            conditions=condition_sentences(info, self.parameters, method),
+            is_certified=is_run_certified(conditions, method),
             stopped_by=self._stopped_by,
             recording=self._path,
         )
@@ -284,9 +323,9 @@ class Bridge:
         self.scene.claim()
         resources.callback(self.scene.release)
         scene, clock, info = self.scene, self.clock, self.device.info
-        prepare(scene, self.coupling, self.period, self._substeps)
+        felt = prepare(scene, self.coupling, self.period, self._substeps, self._method)
         self._sample[:] = self.device.start(self.period)
-        self.parameters = self._parameters()
+        self.parameters = self._parameters(felt)
         self._binding = Binding(scene.model, scene.data, self.parameters)
         refuse_stretched_start(self._binding.state, self._limits)
         is_read = self._path is not None or self._is_live
@@ -312,7 +351,7 @@ class Bridge:
         self._recorder.wait_until_ready()
         self._event("start")
 
-    def _parameters(self) -> RunParameters:
+    def _parameters(self, felt: Coupling | None) -> RunParameters:
         first = self._sample[0]
         start = tuple(float(v) for v in (*first["position"], *first["quaternion"]))
         grip = self.scene.grip_pose()
@@ -331,6 +370,11 @@ class Bridge:
             device_origin=identity if self._is_absolute else start,
             handle_origin=identity if self._is_absolute else grip,
             device_start=start,
+            scheme=self._method.scheme,
+            felt=felt,
+            contact_stiffness=self._contact_stiffness,
+            device_damping=self.device.info.damping,
+            device_rotational_damping=self.device.info.rotational_damping,
         )
 
     def _compile(self) -> None:

@@ -4,15 +4,27 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cache
+from typing import Literal
+
+import numpy as np
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import CouplingError
+from hapticbridge.kernel.parameters import SLACK_SHARE, RunParameters
 from hapticbridge.passivity import minimum_damping, stiffest_coupling
+from hapticbridge.rendering import Method
 
 UNKNOWN_DAMPING, UNKNOWN_ROTATIONAL_DAMPING = 2.0, 2e-3
 """N s/m and N m s/rad from which the default coupling follows where the device's are unknown: those
 of the default simulated device. Larger ones would feel stiffer and be safe on fewer devices."""
+
+
+LOWEST_FREQUENCY, FREQUENCIES = 3e-3, 60
+"""Where the search for the damping that substeps need begins, in rad per tick, and how many
+frequencies it looks at. In all cases tried the largest value lies at one end: at Nyquist, or at the
+limit towards rest, which 3e-3 reaches to 1e-5."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,8 +54,69 @@ class Condition:
         return text if self.holds else f"{text}; lower stiffness or damping, or raise the rate"
 
 
+@cache
+def needed_damping(
+    coupling: Coupling,
+    period: float,
+    laws: int = 1,
+    axis: Literal["translation", "rotation"] = "translation",
+) -> float:
+    """Returns the damping b that a device needs behind a coupling, in N s/m or N m s/rad.
+
+    With one law a tick it is K T/2 + B. With n, over each of which the handle moves by the n-th
+    part of its step, and whose mean is sent, there is no such formula: b is the least for which
+
+        Σ_k f̄_k·δh_{k+1} + (b/T) ‖δh_k‖² − Σ_i f_i·δx_i − ½ s ‖δx_i‖²_{K + nB/T} >= 0,
+        f_i = K e_i + (nB/T) δe_i,   e = h − x
+
+    for every motion, where s = ``SLACK_SHARE`` of the slack may be used. It is found frequency by
+    frequency, as the smallest value of a quadratic form over the n deflections e_i; where B = 0 it
+    grows with n (strictly K T n/2: the mean comes late), where B > K T it falls towards B.
+
+    Args:
+        coupling: K and B.
+        period: T in s, of the device.
+        laws: n.
+        axis: Which gains to take.
+
+    Raises:
+        CouplingError: There is no whole law in a tick, or the period is out of range.
+
+    References:
+        Brown & Colgate 1997, eq. (6), for n = 1.
+    """
+    if laws < 1:
+        raise CouplingError(f"substeps is {laws}; it must be 1 or more")
+    if laws == 1:
+        return float(minimum_damping(coupling, period, axis=axis))
+    is_linear = axis == "translation"
+    k = coupling.stiffness if is_linear else coupling.rotational_stiffness
+    b = (coupling.damping if is_linear else coupling.rotational_damping) * laws / period
+    if k == 0.0:
+        return float(b * period / laws)
+    identity, ones = np.eye(laws), np.full(laws, 1.0 / laws)
+    most = 0.0
+    for theta in np.geomspace(LOWEST_FREQUENCY, np.pi, FREQUENCIES):
+        z = np.exp(1j * theta)
+        difference = identity - np.eye(laws, k=-1) + 0j
+        difference[0, -1] -= 1 / z  # the last deflection of the tick before
+        law = k * identity + b * difference
+        form = law.conj().T @ difference
+        slack = 0.5 * SLACK_SHARE * (k + b)
+        form = 0.5 * (form + form.conj().T) - slack * difference.conj().T @ difference
+        linear = 0.5 * law.conj().T @ ((z - 1) * ones) + slack * difference.conj().T @ ones
+        gained = np.vdot(linear, np.linalg.solve(form, linear)).real + slack / laws
+        most = max(most, float(gained))
+    return most * period
+
+
 def device_conditions(
-    info: DeviceInfo, coupling: Coupling, period: float, scale: float, force_scale: float
+    info: DeviceInfo,
+    coupling: Coupling,
+    period: float,
+    scale: float,
+    force_scale: float,
+    laws: int = 1,
 ) -> tuple[Condition, ...]:
     """Returns the condition per kind of axis that the device has, if its damping is known.
 
@@ -57,18 +130,72 @@ def device_conditions(
         period: T in s.
         scale: Handle motion per device motion.
         force_scale: Force on the device per force on the tool.
+        laws: How often per tick the wrench is computed (substeps).
 
     References:
         Brown & Colgate 1997, eq. (6); sufficient for any environment that satisfies (14).
     """
     conditions = []
     if info.damping is not None:
-        needed = scale * force_scale * minimum_damping(coupling, period)
+        needed = scale * force_scale * needed_damping(coupling, period, laws)
         conditions.append(Condition("translation", needed, info.damping))
         if info.rotational_damping is not None and info.degrees_of_freedom > 3:
-            needed = force_scale / scale * minimum_damping(coupling, period, axis="rotation")
+            needed = force_scale / scale * needed_damping(coupling, period, laws, "rotation")
             conditions.append(Condition("rotation", needed, info.rotational_damping))
     return tuple(conditions)
+
+
+def run_conditions(
+    info: DeviceInfo, parameters: RunParameters, method: Method
+) -> tuple[Condition, ...]:
+    """Returns the device conditions of a run; none for a prescribed motion or without a coupling.
+
+    A weld is judged by the stiffness and damping that it truly has.
+    """
+    if info.is_prescribed or not method.has_coupling:
+        return ()
+    return device_conditions(
+        info,
+        parameters.felt or parameters.coupling,
+        parameters.period,
+        parameters.scale,
+        parameters.force_scale,
+        parameters.laws,
+    )
+
+
+def condition_sentences(
+    info: DeviceInfo, parameters: RunParameters, method: Method
+) -> tuple[str, ...]:
+    """Returns what is to be said of device and method, one sentence each.
+
+    Without a coupling geometry decides: two contacts of stiffness K_c on opposite sides of a tool,
+    L apart, are a rotational spring of ½ K_c L² about the middle, and stable only for
+    L <= 2 √(b_θ/(T K_c)).
+
+    References:
+        Brown & Colgate 1997, eq. (1).
+    """
+    sentences = [condition.sentence() for condition in run_conditions(info, parameters, method)]
+    if method.has_coupling or info.is_prescribed:
+        return tuple(sentences)
+    if info.rotational_damping is None or info.degrees_of_freedom <= 3:
+        return ("geometry decides: no coupling bounds what contacts do to the device",)
+    damping = info.rotational_damping * parameters.scale / parameters.force_scale
+    length = 2.0 * math.sqrt(damping / (parameters.period * parameters.contact_stiffness))
+    return (
+        f"geometry decides: two contacts of {parameters.contact_stiffness:g} N/m on opposite sides "
+        f"of the tool need L <= 2 sqrt(b_theta/(T K_c)) = {length:.3g} m between them",
+    )
+
+
+def is_run_certified(conditions: tuple[Condition, ...], method: Method) -> bool | None:
+    """As ``is_certified``; None also where the conditions hold, but no coupling law makes them do.
+
+    For a weld b >= KT/2 + B is necessary with what it truly is, but nothing proves it enough.
+    """
+    verdict = is_certified(conditions)
+    return None if verdict and not method.has_law else verdict
 
 
 def is_certified(conditions: tuple[Condition, ...]) -> bool | None:

@@ -31,6 +31,8 @@ class Ledger:
         slack_share: Largest share of the slack that was ever used, 0 if always strict.
         first_unstrict: First tick at which (14) did not hold, or None.
         first_active: First tick at which the slack was exceeded, or None.
+        first_kick: First tick at which a device whose wrench comes from no coupling law had been
+            given more than its damping burns and the scene gave up, or None.
     """
 
     kinetic: float
@@ -44,17 +46,15 @@ class Ledger:
     slack_share: float
     first_unstrict: int | None
     first_active: int | None
+    first_kick: int | None
 
     @classmethod
     def of(cls, state: NDArray[np.void]) -> Ledger:
         """Reads the ledger out of the kernel's state (``STATE_DTYPE``, one element)."""
         values = {name: float(state[name][0]) for name in _ENERGIES}
-        ticks = {name: int(state[name][0]) for name in ("first_unstrict", "first_active")}
-        return cls(
-            **values,
-            first_unstrict=ticks["first_unstrict"] if ticks["first_unstrict"] >= 0 else None,
-            first_active=ticks["first_active"] if ticks["first_active"] >= 0 else None,
-        )
+        ticks = [int(state[name][0]) for name in _TICKS]
+        unstrict, active, kick = (tick if tick >= 0 else None for tick in ticks)
+        return cls(**values, first_unstrict=unstrict, first_active=active, first_kick=kick)
 
     @property
     def environment(self) -> Environment:
@@ -62,6 +62,13 @@ class Ledger:
         if self.first_active is not None:
             return "active"
         return "strict" if self.first_unstrict is None else "within slack"
+
+    @property
+    def fault(self) -> tuple[int, str] | None:
+        """Tick and port of the first fault, ``environment`` or ``device``; None if passive."""
+        faults = ((self.first_active, "environment"), (self.first_kick, "device"))
+        found = [(tick, port) for tick, port in faults if tick is not None]
+        return min(found) if found else None
 
     def energies(self) -> dict[str, float]:
         """Returns the energies by name, in J."""
@@ -79,3 +86,5 @@ _ENERGIES = (
     "slack",
     "slack_share",
 )
+
+_TICKS = ("first_unstrict", "first_active", "first_kick")

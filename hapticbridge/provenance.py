@@ -21,15 +21,16 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.kernel.state import Binding, RunParameters
+from hapticbridge.kernel.step import WELD
 from hapticbridge.recording import Attachment
-from hapticbridge.rendering import method_named
+from hapticbridge.rendering import Method, method_named
 from hapticbridge.scene import Scene
 
 MODEL_ATTACHMENT = "model.mjb"
 STATE_ATTACHMENT = "start_state.f64"
 SOURCE_PREFIX = "scene/"
 
-_FLOATS = ("scale", "force_scale", "force_limit", "torque_limit")
+_FLOATS = ("scale", "force_scale", "force_limit", "torque_limit", "contact_stiffness")
 _POSES = ("device_origin", "handle_origin", "device_start")
 _GAINS = ("stiffness", "damping", "rotational_stiffness", "rotational_damping")
 STARTS = {"handle_start": 7, "tool_start": 7, "start_kinetic": 1, "start_potential": 1}
@@ -128,6 +129,7 @@ def describe_run(
 ) -> dict[str, str]:
     """Returns the recording's metadata; see ``parameters_of`` for the way back."""
     coupling = parameters.coupling
+    felt = parameters.felt
     meta = {name: repr(float(getattr(parameters, name))) for name in _FLOATS}
     meta |= {name: repr(float(getattr(coupling, name))) for name in _GAINS}
     meta |= {name: json.dumps(getattr(parameters, name)) for name in (*_POSES, "axes")}
@@ -139,6 +141,7 @@ def describe_run(
         "substeps": str(parameters.substeps),
         "ramp_ticks": str(parameters.ramp_ticks),
         "method": method,
+        "felt": json.dumps(felt and [getattr(felt, name) for name in _GAINS]),
         "discretization": method_named(method).discretization,
         "grip": parameters.grip,
         "clock": clock,
@@ -214,6 +217,13 @@ def meta_count(meta: Mapping[str, str], name: str) -> int:
     return int(value)
 
 
+def _felt(meta: Mapping[str, str], method: Method) -> Coupling | None:
+    """Returns the coupling that a weld truly was; None for methods that have the one asked for."""
+    if method.scheme != WELD:
+        return None
+    return Coupling(*meta_numbers(meta, "felt", len(_GAINS)))
+
+
 def parameters_of(meta: Mapping[str, str]) -> RunParameters:
     """Returns the parameters of a recorded run.
 
@@ -221,6 +231,8 @@ def parameters_of(meta: Mapping[str, str]) -> RunParameters:
         RecordingError: Something is missing or out of range.
     """
     try:
+        method = method_named(meta.get("method", ""))
+        device = None if method.has_law else DeviceInfo.from_json(meta.get("device", ""))
         return RunParameters(
             grip=meta.get("grip", ""),
             period=meta_float(meta, "period_s"),
@@ -235,6 +247,11 @@ def parameters_of(meta: Mapping[str, str]) -> RunParameters:
             device_origin=meta_numbers(meta, "device_origin", 7),
             handle_origin=meta_numbers(meta, "handle_origin", 7),
             device_start=meta_numbers(meta, "device_start", 7),
+            scheme=method.scheme,
+            felt=_felt(meta, method),
+            contact_stiffness=meta_float(meta, "contact_stiffness"),
+            device_damping=None if device is None else device.damping,
+            device_rotational_damping=None if device is None else device.rotational_damping,
         )
     except RecordingError:
         raise

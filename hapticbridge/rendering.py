@@ -1,16 +1,31 @@
 """The methods that render a rigid tool, behind one interface.
 
-A method decides how the coupling's wrench reaches the tool: which integrator MuJoCo uses and which
-gains its actuators get. The tick's arithmetic is the kernel's in every method.
+A method decides how the coupling's wrench reaches the tool: which integrator MuJoCo uses, which
+gains its actuators get, whether a weld replaces them, or whether there is a coupling at all. The
+tick's arithmetic is the kernel's in every method, and so are ledger, records and audit.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from typing import Any
+
+import mujoco
 
 from hapticbridge.coupling import Coupling
-from hapticbridge.errors import SceneError, choices
+from hapticbridge.errors import DeviceError, SceneError, choices
+from hapticbridge.kernel.parameters import RunParameters
+from hapticbridge.kernel.state import WELD_NAME
+from hapticbridge.kernel.step import COUPLED, DIRECT, HELD, WELD
 from hapticbridge.scene import Scene
+from hapticbridge.scene.methods import check_massless_tool, check_metered
+from hapticbridge.scene.weld import check_weldable, measured_weld
+
+Gains = tuple[float, float, float]
+"""Of a coupling actuator: factor of its control, stiffness in N/m, damping in N s/m (rotation: N m,
+N m/rad and N m s/rad per unit of control)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,23 +34,146 @@ class Method:
 
     Attributes:
         name: What ``--method`` and the recording's metadata call it.
-        discretization: How the coupling's damper is discretised, as the bounds call it.
-        about: One sentence.
+        about: What it is, in one sentence.
+        hazard: What it may do on a real device, in one sentence; empty where nothing more than the
+            device condition is to be said.
+        scheme: How the wrench reaches the tool, as the kernel counts (``kernel.step.COUPLED`` …).
+        integrator: MuJoCo's, by the name that MJCF gives it.
+        discretization: How the coupling's damper is discretised, as the bounds call it; ``none``
+            where no coupling law gives the wrench.
+        compensated: Whether the actuators get the extra K T of damping that makes the implicit
+            integration of velocity alone one of position too.
     """
 
     name: str
-    discretization: str
     about: str
+    hazard: str
+    scheme: int
+    integrator: str
+    discretization: str = "backward"
+    compensated: bool = False
 
+    @property
+    def step(self) -> Callable[[Any, Any], None]:
+        """MuJoCo's part of a substep, through the Python bindings, on model and data.
+
+        ``kernel.step.advance`` is the same by C symbol, to the bit.
+        """
+        step: Callable[[Any, Any], None] = (
+            mujoco.mj_step if self.has_coupling else mujoco.mj_fwdPosition
+        )
+        return step
+
+    @property
+    def has_law(self) -> bool:
+        """Whether the coupling law gives the wrench, so that the device condition proves safety."""
+        return self.scheme in (COUPLED, HELD)
+
+    @property
+    def meters_inputs(self) -> bool:
+        """Whether the work of applied forces and moved mocap bodies is known."""
+        return self.integrator != "RK4" and self.scheme != DIRECT
+
+    @property
+    def has_coupling(self) -> bool:
+        """Whether anything elastic lies between handle and tool, so that there is a slack."""
+        return self.scheme != DIRECT
+
+    def gains(self, coupling: Coupling, period: float) -> tuple[Gains, Gains]:
+        """Returns the gains of the coupling's actuators, for forces and for torques."""
+        if self.scheme == HELD:
+            return (1.0, 0.0, 0.0), (1.0, 0.0, 0.0)
+        if self.scheme != COUPLED:
+            return (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
+        more = period if self.compensated else 0.0
+        k, b = coupling.stiffness, coupling.damping
+        kr, br = coupling.rotational_stiffness, coupling.rotational_damping
+        return (b, k, b + k * more), (br, kr, br + kr * more)
+
+
+_CREATES = "creates energy in free motion, more the lighter the tool and the stiffer the coupling"
+_HELD_ABOUT = (
+    "the wrench of the coupling law, computed after each step and applied as a force during the "
+    "next tick, held; under MuJoCo's integrator {}"
+)
+_HELD_HAZARD = (
+    f"the wrench acts one tick late: it {_CREATES}, and a light tool diverges whatever the device"
+)
 
 IMPLICIT = Method(
     name="implicit",
-    discretization="backward",
     about="the coupling as actuators under MuJoCo's discrete integrator: implicit in position and "
     "velocity, solved together with the contacts, passive behind the coupling",
+    hazard="",
+    scheme=COUPLED,
+    integrator="discrete",
 )
 
-METHODS = {method.name: method for method in (IMPLICIT,)}
+METHODS = {
+    method.name: method
+    for method in (
+        IMPLICIT,
+        Method(
+            name="implicitfast",
+            about="the same actuators under implicitfast: implicit in velocity, not in position",
+            hazard=f"the spring is not solved implicitly: it {_CREATES}",
+            scheme=COUPLED,
+            integrator="implicitfast",
+        ),
+        Method(
+            name="implicitfast:compensated",
+            about="the same actuators under implicitfast with K T more damping, which away from "
+            "contact makes the step equal to that of 'implicit'",
+            hazard="contacts are solved without the coupling's stiffness and may create energy",
+            scheme=COUPLED,
+            integrator="implicitfast",
+            compensated=True,
+        ),
+        *(
+            Method(
+                name="explicit" if integrator == "Euler" else f"explicit:{integrator.lower()}",
+                about=_HELD_ABOUT.format(integrator),
+                hazard=_HELD_HAZARD,
+                scheme=HELD,
+                integrator=integrator,
+            )
+            for integrator in ("Euler", "implicitfast", "RK4")
+        ),
+        Method(
+            name="weld",
+            about="an equality constraint of MuJoCo welds the tool to the handle, under "
+            "implicitfast, with K and B as its solref; how stiff it truly is depends on the tool's "
+            "mass and on the constraint's impedance",
+            hazard="the weld's stiffness is not the one asked for but mass times K/(1 - impedance) "
+            "as measured, and no coupling law proves what the device needs",
+            scheme=WELD,
+            integrator="implicitfast",
+            discretization="none",
+        ),
+        Method(
+            name="direct",
+            about="a tool without mass that is where the handle is, pushed back by a spring per "
+            "contact; there is no coupling",
+            hazard="geometry decides what the device needs: two contacts a distance L apart are "
+            "stable only for L <= 2 sqrt(b_theta / (T K_c))",
+            scheme=DIRECT,
+            integrator="discrete",
+            discretization="none",
+        ),
+    )
+}
+
+_INTEGRATORS = {
+    "Euler": mujoco.mjtIntegrator.mjINT_EULER,
+    "RK4": mujoco.mjtIntegrator.mjINT_RK4,
+    "implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
+    "discrete": mujoco.mjtIntegrator.mjINT_DISCRETE,
+}
+
+
+MEASURED_AGAIN = 1e-6
+"""Relative difference at which a weld measured again is another one; no unit. Probing by 1e-6 m
+leaves 1e-10 of rounding, another processor hardly more."""
 
 
 def method_named(name: str) -> Method:
@@ -49,18 +187,117 @@ def method_named(name: str) -> Method:
     return METHODS[name]
 
 
-def prepare(scene: Scene, coupling: Coupling, period: float, substeps: int) -> None:
-    """Makes a scene render a coupling by ``implicit``: gains, timestep, and the scene reset.
+def refuse_unknowing(method: Method, *, is_real: bool, i_know: bool) -> None:
+    """Refuses a method that may kick on a device with a motor, unless the user knows.
+
+    Raises:
+        DeviceError: Says what the method may do, and how to go on.
+    """
+    if is_real and method.hazard and not i_know:
+        raise DeviceError(
+            f"method '{method.name}' on a real device: {method.hazard}; use 'implicit', or say "
+            "--i-know (Bridge(i_know=True))"
+        )
+
+
+def contact_stiffness_of(
+    method: Method, coupling: Coupling, contact_stiffness: float | None
+) -> float:
+    """Returns K_c in N/m for ``RunParameters``: as asked, or the coupling's K; 0 for others.
+
+    Raises:
+        SceneError: It is not finite and > 0, or the method has no contact springs of its own.
+    """
+    if method.has_coupling:
+        if contact_stiffness is not None:
+            raise SceneError(
+                f"contact stiffness is {contact_stiffness!r} N/m, but method '{method.name}' "
+                "leaves contacts to MuJoCo; only 'direct' takes it"
+            )
+        return 0.0
+    stiffness = coupling.stiffness if contact_stiffness is None else contact_stiffness
+    if not math.isfinite(stiffness) or stiffness <= 0:
+        raise SceneError(f"contact stiffness is {stiffness!r} N/m; it must be finite and > 0")
+    return float(stiffness)
+
+
+def check_scene(model: mujoco.MjModel, grip: str, method: Method) -> None:
+    """Refuses a scene that a method cannot render, or whose ports could not be metered under it.
 
     Args:
-        scene: Changed in place.
+        model: The compiled scene.
+        grip: Name of the site on the tool.
+        method: How it will be rendered.
+
+    Raises:
+        SceneError: Says what in the scene is the obstacle.
+    """
+    if method.scheme == DIRECT:
+        check_massless_tool(model, grip, method.name)
+    if method.scheme == WELD:
+        check_weldable(model, grip)
+    check_metered(model, method.integrator, method.name)
+
+
+def prepare(
+    scene: Scene,
+    coupling: Coupling,
+    period: float,
+    substeps: int,
+    method: Method = IMPLICIT,
+) -> Coupling | None:
+    """Makes a scene render a coupling by a method: integrator, gains, timestep, and a reset.
+
+    Args:
+        scene: Changed in place; for a weld its model and data become new ones, with everything that
+            was changed in the old model carried over.
         coupling: What the user should feel.
         period: T in s.
         substeps: MuJoCo steps per tick.
+        method: How.
+
+    Returns:
+        The coupling that the tool is really held by, where it is not the one asked for (a weld);
+        for ``RunParameters.felt``.
 
     Raises:
-        SceneError: Period or substeps are out of range.
+        SceneError: Period or substeps are out of range, or the scene does not suit the method.
     """
+    check_scene(scene.model, scene.grip, method)
+    scene.set_weld(coupling if method.scheme == WELD else None)
     scene.set_timestep(period, substeps)
-    scene.set_coupling(coupling)
+    scene.model.opt.integrator = _INTEGRATORS[method.integrator]
+    scene.set_gains(*method.gains(coupling, period))
+    felt = measured_weld(scene.model, scene.grip) if method.scheme == WELD else None
     scene.reset()
+    return felt
+
+
+def check_prepared(model: mujoco.MjModel, parameters: RunParameters, method: Method) -> None:
+    """Refuses a model that ``prepare`` would not have left for these parameters.
+
+    Raises:
+        SceneError: Names the first difference.
+    """
+    check_scene(model, parameters.grip, method)
+    if model.opt.integrator != _INTEGRATORS[method.integrator]:
+        raise SceneError(f"the integrator is not {method.integrator}, that of '{method.name}'")
+    has_weld = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_EQUALITY, WELD_NAME) >= 0
+    if has_weld != (method.scheme == WELD):
+        raise SceneError(f"a weld to the handle is not as '{method.name}' wants it")
+    if has_weld:
+        gains = -model.eq_solref[model.equality(WELD_NAME).id]
+        coupling = parameters.coupling
+        if gains.tolist() != [coupling.stiffness, coupling.damping]:
+            raise SceneError(
+                f"the weld has K = {gains[0]!r}, B = {gains[1]!r}, the metadata say "
+                f"{coupling.stiffness!r}, {coupling.damping!r}"
+            )
+        felt, measured = parameters.felt or coupling, measured_weld(model, parameters.grip)
+        for item in fields(Coupling):
+            claimed, true = getattr(felt, item.name), getattr(measured, item.name)
+            if not math.isclose(claimed, true, rel_tol=MEASURED_AGAIN):
+                raise SceneError(
+                    f"{item.name.replace('_', ' ')} of the weld is {true:.6g} in SI units, the "
+                    f"metadata say {claimed:.6g}"
+                )

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from hapticbridge.coupling import Coupling
+
 
 @dataclass(frozen=True, slots=True)
 class Summary:
@@ -21,8 +23,16 @@ class Summary:
         energies: Energies by name in J.
         environment: ``strict``, ``within slack`` or ``active``.
         slack_share: Largest share of the slack that was used.
+        method: How the tool was rendered.
+        about: What that means, in a sentence.
+        hazard: What it may do on a real device, in a sentence; empty for ``implicit``.
+        felt: The coupling that the tool was truly held by, where it is not the one asked for (a
+            weld: the stiffest axis, as measured at the start).
+        fault: Tick and port (``environment`` or ``device``) of the first fault, or None.
+        conditions: What the device must satisfy, as sentences.
         is_certified: Whether b >= scale · force_scale · (KT/2 + B) holds for the device in
-            translation and rotation; None where its damping is unknown.
+            translation and rotation; None where its damping is unknown, or where no coupling law
+            makes that condition enough.
         stopped_by: ``duration``, ``signal`` or ``caller``.
         recording: The file, if one was written.
     """
@@ -37,11 +47,17 @@ class Summary:
     energies: dict[str, float]
     environment: str
     slack_share: float
+    method: str
+    about: str
+    hazard: str
+    felt: Coupling | None
+    fault: tuple[int, str] | None
+    conditions: tuple[str, ...]
     is_certified: bool | None
     stopped_by: str
     recording: Path | None
 
     @property
     def verdict(self) -> str:
-        """``passive`` (strict or within slack) or ``active``."""
-        return "active" if self.environment == "active" else "passive"
+        """``passive`` (strict or within slack, and no kick of the device) or ``active``."""
+        return "active" if self.fault is not None else "passive"

@@ -21,8 +21,6 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from hapticbridge import bridge as bridge_module
-from hapticbridge import rendering
 from hapticbridge.audit import AuditReport, audit
 from hapticbridge.audit.balance import Balance, turn_between
 from hapticbridge.bridge import Bridge
@@ -40,7 +38,7 @@ from hapticbridge.provenance import (
 )
 from hapticbridge.recording import Recording, read_recording, repair
 from hapticbridge.recording.format import Digest
-from hapticbridge.scene import Scene, scene_names
+from hapticbridge.scene import scene_names
 from hapticbridge.scene.library import scene_path
 from hapticbridge.tick import CLOCK_FIELDS, TICK_DTYPE, TickFlag
 
@@ -74,16 +72,6 @@ def held(folder: Path) -> Recording:
     tapped(folder)
     recorded(path, device=f"simulated:path={motion}", duration=0.2)
     return read_recording(path)
-
-
-def euler_instead(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Makes the bridge step its scene by the semi-implicit scheme, which creates energy."""
-
-    def prepare_otherwise(scene: Scene, *arguments: Any) -> None:
-        rendering.prepare(scene, *arguments)
-        scene.model.opt.integrator = mujoco.mjtIntegrator.mjINT_EULER
-
-    monkeypatch.setattr(bridge_module, "prepare", prepare_otherwise)
 
 
 def swing(tick: int) -> tuple[float, ...]:
@@ -184,12 +172,10 @@ def test_trip_leaves_a_recording_that_audits_and_tells(tmp_path: Path) -> None:
 # --- active runs, and what strictness and the device's damping make of passive ones
 
 
-def test_energy_that_an_integrator_creates_is_active(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = tmp_path / "euler.mcap"
-    euler_instead(monkeypatch)
-    summary = recorded(path, "point_mass", ScriptedDevice(swing), LOOSE, duration=0.3)
+def test_energy_that_an_integrator_creates_is_active(tmp_path: Path) -> None:
+    path = tmp_path / "fast.mcap"
+    device = ScriptedDevice(swing)
+    summary = recorded(path, "point_mass", device, LOOSE, duration=0.3, method="implicitfast")
     report = audit(path)
     assert report.resimulation == "bit for bit"  # an honest file of a bad run
     created, slack = energy_by_hand(read_recording(path))
@@ -232,14 +218,12 @@ def test_stiff_contact_on_a_light_tool_is_active(tmp_path: Path) -> None:
     assert read_recording(path).ticks["contacts"][report.tick - 10 : report.tick].any()
 
 
-def test_strict_refuses_what_the_slack_allows(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_strict_refuses_what_the_slack_allows(tmp_path: Path) -> None:
     path = tmp_path / "slack.mcap"
-    euler_instead(monkeypatch)
     # more damping in the coupling: the same creation stays below the slack
     coupling = Coupling(stiffness=2000, damping=2, rotational_stiffness=2, rotational_damping=5e-4)
-    recorded(path, "point_mass", ScriptedDevice(swing), coupling, duration=0.3)
+    device = ScriptedDevice(swing)
+    recorded(path, "point_mass", device, coupling, duration=0.3, method="implicitfast")
     loose, strict = audit(path), audit(path, strict=True)
     created, slack = energy_by_hand(read_recording(path))
     assert (loose.verdict, loose.environment) == ("passive", "within slack")

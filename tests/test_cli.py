@@ -202,6 +202,27 @@ def test_options_of_a_run_reach_the_recording(call: Called, tmp_path: Path) -> N
     assert json.loads(meta["axes"]) == [0, -1, 0, 1, 0, 0, 0, 0, 1]
 
 
+def test_run_says_what_a_method_is_and_may_do(call: Called) -> None:
+    command = ("run", "peg_in_hole", "--fast", "--duration", 0.1)
+    code, out, err = call(*command, "--method", "direct", "--contact-stiffness", 5000)
+    assert code == 0, err
+    assert "a tool without mass" in out
+    assert "geometry decides" in out
+    assert "5000 N/m" in out
+    assert "L <= 2 sqrt(b_theta / (T K_c))" in " ".join(err.split())
+    code, out, err = call(*command)
+    assert code == 0, err
+    assert "method" not in out + err
+
+
+def test_run_tells_how_stiff_a_weld_truly_is(call: Called) -> None:
+    command = ("run", "point_mass", "--fast", "--duration", 0.1, "--stiffness", 1000)
+    _, out, err = call(*command, "--method", "weld")
+    told = " ".join(out.split())
+    assert "the weld is 2000 N/m" in told, err  # 0.1 kg · 1000 / (1 − 0.95)
+    assert "asked for: 1000" in told
+
+
 def test_default_stiffness_changes_with_what_the_user_gives_only(
     call: Called, tmp_path: Path
 ) -> None:

@@ -35,6 +35,7 @@ from scipy.spatial.transform import Rotation
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import HapticBridgeError, SceneError
 from hapticbridge.kernel import native
+from hapticbridge.kernel.handle import handle_pose
 from hapticbridge.kernel.step import (
     BAD_RESULT,
     BAD_SAMPLE,
@@ -43,7 +44,6 @@ from hapticbridge.kernel.step import (
     TAIL,
     after_step,
     before_step,
-    handle_pose,
     publish,
     simulate,
 )

@@ -41,7 +41,7 @@ from kernel_runs import (
 from scipy.spatial.transform import Rotation
 
 from hapticbridge.coupling import Coupling
-from hapticbridge.kernel.step import ENERGY_TOLERANCE
+from hapticbridge.kernel.meter import ENERGY_TOLERANCE
 
 G = 9.81
 GRAVITY = 'gravity="0 0 -9.81"'

@@ -478,7 +478,7 @@ def test_few_tasks_are_in_flight_at_once(monkeypatch: pytest.MonkeyPatch) -> Non
             future.set_result(work())
         return concurrent.futures.wait(*arguments, **named)
 
-    monkeypatch.setattr("hapticbridge.study.sweep.wait_for", wait)
+    monkeypatch.setattr(sys.modules["hapticbridge.study.sweep"], "wait_for", wait)
     half_more = functools.partial(functions.plus, more=0.5)
     table = sweep(half_more, grid(n=range(500)), executor=Idle(), chunk=1)
     assert table["sum"].tolist() == [n + 0.5 for n in range(500)]

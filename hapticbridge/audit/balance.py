@@ -16,6 +16,10 @@ from hapticbridge.kernel.state import RunParameters
 
 Array = NDArray[np.float64]
 
+SLACK_SHARE = 0.5
+"""Share of the slack that counts where several laws are computed in a tick, without unit: as
+``certificate.needed_damping`` assumes."""
+
 
 def quaternion_product(a: Array, b: Array) -> Array:
     """Returns a ⊗ b over arrays (…, 4), scalar first."""
@@ -55,16 +59,20 @@ class Balance:
     """What the recorded poses and wrenches say by themselves.
 
     Attributes:
-        wrench_on_tool: The coupling law at the recorded poses, (n, 6) in N and N m.
+        wrench_on_tool: The coupling law at the recorded poses, (n, 6) in N and N m; the recorded
+            wrench itself where the recorded poses alone do not tell it.
         wrench_on_device: What the guard should have sent for the recorded wrench, (n, 6).
         handle_position: Where the recorded device pose puts the handle, (n, 3) in m.
         handle_turn: By how much the recorded handle is turned from where it should be, (n,) in rad.
-        coupling_work: Cumulative Σ f·δx + τ·δφ of the recorded wrench, (n,) in J.
+        coupling_work: Cumulative Σ f·δx + τ·δφ of the recorded wrench, (n,) in J; as recorded
+            where it is summed over several laws a tick.
         throughput: Cumulative Σ |f·δx + τ·δφ|, (n,) in J.
         device_energy: Cumulative energy given to the device by the recorded wrenches, (n,) in J.
         device_throughput: The same with absolute values.
         environment_energy: S_k − S_start − works, with ``coupling_work`` from here, (n,) in J.
         slack: Σ ½‖δx‖²_{K+B/T} + ½‖δφ‖²_{K_r+B_r/T}, (n,) in J.
+        kicked: What the device was given beyond what its damping burns and the scene gave up, (n,)
+            in J; zero where a coupling law stands between, or the damping is unknown.
     """
 
     wrench_on_tool: Array
@@ -77,6 +85,7 @@ class Balance:
     device_throughput: Array
     environment_energy: Array
     slack: Array
+    kicked: Array
 
     @classmethod
     def of(
@@ -111,9 +120,13 @@ class Balance:
         )
 
         recorded = ticks["wrench_on_tool"]
+        law = np.concatenate([force, torque], axis=1)
+        if not parameters.has_law or parameters.laws > 1:
+            law = recorded
         work = np.sum(recorded[:, :3] * tool_step, axis=1)
         work += np.sum(recorded[:, 3:] * tool_turn, axis=1)
-        coupling_work = np.cumsum(work)
+        # over several laws a tick the work is a sum that their mean does not tell
+        coupling_work = ticks["coupling_work"] if parameters.laws > 1 else np.cumsum(work)
 
         device_start = np.array(parameters.device_start)
         sent = np.concatenate([np.zeros((1, 6)), ticks["wrench_on_device"][:-1]])
@@ -127,12 +140,11 @@ class Balance:
 
         position, orientation = _handle(ticks, parameters)
         stored = ticks["kinetic"] + ticks["potential"] - start_energy
-        linear = coupling.stiffness + coupling.damping / period
-        angular = coupling.rotational_stiffness + coupling.rotational_damping / period
+        linear, angular = _slack_gains(parameters)
         slack = 0.5 * linear * np.sum(tool_step**2, axis=1)
         slack += 0.5 * angular * np.sum(tool_turn**2, axis=1)
         return cls(
-            wrench_on_tool=np.concatenate([force, torque], axis=1),
+            wrench_on_tool=law,
             wrench_on_device=_guarded(ticks, parameters, resumed),
             handle_position=position,
             handle_turn=np.linalg.norm(
@@ -147,7 +159,42 @@ class Balance:
             - ticks["actuator_work"]
             - ticks["external_work"],
             slack=np.cumsum(slack),
+            kicked=_kicked(
+                ticks,
+                parameters,
+                np.cumsum(device_work),
+                stored - ticks["actuator_work"] - ticks["external_work"],
+            ),
         )
+
+
+def _slack_gains(parameters: RunParameters) -> tuple[float, float]:
+    """Returns K + B/T and K_r + B_r/T of the coupling that the tool was held by.
+
+    With n laws a tick only half of K/n + B/T counts; without a coupling nothing does.
+    """
+    coupling = parameters.felt or parameters.coupling
+    if not parameters.has_law and parameters.felt is None:
+        return 0.0, 0.0
+    n, share = parameters.laws, 1.0 if parameters.laws == 1 else SLACK_SHARE
+    linear = coupling.stiffness / n + coupling.damping / parameters.period
+    angular = coupling.rotational_stiffness / n + coupling.rotational_damping / parameters.period
+    return share * linear, share * angular
+
+
+def _kicked(
+    ticks: NDArray[np.void], parameters: RunParameters, given: Array, gained: Array
+) -> Array:
+    """Returns Σ w·δp − Σ b‖δp‖²/T + (S − S_start − works), the last in the device's scale."""
+    if parameters.has_law or parameters.device_damping is None:
+        return np.zeros(len(ticks))
+    start = np.array(parameters.device_start)
+    moved = steps(ticks["device_position"], start[:3])
+    turned = turns(ticks["device_quaternion"], start[3:])
+    burnt = parameters.device_damping * np.sum(moved**2, axis=1)
+    burnt += (parameters.device_rotational_damping or 0.0) * np.sum(turned**2, axis=1)
+    ratio = parameters.force_scale / parameters.scale
+    return np.asarray(given - np.cumsum(burnt) / parameters.period + ratio * gained)
 
 
 def _handle(ticks: NDArray[np.void], parameters: RunParameters) -> tuple[Array, Array]:

@@ -26,6 +26,7 @@ from hapticbridge.provenance import (
     versions,
 )
 from hapticbridge.recording import Recording
+from hapticbridge.rendering import check_prepared, method_named
 from hapticbridge.tick import CLOCK_FIELDS, SAMPLE_DTYPE, TICK_DTYPE, TickFlag
 
 DECISIVE = ("hapticbridge", "mujoco", "numba")
@@ -75,7 +76,7 @@ def replay(recording: Recording, parameters: RunParameters) -> Replay:
     data = mujoco.MjData(model)
     # an error inside the C symbol would end the process, so MuJoCo takes its first step in Python
     restore_state(model, data, recording.attachments[STATE_ATTACHMENT])
-    mujoco.mj_step(model, data)
+    method_named(recording.meta.get("method", "")).step(model, data)
     restore_state(model, data, recording.attachments[STATE_ATTACHMENT])
     binding = Binding(model, data, parameters)
     _check_start(recording, binding.state)
@@ -109,18 +110,22 @@ def _model(recording: Recording, parameters: RunParameters) -> mujoco.MjModel:
         kind = mujoco.mjtObj.mjOBJ_SITE if name == parameters.grip else mujoco.mjtObj.mjOBJ_ACTUATOR
         if mujoco.mj_name2id(model, kind, name) < 0:
             raise RecordingError(f"the attached model has no '{name}'")
-    coupling = parameters.coupling
+    method = method_named(recording.meta.get("method", ""))
+    forces, torques = method.gains(parameters.coupling, parameters.period)
     for axis, name in enumerate(COUPLING_ACTUATORS):
         actuator_id = model.actuator(name).id
-        stiffness = coupling.stiffness if axis < 3 else coupling.rotational_stiffness
-        damping = coupling.damping if axis < 3 else coupling.rotational_damping
+        factor, stiffness, damping = forces if axis < 3 else torques
         bias = model.actuator_biasprm[actuator_id].tolist()
         gain = float(model.actuator_gainprm[actuator_id, 0])
-        if (bias[1], bias[2], gain) != (-stiffness, -damping, damping):
+        if (bias[1], bias[2], gain) != (-stiffness, -damping, factor):
             raise RecordingError(
                 f"the attached model's coupling has K = {-bias[1]!r}, B = {gain!r} in {name}, "
-                f"the metadata say {stiffness!r}, {damping!r}"
+                f"the metadata say {stiffness!r}, {factor!r}"
             )
+    try:
+        check_prepared(model, parameters, method)
+    except HapticBridgeError as error:
+        raise RecordingError(f"the attached model does not fit the metadata: {error}") from None
     if model.opt.timestep != parameters.period / parameters.substeps:
         raise RecordingError(
             f"the attached model's timestep is {model.opt.timestep!r} s, the metadata's period "

@@ -14,14 +14,14 @@ from numpy.typing import NDArray
 from hapticbridge.audit.balance import Balance
 from hapticbridge.audit.replay import replay
 from hapticbridge.audit.structure import TOLERANCE, Fault, structure_fault
-from hapticbridge.certificate import Condition, device_conditions, is_certified
+from hapticbridge.certificate import condition_sentences, is_run_certified, run_conditions
 from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.guard import Limits, limits_for
 from hapticbridge.kernel.state import RunParameters
 from hapticbridge.provenance import STARTS, meta_start, parameters_of
 from hapticbridge.recording import Recording, read_recording
-from hapticbridge.rendering import method_named
+from hapticbridge.rendering import Method, method_named
 from hapticbridge.tick import TickFlag
 
 
@@ -46,6 +46,7 @@ class AuditReport:
         ticks: Number of records.
         duration: Their number times the period, in s.
         conditions: The device condition per kind of axis, as sentences.
+        unchecked: What records alone do not tell and only the re-simulation confirms, or nothing.
         energies: Energies at the end, in J.
         events: How many events of each kind.
     """
@@ -64,6 +65,7 @@ class AuditReport:
     ticks: int = 0
     duration: float = 0.0
     conditions: tuple[str, ...] = ()
+    unchecked: str = ""
     energies: dict[str, float] = field(default_factory=dict)
     events: dict[str, int] = field(default_factory=dict)
 
@@ -108,12 +110,12 @@ def audit(path: str | Path, *, strict: bool = False) -> AuditReport:
     }
     try:
         parameters = parameters_of(recording.meta)
-        conditions = _conditions(recording, parameters)
+        info, method = _device_and_method(recording, parameters)
+        facts |= _device_facts(info, parameters, method)
     except RecordingError as error:
         return _invalid(facts, Fault(str(error)))
     facts["duration"] = len(recording.ticks) * parameters.period
-    facts["certified"] = is_certified(conditions)
-    facts["conditions"] = tuple(condition.sentence() for condition in conditions)
+    facts["unchecked"] = _unchecked(parameters, method)
     resumed = np.array([float(e["tick"]) for e in recording.events if _is_resume(e)])
     fault = structure_fault(recording, parameters, resumed)
     if fault:
@@ -147,7 +149,8 @@ def audit(path: str | Path, *, strict: bool = False) -> AuditReport:
     report = _judged(facts, balance, strict=strict)
     trips = [event.get("tick") for event in recording.events if event.get("event") == "trip"]
     tripped = f"; the guard tripped at tick {trips[0]}" if trips else ""
-    return replace(report, reason=report.reason + tripped)
+    unchecked = f"; {report.unchecked}" if report.unchecked else ""
+    return replace(report, reason=report.reason + tripped + unchecked)
 
 
 def _is_resume(event: dict[str, Any]) -> bool:
@@ -162,7 +165,9 @@ def _event_counts(recording: Recording) -> dict[str, int]:
     return counts
 
 
-def _conditions(recording: Recording, parameters: RunParameters) -> tuple[Condition, ...]:
+def _device_and_method(
+    recording: Recording, parameters: RunParameters
+) -> tuple[DeviceInfo, Method]:
     try:
         info = DeviceInfo.from_json(recording.meta.get("device", ""))
         limits_for(info, Limits(force=parameters.force_limit, torque=parameters.torque_limit))
@@ -171,11 +176,28 @@ def _conditions(recording: Recording, parameters: RunParameters) -> tuple[Condit
         raise RecordingError(f"the metadata do not describe a run: {error}") from None
     if recording.meta.get("discretization") != method.discretization:
         raise RecordingError(f"metadata 'discretization' is not that of method '{method.name}'")
-    if info.is_prescribed:
-        return ()
-    return device_conditions(
-        info, parameters.coupling, parameters.period, parameters.scale, parameters.force_scale
-    )
+    return info, method
+
+
+def _device_facts(info: DeviceInfo, parameters: RunParameters, method: Method) -> dict[str, Any]:
+    try:
+        return {
+            "certified": is_run_certified(run_conditions(info, parameters, method), method),
+            "conditions": condition_sentences(info, parameters, method),
+        }
+    except HapticBridgeError as error:  # numbers beyond what the theory computes with
+        raise RecordingError(f"the metadata are out of range: {error}") from None
+
+
+def _unchecked(parameters: RunParameters, method: Method) -> str:
+    """Says what only the re-simulation can confirm, because records alone do not tell it."""
+    if not method.has_coupling:
+        return "the wrench is the contacts': checked by re-simulation alone"
+    if not method.has_law:
+        return "the wrench is MuJoCo's constraint force: checked by re-simulation alone"
+    if parameters.laws > 1:
+        return "the wrench is a mean over substeps: it and its work checked by re-simulation alone"
+    return ""
 
 
 def _invalid(facts: dict[str, Any], fault: Fault) -> AuditReport:
@@ -265,6 +287,21 @@ def _judged(facts: dict[str, Any], balance: Balance, *, strict: bool) -> AuditRe
     unstrict = created > rounding
     active = created > balance.slack + rounding
     share = float(np.max(np.where(unstrict, created / (balance.slack + rounding), 0.0)))
+    kicked = balance.kicked > rounding
+    if kicked.any() and not (active & (np.arange(len(active)) <= np.argmax(kicked))).any():
+        tick = int(np.argmax(kicked))
+        excess = float(balance.kicked[tick])
+        return AuditReport(
+            **facts,
+            verdict="active",
+            environment="within slack" if unstrict.any() else "strict",
+            reason=f"from tick {tick} the device is given {excess:.3g} J more than its damping "
+            "burns and the scene gives up",
+            tick=tick,
+            port="device",
+            joules=excess,
+            slack_share=share,
+        )
     lost = -float(created[-1])
     if not unstrict.any():
         reason = f"the environment never gave out more than it got ({lost:.3g} J dissipated)"

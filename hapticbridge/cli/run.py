@@ -49,11 +49,19 @@ class Run:
     overwrite: bool = False
     """Replace the recording if the file exists."""
     method: str = IMPLICIT.name
-    """How the tool is rendered."""
+    """How the tool is rendered: 'implicit' (the coupling inside MuJoCo's implicit step),
+    'implicitfast' or 'implicitfast:compensated' (the same actuators under that integrator, with K T
+    more damping), 'explicit', 'explicit:implicitfast' or 'explicit:rk4' (applied as a force and
+    held, under Euler or the integrator named), 'weld' (MuJoCo's weld constraint), 'direct' (a tool
+    without mass, no coupling). All but the first exist to be compared."""
+    contact_stiffness: float | None = None
+    """Stiffness per contact in N/m of method 'direct'; by default that of the coupling."""
+    i_know: bool = False
+    """Accept a method other than 'implicit' on a real device."""
     rate: float = 1000.0
     """Ticks per second."""
     substeps: int = 1
-    """MuJoCo steps per tick; with more than one even a free tool may use slack."""
+    """MuJoCo steps per tick; with more than one the mean of their wrenches is sent."""
     fast: bool = False
     """Simulated time: as fast as it goes, and the same in every run."""
     stiffness: float | None = None
@@ -97,6 +105,8 @@ class Run:
             rate=self.rate,
             substeps=self.substeps,
             method=self.method,
+            contact_stiffness=self.contact_stiffness,
+            i_know=self.i_know,
             recording=self.record,
             clock=SimulatedClock() if self.fast else RealClock(),
             scale=scales[0],
@@ -122,7 +132,7 @@ class Run:
             values = asdict(summary) | {"verdict": summary.verdict}
             out.print_json(json.dumps(values | {"recording": str(self.record or "") or None}))
         else:
-            _print_summary(summary)
+            _print_summary(summary, bridge.coupling, bridge.laws)
         is_good = summary.verdict == "passive" and summary.is_certified is not False
         return 0 if is_good else 1
 
@@ -142,13 +152,29 @@ def _announce(bridge: Bridge, scales: tuple[float, float]) -> None:
         f"K_r = {coupling.rotational_stiffness:g} N m/rad, "
         f"B_r = {coupling.rotational_damping:g} N m s/rad, {1 / bridge.period:g} Hz"
     )
-    conditions = device_conditions(bridge.device.info, coupling, bridge.period, *scales)
+    if bridge.method != IMPLICIT:
+        err.print(f"method {bridge.method.name}: {escape(bridge.method.about)}")
+        err.print(f"[yellow]warning:[/yellow] {escape(bridge.method.hazard)}")
+    if not bridge.method.has_law:
+        return  # what must be known of a weld is measured, and told, when it has run
+    conditions = device_conditions(
+        bridge.device.info, coupling, bridge.period, *scales, bridge.laws
+    )
     for condition in conditions:
         if not condition.holds:
             err.print(f"[yellow]warning:[/yellow] {condition.sentence()}")
 
 
-def _print_summary(summary: Summary) -> None:
+def _true_weld(felt: Coupling, asked: Coupling) -> str:
+    return (
+        f"the weld is {felt.stiffness:.4g} N/m, {felt.damping:.4g} N s/m, "
+        f"{felt.rotational_stiffness:.4g} N m/rad, {felt.rotational_damping:.4g} N m s/rad in its "
+        f"stiffest directions at the start; asked for: {asked.stiffness:.4g}, {asked.damping:.4g}, "
+        f"{asked.rotational_stiffness:.4g}, {asked.rotational_damping:.4g}"
+    )
+
+
+def _print_summary(summary: Summary, asked: Coupling, laws: int) -> None:
     table = Table(show_header=False, box=None, pad_edge=False)
     table.add_row("ran", f"{summary.duration:.3f} s, {summary.ticks} ticks ({summary.stopped_by})")
     skipped = f" ({summary.skipped} deadlines skipped)" if summary.skipped else ""
@@ -161,11 +187,24 @@ def _print_summary(summary: Summary) -> None:
     out.print(table)
     used = f", {summary.slack_share:.0%} of the slack used" if summary.slack_share else ""
     out.print(f"environment [bold]{summary.verdict}[/bold] ({summary.environment}{used})")
-    certified = {
-        True: "device certified: b >= KT/2 + B",
-        False: "device not certified: b < KT/2 + B",
-        None: "device unknown: b >= KT/2 + B not checked",
-    }
-    out.print(certified[summary.is_certified])
+    if summary.fault is not None:
+        tick, port = summary.fault
+        out.print(f"from tick {tick} on, at port {port}")
+    if summary.method != IMPLICIT.name:
+        out.print(f"method {escape(summary.method)}: {escape(summary.about)}")
+    if summary.felt is not None:
+        out.print(_true_weld(summary.felt, asked))
+    if summary.is_certified is None and summary.conditions:
+        for sentence in summary.conditions:
+            out.print(escape(sentence))
+        out.print("nothing proves that this is enough under this method")
+    else:
+        bound = "KT/2 + B" if laws == 1 else f"what {laws} substeps need"
+        certified = {
+            True: f"device certified: b >= {bound}",
+            False: f"device not certified: b < {bound}",
+            None: f"device unknown: b >= {bound} not checked",
+        }
+        out.print(certified[summary.is_certified])
     if summary.recording is not None:
         out.print(f"next: hapticbridge audit {escape(shlex.quote(str(summary.recording)))}")

@@ -28,12 +28,16 @@ from hapticbridge.pose import (
 MAX_DELAY = 100
 """Largest output delay in samples."""
 
+FREE, IN_A_HAND, ON_A_LINE = 0, 1, 2
+"""Who holds the device: nobody, a hand of inertia, damper and spring, or a lossless line tuned to
+be the worst passive hand."""
+
 STATE_DTYPE = np.dtype(
     [
         ("tick", "<i8"),
         ("cursor", "<i8"),
         ("period", "<f8"),
-        ("is_held", "<i8"),
+        ("holder", "<i8"),
         ("position", "<f8", 3),
         ("velocity", "<f8", 3),
         ("quaternion", "<f8", 4),
@@ -47,10 +51,14 @@ STATE_DTYPE = np.dtype(
         ("on_the_way", "<f8", (MAX_DELAY + 1, 6)),
         ("translation", AXIS_DTYPE),
         ("rotation", AXIS_DTYPE),
+        ("translation_line", "<f8", 3),
+        ("rotation_line", "<f8", 3),
+        ("held_before", "<f8", 6),
     ]
 )
 """What the step reads and writes. ``written`` is the newest wrench; ``on_the_way`` is a ring of
-``delay`` + 1 wrenches between the write and the motors; ``is_held``: 1 in a hand, 0 free."""
+``delay`` + 1 wrenches between the write and the motors; ``holder``: ``FREE``, ``IN_A_HAND`` or
+``ON_A_LINE``; the lines hold p, q, r of v_k = p v_{k−1} + q F_k + r F_{k−1}."""
 
 
 @compiled
@@ -101,6 +109,29 @@ def _rotate(s: Record, wrench: NDArray[np.float64], target: Quaternion) -> None:
 
 
 @compiled
+def _follow_lines(s: Record, wrench: NDArray[np.float64]) -> None:
+    """Moves every axis by one period as device and worst hand do together (``WorstHand``)."""
+    line = s.translation_line
+    for i in range(3):
+        s.velocity[i] = line[0] * s.velocity[i] + line[1] * wrench[i] + line[2] * s.held_before[i]
+        s.position[i] += s.period * s.velocity[i]
+    line = s.rotation_line
+    for i in range(3):
+        before = s.held_before[3 + i]
+        s.angular_velocity[i] = (
+            line[0] * s.angular_velocity[i] + line[1] * wrench[3 + i] + line[2] * before
+        )
+    for i in range(6):
+        s.held_before[i] = wrench[i]
+    w = s.angular_velocity
+    turn = scaled(s.period, (w[0], w[1], w[2]))
+    q = (s.quaternion[0], s.quaternion[1], s.quaternion[2], s.quaternion[3])
+    turned = canonical(product(quaternion_exp(turn), q))
+    for i in range(4):
+        s.quaternion[i] = turned[i]
+
+
+@compiled
 def next_sample(
     states: NDArray[np.void], motion: NDArray[np.float64], samples: NDArray[np.void]
 ) -> None:
@@ -113,14 +144,17 @@ def next_sample(
         for i in range(6):
             entry[i] = s.written[i]
         wrench = s.on_the_way[s.tick % line]
-        position, quaternion = (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)
-        if s.is_held == 1:
-            if motion.shape[0] > 0:
-                s.cursor, position, quaternion = pose_at(motion, s.tick * s.period, s.cursor)
-            else:
-                position, quaternion = lissajous(s.tick * s.period)
-        _translate(s, wrench, position)
-        _rotate(s, wrench, quaternion)
+        if s.holder == ON_A_LINE:
+            _follow_lines(s, wrench)
+        else:
+            position, quaternion = (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)
+            if s.holder == IN_A_HAND:
+                if motion.shape[0] > 0:
+                    s.cursor, position, quaternion = pose_at(motion, s.tick * s.period, s.cursor)
+                else:
+                    position, quaternion = lissajous(s.tick * s.period)
+            _translate(s, wrench, position)
+            _rotate(s, wrench, quaternion)
     s.tick += 1
     sample = samples[0]
     sample.buttons = 0

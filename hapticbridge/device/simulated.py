@@ -8,14 +8,23 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from hapticbridge.device.base import DeviceInfo, checked_number, checked_period
-from hapticbridge.device.handheld import MAX_DELAY, STATE_DTYPE, next_sample
+from hapticbridge.device.handheld import (
+    FREE,
+    IN_A_HAND,
+    MAX_DELAY,
+    ON_A_LINE,
+    STATE_DTYPE,
+    next_sample,
+)
 from hapticbridge.device.motion import Motion
 from hapticbridge.device.motion_csv import read_motion
 from hapticbridge.device.sampled_axis import sampled_axis
 from hapticbridge.errors import DeviceError
 from hapticbridge.jit import direct
+from hapticbridge.passivity import WorstHand
 from hapticbridge.tick import SAMPLE_DTYPE
 
 
@@ -97,7 +106,10 @@ class SimulatedDevice:
         damping: b in N s/m, >= 0.
         rotational_inertia: In kg m², > 0.
         rotational_damping: In N m s/rad, >= 0.
-        hand: Who holds it; None: it is free, and the path is not used.
+        hand: Who holds it; None: it is free, and the path is not used. A ``WorstHand`` stands for
+            device and hand together: mass, damping and path are then not used, and the orientation
+            is held still unless ``rotational_hand`` is given.
+        rotational_hand: The same for rotation, in N m s/rad; only beside a ``WorstHand``.
         path: Where the hand wants to go, from its first pose and in the device's frame: a CSV
             file (``read_motion``), a motion, or None for a slow Lissajous figure (``lissajous``).
             After the end of a motion the hand stays at its last pose.
@@ -120,7 +132,8 @@ class SimulatedDevice:
         damping: float = 2.0,
         rotational_inertia: float = 1e-4,
         rotational_damping: float = 2e-3,
-        hand: Hand | None = _DEFAULT_HAND,
+        hand: Hand | WorstHand | None = _DEFAULT_HAND,
+        rotational_hand: WorstHand | None = None,
         path: str | os.PathLike[str] | Motion | None = None,
         resolution: float = 0.0,
         rotational_resolution: float = 0.0,
@@ -134,7 +147,12 @@ class SimulatedDevice:
             raise DeviceError(f"delay = {delay!r}: must be 0 to {MAX_DELAY} whole samples")
         self._motion = np.empty((0, 8))
         duration = None
-        if hand is not None and path is not None:
+        is_line = isinstance(hand, WorstHand)
+        if rotational_hand is not None and not is_line:
+            raise DeviceError("rotational_hand goes only with a WorstHand as hand")
+        if is_line and friction:
+            raise DeviceError(f"friction = {friction!r} N: a worst hand is linear and has none")
+        if hand is not None and not is_line and path is not None:
             motion = path if isinstance(path, Motion) else read_motion(path)
             self._motion = motion.relative().table
             duration = motion.duration
@@ -162,7 +180,7 @@ class SimulatedDevice:
             is_real=False,
             duration=duration,
         )
-        holder = hand or _NO_HAND
+        holder = hand if isinstance(hand, Hand) else _NO_HAND
         self._translation = {
             "inertia": mass + holder.mass,
             "damping": damping,
@@ -178,6 +196,7 @@ class SimulatedDevice:
             "friction": 0.0,
         }
         self.hand = hand
+        self._lines = (hand if isinstance(hand, WorstHand) else None, rotational_hand)
         self._rotational_resolution = checked_number(
             "rotational_resolution", rotational_resolution, "rad"
         )
@@ -196,12 +215,21 @@ class SimulatedDevice:
             The pose before the first tick, shape (1,), ``SAMPLE_DTYPE``.
 
         Raises:
-            DeviceError: The period is not, or is too long for a stiff hand with friction.
+            DeviceError: The period is not, is too long for a stiff hand with friction, or is not
+                the one that a worst hand is tuned to.
         """
         period = checked_period(period)
         state = np.zeros((), STATE_DTYPE)
         state["period"] = period
-        state["is_held"] = self.hand is not None
+        state["holder"] = ON_A_LINE if self._lines[0] else FREE if self.hand is None else IN_A_HAND
+        for name, line in zip(("translation_line", "rotation_line"), self._lines, strict=True):
+            if line is not None:
+                if line.period != period:
+                    raise DeviceError(
+                        f"the worst hand is tuned to a period of {line.period:g} s, the loop's is "
+                        f"{period:g} s"
+                    )
+                state[name] = line.recursion()
         state["quaternion"][0] = state["target_quaternion"][0] = 1.0
         state["resolution"] = self.info.resolution
         state["rotational_resolution"] = self._rotational_resolution
@@ -235,6 +263,30 @@ class SimulatedDevice:
             wrench: Shape (6,): force in N, torque in N m, in the device's frame.
         """
         self._written[:] = wrench
+
+    def displace(self, offset: NDArray[np.float64]) -> None:
+        """Moves the device before its first sample, as a knock would: for runs that must decay.
+
+        Args:
+            offset: Shape (6,): displacement in m and rotation vector in rad, in the device's frame.
+
+        Raises:
+            DeviceError: The device has not been started, or has been read already.
+        """
+        state = self._states[0]
+        if not self._is_started or state["tick"] > 0:
+            raise DeviceError("a device is displaced after its start and before its first sample")
+        state["position"] += offset[:3]
+        x, y, z, w = Rotation.from_rotvec(offset[3:]).as_quat(canonical=True)
+        state["quaternion"] = w, x, y, z
+
+    @property
+    def stepper(self) -> tuple[NDArray[np.void], NDArray[np.float64]]:
+        """State and motion that ``handheld.next_sample`` takes: for loops that are compiled whole.
+
+        The newest wrench is the state's field ``written``.
+        """
+        return self._states, self._motion
 
     def close(self) -> None:
         """Does nothing: there is nothing to release."""

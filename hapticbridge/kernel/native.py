@@ -42,6 +42,7 @@ _ON_DATA = types.void(_ADDRESS, _ADDRESS)
 mj_step: Any = types.ExternalFunction("mj_step", _ON_DATA)
 mj_kinematics: Any = types.ExternalFunction("mj_kinematics", _ON_DATA)
 mj_fwd_kinematics: Any = types.ExternalFunction("mj_fwdKinematics", _ON_DATA)
+mj_fwd_position: Any = types.ExternalFunction("mj_fwdPosition", _ON_DATA)
 mj_com_pos: Any = types.ExternalFunction("mj_comPos", _ON_DATA)
 mj_make_m: Any = types.ExternalFunction("mj_makeM", _ON_DATA)
 mj_energy_pos: Any = types.ExternalFunction("mj_energyPos", _ON_DATA)
@@ -136,7 +137,14 @@ def field_address(data: mujoco.MjData, name: str) -> int:
 def contact_layout() -> dict[str, int]:
     """Returns the size of ``mjContact`` and the offsets of what a tick reads of it, in bytes."""
     contact = _struct("mjContact")
-    fields = {"point": "pos", "frame": "frame", "geoms": "geom", "dim": "dim", "row": "efc_address"}
+    fields = {
+        "distance": "dist",
+        "point": "pos",
+        "frame": "frame",
+        "geoms": "geom",
+        "dim": "dim",
+        "row": "efc_address",
+    }
     offsets = {name: int(getattr(contact, field).offset) for name, field in fields.items()}
     return {"size": ctypes.sizeof(contact), **offsets}
 

@@ -6,24 +6,24 @@ single array costs 0.1 µs, unpacking forty would cost more than MuJoCo's step.
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass
-
 import mujoco
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from hapticbridge.coupling import Coupling
-from hapticbridge.errors import HapticBridgeError
 from hapticbridge.kernel import native
-from hapticbridge.kernel.step import handle_pose, refresh_energies
+from hapticbridge.kernel.direct import balance_contacts, tool_map
+from hapticbridge.kernel.handle import handle_pose
+from hapticbridge.kernel.meter import refresh_energies
+from hapticbridge.kernel.parameters import RunParameters as RunParameters  # noqa: PLC0414
+from hapticbridge.kernel.parameters import rotation_numbers as rotation_numbers  # noqa: PLC0414
+from hapticbridge.kernel.step import DIRECT, WELD
 from hapticbridge.tick import TICK_DTYPE
 
 HANDLE = "handle"
 """Name of the mocap body, and of its site, that the bridge adds to a scene."""
 
-MOST_SUBSTEPS = 100
-"""MuJoCo steps per tick at most; more would not fit into any period that can be felt."""
+WELD_NAME = "handle_weld"
+"""Name of the equality constraint that joins the grip to the handle, where a method wants one."""
 
 COUPLING_ACTUATORS = tuple(
     f"coupling_{kind}_{axis}" for kind in ("force", "torque") for axis in ("x", "y", "z")
@@ -31,6 +31,7 @@ COUPLING_ACTUATORS = tuple(
 """Names of the six actuators that couple the grip to the handle, in the order of a wrench."""
 
 _POINTERS = (
+    "qpos",
     "qvel",
     "qacc",
     "ctrl",
@@ -75,6 +76,9 @@ _POINTERS = (
     "equality_before",
     "tendon_before",
     "scratch",
+    "tool_map",
+    "tool_qpos",
+    "geom_is_tool",
 )
 
 _COUNTS = (
@@ -85,14 +89,21 @@ _COUNTS = (
     "ntendon",
     "equality_capacity",
     "contact_size",
+    "contact_distance",
     "contact_point",
     "contact_frame",
     "contact_geoms",
     "contact_dim",
     "contact_row",
+    "scheme",
     "substeps",
+    "laws",
     "handle_mocap_id",
+    "handle_site_id",
     "grip_site_id",
+    "weld_id",
+    "tool_map_size",
+    "watches_device",
     "coupling_actuator_id",
     "coupling_output_adr",
     "coupling_ctrl_adr",
@@ -109,6 +120,11 @@ _PARAMETERS = (
     "damping",
     "rotational_stiffness",
     "rotational_damping",
+    "slack_stiffness",
+    "slack_rotational_stiffness",
+    "contact_stiffness",
+    "device_damping",
+    "device_rotational_damping",
     "scale",
     "force_scale",
     "force_limit",
@@ -125,6 +141,7 @@ _RUNNING_COUNTS = (
     "equality_rows",
     "first_unstrict",
     "first_active",
+    "first_kick",
 )
 
 _RUNNING = (
@@ -136,6 +153,7 @@ _RUNNING = (
     "external_work",
     "environment_energy",
     "device_energy",
+    "device_burnt",
     "throughput",
     "slack",
     "slack_share",
@@ -155,107 +173,14 @@ STATE_DTYPE = np.dtype(
     ]
     + [(f"{name}_position", "<f8", 3) for name in _POSES]
     + [(f"{name}_quaternion", "<f8", 4) for name in _POSES]
-    + [("handle_step", "<f8", 3), ("handle_turn", "<f8", 3), ("wrench_on_device", "<f8", 6)]
+    + [("handle_step", "<f8", 3), ("handle_turn", "<f8", 3)]
+    + [(name, "<f8", 6) for name in ("wrench_on_tool", "motion", "wrench_on_device")]
     + [(name, "<i8") for name in _RUNNING_COUNTS]
     + [(name, "<f8") for name in _RUNNING]
 )
 """Addresses, sizes, parameters, the previous tick's poses, and the energies so far. Poses are
 (x, y, z, qw, qx, qy, qz); ``axes`` is the row-major rotation from the device's frame to the
 scene's, ``axes_quaternion`` the same as a quaternion."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RunParameters:
-    """Everything beside scene and device motion that decides what a run computes.
-
-    Attributes:
-        grip: Name of the site on the tool.
-        period: T in s.
-        substeps: MuJoCo steps per tick, >= 1.
-        coupling: K and B.
-        scale: Handle motion per device motion, without unit.
-        force_scale: Force on the device per force on the tool, without unit. Power is equal on both
-            sides where it equals ``scale``; torques return by force_scale / scale.
-        axes: Row-major rotation from the device's frame to the scene's.
-        force_limit: Largest force norm on the device in N.
-        torque_limit: Largest torque norm on the device in N m.
-        ramp_ticks: Ticks over which the wrench on the device rises to its full value.
-        device_origin: Device pose (x, y, z, qw, qx, qy, qz) that maps to ``handle_origin``.
-        handle_origin: Handle pose of the same form, in the scene.
-        device_start: Device pose of the same form before the first tick.
-
-    Raises:
-        HapticBridgeError: A value is out of range.
-    """
-
-    grip: str
-    period: float
-    substeps: int
-    coupling: Coupling
-    scale: float = 1.0
-    force_scale: float = 1.0
-    axes: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
-    force_limit: float
-    torque_limit: float
-    ramp_ticks: int
-    device_origin: tuple[float, ...]
-    handle_origin: tuple[float, ...]
-    device_start: tuple[float, ...]
-
-    def __post_init__(self) -> None:
-        positive = ("period", "substeps", "scale", "force_scale", "force_limit", "torque_limit")
-        for name in positive:
-            value = getattr(self, name)
-            if not math.isfinite(value) or value <= 0:
-                raise HapticBridgeError(f"{name} is {value!r}; it must be finite and > 0")
-        if self.ramp_ticks < 0:
-            raise HapticBridgeError(f"ramp_ticks is {self.ramp_ticks}; it must be >= 0")
-        for name in ("device_origin", "handle_origin", "device_start"):
-            pose = getattr(self, name)
-            if len(pose) != 7 or not all(math.isfinite(value) for value in pose):
-                raise HapticBridgeError(f"{name} is {pose!r}; it must be 7 finite numbers")
-            if abs(math.hypot(*pose[3:]) - 1) > 1e-9:
-                raise HapticBridgeError(f"{name} is {pose!r}; its quaternion must have norm 1")
-        if not isinstance(self.substeps, int) or self.substeps > MOST_SUBSTEPS:
-            raise HapticBridgeError(
-                f"substeps is {self.substeps!r}; it must be a whole number, 1 to {MOST_SUBSTEPS}"
-            )
-        rotation = np.asarray(self.axes, dtype=np.float64)
-        if rotation.shape != (9,) or not (
-            np.allclose(rotation.reshape(3, 3) @ rotation.reshape(3, 3).T, np.eye(3), atol=1e-12)
-            and np.linalg.det(rotation.reshape(3, 3)) > 0
-        ):
-            raise HapticBridgeError(
-                f"axes is {self.axes!r}; it must be the 9 numbers of a right-handed rotation "
-                "matrix, row by row"
-            )
-
-
-def rotation_numbers(matrix: ArrayLike) -> tuple[float, ...]:
-    """Returns the 9 numbers, row by row, of the rotation nearest to a matrix.
-
-    Axes are written with few digits (0.707107); the polar factor makes them a rotation to the last
-    one, so that positions, orientations and forces turn by the same.
-
-    Args:
-        matrix: 3 × 3, or 9 numbers; orthogonal to 1e-5 and right-handed.
-
-    Raises:
-        HapticBridgeError: It is not.
-    """
-    try:
-        given = np.asarray(matrix, dtype=np.float64)
-    except (TypeError, ValueError):
-        given = np.zeros(0)
-    if given.size == 9 and np.all(np.isfinite(given)):
-        square = given.reshape(3, 3)
-        if np.abs(square @ square.T - np.eye(3)).max() < 1e-5 and np.linalg.det(square) > 0:
-            left, _, right = np.linalg.svd(square)
-            return tuple((left @ right).ravel().tolist())
-    raise HapticBridgeError(
-        f"axes is {matrix!r}; it must be the 9 numbers of a right-handed rotation matrix, "
-        "row by row"
-    )
 
 
 class Binding:
@@ -289,6 +214,7 @@ class Binding:
     def _fill_parameters(self, model: mujoco.MjModel, parameters: RunParameters) -> None:
         state = self.state
         first = model.actuator(COUPLING_ACTUATORS[0]).id
+        state["handle_site_id"] = model.site(HANDLE).id
         state["handle_mocap_id"] = model.body_mocapid[model.body(HANDLE).id]
         state["grip_site_id"] = model.site(parameters.grip).id
         state["coupling_actuator_id"] = first
@@ -304,6 +230,15 @@ class Binding:
         coupling = parameters.coupling
         for name in ("stiffness", "damping", "rotational_stiffness", "rotational_damping"):
             state[name] = getattr(coupling, name)
+        state["scheme"], state["laws"] = parameters.scheme, parameters.laws
+        state["slack_stiffness"], state["slack_rotational_stiffness"] = parameters.slack_gains()
+        state["contact_stiffness"] = parameters.contact_stiffness
+        state["device_damping"] = parameters.device_damping or 0.0
+        state["device_rotational_damping"] = parameters.device_rotational_damping or 0.0
+        state["watches_device"] = not parameters.has_law and parameters.device_damping is not None
+        state["weld_id"] = model.equality(WELD_NAME).id if parameters.scheme == WELD else -1
+        if parameters.scheme == DIRECT:
+            self._bind_massless(model)
         state["axes"] = parameters.axes
         quaternion = np.zeros(4)
         mujoco.mju_mat2Quat(quaternion, np.asarray(parameters.axes, dtype=np.float64))
@@ -312,6 +247,21 @@ class Binding:
             parameters.device_origin,
             parameters.handle_origin,
         )
+
+    def _bind_massless(self, model: mujoco.MjModel) -> None:
+        grip = int(self.state["grip_site_id"][0])
+        numbers, addresses = tool_map(model, grip)
+        tool = model.body_weldid[model.site_bodyid[grip]]
+        is_tool = model.body_weldid[model.geom_bodyid] == tool
+        owned: dict[str, NDArray[np.generic]] = {
+            "tool_map": numbers,
+            "tool_qpos": addresses,
+            "geom_is_tool": np.ascontiguousarray(is_tool, dtype=np.int32),
+        }
+        for name, array in owned.items():
+            self.state[name] = array.ctypes.data
+        self._owned |= owned
+        self.state["tool_map_size"] = numbers.size
 
     def _start(self, model: mujoco.MjModel, data: mujoco.MjData, parameters: RunParameters) -> None:
         state = self.state
@@ -328,8 +278,13 @@ class Binding:
         mocap_previous = self._owned["mocap_previous"]
         mocap_previous[: model.nmocap, :3] = data.mocap_pos
         mocap_previous[: model.nmocap, 3:] = data.mocap_quat
-        state["first_unstrict"] = state["first_active"] = -1
-        refresh_energies(state)
+        for name in ("first_unstrict", "first_active", "first_kick"):
+            state[name] = -1
+        if parameters.scheme == DIRECT:
+            mujoco.mj_fwdPosition(model, data)
+            balance_contacts(state)
+        else:
+            refresh_energies(state)
         state["start_energy"] = state["kinetic"] + state["potential"]
 
 
@@ -346,7 +301,7 @@ def _bind_addresses(
     """
     state["model"], state["data"] = native.addresses(model, data)
     buffer_fields = (
-        "qvel qacc ctrl mocap_pos mocap_quat site_xpos site_xquat xipos ten_length "
+        "qpos qvel qacc ctrl mocap_pos mocap_quat site_xpos site_xquat xipos ten_length "
         "qfrc_actuator qfrc_applied qfrc_gravcomp xfrc_applied actuator_force moment_rownnz "
         "moment_rowadr moment_colind actuator_moment energy solver_niter"
     )

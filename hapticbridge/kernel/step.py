@@ -1,7 +1,8 @@
 """The tick's arithmetic: before MuJoCo's step, after it, and the hand-over of the record.
 
-The live loop calls ``before_step``, ``mujoco.mj_step``, ``after_step`` and ``publish``; the
-re-simulation calls ``simulate``, which inlines the same functions around MuJoCo's C symbol.
+The live loop calls ``before_step``, MuJoCo through its Python bindings, ``after_step`` and
+``publish``; the re-simulation calls ``simulate``, which inlines the same functions around
+``advance``, MuJoCo by its C symbol.
 """
 
 from __future__ import annotations
@@ -12,19 +13,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.jit import compiled, compiled_for_threads
-from hapticbridge.kernel.native import (
-    floats,
-    ints,
-    mj_com_pos,
-    mj_energy_pos,
-    mj_energy_vel,
-    mj_fwd_kinematics,
-    mj_kinematics,
-    mj_make_m,
-    mj_step,
-    release_fence,
+from hapticbridge.kernel.direct import balance_contacts, place_tool
+from hapticbridge.kernel.handle import (
+    device_from_scene,
+    handle_pose,
+    quaternion_of,
+    store_quaternion,
+    store_vector,
+    vector_of,
 )
+from hapticbridge.kernel.meter import (
+    add_coupling_work,
+    judge_environment,
+    refresh_energies,
+    refresh_grip,
+)
+from hapticbridge.kernel.native import floats, ints, mj_fwd_position, mj_step, release_fence
 from hapticbridge.kernel.ports import meter_ports, note_moved_mocap_bodies
+from hapticbridge.kernel.weld import weld_wrench
 from hapticbridge.pose import (
     Quaternion,
     Vector,
@@ -48,73 +54,45 @@ OK, BAD_SAMPLE, BAD_RESULT = 0, 1, 2
 """What a kernel function returns: go on, the device's sample is not finite, the simulation's
 result is not finite."""
 
-ENERGY_TOLERANCE = 1e-9
-"""An environment is strict while Σ E_k <= 1e-9 J + 1e-9 Σ|f·δx|: rounding of a sum of many small
-works, not physics. Larger hides real creation, smaller reports rounding."""
+COUPLED, HELD, WELD, DIRECT = 0, 1, 2, 3
+"""How the wrench reaches the tool (``scheme``): by the coupling's actuators, which compute it while
+MuJoCo steps; by the same actuators as the wrench of the tick before, held; by an equality
+constraint; or not at all, because the tool has no mass and is where the handle is."""
+
+LARGEST_CONTROL = 1e10
+"""mjMAXVAL, in N and N m. Beyond it the run has diverged anyway."""
 
 HEAD, TAIL = 0, 1
 """Cursors of the ring: records written, records read."""
 
 
 @compiled
-def vector_of(values: NDArray[np.float64]) -> Vector:
-    """Returns the first three elements as a tuple."""
-    return values[0], values[1], values[2]
-
-
-@compiled
-def quaternion_of(values: NDArray[np.float64]) -> Quaternion:
-    """Returns the first four elements as a tuple."""
-    return values[0], values[1], values[2], values[3]
-
-
-@compiled
-def _store_vector(target: NDArray[np.float64], v: Vector) -> None:
-    target[0], target[1], target[2] = v
-
-
-@compiled
-def _store_quaternion(target: NDArray[np.float64], q: Quaternion) -> None:
-    target[0], target[1], target[2], target[3] = q
-
-
-@compiled
-def _scene_from_device(axes: NDArray[np.float64], v: Vector) -> Vector:
-    return (
-        axes[0] * v[0] + axes[1] * v[1] + axes[2] * v[2],
-        axes[3] * v[0] + axes[4] * v[1] + axes[5] * v[2],
-        axes[6] * v[0] + axes[7] * v[1] + axes[8] * v[2],
-    )
-
-
-@compiled
-def _device_from_scene(axes: NDArray[np.float64], v: Vector) -> Vector:
-    return (
-        axes[0] * v[0] + axes[3] * v[1] + axes[6] * v[2],
-        axes[1] * v[0] + axes[4] * v[1] + axes[7] * v[2],
-        axes[2] * v[0] + axes[5] * v[1] + axes[8] * v[2],
-    )
-
-
-@compiled
-def handle_pose(
-    state: NDArray[np.void], position: Vector, quaternion: Quaternion
-) -> tuple[Vector, Quaternion]:
-    """Maps a device pose into the scene.
-
-        h = h_0 + scale · A (p − p_0),    R_h = A (R R_0ᵀ) Aᵀ R_h0
-
-    A is the rotation from the device's axes to the scene's, subscript 0 the pose at the start.
-    """
+def _show_handle(state: NDArray[np.void], substep: int) -> None:
+    """Puts the handle where it is in this substep, and gives the actuators their control."""
     s = state[0]
-    offset = subtract(position, (s.device_origin[0], s.device_origin[1], s.device_origin[2]))
-    moved = scaled(s.scale, _scene_from_device(s.axes, offset))
-    origin = s.handle_origin
-    start = (s.device_origin[3], s.device_origin[4], s.device_origin[5], s.device_origin[6])
-    axes = quaternion_of(s.axes_quaternion)
-    turn = product(product(axes, product(quaternion, conjugate(start))), conjugate(axes))
-    turned = product(turn, (origin[3], origin[4], origin[5], origin[6]))
-    return add((origin[0], origin[1], origin[2]), moved), canonical(turned)
+    position = vector_of(s.handle_position)
+    orientation = quaternion_of(s.handle_quaternion)
+    remaining = (s.substeps - 1 - substep) / s.substeps
+    if remaining > 0.0:
+        position = subtract(position, scaled(remaining, vector_of(s.handle_step)))
+        back = quaternion_exp(scaled(-remaining, vector_of(s.handle_turn)))
+        orientation = product(back, orientation)
+    m = s.handle_mocap_id
+    store_vector(floats(s.mocap_pos + 24 * m, 3), position)
+    store_quaternion(floats(s.mocap_quat + 32 * m, 4), orientation)
+    if s.scheme == DIRECT:
+        place_tool(state)
+        return
+    to_handle = conjugate(orientation)
+    ctrl = floats(s.ctrl + 8 * s.coupling_ctrl_adr, 6)
+    if s.scheme == HELD:
+        w = s.wrench_on_tool  # of the tick before: held, as a zero-order hold would
+        store_vector(ctrl[0:3], rotated(to_handle, (w[0], w[1], w[2])))
+        store_vector(ctrl[3:6], rotated(to_handle, (w[3], w[4], w[5])))
+        return
+    rate = 1.0 / s.period
+    store_vector(ctrl[0:3], scaled(rate, rotated(to_handle, vector_of(s.handle_step))))
+    store_vector(ctrl[3:6], scaled(rate, rotated(to_handle, vector_of(s.handle_turn))))
 
 
 @compiled
@@ -125,7 +103,8 @@ def before_step(
 
     Over substeps the handle moves uniformly from its previous pose to the new one, which it
     reaches in the last. The control of the coupling's actuators is the handle's velocity in the
-    handle's own axes, R_hᵀ δh/T and R_hᵀ δφ_h/T: a mocap body has no velocity of its own.
+    handle's own axes, R_hᵀ δh/T and R_hᵀ δφ_h/T: a mocap body has no velocity of its own. Where
+    the wrench is applied and held, the control is the wrench of the tick before, in those axes.
 
     Returns:
         ``OK`` or ``BAD_SAMPLE``; in the latter case nothing was changed.
@@ -145,62 +124,30 @@ def before_step(
         turned = rotation_between(quaternion_of(s.device_quaternion), quaternion)
         w = s.wrench_on_device
         s.device_energy += dot((w[0], w[1], w[2]), moved) + dot((w[3], w[4], w[5]), turned)
-        _store_vector(s.device_position, position)
-        _store_quaternion(s.device_quaternion, quaternion)
+        s.device_burnt += s.device_damping / s.period * dot(moved, moved)
+        s.device_burnt += s.device_rotational_damping / s.period * dot(turned, turned)
+        store_vector(s.device_position, position)
+        store_quaternion(s.device_quaternion, quaternion)
 
         handle, orientation = handle_pose(state, position, quaternion)
-        _store_vector(s.handle_step, subtract(handle, vector_of(s.handle_position)))
-        _store_vector(
+        store_vector(s.handle_step, subtract(handle, vector_of(s.handle_position)))
+        store_vector(
             s.handle_turn, rotation_between(quaternion_of(s.handle_quaternion), orientation)
         )
-        _store_vector(s.handle_position, handle)
-        _store_quaternion(s.handle_quaternion, orientation)
+        store_vector(s.handle_position, handle)
+        store_quaternion(s.handle_quaternion, orientation)
         if s.nmocap > 1:
             note_moved_mocap_bodies(state)
 
         r.tick = s.tick
         r.buttons = sample[0].buttons
-        _store_vector(r.device_position, position)
-        _store_quaternion(r.device_quaternion, quaternion)
-        _store_vector(r.handle_position, handle)
-        _store_quaternion(r.handle_quaternion, orientation)
+        store_vector(r.device_position, position)
+        store_quaternion(r.device_quaternion, quaternion)
+        store_vector(r.handle_position, handle)
+        store_quaternion(r.handle_quaternion, orientation)
 
-    position = vector_of(s.handle_position)
-    orientation = quaternion_of(s.handle_quaternion)
-    remaining = (s.substeps - 1 - substep) / s.substeps
-    if remaining > 0.0:
-        position = subtract(position, scaled(remaining, vector_of(s.handle_step)))
-        back = quaternion_exp(scaled(-remaining, vector_of(s.handle_turn)))
-        orientation = product(back, orientation)
-    m = s.handle_mocap_id
-    _store_vector(floats(s.mocap_pos + 24 * m, 3), position)
-    _store_quaternion(floats(s.mocap_quat + 32 * m, 4), orientation)
-    to_handle = conjugate(orientation)
-    rate = 1.0 / s.period
-    ctrl = floats(s.ctrl + 8 * s.coupling_ctrl_adr, 6)
-    _store_vector(ctrl[0:3], scaled(rate, rotated(to_handle, vector_of(s.handle_step))))
-    _store_vector(ctrl[3:6], scaled(rate, rotated(to_handle, vector_of(s.handle_turn))))
+    _show_handle(state, substep)
     return OK
-
-
-@compiled
-def refresh_energies(state: NDArray[np.void]) -> None:
-    """Brings positions and energies to the state after the step (``mj_step`` leaves them before).
-
-    Kinetic energy needs the inertia matrix, potential energy the positions and, where there are
-    any, tendon lengths.
-    """
-    s = state[0]
-    if s.has_tendons_or_flexes:
-        mj_fwd_kinematics(s.model, s.data)
-    else:
-        mj_kinematics(s.model, s.data)
-    mj_com_pos(s.model, s.data)
-    mj_make_m(s.model, s.data)
-    mj_energy_pos(s.model, s.data)
-    mj_energy_vel(s.model, s.data)
-    energy = floats(s.energy, 2)
-    s.potential, s.kinetic = energy[0], energy[1]
 
 
 @compiled
@@ -212,39 +159,47 @@ def _limited(v: Vector, limit: float) -> tuple[Vector, bool]:
 
 
 @compiled
-def _meter_coupling(
-    state: NDArray[np.void], force: Vector, torque: Vector, moved: Vector, turned: Vector
-) -> None:
-    """Adds this tick to the coupling's port and holds the environment against (14) and the slack.
-
-    E_k = S_k − S_{k−1} − (f_k·δx_k + τ_k·δφ_k) − actuators − external
-    slack_k = Σ ½ ‖δx_k‖²_{K + B/T} + ½ ‖δφ_k‖²_{K_r + B_r/T}
-    """
+def _law(
+    state: NDArray[np.void],
+    handle: tuple[Vector, Quaternion],
+    tool: tuple[Vector, Quaternion],
+    moved: Vector,
+    turned: Vector,
+) -> tuple[Vector, Vector]:
+    """The coupling's force and torque on the tool, over one of the tick's ``laws``."""
     s = state[0]
-    work = dot(force, moved) + dot(torque, turned)
-    s.coupling_work += work
-    s.throughput += abs(work)
-    s.slack += 0.5 * (s.stiffness + s.damping / s.period) * dot(moved, moved)
-    s.slack += (
-        0.5 * (s.rotational_stiffness + s.rotational_damping / s.period) * dot(turned, turned)
+    share, rate = 1.0 / s.laws, s.laws / s.period
+    stretch = subtract(handle[0], tool[0])
+    twist = rotation_between(tool[1], handle[1])
+    force = add(
+        scaled(s.stiffness, stretch),
+        scaled(s.damping * rate, subtract(scaled(share, vector_of(s.handle_step)), moved)),
     )
-    stored = (s.kinetic + s.potential) - s.start_energy
-    s.environment_energy = stored - s.coupling_work - s.actuator_work - s.external_work
-    allowed = ENERGY_TOLERANCE * (1.0 + s.throughput)
-    if s.environment_energy > allowed:
-        if s.first_unstrict < 0:
-            s.first_unstrict = s.tick
-        s.slack_share = max(s.slack_share, s.environment_energy / (s.slack + allowed))
-        if s.environment_energy > s.slack + allowed and s.first_active < 0:
-            s.first_active = s.tick
+    torque = add(
+        scaled(s.rotational_stiffness, twist),
+        scaled(
+            s.rotational_damping * rate,
+            subtract(scaled(share, vector_of(s.handle_turn)), turned),
+        ),
+    )
+    return force, torque
+
+
+@compiled
+def _handle_in_scene(state: NDArray[np.void]) -> tuple[Vector, Quaternion]:
+    """The handle's pose as the step that just ended had it."""
+    s = state[0]
+    m = s.handle_mocap_id
+    position = vector_of(floats(s.mocap_pos + 24 * m, 3))
+    return position, canonical(quaternion_of(floats(s.mocap_quat + 32 * m, 4)))
 
 
 @compiled
 def _render(state: NDArray[np.void], force: Vector, torque: Vector) -> None:
     """Turns the wrench on the tool into the one on the device: scale, limit by norm, start ramp."""
     s = state[0]
-    on_device = scaled(-s.force_scale, _device_from_scene(s.axes, force))
-    torque_on_device = scaled(-s.force_scale / s.scale, _device_from_scene(s.axes, torque))
+    on_device = scaled(-s.force_scale, device_from_scene(s.axes, force))
+    torque_on_device = scaled(-s.force_scale / s.scale, device_from_scene(s.axes, torque))
     on_device, is_limited = _limited(on_device, s.force_limit)
     torque_on_device, is_torque_limited = _limited(torque_on_device, s.torque_limit)
     if is_limited or is_torque_limited:
@@ -254,75 +209,132 @@ def _render(state: NDArray[np.void], force: Vector, torque: Vector) -> None:
         s.flags |= RAMPING
         ramp = (since_start + 1.0) / (s.ramp_ticks + 1.0)
         on_device, torque_on_device = scaled(ramp, on_device), scaled(ramp, torque_on_device)
-    _store_vector(s.wrench_on_device[0:3], on_device)
-    _store_vector(s.wrench_on_device[3:6], torque_on_device)
+    store_vector(s.wrench_on_device[0:3], on_device)
+    store_vector(s.wrench_on_device[3:6], torque_on_device)
 
 
 @compiled
-def after_step(state: NDArray[np.void], row: NDArray[np.void], substep: int) -> int:
-    """Meters the step that just ended; after the last substep, computes and records the wrench.
+def advance(state: NDArray[np.void]) -> None:
+    """MuJoCo's part of a substep, by C symbol: what ``Method.step`` is in Python.
 
-    Returns:
-        ``OK`` or ``BAD_RESULT``; in the latter case the wrench on the device is zero.
+    A massless tool has no dynamics: for it only positions and contacts are computed.
     """
-    s, r = state[0], row[0]
-    meter_ports(state)
-    if substep + 1 < s.substeps:
-        return OK
-    refresh_energies(state)
+    s = state[0]
+    if s.scheme == DIRECT:
+        mj_fwd_position(s.model, s.data)
+    else:
+        mj_step(s.model, s.data)
 
+
+@compiled
+def _wrench_of_step(
+    state: NDArray[np.void], substep: int, is_last: bool
+) -> tuple[Vector, Vector, Vector, Vector]:
+    """Returns the wrench on the tool and the tool's motion since the last time it was asked.
+
+    Brings the tool's pose and, at the end of the tick, the energies up to date on the way.
+    """
+    s = state[0]
+    applied = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    if s.scheme == WELD:
+        applied = weld_wrench(state)  # in the Jacobians of the step's start, as the step had them
+    elif s.scheme == DIRECT:
+        applied = balance_contacts(state)
+    if s.scheme != DIRECT:
+        if is_last:
+            refresh_energies(state)
+        else:
+            refresh_grip(state)
     grip = s.grip_site_id
-    tool = vector_of(floats(s.site_xpos + 24 * grip, 3))
-    tool_orientation = canonical(quaternion_of(floats(s.site_xquat + 32 * grip, 4)))
-    moved = subtract(tool, vector_of(s.tool_position))
-    turned = rotation_between(quaternion_of(s.tool_quaternion), tool_orientation)
-    stretch = subtract(vector_of(s.handle_position), tool)
-    twist = rotation_between(tool_orientation, quaternion_of(s.handle_quaternion))
-    rate = 1.0 / s.period
-    force = add(
-        scaled(s.stiffness, stretch),
-        scaled(s.damping * rate, subtract(vector_of(s.handle_step), moved)),
-    )
-    torque = add(
-        scaled(s.rotational_stiffness, twist),
-        scaled(s.rotational_damping * rate, subtract(vector_of(s.handle_turn), turned)),
-    )
-    _store_vector(s.tool_position, tool)
-    _store_quaternion(s.tool_quaternion, tool_orientation)
+    position = vector_of(floats(s.site_xpos + 24 * grip, 3))
+    orientation = canonical(quaternion_of(floats(s.site_xquat + 32 * grip, 4)))
+    moved = subtract(position, vector_of(s.tool_position))
+    turned = rotation_between(quaternion_of(s.tool_quaternion), orientation)
+    if s.scheme <= HELD:
+        handle = (vector_of(s.handle_position), quaternion_of(s.handle_quaternion))
+        if not is_last:
+            handle = _handle_in_scene(state)
+        applied = _law(state, handle, (position, orientation), moved, turned)
+    store_vector(s.tool_position, position)
+    store_quaternion(s.tool_quaternion, orientation)
+    return applied[0], applied[1], moved, turned
 
-    _meter_coupling(state, force, torque, moved, turned)
-    s.flags = 0
-    if not math.isfinite(dot(force, force) + dot(torque, torque) + s.environment_energy):
-        s.flags = TRIP
-        for i in range(6):
-            s.wrench_on_device[i] = 0.0
-        return BAD_RESULT
-    _render(state, force, torque)
-    contacts = ints(s.ncon, 1)[0]
-    if contacts > 0:
-        s.flags |= CONTACT
-    s.peak_force = max(s.peak_force, norm(force))
-    s.peak_torque = max(s.peak_torque, norm(torque))
 
+@compiled
+def _record(state: NDArray[np.void], row: NDArray[np.void]) -> None:
+    """Copies what the tick computed into its record."""
+    s, r = state[0], row[0]
     r.flags = s.flags
-    r.contacts = contacts
+    r.contacts = ints(s.ncon, 1)[0]
     # without islands MuJoCo counts its iterations as those of island 0
     islands = max(ints(s.nisland, 1)[0], 1)
     iterations = ints(s.solver_niter, min(islands, 20))
     r.solver_iterations = 0
     for i in range(iterations.size):
         r.solver_iterations += iterations[i]
-    _store_vector(r.tool_position, tool)
-    _store_quaternion(r.tool_quaternion, tool_orientation)
-    _store_vector(r.wrench_on_tool[0:3], force)
-    _store_vector(r.wrench_on_tool[3:6], torque)
+    store_vector(r.tool_position, vector_of(s.tool_position))
+    store_quaternion(r.tool_quaternion, quaternion_of(s.tool_quaternion))
     for i in range(6):
+        r.wrench_on_tool[i] = s.wrench_on_tool[i]
         r.wrench_on_device[i] = s.wrench_on_device[i]
     r.kinetic, r.potential = s.kinetic, s.potential
     r.coupling_work, r.actuator_work = s.coupling_work, s.actuator_work
     r.external_work = s.external_work
     r.environment_energy, r.device_energy = s.environment_energy, s.device_energy
     r.injected_damping = 0.0
+
+
+@compiled
+def after_step(state: NDArray[np.void], row: NDArray[np.void], substep: int) -> int:
+    """Meters the step that just ended; after the last substep, computes and records the wrench.
+
+    With several laws a tick the wrench is their mean: the handle moves uniformly within a tick, so
+    the mean does on it the work that the single ones did.
+
+    Returns:
+        ``OK`` or ``BAD_RESULT``; in the latter case the wrench on the device is zero.
+    """
+    s = state[0]
+    if s.scheme != DIRECT:
+        meter_ports(state)
+    is_last = substep + 1 == s.substeps
+    if s.laws == 1 and not is_last:
+        return OK
+    force, torque, moved, turned = _wrench_of_step(state, substep, is_last)
+    add_coupling_work(state, force, torque, moved, turned)
+    if s.laws > 1:
+        share = 1.0 / s.laws
+        force, torque = scaled(share, force), scaled(share, torque)
+        if substep > 0:
+            w, m = s.wrench_on_tool, s.motion
+            force = add((w[0], w[1], w[2]), force)
+            torque = add((w[3], w[4], w[5]), torque)
+            moved = add((m[0], m[1], m[2]), moved)
+            turned = add((m[3], m[4], m[5]), turned)
+        store_vector(s.motion[0:3], moved)
+        store_vector(s.motion[3:6], turned)
+    store_vector(s.wrench_on_tool[0:3], force)
+    store_vector(s.wrench_on_tool[3:6], torque)
+    if not is_last:
+        return OK
+    judge_environment(state, moved, turned)
+    s.flags = 0
+    square = dot(force, force) + dot(torque, torque)
+    # MuJoCo ignores a control beyond its limit, so a wrench that is to be applied must stay below
+    if not math.isfinite(square + s.environment_energy) or (
+        s.scheme == HELD and square > LARGEST_CONTROL * LARGEST_CONTROL
+    ):
+        s.flags = TRIP
+        for i in range(6):
+            s.wrench_on_device[i] = 0.0
+        return BAD_RESULT
+    _render(state, force, torque)
+    if ints(s.ncon, 1)[0] > 0:
+        s.flags |= CONTACT
+    s.peak_force = max(s.peak_force, norm(force))
+    s.peak_torque = max(s.peak_torque, norm(torque))
+
+    _record(state, row)
     s.tick += 1
     return OK
 
@@ -381,7 +393,7 @@ def simulate(
         for substep in range(s.substeps):
             if before_step(state, samples[k : k + 1], row, substep) != OK:
                 return k
-            mj_step(s.model, s.data)
+            advance(state)
             if after_step(state, row, substep) != OK:
                 return k
         rows[k] = row[0]

@@ -13,11 +13,12 @@ import numpy as np
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import SceneError
-from hapticbridge.kernel.state import COUPLING_ACTUATORS, HANDLE
+from hapticbridge.kernel.state import COUPLING_ACTUATORS, HANDLE, WELD_NAME
 from hapticbridge.scene.attach import attach_handle, seat_handle, set_options
 from hapticbridge.scene.checks import check_model, check_numbers, check_options, check_start
 from hapticbridge.scene.library import scene_path
 from hapticbridge.scene.source import SourceFile, collect_sources
+from hapticbridge.scene.weld import add_weld, carry_over, set_weld_gains
 
 START_KEYFRAME = "home"
 
@@ -40,6 +41,7 @@ class Scene:
     data: mujoco.MjData
     sources: tuple[SourceFile, ...]
 
+    _spec: mujoco.MjSpec | None = None
     _is_claimed: bool = False
 
     def claim(self) -> None:
@@ -97,14 +99,52 @@ class Scene:
 
     def set_coupling(self, coupling: Coupling) -> None:
         """Sets the gains of the coupling's actuators; needs no compilation."""
+        self.set_gains(
+            (coupling.damping, coupling.stiffness, coupling.damping),
+            (
+                coupling.rotational_damping,
+                coupling.rotational_stiffness,
+                coupling.rotational_damping,
+            ),
+        )
+
+    def set_gains(
+        self, force: tuple[float, float, float], torque: tuple[float, float, float]
+    ) -> None:
+        """Sets factor of the control, stiffness and damping of the coupling's actuators.
+
+        Args:
+            force: Of the three that push, in SI units per metre and metre per second.
+            torque: Of the three that turn, in SI units per rad and rad per second.
+        """
         for axis, name in enumerate(COUPLING_ACTUATORS):
-            is_rotation = axis >= 3  # forces come first in a wrench
-            stiffness = coupling.rotational_stiffness if is_rotation else coupling.stiffness
-            damping = coupling.rotational_damping if is_rotation else coupling.damping
+            gain, stiffness, damping = force if axis < 3 else torque  # forces come first
             actuator_id = self.model.actuator(name).id
-            self.model.actuator_gainprm[actuator_id, 0] = damping
+            self.model.actuator_gainprm[actuator_id, 0] = gain
             self.model.actuator_biasprm[actuator_id, 1] = -stiffness
             self.model.actuator_biasprm[actuator_id, 2] = -damping
+
+    def set_weld(self, coupling: Coupling | None) -> None:
+        """Welds the grip to the handle with K and B as ``solref``, or (None) takes the weld off.
+
+        A weld changes the model's size, so ``model`` and ``data`` become new ones; what was changed
+        in the old model is carried over. Without a weld before and after, nothing changes.
+
+        Raises:
+            SceneError: The scene was not made by ``load_scene``, or has a constraint of that name.
+        """
+        has_weld = mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_EQUALITY, WELD_NAME) >= 0
+        if has_weld != (coupling is not None):
+            if self._spec is None:
+                raise SceneError("only a scene from load_scene can be welded to its handle")
+            spec = self._spec.copy()
+            if coupling is not None:
+                add_weld(spec, self.grip)
+            model = _compiled(spec, self.sources)
+            carry_over(self.model, model)
+            self.model, self.data = model, mujoco.MjData(model)
+        if coupling is not None:
+            set_weld_gains(self.model, coupling)
 
 
 def load_scene(path_or_name: str | Path, grip: str = "grip") -> Scene:
@@ -137,7 +177,7 @@ def load_scene(path_or_name: str | Path, grip: str = "grip") -> Scene:
         model = _compiled(spec, sources)
         concerns += check_model(model, grip)
         seat_handle(model, grip)
-        scene = Scene(path, grip, model, mujoco.MjData(model), sources)
+        scene = Scene(path, grip, model, mujoco.MjData(model), sources, spec)
         scene.reset()
     except (ValueError, OSError, MemoryError, mujoco.FatalError) as error:
         raise SceneError(f"cannot compile scene '{path}': {_sentence(error)}") from None

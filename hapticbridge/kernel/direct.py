@@ -1,0 +1,136 @@
+"""A massless rigid tool that is where the handle is, and is pushed back by contact springs.
+
+Per contact, frictionless:  F = K_c p n,  V = ½ K_c p²
+
+with p the penetration in m, n the contact's normal, K_c the contact stiffness in N/m. The tool has
+no mass, so the wrench of the hand on it is minus the sum of the contacts' wrenches.
+"""
+
+from __future__ import annotations
+
+import math
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticbridge.jit import compiled
+from hapticbridge.kernel.native import floats, ints, pointer_at
+from hapticbridge.pose import (
+    Quaternion,
+    Vector,
+    add,
+    conjugate,
+    cross,
+    dot,
+    product,
+    quaternion_exp,
+    rotated,
+    scaled,
+    subtract,
+)
+
+FREE_TOOL = 7
+PLANAR_TOOL = 22
+"""How many numbers ``tool_map`` returns for a tool of either kind."""
+
+
+def tool_map(model: mujoco.MjModel, site_id: int) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+    """Returns what ``place_tool`` needs to know of the tool, and where its coordinates lie.
+
+    A tool on a free joint: the grip's position in the body (3) and its orientation there (4). A
+    planar one, on two slides and then a hinge: the axes of the slides (6) and of the hinge (3), the
+    hinge's anchor (3), the grip's position (3) and orientation (4) in the world at ``qpos0``, and
+    ``qpos0`` of the three joints (3).
+
+    Args:
+        model: A scene that ``scene.checks.check_direct`` accepts.
+        site_id: The grip.
+    """
+    body_id = int(model.site_bodyid[site_id])
+    first, count = int(model.body_jntadr[body_id]), int(model.body_jntnum[body_id])
+    addresses = np.ascontiguousarray(model.jnt_qposadr[first : first + count], dtype=np.int32)
+    if count == 1:
+        frame = np.concatenate([model.site_pos[site_id], model.site_quat[site_id]])
+        return np.ascontiguousarray(frame), addresses
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    numbers = [
+        data.xaxis[first : first + 3].ravel(),
+        data.xanchor[first + 2],
+        data.site_xpos[site_id],
+        data.site_xquat[site_id],
+        model.qpos0[addresses],
+    ]
+    return np.ascontiguousarray(np.concatenate(numbers)), addresses
+
+
+@compiled
+def _triple(values: NDArray[np.float64], first: int) -> Vector:
+    return values[first], values[first + 1], values[first + 2]
+
+
+@compiled
+def _quadruple(values: NDArray[np.float64], first: int) -> Quaternion:
+    return values[first], values[first + 1], values[first + 2], values[first + 3]
+
+
+@compiled
+def place_tool(state: NDArray[np.void]) -> None:
+    """Writes the tool's coordinates so that the grip is at the handle.
+
+    A planar tool follows as far as its joints let it: by the part of the handle's turn about the
+    hinge, and by the part of its motion along the slides.
+    """
+    s = state[0]
+    handle = _triple(s.handle_position, 0)
+    orientation = _quadruple(s.handle_quaternion, 0)
+    numbers = floats(s.tool_map, s.tool_map_size)
+    addresses = ints(s.tool_qpos, 3)
+    if s.tool_map_size == FREE_TOOL:
+        body = product(orientation, conjugate(_quadruple(numbers, 3)))
+        position = subtract(handle, rotated(body, _triple(numbers, 0)))
+        qpos = floats(s.qpos + 8 * addresses[0], 7)
+        qpos[0], qpos[1], qpos[2] = position
+        qpos[3], qpos[4], qpos[5], qpos[6] = body
+        return
+    axis, anchor, grip = _triple(numbers, 6), _triple(numbers, 9), _triple(numbers, 12)
+    turn = product(orientation, conjugate(_quadruple(numbers, 15)))
+    angle = 2.0 * math.atan2(dot((turn[1], turn[2], turn[3]), axis), turn[0])
+    angle = math.atan2(math.sin(angle), math.cos(angle))
+    swung = rotated(quaternion_exp(scaled(angle, axis)), subtract(grip, anchor))
+    left = subtract(handle, add(anchor, swung))
+    for joint in range(2):
+        slide = dot(_triple(numbers, 3 * joint), left)
+        floats(s.qpos + 8 * addresses[joint], 1)[0] = numbers[19 + joint] + slide
+    floats(s.qpos + 8 * addresses[2], 1)[0] = numbers[21] + angle
+
+
+@compiled
+def balance_contacts(state: NDArray[np.void]) -> tuple[Vector, Vector]:
+    """Returns the wrench that balances the contacts on the tool, about the grip; sets the energies.
+
+    The energies are those of the springs; a tool without mass has no kinetic one.
+    """
+    s = state[0]
+    grip = _triple(floats(s.site_xpos + 24 * s.grip_site_id, 3), 0)
+    is_tool = ints(s.geom_is_tool, s.ngeom)
+    force, torque = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
+    energy = 0.0
+    for c in range(ints(s.ncon, 1)[0]):
+        contact = pointer_at(s.contact) + c * s.contact_size
+        depth = -floats(contact + s.contact_distance, 1)[0]
+        geoms = ints(contact + s.contact_geoms, 2)
+        if depth <= 0.0 or geoms[0] < 0 or geoms[1] < 0:
+            continue
+        side = is_tool[geoms[1]] - is_tool[geoms[0]]
+        if side == 0:
+            continue
+        # the normal points from the first geom to the second
+        normal = _triple(floats(contact + s.contact_frame, 3), 0)
+        push = scaled(side * s.contact_stiffness * depth, normal)
+        arm = subtract(_triple(floats(contact + s.contact_point, 3), 0), grip)
+        force, torque = subtract(force, push), subtract(torque, cross(arm, push))
+        energy += 0.5 * s.contact_stiffness * depth * depth
+    s.kinetic, s.potential = 0.0, energy
+    return force, torque

@@ -1,0 +1,175 @@
+"""Everything beside scene and device motion that decides what a run computes."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from hapticbridge.coupling import Coupling
+from hapticbridge.errors import HapticBridgeError
+from hapticbridge.kernel.step import COUPLED, DIRECT, HELD, WELD
+
+SLACK_SHARE = 0.5
+"""Share of ½‖δx_i‖²_{K + nB/T} that counts as slack where n > 1 laws are computed in a tick; no
+unit. A larger one needs more device damping (infinite at 1 and B = 0), a smaller one calls an
+environment active sooner."""
+
+MOST_SUBSTEPS = 100
+"""MuJoCo steps per tick at most; more would not fit into any period that can be felt."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RunParameters:
+    """Everything beside scene and device motion that decides what a run computes.
+
+    Attributes:
+        grip: Name of the site on the tool.
+        period: T in s.
+        substeps: MuJoCo steps per tick, >= 1.
+        coupling: K and B.
+        scale: Handle motion per device motion, without unit.
+        force_scale: Force on the device per force on the tool, without unit. Power is equal on both
+            sides where it equals ``scale``; torques return by force_scale / scale.
+        axes: Row-major rotation from the device's frame to the scene's.
+        force_limit: Largest force norm on the device in N.
+        torque_limit: Largest torque norm on the device in N m.
+        ramp_ticks: Ticks over which the wrench on the device rises to its full value.
+        device_origin: Device pose (x, y, z, qw, qx, qy, qz) that maps to ``handle_origin``.
+        handle_origin: Handle pose of the same form, in the scene.
+        device_start: Device pose of the same form before the first tick.
+        scheme: How the wrench reaches the tool, one of ``kernel.step``'s four.
+        felt: The coupling that the tool is really held by, where it is not ``coupling`` (a weld);
+            the slack is counted with it.
+        contact_stiffness: K_c in N/m per contact of a tool without mass, > 0 for it, else 0.
+        device_damping: b of the device in N s/m, None where unknown. Where no coupling law leaves
+            a slack, what the device was given is held against what this damping burns.
+        device_rotational_damping: In N m s/rad, None where unknown.
+
+    Raises:
+        HapticBridgeError: A value is out of range.
+    """
+
+    grip: str
+    period: float
+    substeps: int
+    coupling: Coupling
+    scale: float = 1.0
+    force_scale: float = 1.0
+    axes: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+    force_limit: float
+    torque_limit: float
+    ramp_ticks: int
+    device_origin: tuple[float, ...]
+    handle_origin: tuple[float, ...]
+    device_start: tuple[float, ...]
+    scheme: int = COUPLED
+    felt: Coupling | None = None
+    contact_stiffness: float = 0.0
+    device_damping: float | None = None
+    device_rotational_damping: float | None = None
+
+    def __post_init__(self) -> None:
+        positive = ("period", "substeps", "scale", "force_scale", "force_limit", "torque_limit")
+        for name in positive:
+            value = getattr(self, name)
+            if not math.isfinite(value) or value <= 0:
+                raise HapticBridgeError(f"{name} is {value!r}; it must be finite and > 0")
+        if self.scheme not in (COUPLED, HELD, WELD, DIRECT):
+            raise HapticBridgeError(f"scheme is {self.scheme!r}; it must be 0 to 3")
+        stiffness = self.contact_stiffness
+        if (
+            not math.isfinite(stiffness)
+            or stiffness < 0
+            or (stiffness > 0) != (self.scheme == DIRECT)
+        ):
+            raise HapticBridgeError(
+                f"contact stiffness is {stiffness!r} N/m; it must be finite and > 0 for a tool "
+                "without mass, and has no meaning for another"
+            )
+        if self.scheme == DIRECT and self.substeps != 1:
+            raise HapticBridgeError(
+                f"substeps is {self.substeps!r}; a tool without mass has no motion to divide, so "
+                "it must be 1"
+            )
+        if self.ramp_ticks < 0:
+            raise HapticBridgeError(f"ramp_ticks is {self.ramp_ticks}; it must be >= 0")
+        for name in ("device_origin", "handle_origin", "device_start"):
+            pose = getattr(self, name)
+            if len(pose) != 7 or not all(math.isfinite(value) for value in pose):
+                raise HapticBridgeError(f"{name} is {pose!r}; it must be 7 finite numbers")
+            if abs(math.hypot(*pose[3:]) - 1) > 1e-9:
+                raise HapticBridgeError(f"{name} is {pose!r}; its quaternion must have norm 1")
+        if not isinstance(self.substeps, int) or self.substeps > MOST_SUBSTEPS:
+            raise HapticBridgeError(
+                f"substeps is {self.substeps!r}; it must be a whole number, 1 to {MOST_SUBSTEPS}"
+            )
+        rotation = np.asarray(self.axes, dtype=np.float64)
+        if rotation.shape != (9,) or not (
+            np.allclose(rotation.reshape(3, 3) @ rotation.reshape(3, 3).T, np.eye(3), atol=1e-12)
+            and np.linalg.det(rotation.reshape(3, 3)) > 0
+        ):
+            raise HapticBridgeError(
+                f"axes is {self.axes!r}; it must be the 9 numbers of a right-handed rotation "
+                "matrix, row by row"
+            )
+
+    @property
+    def laws(self) -> int:
+        """How often per tick the wrench on the tool is computed."""
+        return 1 if self.scheme == HELD else self.substeps
+
+    @property
+    def has_law(self) -> bool:
+        """Whether the coupling law gives the wrench."""
+        return self.scheme in (COUPLED, HELD)
+
+    def slack_gains(self) -> tuple[float, float]:
+        """Returns gain g in N/m and its rotational counterpart in N m/rad: slack = Σ ½ g ‖δx_k‖².
+
+        g = K + B/T with one law a tick, half of K/n + B/T with n > 1; zero for a tool without mass,
+        which has no coupling. With several laws a tick, ½‖δx_i‖²_{K + nB/T} per law would be
+        affordable at no device damping where B = 0; half of it is (``certificate.needed_damping``),
+        and of the motions δx_i the records only tell their sum, over which uniform motion is least.
+        """
+        if self.scheme == DIRECT:
+            return 0.0, 0.0
+        coupling = self.felt or self.coupling
+        share = 1.0 if self.laws == 1 else SLACK_SHARE
+        return (
+            share * (coupling.stiffness / self.laws + coupling.damping / self.period),
+            share
+            * (
+                coupling.rotational_stiffness / self.laws
+                + coupling.rotational_damping / self.period
+            ),
+        )
+
+
+def rotation_numbers(matrix: ArrayLike) -> tuple[float, ...]:
+    """Returns the 9 numbers, row by row, of the rotation nearest to a matrix.
+
+    Axes are written with few digits (0.707107); the polar factor makes them a rotation to the last
+    one, so that positions, orientations and forces turn by the same.
+
+    Args:
+        matrix: 3 × 3, or 9 numbers; orthogonal to 1e-5 and right-handed.
+
+    Raises:
+        HapticBridgeError: It is not.
+    """
+    try:
+        given = np.asarray(matrix, dtype=np.float64)
+    except (TypeError, ValueError):
+        given = np.zeros(0)
+    if given.size == 9 and np.all(np.isfinite(given)):
+        square = given.reshape(3, 3)
+        if np.abs(square @ square.T - np.eye(3)).max() < 1e-5 and np.linalg.det(square) > 0:
+            left, _, right = np.linalg.svd(square)
+            return tuple((left @ right).ravel().tolist())
+    raise HapticBridgeError(
+        f"axes is {matrix!r}; it must be the 9 numbers of a right-handed rotation matrix, "
+        "row by row"
+    )

@@ -1,0 +1,160 @@
+"""A weld between grip and handle, as MuJoCo's equality constraint, and how stiff it truly is."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticbridge.coupling import Coupling
+from hapticbridge.errors import SceneError
+from hapticbridge.kernel.state import HANDLE, WELD_NAME
+
+IMPEDANCE = 0.95
+"""d of the weld, without unit, the same at every displacement (MuJoCo's default reaches 0.95 at
+1 mm). The true stiffness is mass times K/(1 − d): nearer to 1 the weld is stiffer."""
+
+PROBE = 1e-6
+"""Displacement in m, angle in rad and velocity in m/s and rad/s by which the weld is measured: the
+constraint is linear in them as long as the angle's sine is the angle."""
+
+_NOT_CARRIED = ("eq_", "name", "text", "tuple", "paths")
+
+
+def add_weld(spec: mujoco.MjSpec, grip: str) -> None:
+    """Adds the equality constraint between the sites of grip and handle.
+
+    Raises:
+        SceneError: The scene has one of that name.
+    """
+    if WELD_NAME in [equality.name for equality in spec.equalities]:
+        raise SceneError(
+            f"the scene already has equality constraint '{WELD_NAME}', a name that the bridge "
+            "adds; rename yours"
+        )
+    equality = spec.add_equality(name=WELD_NAME)
+    equality.type = mujoco.mjtEq.mjEQ_WELD
+    equality.objtype = mujoco.mjtObj.mjOBJ_SITE
+    equality.name1, equality.name2 = grip, HANDLE
+    equality.active = True
+    data = np.zeros(len(equality.data))
+    data[6] = data[10] = 1.0  # no rotation between the sites, torque scale 1
+    equality.data = data
+
+
+def set_weld_gains(model: mujoco.MjModel, coupling: Coupling) -> None:
+    """Gives K and B to the weld as its direct ``solref``, one pair for all six axes."""
+    weld_id = model.equality(WELD_NAME).id
+    model.eq_solref[weld_id] = -coupling.stiffness, -coupling.damping
+    model.eq_solimp[weld_id] = IMPEDANCE, IMPEDANCE, 1e-3, 0.5, 2.0
+
+
+def check_weldable(model: mujoco.MjModel, grip: str) -> None:
+    """Refuses a tool that cannot move along and about all axes.
+
+    A row of the weld whose axis the joints block has no inertia to give way: MuJoCo makes it rigid
+    (1e18 N/m), and its force, which moves nothing, would be what the hand feels.
+
+    Raises:
+        SceneError: Says how many directions the joints leave.
+    """
+    data = mujoco.MjData(model)
+    _seat(model, data, grip)
+    jacobian = np.zeros((6, model.nv))
+    mujoco.mj_jacSite(model, data, jacobian[:3], jacobian[3:], model.site(grip).id)
+    free = np.linalg.matrix_rank(jacobian)
+    if free < 6:
+        raise SceneError(
+            "a weld needs a tool that can move along and about all three axes; the joints of grip "
+            f"'{grip}' leave it {free} of 6, and the weld would be rigid along the others"
+        )
+
+
+def carry_over(old: mujoco.MjModel, new: mujoco.MjModel) -> None:
+    """Copies everything from a model to one that differs by equality constraints alone.
+
+    What was changed after loading (masses, contact parameters) would be lost in a compilation.
+    """
+    for name in dir(old):
+        if name.startswith(("_", *_NOT_CARRIED)):
+            continue
+        value = getattr(old, name)
+        if isinstance(value, np.ndarray) and value.shape == getattr(new, name).shape:
+            getattr(new, name)[...] = value
+    for name in dir(old.opt):
+        if name.startswith("_"):
+            continue
+        value = getattr(old.opt, name)
+        if isinstance(value, np.ndarray):
+            getattr(new.opt, name)[...] = value
+        elif not callable(value):
+            setattr(new.opt, name, value)
+
+
+def measured_weld(model: mujoco.MjModel, grip: str) -> Coupling:
+    """Returns the stiffness and damping that a weld truly has at the scene's start, by MuJoCo.
+
+    With the tool held still, the constraint's force is λ = D a_ref, where D = d/((1 − d) A), A the
+    inverse inertia that the row sees, and a_ref = −b v − k r with direct solref k = K/d, b = B/d.
+    Static stiffness m K/(1 − d) and damping m B/(1 − d) follow, m = 1/A: mass for translation
+    through the centre of mass, inertia for rotation, less for a grip off centre. Where they differ
+    between axes, the largest is returned: that is the one the device must bear.
+
+    Args:
+        model: A scene that ``check_weldable`` accepts, with the weld, its gains set.
+        grip: Name of the site on the tool.
+
+    References:
+        MuJoCo documentation, "Computation", section "Constraint model".
+    """
+    data = mujoco.MjData(model)
+    stiffness, damping = np.zeros(6), np.zeros(6)
+    handle = model.body_mocapid[model.body(HANDLE).id]
+    for axis in range(6):
+        _seat(model, data, grip)
+        jacobian = np.zeros((6, model.nv))
+        site_id = model.site(grip).id
+        mujoco.mj_jacSite(model, data, jacobian[:3], jacobian[3:], site_id)
+        unit = np.eye(6)[axis]
+        data.qvel[:] = PROBE * np.linalg.pinv(jacobian) @ unit
+        damping[axis] = _static_force(model, data, axis) / PROBE
+        data.qvel[:] = 0.0
+        data.mocap_pos[handle] -= PROBE * unit[:3]
+        turned = np.zeros(4)
+        mujoco.mju_axisAngle2Quat(turned, unit[3:], -PROBE if axis >= 3 else 0.0)
+        orientation = data.mocap_quat[handle].copy()
+        mujoco.mju_mulQuat(data.mocap_quat[handle], turned, orientation)
+        stiffness[axis] = _static_force(model, data, axis) / PROBE
+    return Coupling(
+        stiffness=float(stiffness[:3].max()),
+        damping=max(float(damping[:3].max()), 0.0),
+        rotational_stiffness=max(float(stiffness[3:].max()), 0.0),
+        rotational_damping=max(float(damping[3:].max()), 0.0),
+    )
+
+
+def _seat(model: mujoco.MjModel, data: mujoco.MjData, grip: str) -> None:
+    key = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_KEY, "home")
+    if key >= 0:
+        mujoco.mj_resetDataKeyframe(model, data, key)
+    else:
+        mujoco.mj_resetData(model, data)
+    data.qvel[:] = 0.0
+    mujoco.mj_kinematics(model, data)
+    handle = model.body_mocapid[model.body(HANDLE).id]
+    data.mocap_pos[handle] = data.site(grip).xpos
+    data.mocap_quat[handle] = data.site_xquat[model.site(grip).id]
+    mujoco.mj_forward(model, data)
+
+
+def _static_force(model: mujoco.MjModel, data: mujoco.MjData, axis: int) -> float:
+    """The weld's force against a displacement or velocity along an axis, the tool held still."""
+    mujoco.mj_forward(model, data)
+    weld_id = model.equality(WELD_NAME).id
+    is_weld = (data.efc_type[: data.ne] == mujoco.mjtConstraint.mjCNSTR_EQUALITY) & (
+        data.efc_id[: data.ne] == weld_id
+    )
+    rows: NDArray[np.intp] = np.flatnonzero(is_weld)
+    force = -(data.efc_D[rows] * data.efc_aref[rows])[axis]
+    # a row of rotation is half an angle, in force as in displacement
+    return float(0.5 * force if axis >= 3 else force)

@@ -1,0 +1,159 @@
+"""Rigs that show what a rendering method does: one free mass, a light rotor between walls."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from kernel_runs import IDENTITY, Array, Run, T, load, run_of, samples_of
+from numpy.typing import NDArray
+
+from hapticbridge.coupling import Coupling
+from hapticbridge.device import DeviceInfo
+from hapticbridge.kernel.state import Binding, RunParameters
+from hapticbridge.kernel.step import simulate
+from hapticbridge.rendering import contact_stiffness_of, method_named, prepare
+from hapticbridge.scene import Scene
+from hapticbridge.tick import SAMPLE_DTYPE, TICK_DTYPE
+
+FREE_MASS = """
+<mujoco>
+  <option gravity="0 0 0"/>
+  <worldbody>
+    <body name="tool"><freejoint/>
+      <geom type="sphere" size="0.01" mass="{mass}" contype="0" conaffinity="0"/>
+      <site name="grip"/>
+    </body>
+  </worldbody>
+</mujoco>"""
+
+FIFTY_GRAMS = FREE_MASS.format(mass=0.05)
+
+SLOT = """
+<mujoco>
+  <compiler angle="radian"/>
+  <option gravity="0 0 0" cone="elliptic"/>
+  <default><geom solref="0.002 1" solimp="0.9 0.95 0.001" friction="0 0 0"/></default>
+  <worldbody>
+    <geom name="east" type="box" size="0.01 0.05 0.6" pos="0.015 0 0"/>
+    <geom name="west" type="box" size="0.01 0.05 0.6" pos="-0.015 0 0"/>
+    <body name="bar">
+      <joint type="slide" axis="1 0 0"/><joint type="slide" axis="0 0 1"/>
+      <joint type="hinge" axis="0 1 0"/>
+      <geom type="sphere" size="0.005" pos="0 0 {half}" mass="0.05"/>
+      <geom type="sphere" size="0.005" pos="0 0 -{half}" mass="0.05"/>
+      <site name="grip"/>
+    </body>
+  </worldbody>
+</mujoco>"""
+"""A planar bar whose two ends just touch both walls: turned either way, each end presses on one."""
+
+
+def rendered(
+    method: str,
+    coupling: Coupling,
+    samples: NDArray[np.void],
+    scene: Scene | str = FIFTY_GRAMS,
+    *,
+    contact_stiffness: float | None = None,
+    substeps: int = 1,
+    **changes: Any,
+) -> Run:
+    """Runs a method inside the compiled kernel, without force limits."""
+    scene = load(scene) if isinstance(scene, str) else scene
+    chosen = method_named(method)
+    felt = prepare(scene, coupling, T, substeps, chosen)
+    parameters = RunParameters(
+        grip=scene.grip,
+        period=T,
+        substeps=substeps,
+        coupling=coupling,
+        force_limit=1e9,
+        torque_limit=1e9,
+        ramp_ticks=0,
+        device_origin=IDENTITY,
+        handle_origin=scene.grip_pose(),
+        device_start=IDENTITY,
+        scheme=chosen.scheme,
+        felt=felt,
+        contact_stiffness=contact_stiffness_of(chosen, coupling, contact_stiffness),
+        **changes,
+    )
+    binding = Binding(scene.model, scene.data, parameters)
+    run = run_of(scene, binding, parameters)
+    rows = np.zeros(len(samples), TICK_DTYPE)
+    done = simulate(binding.state, samples, binding.row, rows)
+    run.ticks = rows[:done]
+    return run
+
+
+def sway(count: int = 2000, amplitude: float = 0.02, frequency: float = 3.0) -> NDArray[np.void]:
+    """Returns samples of a hand that moves along x alone."""
+    motion: Array = np.zeros((count, 3))
+    motion[:, 0] = amplitude * np.sin(2 * np.pi * frequency * T * np.arange(1, count + 1))
+    return samples_of(motion)
+
+
+class Rotor:
+    """A free device that only turns about y: I θ̈ = τ − b θ̇, exact under the hold, flicked once.
+
+    Args:
+        damping: b in N m s/rad.
+        inertia: I in kg m²; light, so that the damping alone limits the stiffness.
+        flick: Angular velocity at the start in rad/s.
+        is_real: What its data sheet claims.
+    """
+
+    def __init__(
+        self,
+        damping: float = 2e-3,
+        inertia: float = 1e-7,
+        flick: float = 0.02,
+        *,
+        is_real: bool = False,
+    ) -> None:
+        self.info = DeviceInfo(
+            name="rotor",
+            degrees_of_freedom=6,
+            mass=0.1,
+            damping=50.0,
+            rotational_inertia=inertia,
+            rotational_damping=damping,
+            friction=None,
+            resolution=None,
+            force_limit=100.0,
+            torque_limit=10.0,
+            speed_limit=5.0,
+            rate=None,
+            is_prescribed=False,
+            is_real=is_real,
+            duration=None,
+        )
+        self.writes: list[Array] = []
+        self._flick = flick
+        self._torque = 0.0
+
+    def start(self, period: float) -> NDArray[np.void]:
+        self._angle, self._speed = 0.0, self._flick
+        self._period = period
+        sample = np.zeros(1, SAMPLE_DTYPE)
+        sample["quaternion"][0, 0] = 1.0
+        return sample
+
+    def read(self, sample: NDArray[np.void]) -> None:
+        damping, inertia = self.info.rotational_damping or 0.0, self.info.rotational_inertia or 1.0
+        rate = damping / inertia
+        steady = self._torque / damping
+        decay = np.exp(-rate * self._period)
+        self._angle += steady * self._period + (self._speed - steady) * (1 - decay) / rate
+        self._speed = steady + (self._speed - steady) * decay
+        sample["position"] = 0.0
+        half = 0.5 * self._angle
+        sample["quaternion"][0] = np.cos(half), 0.0, np.sin(half), 0.0
+
+    def write(self, wrench: NDArray[np.float64]) -> None:
+        self.writes.append(wrench.copy())
+        self._torque = float(wrench[4])
+
+    def close(self) -> None:
+        pass

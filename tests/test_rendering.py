@@ -1,0 +1,612 @@
+"""Every method renders, is metered, recorded and audited alike, and fails where it must."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+from audit_cases import ScriptedDevice, recorded, rewritten
+from kernel_runs import T, live, load, samples_of, sines, wrench_law
+from rendering_runs import FREE_MASS, SLOT, Rotor, rendered, sway
+from scipy.spatial.transform import Rotation
+
+from hapticbridge.audit import audit
+from hapticbridge.bridge import Bridge
+from hapticbridge.certificate import needed_damping
+from hapticbridge.clock import SimulatedClock
+from hapticbridge.coupling import Coupling
+from hapticbridge.device import DeviceInfo
+from hapticbridge.errors import CouplingError, DeviceError, HapticBridgeError, SceneError
+from hapticbridge.guard import Limits
+from hapticbridge.kernel.state import Binding, RunParameters
+from hapticbridge.kernel.step import OK, after_step, before_step
+from hapticbridge.recording import read_recording
+from hapticbridge.rendering import IMPLICIT, METHODS, method_named, prepare
+from hapticbridge.scene import load_scene
+
+COUPLING = Coupling(2000.0, 2.0, 2.0, 2e-3)
+FREE = Limits(force=100.0, torque=10.0, ramp=0.0)
+OTHERS = [name for name in METHODS if name != IMPLICIT.name]
+FREE_TOOL = [name for name in METHODS if name != "direct"]
+
+TURNED_TOOL = """
+<mujoco>
+  <option gravity="0 0 0"/>
+  <worldbody>
+    <body name="tool" euler="10 20 30"><freejoint/>
+      <geom type="box" size="0.01 0.02 0.03" mass="0.1" contype="0" conaffinity="0"/>
+      <site name="grip" pos="0.02 0.01 0" euler="40 0 10"/>
+    </body>
+  </worldbody>
+</mujoco>"""
+
+SERVO = """
+<mujoco>
+  <option gravity="0 0 0"/>
+  <worldbody>
+    <body name="tool"><freejoint/><geom size="0.01" mass="0.1"/><site name="grip"/></body>
+    <body name="arm" pos="0.2 0 0" gravcomp="{gravcomp}"><joint name="arm" type="slide"/>
+      <geom size="0.01" mass="0.2"/></body>
+    <body name="plate" mocap="{mocap}" pos="0 0 1"/>
+  </worldbody>
+  <actuator>{actuator}</actuator>
+</mujoco>"""
+
+
+def waved(count: int = 300) -> Any:
+    """A hand that moves and turns about all axes."""
+    return samples_of(sines(count, 0.02, 3.0), Rotation.from_rotvec(sines(count, 0.3, 2.0)))
+
+
+# --- one interface
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_every_method_is_recorded_and_simulated_again_bit_for_bit(
+    name: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "run.mcap"
+    scene = "peg_in_hole" if name != "weld" else "point_mass"
+    summary = recorded(path, scene, "simulated", duration=0.4, method=name)
+    report, meta = audit(path), read_recording(path).meta
+    assert report.resimulation == "bit for bit"
+    assert meta["method"] == summary.method == name
+    assert (report.verdict, report.environment) == (summary.verdict, summary.environment)
+    assert report.certified == summary.is_certified
+    assert report.conditions == summary.conditions
+
+
+@pytest.mark.parametrize("name", METHODS)
+@pytest.mark.parametrize("substeps", [1, 3])
+def test_compiled_advance_equals_the_python_binding(name: str, substeps: int) -> None:
+    if name == "direct" and substeps > 1:
+        pytest.skip("a tool without mass has no substeps")
+    samples, method = waved(150), method_named(name)
+    run = rendered(name, COUPLING, samples, TURNED_TOOL, substeps=substeps)
+    scene = load(TURNED_TOOL)
+    prepare(scene, COUPLING, T, substeps, method)
+    binding = Binding(scene.model, scene.data, run.parameters)
+    for k in range(len(samples)):
+        for substep in range(substeps):
+            assert before_step(binding.state, samples[k : k + 1], binding.row, substep) == OK
+            method.step(scene.model, scene.data)
+            assert after_step(binding.state, binding.row, substep) == OK
+        assert binding.row[0].tobytes() == run.ticks[k].tobytes()
+
+
+def test_prepare_without_a_method_is_the_default_one() -> None:
+    samples = waved()
+    run = rendered("implicit", COUPLING, samples, TURNED_TOOL)
+    assert run.ticks.tobytes() == live(TURNED_TOOL, samples, COUPLING).ticks.tobytes()
+
+
+@pytest.mark.parametrize(
+    "name",
+    [n for n in METHODS if METHODS[n].has_law and METHODS[n].scheme == IMPLICIT.scheme]
+    + ["explicit", "explicit:implicitfast", "explicit:rk4"],
+)
+def test_wrench_is_the_coupling_law_at_the_recorded_poses(name: str) -> None:
+    run = rendered(name, COUPLING, waved(), TURNED_TOOL)
+    scale = np.abs(run.ticks["wrench_on_tool"]).max()
+    assert run.ticks["wrench_on_tool"] == pytest.approx(wrench_law(run), abs=1e-11 * scale)
+
+
+def test_unknown_method_lists_those_that_exist() -> None:
+    with pytest.raises(SceneError, match=r"'direct', 'explicit', 'explicit:implicitfast'"):
+        method_named("impedance")
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_on_a_real_device_only_implicit_goes_unasked(name: str) -> None:
+    with pytest.raises(DeviceError, match="--i-know") as caught:
+        Bridge("point_mass", Rotor(is_real=True), COUPLING, method=name)
+    assert METHODS[name].hazard in str(caught.value)
+    Bridge("point_mass", Rotor(is_real=True), COUPLING, method=name, i_know=True)
+    Bridge("point_mass", Rotor(is_real=True), COUPLING)
+
+
+# --- what each integrator creates
+
+
+def test_created_energies_of_one_free_mass_are_those_of_the_theory() -> None:
+    """K = 2000, B = 2, 50 g, 3 Hz for 2 s: none, 0.29 J for actuators that miss the position."""
+    samples = sway()
+    for name in ("implicit", "implicitfast:compensated"):
+        run = rendered(name, COUPLING, samples)
+        assert run.ticks["environment_energy"].max() <= 0
+        assert run.ledger.environment == "strict"
+    run = rendered("implicitfast", COUPLING, samples)
+    assert run.ticks["environment_energy"].max() == pytest.approx(0.29, abs=0.005)
+    assert run.ledger.environment != "strict"
+
+
+def test_compensated_implicitfast_is_implicit_away_from_contact() -> None:
+    samples = sway(500)
+    implicit = rendered("implicit", COUPLING, samples)
+    compensated = rendered("implicitfast:compensated", COUPLING, samples)
+    plain = rendered("implicitfast", COUPLING, samples)
+    expected = implicit.ticks["tool_position"]
+    assert compensated.ticks["tool_position"] == pytest.approx(expected, abs=1e-14)
+    assert np.abs(plain.ticks["tool_position"] - expected).max() > 1e-4
+
+
+@pytest.mark.parametrize("mass", [0.02, 0.05, 1.0])
+def test_held_force_creates_half_m_dv_squared_a_step(mass: float) -> None:
+    """Σ E_k = Σ_{i<k} T² f_i²/(2 m) − f_k·δx_k: the last wrench has not acted yet."""
+    run = rendered("explicit", COUPLING, sway(500), FREE_MASS.format(mass=mass))
+    force = run.ticks["wrench_on_tool"][:, 0]
+    created = np.concatenate([[0.0], np.cumsum((T * force) ** 2 / (2 * mass))[:-1]])
+    expected = created - force * run.tool_steps()[:, 0]
+    assert run.ticks["environment_energy"] == pytest.approx(
+        expected, abs=1e-12 * np.abs(expected).max() + 1e-13
+    )
+    velocity = run.tool_steps()[:, 0] / T
+    assert mass * np.diff(velocity) == pytest.approx(T * force[:-1], abs=1e-11)
+
+
+def test_held_force_under_rk4_is_the_exact_hold() -> None:
+    run = rendered("explicit:rk4", COUPLING, sway(500))
+    force, steps = run.ticks["wrench_on_tool"][:, 0], run.tool_steps()[:, 0]
+    # x_{k+1} − 2 x_k + x_{k−1} = T² (f_k + f_{k−1}) / (2 m)
+    expected = T**2 * (force[1:-1] + force[:-2]) / (2 * 0.05)
+    assert np.diff(steps)[1:] == pytest.approx(expected, abs=1e-14)
+
+
+@pytest.mark.parametrize("name", ["explicit", "explicit:implicitfast", "explicit:rk4"])
+def test_held_force_diverges_on_a_light_tool_where_implicit_is_strict(name: str) -> None:
+    """Under Euler below m = (T/2)(KT/2 + B) = 1.5 g."""
+    light = FREE_MASS.format(mass=0.001)
+    failed = rendered(name, COUPLING, sway(300), light)
+    assert len(failed.ticks) < 300  # stopped as no longer finite
+    fault = failed.ledger.fault
+    assert fault is not None
+    assert fault[1] == "environment"
+    safe = rendered("implicit", COUPLING, sway(300), light)
+    assert safe.ledger.environment == "strict"
+
+
+@pytest.mark.parametrize(("mass", "is_bounded"), [(0.00140, False), (0.00165, True)])
+def test_held_force_needs_the_mass_that_the_theory_says(mass: float, is_bounded: bool) -> None:
+    run = rendered("explicit", COUPLING, sway(2000), FREE_MASS.format(mass=mass))
+    assert (len(run.ticks) == 2000) == is_bounded
+
+
+@pytest.mark.parametrize(
+    ("name", "mass"),
+    [
+        ("implicitfast", 0.002),
+        ("explicit", 0.0006),
+        ("explicit:implicitfast", 0.0006),
+        ("explicit:rk4", 0.004),
+    ],
+)
+def test_meter_and_audit_name_the_tick_at_which_energy_was_created(
+    name: str, mass: float, tmp_path: Path
+) -> None:
+    loose = Coupling(2000.0, 0.0, 2.0, 0.0)
+
+    def swing(tick: int) -> tuple[float, ...]:
+        return (0.02 * math.sin(0.02 * tick), 0, 0, 1, 0, 0, 0)
+
+    scene = tmp_path / "light.xml"
+    scene.write_text(FREE_MASS.format(mass=mass))
+    reports = {}
+    for method in (name, "implicit"):
+        path = tmp_path / f"{method.replace(':', '_')}.mcap"
+        device = ScriptedDevice(swing, strength=200.0)
+        summary = recorded(path, scene, device, loose, duration=0.2, method=method, limits=FREE)
+        reports[method] = audit(path)
+        found = (reports[method].tick, reports[method].port)
+        assert found == (summary.fault or (None, ""))
+        assert reports[method].resimulation == "bit for bit"
+    assert reports[name].verdict == "active"
+    assert reports[name].port == "environment"
+    assert f"tick {reports[name].tick}" in reports[name].reason
+    assert (reports["implicit"].verdict, reports["implicit"].environment) == ("passive", "strict")
+
+
+# --- weld
+
+
+def test_wrench_of_the_weld_is_what_moves_the_tool() -> None:
+    method, samples = method_named("weld"), waved()
+    scene = load(TURNED_TOOL)
+    felt = prepare(scene, COUPLING, T, 1, method)
+    run = rendered("weld", COUPLING, samples, TURNED_TOOL)
+    assert felt == run.parameters.felt
+    model, data = scene.model, scene.data
+    binding = Binding(model, data, run.parameters)
+    jacobian = np.zeros((6, model.nv))
+    for k in range(len(samples)):
+        assert before_step(binding.state, samples[k : k + 1], binding.row, 0) == OK
+        mujoco.mj_step(model, data)
+        mujoco.mj_jacSite(model, data, jacobian[:3], jacobian[3:], model.site("grip").id)
+        on_joints = data.qfrc_constraint.copy()
+        assert after_step(binding.state, binding.row, 0) == OK
+        given = jacobian.T @ binding.row["wrench_on_tool"][0]
+        assert given == pytest.approx(on_joints, abs=1e-12)
+    assert np.abs(on_joints).max() > 1e-3
+
+
+@pytest.mark.parametrize("mass", [0.05, 1.0])
+@pytest.mark.parametrize("stiffness", [500.0, 2000.0])
+def test_true_stiffness_of_a_weld_is_mass_times_k_over_one_minus_d(
+    mass: float, stiffness: float
+) -> None:
+    """So a 1 N pull displaces 1 kg behind a 'stiffness' of 1000 by 0.05 mm, not by 1 mm."""
+    coupling = Coupling(stiffness, 40.0, 1.0, 1e-3)
+    scene = load(FREE_MASS.format(mass=mass))
+    felt = prepare(scene, coupling, T, 1, method_named("weld"))
+    assert felt is not None
+    assert felt.stiffness == pytest.approx(mass * stiffness / 0.05, rel=1e-6)
+    assert felt.damping == pytest.approx(mass * 40.0 / 0.05, rel=1e-6)
+    inertia = 0.4 * mass * 0.01**2
+    assert felt.rotational_stiffness == pytest.approx(inertia * stiffness / 0.05, rel=1e-6)
+    body = scene.model.body("tool").id
+    for axis, expected in ((0, felt.stiffness), (5, felt.rotational_stiffness)):
+        scene.reset()
+        scene.data.xfrc_applied[body, axis] = 1e-2 * expected  # less is below the solver's grain
+        for _ in range(4000):
+            mujoco.mj_step(scene.model, scene.data)
+        moved = scene.data.qpos[0] if axis == 0 else 2 * scene.data.qpos[6]
+        assert moved == pytest.approx(1e-2, rel=2e-4)
+
+
+def test_weld_carries_changes_over_and_comes_off_again() -> None:
+    scene = load(FREE_MASS.format(mass=0.05))
+    scene.model.body_mass[scene.model.body("tool").id] = 0.2
+    mujoco.mj_setConst(scene.model, scene.data)
+    scene.model.opt.gravity[:] = 0, 0, -1
+    plain = scene.model
+    felt = prepare(scene, COUPLING, T, 1, method_named("weld"))
+    assert felt is not None
+    assert felt.stiffness == pytest.approx(0.2 * 2000 / 0.05, rel=1e-6)
+    assert scene.model.opt.gravity.tolist() == [0, 0, -1]
+    assert scene.model.neq == 1
+    assert prepare(scene, COUPLING, T, 1) is None
+    assert scene.model.neq == 0
+    assert (scene.model.body_mass == plain.body_mass).all()
+
+
+def test_weld_refuses_a_tool_whose_joints_block_an_axis() -> None:
+    with pytest.raises(SceneError, match="1 of 6"):
+        prepare(load_scene("virtual_wall"), COUPLING, T, 1, method_named("weld"))
+
+
+@pytest.mark.parametrize(("method", "verdict"), [("weld", "active"), ("implicit", "passive")])
+def test_weld_kicks_a_device_that_bears_the_coupling_asked_for(
+    method: str, verdict: str, tmp_path: Path
+) -> None:
+    """The tool's inertia makes it I K d = 6.8 N m/rad to a free tool; 1 was asked, 4 is borne."""
+    scene, path = tmp_path / "ball.xml", tmp_path / "run.mcap"
+    scene.write_text(FREE_MASS.format(mass=1.0).replace("0.01", "0.03"))
+    coupling = Coupling(2e4, 0.5, 1.0, 5e-4)
+    summary = recorded(path, scene, Rotor(), coupling, duration=0.3, method=method, limits=FREE)
+    report = audit(path)
+    assert (summary.verdict, report.verdict) == (verdict, verdict)
+    assert report.resimulation == "bit for bit"
+    assert report.certified is (method == "implicit")
+    assert report.environment == "strict"  # (14) alone would not have seen it
+    if method == "weld":
+        assert summary.felt is not None
+        assert summary.felt.rotational_stiffness == pytest.approx(3.6e-4 * 2e4 / 0.05, rel=1e-6)
+        assert (report.tick, report.port) == summary.fault
+        assert report.port == "device"
+        assert "constraint force" in report.unchecked
+    else:
+        assert (report.port, report.unchecked) == ("", "")
+
+
+def test_meter_and_audit_agree_on_the_tick_of_a_kick_in_all_directions(tmp_path: Path) -> None:
+    """The shipped peg behind a weld of 4800 N/m, on a device of 2 N s/m: it bears 4000."""
+    path = tmp_path / "run.mcap"
+    summary = recorded(path, "peg_in_hole", "simulated", duration=1.6, method="weld")
+    report = audit(path)
+    assert report.verdict == "active"
+    assert summary.fault == (report.tick, report.port)
+    assert report.port == "device"
+
+
+# --- direct
+
+
+@pytest.mark.parametrize("xml", [SLOT.format(half=0.02), TURNED_TOOL])
+def test_massless_tool_is_where_the_handle_is(xml: str) -> None:
+    turning = Rotation.from_rotvec(sines(200, 0.1, 2.0) * [0, 1, 0])
+    motion = sines(200, 0.02) * [1, 0, 1]
+    run = rendered("direct", COUPLING, samples_of(motion, turning), xml)
+    assert run.ticks["tool_position"] == pytest.approx(run.ticks["handle_position"], abs=1e-15)
+    assert run.ticks["tool_quaternion"] == pytest.approx(run.ticks["handle_quaternion"], abs=1e-14)
+
+
+def test_contact_force_of_a_massless_tool_is_its_stiffness_times_penetration() -> None:
+    samples = samples_of(np.array([[1e-3, 0, 0], [-2e-3, 0, 0.1], [0, 0, 0.2]]))
+    run = rendered("direct", COUPLING, samples, SLOT.format(half=0.02), contact_stiffness=500.0)
+    # both ends press on one wall; the hand must push the tool in
+    force = run.ticks["wrench_on_tool"][:, 0]
+    assert force == pytest.approx([2 * 500 * 1e-3, -2 * 500 * 2e-3, 0.0], abs=1e-9)
+    assert run.ticks["potential"] == pytest.approx([500 * 1e-6, 500 * 4e-6, 0.0], abs=1e-12)
+    assert (run.ticks["kinetic"] == 0).all()
+    assert run.ledger.slack == 0
+    turned = samples_of(np.zeros((1, 3)), Rotation.from_rotvec([[0, 1e-4, 0]]))
+    run = rendered("direct", COUPLING, turned, SLOT.format(half=0.02), contact_stiffness=500.0)
+    # K = diag(..., K_c L²/2): each end presses on one wall
+    assert run.ticks["wrench_on_tool"][0, 4] == pytest.approx(0.5 * 500 * 0.04**2 * 1e-4, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("method", "share", "verdict"),
+    [
+        ("direct", 0.98, "passive"),
+        ("direct", 1.2, "active"),
+        ("implicit", 0.98, "passive"),
+        ("implicit", 1.2, "passive"),
+        ("implicit", 2.0, "passive"),
+    ],
+)
+def test_geometry_decides_for_a_massless_tool_and_not_behind_a_coupling(
+    method: str, share: float, verdict: str, tmp_path: Path
+) -> None:
+    damping, stiffness = 2e-3, 2000.0
+    limit = 2 * math.sqrt(damping / (T * stiffness))
+    scene, path = tmp_path / "slot.xml", tmp_path / "run.mcap"
+    scene.write_text(SLOT.format(half=0.5 * share * limit))
+    options: dict[str, Any] = {"contact_stiffness": stiffness} if method == "direct" else {}
+    coupling = Coupling(stiffness, 0.5, 2.0, 5e-4)
+    summary = recorded(
+        path, scene, Rotor(damping), coupling, duration=0.3, method=method, limits=FREE, **options
+    )
+    report = audit(path)
+    assert (summary.verdict, report.verdict) == (verdict, verdict)
+    assert (report.tick, report.port) == (summary.fault or (None, ""))
+    assert report.resimulation == "bit for bit"
+    if method == "direct":
+        assert report.certified is None
+        assert f"{limit:.3g} m" in report.conditions[0]
+    if verdict == "active":
+        assert report.port == "device"
+
+
+@pytest.mark.parametrize(
+    ("scene", "message"),
+    [
+        ("virtual_wall", "free joint"),
+        (SERVO.format(gravcomp=0, mocap="false", actuator=""), "other joints"),
+        (
+            SERVO.format(gravcomp=0, mocap="true", actuator='<motor joint="arm"/>'),
+            "other joints and actuators and mocap bodies",
+        ),
+    ],
+)
+def test_massless_tool_refuses_a_scene_in_which_more_moves(scene: str, message: str) -> None:
+    loaded = load(scene) if scene.lstrip().startswith("<") else load_scene(scene)
+    with pytest.raises(SceneError, match=message):
+        prepare(loaded, COUPLING, T, 1, method_named("direct"))
+
+
+@pytest.mark.parametrize("stiffness", [0.0, -1.0, math.nan, math.inf])
+def test_bad_contact_stiffness_is_refused(stiffness: float) -> None:
+    with pytest.raises(SceneError, match="contact stiffness"):
+        Bridge("peg_in_hole", "simulated", method="direct", contact_stiffness=stiffness)
+
+
+def test_contact_stiffness_belongs_to_direct_alone() -> None:
+    with pytest.raises(SceneError, match="only 'direct'"):
+        Bridge("peg_in_hole", "simulated", contact_stiffness=500.0)
+
+
+# --- ports that an integrator hides
+
+
+@pytest.mark.parametrize(
+    ("method", "actuator", "gravcomp", "message"),
+    [
+        ("explicit:rk4", '<motor name="m" joint="arm"/>', 0, "'m'"),
+        ("explicit:rk4", "", 1, "gravity compensation"),
+        ("implicitfast", '<velocity name="v" joint="arm" kv="1"/>', 0, "'v'"),
+        ("weld", '<position name="p" joint="arm" kv="1"/>', 0, "'p'"),
+    ],
+)
+def test_scene_whose_ports_cannot_be_metered_is_refused(
+    method: str, actuator: str, gravcomp: int, message: str
+) -> None:
+    scene = load(SERVO.format(gravcomp=gravcomp, mocap="false", actuator=actuator))
+    with pytest.raises(SceneError, match=message):
+        prepare(scene, COUPLING, T, 1, method_named(method))
+    prepare(scene, COUPLING, T, 1)
+
+
+@pytest.mark.parametrize("method", ["explicit:rk4", "direct"])
+def test_inputs_that_cannot_be_metered_are_refused(method: str) -> None:
+    with (
+        Bridge("peg_in_hole", Rotor(), clock=SimulatedClock(), method=method) as bridge,
+        pytest.raises(SceneError, match="cannot meter the work of inputs"),
+    ):
+        bridge.set_input(body_wrench={"peg": np.zeros(6)})
+
+
+@pytest.mark.parametrize("method", ["explicit", "explicit:implicitfast", "implicitfast"])
+def test_ports_of_a_separate_arm_close_to_its_dissipation(method: str) -> None:
+    """A motor and an applied force on an arm apart: Σ E is what the step leaves, −½m(Δv)²."""
+    scene = load(SERVO.format(gravcomp=0, mocap="false", actuator='<motor name="m" joint="arm"/>'))
+    chosen = method_named(method)
+    prepare(scene, COUPLING, T, 1, chosen)
+    parameters = RunParameters(
+        grip="grip",
+        period=T,
+        substeps=1,
+        coupling=COUPLING,
+        force_limit=1e9,
+        torque_limit=1e9,
+        ramp_ticks=0,
+        device_origin=(0, 0, 0, 1, 0, 0, 0),
+        handle_origin=scene.grip_pose(),
+        device_start=(0, 0, 0, 1, 0, 0, 0),
+        scheme=chosen.scheme,
+    )
+    binding = Binding(scene.model, scene.data, parameters)
+    still, left, speed = samples_of(np.zeros((1, 3))), 0.0, 0.0
+    for k in range(200):
+        scene.data.ctrl[0 if scene.model.actuator(0).name == "m" else -1] = 0.0
+        scene.data.ctrl[scene.model.actuator_ctrladr[scene.model.actuator("m").id]] = math.sin(k)
+        scene.data.qfrc_applied[6] = math.cos(0.1 * k)
+        assert before_step(binding.state, still, binding.row, 0) == OK
+        chosen.step(scene.model, scene.data)
+        assert after_step(binding.state, binding.row, 0) == OK
+        left -= 0.1 * (scene.data.qvel[6] - speed) ** 2
+        speed = float(scene.data.qvel[6])
+    assert binding.state["environment_energy"][0] == pytest.approx(left, rel=1e-9)
+    assert abs(binding.state["actuator_work"][0]) > 1e-5
+    assert abs(binding.state["external_work"][0]) > 1e-5
+
+
+# --- substeps
+
+
+@pytest.mark.parametrize("substeps", [2, 4, 8])
+def test_mean_over_substeps_does_the_work_of_the_single_wrenches(substeps: int) -> None:
+    """So a free mass is strict: Σ E = −Σ ½ m (Δv)², step by step, whatever the substeps."""
+    run = rendered("implicit", COUPLING, sway(500), substeps=substeps)
+    assert run.ticks["environment_energy"].max() <= 0
+    assert run.ledger.environment == "strict"
+    handle = run.handle_steps()[:, 0] / substeps
+    mass, h = 0.05, T / substeps
+    x = v = position = work_on_handle = 0.0
+    for k in range(500):
+        for _ in range(substeps):
+            position += handle[k]
+            # m (v⁺ − v)/h = K (p − x − h v⁺) + B (δp/h − v⁺)
+            k_, b_ = COUPLING.stiffness, COUPLING.damping
+            v = (mass * v / h + k_ * (position - x) + b_ * handle[k] / h) / (mass / h + k_ * h + b_)
+            x += h * v
+            work_on_handle += (k_ * (position - x) + b_ * (handle[k] / h - v)) * handle[k]
+    assert run.ticks["tool_position"][-1, 0] == pytest.approx(x, abs=1e-12)
+    sent = np.sum(run.ticks["wrench_on_tool"][:, 0] * run.handle_steps()[:, 0])
+    assert sent == pytest.approx(work_on_handle, rel=1e-9)
+
+
+def test_needed_damping_with_one_law_is_that_of_the_theory_and_grows_with_the_delay() -> None:
+    assert needed_damping(COUPLING, T) == pytest.approx(3.0, rel=1e-12)
+    undamped = Coupling(2000.0, 0.0, 2.0, 0.0)
+    needed = [needed_damping(undamped, T, n) for n in (1, 2, 4, 8)]
+    # s = 1/2 of the slack may be used; strictly it would be K T n / 2
+    assert needed == pytest.approx([1.0, 2.5, 6.25, 14.125], rel=1e-4)
+    damped = Coupling(2000.0, 2.0, 2.0, 2e-3)
+    assert [needed_damping(damped, T, n) for n in (2, 4, 8)] == pytest.approx(
+        [2.6429, 2.4423, 2.3350], abs=1e-4
+    )
+    assert needed_damping(damped, T, 4, "rotation") == pytest.approx(2.4423e-3, abs=1e-7)
+    with pytest.raises(CouplingError, match="substeps"):
+        needed_damping(damped, T, 0)
+
+
+def test_needed_damping_bounds_random_motions_behind_substeps() -> None:
+    """The inequality that defines it holds for motions that return to rest, and fails below."""
+    coupling, n = Coupling(2000.0, 1.0, 0.0, 0.0), 4
+    needed = needed_damping(coupling, T, n)
+    rng = np.random.default_rng(3)
+    k_, b_ = coupling.stiffness, coupling.damping * n / T
+    for _ in range(50):
+        ticks = 40
+        d = rng.normal(size=ticks) * 1e-3
+        d[[0, -1]] = 0.0
+        d[-2] -= d.sum()
+        h = np.cumsum(np.repeat(d / n, n))
+        e = rng.normal(size=ticks * n) * 1e-3 * rng.uniform(0, 2)
+        e[: 2 * n], e[-2 * n :] = 0.0, 0.0
+        x = h - e
+        step_e, step_x = np.diff(e, prepend=0.0), np.diff(x, prepend=0.0)
+        f = k_ * e + b_ * step_e
+        mean = f.reshape(ticks, n).mean(axis=1)
+        sides = np.sum(mean[:-1] * d[1:]) - np.sum(f * step_x)
+        sides -= 0.25 * (k_ + b_) * np.sum(step_x**2)
+        assert sides + needed / T * np.sum(d**2) > -1e-12
+
+
+def test_audit_says_what_a_mean_leaves_unchecked(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    recorded(path, "peg_in_hole", "simulated", duration=0.2, substeps=4)
+    report = audit(path)
+    assert (report.resimulation, report.verdict) == ("bit for bit", "passive")
+    assert "re-simulation alone" in report.unchecked
+    recorded(path, "peg_in_hole", "simulated", duration=0.2)
+    assert audit(path).unchecked == ""
+
+
+# --- what the audit refuses
+
+
+@pytest.mark.parametrize(
+    ("method", "claimed"),
+    [("explicit", "implicit"), ("implicitfast", "implicit"), ("explicit", "explicit:rk4")],
+)
+def test_recording_that_claims_another_method_is_invalid(
+    method: str, claimed: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "run.mcap"
+    recorded(path, "point_mass", "simulated", duration=0.1, method=method)
+    changed = rewritten(read_recording(path), tmp_path / "b.mcap", meta={"method": claimed})
+    assert audit(changed).verdict == "invalid"
+
+
+def test_recording_that_claims_a_softer_weld_is_invalid(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    recorded(path, "point_mass", "simulated", duration=0.1, method="weld")
+    recording = read_recording(path)
+    changed = rewritten(recording, tmp_path / "b.mcap", meta={"felt": "[1.0, 0.0, 0.0, 0.0]"})
+    assert "weld" in audit(changed).reason
+    assert audit(changed).verdict == "invalid"
+
+
+def test_parameters_that_contradict_each_other_are_refused() -> None:
+    common: dict[str, Any] = {
+        "grip": "grip",
+        "period": T,
+        "substeps": 1,
+        "coupling": COUPLING,
+        "force_limit": 1.0,
+        "torque_limit": 1.0,
+        "ramp_ticks": 0,
+        "device_origin": (0, 0, 0, 1, 0, 0, 0),
+        "handle_origin": (0, 0, 0, 1, 0, 0, 0),
+        "device_start": (0, 0, 0, 1, 0, 0, 0),
+    }
+    direct = METHODS["direct"].scheme
+    with pytest.raises(HapticBridgeError, match="scheme is 7"):
+        RunParameters(**common, scheme=7)
+    with pytest.raises(HapticBridgeError, match=r"contact stiffness is 0\.0"):
+        RunParameters(**common, scheme=direct)
+    with pytest.raises(HapticBridgeError, match=r"contact stiffness is 5\.0"):
+        RunParameters(**common, contact_stiffness=5.0)
+    with pytest.raises(HapticBridgeError, match="substeps is 2"):
+        RunParameters(**(common | {"substeps": 2}), scheme=direct, contact_stiffness=5.0)
+
+
+def test_fake_real_device_needs_its_own_flag_in_its_sheet() -> None:
+    info: DeviceInfo = Rotor(is_real=True).info
+    assert info.is_real
+    assert DeviceInfo.from_json(info.to_json()) == info
