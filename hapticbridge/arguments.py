@@ -1,15 +1,25 @@
-"""What a numeric argument may be, refused in one sentence otherwise."""
+"""What an argument may be, refused in one sentence otherwise."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hapticbridge.errors import HapticBridgeError
+from hapticbridge.errors import HapticBridgeError, choices
 
 Array = NDArray[np.float64]
+
+SMALLEST, LARGEST = 1e-30, 1e30
+"""Range of a magnitude, in the unit of the argument. Nothing that is built or simulated lies
+outside. The theory multiplies up to about ten arguments, and 1e300 is still a double: within the
+range nothing overflows that matters. Larger limits would let it; a magnitude below the range counts
+as 0 where 0 is valid."""
+
+LONGEST = 80
+"""Characters of a refused value that a message shows; more makes it no clearer."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -18,9 +28,13 @@ class Arguments:
 
     Attributes:
         error: What is raised.
+        smallest: Smallest magnitude that is not 0.
+        largest: Largest magnitude.
     """
 
     error: type[HapticBridgeError]
+    smallest: float = SMALLEST
+    largest: float = LARGEST
 
     def numbers(
         self,
@@ -36,11 +50,13 @@ class Arguments:
 
         Args:
             name: What the numbers are, for the message.
-            value: Any shape; not empty, and no flags or text.
+            value: Any shape; not empty, and no flags, text or dates. Magnitudes are at most
+                ``largest``; below ``smallest`` they are taken for 0.
             unit: For the message.
             least: Smallest valid value.
             most: Largest valid value.
-            is_open: Whether the smallest value is out of range too.
+            is_open: Whether the smallest value is out of range too; what is smaller than
+                ``smallest`` then also is.
 
         Raises:
             HapticBridgeError: The family's own: a value is not a number, not finite, or out of
@@ -48,19 +64,32 @@ class Arguments:
         """
         try:
             given = np.asarray(value)
-        except ValueError:  # rows of different lengths
+        except (TypeError, ValueError, OverflowError):  # as rows of different lengths
             given = np.empty(0, dtype=object)
         if given.dtype.kind not in "iuf":
-            raise self.error(f"{name} is {value!r:.80}; it must be numbers{_of(unit)}")
-        array = given.astype(np.float64)
+            raise self.error(f"{name} is {shown(value)}; it must be numbers{_of(unit)}")
+        with np.errstate(over="ignore"):  # longer floats become inf, which is refused
+            array = given.astype(np.float64)
         if array.size == 0:
             raise self.error(f"{name} is an empty array; it must hold at least one number")
         is_valid = np.isfinite(array) & (array <= most)
         is_valid &= array > least if is_open else array >= least
         if not is_valid.all():
-            culprit = float(array[~is_valid].flat[0]) if array.ndim else float(array)
-            shown = f"{culprit:g} {unit}".rstrip()
-            raise self.error(f"{name} is {shown}; it must be {_range(least, most, is_open)}")
+            raise self.error(
+                f"{name} is {_first(array, ~is_valid, unit)}; "
+                f"it must be {_range(least, most, is_open)}"
+            )
+        size = np.abs(array)
+        is_tiny = size < self.smallest
+        is_extreme = size > self.largest
+        if is_open:
+            is_extreme |= is_tiny
+        if is_extreme.any():
+            raise self.error(
+                f"{name} is {_first(array, is_extreme, unit)}; "
+                f"its magnitude must lie between {self.smallest:g} and {self.largest:g}"
+            )
+        array[is_tiny] = 0.0
         return array
 
     def number(
@@ -83,6 +112,31 @@ class Arguments:
             raise self.error(f"{name} has shape {array.shape}; it must be one number{_of(unit)}")
         return float(array)
 
+    def whole(self, name: str, value: int, unit: str = "", *, least: int, most: int) -> int:
+        """Returns a whole number within limits; flags and floats are refused.
+
+        Raises:
+            HapticBridgeError: It is none, or out of range.
+        """
+        is_whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
+        if not is_whole or not least <= value <= most:
+            raise self.error(
+                f"{name} is {shown(value)}; it must be a whole number{_of(unit, 'of')} >= {least} "
+                f"and <= {most}"
+            )
+        return int(value)
+
+    def one_of(self, name: str, value: str, valid: Iterable[str]) -> str:
+        """Returns the value if it is one of the valid names.
+
+        Raises:
+            HapticBridgeError: It is none of them; lists them.
+        """
+        names = tuple(valid)
+        if not isinstance(value, str) or value not in names:
+            raise self.error(f"{name} is {shown(value)}; choose one of {choices(names)}")
+        return value
+
     def shape(self, **arrays: Array) -> tuple[int, ...]:
         """Returns the shape to which arrays broadcast together.
 
@@ -98,8 +152,21 @@ class Arguments:
             raise self.error(f"shapes do not broadcast together: {shapes}") from None
 
 
-def _of(unit: str) -> str:
-    return f" in {unit}" if unit else ""
+def shown(value: object) -> str:
+    """Returns what a message shows of a refused value: one line, not too long."""
+    try:
+        text = " ".join(repr(value).split())
+    except ValueError:  # a whole number of more digits than Python prints
+        text = f"a {type(value).__name__}"
+    return text if len(text) <= LONGEST else f"{text[: LONGEST - 1]}…"
+
+
+def _of(unit: str, word: str = "in") -> str:
+    return f" {word} {unit}" if unit else ""
+
+
+def _first(array: Array, is_wrong: NDArray[np.bool_], unit: str) -> str:
+    return f"{float(array[is_wrong].flat[0]):g} {unit}".rstrip()
 
 
 def _range(least: float, most: float, is_open: bool) -> str:

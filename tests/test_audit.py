@@ -195,6 +195,7 @@ def test_same_motion_under_the_default_integrator_is_strict(tmp_path: Path) -> N
     assert (report.verdict, report.environment) == ("passive", "strict")
 
 
+@pytest.mark.filterwarnings("ignore:.*more energy than the coupling's slack:UserWarning")
 def test_stiff_contact_on_a_light_tool_is_active(tmp_path: Path) -> None:
     scene = tmp_path / "wall.xml"
     text = scene_path("virtual_wall").read_text()

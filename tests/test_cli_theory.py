@@ -138,17 +138,17 @@ def test_picture_is_written_where_it_is_wanted(
 @pytest.mark.parametrize(
     ("command", "sentence"),
     [
-        ("zwidth --damping 0", "device damping is 0.0 N s/m"),
+        ("zwidth --damping 0", "device damping is 0 N s/m"),
         ("zwidth --damping nan", "device damping is nan"),
-        ("zwidth --damping 2 --mass -1", "mass is -1.0 kg"),
+        ("zwidth --damping 2 --mass -1", "mass is -1 kg"),
         ("zwidth --damping 2 --delay -1", "delay is -1"),
         ("zwidth --damping 2 --rate 0", "rate is 0.0 Hz"),
         ("zwidth --damping 2 --plot x.gif", "does not end like a picture"),
         ("bound --stiffness -1", "stiffness is -1"),
         ("bound --stiffness inf", "stiffness is inf"),
         ("bound --stiffness 1 --rate nan", "rate is nan Hz"),
-        ("bound --stiffness 1 --filter-time -1", "filter time is -1.0 s"),
-        ("bound --stiffness 1 --device-damping 0", "device damping is 0.0 N s/m"),
+        ("bound --stiffness 1 --filter-time -1", "filter time is -1 s"),
+        ("bound --stiffness 1 --device-damping 0", "device damping is 0 N s/m"),
         ("bound --stiffness 1 --plot x", "does not end like a picture"),
         ("bound --stiffness 1 --plot /nowhere/x.png", "cannot write '/nowhere/x.png'"),
     ],
@@ -170,3 +170,66 @@ def test_help_holds_an_example(command: str, capsys: pytest.CaptureFixture[str])
     out = capsys.readouterr().out
     assert f"hapticbridge {command}" in out.split("usage:")[1].partition("\n")[2]
     assert "{None}" not in out
+
+
+def test_bound_of_a_plain_spring_names_no_frequency(capsys: pytest.CaptureFixture[str]) -> None:
+    told = Told("bound --stiffness 2000", capsys)
+    assert "Tustin's damper 1 N s/m every frequency" in told.words
+    assert "500 Hz" not in told.words
+    facts = Told("bound --stiffness 2000 --json", capsys).json()
+    assert facts["frequency_hz"] is None
+    assert facts["alternatives"][3] == {
+        "name": "Tustin's damper", "needed": 1.0, "frequency_hz": None
+    }  # fmt: skip
+
+
+def test_a_heavy_device_is_limited_by_the_hand(capsys: pytest.CaptureFixture[str]) -> None:
+    told = Told("zwidth --damping 2 --mass 1e9", capsys)
+    assert "stable without a hand 4000 N/m" in told.words
+    assert "limited by: passive for any hand" in told.out
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        "zwidth --damping 1e300",
+        "zwidth --damping 1e-300",
+        "zwidth --damping 2 --mass 1e300",
+        "zwidth --damping 2 --friction 1e300 --resolution 1e-5",
+        "zwidth --damping 2 --filter-time 1e300",
+        "zwidth --damping 2 --delay 1000",
+        "bound --stiffness 1e300",
+        "bound --stiffness 1e-300",
+        "bound --stiffness 1 --damping 1e300",
+        "bound --stiffness 1 --filter-time 1e300",
+        "bound --stiffness 1 --device-damping 1e300",
+    ],
+)
+@pytest.mark.parametrize("option", ["", " --json"])
+def test_extreme_numbers_are_refused_in_one_line(
+    command: str, option: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    told = Told(command + option, capsys)
+    assert told.code == 2
+    assert told.out == ""
+    assert told.err.startswith("error: ")
+    assert "between 1e-30 and 1e+30" in " ".join(told.err.split()) or "delay is 1000" in told.err
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        "zwidth --damping 1e30 --rate 1e6",
+        "zwidth --damping 1e-30 --mass 1e30 --rate 1",
+        "zwidth --damping 2 --friction 1e30 --resolution 1e-30",
+        "zwidth --damping 2 --delay 3 --filter-time 1e25",
+        "bound --stiffness 1e24 --damping 1e30 --device-damping 1e-30",
+        "bound --stiffness 1e-20 --damping 1e30 --device-damping 1e30",
+    ],
+)
+def test_numbers_at_the_ends_of_the_range_give_valid_json(
+    command: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    told = Told(f"{command} --json", capsys)
+    assert told.code in {0, 1}
+    assert told.json()

@@ -826,6 +826,7 @@ def _euler(scene_text: str, coupling: Coupling, samples: Any) -> Run:
     return live(scene, samples, coupling, on_tick=spoil)
 
 
+@pytest.mark.filterwarnings("ignore:.*more energy than the coupling's slack:UserWarning")
 @pytest.mark.parametrize("kind", ["stiff contact", "wrong integrator"])
 def test_an_active_environment_is_named_with_its_first_ticks(kind: str) -> None:
     if kind == "stiff contact":

@@ -105,5 +105,5 @@ def test_coupling_damping_out_of_range_is_refused(value: float) -> None:
 
 
 def test_unknown_axis_is_refused_with_the_choices() -> None:
-    with pytest.raises(CouplingError, match="choose 'translation' or 'rotation'"):
+    with pytest.raises(CouplingError, match="choose one of 'rotation', 'translation'"):
         minimum_damping(Coupling(1, 0, 0, 0), T, axis="x")  # type: ignore[call-overload]

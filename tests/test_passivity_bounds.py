@@ -276,9 +276,11 @@ def test_mis_shaped_and_unknown_arguments_are_refused() -> None:
         CouplingGrid([1.0, 2.0], [1.0, 2.0, 3.0])
     with pytest.raises(CouplingError, match="whole number of samples"):
         minimum_damping(coupling, T, delay=0.5)  # type: ignore[call-overload]
-    with pytest.raises(CouplingError, match="choose 'backward' or 'tustin'"):
+    with pytest.raises(CouplingError, match="choose one of 'backward', 'tustin'"):
         minimum_damping(coupling, T, discretization="euler")  # type: ignore[call-overload]
-    with pytest.raises(CouplingError, match="choose 'explicit', 'implicit', 'semi_implicit'"):
+    with pytest.raises(
+        CouplingError, match="choose one of 'explicit', 'implicit', 'semi_implicit'"
+    ):
         minimum_mass(coupling, T, "rk4")  # type: ignore[arg-type]
     with pytest.raises(CouplingError, match="half the sampling rate"):
         damping_spectrum(coupling, T, 4 / T)
@@ -288,3 +290,78 @@ def test_mis_shaped_and_unknown_arguments_are_refused() -> None:
         matrix_margin([[1, 2], [0, 1]], np.eye(2), np.eye(2), T)
     with pytest.raises(CouplingError, match="sizes"):
         matrix_margin(np.eye(3), np.eye(2), np.eye(2), T)
+
+
+@pytest.mark.parametrize(
+    ("b", "friction", "region"),
+    [
+        (0.5, 0.06, "locally stable"),  # β = ½ is not above it
+        (0.6, 0.05, "bounded limit cycle"),  # nor is σ = ½
+        (0.5, 0.05, "unstable"),
+    ],
+)
+def test_edges_of_diolaitis_regions_belong_to_what_promises_less(
+    b: float, friction: float, region: str
+) -> None:
+    device = SimpleNamespace(damping=b, friction=friction, resolution=1e-4)
+    limit = quantization_limit(device, Coupling(1000, 0, 0, 0), T)
+    assert limit.region == region
+    assert (limit.beta == 0.5) == (b == 0.5)
+    assert (limit.sigma == 0.5) == (friction == 0.05)
+
+
+def test_exact_positions_leave_only_the_damping_to_limit() -> None:
+    device = SimpleNamespace(damping=1.0, friction=0.0, resolution=0.0)
+    limit = quantization_limit(device, Coupling(1000, 2.0, 0, 0), T)
+    assert limit.limited_by == "damping"
+    assert limit.stiffness == 0  # the damper alone is too much
+    assert limit.sigma == np.inf
+    assert limit.friction_needed == 0
+
+
+def test_fields_of_a_grid_are_its_own_and_cannot_be_written() -> None:
+    stiffness = np.array([1.0, 2.0])
+    grid = CouplingGrid(stiffness, 1.0)
+    stiffness[0] = 7.0
+    for field in (grid.stiffness, grid.damping, grid.rotational_stiffness):
+        array = np.asarray(field)
+        assert not array.flags.writeable
+        with pytest.raises(ValueError, match="read-only"):
+            array[...] = 3.0
+    assert np.asarray(grid.stiffness)[0] == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        ({"stiffness": -np.eye(2)}, "stiffness has the eigenvalue -1; all must be >= 0"),
+        ({"damping": [[1, 2], [2, 1]]}, "damping has the eigenvalue -1"),
+        ({"stiffness": [[np.nan, 0], [0, 1]]}, "stiffness is nan"),
+        ({"device_damping": [[1, 2], [3]]}, "device damping is .* must be numbers"),
+        ({"device_damping": np.zeros((0, 0))}, "device damping is an empty array"),
+        ({"stiffness": np.ones((2, 1, 1)), "damping": np.ones((3, 1, 1))}, "do not broadcast"),
+        ({"scale": 0.0}, "scale is 0"),
+        ({"force_scale": -1.0}, "force scale is -1"),
+        ({"period": 0.0}, "period is 0"),
+    ],
+)
+def test_matrices_without_meaning_are_refused(arguments: dict[str, Any], sentence: str) -> None:
+    valid: dict[str, Any] = dict.fromkeys(("stiffness", "damping", "device_damping"), np.eye(2))
+    valid["period"] = T
+    if "stiffness" in arguments and "damping" in arguments:
+        valid["device_damping"] = 1.0
+    with pytest.raises(CouplingError, match=sentence):
+        matrix_margin(**(valid | arguments))
+
+
+def test_a_late_force_without_damper_is_no_stable_environment_whatever_the_mass() -> None:
+    undamped = Coupling(1000, 0, 0, 0)
+    late = environment_minimum_damping(undamped, T, [0.05, 1, 1e6], "semi_implicit")
+    np.testing.assert_array_equal(late, np.inf)
+    assert np.isfinite(environment_minimum_damping(undamped, T, 0.05, "implicit"))
+
+
+def test_stiffness_inertia_and_damper_a_hundred_orders_apart_are_refused() -> None:
+    grid = CouplingGrid([1e-30, 1000], [1e30, 1])
+    with pytest.raises(CouplingError, match="too far apart for double precision"):
+        environment_minimum_damping(grid, 1e-30, 1e30)

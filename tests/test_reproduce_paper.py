@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import runpy
+import subprocess
+import sys
 from collections.abc import Callable
 from html.parser import HTMLParser
 from pathlib import Path
@@ -78,7 +81,7 @@ def test_every_number_is_reproduced(walk: tuple[int, Path]) -> None:
 
 def test_page_walks_through_every_equation_with_its_picture(walk: tuple[int, Path]) -> None:
     page = (walk[1] / PAGE).read_text(encoding="utf-8")
-    headings = " ".join(line for line in page.splitlines() if line.startswith("<h2>"))
+    headings = " ".join(line for line in page.splitlines() if line.startswith("<h2"))
     for equation in EQUATIONS:
         assert f"({equation})" in headings
         assert f"<td>({equation})</td>" in page, "no check"
@@ -249,3 +252,47 @@ def test_a_number_equals_itself_at_no_tolerance(value: float) -> None:
 
 def test_numbers_are_written_for_readers() -> None:
     assert [number(v) for v in (np.inf, -np.inf, -0.5, 1e-7)] == ["∞", "−∞", "−0.5", "1e−07"]
+
+
+def test_every_check_is_shown_once_and_every_section_is_linked(walk: tuple[int, Path]) -> None:
+    page = (walk[1] / PAGE).read_text(encoding="utf-8")
+    count = int(page.split(" checks, ")[0].rpartition(">")[2])
+    assert page.count('<td class="ok">pass</td>') == count + len(STEPS)
+    for index in range(1, len(STEPS) + 1):
+        assert page.count(f'href="#section-{index}"') == 1
+        assert page.count(f'id="section-{index}"') == 1
+
+
+def test_figures_name_every_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(virtual_mass, "KEPT", {})
+    for section, names in (
+        (virtual_mass, ("B ≤ KT: no mass suffices", "j = 1: 1.25 g", "j = 2: 4 g")),
+        (transmission_line, ("B = 0.5 N s/m", "1 sample there and back")),
+        (explicit_euler, ("implicit midpoint",)),
+    ):
+        (curve,) = section.section().curves
+        panels = [axes.get_legend_handles_labels()[1] for axes in curve.figure.axes]
+        assert all(panels)
+        labels = [label for panel in panels for label in panel]
+        for name in names:
+            assert any(name in label for label in labels)
+
+
+def test_ctrl_c_during_the_imports_ends_without_traceback(tmp_path: Path) -> None:
+    slow = tmp_path / "rich"
+    slow.mkdir()
+    # stands for the first of the imports that take seconds
+    (slow / "__init__.py").write_text(
+        "import os, signal, time\nos.kill(os.getpid(), signal.SIGINT)\ntime.sleep(60)\n",
+        encoding="utf-8",
+    )
+    ended = subprocess.run(
+        [sys.executable, str(SCRIPT), str(tmp_path / "out")],
+        env=os.environ | {"PYTHONPATH": str(tmp_path)},
+        capture_output=True,
+        text=True,
+        timeout=30,
+        check=False,
+    )
+    assert ended.returncode == 130
+    assert ended.stderr == "stopped\n"

@@ -20,6 +20,7 @@ from hapticbridge.passivity import (
     minimum_mass,
     stability_limit,
 )
+from hapticbridge.passivity.stability import decays, threshold
 from hapticbridge.passivity.virtual_mass import Integrator
 
 PERIODS = (2e-3, 1e-3, 2.5e-4)
@@ -201,7 +202,7 @@ def test_hand_refuses_bad_numbers(arguments: dict[str, float], named: str) -> No
         ({"delay": 1.5}, "delay"),
         ({"filter_time": math.nan}, "filter time"),
         ({"integrator": "leapfrog"}, "'implicit', 'semi_implicit'"),
-        ({"discretization": "forward"}, "'backward' or 'tustin'"),
+        ({"discretization": "forward"}, "'backward', 'tustin'"),
     ],
 )
 def test_loop_refuses_bad_numbers_and_names(arguments: dict[str, float], named: str) -> None:
@@ -235,3 +236,51 @@ def test_tustins_damper_on_a_light_tool_asks_for_a_hundred_newton_seconds_per_me
     loop = SampledLoop(coupling(4000, 0.5), 1e-3, mass=0.05, discretization="tustin")
     assert stability_limit(loop) == pytest.approx(100.0, rel=SHARE)
     assert stability_limit(replace(loop, discretization="backward")) < 2.5
+
+
+def test_the_search_for_the_limit_knows_nothing_of_the_bound() -> None:
+    """Every loop misses its bound by another share; a bracket scaled from it would miss alike."""
+    shares = set()
+    for stiffness in (700, 1300, 2900, 6100):
+        k_and_b = coupling(stiffness, 0.7)
+        bound = minimum_damping(k_and_b, 1e-3)
+        shares.add(round(stability_limit(SampledLoop(k_and_b, 1e-3)) / bound - 1, 9))
+    assert len(shares) == 4
+
+
+@given(st.floats(-20, 20), st.floats(-3, 3))
+def test_threshold_is_found_from_any_start(log_threshold: float, log_start: float) -> None:
+    value = 10**log_threshold
+    found = threshold(lambda x: x > value, 10**log_start, 1e-6)
+    assert found == pytest.approx(value, rel=1e-6)
+
+
+def test_threshold_that_lies_outside_the_range_is_zero_or_infinite() -> None:
+    assert threshold(lambda _: True, 1.0, 1e-3) == 0
+    assert threshold(lambda _: False, 1.0, 1e-3) == math.inf
+
+
+def test_run_that_diverges_with_its_last_sample_is_not_whole() -> None:
+    loop = SampledLoop(coupling(2000, 0.5), 1e-3)
+    hand = WorstHand(0.1, np.pi / 1e-3, 1e-3)
+    whole = loop.simulate(hand, 10_000).force
+    assert np.abs(whole[-1]) >= 1e100 > np.abs(whole[:-1]).max()
+    assert loop.simulate(hand, whole.size).force.size == whole.size - 1
+    assert loop.simulate(hand, whole.size - 1).force.size == whole.size - 1
+    assert not decays(loop.simulate(hand, whole.size).force, whole.size)
+
+
+@pytest.mark.parametrize("period", [1e-3, 7e-4, 1 / 3000])
+def test_nyquist_hand_has_no_reactance_left_from_rounding(period: float) -> None:
+    for response in (None, 1e9 + 1e9j):
+        hand = WorstHand(2.0, np.pi / period, period, response)
+        assert hand.reactance == 0
+        assert hand.recursion() == (0.0, 0.5, 0.0)
+
+
+@pytest.mark.parametrize("bad", [[100.0], "a", None, True])
+def test_hand_refuses_what_is_no_frequency(bad: object) -> None:
+    with pytest.raises(CouplingError, match="frequency is"):
+        WorstHand(1.0, bad, 1e-3)  # type: ignore[arg-type]
+    with pytest.raises(CouplingError, match="response is"):
+        WorstHand(1.0, 100.0, 1e-3, "a")  # type: ignore[arg-type]

@@ -82,7 +82,9 @@ def test_z_width_picture_names_every_line_and_the_corner() -> None:
     np.testing.assert_allclose(values[:80], z.lines[0].stiffness[:80])
     assert values[-1] == 0  # it ends where it reaches 0
     assert np.asarray(drawn.get_xdata(), dtype=float)[-1] == pytest.approx(2, rel=1e-9)
-    assert figure.get_suptitle().endswith("b = 2 N s/m, 1000 Hz, delay of 1 ms")
+    assert figure.get_suptitle().split(": ")[1] == (
+        "b = 2 N s/m, 1000 Hz, 0.1 kg, friction 0 N, steps of 1e-05 m,\ndelay of 1 ms"
+    )
 
 
 def test_bound_picture_shows_every_way_and_the_device() -> None:
@@ -119,3 +121,25 @@ def test_letters_that_the_font_lacks_are_no_warning_and_svg_stands_alone() -> No
     text = inline_svg(figure)
     assert text.startswith("<svg")
     assert "<dc:date" not in text
+
+
+def test_plain_spring_needs_the_same_at_every_frequency() -> None:
+    ways = alternatives(Coupling(2000, 0, 0, 0), T, T)
+    asked, half, low_pass, tustin, wall, *_ = ways
+    assert [way.frequency for way in (asked, half, low_pass, tustin)] == [None] * 4
+    for way in (asked, half, low_pass, tustin):
+        assert way.spectrum is not None
+        np.testing.assert_allclose(way.spectrum[1], way.needed, rtol=1e-9)
+    assert wall.frequency == 0  # the delay asks for most at low frequency
+
+
+def test_pictures_show_four_times_the_region_and_twice_the_need_at_most() -> None:
+    light = z_width(2, T, friction=0.05, resolution=1e-5)
+    (axes,) = draw_z_width(light).axes
+    assert axes.get_ylim() == pytest.approx((0, 1.08 * 10_000))
+    slippery = z_width(2, T, friction=1.0, resolution=1e-6)  # its line begins at 2 million
+    (axes,) = draw_z_width(slippery).axes
+    assert axes.get_ylim() == pytest.approx((0, 4 * 4000))
+    ways = alternatives(Coupling(2000, 1, 0, 0), T, T)
+    assert draw_alternatives(ways, "title").axes[0].get_ylim()[1] == pytest.approx(2 * 2.0)
+    assert draw_alternatives(ways, "title", 5.0).axes[0].get_ylim()[1] == pytest.approx(2 * 5.0)

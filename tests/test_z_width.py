@@ -268,3 +268,67 @@ def test_mis_shaped_arguments_are_refused() -> None:
         z_width([1.0, 2.0], T)  # type: ignore[arg-type]
     with pytest.raises(CouplingError, match="delay is"):
         z_width(2, T, delay=0.5)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("mass", [1e3, 1e6, 1e9, 1e15])
+def test_no_rounding_puts_the_line_of_a_heavy_device_below_the_passive_one(mass: float) -> None:
+    z = z_width(2, T, mass=mass)
+    passive, free = z.lines
+    assert (free.stiffness >= passive.stiffness).all()
+    assert free.largest_damping >= passive.largest_damping
+    assert z.corner.stiffness == pytest.approx(2400, rel=1e-12)
+    assert z.corner_limited_by == ANY_HAND
+
+
+@pytest.mark.parametrize(
+    ("b", "mass", "damping", "delay"), [(2, 0.1, 0, 0), (5, 0.3, 2, 1), (1, 0.05, 0.5, 4)]
+)
+def test_boundary_of_the_free_device_is_found_to_a_hundred_millionth(
+    b: float, mass: float, damping: float, delay: int
+) -> None:
+    """Against eigenvalues of the sampled state equations, bisected to the end."""
+    rates = np.array([[0.0, 1.0, 0.0], [0.0, -b / mass, 1 / mass], [0.0, 0.0, 0.0]])
+    hold = expm(rates * T)
+
+    def is_stable(stiffness: float) -> bool:
+        # position, velocity, last position, forces on their way
+        size = 3 + delay
+        force = np.zeros(size)
+        force[[0, 2]] = -stiffness - damping / T, damping / T
+        step = np.zeros((size, size))
+        step[:2, :2], step[2, 0] = hold[:2, :2], 1
+        if delay:
+            step[:2, 3] = hold[:2, 2]
+            step[range(3, size - 1), range(4, size)] = 1
+            step[size - 1] = force
+        else:
+            step[:2] += np.outer(hold[:2, 2], force)
+        return bool(np.abs(np.linalg.eigvals(step)).max() < 1)
+
+    low, high = 1.0, 1e5
+    for _ in range(60):
+        middle = (low + high) / 2
+        low, high = (middle, high) if is_stable(middle) else (low, middle)
+    found = free_device_stiffness(b, T, mass, damping, delay=delay)
+    assert found == pytest.approx(low, rel=2e-8)
+
+
+def test_friction_counts_as_a_limit_from_a_tenth_of_the_damping_on() -> None:
+    # f_c T/Δ = 0.2 N s/m is a tenth of b = 2 N s/m
+    enough, little = (z_width(2, T, friction=f, resolution=1e-5) for f in (2.001e-3, 1.999e-3))
+    assert [line.is_required for line in enough.lines] == [True, True]
+    assert [line.is_required for line in little.lines] == [True, False]
+    assert enough.notes == ()
+
+
+def test_region_says_what_it_was_asked_for() -> None:
+    z = z_width(2, T, mass=0.1, friction=0.05, resolution=1e-5)
+    assert (z.mass, z.friction, z.resolution) == (0.1, 0.05, 1e-5)
+    z = z_width(2, T)
+    assert (z.mass, z.friction, z.resolution) == (None, None, 0)
+
+
+@pytest.mark.parametrize("points", [True, 10**9])
+def test_more_points_than_a_picture_has_are_refused(points: int) -> None:
+    with pytest.raises(CouplingError, match="points is"):
+        z_width(2, T, points=points)

@@ -16,6 +16,7 @@ from rich.markup import escape
 from hapticbridge.cli.judge import Audit, Repair
 from hapticbridge.cli.run import Run
 from hapticbridge.cli.scenes import Scenes
+from hapticbridge.cli.stability import Stability
 from hapticbridge.cli.terminal import err, out, print_error
 from hapticbridge.cli.theory import Bound, Zwidth
 from hapticbridge.errors import HapticBridgeError, SafetyTrip
@@ -24,6 +25,7 @@ Command = (
     Annotated[Run, tyro.conf.subcommand("run")]
     | Annotated[Audit, tyro.conf.subcommand("audit")]
     | Annotated[Scenes, tyro.conf.subcommand("scenes")]
+    | Annotated[Stability, tyro.conf.subcommand("stability")]
     | Annotated[Repair, tyro.conf.subcommand("repair")]
     | Annotated[Zwidth, tyro.conf.subcommand("zwidth")]
     | Annotated[Bound, tyro.conf.subcommand("bound")]

@@ -183,7 +183,8 @@ def _print_summary(summary: Summary, asked: Coupling, laws: int) -> None:
         "peak", f"{quantity(summary.peak_force, 'N')}, {quantity(summary.peak_torque, 'N m')}"
     )
     for name, joules in summary.energies.items():
-        table.add_row(name.replace("_", " "), quantity(joules, "J"))
+        if joules:  # a scene without motors or springs has no news of them
+            table.add_row(name.replace("_", " "), quantity(joules, "J"))
     out.print(table)
     used = f", {summary.slack_share:.0%} of the slack used" if summary.slack_share else ""
     out.print(f"environment [bold]{summary.verdict}[/bold] ({summary.environment}{used})")

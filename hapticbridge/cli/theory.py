@@ -15,8 +15,8 @@ from rich.table import Table
 from hapticbridge.cli.terminal import err, out, plain
 from hapticbridge.clock import period_of
 from hapticbridge.coupling import Coupling
-from hapticbridge.errors import CouplingError
 from hapticbridge.passivity import ZWidth, maximum_stiffness, z_width
+from hapticbridge.passivity.grid import scalar
 from hapticbridge.picture import check_ending, write_picture
 from hapticbridge.study.theory import Alternative, alternatives, draw_alternatives, draw_z_width
 
@@ -27,6 +27,19 @@ DEFAULT_RATE = 1000.0
 def _next_command(stiffness: float, damping: float, rate: float) -> str:
     command = f"hapticbridge run SCENE --stiffness {stiffness:.6g} --damping {damping:.6g}"
     return command if rate == DEFAULT_RATE else f"{command} --rate {rate:.6g}"
+
+
+def _print_json(facts: dict[str, object]) -> None:
+    out.print_json(json.dumps(_without_inf(facts), allow_nan=False))
+
+
+def _without_inf(fact: object) -> object:
+    """Returns a fact with null in place of numbers that JSON does not have."""
+    if isinstance(fact, dict):
+        return {key: _without_inf(value) for key, value in fact.items()}
+    if isinstance(fact, list):
+        return [_without_inf(value) for value in fact]
+    return None if isinstance(fact, float) and not math.isfinite(fact) else fact
 
 
 def _write(figure: Figure, path: Path) -> None:
@@ -82,7 +95,7 @@ class Zwidth:
         command = _next_command(corner.stiffness, corner.damping, self.rate)
         told = None if z.filter_time else command
         if self.as_json:
-            out.print_json(json.dumps(_z_width_facts(z, told)))
+            _print_json(_z_width_facts(z, told))
         else:
             _print_z_width(z, told)
         if self.plot is not None:
@@ -168,15 +181,15 @@ class Bound:
         if self.plot is not None:
             check_ending(self.plot)
         b = self.device_damping
-        if b is not None and not 0 < b < math.inf:
-            raise CouplingError(f"device damping is {b!r} N s/m; it must be finite and > 0")
+        if b is not None:
+            scalar("device damping", b, "N s/m", positive=True)
         period = period_of(self.rate)
         coupling = Coupling(self.stiffness, self.damping, 0.0, 0.0)
         filter_time = period if self.filter_time is None else self.filter_time
         ways = alternatives(coupling, period, filter_time)
         holds = b is None or b >= ways[0].needed
         if self.as_json:
-            out.print_json(json.dumps(self._facts(ways, period)))
+            _print_json(self._facts(ways, period))
         else:
             self._print(ways, period)
         if self.plot is not None:
@@ -194,7 +207,7 @@ class Bound:
             "alternatives": [
                 {
                     "name": way.name,
-                    "needed": way.needed if math.isfinite(way.needed) else None,
+                    "needed": way.needed,
                     "frequency_hz": _hertz(way),
                 }
                 for way in ways

@@ -6,8 +6,12 @@ from collections.abc import Iterable
 
 from numpy.typing import ArrayLike
 
-from hapticbridge.arguments import Arguments, Array
-from hapticbridge.errors import MechanicsError, choices
+from hapticbridge.arguments import Arguments, Array, shown
+from hapticbridge.coupling import Coupling
+from hapticbridge.errors import MechanicsError
+
+MOST_STEPS = 10**8
+"""Longest run in steps: a day at 1 kHz, and what fits into memory."""
 
 _ARGUMENTS = Arguments(MechanicsError)
 
@@ -32,14 +36,26 @@ def step(period: float) -> float:
     return _ARGUMENTS.number("period", period, "s", least=0, is_open=True)
 
 
+def whole(name: str, value: int, least: int) -> int:
+    """Returns a whole number in [least, ``MOST_STEPS``], or raises MechanicsError."""
+    return _ARGUMENTS.whole(name, value, least=least, most=MOST_STEPS)
+
+
 def chosen(name: str, value: str, valid: Iterable[str]) -> str:
     """Returns the value if it is one of the valid names, or raises MechanicsError."""
-    valid = tuple(valid)
-    if value not in valid:
-        raise MechanicsError(f"{name} is {value!r}; choose one of {choices(valid)}")
-    return value
+    return _ARGUMENTS.one_of(name, value, valid)
 
 
 def common_shape(**arrays: Array) -> tuple[int, ...]:
     """Returns the shape to which the arrays broadcast together, or raises MechanicsError."""
     return _ARGUMENTS.shape(**arrays)
+
+
+def spring_and_damper(coupling: Coupling) -> tuple[float, float]:
+    """Returns K in N/m and B in N s/m of a coupling, or raises MechanicsError."""
+    if not isinstance(coupling, Coupling):
+        raise MechanicsError(f"coupling is {shown(coupling)}; it must be a Coupling")
+    return (
+        _ARGUMENTS.number("coupling stiffness", float(coupling.stiffness), "N/m", least=0),
+        _ARGUMENTS.number("coupling damping", float(coupling.damping), "N s/m", least=0),
+    )

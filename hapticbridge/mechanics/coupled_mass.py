@@ -11,7 +11,14 @@ from numpy.typing import ArrayLike, NDArray
 from hapticbridge.arguments import Array
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import MechanicsError
-from hapticbridge.mechanics.arguments import chosen, common_shape, finite, positive, step
+from hapticbridge.mechanics.arguments import (
+    chosen,
+    common_shape,
+    finite,
+    positive,
+    spring_and_damper,
+    step,
+)
 
 CoupledScheme = Literal["held", "implicit", "compensated", "midpoint"]
 COUPLED_SCHEMES = ("held", "implicit", "compensated", "midpoint")
@@ -43,8 +50,10 @@ class CoupledMotion:
         References:
             Brown & Colgate 1997, eqs. (11), (16).
         """
-        kinetic = 0.5 * self.mass * self.velocity**2
-        return np.diff(kinetic, axis=0) - self.force[1:] * np.diff(self.position, axis=0)
+        # a held force that diverges ends in inf and nan, as the motion itself
+        with np.errstate(over="ignore", invalid="ignore"):
+            kinetic = 0.5 * self.mass * self.velocity**2
+            return np.diff(kinetic, axis=0) - self.force[1:] * np.diff(self.position, axis=0)
 
 
 def drive_mass(
@@ -101,7 +110,7 @@ def drive_mass(
         raise MechanicsError(f"handle has shape {h.shape}; it must be (N + 1, ...) with N >= 1")
     start = h[0] if position is None else finite("position", position, "m")
     velocity = finite("velocity", velocity, "m/s")
-    k, b = np.asarray(coupling.stiffness), np.asarray(coupling.damping)
+    k, b = (np.asarray(value) for value in spring_and_damper(coupling))
     shape = common_shape(mass=mass, handle=h[0], position=start, velocity=velocity, coupling=k + b)
     if scheme == "compensated":
         b = np.maximum(b - k * period, 0)
@@ -143,11 +152,19 @@ def exact_mass_response(
         mass: M in kg, finite and > 0.
         frequency: In Hz, finite and > 0; broadcast against the mass.
 
+    Returns:
+        X/H, complex, of the shape that mass and frequency broadcast to; inf at the resonance of an
+        undamped mass.
+
     Raises:
         MechanicsError: An argument is not finite, not positive or mis-shaped.
     """
     mass, frequency = positive("mass", mass, "kg"), positive("frequency", frequency, "Hz")
     common_shape(mass=mass, frequency=frequency)
     omega = 2 * np.pi * frequency
-    impedance = coupling.stiffness + 1j * omega * coupling.damping
-    return np.asarray(impedance / (impedance - mass * omega**2), dtype=np.complex128)
+    stiffness, damping = spring_and_damper(coupling)
+    impedance = stiffness + 1j * omega * damping
+    rest = impedance - mass * omega**2
+    with np.errstate(divide="ignore", invalid="ignore"):
+        response = impedance / rest
+    return np.asarray(np.where(rest == 0, np.inf, response), dtype=np.complex128)

@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hapticbridge.arguments import Array
+from hapticbridge.arguments import Array, shown
 from hapticbridge.errors import MechanicsError
 from hapticbridge.mechanics.arguments import chosen, common_shape, finite, positive, within
 from hapticbridge.mechanics.normal_path import NormalPath
@@ -88,9 +88,17 @@ class ImpactBody:
 
         Returns:
             Change of (V_t, V_n, ω) of the centre of mass in m/s and rad/s, shape (..., 3).
+
+        Raises:
+            MechanicsError: The impulse is not finite or mis-shaped.
         """
         impulse = finite("impulse", impulse, "N s")
+        if impulse.shape[-1:] != (2,):
+            raise MechanicsError(
+                f"impulse has shape {impulse.shape}; it must be (..., 2): P_t, P_n"
+            )
         mass, inertia, arm = (np.asarray(a) for a in (self.mass, self.inertia, self.arm))
+        common_shape(body=self.compliance()[0], impulse=impulse[..., 0])
         moment = arm[..., 0] * impulse[..., 1] - arm[..., 1] * impulse[..., 0]
         changes = (impulse[..., 0] / mass, impulse[..., 1] / mass, moment / inertia)
         return np.stack(np.broadcast_arrays(*changes), axis=-1)
@@ -152,7 +160,8 @@ def resolve_impact(
         other: The second body, its arm from its own centre of mass; None for the ground.
 
     Raises:
-        MechanicsError: An argument is not finite, out of range or mis-shaped.
+        MechanicsError: An argument is not finite, out of range or mis-shaped, or they lie so far
+            apart that the impulse overflows.
 
     References:
         Routh 1905, Dynamics of a System of Rigid Bodies I, art. 182 ff.; Stronge 1990, Proc. R.
@@ -170,40 +179,68 @@ def resolve_impact(
         )
     mu = within("friction", friction, "(no unit)", 0, np.inf)
     e = within("restitution", restitution, "(no unit)", 0, 1)
+    for name, one in (("body", body), ("other", other)):
+        if not isinstance(one, ImpactBody) and not (name == "other" and one is None):
+            raise MechanicsError(f"{name} is {shown(one)}; it must be an ImpactBody")
     a, d, g = body.compliance()
     if other is not None:
         common_shape(body=a, other=other.compliance()[0])
         a, d, g = (mine + its for mine, its in zip((a, d, g), other.compliance(), strict=True))
     common_shape(bodies=a, velocity=v_t, friction=mu, restitution=e)
 
-    side = np.sign(v_t)
-    braking = mu * a + side * g
-    # P_s; a contact without tangential velocity has no first segment, one that speeds up no second
-    with np.errstate(divide="ignore", invalid="ignore"):
+    # what overflows is refused below, what divides by zero is not used
+    with np.errstate(all="ignore"):
+        side = np.sign(v_t)
+        braking = mu * a + side * g
+        # P_s; a contact without tangential velocity has no first segment, one that speeds up no
+        # second
         slide_end = np.where(braking > 0, np.abs(v_t) / braking, np.inf)
-    slide_end = np.where(side == 0, 0.0, slide_end)
-    sticks = mu * a >= np.abs(g)
-    later_slope = np.where(sticks, g / a, mu * np.sign(g))
-    first = d + mu * side * g  # dv_n/dP_n while sliding, later: in what follows
-    second = d - g * later_slope
-    path = NormalPath(v_n, first, second, slide_end)
+        slide_end = np.where(side == 0, 0.0, slide_end)
+        sticks = mu * a >= np.abs(g)
+        later_slope = np.where(sticks, g / a, mu * np.sign(g))
+        first = d + mu * side * g  # dv_n/dP_n while sliding, later: in what follows
+        # D − G²/A = (A D − G²)/A, and what sliding back adds to it, as sums of what is positive
+        second = _determinant(body, other) / a
+        second = second + np.where(sticks, 0.0, np.abs(g) * (np.abs(g) / a - mu))
+        path = NormalPath(v_n, first, second, slide_end)
 
-    compression = path.impulse_at(np.zeros_like(v_n))
-    if law == "newton":
-        normal = path.impulse_at(-e * v_n)
-    elif law == "poisson":
-        normal = (1 + e) * compression
-    else:
-        normal = path.impulse_after_work(compression, e)
-    sliding = np.minimum(normal, slide_end)
-    tangential = later_slope * (normal - sliding) - mu * side * sliding
-    impulse = np.stack(np.broadcast_arrays(tangential, normal), axis=-1)
-    after = np.stack(
-        np.broadcast_arrays(v_t + a * tangential - g * normal, v_n + d * normal - g * tangential),
-        axis=-1,
-    )
-    energy = 0.5 * np.sum(impulse * (velocity + after), axis=-1)
+        compression = path.impulse_at(np.zeros_like(v_n))
+        if law == "newton":
+            normal = path.impulse_at(-e * v_n)
+        elif law == "poisson":
+            normal = (1 + e) * compression
+        else:
+            normal = path.impulse_after_work(compression, e)
+        sliding = np.minimum(normal, slide_end)
+        tangential = later_slope * (normal - sliding) - mu * side * sliding
+        impulse = np.stack(np.broadcast_arrays(tangential, normal), axis=-1)
+        after = np.stack(
+            np.broadcast_arrays(
+                v_t + a * tangential - g * normal, v_n + d * normal - g * tangential
+            ),
+            axis=-1,
+        )
+        energy = 0.5 * np.sum(impulse * (velocity + after), axis=-1)
+    if not (np.isfinite(impulse).all() and np.isfinite(after).all() and np.isfinite(energy).all()):
+        raise MechanicsError("masses, arms and velocities lie too far apart for double precision")
     mode = np.where(sticks, Mode.STICKS_IN_COMPRESSION, Mode.REVERSES_IN_COMPRESSION)
     mode = np.where(slide_end > compression, mode + 1, mode)
     mode = np.where((slide_end >= normal) | ((side == 0) & ~sticks), Mode.SLIDING, mode)
     return Impact(impulse, after, compression, energy, mode.astype(np.int8))
+
+
+def _determinant(body: ImpactBody, other: ImpactBody | None) -> Array:
+    """Returns A D − G² in 1/kg² without cancellation; it is > 0 for every pair of bodies."""
+    bodies = [body] if other is None else [body, other]
+    masses, inertias, arms = (
+        [np.asarray(getattr(one, name)) for one in bodies] for name in ("mass", "inertia", "arm")
+    )
+    free = sum(1 / mass for mass in masses)
+    turning = sum(
+        (arm**2).sum(axis=-1) / inertia for arm, inertia in zip(arms, inertias, strict=True)
+    )
+    determinant = free**2 + free * turning
+    if other is not None:
+        across = arms[0][..., 0] * arms[1][..., 1] - arms[0][..., 1] * arms[1][..., 0]
+        determinant = determinant + across**2 / inertias[0] / inertias[1]
+    return np.asarray(determinant)

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from hapticbridge.arguments import Array
+from hapticbridge.arguments import LARGEST, Array
 from hapticbridge.errors import MechanicsError
 from hapticbridge.jit import compiled
-from hapticbridge.mechanics.arguments import chosen, common_shape, finite, positive, step
+from hapticbridge.mechanics.arguments import chosen, common_shape, finite, positive, step, whole
 from hapticbridge.mechanics.particle import SCHEMES, Scheme
 from hapticbridge.pose import Quaternion, Vector, cross, norm, product, quaternion_exp, scaled
 
@@ -95,8 +95,7 @@ def integrate_rotation(
     chosen("scheme", scheme, SCHEMES)
     inertia, period = positive("inertia", inertia, "kg m²"), step(period)
     omega = finite("angular velocity", angular_velocity, "rad/s")
-    if not isinstance(steps, int) or steps < 1:
-        raise MechanicsError(f"steps is {steps!r}; it must be a whole number >= 1")
+    steps = whole("steps", steps, least=1)
     tau = np.zeros((steps + 1, 3)) if torque is None else finite("torque", torque, "N m")
     if len(np.atleast_1d(tau)) != steps + 1:
         raise MechanicsError(f"torque has shape {tau.shape}; it must be ({steps + 1}, ..., 3)")
@@ -119,7 +118,8 @@ def integrate_rotation(
         rates.reshape(steps + 1, -1, 3),
         turns.reshape(steps + 1, -1, 4),
     )
-    if not np.all(np.isfinite(rates)):
+    # beyond, the energy would overflow
+    if not (np.abs(rates).max() <= LARGEST**3 and np.isfinite(turns).all()):
         turn = period * float(np.max(np.linalg.norm(omega, axis=-1)))
         raise MechanicsError(
             f"the {scheme} step has no finite solution: it began with {turn:g} rad per sample; "

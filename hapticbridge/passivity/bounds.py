@@ -13,13 +13,14 @@ from hapticbridge.passivity.grid import (
     Axis,
     CouplingGrid,
     checked,
+    delayed_by,
+    one_of,
     plain,
     scalar,
     spring_and_damper,
     together,
-    whole,
 )
-from hapticbridge.passivity.spectrum import Discretization, coupling_transfer
+from hapticbridge.passivity.spectrum import DISCRETIZATIONS, Discretization
 from hapticbridge.passivity.wall import wall_supremum
 
 STIFFNESS_MARGIN = 0.8
@@ -85,7 +86,7 @@ def minimum_damping(
         coupling: K, B and their rotational counterparts; a ``CouplingGrid`` for many at once.
         period: T in s, finite and > 0: how long the device holds a wrench.
         discretization: Of the damper.
-        delay: d, whole samples from position to force.
+        delay: d, whole samples from position to force, 0 to 50.
         filter_time: τ in s, >= 0, of a first-order low-pass behind the damper, discretised alike.
         axis: Which pair of K and B is asked for.
 
@@ -102,21 +103,14 @@ def minimum_damping(
     """
     period = scalar("period", period, "s", positive=True)
     filter_time = scalar("filter time", filter_time, "s")
-    delay = whole("delay", delay)
+    delay = delayed_by(delay)
     stiffness, damping = spring_and_damper(coupling, axis)
-    if discretization not in {"backward", "tustin"}:
-        raise CouplingError(f"discretization is {discretization!r}; choose 'backward' or 'tustin'")
+    one_of("discretization", discretization, DISCRETIZATIONS)
     unbounded = discretization == "tustin" and filter_time == 0
     if delay:
         # without low-pass, Tustin is only asked where B = 0, and is the backward difference there
         scheme: Discretization = "backward" if unbounded else discretization
-
-        def transfer(
-            k: NDArray[np.float64], b: NDArray[np.float64], theta: NDArray[np.float64]
-        ) -> NDArray[np.complex128]:
-            return coupling_transfer(k, b, period, theta, scheme, filter_time)
-
-        needed = wall_supremum(transfer, stiffness, damping, period, delay, filter_time)
+        needed, _ = wall_supremum(stiffness, damping, period, scheme, delay, filter_time)
     else:
         if unbounded:
             share = 1.0

@@ -16,7 +16,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hapticbridge.passivity.grid import checked, plain, scalar, together, whole
+from hapticbridge.passivity.grid import checked, delayed_by, plain, scalar, together
 
 _Array = NDArray[np.float64]
 
@@ -28,8 +28,9 @@ SMALL = 1e-2
 """b T/m below which φ₂ is summed as a series, without unit; five terms leave 1e-14 there, while
 the closed form loses that many digits to cancellation below it."""
 
-BISECTIONS = 46
-"""Halvings of an octave: 2^-46 = 1e-14."""
+BISECTIONS = 27
+"""Halvings of an octave: 2^-27 = 7e-9, a hundredth of what double roots near 1 let the boundary be
+known to (1e-6). More would only take longer."""
 
 OCTAVES = 200
 """Doublings after which the search gives up, far beyond every limit."""
@@ -133,7 +134,7 @@ def free_device_stiffness(
         period: T in s, finite and > 0.
         mass: m_d in kg, finite and > 0.
         damping: B in N s/m, finite and >= 0.
-        delay: d, whole samples from position to force.
+        delay: d, whole samples from position to force, 0 to 50.
         filter_time: τ in s, >= 0, of a first-order low-pass behind the damper (backward).
 
     Returns:
@@ -154,7 +155,7 @@ def free_device_stiffness(
         mass=checked("mass", mass, "kg", positive=True),
         coupling_damping=checked("coupling damping", damping, "N s/m"),
     )
-    polynomial = _loop(b, masses, dampings, period, whole("delay", delay), lag)
+    polynomial = _loop(b, masses, dampings, period, delayed_by(delay), lag)
     available = (b + dampings) * period / masses
     start = FIRST_SHARE * np.where(available > 0, available, 1.0)
     kappa = _first_unstable(lambda value: _is_stable(polynomial(value)), start)
@@ -178,7 +179,7 @@ def free_device_damping(
         device_damping: b in N s/m, finite and >= 0.
         period: T in s, finite and > 0.
         mass: m_d in kg, finite and > 0.
-        delay: d, whole samples from position to force.
+        delay: d, whole samples from position to force, 0 to 50.
         filter_time: τ in s, >= 0, of a first-order low-pass behind the damper (backward).
 
     Returns:
@@ -192,7 +193,7 @@ def free_device_damping(
     """
     period = scalar("period", period, "s", positive=True)
     lag = scalar("filter time", filter_time, "s") / period
-    samples = whole("delay", delay)
+    samples = delayed_by(delay)
     b, masses = together(
         device_damping=checked("device damping", device_damping, "N s/m"),
         mass=checked("mass", mass, "kg", positive=True),

@@ -2,21 +2,30 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, fields
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hapticbridge.arguments import Arguments
+from hapticbridge.arguments import LARGEST, SMALLEST, Arguments, shown
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import CouplingError
 
 Axis = Literal["translation", "rotation"]
 """Which pair of K and B a bound is about."""
 
+MOST_DELAY = 50
+"""Longest delay in samples that is computed: 50 ms at 1 kHz, where a coupling has long been too
+soft to be of use. The time to find a bound grows with its square; more would only take longer."""
+
+MOST_SAMPLES = 10**8
+"""Longest run or series in samples: a day at 1 kHz, and what fits into memory."""
 
 _ARGUMENTS = Arguments(CouplingError)
+# a frequency is an angle over a period
+_FREQUENCIES = Arguments(CouplingError, SMALLEST**2, LARGEST**2)
 
 
 def checked(
@@ -31,15 +40,29 @@ def scalar(name: str, value: float, unit: str = "", *, positive: bool = False) -
     return _ARGUMENTS.number(name, value, unit, least=0, is_open=positive)
 
 
-def whole(name: str, value: int, least: int = 0) -> int:
-    """Returns a number of samples.
+def frequencies(value: ArrayLike) -> NDArray[np.float64]:
+    """Returns frequencies in rad/s as an array, all finite and > 0, or raises CouplingError."""
+    return _FREQUENCIES.numbers("frequency", value, "rad/s", least=0, is_open=True)
 
-    Raises:
-        CouplingError: It is not a whole number, or less than the least that is valid.
-    """
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
-        raise CouplingError(f"{name} is {value!r}; it must be a whole number of samples >= {least}")
-    return int(value)
+
+def finite(name: str, value: ArrayLike, unit: str = "") -> NDArray[np.float64]:
+    """Returns numbers of any sign as an array, all finite, or raises CouplingError."""
+    return _ARGUMENTS.numbers(name, value, unit)
+
+
+def whole(name: str, value: int, least: int = 0, most: int = MOST_SAMPLES) -> int:
+    """Returns a whole number of samples in [least, most], or raises CouplingError."""
+    return _ARGUMENTS.whole(name, value, "samples", least=least, most=most)
+
+
+def delayed_by(value: int) -> int:
+    """Returns a delay of 0 to ``MOST_DELAY`` samples, or raises CouplingError."""
+    return whole("delay", value, most=MOST_DELAY)
+
+
+def one_of(name: str, value: str, valid: Iterable[str]) -> str:
+    """Returns the value if it is one of the valid names, or raises CouplingError."""
+    return _ARGUMENTS.one_of(name, value, valid)
 
 
 def together(**arrays: NDArray[np.float64]) -> list[NDArray[np.float64]]:
@@ -88,20 +111,41 @@ class CouplingGrid:
         together(**arrays)
 
 
+_OF_ROTATION = ("rotational_stiffness", "rotational_damping")
+
+
 def spring_and_damper(
     coupling: Coupling | CouplingGrid, axis: Axis = "translation"
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Returns K and B of one kind of axis, broadcast to one shape.
 
     Raises:
-        CouplingError: The axis is unknown.
+        CouplingError: The axis is unknown, the coupling is none, or a value is too large or small.
     """
-    if axis == "translation":
-        pair = (coupling.stiffness, coupling.damping)
-    elif axis == "rotation":
-        pair = (coupling.rotational_stiffness, coupling.rotational_damping)
-    else:
-        raise CouplingError(f"axis is {axis!r}; choose 'translation' or 'rotation'")
-    stiffness, damping = (np.asarray(value, dtype=np.float64) for value in pair)
-    stiffness, damping = together(stiffness=stiffness, damping=damping)
+    is_translation = one_of("axis", axis, ("translation", "rotation")) == "translation"
+    if not isinstance(coupling, Coupling | CouplingGrid):
+        raise CouplingError(
+            f"coupling is {shown(coupling)}; it must be a Coupling or a CouplingGrid"
+        )
+    names = ("stiffness", "damping") if is_translation else _OF_ROTATION
+    if isinstance(coupling, Coupling):
+        # a Coupling knows no largest value, and may hold fractions
+        stiffness, damping = (
+            checked(f"coupling {name}", float(getattr(coupling, name)), positive=is_first)
+            for name, is_first in zip(names, (is_translation, False), strict=True)
+        )
+        return stiffness, damping
+    stiffness, damping = together(**{name: getattr(coupling, name) for name in names})
     return stiffness, damping
+
+
+def single(coupling: Coupling) -> tuple[float, float]:
+    """Returns K and B in translation of one coupling.
+
+    Raises:
+        CouplingError: It is no ``Coupling``, or a value is too large or small.
+    """
+    if not isinstance(coupling, Coupling):
+        raise CouplingError(f"coupling is {shown(coupling)}; it must be one Coupling")
+    stiffness, damping = spring_and_damper(coupling)
+    return float(stiffness), float(damping)

@@ -6,23 +6,18 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hapticbridge.errors import CouplingError
-from hapticbridge.passivity.grid import scalar
+from hapticbridge.passivity.grid import finite, scalar
 
 SYMMETRY = 1e-9
 """Largest asymmetry relative to a matrix' largest entry that passes for rounding, without unit."""
 
 
 def _symmetric(name: str, value: ArrayLike) -> NDArray[np.float64]:
-    try:
-        matrix = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise CouplingError(f"{name} is not a matrix of numbers") from error
+    matrix = finite(name, value)
     if matrix.ndim == 0:
         matrix = matrix.reshape(1, 1)
-    if matrix.ndim < 2 or matrix.shape[-1] != matrix.shape[-2] or matrix.size == 0:
+    if matrix.ndim < 2 or matrix.shape[-1] != matrix.shape[-2]:
         raise CouplingError(f"{name} has shape {matrix.shape}; it must be square: (..., n, n)")
-    if not np.isfinite(matrix).all():
-        raise CouplingError(f"{name} holds a value that is not finite")
     transposed = np.swapaxes(matrix, -1, -2)
     if np.abs(matrix - transposed).max() > SYMMETRY * np.abs(matrix).max():
         raise CouplingError(f"{name} is not symmetric; the condition holds only for symmetric ones")

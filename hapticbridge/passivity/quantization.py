@@ -7,7 +7,7 @@ from typing import Literal, Protocol
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import CouplingError
-from hapticbridge.passivity.grid import scalar
+from hapticbridge.passivity.grid import scalar, single
 
 Region = Literal["passive", "locally stable", "bounded limit cycle", "unstable"]
 """Diolaiti's four regions of (β, σ)."""
@@ -73,15 +73,15 @@ def quantization_limit(device: Mechanism, coupling: Coupling, period: float) -> 
     period = scalar("period", period, "s", positive=True)
     values = []
     for name, value, unit in (
-        ("damping", device.damping, "N s/m"),
-        ("friction", device.friction, "N"),
-        ("resolution", device.resolution, "m"),
+        ("damping", getattr(device, "damping", None), "N s/m"),
+        ("friction", getattr(device, "friction", None), "N"),
+        ("resolution", getattr(device, "resolution", None), "m"),
     ):
         if value is None:
             raise CouplingError(f"device {name} is not known; give it in {unit}")
         values.append(scalar(f"device {name}", value, unit))
     b, friction, quantum = values
-    k, damping = coupling.stiffness, coupling.damping
+    k, damping = single(coupling)
     by_damping = 2 * (b - damping) / period
     by_friction = 2 * (friction / quantum - damping / period) if quantum else float("inf")
     beta = b / (k * period)

@@ -8,11 +8,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import optimize
 
+from hapticbridge.arguments import shown
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import CouplingError
-from hapticbridge.jit import compiled
-from hapticbridge.passivity.grid import scalar, whole
+from hapticbridge.passivity.grid import delayed_by, one_of, scalar, single, whole
+from hapticbridge.passivity.recursion import run
 from hapticbridge.passivity.spectrum import (
+    DISCRETIZATIONS,
     Discretization,
     angles,
     coupling_transfer,
@@ -22,12 +24,6 @@ from hapticbridge.passivity.virtual_mass import Integrator, force_delay
 from hapticbridge.passivity.worst_hand import WorstHand
 
 _Array = NDArray[np.float64]
-
-KICK = 1e-3
-"""First displacement of the handle in m. The loop is linear, so it only scales what follows."""
-
-HUGE = 1e100
-"""Force in N at which a run has diverged beyond doubt and ends."""
 
 GRID_POINTS = 2000
 """Angles, even in θ and even in log θ, from which the search for the worst frequency starts."""
@@ -76,7 +72,7 @@ class SampledLoop:
         mass: m in kg, finite and > 0; None for a wall, x = 0.
         integrator: Of the mass.
         discretization: Of the damper.
-        delay: d, whole samples from the coupling's force to the device.
+        delay: d, whole samples from the coupling's force to the device, 0 to 50.
         filter_time: τ in s of a first-order low-pass behind the damper, >= 0.
 
     Raises:
@@ -95,16 +91,14 @@ class SampledLoop:
     filter_time: float = 0.0
 
     def __post_init__(self) -> None:
+        single(self.coupling)
         scalar("period", self.period, "s", positive=True)
         scalar("filter time", self.filter_time, "s")
         if self.mass is not None:
             scalar("mass", self.mass, "kg", positive=True)
-        whole("delay", self.delay)
+        delayed_by(self.delay)
         force_delay(self.integrator)
-        if self.discretization not in {"backward", "tustin"}:
-            raise CouplingError(
-                f"discretization is {self.discretization!r}; choose 'backward' or 'tustin'"
-            )
+        one_of("discretization", self.discretization, DISCRETIZATIONS)
 
     def response(self, frequency: ArrayLike) -> NDArray[np.complex128]:
         """Returns what the device feels, H = C e^{−jdθ} / (1 − λ C e^{j(1−n)θ}).
@@ -162,6 +156,9 @@ class SampledLoop:
         Where it is flat, as for a plain spring on a wall, the highest of equals is taken, because
         there a loop grows fastest.
         """
+        # not the search of ``wall_supremum``, whose grid knows ripples of a delay only: a tool on
+        # its spring has a resonance, anywhere and as narrow as its damping is low, so the grid is
+        # fine throughout; and it starts where a worst hand can still be told
         even = np.linspace(LOWEST_ANGLE, np.pi, GRID_POINTS)
         theta = np.union1d(even, np.geomspace(LOWEST_ANGLE, np.pi, GRID_POINTS))
         needed = self.damping_spectrum(theta / self.period)
@@ -187,13 +184,15 @@ class SampledLoop:
         Raises:
             CouplingError: The periods differ, or samples is no whole number >= 1.
         """
+        if hand is not None and not isinstance(hand, WorstHand):
+            raise CouplingError(f"hand is {shown(hand)}; it must be a WorstHand or None")
         if hand is not None and hand.period != self.period:
             raise CouplingError(
                 f"the hand's period is {hand.period:g} s, the loop's {self.period:g} s"
             )
         force, handle, tool = np.zeros((3, whole("run", samples, least=1)))
         step = self.period if self.discretization == "backward" else self.period / 2
-        done = _run(
+        done = run(
             self.coupling.stiffness,
             self.coupling.damping / (step + self.filter_time),
             (self.filter_time - (self.period - step)) / (step + self.filter_time),
@@ -207,45 +206,3 @@ class SampledLoop:
             tool,
         )
         return LoopMotion(force[:done], handle[:done], tool[:done])
-
-
-@compiled
-def _run(
-    stiffness: float,
-    c: float,
-    a: float,
-    inverse_mass: float,
-    integrator: int,
-    delay: int,
-    period: float,
-    p: float,
-    q: float,
-    r: float,
-    force: _Array,
-    handle: _Array,
-    tool: _Array,
-) -> int:
-    """Fills the arrays; returns how many samples it took."""
-    h, x, v, stretch, damper, f = KICK, 0.0, 0.0, 0.0, 0.0, 0.0
-    held_before, device_velocity = 0.0, 0.0
-    step_compliance = period * period * inverse_mass if integrator == 0 else 0.0
-    for k in range(force.size):
-        if k > 0:
-            x += period * v
-        if integrator == 2:
-            v += period * inverse_mass * f
-        f = (stiffness + c) * (h - x) - c * stretch + a * damper
-        f /= 1 + (stiffness + c) * step_compliance
-        if integrator != 2:
-            v += period * inverse_mass * f
-        x += step_compliance * f
-        stretch = h - x
-        damper = f - stiffness * stretch
-        force[k], handle[k], tool[k] = f, h, x
-        if not abs(f) < HUGE:
-            return k + 1 if k + 1 < force.size else k
-        held = -force[k - delay] if k >= delay else 0.0
-        device_velocity = p * device_velocity + q * held + r * held_before
-        held_before = held
-        h += period * device_velocity
-    return int(force.size)

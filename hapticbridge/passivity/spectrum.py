@@ -14,26 +14,31 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import signal
 
+from hapticbridge.arguments import LARGEST, shown
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import CouplingError
 from hapticbridge.passivity.grid import (
     Axis,
     CouplingGrid,
-    checked,
+    delayed_by,
+    frequencies,
+    one_of,
     plain,
     scalar,
     spring_and_damper,
-    whole,
 )
 
 Discretization = Literal["backward", "tustin"]
 """How the damper's velocity is taken from sampled positions."""
 
+DISCRETIZATIONS = ("backward", "tustin")
+
 Transfer = Callable[[NDArray[np.complex128]], Any]
 """A transfer function of z, from the handle's position in m to the force in N."""
 
 _NYQUIST_ROUNDING = 1e-12
-"""Relative excess over π/T that is taken for rounding of a grid, without unit."""
+"""Relative distance from π/T that is taken for rounding, without unit: (π/T)·T may differ from π,
+and at Nyquist itself a hand has no reactance."""
 
 
 def angles(frequency: ArrayLike, period: float) -> NDArray[np.float64]:
@@ -42,13 +47,13 @@ def angles(frequency: ArrayLike, period: float) -> NDArray[np.float64]:
     Raises:
         CouplingError: A frequency is not finite, not positive, or above Nyquist's.
     """
-    theta = checked("frequency", frequency, "rad/s", positive=True) * period
+    theta = frequencies(frequency) * period
     if theta.max() > np.pi * (1 + _NYQUIST_ROUNDING):
         raise CouplingError(
             f"frequency {theta.max() / period:g} rad/s is above {np.pi / period:g} rad/s, "
             "half the sampling rate; choose 0 < frequency <= pi / period"
         )
-    return np.minimum(theta, np.pi)
+    return np.where(theta > np.pi * (1 - _NYQUIST_ROUNDING), np.pi, theta)
 
 
 def coupling_transfer(
@@ -78,15 +83,13 @@ def coupling_transfer(
     References:
         Brown & Colgate 1997, eqs. (4) and (5).
     """
-    if discretization == "backward":
+    if one_of("discretization", discretization, DISCRETIZATIONS) == "backward":
         # 2 sin²(θ/2) is 1 − cos θ without its cancellation
         difference = 2 * np.sin(theta / 2) ** 2 + 1j * np.sin(theta)
         step = period
-    elif discretization == "tustin":
+    else:
         difference = 1j * np.tan(theta / 2)
         step = period / 2
-    else:
-        raise CouplingError(f"discretization is {discretization!r}; choose 'backward' or 'tustin'")
     transfer: NDArray[np.complex128] = stiffness + damping * (
         difference / (step + filter_time * difference)
     )
@@ -148,7 +151,7 @@ def damping_spectrum(
         period: T in s, finite and > 0.
         frequency: ω in rad/s, 0 < ω <= π/T, shape F.
         discretization: Of the damper.
-        delay: d, whole samples from position to force.
+        delay: d, whole samples from position to force, 0 to 50.
         filter_time: τ in s of a first-order low-pass behind the damper, >= 0.
         axis: Which pair of K and B is asked for.
 
@@ -163,7 +166,7 @@ def damping_spectrum(
     """
     period = scalar("period", period, "s", positive=True)
     filter_time = scalar("filter time", filter_time, "s")
-    delay = whole("delay", delay)
+    delay = delayed_by(delay)
     theta = angles(frequency, period)
     stiffness, damping = (
         value.reshape(value.shape + (1,) * theta.ndim)
@@ -218,18 +221,25 @@ def damping_spectrum_of(
                 f"the transfer function is sampled every {transfer.dt:g} s, not every {period:g} s"
             )
         rational = transfer.to_tf()
-        value = np.polyval(rational.num, z) / np.polyval(rational.den, z)
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):  # a pole is refused
+            value = np.polyval(rational.num, z) / np.polyval(rational.den, z)
     elif callable(transfer):
         value = transfer(z)
     else:
         raise CouplingError(
-            f"transfer is {transfer!r}; it must be a callable of z or a scipy.signal system"
+            f"transfer is {shown(transfer)}; it must be a callable of z or a scipy.signal system"
         )
-    response = np.asarray(value, dtype=np.complex128)
+    try:
+        given = np.asarray(value)
+    except (TypeError, ValueError):  # as rows of different lengths
+        given = np.empty(0, dtype=object)
+    if given.dtype.kind not in "iufc":
+        raise CouplingError(f"transfer returned {shown(value)}; it must return numbers in N/m")
+    response: NDArray[np.complex128] = given.astype(np.complex128)
     if response.shape not in {(), theta.shape}:
         raise CouplingError(
             f"transfer returned shape {response.shape} for z of shape {theta.shape}"
         )
-    if not np.isfinite(response).all():
+    if not (np.abs(response) <= LARGEST**2).all():
         raise CouplingError("the transfer function is not finite at one of the frequencies")
     return plain(needed_for_any_environment(response, period, theta))

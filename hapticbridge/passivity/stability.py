@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticbridge.arguments import LARGEST, SMALLEST
 from hapticbridge.passivity.sampled_loop import SampledLoop
 from hapticbridge.passivity.worst_hand import WorstHand
 
@@ -24,12 +27,17 @@ count as stable by chance; larger ones shift limits at low frequency."""
 TOLERANCE = 1e-5
 """Relative width at which the bisection ends, a hundredth of what the bounds are checked to."""
 
+STEP = 10.0
+"""Factor by which a threshold is enclosed before it is bisected, without unit. Any would do; ten
+makes a search plainly independent of the number that it is to confirm."""
+
 
 def stability_limit(loop: SampledLoop) -> float:
     """Returns the smallest device damping at which the loop with its worst hand is stable.
 
-    Found by bisection on runs in the time domain: a run is stable if the force decays. The
-    hand is tuned to ``worst_frequency`` and stays what it is while b varies.
+    Found by runs in the time domain, which are stable if the force decays: powers of ten around
+    K T + B enclose the limit, and bisection closes in. Of the theory only the hand is used, tuned
+    to ``worst_frequency`` and the same for every b.
 
     Args:
         loop: What the device feels.
@@ -46,23 +54,40 @@ def stability_limit(loop: SampledLoop) -> float:
         return float("inf")
     frequency = loop.worst_frequency()
     response = complex(loop.response(frequency))
-    expected = float(loop.damping_spectrum(frequency))
-    if expected <= 0:
-        return 0.0
 
     def is_stable(damping: float) -> bool:
         hand = WorstHand(damping, frequency, loop.period, response)
         return decays(loop.simulate(hand, SAMPLES).force, SAMPLES)
 
-    # the bracket is not centred on the bound, so that no midpoint of it is the bound
-    lower, upper = expected / 3, 2 * expected
-    while is_stable(lower):
-        lower, upper = lower / 4, lower
-    while not is_stable(upper):
-        lower, upper = upper, 4 * upper
-    while upper - lower > TOLERANCE * upper:
+    size = loop.coupling.stiffness * loop.period + loop.coupling.damping
+    start = float(np.clip(10.0 ** np.floor(np.log10(size)), SMALLEST, LARGEST))
+    return threshold(is_stable, start, TOLERANCE)
+
+
+def threshold(holds: Callable[[float], bool], start: float, tolerance: float) -> float:
+    """Returns the value above which something holds, knowing only where to begin.
+
+    Args:
+        holds: Whether it holds at a positive value; false below the threshold, true above.
+        start: First value that is tried, > 0; steps by ``STEP`` lead from it to both sides of the
+            threshold.
+        tolerance: Relative width at which the bisection ends.
+
+    Returns:
+        The middle of the last bracket; 0 where it holds everywhere down to 1e-30, inf where
+        nowhere up to 1e30.
+    """
+    lower = upper = float(start)
+    does_hold = holds(start)
+    while holds(lower) if does_hold else not holds(upper):
+        lower, upper = (lower / STEP, lower) if does_hold else (upper, upper * STEP)
+        if lower < SMALLEST:
+            return 0.0
+        if upper > LARGEST:
+            return float("inf")
+    while upper - lower > tolerance * upper:
         middle = (lower + upper) / 2
-        lower, upper = (lower, middle) if is_stable(middle) else (middle, upper)
+        lower, upper = (lower, middle) if holds(middle) else (middle, upper)
     return (lower + upper) / 2
 
 

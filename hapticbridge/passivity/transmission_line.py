@@ -14,18 +14,19 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hapticbridge.errors import CouplingError
-from hapticbridge.passivity.grid import checked, plain, scalar, whole
+from hapticbridge.passivity.grid import checked, one_of, plain, scalar, whole
 from hapticbridge.passivity.spectrum import angles
 
 Termination = Literal["software", "device"]
 """What ends the line at the device."""
 
+LONGEST_TRIP = 1_000_000
+"""Longest way there and back in samples: beyond it nθ/2 is no longer told from a pole."""
+
 
 def _checked(termination: Termination, round_trip: int) -> int:
-    if termination not in {"software", "device"}:
-        raise CouplingError(f"termination is {termination!r}; choose 'software' or 'device'")
-    return whole("round trip", round_trip, least=1)
+    one_of("termination", termination, ("software", "device"))
+    return whole("round trip", round_trip, least=1, most=LONGEST_TRIP)
 
 
 def transmission_line_spectrum(

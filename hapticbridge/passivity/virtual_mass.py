@@ -17,10 +17,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hapticbridge.coupling import Coupling
-from hapticbridge.errors import CouplingError, choices
+from hapticbridge.errors import CouplingError
 from hapticbridge.passivity.grid import (
     CouplingGrid,
     checked,
+    one_of,
     plain,
     scalar,
     spring_and_damper,
@@ -33,6 +34,10 @@ Integrator = Literal["implicit", "semi_implicit", "explicit"]
 FORCE_DELAY: dict[str, int] = {"implicit": 0, "semi_implicit": 1, "explicit": 2}
 """Samples from force to position, per integrator."""
 
+LARGEST_PRODUCT = 1e280
+"""Largest product of two coefficients, in units of K: the double's range, less what a sum of a few
+needs."""
+
 _Array = NDArray[np.float64]
 
 
@@ -42,9 +47,7 @@ def force_delay(integrator: Integrator) -> int:
     Raises:
         CouplingError: The integrator is unknown.
     """
-    if integrator not in FORCE_DELAY:
-        raise CouplingError(f"integrator is {integrator!r}; choose {choices(FORCE_DELAY)}")
-    return FORCE_DELAY[integrator]
+    return FORCE_DELAY[one_of("integrator", integrator, FORCE_DELAY)]
 
 
 def _smallest_stable_mass(stiffness: _Array, damping: _Array, period: float, delay: int) -> _Array:
@@ -182,7 +185,8 @@ def environment_minimum_damping(
         ``minimum_mass``, and with the semi-implicit step for B = 0.
 
     Raises:
-        CouplingError: An argument is out of range or mis-shaped.
+        CouplingError: An argument is out of range or mis-shaped, or K, B/T and m/T² lie a hundred
+            orders of magnitude apart.
 
     References:
         Brown & Colgate 1997, eq. (19) (reconstructed for the explicit scheme).
@@ -199,6 +203,16 @@ def environment_minimum_damping(
     g = damping / period / k
     inertia = 2 * masses / period**2 / k
     unit = np.ones_like(k)
+    with np.errstate(over="ignore", invalid="ignore"):
+        top, bottom = _polynomials(unit, g, inertia, delay)
+        size = np.abs(top).max(axis=-1) * np.abs(bottom).max(axis=-1)
+    # products of the coefficients must be doubles, and μ k⁴ must not vanish beside them
+    is_exact = (size < LARGEST_PRODUCT) & (inertia > 1 / LARGEST_PRODUCT)
+    if not (is_exact | ~stable).all():
+        raise CouplingError(
+            "stiffness, damping/period and mass/period² lie too far apart for double precision"
+        )
+    g, inertia = np.where(is_exact, (g, inertia), 1.0)
     top, bottom = _polynomials(unit, g, inertia, delay)
     points = _stationary_points(top, bottom)
     points = np.concatenate([points, np.full((*k.shape, 1), 2.0)], axis=-1)

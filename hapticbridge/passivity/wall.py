@@ -1,4 +1,4 @@
-"""The supremum over frequency of what a delayed coupling against a wall needs."""
+"""The supremum over frequency of what a delayed coupling against a wall needs, and where it is."""
 
 from __future__ import annotations
 
@@ -7,7 +7,11 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.passivity.spectrum import needed_for_fixed_environment
+from hapticbridge.passivity.spectrum import (
+    Discretization,
+    coupling_transfer,
+    needed_for_fixed_environment,
+)
 
 _Array = NDArray[np.float64]
 
@@ -22,68 +26,118 @@ share of about (d θ)² and (τθ/T)²: 1e-9 up to a delay or low-pass of 30 sam
 POINTS_PER_SEGMENT = 8
 """Grid cells that share one refinement, without unit: half a ripple, which has one maximum."""
 
-GOLDEN_STEPS = 44
-"""Golden-section steps: 0.618^44 = 6e-10 of a grid cell, beyond which θ does not matter for a
-maximum in double precision."""
+GOLDEN_STEPS = 32
+"""Golden-section steps: 0.618^32 = 2e-7 of a grid cell. The spectrum is flat at its top, so the
+value there is off by less than 1e-15 of itself; more steps would compare rounding."""
+
+BATCH = 100_000
+"""Values that are computed at once: enough that NumPy's calls do not count, and a megabyte."""
 
 _RATIO = (np.sqrt(5) - 1) / 2
 
 
 def wall_supremum(
-    transfer: Callable[[_Array, _Array, _Array], NDArray[np.complex128]],
     stiffness: _Array,
     damping: _Array,
     period: float,
+    scheme: Discretization,
     delay: int,
     filter_time: float,
-) -> _Array:
+) -> tuple[_Array, _Array]:
     """Returns the supremum over 0 < θ <= π of (T/2) Re{(1 − e^{−jθ}) C e^{−jdθ}} / (1 − cos θ).
 
     The grid is even in θ and, with a low-pass, also in log θ down to its corner. The best cell of
     every half ripple is then refined by golden section, because ripples can be equally high.
 
     Args:
-        transfer: C(K, B, θ) without the delay.
         stiffness: K in N/m.
         damping: B in N s/m, of the same shape.
         period: T in s.
+        scheme: How the damper is discretised; finite at Nyquist.
         delay: d in samples.
         filter_time: τ in s.
+
+    Returns:
+        The supremum in N s/m, and θ in rad at which it is attained, to about 1e-7; of equal maxima
+        the first.
     """
+    grid = search_grid(delay, filter_time / period)
+    # the points of each segment; segments share their ends
+    firsts = np.arange(0, grid.size - 1, POINTS_PER_SEGMENT)
+    points = np.minimum(firsts[:, None] + np.arange(POINTS_PER_SEGMENT + 1), grid.size - 1)
+    batch = max(1, BATCH // max(1, stiffness.size * points.shape[1]))
+    # one axis for the segments of a batch
+    k, b = stiffness[..., None], damping[..., None]
 
     def needed(theta: _Array) -> _Array:
-        delayed = transfer(stiffness, damping, theta) * np.exp(-1j * delay * theta)
+        more = (1,) * (theta.ndim - k.ndim)
+        transfer = coupling_transfer(
+            k.reshape(k.shape + more), b.reshape(b.shape + more), period, theta, scheme, filter_time
+        )
+        delayed = transfer * np.exp(-1j * delay * theta)
         return needed_for_fixed_environment(delayed, period, theta)
 
-    grid = np.linspace(LOWEST_ANGLE, np.pi, POINTS_PER_RIPPLE * (delay + 1) + 1)
-    if filter_time > 0:
-        corner = min(1e-2 * period / filter_time, grid[1])
-        low = np.geomspace(max(corner, LOWEST_ANGLE), grid[1], POINTS_PER_RIPPLE)
-        grid = np.union1d(grid, low)
     best = np.full(stiffness.shape, -np.inf)
-    for first in range(0, grid.size - 1, POINTS_PER_SEGMENT):
-        segment = range(first, min(first + POINTS_PER_SEGMENT + 1, grid.size))
-        best = np.maximum(best, _refined(needed, grid, segment, stiffness.shape))
-    return best
+    place = np.full(stiffness.shape, grid[0])
+    for first in range(0, len(points), batch):
+        values, angles = _refined(needed, grid, points[first : first + batch], k.shape[:-1])
+        highest = values.argmax(axis=-1)[..., None]
+        value, angle = (
+            np.take_along_axis(array, highest, -1)[..., 0] for array in (values, angles)
+        )
+        place = np.where(value > best, angle, place)
+        best = np.maximum(best, value)
+    return best, place
+
+
+def search_grid(delay: int, lag: float) -> _Array:
+    """Returns the angles in rad, ascending, between which maxima are looked for.
+
+    Args:
+        delay: d in samples.
+        lag: τ/T, without unit.
+    """
+    grid = np.linspace(LOWEST_ANGLE, np.pi, POINTS_PER_RIPPLE * (delay + 1) + 1)
+    corner = max(1e-2 / lag, LOWEST_ANGLE) if lag > 0 else np.inf
+    # a corner beyond the first cell needs no finer grid, and equal ends would differ by rounding
+    if corner < grid[1]:
+        low = np.geomspace(corner, grid[1], POINTS_PER_RIPPLE)
+        grid = np.concatenate([grid[:1], low[low > grid[0]][:-1], grid[1:]])
+    return grid
 
 
 def _refined(
-    needed: Callable[[_Array], _Array], grid: _Array, segment: range, shape: tuple[int, ...]
-) -> _Array:
-    """Returns the largest value around the best grid point of a segment, by golden section."""
-    best = np.full(shape, -np.inf)
-    lower, upper = np.full(shape, grid[0]), np.full(shape, grid[0])
-    for i in segment:
-        value = needed(grid[i])
-        better = value > best
-        best = np.where(better, value, best)
-        lower = np.where(better, grid[max(i - 1, 0)], lower)
-        upper = np.where(better, grid[min(i + 1, grid.size - 1)], upper)
+    needed: Callable[[_Array], _Array],
+    grid: _Array,
+    points: NDArray[np.intp],
+    shape: tuple[int, ...],
+) -> tuple[_Array, _Array]:
+    """Returns the largest value around the best grid point of each segment, and its θ."""
+    index = (1,) * len(shape)
+    theta = np.broadcast_to(grid[points], (*index, *points.shape))
+    at_points = needed(theta)
+    top = at_points.argmax(axis=-1)
+    best = np.take_along_axis(at_points, top[..., None], -1)[..., 0]
+    middle = points[np.arange(len(points)), top]
+    place = grid[middle]
+    lower = grid[np.maximum(middle - 1, 0)]
+    upper = grid[np.minimum(middle + 1, grid.size - 1)]
+    width = _RATIO * (upper - lower)
+    left, right = upper - width, lower + width
+    at_left, at_right = needed(left), needed(right)
     for _ in range(GOLDEN_STEPS):
-        width = _RATIO * (upper - lower)
-        left, right = upper - width, lower + width
-        at_left, at_right = needed(left), needed(right)
-        best = np.maximum(best, np.maximum(at_left, at_right))
         rising = at_right > at_left
         lower, upper = np.where(rising, left, lower), np.where(rising, upper, right)
-    return best
+        width = _RATIO * (upper - lower)
+        # one of the two inner points is kept, the other is new
+        fresh = np.where(rising, lower + width, upper - width)
+        value = needed(fresh)
+        left, right = np.where(rising, right, fresh), np.where(rising, fresh, left)
+        at_left, at_right = (
+            np.where(rising, at_right, value),
+            np.where(rising, value, at_left),
+        )
+    for value, inner in ((at_left, left), (at_right, right)):
+        better = value > best
+        best, place = np.where(better, value, best), np.where(better, inner, place)
+    return best, place

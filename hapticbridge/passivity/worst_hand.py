@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hapticbridge.arguments import LARGEST, shown
 from hapticbridge.errors import CouplingError
 from hapticbridge.passivity.grid import scalar
 from hapticbridge.passivity.spectrum import angles
@@ -57,9 +58,13 @@ class WorstHand:
     def __post_init__(self) -> None:
         scalar("device damping", self.damping, "N s/m", positive=True)
         scalar("period", self.period, "s", positive=True)
-        angles(scalar("frequency", self.frequency, "rad/s", positive=True), self.period)
-        if self.response is not None and not np.isfinite(self.response):
-            raise CouplingError(f"response is {self.response!r} N/m; it must be finite")
+        if angles(self.frequency, self.period).ndim:
+            raise CouplingError(f"frequency is {shown(self.frequency)}; it must be one number")
+        if self.response is not None:
+            if not isinstance(self.response, complex | float | int | np.number):
+                raise CouplingError(f"response is {shown(self.response)}; it must be a number")
+            if not abs(self.response) <= LARGEST**3:
+                raise CouplingError(f"response is {self.response!r} N/m; it must be finite")
 
     @property
     def reactance(self) -> float:

@@ -8,9 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.coupling import Coupling
-from hapticbridge.passivity.bounds import DAMPING_SHARE, STIFFNESS_MARGIN, minimum_damping
+from hapticbridge.passivity.bounds import DAMPING_SHARE, STIFFNESS_MARGIN
 from hapticbridge.passivity.free_device import free_device_damping, free_device_stiffness
-from hapticbridge.passivity.grid import CouplingGrid, scalar, whole
+from hapticbridge.passivity.grid import delayed_by, scalar, whole
+from hapticbridge.passivity.passive_line import PassiveLine
 
 _Array = NDArray[np.float64]
 
@@ -24,16 +25,11 @@ LEAST_FRICTION_SHARE = 0.1
 limit, without unit. Below it a coupling free of limit cycles would be softer than a tenth of the
 passive one, and the result tells of limit cycles instead. Our choice; larger tolerates more."""
 
+MOST_POINTS = 100_000
+"""Most values of B: far more than a picture has pixels."""
+
 MARGIN_OF_RANGE = 1.25
 """How far B reaches beyond what passivity allows, without unit; more shows more of what is not."""
-
-SECANTS, SETTLED = 60, 1e-13
-"""Most secant steps towards the line against a wall (about ten are taken), and the relative step in
-K at which they end: what the bound itself resolves. Both without unit."""
-
-SOFT = 1e-12
-"""Stiffness, as a share of B/T or b/T, that stands for K → 0, without unit."""
-
 
 _CYCLES = "limit cycles, which stay bounded as long as K < 2b/T"
 _DELAYED = "with a delay the bound is that of a wall; in general none can be promised, meter it"
@@ -75,6 +71,9 @@ class ZWidth:
         period: T in s.
         delay: d in samples.
         filter_time: τ in s.
+        mass: m_d in kg; None where it was not given.
+        friction: f_c in N; None where it was not given.
+        resolution: Δ in m.
     """
 
     damping: _Array
@@ -88,50 +87,9 @@ class ZWidth:
     period: float
     delay: int
     filter_time: float
-
-
-@dataclass(frozen=True, slots=True)
-class _Loop:
-    """What all lines depend on."""
-
-    b: float
-    period: float
-    delay: int
-    filter_time: float
-
-    @property
-    def share(self) -> float:
-        """How much of B the low-pass leaves to be paid for, without a delay."""
-        return self.period / (self.period + 2 * self.filter_time)
-
-    def passive(self, damping: _Array) -> _Array:
-        """Returns the largest K for any hand; with a delay against a wall."""
-        if self.delay == 0:
-            return np.maximum(0.0, 2 * (self.b - self.share * damping) / self.period)
-        # minimum_damping is convex in K, so secants from above never step past the line; they start
-        # beyond it, because at ω → 0 the wall alone asks for (d + ½) K T − B
-        soft = SOFT * self.b / self.period
-        before, last = ((self.b + damping) / (self.period * self.delay) * x for x in (1.1, 1.0))
-        needed_before = self._needed(before, damping)
-        for _ in range(SECANTS):
-            needed = self._needed(last, damping)
-            rise, step = needed_before - needed, before - last
-            following = last - (needed - self.b) * step / np.where(rise > 0, rise, np.inf)
-            before, needed_before = last, needed
-            last = np.clip(following, soft, last)
-            if (before - last <= SETTLED * before).all():
-                break
-        return np.where(last > 2 * soft, last, 0.0)
-
-    def passive_damping(self) -> float:
-        """Returns the B at which ``passive`` has fallen to 0."""
-        if self.delay == 0:
-            return self.b / self.share
-        return float(self.b / self._needed(np.full(1, SOFT / self.period), np.ones(1))[0])
-
-    def _needed(self, stiffness: _Array, damping: _Array) -> _Array:
-        pairs, tau = CouplingGrid(stiffness, damping), self.filter_time
-        return np.asarray(minimum_damping(pairs, self.period, delay=self.delay, filter_time=tau))
+    mass: float | None
+    friction: float | None
+    resolution: float
 
 
 def z_width(
@@ -158,7 +116,9 @@ def z_width(
     line is that of a loop without delay and without low-pass (which makes the damper's jumps
     smaller). It is required only where f_c T/Δ reaches ``LEAST_FRICTION_SHARE`` of b; else limit
     cycles are to be expected, which stay bounded while β = b/(K T) > ½, that is everywhere below
-    the first line, and the note says so. The line without a hand lies above the first one.
+    the first line, and the note says so. What is passive against a wall is stable without a hand:
+    the last line lies above the first one, and where rounding puts that of a very heavy device
+    below, the first one is taken.
 
     Args:
         device_damping: b in N s/m, finite and > 0.
@@ -166,7 +126,7 @@ def z_width(
         mass: m_d in kg, finite and > 0; None leaves its line out.
         friction: f_c in N, finite and >= 0; None: unknown.
         resolution: Δ in m, finite and >= 0; 0: positions are exact.
-        delay: d, whole samples from position to force.
+        delay: d, whole samples from position to force, 0 to 50.
         filter_time: τ in s, >= 0, of a first-order low-pass behind the damper.
         points: How many values of B, >= 2.
 
@@ -177,16 +137,16 @@ def z_width(
         Brown & Colgate 1997, eq. (6); Colgate & Schenkel 1997 (wall); Abbott & Okamura 2005
         (friction); Diolaiti et al. 2006 (limit cycles); Colgate & Brown 1994 (Z-width).
     """
-    loop = _Loop(
+    loop = PassiveLine(
         scalar("device damping", device_damping, "N s/m", positive=True),
         scalar("period", period, "s", positive=True),
-        whole("delay", delay),
+        delayed_by(delay),
         scalar("filter time", filter_time, "s"),
     )
-    count = whole("points", points, least=2)
+    count = whole("points", points, least=2, most=MOST_POINTS)
     quantum = scalar("resolution", resolution, "m")
     allowed, of_friction = _friction(friction, quantum, loop)
-    passive_damping = loop.passive_damping()
+    passive_damping = loop.largest_damping()
     is_kept = (allowed or 0.0) >= LEAST_FRICTION_SHARE * loop.b
     available = min(passive_damping, allowed) if allowed and is_kept else passive_damping
     grid = np.linspace(0.0, MARGIN_OF_RANGE * passive_damping, count)
@@ -199,7 +159,8 @@ def z_width(
         because = "f_c >= K Δ/2 + B Δ/T"
         lines.append(LimitLine(NO_LIMIT_CYCLES, because, stiffness, allowed, is_kept))
     if mass is not None:
-        lines.append(_free_line(loop, scalar("mass", mass, "kg", positive=True), damping))
+        heft = scalar("mass", mass, "kg", positive=True)
+        lines.append(_free_line(loop, heft, damping, lines[0]))
     # where several are 0, the one that was so first limits
     required = [line for line in lines if line.is_required]
     required.sort(key=lambda line: line.largest_damping)
@@ -217,25 +178,33 @@ def z_width(
         period=period,
         delay=delay,
         filter_time=filter_time,
+        mass=mass,
+        friction=friction,
+        resolution=quantum,
     )
 
 
-def _passive_line(loop: _Loop, damping: _Array, largest: float) -> LimitLine:
+def _passive_line(loop: PassiveLine, damping: _Array, largest: float) -> LimitLine:
     name, reason = ANY_HAND, "b > K T/2 + B T/(T + 2τ)" if loop.filter_time else "b > K T/2 + B"
     if loop.delay:
         name, reason = WALL, "at the worst frequency"
-    return LimitLine(name, reason, loop.passive(damping), largest, is_required=True)
+    return LimitLine(name, reason, loop.stiffness(damping), largest, is_required=True)
 
 
-def _free_line(loop: _Loop, mass: float, damping: _Array) -> LimitLine:
+def _free_line(loop: PassiveLine, mass: float, damping: _Array, passive: LimitLine) -> LimitLine:
     b, period, late, tau = loop.b, loop.period, loop.delay, loop.filter_time
     stiffness = free_device_stiffness(b, period, mass, damping, delay=late, filter_time=tau)
     largest = free_device_damping(b, period, mass, delay=late, filter_time=tau)
+    # the roots of a heavy device lie so near to 1 that its damping is lost in rounding
+    stiffness = np.maximum(stiffness, passive.stiffness)
+    largest = max(float(largest), passive.largest_damping)
     reason = f"{mass:g} kg let go against a wall"
-    return LimitLine(WITHOUT_HAND, reason, np.asarray(stiffness), float(largest), is_required=True)
+    return LimitLine(WITHOUT_HAND, reason, stiffness, largest, is_required=True)
 
 
-def _friction(friction: float | None, quantum: float, loop: _Loop) -> tuple[float | None, str]:
+def _friction(
+    friction: float | None, quantum: float, loop: PassiveLine
+) -> tuple[float | None, str]:
     """Returns f_c T/Δ, what friction allows of B (None: no such line), and what to say of it."""
     known = None if friction is None else scalar("friction", friction, "N")
     if quantum == 0:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from textwrap import wrap
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -29,6 +30,9 @@ HIGHEST_SHOWN = 4.0
 of the region, the damping needed); more shows more of what lies far outside and flattens the rest.
 """
 
+TITLE_WIDTH = 95
+"""Characters of a title's line that fit into 8 inches; more would be cut off."""
+
 _COLOURS = ("#1a5fb4", "#b3261e", "#2e7d32", "#8e44ad", "#c77700", "#5f6368")
 _STYLES = ("-", "--", "-.", ":", (0, (5, 1)), (0, (1, 1)))
 
@@ -41,7 +45,7 @@ class Alternative:
         name: What is different.
         needed: Device damping in N s/m; inf where none suffices.
         frequency: Where it is needed, in rad/s: 0.0 at low frequency; None where there is no single
-            one (needed alike at all of them, or not at all a matter of one frequency).
+            one: needed alike at all of them, as by a spring without damper, or at none.
         spectrum: Frequencies in rad/s and the damping needed there; None where none is drawn.
     """
 
@@ -85,6 +89,8 @@ def alternatives(coupling: Coupling, period: float, filter_time: float) -> tuple
         spectrum = damping_spectrum(
             coupling, step, frequency, discretization=scheme, delay=delay, filter_time=low_pass
         )
+        if delay == 0 and coupling.damping == 0:  # a plain spring asks for K T/2 at all of them
+            return Alternative(name, needed, None, (frequency, spectrum))
         worst = worst_frequency(
             coupling, step, discretization=scheme, delay=delay, filter_time=low_pass
         )
@@ -93,14 +99,15 @@ def alternatives(coupling: Coupling, period: float, filter_time: float) -> tuple
     asked = way("as asked (backward difference)")
     frequency = _frequencies(period)
     line = transmission_line_spectrum(coupling.stiffness * period, period, frequency)
+    # the phase of (1 − z⁻¹)z/C passes through π on its way to Nyquist, whatever K and B
+    anywhere = Alternative("one sample of delay, any environment", float("inf"), None, None)
     return (
         asked,
         way("half the period", step=period / 2),
         way(f"low-pass of {1e3 * filter_time:g} ms on the damper", low_pass=filter_time),
         way("Tustin's damper", scheme="tustin"),
         way("one sample of delay, against a wall", delay=1),
-        # the phase of (1 − z⁻¹)z/C passes through π on its way to Nyquist, whatever K and B
-        Alternative("one sample of delay, any environment", float("inf"), None, None),
+        anywhere,
         Alternative(
             "lossless line of that stiffness",
             float(line.max()),
@@ -193,9 +200,14 @@ def draw_z_width(z: ZWidth) -> Figure:
     axes.set_ylabel("coupling stiffness K (N/m)")
     axes.grid(alpha=0.3)
     facts = [f"b = {z.device_damping:g} N s/m", f"{1 / z.period:g} Hz"]
+    facts += [] if z.mass is None else [f"{z.mass:g} kg"]
+    facts += [] if z.friction is None else [f"friction {z.friction:g} N"]
+    facts += [f"steps of {z.resolution:g} m"] * bool(z.resolution)
     facts += [f"delay of {1e3 * z.delay * z.period:g} ms"] * bool(z.delay)
     facts += [f"low-pass of {1e3 * z.filter_time:g} ms"] * bool(z.filter_time)
-    title = f"What a device can show: {', '.join(facts)}"
+    # a line may end between facts only
+    kept = ", ".join(fact.replace(" ", "\xa0") for fact in facts)
+    title = "\n".join(wrap(f"What a device can show: {kept}", TITLE_WIDTH)).replace("\xa0", " ")
     figure.suptitle(title, fontsize="medium", parse_math=False)
     figure.legend(loc="outside lower center", fontsize="small", ncols=1, frameon=False)
     return figure

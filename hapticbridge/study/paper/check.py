@@ -12,7 +12,12 @@ Relation = Literal["equals", "at most", "at least"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Check:
-    """A number of the paper, got by two routes that share no code.
+    """A number of the paper, got by two routes.
+
+    The routes share as little as can be, and ``route`` says what was done. A closed form and its
+    sweep over frequency have only the coupling in common. A time-domain loop takes its worst hand
+    from the theory, and finds the limit itself. Where only a kept value stands against the code,
+    ``route`` says that too.
 
     Attributes:
         equation: Which equation it belongs to, as the paper numbers it: ``(6)``.

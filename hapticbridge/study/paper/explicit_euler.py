@@ -48,9 +48,17 @@ def section() -> Section:
     }
     for scheme, turn in turns.items():
         share = turn.kinetic_energy / turn.kinetic_energy[0] - 1
-        body.plot(PERIOD * np.arange(len(share)), 100 * share, color=COLOURS[scheme])
+        body.plot(
+            PERIOD * np.arange(len(share)),
+            100 * share,
+            color=COLOURS[scheme],
+            label=NAMES[scheme],
+            # it lies upon the explicit one
+            ls="--" if scheme == "semi_implicit" else "-",
+        )
     body.set_xlabel("time (s)")
     body.set_ylabel("energy of a tumbling body, change (%)")
+    body.legend(fontsize="small", loc="upper left")
 
     def drift(scheme: Scheme) -> float:
         energy = turns[scheme].kinetic_energy

@@ -13,6 +13,7 @@ from hapticbridge.errors import SceneError
 from hapticbridge.kernel.state import Binding, RunParameters
 from hapticbridge.kernel.step import OK, after_step, before_step
 from hapticbridge.passivity import WorstHand
+from hapticbridge.passivity.stability import threshold
 from hapticbridge.rendering import prepare
 from hapticbridge.scene import load_scene
 from hapticbridge.tick import SAMPLE_DTYPE, TICK_DTYPE
@@ -36,8 +37,8 @@ DECAYED = 1e-7
 """Share of its largest value below which a force has decayed beyond doubt, without unit. MuJoCo's
 step with a free light tool keeps about 3e-8 N alive, which neither grows nor falls."""
 
-BISECTIONS = 12
-"""Halvings of a bracket of ±20 %: the limit is found to 1e-4."""
+TOLERANCE = 1e-4
+"""Relative width at which a bisection ends: less than what ``TICKS`` let one tell."""
 
 _NO_LIMIT = 1e12  # N and N m
 _POSE = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
@@ -176,26 +177,24 @@ def decays(force: _Array, ticks: int) -> bool:
 
 
 def limit_of(
-    felt: Callable[[], Callable[[float], float]], hand: Callable[[float], WorstHand], guess: float
+    felt: Callable[[], Callable[[float], float]], hand: Callable[[float], WorstHand]
 ) -> float:
-    """Finds the device damping at which a loop begins to be stable, by bisection.
+    """Finds the device damping at which a loop begins to be stable.
+
+    Powers of ten from 1 N s/m on enclose it, so that no bound of the theory enters the search.
 
     Args:
         felt: Makes a fresh environment.
         hand: The worst hand for a device damping in N s/m.
-        guess: About where; searched within 20 %.
 
     Returns:
-        b in N s/m; an end of the bracket where the limit lies outside.
+        b in N s/m.
     """
-    lower, upper = 0.8 * guess, 1.2 * guess
-    for _ in range(BISECTIONS):
-        middle = (lower + upper) / 2
-        if decays(hold(felt(), hand(middle), TICKS), TICKS):
-            upper = middle
-        else:
-            lower = middle
-    return (lower + upper) / 2
+
+    def is_stable(damping: float) -> bool:
+        return decays(hold(felt(), hand(damping), TICKS), TICKS)
+
+    return threshold(is_stable, 1.0, TOLERANCE)
 
 
 def wall_limit(coupling: Coupling, period: float) -> float:
@@ -207,4 +206,4 @@ def wall_limit(coupling: Coupling, period: float) -> float:
     def fresh() -> Callable[[float], float]:
         return ImplicitMass(coupling, period, HEAVY).force
 
-    return limit_of(fresh, hand, coupling.stiffness * period / 2 + coupling.damping)
+    return limit_of(fresh, hand)

@@ -18,6 +18,7 @@ from hapticbridge.passivity.virtual_mass import Integrator
 from hapticbridge.study.paper.check import Check
 from hapticbridge.study.paper.drawing import panels
 from hapticbridge.study.paper.in_mujoco import AppliedForceMass, ImplicitMass, limit_of
+from hapticbridge.study.paper.least_mass import NAMES, draw_least_mass, least_stable_mass
 from hapticbridge.study.paper.section import Curve, Section, Table
 
 PERIOD = 1e-3
@@ -25,12 +26,6 @@ COUPLING = Coupling(1000.0, 2.0, 0.0, 0.0)
 K, B = COUPLING.stiffness, COUPLING.damping
 
 SCHEMES: tuple[Integrator, ...] = ("implicit", "semi_implicit", "explicit")
-NAMES = {
-    "implicit": "implicit Euler, j = 0",
-    "semi_implicit": "force before the step, j = 1",
-    "explicit": "explicit Euler, j = 2: (19)",
-}
-
 KEPT: dict[float, tuple[float, float, float]] = {
     0.002: (1.5385, 6.6667, np.inf),
     0.005: (2.0, 3.3333, 2.0),
@@ -68,8 +63,7 @@ def _in_mujoco(mass: float, integrator: Integrator) -> float:
         kind = ImplicitMass if integrator == "implicit" else AppliedForceMass
         return kind(COUPLING, PERIOD, mass).force
 
-    guess = float(environment_minimum_damping(COUPLING, PERIOD, mass, integrator))
-    return limit_of(felt, hand, guess)
+    return limit_of(felt, hand)
 
 
 def _checks() -> tuple[list[Check], list[tuple[str, ...]]]:
@@ -139,7 +133,7 @@ def section() -> Section:
     """Walks through (19) and its neighbours."""
     # finer where the explicit mass is about to be unstable
     masses = np.union1d(np.geomspace(1e-3, 1, 400), np.linspace(4e-3, 4.4e-3, 100))
-    figure, (axes,) = panels(1, height=4.4)
+    figure, (axes, damper) = panels(1, height=4.4, columns=2)
     for integrator, colour in zip(SCHEMES, ("C0", "C1", "C3"), strict=True):
         needed = np.asarray(environment_minimum_damping(COUPLING, PERIOD, masses, integrator))
         shown = np.where(np.isfinite(needed), needed, np.nan)
@@ -150,29 +144,31 @@ def section() -> Section:
             label=NAMES[integrator],
             ls="--" if integrator == "explicit" else "-",
         )
-        least = float(minimum_mass(COUPLING, PERIOD, integrator))
-        if least > 0:
-            axes.axvline(1e3 * least, color=colour, ls=":", lw=1)
-    axes.plot([], [], color="grey", ls=":", lw=1, label="least stable mass")
+        least_mass = 1e3 * float(minimum_mass(COUPLING, PERIOD, integrator))
+        if least_mass > 0:
+            delay = SCHEMES.index(integrator)
+            name = f"least stable mass, j = {delay}: {least_mass:g} g"
+            axes.axvline(least_mass, color=colour, ls=(":", (0, (1, 3)))[delay - 1], label=name)
     axes.axhline(K * PERIOD / 2 + B, color="k", lw=0.8, ls="-.", label="KT/2 + B, (6)")
     axes.set_ylim(0, 8)
     axes.set_xlabel("virtual mass (g)")
     axes.set_ylabel("device damping needed (N s/m)")
-    axes.legend(fontsize="small", loc="upper right")
+    axes.legend(fontsize="x-small", loc="upper right")
+    draw_least_mass(damper, K, PERIOD)
 
     checks, rows = _checks()
-    for integrator, expected in (
-        ("semi_implicit", PERIOD / 2 * (K * PERIOD / 2 + B)),
-        ("explicit", B**2 * PERIOD / (B - K * PERIOD)),
-    ):
-        least = expected
+    least: dict[Integrator, float] = {
+        "semi_implicit": PERIOD / 2 * (K * PERIOD / 2 + B),
+        "explicit": B**2 * PERIOD / (B - K * PERIOD),
+    }
+    for integrator, expected in least.items():
         checks.append(
             Check(
                 equation="(19)",
                 quantity=f"least stable mass, {NAMES[integrator]}",
                 route="time-domain loop, handle held still, bisection",
                 expected=expected,
-                got=_least_mass("explicit" if integrator == "explicit" else "semi_implicit", least),
+                got=least_stable_mass(COUPLING, PERIOD, integrator),
                 unit="kg",
                 tolerance=1e-3,
             )
@@ -200,10 +196,12 @@ def section() -> Section:
         curves=(
             Curve(
                 "virtual_mass",
-                f"Damping needed over the mass, K = {K:g} N/m, B = {B:g} N s/m, T = 1 ms. Where "
+                f"Left: damping needed over the mass, K = {K:g} N/m, B = {B:g} N s/m, T = 1 ms. "
+                "Where "
                 "the "
                 "blue and the red curve both exist they fall together, but for the last percents "
-                "before the explicit mass is unstable by itself.",
+                "before the explicit mass is unstable by itself. Right: the mass above which the "
+                "tool is stable by itself; under explicit Euler there is none for B ≤ KT.",
                 figure,
             ),
         ),
@@ -218,17 +216,3 @@ def section() -> Section:
             tuple(rows),
         ),
     )
-
-
-def _least_mass(integrator: Integrator, guess: float) -> float:
-    """Bisects the mass at which the loop with the handle held still begins to decay."""
-    lower, upper = 0.8 * guess, 1.3 * guess
-    samples = 20_000
-    for _ in range(16):
-        middle = (lower + upper) / 2
-        loop = SampledLoop(COUPLING, PERIOD, mass=middle, integrator=integrator)
-        force = np.abs(loop.simulate(None, samples).force)
-        third = samples // 3
-        grows = force.size < samples or force[-third:].max() > force[-2 * third : -third].max()
-        lower, upper = (middle, upper) if grows else (lower, middle)
-    return (lower + upper) / 2

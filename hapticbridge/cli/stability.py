@@ -1,0 +1,88 @@
+"""``hapticbridge stability``."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+from hapticbridge.cli.terminal import err, out, plain
+from hapticbridge.errors import StudyError, choices
+from hapticbridge.study.maps import MAPS, MapFiles, StabilityMap, run_map
+
+ALL = "all"
+
+
+@dataclass(frozen=True, slots=True)
+class Stability:
+    """Map where ways to render a tool lose passivity or stability, theory on top of measurement.
+
+    Writes NAME.png, NAME.csv and NAME.json into the folder. What is done stays in NAME.parts:
+    begun again after a stop, a map goes on from there. Example:
+
+        hapticbridge stability coupling --out maps
+    """
+
+    name: tyro.conf.Positional[str]
+    """A map's name, or 'all'; an unknown one lists them."""
+    out: Path = Path("stability")
+    """Folder to write to."""
+    points: int | None = None
+    """About how many runs or points; by default the map's own number, for about a minute."""
+    form: Annotated[Literal["csv", "parquet"], tyro.conf.arg(name="format")] = "csv"
+    """Of the table; parquet needs the extra 'tables'."""
+    scheduler: str | None = None
+    """Address of a dask.distributed scheduler to compute on (extra 'cluster')."""
+    as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
+    """Print what each map found as a JSON list."""
+
+    def execute(self) -> int:
+        """Computes the maps; returns the exit code."""
+        if self.name != ALL and self.name not in MAPS:
+            listed = "; ".join(f"{name}: {each.about}" for name, each in MAPS.items())
+            raise StudyError(
+                f"no map is called '{self.name}'; maps: {choices([*MAPS, ALL])} ({listed})"
+            )
+        chosen = MAPS.values() if self.name == ALL else (MAPS[self.name],)
+        said = []
+        for each in chosen:
+            files = self._computed(each)
+            said.append(json.loads(files.boundary.read_text(encoding="utf-8")))
+            if not self.as_json:
+                _print(each, files)
+        if self.as_json:
+            out.print_json(json.dumps(said))
+        return 0
+
+    def _computed(self, each: StabilityMap) -> MapFiles:
+        columns = (
+            TextColumn("{task.description}"),
+            BarColumn(),
+            TextColumn("{task.completed}/{task.total}"),
+            TimeRemainingColumn(),
+        )
+        with Progress(*columns, console=err, transient=True) as bar:
+            task = bar.add_task(f"map {each.name}", total=None)
+
+            def show(done: int, total: int) -> None:
+                bar.update(task, completed=done, total=total)
+
+            return run_map(
+                each,
+                self.out,
+                points=self.points,
+                form=self.form,
+                scheduler=self.scheduler,
+                progress=show,
+            )
+
+
+def _print(each: StabilityMap, files: MapFiles) -> None:
+    out.print(f"[bold]{each.name}[/]: {plain(files.finding.paragraph)}")
+    if files.failed:
+        out.print(f"  [yellow]{files.failed} points could not be computed[/]; see {files.table}")
+    err.print(f"wrote {plain(str(files.picture))}, {files.table.name}, {files.boundary.name}")

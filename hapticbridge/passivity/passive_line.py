@@ -1,0 +1,71 @@
+"""The line of passivity in the plane of K and B."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticbridge.passivity.wall import wall_supremum
+
+_Array = NDArray[np.float64]
+
+SECANTS, SETTLED = 60, 1e-13
+"""Most secant steps towards the line against a wall (about ten are taken), and the relative step in
+K at which they end: what the bound itself resolves. Both without unit."""
+
+SOFT = 1e-12
+"""Stiffness, as a share of B/T or b/T, that stands for K → 0, without unit."""
+
+
+@dataclass(frozen=True, slots=True)
+class PassiveLine:
+    """The largest stiffness over the coupling's damping that is passive on a device.
+
+    Attributes:
+        b: Device damping in N s/m, > 0.
+        period: T in s, > 0.
+        delay: d in samples; with one it is the line against a wall.
+        filter_time: τ in s, >= 0.
+    """
+
+    b: float
+    period: float
+    delay: int
+    filter_time: float
+
+    @property
+    def share(self) -> float:
+        """How much of B the low-pass leaves to be paid for, without a delay."""
+        return self.period / (self.period + 2 * self.filter_time)
+
+    def stiffness(self, damping: _Array) -> _Array:
+        """Returns the largest K for any hand; with a delay against a wall."""
+        if self.delay == 0:
+            return np.maximum(0.0, 2 * (self.b - self.share * damping) / self.period)
+        # what a wall needs is convex in K, so secants from above never step past the line; they
+        # start beyond it, because at ω → 0 the wall alone asks for (d + ½) K T − B
+        soft = SOFT * self.b / self.period
+        before, last = ((self.b + damping) / (self.period * self.delay) * x for x in (1.1, 1.0))
+        needed_before = self._needed(before, damping)
+        for _ in range(SECANTS):
+            needed = self._needed(last, damping)
+            rise, step = needed_before - needed, before - last
+            following = last - (needed - self.b) * step / np.where(rise > 0, rise, np.inf)
+            before, needed_before = last, needed
+            last = np.clip(following, soft, last)
+            if (before - last <= SETTLED * before).all():
+                break
+        return np.where(last > 2 * soft, last, 0.0)
+
+    def largest_damping(self) -> float:
+        """Returns the B at which ``stiffness`` has fallen to 0."""
+        if self.delay == 0:
+            return self.b / self.share
+        return float(self.b / self._needed(np.full(1, SOFT / self.period), np.ones(1))[0])
+
+    def _needed(self, stiffness: _Array, damping: _Array) -> _Array:
+        return wall_supremum(
+            stiffness, damping, self.period, "backward", self.delay, self.filter_time
+        )[0]

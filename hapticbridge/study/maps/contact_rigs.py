@@ -1,0 +1,232 @@
+"""Contact settings on two rigs: one mass on a wall, and a peg that jams in its hole."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from hapticbridge.coupling import Coupling
+from hapticbridge.device import Hand, Motion, SimulatedDevice
+from hapticbridge.device.motion_csv import read_motion
+from hapticbridge.rendering import METHODS
+from hapticbridge.scene import scene_path
+from hapticbridge.study.closed_loop import ClosedLoop
+from hapticbridge.study.maps.contact_treatments import PERIOD, Treatment
+from hapticbridge.study.maps.rigs import loop_in, set_tool_mass
+
+DEVICE_MARGIN = 1.25
+"""Device damping over the KT/2 + B of (6): the device is never what fails here."""
+
+WALL_DAMPING = 2.0
+"""B on the wall, in N s/m."""
+
+PEG_DAMPING = 0.5
+"""B on the peg, in N s/m; soft, so that the coupling hides little of what contacts create."""
+
+PEG_ROTATION = (1e-3, 5e-4)
+"""K_r over K, in m²/rad, and B_r in N m s/rad: the README's 2 N m/rad at 2000 N/m."""
+
+PEG_START = 0.005
+"""Height of the peg's centre at the start in m: 25 mm of the 60 mm peg stand in the hole."""
+
+RECORDED = (3.5, 6.0)
+"""Part of the recorded hand in s: into the hole and to the bottom, pressing to the sides."""
+
+DEPTH_EVERY = 20
+"""Ticks in contact between two looks at the depth: the peak of a push lasts longer, and every look
+costs as much as five ticks."""
+
+WALL_RUNS = tuple(itertools.product((0.01, 0.05, 0.2), (0, 1)))
+"""Tool mass in kg and hand."""
+
+PEG_RUNS = tuple(itertools.product((0.03, 0.1), (0.0, 0.42), (1, 2)))
+"""Tool mass in kg, friction and hand (0 is the recorded one, others are seeds)."""
+
+
+@dataclass(frozen=True, slots=True)
+class ContactRun:
+    """One closed loop with contact.
+
+    Attributes:
+        environment: The ledger's verdict.
+        created: Largest Σ E_k in J.
+        slack_share: Largest share of the slack that was used.
+        first_active: Tick at which the environment went beyond the slack, −1 for none.
+        peak_force: In N.
+        depth: Largest penetration in m.
+    """
+
+    environment: str
+    created: float
+    slack_share: float
+    first_active: int
+    peak_force: float
+    depth: float
+
+
+def summary(runs: Sequence[ContactRun]) -> dict[str, float | int]:
+    """Returns how many runs had each verdict, and the worst and the usual of them."""
+    verdicts = [run.environment for run in runs]
+    failed = [run.first_active for run in runs if run.first_active >= 0]
+    depths = [run.depth for run in runs]
+    return {
+        "runs": len(runs),
+        "strict": verdicts.count("strict"),
+        "within_slack": verdicts.count("within slack"),
+        "active": verdicts.count("active"),
+        "created": max(run.created for run in runs),
+        "slack_share": max(run.slack_share for run in runs),
+        "first_active": min(failed, default=-1),
+        "peak_force": max(run.peak_force for run in runs),
+        "median_depth": float(np.median(depths)),
+        "largest_depth": max(depths),
+    }
+
+
+def wall_runs(
+    treatment: Treatment, stiffness: float, cases: Iterable[tuple[float, int]] = WALL_RUNS
+) -> list[ContactRun]:
+    """Runs masses (kg) against a wall with hands (0 slow and deep, 1 fast) at K in N/m."""
+    loop = loop_in("virtual_wall", "contact")
+    treatment.apply(loop.scene.model, 0.0)
+    coupling = Coupling(stiffness, WALL_DAMPING, 1.0, 1e-3)  # the rail lets nothing turn
+    found = []
+    for mass, hand in cases:
+        _set_mass(loop, "tool", mass)
+        device = _device(coupling, _tapping((3.0, 6.0)[hand]), Hand(stiffness=2000.0, damping=25.0))
+        records, run = _run(loop, device, coupling, treatment, 1000)
+        # the face is 10 mm from where the tool's surface starts
+        depth = max(0.0, float(records["tool_position"][:, 0].max()) - 0.01)
+        found.append(replace(run, depth=depth))
+    return found
+
+
+def peg_runs(
+    treatment: Treatment,
+    stiffness: float,
+    cases: Iterable[tuple[float, float, int]] = PEG_RUNS,
+) -> list[ContactRun]:
+    """Runs pegs by mass (kg), friction and hand in the hole at K in N/m."""
+    loop = loop_in("peg_in_hole", "contact", _start_in_hole)
+    per_k, rotational_damping = PEG_ROTATION
+    coupling = Coupling(stiffness, PEG_DAMPING, per_k * stiffness, rotational_damping)
+    found = []
+    for mass, friction, hand in cases:
+        treatment.apply(loop.scene.model, friction)
+        _set_mass(loop, "peg", mass)
+        path, holder = _recorded() if hand == 0 else _random_push(hand)
+        device = _device(coupling, path, holder)
+        ticks = int(path.duration / PERIOD)
+        records, run = _run(loop, device, coupling, treatment, ticks)
+        found.append(replace(run, depth=_depth(loop, records)))
+    return found
+
+
+def _run(
+    loop: ClosedLoop,
+    device: SimulatedDevice,
+    coupling: Coupling,
+    treatment: Treatment,
+    ticks: int,
+) -> tuple[NDArray[np.void], ContactRun]:
+    outcome = loop.run(
+        device,
+        coupling,
+        METHODS[treatment.method],
+        period=PERIOD,
+        ticks=ticks,
+        substeps=treatment.substeps,
+        keep_records=True,
+    )
+    run = ContactRun(
+        outcome.environment,
+        outcome.created,
+        outcome.slack_share,
+        outcome.first_active,
+        outcome.peak_force,
+        0.0,
+    )
+    return outcome.records, run
+
+
+def _device(coupling: Coupling, path: Motion, hand: Hand) -> SimulatedDevice:
+    half = PERIOD / 2
+    return SimulatedDevice(
+        damping=DEVICE_MARGIN * (coupling.stiffness * half + coupling.damping),
+        rotational_damping=DEVICE_MARGIN
+        * (coupling.rotational_stiffness * half + coupling.rotational_damping),
+        hand=hand,
+        path=path,
+    )
+
+
+def _set_mass(loop: ClosedLoop, body: str, mass: float) -> None:
+    set_tool_mass(loop.scene.model, body, mass)
+    mujoco.mj_setConst(loop.scene.model, loop.scene.data)
+
+
+def _start_in_hole(model: mujoco.MjModel) -> None:
+    model.key_qpos[0, 2] = PEG_START
+
+
+@cache
+def _tapping(frequency: float) -> Motion:
+    """A hand that taps at a frequency in Hz and wants to go 6 mm behind the wall's face."""
+    time = np.linspace(0.0, 1.0, 301)
+    path = np.zeros((time.size, 3))
+    path[:, 0] = 0.008 * (1 - np.cos(2 * np.pi * frequency * time))
+    return Motion(time, path)
+
+
+@cache
+def _recorded() -> tuple[Motion, Hand]:
+    """The scene's recorded hand while it is in the hole, with the grip of a firm hand."""
+    table = read_motion(scene_path("peg_in_hole").with_suffix(".csv")).table
+    rows = (table[:, 0] >= RECORDED[0]) & (table[:, 0] <= RECORDED[1])
+    path = Motion(table[rows, 0], table[rows, 1:4], table[rows, 4:]).relative()
+    return path, Hand(
+        stiffness=2000.0, damping=25.0, rotational_stiffness=5.0, rotational_damping=0.05
+    )
+
+
+@cache
+def _random_push(seed: int) -> tuple[Motion, Hand]:
+    """A random firm hand that wants to go up to 8 mm and 0.15 rad out of place, at 0.5 to 3 Hz."""
+    random = np.random.default_rng(seed)
+    time = np.linspace(0.0, 2.0, 81)
+
+    def smooth(size: float) -> NDArray[np.float64]:
+        frequency, phase = random.uniform(0.5, 3.0, 5), random.uniform(0, 2 * np.pi, 5)
+        angle = 2 * np.pi * frequency[:, None] * time + phase[:, None]
+        waves = random.normal(size=5) @ (np.sin(angle) - np.sin(phase)[:, None])
+        return np.asarray(size * waves / np.abs(waves).max())
+
+    position = np.column_stack([smooth(8e-3) for _ in range(3)])
+    turn = Rotation.from_rotvec(np.column_stack([smooth(0.15), smooth(0.15), smooth(0.1)]))
+    hand = Hand(
+        mass=random.uniform(0.2, 0.8),
+        stiffness=random.uniform(800, 3000),
+        damping=random.uniform(5, 30),
+        rotational_stiffness=random.uniform(1, 5),
+        rotational_damping=random.uniform(0.01, 0.05),
+    )
+    return Motion(time, position, turn.as_quat(canonical=True)[:, [3, 0, 1, 2]]), hand
+
+
+def _depth(loop: ClosedLoop, records: NDArray[np.void]) -> float:
+    """Returns the largest penetration in m, from the poses that were recorded."""
+    model, data = loop.scene.model, loop.scene.data
+    depth = 0.0
+    for row in records[records["contacts"] > 0][::DEPTH_EVERY]:
+        data.qpos[:3], data.qpos[3:7] = row["tool_position"], row["tool_quaternion"]
+        mujoco.mj_fwdPosition(model, data)
+        if data.ncon:
+            depth = max(depth, -float(data.contact.dist.min()))
+    return depth

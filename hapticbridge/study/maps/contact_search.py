@@ -1,0 +1,79 @@
+"""The search of the map ``contact``: which treatment of the peg's contact is strict at 1 kHz."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+
+from hapticbridge.study.maps.contact_rigs import peg_runs, summary
+from hapticbridge.study.maps.contact_treatments import TREATMENTS
+from hapticbridge.study.maps.verdicts import COLOURS, VERDICTS
+from hapticbridge.study.table import Table
+
+SEARCH_MASSES = (0.03, 0.1, 0.3)
+"""In kg."""
+
+SEARCH_STIFFNESS = (1000.0, 6000.0)
+"""K in N/m."""
+
+SEARCH_HANDS = (0, 1, 2)
+"""The recorded one and two seeds."""
+
+FRICTION = (0.0, 0.42)
+
+
+def search(name: str, mass: float) -> dict[str, float | int]:
+    """Runs a peg of a mass in kg in one treatment, by K, friction and hand."""
+    cases = list(itertools.product([mass], FRICTION, SEARCH_HANDS))
+    treatment = TREATMENTS[name]
+    return summary([run for k in SEARCH_STIFFNESS for run in peg_runs(treatment, k, cases)])
+
+
+def searched(table: Table, name: str) -> dict[str, Any]:
+    """Returns what one treatment came to in a table of the map, over all tools."""
+    mine = table.select(table["treatment"] == name)
+    treatment = TREATMENTS[name]
+    return {
+        "treatment": name,
+        "relaxation": treatment.relaxation,
+        "static_depth": treatment.static_depth,
+        "runs": int(mine["runs"].sum()),
+        "strict": int(mine["strict"].sum()),
+        "within_slack": int(mine["within_slack"].sum()),
+        "active": int(mine["active"].sum()),
+        "created": float(mine["created"].max()),
+        "slack_share": float(mine["slack_share"].max()),
+        "median_depth": float(np.median(mine["median_depth"])),
+        "largest_depth": float(mine["largest_depth"].max()),
+    }
+
+
+def draw_search(axes: Axes, found: Sequence[Mapping[str, Any]]) -> None:
+    """Draws a bar a treatment, runs by verdict, with depths beside it."""
+    places = np.arange(len(found))[::-1]
+    left = np.zeros(len(found))
+    for verdict, colour in zip(VERDICTS[:3], COLOURS[:3], strict=True):
+        width = np.array([one[verdict.replace(" ", "_")] for one in found])
+        axes.barh(places, width, left=left, color=colour, height=0.8)
+        left = left + width
+    most = max(left.max(), 1.0)
+    for place, one in zip(places, found, strict=True):
+        text = f"{1e3 * one['median_depth']:.2f}   {1e3 * one['largest_depth']:.2f}"
+        text += f"   {one['static_depth']:.3g}   {1e3 * one['relaxation']:.3g}"
+        axes.text(1.02 * most, place, text, va="center", size=8)
+        axes.text(0.01 * most, place, f"{one['created']:.1e} J", va="center", size=7)
+    heading = "depth, mm: median,\nlargest; steady, ×; τ, ms"
+    axes.text(1.02 * most, len(found) + 0.2, heading, va="center", size=8)
+    axes.set_yticks(places, [one["treatment"] for one in found], size=8)
+    axes.set_xlim(0, 1.33 * most)
+    axes.set_ylim(-0.6, len(found) + 1.2)
+    axes.set_xlabel("runs by verdict, and the most energy that one created")
+    axes.set_title(
+        "The search on the peg: 30, 100 and 300 g, K = 1000 and 6000 N/m, friction 0 and 0.42,\n"
+        "one recorded and two random hands",
+        fontsize="small",
+    )

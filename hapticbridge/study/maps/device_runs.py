@@ -1,0 +1,190 @@
+"""Runs of a device with encoder steps and dry friction on a wall, and what they did."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticbridge.coupling import Coupling
+from hapticbridge.device import Hand, Motion, SimulatedDevice
+from hapticbridge.rendering import METHODS
+from hapticbridge.study.closed_loop import LoopOutcome
+from hapticbridge.study.maps.rigs import loop_in, set_tool_mass
+
+PERIOD = 1e-3
+STIFFNESS = 2000.0
+"""K in N/m. Only β = b/(K T) and σ = f_c/(K Δ) count, and the mass a little."""
+
+RESOLUTION = 1e-5
+"""Δ in m: an encoder of 10 µm at the handle."""
+
+QUANTUM = STIFFNESS * RESOLUTION
+"""K Δ in N, the step of the force."""
+
+DEVICE_MASS = 0.1
+"""m_d in kg, that of the default simulated device."""
+
+PULL = 1.0
+"""Stiffness of the hand in N/m: a five hundredth of K's step in force is what it varies by, so that
+it presses with a steady force."""
+
+PRESSED = 5.5
+"""Force of the hand in steps of K Δ. The half matters: the wall can answer with five or six steps,
+each wrong by half of one, and half a step is the friction that then holds the device."""
+
+LARGE = 3000.0
+"""Knock of the second run in steps of the encoder: 3 cm. Friction alone can stop a smaller one even
+where damping does not suffice: it takes 4 σ steps a swing from any motion."""
+
+WALL_MASS = 1e9
+"""In kg: a tool that the hand's press moves by 2e-9 m in a run, a five thousandth of a step."""
+
+TICKS = 6000
+"""Of a knocked run; one that is only pressed has settled in half of them."""
+
+CHANGED = 0.02
+"""Share by which the range of motion must rise or fall between the last two sixths of a run to
+count as doing so, without unit; less would take the beat of a cycle with the samples for it."""
+
+NOTHING = 2.0
+"""Range in steps of the encoder up to which motion is the cycle across one border, and neither
+rises nor falls."""
+
+DIVERGED = 3.0
+"""Multiple of the knock beyond which motion has diverged, without unit; a free device overshoots at
+most to its start."""
+
+DAMPED = 4.0
+"""b in N s/m while B is varied, above K T/2 + B throughout."""
+
+SHAKEN = 0.05
+"""Stroke of the shaken hand, in steps of the encoder: small, so that the device's own damping takes
+nothing, which would otherwise help friction."""
+
+
+def region_of(small: str, large: str) -> str:
+    """Returns the region that two runs show, from what they did alone.
+
+    Args:
+        small: What became of a device that was only pressed, as ``settle`` names it.
+        large: The same of one that was knocked as well; where it ``falls`` until the end, the
+            small one says what it falls to.
+    """
+    if "diverges" in {small, large}:
+        return "locally stable" if small == "rest" else "unstable"
+    is_passive = small == "rest" and large in {"rest", "falls"}
+    return "passive" if is_passive else "bounded limit cycle"
+
+
+def settle(
+    beta: float, sigma: float, knock: float, damping: float = 0.0
+) -> tuple[str, float, LoopOutcome]:
+    """Runs a device that a hand presses on a wall, after a knock.
+
+    Args:
+        beta: b/(K T), without unit, >= 0.
+        sigma: f_c/(K Δ), without unit, >= 0.
+        knock: Displacement at the start in steps of the encoder.
+        damping: B in N s/m, >= 0.
+
+    Returns:
+        ``rest``, ``cycle`` (motion that neither ends nor grows), ``falls`` (it is still on its way
+        down) or ``diverges``; the range of the
+        reported position in the last sixth in steps of the encoder; and the run.
+    """
+    time = [0.0, 0.02, 100.0]
+    target = np.zeros((3, 3))
+    target[1:, 0] = PRESSED * QUANTUM / PULL
+    hand = Hand(
+        mass=0.0,
+        damping=0.0,
+        stiffness=PULL,
+        rotational_inertia=0.0,
+        rotational_damping=0.0,
+        rotational_stiffness=0.0,
+    )
+    device = SimulatedDevice(
+        mass=DEVICE_MASS,
+        damping=beta * STIFFNESS * PERIOD,
+        friction=sigma * QUANTUM,
+        resolution=RESOLUTION,
+        hand=hand,
+        path=Motion(time, target),
+    )
+    start = np.array([knock * RESOLUTION, 0.0, 0.0, 0.0, 0.0, 0.0])
+    ticks = TICKS if knock else TICKS // 2
+    run = _wall(device, damping, ticks, start)
+    steps = run.records["device_position"][:, 0] / RESOLUTION
+    width = ticks // 6
+    if run.ticks < ticks or np.abs(steps).max() > DIVERGED * max(knock, 2 * PRESSED):
+        return "diverges", float(np.ptp(steps[-width:])), run
+    before, last = float(np.ptp(steps[-2 * width : -width])), float(np.ptp(steps[-width:]))
+    if last == 0:
+        return "rest", last, run
+    if last > NOTHING and last > before * (1 + CHANGED):
+        return "diverges", last, run
+    if last > NOTHING and last < before * (1 - CHANGED):
+        return "falls", last, run
+    return "cycle", last, run
+
+
+def _wall(
+    device: SimulatedDevice, damping: float, ticks: int, knock: NDArray[np.float64]
+) -> LoopOutcome:
+    return loop_in("virtual_wall", "heavy for device", _make_heavy).run(
+        device,
+        Coupling(STIFFNESS, damping, 0.0, 0.0),
+        METHODS["implicit"],
+        period=PERIOD,
+        ticks=ticks,
+        knock=knock,
+        keep_records=True,
+    )
+
+
+def _make_heavy(model: mujoco.MjModel) -> None:
+    set_tool_mass(model, "tool", WALL_MASS)
+
+
+def friction_to_rest(damping: float) -> float:
+    """Returns the least σ at which a pressed device comes to rest, by bisection."""
+    beta = DAMPED / (STIFFNESS * PERIOD)
+    lower, upper = 0.0, 2.0
+    while upper - lower > 0.02:
+        middle = (lower + upper) / 2
+        if settle(beta, middle, 0.0, damping)[0] == "rest":
+            upper = middle
+        else:
+            lower = middle
+    return (lower + upper) / 2
+
+
+def shaken(damping: float) -> float:
+    """Returns the σ that pays for what the motor gives a hand that shakes it across one step.
+
+    The hand is stiff and moves the device to and fro across a border between two encoder steps,
+    once a tick; the motor's work on it, over the way, is the friction that would take it.
+
+    Args:
+        damping: B in N s/m, >= 0.
+    """
+    ticks = 400
+    side = np.where(np.arange(ticks + 2) % 2 == 0, -0.5, 0.5) * SHAKEN
+    side[0] = 0.0
+    # a border lies half a step from where the device starts, and it goes there first
+    way = np.concatenate([[0.0, 0.0], np.full(50, 0.5), 0.5 + side]) * RESOLUTION
+    path = np.zeros((way.size, 3))
+    path[:, 0] = way
+    device = SimulatedDevice(
+        mass=1e-3,
+        damping=DAMPED,
+        resolution=RESOLUTION,
+        hand=Hand(mass=0.0, damping=1e6, stiffness=1e9),
+        path=Motion(PERIOD * np.arange(way.size), path),
+    )
+    run = _wall(device, damping, way.size - 1, np.zeros(6))
+    first = way.size - 300
+    force = run.records["wrench_on_device"][first:-1, 0]
+    moved = np.diff(way)[first : first + force.size]
+    return float((force * moved).sum() / np.abs(moved).sum() / QUANTUM)

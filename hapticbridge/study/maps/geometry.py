@@ -1,0 +1,204 @@
+"""Map ``geometry``: how long a peg may be, rendered directly and through the coupling."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from numpy.typing import NDArray
+
+from hapticbridge.passivity import maximum_stiffness
+from hapticbridge.picture import new_figure
+from hapticbridge.study.maps.fitting_peg import (
+    DEVICE_DAMPING,
+    PERIOD,
+    ROTATIONAL_DAMPING,
+    contact_stiffness_limit,
+    first_growth,
+    has_calmed,
+    is_stable,
+    length_limit,
+    run,
+)
+from hapticbridge.study.maps.stability_map import Finding, Point, StabilityMap
+from hapticbridge.study.maps.verdicts import draw_verdicts, verdict_legend, verdict_numbers
+from hapticbridge.study.table import Table
+
+LENGTH = (5e-3, 0.5)
+"""Range of L in m, even in its logarithm."""
+
+CONTACT_STIFFNESS = (10.0, 1e6)
+"""Range of K_c in N/m, even in its logarithm: its limit at both ends of ``LENGTH`` lies within."""
+
+ROTATIONAL_STIFFNESS = (0.1, 10.0)
+"""Range of K_r in N m/rad, even in its logarithm, about the bound of 3 N m/rad."""
+
+LIMIT_WIDTH = 2e-3
+"""Relative width at which the search for a limit ends: far below the 15 % that are promised."""
+
+LIMITS_AMONG = 60
+"""One limit is searched for every so many cells; a search takes about a dozen runs."""
+
+METHODS_SHOWN = ("direct", "implicit")
+
+
+def points(count: int) -> Sequence[Point]:
+    """Returns a grid of length and stiffness for both methods, about ``count`` in all, and limits.
+
+    ``stiffness`` is K_c in N/m for ``direct`` and K_r in N m/rad for ``implicit``. The limits are
+    searched over L at given K_c for ``direct``, and over K_r at given L for ``implicit``.
+    """
+    side = max(2, round((count / 2) ** 0.5))
+    lengths = np.geomspace(*LENGTH, side)
+    ranges = {"direct": CONTACT_STIFFNESS, "implicit": ROTATIONAL_STIFFNESS}
+    cells: list[Point] = [
+        {"what": "cell", "method": name, "length": float(length), "stiffness": float(stiffness)}
+        for name in METHODS_SHOWN
+        for length in lengths
+        for stiffness in np.geomspace(*ranges[name], side)
+    ]
+    many = max(3, count // (2 * LIMITS_AMONG))
+    searched = np.geomspace(*LENGTH, many)
+    direct: list[Point] = [
+        {"what": "limit", "method": "direct", "length": 0.0, "stiffness": float(stiffness)}
+        for stiffness in contact_stiffness_limit(searched[::-1])
+    ]
+    behind: list[Point] = [
+        {"what": "limit", "method": "implicit", "length": float(length), "stiffness": 0.0}
+        for length in searched
+    ]
+    return cells + direct + behind
+
+
+def evaluate(point: Point) -> Mapping[str, float | int | str | bool]:
+    """Runs one peg behind its worst hand, or searches for the limit that the point leaves open."""
+    name, length, stiffness = (
+        str(point["method"]),
+        float(point["length"]),
+        float(point["stiffness"]),
+    )
+    if point["what"] == "limit":
+        if name == "direct":
+            return {"limit": _largest(LENGTH, lambda found: is_stable(name, found, stiffness))}
+        return {
+            "limit": _largest(ROTATIONAL_STIFFNESS, lambda found: is_stable(name, length, found))
+        }
+    outcome = run(name, length, stiffness)
+    return {
+        "stable": has_calmed(outcome, name, length, stiffness),
+        "environment": outcome.environment,
+        "created": outcome.created,
+        "first_active": outcome.first_active,
+        "first_growth": first_growth(outcome, name, length, stiffness),
+    }
+
+
+def _largest(within: tuple[float, float], is_good: Callable[[float], bool]) -> float:
+    """Returns the largest value at which a run is stable, searched a factor 4 beyond a range."""
+    lower, upper = within[0] / 4, 4 * within[1]
+    while upper > lower * (1 + LIMIT_WIDTH):
+        middle = (lower * upper) ** 0.5
+        lower, upper = (middle, upper) if is_good(middle) else (lower, middle)
+    return float((lower * upper) ** 0.5)
+
+
+def read(table: Table) -> Finding:
+    """Draws contact or coupling stiffness over the length, with the limits on top."""
+    limits = table.select(table["what"] == "limit")
+    direct = limits.select(limits["method"] == "direct")
+    behind = limits.select(limits["method"] == "implicit")
+    bound = float(maximum_stiffness(DEVICE_DAMPING, PERIOD, ROTATIONAL_DAMPING))
+    predicted = length_limit(direct["stiffness"])
+    figure = new_figure(8, 4.6)
+    left, right = figure.subplots(1, 2, sharex=True)
+    _draw_cells(left, table, "direct")
+    _draw_cells(right, table, "implicit")
+    lengths = np.geomspace(*LENGTH, 100)
+    left.plot(1e3 * lengths, contact_stiffness_limit(lengths), color="black", lw=1.8)
+    left.plot(1e3 * direct["limit"], direct["stiffness"], "o", color="black", ms=4, mfc="white")
+    right.axhline(bound, color="#1a5fb4", lw=1.8, ls="--")
+    right.plot(1e3 * behind["length"], behind["limit"], "o", color="black", ms=4, mfc="white")
+    left.set_title("direct: no coupling", fontsize="medium")
+    right.set_title("implicit: behind the coupling", fontsize="medium")
+    left.set_ylabel("contact stiffness K_c (N/m)")
+    right.set_ylabel("coupling stiffness K_r (N m/rad)")
+    left.set_ylim(*CONTACT_STIFFNESS)
+    right.set_ylim(*ROTATIONAL_STIFFNESS)
+    for axes in (left, right):
+        axes.set_xlabel("length of the peg L (mm)")
+        axes.set_xlim(1e3 * LENGTH[0], 1e3 * LENGTH[1])
+    figure.suptitle(
+        f"A peg that fills its hole, handle midway, b_θ = {1e3 * DEVICE_DAMPING:g} mN m s/rad "
+        f"at {1 / PERIOD:g} Hz,\nworst hand in rotation; B_r = "
+        f"{1e3 * ROTATIONAL_DAMPING:g} mN m s/rad in the coupling",
+        fontsize="medium",
+    )
+    verdict_legend(
+        figure,
+        [
+            ("L = 2 √(b_θ/(T K_c))", "black", "-"),
+            ("(6): K_r = 2 (b_θ − B_r)/T", "#1a5fb4", "--"),
+            ("measured limit", "black", "o"),
+        ],
+    )
+    return Finding(
+        figure,
+        _paragraph(direct["limit"], predicted, behind["limit"], bound),
+        {
+            "period": PERIOD,
+            "device_rotational_damping": DEVICE_DAMPING,
+            "direct": {
+                "contact_stiffness": direct["stiffness"].tolist(),
+                "measured_length": direct["limit"].tolist(),
+                "predicted_length": predicted.tolist(),
+                "largest_deviation": _deviation(direct["limit"], predicted),
+            },
+            "implicit": {
+                "coupling_rotational_damping": ROTATIONAL_DAMPING,
+                "length": behind["length"].tolist(),
+                "measured_rotational_stiffness": behind["limit"].tolist(),
+                "predicted_6": bound,
+                "largest_deviation": _deviation(behind["limit"], np.asarray(bound)),
+                "largest_over_smallest": float(behind["limit"].max() / behind["limit"].min()),
+            },
+        },
+    )
+
+
+def _deviation(measured: NDArray[np.float64], predicted: NDArray[np.float64]) -> float:
+    return float(np.abs(measured / predicted - 1).max())
+
+
+def _paragraph(
+    lengths: NDArray[np.float64],
+    predicted: NDArray[np.float64],
+    stiffness: NDArray[np.float64],
+    bound: float,
+) -> str:
+    return (
+        f"Rendered directly, a peg is stable up to a length of {1e3 * lengths.min():.3g} to "
+        f"{1e3 * lengths.max():.3g} mm, the less the stiffer its contacts are: within "
+        f"{100 * _deviation(lengths, predicted):.2g} % of L = 2 √(b_θ/(T K_c)). Behind the "
+        f"coupling the largest K_r lies between {stiffness.min():.4g} and {stiffness.max():.4g} "
+        f"N m/rad over all lengths, within {100 * _deviation(stiffness, np.asarray(bound)):.2g} % "
+        f"of the {bound:.3g} N m/rad of eq. (6), which does not know L."
+    )
+
+
+def _draw_cells(axes: Axes, table: Table, name: str) -> None:
+    cells = table.select((table["what"] == "cell") & (table["method"] == name))
+    verdict = verdict_numbers(cells["stable"], cells["environment"])
+    length = 1e3 * cells["length"]
+    draw_verdicts(axes, length, cells["stiffness"], verdict, log_x=True, log_y=True)
+
+
+GEOMETRY = StabilityMap(
+    name="geometry",
+    about="length of a peg against the stiffness of its contacts, rendered directly, and against "
+    "that of the coupling in front of it",
+    default_points=3600,
+    points=points,
+    evaluate=evaluate,
+    read=read,
+)

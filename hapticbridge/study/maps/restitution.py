@@ -1,0 +1,206 @@
+"""Map ``restitution``: a rod after one contact of MuJoCo's, against three laws of impact."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+
+from hapticbridge.mechanics import ImpactBody, resolve_impact
+from hapticbridge.mechanics.impact import Law
+from hapticbridge.picture import new_figure
+from hapticbridge.study.maps.falling_rod import (
+    APPROACH,
+    INERTIA,
+    LENGTH,
+    MASS,
+    SETTINGS,
+    TIP,
+    drop,
+    restitution_of,
+)
+from hapticbridge.study.maps.stability_map import Finding, Point, StabilityMap
+from hapticbridge.study.table import Table
+
+RESTITUTION_LAWS: tuple[Law, ...] = ("newton", "poisson", "stronge")
+
+SLIDE = 0.8
+"""Speed in m/s along the floor, forwards, backwards or none."""
+
+FRICTIONS = (0.0, 0.25, 0.5, 0.75, 1.0)
+SHOWN = 0.75
+"""The friction coefficient whose curves are drawn, that of the example in which Newton gains."""
+
+DRAWN = ("scenes", "bouncy, implicitfast")
+
+COLOURS = {"inelastic": "#7f7f7f", "newton": "#c0504d", "poisson": "#1a5fb4", "stronge": "#2e8b57"}
+"""Of the laws; ``inelastic`` is any of them with e = 0."""
+
+
+def points(count: int) -> Sequence[Point]:
+    """Returns every contact setting, friction and slide at angles that make about ``count``."""
+    angles = np.linspace(0.05, 1.52, max(2, round(count / (len(SETTINGS) * len(FRICTIONS) * 3))))
+    return [
+        {"setting": name, "friction": friction, "slide": slide, "angle": float(angle)}
+        for name in SETTINGS
+        for friction in FRICTIONS
+        for slide in (-SLIDE, 0.0, SLIDE)
+        for angle in angles
+    ]
+
+
+def evaluate(point: Point) -> Mapping[str, float | int]:
+    """Drops a rod on MuJoCo's floor, and resolves the same impact by each law.
+
+    The laws get the e of the contact setting: that of a rod that falls upright without friction,
+    where they agree.
+    """
+    name = str(point["setting"])
+    angle, friction, slide = (float(point[key]) for key in ("angle", "friction", "slide"))
+    found = drop(name, angle, friction, slide)
+    restitution = restitution_of(name)
+    results: dict[str, float | int] = {
+        "energy_change": found.energy_change,
+        "restitution": restitution,
+        "own_restitution": found.velocity[1] / APPROACH,
+        "first_gain": found.first_gain,
+        "steps": found.steps,
+        "inelastic": _by_law("poisson", angle, friction, slide, 0.0),
+    }
+    return results | {
+        law: _by_law(law, angle, friction, slide, restitution) for law in RESTITUTION_LAWS
+    }
+
+
+def _by_law(law: Law, angle: float, friction: float, slide: float, restitution: float) -> float:
+    arm = [-LENGTH / 2 * np.cos(angle), -LENGTH / 2 * np.sin(angle) - TIP]
+    rod = ImpactBody(MASS, INERTIA, arm)
+    velocity = [slide, -APPROACH]
+    return float(resolve_impact(rod, velocity, friction, restitution, law).energy_change)
+
+
+def read(table: Table) -> Finding:
+    """Draws the energy over the angle, and how far each law is from MuJoCo."""
+    by_setting = {name: _summary(table.select(table["setting"] == name)) for name in SETTINGS}
+    figure = new_figure(8, 7.2)
+    panels = figure.subplots(2, 2, gridspec_kw={"height_ratios": [1, 1.1]})
+    for axes, name in zip(panels[0], DRAWN, strict=True):
+        _draw_curves(axes, table, name)
+    panels[0, 0].set_ylabel("change of kinetic energy (J)")
+    _draw_bars(panels[1, 0], by_setting)
+    _draw_gains(panels[1, 1], by_setting)
+    figure.suptitle(
+        f"A rod of {MASS:g} kg and {LENGTH:g} m falls at {APPROACH:g} m/s on MuJoCo's floor;\n"
+        f"above: it slides at {SLIDE:g} m/s, friction {SHOWN:g}",
+        fontsize="medium",
+    )
+    handles, labels = panels[0, 0].get_legend_handles_labels()
+    figure.legend(
+        handles, labels, loc="outside lower center", ncols=5, fontsize="small", frameon=False
+    )
+    return Finding(figure, _paragraph(by_setting), {"settings": by_setting})
+
+
+Summary = dict[str, Any]
+
+
+def _summary(mine: Table) -> Summary:
+    measured = mine["energy_change"]
+    distances = {law: float(np.sqrt(np.mean((measured - mine[law]) ** 2))) for law in COLOURS}
+    return {
+        "restitution": float(mine["restitution"][0]),
+        "rms_distance_to_law": distances,
+        "nearest_law": min(distances, key=distances.__getitem__),
+        "largest_energy_change": float(measured.max()),
+        "largest_by_newton": float(mine["newton"].max()),
+        "share_that_gained": float(np.mean(mine["first_gain"] >= 0)),
+        "at_the_largest": {
+            key: float(mine[key][measured.argmax()]) for key in ("angle", "friction", "slide")
+        },
+        "largest_own_restitution": float(mine["own_restitution"].max()),
+    }
+
+
+def _draw_curves(axes: Axes, table: Table, name: str) -> None:
+    rows = (table["setting"] == name) & (table["friction"] == SHOWN) & (table["slide"] == SLIDE)
+    mine = table.select(rows)
+    angle = np.degrees(mine["angle"])
+    styles = {"inelastic": ":", "newton": "-", "poisson": "--", "stronge": "-."}
+    for law, colour in COLOURS.items():
+        label = "any law, e = 0" if law == "inelastic" else law.capitalize()
+        axes.plot(angle, mine[law], color=colour, ls=styles[law], lw=1.6, label=label)
+    axes.plot(angle, mine["energy_change"], "o", color="black", ms=3.5, mfc="white", label="MuJoCo")
+    axes.axhline(0.0, color="black", lw=0.6)
+    axes.set_xlabel("angle of the rod above the floor (°)")
+    axes.set_title(f"{name}: e = {mine['restitution'][0]:.2g}", fontsize="medium")
+
+
+def _draw_bars(axes: Axes, by_setting: Mapping[str, Summary]) -> None:
+    place = np.arange(len(by_setting))
+    for shift, (law, colour) in enumerate(COLOURS.items()):
+        distances = [row["rms_distance_to_law"][law] for row in by_setting.values()]
+        axes.barh(place + 0.2 * (shift - 1.5), distances, 0.2, color=colour)
+    axes.set_yticks(place, [name.replace(", ", ",\n", 1) for name in by_setting], fontsize="small")
+    axes.invert_yaxis()
+    axes.set_xlabel("distance from MuJoCo, RMS (J)")
+
+
+def _draw_gains(axes: Axes, by_setting: Mapping[str, Summary]) -> None:
+    place = np.arange(len(by_setting))
+    axes.barh(
+        place - 0.18,
+        [row["largest_energy_change"] for row in by_setting.values()],
+        0.36,
+        fc="black",
+    )
+    axes.barh(
+        place + 0.18,
+        [row["largest_by_newton"] for row in by_setting.values()],
+        0.36,
+        color=COLOURS["newton"],
+    )
+    axes.set_yticks(place, [])
+    axes.invert_yaxis()
+    axes.axvline(0.0, color="black", lw=0.6)
+    axes.set_xlabel("largest change of energy (J)\nblack: MuJoCo, red: Newton")
+
+
+def _paragraph(by_setting: Mapping[str, Summary]) -> str:
+    usual = by_setting["scenes"]
+    nearest = [row["nearest_law"] for row in by_setting.values()]
+    counts = {law: nearest.count(law) for law in dict.fromkeys(nearest)}
+    likeness = ", ".join(
+        f"{'the inelastic one' if law == 'inelastic' else law.capitalize()} in {count}"
+        for law, count in sorted(counts.items(), key=lambda pair: -pair[1])
+    )
+    gains = [
+        f"'{name}' up to {row['largest_energy_change']:+.2g} J"
+        for name, row in by_setting.items()
+        if row["largest_energy_change"] > 0
+    ]
+    distances = usual["rms_distance_to_law"]
+    said = (
+        f"With the contact of the scenes a rod that falls upright comes back with e = "
+        f"{usual['restitution']:.2g}, and at any angle and friction its energy changes by "
+        f"{usual['largest_energy_change']:+.2g} J at most. Laws of impact with that e are "
+        f"{1e3 * min(distances[law] for law in RESTITUTION_LAWS):.2g} to "
+        f"{1e3 * max(distances[law] for law in RESTITUTION_LAWS):.2g} mJ away (RMS), e = 0 "
+        f"{1e3 * distances['inelastic']:.2g} mJ. Of the {len(by_setting)} settings the nearest law "
+        f"is {likeness}. "
+    )
+    if gains:
+        return f"{said}Kinetic energy is created with {', '.join(gains)}."
+    return f"{said}No setting created kinetic energy."
+
+
+RESTITUTION = StabilityMap(
+    name="restitution",
+    about="energy of a rod after one contact of MuJoCo's, against the laws of Newton, Poisson and "
+    "Stronge",
+    default_points=4200,
+    points=points,
+    evaluate=evaluate,
+    read=read,
+)

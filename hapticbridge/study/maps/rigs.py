@@ -1,0 +1,73 @@
+"""What maps have in common: hands that stand still, and a scene in every thread."""
+
+from __future__ import annotations
+
+import re
+import tempfile
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from hapticbridge.device import Motion
+from hapticbridge.scene import Scene, load_scene
+from hapticbridge.scene.library import scene_path
+from hapticbridge.study.closed_loop import ClosedLoop
+
+STILL = Motion([0.0, 1.0], np.zeros((2, 3)))
+"""The path of a hand that wants to stay where it is."""
+
+_of_this_thread = threading.local()
+
+
+def scene_of(mjcf: str) -> Scene:
+    """Loads a scene from the text of an MJCF file that refers to no other."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "rig.xml"
+        path.write_text(mjcf, encoding="utf-8")
+        return load_scene(path)
+
+
+def free_tool_and_wall() -> Scene:
+    """Loads ``virtual_wall`` with its rail taken away: a tool of six degrees of freedom."""
+    text = scene_path("virtual_wall").read_text(encoding="utf-8")
+    freed, count = re.subn(r"<joint [^>]*type=\"slide\"[^>]*/>", "<freejoint/>", text)
+    assert count == 1, "virtual_wall has one slide joint"
+    return scene_of(freed.replace('<key name="home" qpos="0"/>', '<key name="home"/>'))
+
+
+def loop_in(
+    scene: str | Callable[[], Scene],
+    key: object = None,
+    change: Callable[[mujoco.MjModel], None] | None = None,
+) -> ClosedLoop:
+    """Returns a closed loop on a scene, made once per thread.
+
+    Args:
+        scene: The name of a shipped one, or what loads it.
+        key: What tells this change from others; loops are kept by scene and key.
+        change: Applied to the model before the first run; derived constants are set again.
+    """
+    loops: dict[object, ClosedLoop] = _of_this_thread.__dict__.setdefault("loops", {})
+    if (scene, key) not in loops:
+        loop = ClosedLoop(load_scene(scene) if isinstance(scene, str) else scene())
+        if change is not None:
+            change(loop.scene.model)
+            mujoco.mj_setConst(loop.scene.model, loop.scene.data)
+        loops[scene, key] = loop
+    return loops[scene, key]
+
+
+def set_tool_mass(model: mujoco.MjModel, body: str, mass: float) -> None:
+    """Gives a body another mass and scales its inertia alike.
+
+    Args:
+        model: Changed in place; ``mj_setConst`` must follow.
+        body: The tool's name.
+        mass: In kg.
+    """
+    body_id = model.body(body).id
+    model.body_inertia[body_id] *= mass / model.body_mass[body_id]
+    model.body_mass[body_id] = mass

@@ -1,0 +1,200 @@
+"""A rig: a free tool with three moments of inertia, held by its centre, behind a handle that spins.
+
+The handle's motion is prescribed, so that speed and angle are what a map asks for, and not what a
+hand's dynamics make of it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from hapticbridge.coupling import Coupling
+from hapticbridge.kernel.parameters import RunParameters
+from hapticbridge.kernel.state import Binding
+from hapticbridge.kernel.step import simulate
+from hapticbridge.ledger import Ledger
+from hapticbridge.rendering import METHODS, prepare
+from hapticbridge.scene import Scene
+from hapticbridge.study.closed_loop import UNLIMITED
+from hapticbridge.study.maps.rigs import loop_in, scene_of
+from hapticbridge.study.maps.tumbling import INERTIA, MIDDLE, OBLIQUE, PERIOD, TICKS
+from hapticbridge.tick import SAMPLE_DTYPE, TICK_DTYPE
+
+MASS = 0.3
+"""In kg."""
+
+STIFFNESS, DAMPING = 2000.0, 0.5
+"""K in N/m and B in N s/m of the coupling's translation: it only keeps the tool in its place."""
+
+ROTATIONAL_DAMPING = 5e-4
+"""B_r in N m s/rad; none where K_r = 0."""
+
+LIMIT_WIDTH = 1e-3
+"""Relative width at which the search for the speed of the cut ends."""
+
+DIVERGED = 1e3
+"""Kinetic energy in J that ends a run: ten times what the tool has at 200 rad/s, so that it has
+diverged beyond doubt, and before MuJoCo warns of numbers that are not finite."""
+
+CHUNK = 2
+"""Ticks after which that is looked at; five beyond it, MuJoCo would warn."""
+
+_TOOL = f"""
+<mujoco>
+  <option gravity="0 0 0"/>
+  <worldbody>
+    <body name="tool">
+      <freejoint/>
+      <inertial pos="0 0 0" mass="{MASS!r}" diaginertia="{" ".join(map(repr, INERTIA.tolist()))}"/>
+      <geom type="sphere" size="0.01" mass="0" contype="0" conaffinity="0"/>
+      <site name="grip"/>
+    </body>
+  </worldbody>
+</mujoco>"""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Spin:
+    """What a run with a spinning handle came to.
+
+    Attributes:
+        ticks: How many were done; fewer than ``TICKS`` where it diverged.
+        environment: ``strict``, ``within slack`` or ``active``.
+        created: The largest Σ E_k so far at any tick, in J.
+        slack_share: Largest share of the slack that was used, without unit.
+        first_active: Tick of the first violation of the slack, −1 for none.
+        largest_angle: Between handle and tool in rad, at most π.
+        crossed: Tick at which the angle had passed π since the tick before, −1 for never.
+        torque_jump: Largest change of the torque on the tool within a tick in N m.
+    """
+
+    ticks: int
+    environment: str
+    created: float
+    slack_share: float
+    first_active: int
+    largest_angle: float
+    crossed: int
+    torque_jump: float
+
+
+def spin(
+    method: str,
+    coupling: Coupling,
+    speed: float,
+    *,
+    angle: float = 0.0,
+    axis: NDArray[np.float64] = OBLIQUE,
+    spins_at_start: bool = True,
+) -> Spin:
+    """Turns the handle at a constant speed for 1 s, with the tool behind it.
+
+    Args:
+        method: One of ``rendering.METHODS`` that has a coupling.
+        coupling: K and B.
+        speed: Of the handle in rad/s.
+        angle: By which the handle is ahead of the tool at the start, about x, in rad.
+        axis: Of the handle's turning, in the world frame, shape (3,), of any length > 0.
+        spins_at_start: Whether the tool turns with the handle from the start, or is at rest.
+
+    Raises:
+        HapticBridgeError: A value is out of range, or the method cannot render a free tool.
+    """
+    scene = loop_in(_load).scene
+    chosen = METHODS[method]
+    felt = prepare(scene, coupling, PERIOD, 1, chosen)
+    direction = axis / np.linalg.norm(axis)
+    time = PERIOD * np.arange(TICKS + 1)
+    turns = Rotation.from_rotvec(np.outer(speed * time, direction)) * Rotation.from_rotvec(
+        [angle, 0.0, 0.0]
+    )
+    quaternions = turns.as_quat(canonical=True)[:, [3, 0, 1, 2]]
+    samples = np.zeros(TICKS, SAMPLE_DTYPE)
+    samples["quaternion"] = quaternions[1:]
+    if spins_at_start:
+        _set_spin(scene, speed * direction)
+    parameters = RunParameters(
+        grip=scene.grip,
+        period=PERIOD,
+        substeps=1,
+        coupling=coupling,
+        force_limit=UNLIMITED,
+        torque_limit=UNLIMITED,
+        ramp_ticks=0,
+        device_origin=(0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0),
+        handle_origin=scene.grip_pose(),
+        device_start=(0.0, 0.0, 0.0, *(float(value) for value in quaternions[0])),
+        scheme=chosen.scheme,
+        felt=felt,
+    )
+    binding = Binding(scene.model, scene.data, parameters)
+    records = np.zeros(TICKS, TICK_DTYPE)
+    done = _run(binding, samples, records)
+    return _read(binding, records[:done])
+
+
+def coupling_of(stiffness: float) -> Coupling:
+    """Returns the coupling with a K_r in N m/rad; with 0 it does not hold the tool's turning."""
+    return Coupling(STIFFNESS, DAMPING, stiffness, ROTATIONAL_DAMPING if stiffness else 0.0)
+
+
+def sudden(method: str, stiffness: float, speed: float) -> Spin:
+    """Turns the handle suddenly about the middle axis, with the tool at rest."""
+    return spin(method, coupling_of(stiffness), speed, axis=MIDDLE, spins_at_start=False)
+
+
+def speed_of_cut(method: str, stiffness: float) -> float:
+    """Returns the speed in rad/s, 1 to 1000, at which a sudden turn winds the angle past π."""
+    lower, upper = 1.0, 1000.0
+    while upper > lower * (1 + LIMIT_WIDTH):
+        middle = (lower * upper) ** 0.5
+        if sudden(method, stiffness, middle).crossed < 0:
+            lower = middle
+        else:
+            upper = middle
+    return float((lower * upper) ** 0.5)
+
+
+def _load() -> Scene:
+    return scene_of(_TOOL)
+
+
+def _set_spin(scene: Scene, omega: NDArray[np.float64]) -> None:
+    scene.data.qvel[3:6] = omega  # the body's axes are the world's at the start
+    mujoco.mj_forward(scene.model, scene.data)
+
+
+def _run(binding: Binding, samples: NDArray[np.void], records: NDArray[np.void]) -> int:
+    for first in range(0, TICKS, CHUNK):
+        part = slice(first, first + CHUNK)
+        done = simulate(binding.state, samples[part], binding.row, records[part])
+        if done < CHUNK or not binding.state["kinetic"][0] < DIVERGED:
+            return first + done
+    return TICKS
+
+
+def _read(binding: Binding, records: NDArray[np.void]) -> Spin:
+    ledger = Ledger.of(binding.state)
+    handle = Rotation.from_quat(records["handle_quaternion"][:, [1, 2, 3, 0]])
+    tool = Rotation.from_quat(records["tool_quaternion"][:, [1, 2, 3, 0]])
+    between = (handle * tool.inv()).as_rotvec()
+    angles = np.linalg.norm(between, axis=1)
+    # just before the cut and just behind it the rotation vectors point opposite ways
+    opposite = np.sum(between[1:] * between[:-1], axis=1) < 0
+    crossed = np.flatnonzero(opposite & (angles[1:] > np.pi / 2) & (angles[:-1] > np.pi / 2))
+    jumps = np.linalg.norm(np.diff(records["wrench_on_tool"][:, 3:], axis=0), axis=1)
+    return Spin(
+        ticks=records.size,
+        environment=ledger.environment,
+        created=float(records["environment_energy"].max(initial=0.0)),
+        slack_share=ledger.slack_share,
+        first_active=-1 if ledger.first_active is None else ledger.first_active,
+        largest_angle=float(angles.max(initial=0.0)),
+        crossed=int(crossed[0]) + 1 if crossed.size else -1,
+        torque_jump=float(jumps.max(initial=0.0)),
+    )

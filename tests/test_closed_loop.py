@@ -1,0 +1,230 @@
+"""The closed loop compiled whole: the same as the live loop, and trusted by the theory."""
+
+from __future__ import annotations
+
+import math
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict
+
+import numpy as np
+import pytest
+
+from hapticbridge.bridge import Bridge
+from hapticbridge.clock import SimulatedClock
+from hapticbridge.coupling import Coupling
+from hapticbridge.device import Hand, Motion, SimulatedDevice
+from hapticbridge.errors import StudyError
+from hapticbridge.guard import Limits
+from hapticbridge.passivity import SampledLoop, WorstHand, minimum_damping
+from hapticbridge.rendering import METHODS
+from hapticbridge.scene import load_scene
+from hapticbridge.study.closed_loop import PARTS, ClosedLoop, LoopOutcome, Timing
+from hapticbridge.tick import CLOCK_FIELDS, TICK_DTYPE
+
+T = 1e-3
+COUPLING = Coupling(2000, 0.5, 2, 5e-4)
+KNOCK = np.array([1e-4, 0, 0, 0, 0, 0])
+STILL = Motion([0.0, 1.0], np.zeros((2, 3)))
+
+
+@pytest.fixture(scope="module")
+def point_mass() -> ClosedLoop:
+    return ClosedLoop(load_scene("point_mass"))
+
+
+def fields_without_times() -> list[str]:
+    return [name for name in TICK_DTYPE.names or () if name not in CLOCK_FIELDS]
+
+
+@pytest.mark.parametrize("method", ["implicit", "explicit", "implicitfast"])
+@pytest.mark.parametrize("scene", ["point_mass", "peg_in_hole"])
+def test_records_are_those_of_the_live_loop_to_the_bit(scene: str, method: str) -> None:
+    path = f"models/{scene}/{scene}.csv"
+
+    def device() -> SimulatedDevice:
+        return SimulatedDevice(
+            damping=3.0,
+            resolution=1e-6,
+            friction=0.02,
+            delay=1,
+            path=path,
+            force_limit=1e9,
+            torque_limit=1e9,
+        )
+
+    outcome = ClosedLoop(load_scene(scene)).run(
+        device(),
+        COUPLING,
+        METHODS[method],
+        period=T,
+        ticks=1500,
+        keep_records=True,
+    )
+    limits = Limits(force=1e9, torque=1e9, ramp=0.0)
+    with Bridge(
+        load_scene(scene), device(), COUPLING, clock=SimulatedClock(), method=method, limits=limits
+    ) as bridge:
+        bridge.run(duration=1.5)
+        expected = bridge.latest_records(1500)
+    assert len(outcome.records) == len(expected) == 1500
+    for name in fields_without_times():
+        assert np.array_equal(outcome.records[name], expected[name]), name
+
+
+def run_worst_hand(loop: ClosedLoop, share: float, ticks: int = 3000) -> LoopOutcome:
+    theory = SampledLoop(COUPLING, T, mass=0.1)
+    frequency = theory.worst_frequency()
+    bound = float(theory.damping_spectrum(frequency))
+    hand = WorstHand(share * bound, frequency, T, complex(theory.response(frequency)))
+    device = SimulatedDevice(hand=hand)
+    return loop.run(device, COUPLING, METHODS["implicit"], ticks=ticks, knock=KNOCK)
+
+
+def test_with_mujoco_in_the_loop_the_worst_hand_diverges_below_the_bound_and_not_above(
+    point_mass: ClosedLoop,
+) -> None:
+    below, above = (run_worst_hand(point_mass, share) for share in (0.98, 1.02))
+    assert not below.is_stable
+    assert below.ticks < 3000
+    assert above.is_stable
+    assert above.ticks == 3000
+    # the simulation is passive in both: it is the device that lacks damping
+    assert below.environment == above.environment == "strict"
+
+
+def test_runs_in_threads_are_the_run_alone() -> None:
+    scene = load_scene("peg_in_hole")
+
+    def run(seed: int) -> LoopOutcome:
+        hand = Hand(stiffness=100.0 + seed)
+        device = SimulatedDevice(hand=hand, path="models/peg_in_hole/peg_in_hole.csv")
+        return ClosedLoop(scene).run(
+            device, COUPLING, METHODS["implicit"], ticks=600, keep_records=True
+        )
+
+    alone = [run(seed) for seed in range(4)]
+    with ThreadPoolExecutor(2) as pool:
+        together = list(pool.map(run, range(4)))
+    for one, other in zip(alone, together, strict=True):
+        assert one.records.tobytes() == other.records.tobytes()
+
+
+def test_one_loop_runs_again_as_if_it_were_new(point_mass: ClosedLoop) -> None:
+    def run(loop: ClosedLoop) -> bytes:
+        device = SimulatedDevice(damping=3.0)
+        outcome = loop.run(device, COUPLING, METHODS["implicit"], ticks=300, keep_records=True)
+        return outcome.records.tobytes()
+
+    first = run(point_mass)
+    point_mass.run(SimulatedDevice(), Coupling(500, 2, 0, 0), METHODS["explicit"], ticks=50)
+    assert run(point_mass) == first == run(ClosedLoop(load_scene("point_mass")))
+
+
+def test_explicit_coupling_on_a_light_stiff_tool_is_named_active_and_implicit_is_strict(
+    point_mass: ClosedLoop,
+) -> None:
+    time = np.linspace(0, 1, 101)
+    path = np.zeros((101, 3))
+    path[:, 0] = 0.01 * np.sin(6 * np.pi * time)
+    stiff = Coupling(30_000, 0, 0, 0)
+    motion = Motion(time, path)
+    explicit, implicit = (
+        point_mass.run(SimulatedDevice(damping=20.0, path=motion), stiff, METHODS[name], ticks=1000)
+        for name in ("explicit", "implicit")
+    )
+    assert explicit.environment == "active"
+    assert 0 <= explicit.first_active < 1000
+    assert explicit.created > 0
+    assert (implicit.environment, implicit.created, implicit.first_active) == ("strict", 0.0, -1)
+
+
+def test_even_timing_changes_nothing_and_late_ticks_do(point_mass: ClosedLoop) -> None:
+    def force(timing: Timing | None) -> LoopOutcome:
+        device = SimulatedDevice(path="models/point_mass/point_mass.csv")
+        return point_mass.run(
+            device,
+            COUPLING,
+            METHODS["implicit"],
+            ticks=400,
+            timing=timing,
+            keep_records=True,
+        )
+
+    without, even, late = force(None), force(Timing()), force(Timing(jitter=0.5, seed=1))
+    assert without.records.tobytes() == even.records.tobytes()
+    assert without.records.tobytes() != late.records.tobytes()
+
+
+def test_device_is_exact_between_uneven_ticks(point_mass: ClosedLoop) -> None:
+    # a damped oscillation of device and hand, whenever it is looked at
+    mass, damping, stiffness = 0.2, 0.5, 400.0
+    timing = Timing(jitter=0.9, drops=0.3, seed=4)
+    hand = Hand(
+        mass=0,
+        damping=0,
+        stiffness=stiffness,
+        rotational_inertia=0,
+        rotational_damping=0,
+        rotational_stiffness=0,
+    )
+    outcome = point_mass.run(
+        SimulatedDevice(mass=mass, damping=damping, hand=hand, path=STILL),
+        Coupling(1e-9, 0, 0, 0),
+        METHODS["implicit"],
+        ticks=200,
+        timing=timing,
+        knock=KNOCK,
+        keep_records=True,
+    )
+    intervals = timing.intervals(200)
+    time = np.cumsum(intervals - intervals[0] * (np.arange(200) == 0)) * T / PARTS
+    decay = damping / (2 * mass)
+    swing = math.sqrt(stiffness / mass - decay**2)
+    expected = np.exp(-decay * time) * (np.cos(swing * time) + decay / swing * np.sin(swing * time))
+    assert outcome.records["device_position"][:, 0] == pytest.approx(1e-4 * expected, abs=1e-12)
+
+
+def test_intervals_are_whole_parts_that_add_up_to_the_time() -> None:
+    ticks = 50_000
+    jittered = Timing(jitter=0.5, seed=2).intervals(ticks)
+    assert jittered.min() >= 1
+    assert abs(int(jittered.sum()) - PARTS * ticks) <= PARTS
+    dropped = Timing(drops=0.25, seed=2).intervals(ticks)
+    assert set(np.unique(dropped % PARTS)) == {0}
+    # a share p of ticks missed makes the mean interval T/(1 − p)
+    assert dropped.mean() == pytest.approx(PARTS / 0.75, rel=0.02)
+    assert np.array_equal(Timing(jitter=0.3, seed=7).intervals(50), Timing(0.3, 0, 7).intervals(50))
+
+
+def test_missed_ticks_make_a_coupling_unstable_that_is_stable_on_time(
+    point_mass: ClosedLoop,
+) -> None:
+    # free device of 0.1 kg against a tool of 1000 kg: K just below the limit of even sampling
+    loop = ClosedLoop(load_scene("point_mass"))
+    loop.scene.model.body_mass[1] = 1e6
+    coupling = Coupling(3900, 0, 0, 0)
+    assert minimum_damping(coupling, T) < 2.0
+    outcomes = [
+        loop.run(
+            SimulatedDevice(hand=None, damping=2.0),
+            coupling,
+            METHODS["implicit"],
+            ticks=4000,
+            knock=KNOCK,
+            timing=timing,
+        )
+        for timing in (None, Timing(drops=0.5, seed=3))
+    ]
+    assert [outcome.is_stable for outcome in outcomes] == [True, False]
+
+
+@pytest.mark.parametrize("bad", [-0.1, 1.0, math.nan])
+@pytest.mark.parametrize("name", ["jitter", "drops"])
+def test_timing_out_of_range_is_refused(name: str, bad: float) -> None:
+    with pytest.raises(StudyError, match=f"{name} is "):
+        Timing(**(asdict(Timing()) | {name: bad}))
+
+
+def test_too_short_a_run_is_refused(point_mass: ClosedLoop) -> None:
+    with pytest.raises(StudyError, match="ticks is 9"):
+        point_mass.run(SimulatedDevice(), COUPLING, METHODS["implicit"], ticks=9)

@@ -1,0 +1,166 @@
+"""The map ``contact``: what creates energy on a wall and in a hole, and what does not."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+
+from hapticbridge.coupling import Coupling
+from hapticbridge.device import Hand, Motion, SimulatedDevice
+from hapticbridge.rendering import METHODS
+from hapticbridge.scene.contact_rule import SUGGESTED
+from hapticbridge.study.maps import contact, contact_search
+from hapticbridge.study.maps.contact import CONTACT, evaluate, points
+from hapticbridge.study.maps.contact_rigs import peg_runs, wall_runs
+from hapticbridge.study.maps.contact_treatments import PERIOD, SHIPPED, TREATMENTS, Treatment
+from hapticbridge.study.maps.rigs import loop_in, set_tool_mass
+from hapticbridge.study.maps.stability_map import run_map
+
+LIGHT = [(0.03, 0.0, 1)]
+"""A peg of 30 g without friction in the first random hand: the hardest case of the search."""
+
+DAMPED = Treatment((SUGGESTED[0] * PERIOD, SUGGESTED[1]))
+
+
+def test_light_frictionless_peg_goes_beyond_the_slack_as_shipped_and_not_damped() -> None:
+    (shipped,) = peg_runs(Treatment(), 1000.0, LIGHT)
+    assert shipped.environment == "active"
+    assert shipped.created > 1e-3
+    assert 50 < shipped.first_active < 500
+    (damped,) = peg_runs(DAMPED, 1000.0, LIGHT)
+    assert damped.environment == "strict"
+    assert damped.created <= 0
+    assert damped.first_active == -1
+    assert damped.peak_force > 3
+    assert damped.depth < 1.5 * shipped.depth
+
+
+def test_strict_contact_need_not_be_softer_than_the_shipped_one() -> None:
+    hard = TREATMENTS["damped hard: 0.00002 100"]
+    for k in (1000.0, 6000.0):
+        (run,) = peg_runs(hard, k, LIGHT)
+        (shipped,) = peg_runs(Treatment(), k, LIGHT)
+        assert run.environment == "strict"
+        assert run.depth < shipped.depth
+
+
+def test_four_substeps_with_the_rule_in_their_own_steps_are_strict_and_stiffer() -> None:
+    (finer,) = peg_runs(TREATMENTS["4 substeps, 0.0005 4"], 1000.0, LIGHT)
+    (whole,) = peg_runs(DAMPED, 1000.0, LIGHT)
+    assert finer.environment == "strict"
+    assert finer.depth < 0.5 * whole.depth
+
+
+def test_pyramidal_cone_is_active_where_friction_is_low_and_the_elliptic_one_is_not() -> None:
+    slippery = [(0.03, 0.1, hand) for hand in (0, 1, 2)]
+    soft = Treatment((0.02, 1.0))
+    pyramidal = peg_runs(replace(soft, cone="pyramidal"), 1000.0, slippery)
+    assert max(run.slack_share for run in pyramidal) > 1.5
+    assert max(run.first_active for run in pyramidal) > 0
+    assert {run.environment for run in peg_runs(soft, 1000.0, slippery)} == {"strict"}
+
+
+def test_direct_format_is_the_same_contact_in_other_words() -> None:
+    # k = 1/(timeconst dampratio)², b = 2/timeconst
+    (one,) = peg_runs(Treatment((0.002, 1.0)), 1000.0, LIGHT)
+    (other,) = peg_runs(Treatment((-2.5e5, -1000.0)), 1000.0, LIGHT)
+    assert other.created == pytest.approx(one.created, rel=1e-6)
+    assert other.depth == pytest.approx(one.depth, rel=1e-6)
+
+
+def test_a_row_that_the_step_cannot_resolve_is_replaced_unless_refsafe_is_off() -> None:
+    cases = [(0.05, 0)]
+    (resolved,) = wall_runs(Treatment((0.001, 1.0)), 2000.0, cases)
+    (stiffer,) = wall_runs(Treatment((0.00025, 1.0)), 2000.0, cases)
+    (as_written,) = wall_runs(Treatment((0.00025, 1.0), refsafe=False), 2000.0, cases)
+    assert stiffer.depth == pytest.approx(resolved.depth, rel=1e-3)
+    assert as_written.depth < 0.97 * resolved.depth
+
+
+@pytest.mark.parametrize("stiffness", [2000.0, 20_000.0])
+def test_implicitfast_creates_energy_on_a_wall_where_implicit_creates_none(
+    stiffness: float,
+) -> None:
+    implicit = wall_runs(DAMPED, stiffness)
+    assert {run.environment for run in implicit} == {"strict"}
+    fast = wall_runs(replace(DAMPED, method="implicitfast"), stiffness)
+    assert max(run.created for run in fast) > 1e-4
+
+
+def test_bouncing_contact_is_active_on_a_wall_and_a_critically_damped_one_is_not() -> None:
+    (bouncing,) = wall_runs(Treatment((0.02, 0.3)), 2000.0, [(0.05, 1)])
+    assert bouncing.environment == "active"
+    assert bouncing.first_active > 0
+    (damped,) = wall_runs(Treatment((0.02, 2.0)), 2000.0, [(0.05, 1)])
+    assert damped.environment == "strict"
+
+
+def test_map_at_reduced_resolution_agrees_with_the_rule(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def few(treatment: Treatment, stiffness: float, *_: Any) -> Any:
+        return peg_runs(treatment, stiffness, LIGHT)
+
+    monkeypatch.setattr(contact, "peg_runs", few)
+    monkeypatch.setattr(contact_search, "peg_runs", few)
+    names = (SHIPPED, "damped: 0.0005 8")
+    chosen = [p for p in points(1) if p["rig"] != "search" or p["treatment"] in names]
+    files = run_map(
+        replace(CONTACT, points=lambda _: chosen), tmp_path, executor=ThreadPoolExecutor(2)
+    )
+    assert files.failed == 0
+    assert files.picture.stat().st_size > 10_000
+    rule = files.finding.boundary["rule"]
+    assert rule["strict"]["strict"] == rule["strict"]["cells"] > 0
+    assert rule["abrupt"]["strict"] < rule["abrupt"]["cells"]
+    shipped, damped = files.finding.boundary["search"]
+    assert shipped["active"] > 0
+    assert damped["strict"] == damped["runs"]
+    assert "least deep is 'damped: 0.0005 8'" in files.finding.paragraph
+
+
+def wall_depths(treatment: Treatment) -> Any:
+    """Returns the depth in m of 50 g that a hand presses hard for 1.5 s and then lightly."""
+    loop = loop_in("virtual_wall", "contact")
+    treatment.apply(loop.scene.model, 0.0)
+    set_tool_mass(loop.scene.model, "tool", 0.05)
+    mujoco.mj_setConst(loop.scene.model, loop.scene.data)
+    place = np.zeros((5, 3))
+    place[:, 0] = 0.0, 0.0125, 0.0125, 0.0105, 0.0105
+    device = SimulatedDevice(
+        damping=5.0,
+        hand=Hand(stiffness=2e4, damping=100.0),
+        path=Motion([0, 0.2, 1.5, 1.6, 3], place),
+    )
+    outcome = loop.run(
+        device, Coupling(2000.0, 2.0, 1.0, 1e-3), METHODS["implicit"], ticks=3000, keep_records=True
+    )
+    return outcome.records["tool_position"][:, 0] - 0.01
+
+
+def test_a_damped_contact_comes_back_with_the_relaxation_time_that_the_rule_is_about() -> None:
+    depth = wall_depths(DAMPED)
+    left = depth[[1650, 1750]] - depth[-1]
+    assert 0.1 / np.log(left[0] / left[1]) == pytest.approx(DAMPED.relaxation, rel=0.1)
+
+
+@pytest.mark.parametrize("name", ["damped: 0.0005 8", "MuJoCo's default 0.02 1"])
+def test_steady_depth_is_as_many_times_the_shipped_one_as_said(name: str) -> None:
+    # the impedance rises with depth, so that deep contacts are stiffer than d₀ says
+    shipped, other = wall_depths(Treatment()), wall_depths(TREATMENTS[name])
+    ratio = float(other[-1] / shipped[-1])
+    said = TREATMENTS[name].static_depth
+    assert 0.35 * said < ratio < 1.05 * said
+
+
+def test_points_are_about_as_many_as_asked_and_evaluate_to_numbers() -> None:
+    assert abs(len(points(CONTACT.default_points)) - CONTACT.default_points) < 40
+    first = next(p for p in points(1) if p["rig"] == "wall")
+    found = evaluate(first)
+    assert found["runs"] == found["strict"] + found["within_slack"] + found["active"]

@@ -1,0 +1,121 @@
+"""Maps in general: files, resumption, failures, and the command."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hapticbridge.cli import main
+from hapticbridge.errors import StudyError
+from hapticbridge.picture import new_figure
+from hapticbridge.study.maps import MAPS
+from hapticbridge.study.maps.stability_map import Finding, Point, StabilityMap, run_map
+from hapticbridge.study.maps.verdicts import VERDICTS, draw_verdicts, verdict_numbers
+from hapticbridge.study.table import Table
+
+calls: list[Point] = []
+
+
+def points(count: int) -> Sequence[Point]:
+    return [{"x": float(i)} for i in range(count)]
+
+
+def square(point: Point) -> Mapping[str, float]:
+    calls.append(point)
+    x = float(point["x"])
+    if x == 3.0:
+        raise ValueError("three is no good")
+    return {"y": x * x}
+
+
+def fail(point: Point) -> Mapping[str, float]:
+    raise ValueError(f"nothing at {point['x']}")
+
+
+def read(table: Table) -> Finding:
+    return Finding(new_figure(4, 3), f"the largest is {table['y'].max():g}", {"rows": len(table)})
+
+
+SQUARES = StabilityMap("squares", "numbers squared", 6, points, square, read)
+
+
+def test_a_map_writes_its_files_and_says_which_points_failed(tmp_path: Path) -> None:
+    with ThreadPoolExecutor(2) as pool:
+        files = run_map(SQUARES, tmp_path / "new", executor=pool)
+    assert files.failed == 1
+    assert "three is no good" in files.table.read_text(encoding="utf-8")
+    said = json.loads(files.boundary.read_text(encoding="utf-8"))
+    assert said["points"] == 6
+    assert said["boundary"] == {"rows": 5}
+    assert said["paragraph"] == "the largest is 25"
+    assert files.picture.read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_map_begun_again_computes_only_what_is_missing(tmp_path: Path) -> None:
+    with ThreadPoolExecutor(1) as pool:
+        run_map(SQUARES, tmp_path, points=5, executor=pool)
+        calls.clear()
+        files = run_map(SQUARES, tmp_path, points=8, executor=pool)
+    assert sorted(point["x"] for point in calls) == [5.0, 6.0, 7.0]
+    assert files.finding.paragraph == "the largest is 49"
+
+
+def test_a_map_can_keep_its_table_as_parquet(tmp_path: Path) -> None:
+    with ThreadPoolExecutor(1) as pool:
+        files = run_map(SQUARES, tmp_path, executor=pool, form="parquet")
+    assert files.table.name == "squares.parquet"
+    assert files.table.read_bytes().startswith(b"PAR1")
+
+
+def test_a_map_of_failures_is_an_error_that_says_the_first(tmp_path: Path) -> None:
+    broken = StabilityMap("broken", "", 4, points, fail, read)
+    with ThreadPoolExecutor(1) as pool, pytest.raises(StudyError, match=r"nothing at 0\.0"):
+        run_map(broken, tmp_path, executor=pool)
+
+
+def test_too_few_points_and_a_file_for_a_folder_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(StudyError, match="points is 3"):
+        run_map(SQUARES, tmp_path, points=3)
+    blocker = tmp_path / "file"
+    blocker.write_text("")
+    with pytest.raises(StudyError, match="folder"):
+        run_map(SQUARES, blocker)
+
+
+def test_an_unstable_loop_is_unstable_whatever_its_environment() -> None:
+    names = np.array(["strict", "active", "within slack", "strict"], dtype=object)
+    numbers = verdict_numbers([True, True, True, False], names)
+    assert [VERDICTS[i] for i in numbers] == ["strict", "active", "within slack", "unstable"]
+
+
+def test_cells_lie_around_their_points() -> None:
+    axes = new_figure(3, 3).subplots()
+    x, y = np.meshgrid([1.0, 10.0, 100.0], [0.0, 1.0])
+    verdict = np.arange(6).reshape(2, 3) % 4
+    draw_verdicts(axes, x.ravel(), y.ravel(), verdict.ravel(), log_x=True)
+    (mesh,) = axes.collections
+    assert np.array_equal(np.asarray(mesh.get_array()), verdict)
+    assert axes.get_xlim() == pytest.approx((10**-0.5, 10**2.5))
+    assert axes.get_ylim() == pytest.approx((-0.5, 1.5))
+
+
+def test_command_lists_the_maps_for_an_unknown_name(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["stability", "couplings"]) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    for name in (*MAPS, "all"):
+        assert f"'{name}'" in said
+
+
+def test_command_maps_with_a_pool_of_processes(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["stability", "coupling", "--points", "20", "--out", str(tmp_path), "--json"]) == 0
+    (said,) = json.loads(capsys.readouterr().out)
+    assert said["map"] == "coupling"
+    assert (tmp_path / "coupling.png").is_file()
