@@ -226,5 +226,5 @@ def test_timing_out_of_range_is_refused(name: str, bad: float) -> None:
 
 
 def test_too_short_a_run_is_refused(point_mass: ClosedLoop) -> None:
-    with pytest.raises(StudyError, match="ticks is 9"):
-        point_mass.run(SimulatedDevice(), COUPLING, METHODS["implicit"], ticks=9)
+    with pytest.raises(StudyError, match="ticks is 49"):
+        point_mass.run(SimulatedDevice(), COUPLING, METHODS["implicit"], ticks=49)

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import os
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -81,6 +83,14 @@ _NO_HAND = Hand(
 )
 
 
+@cache
+def _machine_code() -> Callable[[NDArray[np.void], NDArray[np.float64], NDArray[np.void]], None]:
+    """Returns the compiled step; found once, because looking up the types takes a millisecond."""
+    return direct(
+        next_sample, np.zeros(1, STATE_DTYPE), np.empty((0, 8)), np.zeros(1, SAMPLE_DTYPE)
+    )
+
+
 class SimulatedDevice:
     """Six-axis device with inertia and damping, held by a hand that follows a path.
 
@@ -154,7 +164,7 @@ class SimulatedDevice:
             raise DeviceError(f"friction = {friction!r} N: a worst hand is linear and has none")
         if hand is not None and not is_line and path is not None:
             motion = path if isinstance(path, Motion) else read_motion(path)
-            self._motion = motion.relative().table
+            self._motion = np.ascontiguousarray(motion.relative().table)
             duration = motion.duration
         mass = checked_number("mass", mass, "kg", is_positive=True)
         damping = checked_number("damping", damping, "N s/m")
@@ -238,7 +248,7 @@ class SimulatedDevice:
         state["rotation"] = sampled_axis(period, **self._rotation)
         self._states[0] = state
         sample = np.zeros(1, SAMPLE_DTYPE)
-        self._next_sample = direct(next_sample, self._states, self._motion, sample)
+        self._next_sample = _machine_code()
         self._next_sample(self._states.copy(), self._motion, sample)
         self._is_started = True
         return sample

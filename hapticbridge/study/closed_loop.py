@@ -8,18 +8,21 @@ is what ``Bridge.run`` writes for the same device.
 from __future__ import annotations
 
 import copy
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import SimulatedDevice
+from hapticbridge.device.handheld import STATE_DTYPE as DEVICE_DTYPE
 from hapticbridge.device.handheld import next_sample
 from hapticbridge.errors import StudyError
-from hapticbridge.jit import compiled_for_threads
+from hapticbridge.jit import compiled_for_threads, direct
 from hapticbridge.kernel.parameters import RunParameters
-from hapticbridge.kernel.state import Binding
+from hapticbridge.kernel.state import STATE_DTYPE, Binding
 from hapticbridge.kernel.step import OK, advance, after_step, before_step
 from hapticbridge.ledger import Ledger
 from hapticbridge.passivity.stability import decays
@@ -45,6 +48,11 @@ accelerations (1e10 in SI units) warns and resets."""
 FLOOR = 1e-6
 """Signal in N that counts as none: MuJoCo's solver leaves 3e-8 N on a free mass at its default
 tolerance, whatever the motion."""
+
+
+LEAST_TICKS = 50
+"""Ticks of a run: a fifth of it is the window in which a decay is looked for, and ten samples are
+the fewest that show one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,7 +155,7 @@ class ClosedLoop:
             coupling: K and B.
             method: How the tool is rendered.
             period: T in s.
-            ticks: How many, >= 10.
+            ticks: How many, >= 50.
             substeps: MuJoCo steps per tick.
             knock: Displacement of the device before the first tick, shape (6,), in m and rad.
             timing: Late and missed ticks; None: every one on time.
@@ -156,8 +164,8 @@ class ClosedLoop:
         Raises:
             HapticBridgeError: A value is out of range, or the method cannot render the scene.
         """
-        if ticks < 10:
-            raise StudyError(f"ticks is {ticks}; it must be 10 or more")
+        if ticks < LEAST_TICKS:
+            raise StudyError(f"ticks is {ticks}; it must be {LEAST_TICKS} or more")
         scene = self.scene
         felt = prepare(scene, coupling, period, substeps, method)
         is_even = timing is None or timing.is_even
@@ -189,7 +197,7 @@ class ClosedLoop:
         )
         records = np.zeros(ticks if keep_records else 0, TICK_DTYPE)
         signal, most = np.zeros(ticks), np.zeros(1)
-        done = _run(
+        done = _machine_code()(
             binding.state, *device.stepper, sample, binding.row, intervals, signal, most, records
         )
         state, ledger = binding.state, Ledger.of(binding.state)
@@ -246,3 +254,21 @@ def _run(
         if not signal[k] < HUGE:
             return k + 1 if k + 1 < intervals.size else k
     return int(intervals.size)
+
+
+@cache
+def _machine_code() -> Callable[..., int]:
+    """Returns the compiled loop; found once, because looking up the types takes a millisecond."""
+    none = np.zeros(0)
+    return direct(
+        _run,
+        np.zeros(1, STATE_DTYPE),
+        np.zeros(1, DEVICE_DTYPE),
+        np.empty((0, 8)),
+        np.zeros(1, SAMPLE_DTYPE),
+        np.zeros(1, TICK_DTYPE),
+        np.zeros(0, np.int64),
+        none,
+        none,
+        np.zeros(0, TICK_DTYPE),
+    )
