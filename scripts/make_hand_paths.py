@@ -213,6 +213,24 @@ PATHS = {
         axes=(1, 1, 1, 1, 1, 1),
         seed=4,
     ),
+    # As the square peg's, but it need not be turned to fit; it lands on the chamfer 0.7 mm off
+    # centre and slides in along it, and the wiggle goes round the hole.
+    "round_peg": HandPath(
+        reaching(
+            Reach(0.3, 1.2, (0.7, -0.3, -10.6), (-1.5, 2.0, 0)),
+            Reach(1.7, 0.7, (0, 0, -1.9)),
+            Reach(2.5, 0.7, (-0.7, 0.3, 0), (1.5, -2.0, 0)),
+            Reach(3.3, 1.2, (0, 0, -34.5)),
+            Reach(4.6, 0.5, (2.2, 0, 0), (0, 0, 10.0)),
+            Reach(5.2, 0.4, (-2.2, -2.0, 0), (2.0, 0, 0)),
+            Reach(5.5, 0.4, (-1.5, 3.5, 0), (-2.0, 2.5, 10.0)),
+            Reach(5.8, 0.5, (1.5, -1.5, 0), (0, -2.5, -20.0)),
+            Reach(6.1, 0.5, (0, 0, -4.6)),
+            Reach(6.7, 1.0, (0, 0, 51.6)),
+        ),
+        axes=(1, 1, 1, 1, 1, 1),
+        seed=5,
+    ),
 }
 """The path of every scene. Each reaching motion adds up to zero, so that the hand ends where it
 began."""

@@ -23,7 +23,7 @@ from hapticbridge.device import DeviceInfo, device_for
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.guard import Limits
 from hapticbridge.rendering import IMPLICIT
-from hapticbridge.scene import load_scene
+from hapticbridge.scene import load_scene, settings_from
 from hapticbridge.summary import Summary
 
 
@@ -38,6 +38,11 @@ class Run:
 
     scene: tyro.conf.Positional[str]
     """An MJCF file, or a scene's name (see 'hapticbridge scenes')."""
+    settings: Annotated[
+        tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(name="set", metavar="NAME=VALUE")
+    ] = ()
+    """Set a parameter of the scene, as often as wanted: --set clearance=0.1e-3. What there is, with
+    unit and range: 'hapticbridge scenes NAME'."""
     grip: str = "grip"
     """Site on the tool that the hand holds."""
     device: str = "simulated"
@@ -95,7 +100,7 @@ class Run:
             raise HapticBridgeError(f"duration is {self.duration!r} s; it must be finite and > 0")
         if self.record is not None and self.record.exists() and not self.overwrite:
             raise RecordingError(f"'{self.record}' exists; choose another file or add --overwrite")
-        scene = load_scene(self.scene, self.grip)
+        scene = load_scene(self.scene, self.grip, **settings_from(self.settings))
         device = device_for(scene, self.device)
         scales = self.scale, self.scale if self.force_scale is None else self.force_scale
         bridge = Bridge(

@@ -5,23 +5,30 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import mujoco
+import tyro
 from rich.table import Table
 
-from hapticbridge.cli.terminal import out
-from hapticbridge.scene import load_scene, scene_names
+from hapticbridge.cli.terminal import out, plain
+from hapticbridge.scene import load_scene, scene_names, scene_parameters, scene_path
 
 
 @dataclass(frozen=True, slots=True)
 class Scenes:
-    """List the scenes that come with hapticbridge.
+    """List the scenes that come with hapticbridge, or the parameters of one.
 
-    Any of them, or any MJCF file, can be given to 'hapticbridge run'. Example:
+    Any of them, or any MJCF file, can be given to 'hapticbridge run', and its parameters set with
+    '--set'. Example:
 
-        hapticbridge scenes
+        hapticbridge scenes peg_in_hole
     """
+
+    scene: tyro.conf.Positional[str | None] = None
+    """An MJCF file, or a scene's name: show its parameters with unit, range and default."""
 
     def execute(self) -> int:
         """Prints the table; returns the exit code."""
+        if self.scene is not None:
+            return _show(self.scene)
         table = Table(
             "scene", "moving bodies", "degrees of freedom", "about", box=None, pad_edge=False
         )
@@ -31,6 +38,28 @@ class Scenes:
             table.add_row(name, str(moving), str(model.nv), _about(model))
         out.print(table)
         return 0
+
+
+def _show(scene: str) -> int:
+    """Prints what one scene is and what can be set in it."""
+    path = scene_path(scene)
+    sentence, parameters = _about(load_scene(path).model), scene_parameters(path)
+    out.print(f"[bold]{plain(path.stem)}[/bold]" + (f": {plain(sentence)}" if sentence else ""))
+    if not parameters:
+        out.print("no parameters")
+        return 0
+    table = Table("parameter", "default", "range", "unit", "about", box=None, pad_edge=False)
+    for parameter in parameters:
+        low, high = parameter.minimum, parameter.maximum
+        table.add_row(
+            parameter.name,
+            f"{parameter.default:g}",
+            f"{low:g} to {high:g}",
+            plain(parameter.unit),
+            plain(parameter.about),
+        )
+    out.print(table)
+    return 0
 
 
 def _about(model: mujoco.MjModel) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import mujoco
@@ -17,6 +17,7 @@ from hapticbridge.kernel.state import COUPLING_ACTUATORS, HANDLE, WELD_NAME
 from hapticbridge.scene.attach import attach_handle, seat_handle, set_options
 from hapticbridge.scene.checks import check_model, check_numbers, check_options, check_start
 from hapticbridge.scene.library import scene_path
+from hapticbridge.scene.parameters import apply_parameters
 from hapticbridge.scene.source import SourceFile, collect_sources
 from hapticbridge.scene.weld import add_weld, carry_over, set_weld_gains
 
@@ -33,6 +34,7 @@ class Scene:
         model: MuJoCo's model, with the bridge's handle and coupling in it.
         data: Its state.
         sources: The original bytes of the file, its includes and its assets.
+        parameters: Value of each of the scene's parameters, in the unit that its file names.
     """
 
     path: Path
@@ -40,6 +42,7 @@ class Scene:
     model: mujoco.MjModel
     data: mujoco.MjData
     sources: tuple[SourceFile, ...]
+    parameters: dict[str, float] = field(default_factory=dict)
 
     _spec: mujoco.MjSpec | None = None
     _is_claimed: bool = False
@@ -147,7 +150,7 @@ class Scene:
             set_weld_gains(self.model, coupling)
 
 
-def load_scene(path_or_name: str | Path, grip: str = "grip") -> Scene:
+def load_scene(path_or_name: str | Path, grip: str = "grip", **parameters: float) -> Scene:
     """Loads an MJCF file, or a scene by name, and puts a handle and a coupling into it.
 
     The user's own actuators, equality constraints, keyframes and assets survive. The grip may sit
@@ -156,9 +159,12 @@ def load_scene(path_or_name: str | Path, grip: str = "grip") -> Scene:
     Args:
         path_or_name: An MJCF file, or one of ``scene_names()``.
         grip: Name of the site on the tool.
+        **parameters: Values of the scene's parameters, such as ``clearance=0.1e-3``; see
+            ``scene_parameters`` or ``hapticbridge scenes NAME`` for what there is.
 
     Raises:
-        SceneError: The scene cannot be read, compiled or put behind a device; says why.
+        SceneError: The scene cannot be read, compiled or put behind a device, or has no such
+            parameter or not of that value; says why.
 
     Warns:
         UserWarning: The scene will run, but not quite as its file says.
@@ -171,13 +177,14 @@ def load_scene(path_or_name: str | Path, grip: str = "grip") -> Scene:
         raise SceneError(f"cannot read scene '{path}': {_sentence(error)}") from None
     concerns = check_options(spec)
     check_numbers(sources)
+    values = apply_parameters(spec, path, parameters)
     attach_handle(spec, grip)
     set_options(spec)
     try:
         model = _compiled(spec, sources)
         concerns += check_model(model, grip)
         seat_handle(model, grip)
-        scene = Scene(path, grip, model, mujoco.MjData(model), sources, spec)
+        scene = Scene(path, grip, model, mujoco.MjData(model), sources, values, spec)
         scene.reset()
     except (ValueError, OSError, MemoryError, mujoco.FatalError) as error:
         raise SceneError(f"cannot compile scene '{path}': {_sentence(error)}") from None

@@ -63,12 +63,15 @@ class Element:
 def collect_sources(path: Path) -> tuple[SourceFile, ...]:
     """Returns the main file, first, and everything it refers to that can be found.
 
-    MuJoCo has already read the scene when this runs, so what cannot be found here (a file in a
+    A file of parameters beside the main file comes last. MuJoCo has already read the scene when this
+    runs, so what cannot be found here (a file in a
     search path of MuJoCo's own) is left out instead of refused. Written into an empty folder under
     their names, the files compile to the same model.
     """
     found: dict[Path, Path] = {}
     _find_files(path, found)
+    if path.with_suffix(".toml").is_file():
+        found.setdefault(_key(path.with_suffix(".toml")), path.with_suffix(".toml"))
     root = path.absolute().parent
     while not all(file.is_relative_to(root) for file in found) and root != root.parent:
         root = root.parent
