@@ -46,6 +46,7 @@ MOST_EVENTS = 200
 
 FACTS = {
     "scene": "",
+    "scene_parameters": "",
     "method": "",
     "started": "",
     "clock": "",

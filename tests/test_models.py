@@ -22,8 +22,8 @@ from model_runs import (
     spec_of,
 )
 
-SCENES = ("virtual_wall", "point_mass", "planar_peg", "peg_in_hole")
-CONTACT_SCENES = ("virtual_wall", "planar_peg", "peg_in_hole")
+SCENES = ("virtual_wall", "point_mass", "planar_peg", "peg_in_hole", "round_peg")
+CONTACT_SCENES = ("virtual_wall", "planar_peg", "peg_in_hole", "round_peg")
 
 
 @pytest.mark.parametrize("name", SCENES)

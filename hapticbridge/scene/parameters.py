@@ -25,9 +25,9 @@ from hapticbridge.scene.parameter_file import (
     scene_parameters,
 )
 
-_AGREEMENT = 1e-9
-"""Relative difference between the MJCF and the default, or absolute in SI units below 1: rounding,
-and no more than a nanometre."""
+_AGREEMENT, _ROUNDING = 1e-9, 1e-12
+"""Relative and absolute difference allowed between the MJCF and the default: a file that gives ten
+digits, and the rounding of a sum that should be 0."""
 
 
 def apply_parameters(
@@ -55,11 +55,12 @@ def apply_parameters(
         for setting in parameter.sets:
             for element in _elements(spec, setting, parameter.name):
                 place = setting.kind, str(element.name), setting.field, setting.index
-                if owners.setdefault(place, parameter.name) != parameter.name:
+                if place in owners:
                     raise SceneError(
                         f"parameters '{owners[place]}' and '{parameter.name}' both set "
-                        f"{_words(setting, element)}; one number follows from one parameter"
+                        f"{_words(setting, element)}; one number follows from one parameter, once"
                     )
+                owners[place] = parameter.name
                 _set(element, setting, parameter, values.get(parameter.name))
     return {name: float(values.get(name, parameter.default)) for name, parameter in known.items()}
 
@@ -122,9 +123,10 @@ def _set(element: Any, setting: Setting, parameter: Parameter, value: float | No
     except (AttributeError, TypeError, ValueError, IndexError):
         raise SceneError(f"{where}, which is not a number of the scene") from None
     default = setting.offset + setting.factor * parameter.default
-    if not math.isclose(now, default, rel_tol=_AGREEMENT, abs_tol=_AGREEMENT):
+    if not math.isclose(now, default, rel_tol=_AGREEMENT, abs_tol=_ROUNDING):
         raise SceneError(
-            f"{where} to {default:g} by default, where the scene's file has {now:g}; make them equal"
+            f"{where} to {default:g} by default, where the scene's file has {now:g}; make them "
+            "equal"
         )
     if value is None:
         return

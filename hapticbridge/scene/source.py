@@ -63,10 +63,10 @@ class Element:
 def collect_sources(path: Path) -> tuple[SourceFile, ...]:
     """Returns the main file, first, and everything it refers to that can be found.
 
-    A file of parameters beside the main file comes last. MuJoCo has already read the scene when this
-    runs, so what cannot be found here (a file in a
-    search path of MuJoCo's own) is left out instead of refused. Written into an empty folder under
-    their names, the files compile to the same model.
+    A file of parameters beside the main file is one of them. MuJoCo has already read the scene when
+    this runs, so what cannot be found here (a file in a search path of MuJoCo's own) is left out
+    instead of refused. Written into an empty folder under their names, the files compile to the
+    same model.
     """
     found: dict[Path, Path] = {}
     _find_files(path, found)

@@ -1,0 +1,320 @@
+"""Parameters of scenes: what they set, what they refuse, and that a recording knows them."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import tomllib
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import hapticbridge as hb
+from hapticbridge.cli import main
+from hapticbridge.provenance import compiled_model
+from hapticbridge.scene import (
+    Parameter,
+    load_scene,
+    scene_names,
+    scene_parameters,
+    scene_path,
+    settings_from,
+)
+
+PARAMETERS = [(name, p) for name in scene_names() for p in scene_parameters(scene_path(name))]
+each_parameter = pytest.mark.parametrize(
+    ("name", "parameter"), PARAMETERS, ids=[f"{name} {p.name}" for name, p in PARAMETERS]
+)
+
+SCENE = """<mujoco>
+  <option integrator="discrete" cone="elliptic"><flag diagexact="enable"/></option>
+  <default><geom solref="0.002 1" solimp="0.9 0.95 0.001"/></default>
+  <worldbody>
+    <geom name="wall_0" type="box" size="0.01 0.1 0.1" pos="0.05 0 0"/>
+    <geom name="wall_1" type="box" size="0.01 0.1 0.1" pos="0.05 0 0.3"/>
+    <body name="tool">
+      <joint name="slide" type="slide" axis="1 0 0" stiffness="20"/>
+      <geom name="tool" size="0.01" mass="0.1"/>
+      <site name="grip"/>
+    </body>
+  </worldbody>
+  <keyframe><key name="home" qpos="0.001"/></keyframe>
+</mujoco>"""
+
+TABLE = """[parameters.{name}]
+unit = "m"
+default = {default}
+minimum = 0.01
+maximum = 0.1
+about = "a number"
+sets = [{sets}]
+"""
+WALLS = '{ kind = "geom", name = "wall_*", field = "pos", index = 0, offset = 0.03 }'
+
+
+def table(sets: str = WALLS, name: str = "gap", default: str = "0.02") -> str:
+    return TABLE.format(sets=sets, name=name, default=default)
+
+
+def scene_with(folder: Path, text: str) -> Path:
+    path = folder / "bench.xml"
+    path.write_text(SCENE, encoding="utf-8")
+    path.with_suffix(".toml").write_text(text, encoding="utf-8")
+    return path
+
+
+def refusal(path: str | Path, **values: float) -> str:
+    with pytest.raises(hb.SceneError) as caught:
+        load_scene(path, "grip", **values)
+    message = str(caught.value)
+    assert "\n" not in message
+    return message
+
+
+# --- what is set ----------------------------------------------------------------------------------
+
+
+def test_every_element_that_fits_follows_the_value_and_nothing_else_changes(tmp_path: Path) -> None:
+    path = scene_with(tmp_path, table())
+    plain, moved = load_scene(path).model, load_scene(path, gap=0.07).model
+    for wall in ("wall_0", "wall_1"):
+        assert moved.geom(wall).pos[0] == pytest.approx(0.1, abs=1e-15)
+        moved.geom(wall).pos[0] = plain.geom(wall).pos[0]
+    different = [
+        field
+        for field in dir(plain)
+        if isinstance(getattr(plain, field, None), np.ndarray)
+        and not np.array_equal(getattr(plain, field), getattr(moved, field), equal_nan=True)
+    ]
+    # MuJoCo's boxes around the world's geoms follow the walls
+    assert set(different) <= {"bvh_aabb"}
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.floats(0.01, 0.1))
+def test_a_number_of_the_scene_is_offset_plus_factor_times_value(
+    tmp_path_factory: pytest.TempPathFactory, value: float
+) -> None:
+    sets = (
+        '{ kind = "joint", name = "slide", field = "stiffness", index = 0, factor = 1000.0 }, '
+        '{ kind = "key", name = "home", field = "qpos", index = 0, offset = 0.003, factor = -0.1 },'
+        '{ kind = "geom", name = "tool", field = "mass", offset = 0.3, factor = -10.0 }'
+    )
+    path = scene_with(tmp_path_factory.mktemp("scene"), table(sets))
+    value = min(value, 0.0299)  # beyond, the tool would have no mass left
+    model = load_scene(path, gap=value).model
+    assert model.joint("slide").stiffness[0] == pytest.approx(1000.0 * value, rel=1e-12)
+    assert model.key("home").qpos[0] == pytest.approx(0.003 - 0.1 * value, rel=1e-12)
+    assert model.body("tool").mass[0] == pytest.approx(0.3 - 10.0 * value, rel=1e-9)
+
+
+@each_parameter
+def test_a_shipped_default_gives_the_scene_of_the_file(name: str, parameter: Parameter) -> None:
+    plain, asked = load_scene(name), load_scene(name, "grip", **{parameter.name: parameter.default})
+    assert plain.parameters == asked.parameters
+    for field in (
+        "geom_pos",
+        "geom_size",
+        "geom_friction",
+        "body_pos",
+        "body_inertia",
+        "mesh_vert",
+    ):
+        assert getattr(asked.model, field) == pytest.approx(
+            getattr(plain.model, field), rel=1e-9, abs=1e-12
+        )
+
+
+@each_parameter
+def test_both_ends_of_a_shipped_range_load_and_differ(name: str, parameter: Parameter) -> None:
+    low = load_scene(name, "grip", **{parameter.name: parameter.minimum})
+    high = load_scene(name, "grip", **{parameter.name: parameter.maximum})
+    assert low.parameters[parameter.name] == parameter.minimum
+    assert compiled_model(low.model) != compiled_model(high.model)
+    assert parameter.about
+    assert parameter.unit in {"", "m", "N", "N m", "kg", "N/m", "N m/rad", "rad", "s"}
+
+
+@pytest.mark.parametrize("clearance", [0.05e-3, 0.1e-3, 1e-3])
+@pytest.mark.parametrize("name", ["peg_in_hole", "planar_peg"])
+def test_clearance_is_what_is_left_on_each_side_of_a_closed_hole(
+    name: str, clearance: float
+) -> None:
+    model = load_scene(name, clearance=clearance).model
+    walls = {"east": (0, 1), "west": (0, -1)}
+    if name == "peg_in_hole":
+        walls |= {"north": (1, 1), "south": (1, -1)}
+    for wall, (axis, side) in walls.items():
+        geom = model.geom(f"hole_{wall}")
+        face = side * geom.pos[axis] - geom.size[axis]
+        assert face - 0.01 == pytest.approx(clearance, abs=1e-12)
+    if name == "peg_in_hole":  # the two between reach from face to face: no slot in the corners
+        assert model.geom("hole_north").size[0] == pytest.approx(0.01 + clearance, abs=1e-12)
+        outer = model.geom("hole_north").pos[1] + model.geom("hole_north").size[1]
+        assert model.geom("hole_east").size[1] == pytest.approx(outer, abs=1e-12)
+
+
+@pytest.mark.parametrize("length", [0.04, 0.06, 0.11, 0.2])
+def test_hole_of_the_planar_peg_is_20_mm_less_deep_than_the_peg_is_long(length: float) -> None:
+    model = load_scene("planar_peg", length=length).model
+    peg, wall, bottom = (model.geom(n) for n in ("peg", "hole_east", "hole_bottom"))
+    assert 2 * peg.size[2] == pytest.approx(length, abs=1e-12)
+    assert model.body("peg").mass[0] == pytest.approx(0.1)
+    # it starts 10 mm above the mouth, with the grip in its middle
+    assert model.body("peg").pos[2] - peg.size[2] == pytest.approx(0.01, abs=1e-12)
+    assert wall.pos[2] + wall.size[2] == pytest.approx(0.0, abs=1e-12)
+    floor = bottom.pos[2] + bottom.size[2]
+    assert floor == pytest.approx(0.02 - length, abs=1e-12)
+    assert wall.pos[2] - wall.size[2] == pytest.approx(floor, abs=1e-12)
+    assert model.geom("bench").pos[2] == pytest.approx(bottom.pos[2] - bottom.size[2], abs=1e-12)
+
+
+def test_friction_is_that_of_every_contact_in_the_hole() -> None:
+    for name in ("peg_in_hole", "planar_peg", "round_peg"):
+        scene = load_scene(name, friction=0.17)
+        data = scene.data
+        data.qpos[data.qpos.size - 7 if data.qpos.size == 7 else 0] = 0.202e-3
+        data.qpos[2 if data.qpos.size == 7 else 1] = 0.0 if data.qpos.size == 7 else -0.04
+        mujoco.mj_forward(scene.model, data)
+        assert data.ncon > 0
+        assert all(contact.friction[0] == pytest.approx(0.17) for contact in data.contact)
+
+
+# --- what is refused ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("value", [0.0, 0.04e-3, 1.01e-3, -1e-4, math.nan, math.inf])
+def test_a_value_out_of_range_is_told_the_range_and_all_there_is(value: float) -> None:
+    message = refusal("peg_in_hole", clearance=value)
+    assert f"'clearance' of scene 'peg_in_hole' is {value!r}" in message
+    assert "5e-05 to 0.001 m" in message
+    assert "friction (0 to 1, default 0.42)" in message
+
+
+def test_what_is_no_number_is_refused() -> None:
+    for value in (True, "1e-4", None, [1e-4]):
+        assert "must be a number" in refusal("peg_in_hole", clearance=value)  # type: ignore[arg-type]
+
+
+def test_an_unknown_name_is_told_what_exists() -> None:
+    message = refusal("peg_in_hole", clearence=1e-4)
+    assert "no parameter 'clearence'" in message
+    assert "clearance (5e-05 to 0.001 m, default 0.0002)" in message
+    assert refusal("point_mass", mass=1.0) == (
+        "scene 'point_mass' has no parameters, so 'mass' cannot be set"
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("[parameters", "cannot read"),
+        ("parameters = 3", "table"),
+        (table() + "colour = 3", "keys"),
+        (table().replace('unit = "m"', ""), "keys"),
+        (table(default="0.2"), "minimum <= default <= maximum"),
+        (table(default="nan"), "finite"),
+        (table(default="true"), "finite"),
+        (table(name="grip"), "grip"),
+        (table(name="'a gap'"), "Python argument"),
+        (table(sets=""), "sets nothing"),
+        (table(WALLS.replace("geom", "gear")), "kind must be one of"),
+        (table(WALLS.replace("offset", "ofset")), "at most index, offset and factor"),
+        (table(WALLS.replace("index = 0", "index = -1")), "index a whole number"),
+        (table(WALLS.replace("0.03", "inf")), "finite"),
+        (table(WALLS.replace("wall_*", "door")), "it has: 'tool', 'wall_0', 'wall_1'"),
+        (table(WALLS.replace('"pos"', '"poss"')), "not a number of the scene"),
+        (table(WALLS.replace("index = 0", "index = 3")), "not a number of the scene"),
+        (table(WALLS.replace("index = 0, ", "")), "not a number of the scene"),
+        (table(WALLS.replace("0.03", "0.031")), "to 0.051 by default"),
+        (table(f"{WALLS}, {WALLS}"), "both set pos[0] of geom 'wall_0'"),
+        (table() + table(name="other"), "'gap' and 'other' both set pos[0] of geom 'wall_0'"),
+    ],
+)
+def test_a_file_of_parameters_that_does_not_fit_is_refused_in_a_sentence(
+    tmp_path: Path, text: str, words: str
+) -> None:
+    path = scene_with(tmp_path, text)
+    message = refusal(path)
+    assert words in message
+    assert refusal(path, gap=0.02)
+
+
+def test_a_toml_file_of_somebody_else_is_passed_over(tmp_path: Path) -> None:
+    path = scene_with(tmp_path, '[tool.poetry]\nname = "bench"')
+    assert load_scene(path).parameters == {}
+
+
+# --- the command line and the recording -----------------------------------------------------------
+
+
+@pytest.mark.parametrize("word", ["", "gap", "gap=", "=1", "gap=wide", "grip=1", "gap=1=2"])
+def test_a_word_that_sets_nothing_is_refused(word: str) -> None:
+    with pytest.raises(hb.SceneError, match="a parameter of the scene and a number"):
+        settings_from([word])
+
+
+def test_words_become_values_and_a_name_comes_once() -> None:
+    assert settings_from(["a=1e-4", "b=-2"]) == {"a": 1e-4, "b": -2.0}
+    with pytest.raises(hb.SceneError, match="twice"):
+        settings_from(["a=1", "a=1"])
+
+
+def test_values_used_are_recorded_and_the_run_is_simulated_again_with_them(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "run.mcap"
+    words = ["--set", "clearance=0.1e-3", "--set", "friction=0.3", "--fast", "--duration", "4.8"]
+    assert main(["run", "peg_in_hole", *words, "--record", str(file)]) == 0
+    recording = hb.read_recording(file)
+    used = json.loads(recording.meta["scene_parameters"])
+    assert used == {"clearance": 0.1e-3, "friction": 0.3}
+    report = hb.audit(file)
+    assert (report.verdict, report.resimulation) == ("passive", "bit for bit")
+    # the walls of the recorded model stand where the clearance puts them, and the peg felt them
+    (tmp_path / "model.mjb").write_bytes(recording.attachments["model.mjb"])
+    model = mujoco.MjModel.from_binary_path(str(tmp_path / "model.mjb"))
+    assert model.geom("hole_east").pos[0] == pytest.approx(0.0201, abs=1e-12)
+    # what was set can be set again from the recording's own sources
+    for name in ("peg_in_hole.xml", "peg_in_hole.toml"):
+        (tmp_path / name).write_bytes(recording.attachments[f"scene/{name}"])
+    again = load_scene(tmp_path / "peg_in_hole.xml", **used)
+    assert np.array_equal(again.model.geom_pos, model.geom_pos)
+    capsys.readouterr()
+
+
+def test_scenes_shows_each_parameter_with_unit_range_and_default(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    for name in scene_names():
+        assert main(["scenes", name]) == 0
+        shown = capsys.readouterr().out
+        assert shown.startswith(name)
+        parameters = scene_parameters(scene_path(name))
+        assert ("no parameters" in shown) == (not parameters)
+        for p in parameters:
+            row = rf"{p.name} +{p.default:g} +{p.minimum:g} to {p.maximum:g} +{p.unit}"
+            assert re.search(row, shown), shown
+
+
+def test_a_bad_setting_ends_the_command_with_a_sentence(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert main(["run", "peg_in_hole", "--set", "clearance=1", "--fast"]) == 2
+    assert "must be a number from 5e-05 to 0.001 m" in capsys.readouterr().err
+    assert main(["scenes", "peg_in_hola"]) == 2
+    assert "no scene is called" in capsys.readouterr().err
+
+
+def test_every_file_of_parameters_in_models_belongs_to_a_scene() -> None:
+    folder = scene_path("peg_in_hole").parents[1]
+    files = list(folder.glob("*/*.toml"))
+    assert {path.stem for path in files} >= {"peg_in_hole", "planar_peg", "round_peg"}
+    for path in files:
+        assert path.stem == path.parent.name
+        assert set(tomllib.loads(path.read_text(encoding="utf-8"))) == {"parameters"}
