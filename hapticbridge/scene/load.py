@@ -160,7 +160,7 @@ def load_scene(path_or_name: str | Path, grip: str = "grip", **parameters: float
         path_or_name: An MJCF file, or one of ``scene_names()``.
         grip: Name of the site on the tool.
         **parameters: Values of the scene's parameters, such as ``clearance=0.1e-3``; see
-            ``scene_parameters`` or ``hapticbridge scenes NAME`` for what there is.
+            ``scene.scene_parameters`` or ``hapticbridge scenes NAME`` for what there is.
 
     Raises:
         SceneError: The scene cannot be read, compiled or put behind a device, or has no such

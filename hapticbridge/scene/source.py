@@ -13,6 +13,8 @@ from dataclasses import dataclass
 from html import unescape
 from pathlib import Path
 
+from hapticbridge.scene.parameter_file import parameters_file
+
 _FILE_ATTRIBUTES = (
     "file",
     "fileright",
@@ -70,8 +72,9 @@ def collect_sources(path: Path) -> tuple[SourceFile, ...]:
     """
     found: dict[Path, Path] = {}
     _find_files(path, found)
-    if path.with_suffix(".toml").is_file():
-        found.setdefault(_key(path.with_suffix(".toml")), path.with_suffix(".toml"))
+    parameters = parameters_file(path)
+    if parameters.is_file():
+        found.setdefault(_key(parameters), parameters)
     root = path.absolute().parent
     while not all(file.is_relative_to(root) for file in found) and root != root.parent:
         root = root.parent
