@@ -67,7 +67,8 @@ def test_missing_file_name_and_folder_are_told_apart(tmp_path: Path) -> None:
 def test_name_of_a_model_is_a_scene_and_a_file_in_the_folder_comes_first(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert set(scene_names()) == {"peg_in_hole", "planar_peg", "point_mass", "virtual_wall"}
+    paths = {"peg_in_hole", "planar_peg", "point_mass", "virtual_wall"}
+    assert set(scene_names()) == paths | {"drawer", "hammer", "ratchet"}
     assert load_scene("point_mass").name == "point_mass"
     monkeypatch.chdir(tmp_path)
     scene_file(tmp_path, mjcf(), "point_mass")
