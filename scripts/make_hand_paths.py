@@ -108,15 +108,16 @@ def swinging(lever: float, *reaches: Reach) -> Callable[[Array], Array]:
 
     Args:
         lever: From the axis to the handle's start along x, in m.
-        reaches: What the hand adds; of it the angle about z swings the position along.
+        reaches: What the hand adds: the angle about z swings the position along, x is away from
+            the axis, the rest stays as it is.
     """
     turning = reaching(*reaches)
 
     def motion(times: Array) -> Array:
         total = turning(times)
-        angle = total[:, 5]
-        total[:, 0] += lever * (np.cos(angle) - 1.0)
-        total[:, 1] += lever * np.sin(angle)
+        angle, radius = total[:, 5], lever + total[:, 0]
+        total[:, 0] = radius * np.cos(angle) - lever
+        total[:, 1] += radius * np.sin(angle)
         return total
 
     return motion
@@ -285,6 +286,19 @@ PATHS = {
         ),
         axes=(1, 1, 1, 1, 1, 1),
         seed=7,
+    ),
+    # Turn the nut by a sixth of a turn, pull the wrench off, swing back, seat it on the next flats.
+    "open_wrench": HandPath(
+        swinging(
+            0.1,
+            Reach(0.3, 2.1, degrees=(0, 0, 62.0)),
+            Reach(2.45, 0.4, degrees=(0, 0, -1.5)),
+            Reach(2.8, 0.7, (24.0, 0, 0)),
+            Reach(3.5, 1.6, degrees=(0, 0, -60.5)),
+            Reach(5.6, 1.7, (-24.0, 0, 0)),
+        ),
+        axes=(1, 1, 0, 0, 0, 1),
+        seed=8,
     ),
 }
 """The path of every scene. Each reaching motion adds up to zero, so that the hand ends where it

@@ -68,7 +68,7 @@ def test_name_of_a_model_is_a_scene_and_a_file_in_the_folder_comes_first(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     paths = {"peg_in_hole", "planar_peg", "point_mass", "virtual_wall"}
-    assert set(scene_names()) == paths | {"drawer", "hammer", "ratchet"}
+    assert set(scene_names()) == paths | {"drawer", "hammer", "open_wrench", "ratchet"}
     assert load_scene("point_mass").name == "point_mass"
     monkeypatch.chdir(tmp_path)
     scene_file(tmp_path, mjcf(), "point_mass")

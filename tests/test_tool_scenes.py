@@ -2,13 +2,24 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
 from model_runs import B_R as ROTATIONAL_DAMPING
 from model_runs import K_R as ROTATIONAL_STIFFNESS
-from model_runs import MODELS, B, K, moved_through, run_of_own_path, scene_with_handle, spec_of
+from model_runs import (
+    MODELS,
+    Array,
+    B,
+    K,
+    Run,
+    moved_through,
+    run_of_own_path,
+    scene_with_handle,
+    spec_of,
+)
 from scipy.spatial.transform import Rotation
 
 from hapticbridge.audit import audit
@@ -20,7 +31,7 @@ from hapticbridge.rendering import METHODS
 from hapticbridge.scene import load_scene
 from hapticbridge.study.closed_loop import ClosedLoop
 
-SCENES = ("drawer", "hammer", "ratchet")
+SCENES = ("drawer", "hammer", "open_wrench", "ratchet")
 COUPLING = Coupling(K, B, ROTATIONAL_STIFFNESS, ROTATIONAL_DAMPING)
 
 SEEDS = 20
@@ -123,14 +134,14 @@ def blow_windows() -> list[tuple[int, int]]:
     """The last tick before each impact, and the tick in which the nail has stopped."""
     run = run_of_own_path("hammer")
     depth = -run.joints[:, 0]
-    first = np.flatnonzero(run.touched["nail"][1:] & ~run.touched["nail"][:-1])
-    ends = [*first[1:].tolist(), len(depth) - 1]
+    starts = np.flatnonzero(run.touched["nail"][1:] & ~run.touched["nail"][:-1]).tolist()
+    ends = [*starts[1:], len(depth) - 1]
     # it stops within 10 µm of where it stays until the next blow: beyond that it only creeps
     stops = [
         start + int(np.argmax(depth[start:end] > depth[end] - 1e-5))
-        for start, end in zip(first.tolist(), ends, strict=True)
+        for start, end in zip(starts, ends, strict=True)
     ]
-    return list(zip(first.tolist(), stops, strict=True))
+    return list(zip(starts, stops, strict=True))
 
 
 def test_seven_blows_drive_the_nail_deeper_one_by_one() -> None:
@@ -178,6 +189,12 @@ def test_a_push_within_ten_newtons_does_not_drive_the_nail() -> None:
 TOOTH = 2 * np.pi / 24
 
 
+def moment_about_axis(run: Run) -> Array:
+    """Moment of the coupling's wrench about the world's z axis, in N m."""
+    moment: Array = np.cross(run.tool, run.force)[:, 2] + run.torque[:, 2]
+    return moment
+
+
 def test_pawl_clicks_three_times_a_stroke_on_the_free_way() -> None:
     gear, handle, pawl = run_of_own_path("ratchet").joints.T
     fallen = np.flatnonzero((pawl[1:] < 0.06) & (pawl[:-1] >= 0.06))
@@ -198,11 +215,73 @@ def test_ratchet_drives_the_gear_the_other_way_by_whole_teeth() -> None:
     # while it drives, the hand feels the bolt: 0.2 N m on a lever of 100 mm
     stated = spec_of("ratchet").compile().dof_frictionloss[0]
     driving = slice(6500, 6800)
-    moment = np.cross(run.tool[driving], run.force[driving])[:, 2] + run.torque[driving, 2]
-    assert -moment == pytest.approx(stated, rel=0.1)
+    assert -moment_about_axis(run)[driving] == pytest.approx(stated, rel=0.1)
 
 
 def test_free_way_costs_a_small_part_of_the_drive() -> None:
     run = run_of_own_path("ratchet")
-    moment = np.cross(run.tool, run.force)[:, 2] + run.torque[:, 2]
+    moment = moment_about_axis(run)
     assert np.abs(moment[700:1600]).max() < 0.25 * np.abs(moment[6500:6800]).mean()
+
+
+# --- open wrench ----------------------------------------------------------------------------------
+
+SLACKENED = np.radians(65.0)
+
+
+def swung(*angles: float) -> list[tuple[float, tuple[float, ...], tuple[float, ...]]]:
+    """Poses of a handle 100 mm from the nut, from angle to angle in degrees, half a second each."""
+    poses: list[tuple[float, tuple[float, ...], tuple[float, ...]]] = []
+    for begin, end in pairwise((0.0, *angles)):
+        # in short chords, because moved_through goes straight from pose to pose
+        for angle in np.radians(np.linspace(begin, end, 11)[1:]):
+            offset = (0.1 * (np.cos(angle) - 1), 0.1 * np.sin(angle), 0.0)
+            poses.append((0.05, offset, (0.0, 0.0, float(angle))))
+    return poses
+
+
+def test_nut_turns_by_a_sixth_and_stays_while_the_wrench_is_seated_again() -> None:
+    run = run_of_own_path("open_wrench")
+    nut, _, x, y, angle = run.joints.T
+    assert np.degrees(nut[-1]) == pytest.approx(60.0, abs=2.0)
+    assert np.ptp(nut[2500:]) < np.radians(0.5)
+    away = np.hypot(x, y) > 0.022
+    assert away[3600:5400].all()
+    # swung back by a sixth while it was off, and seated where it began
+    assert np.degrees(angle[3450] - angle[5400]) > 58.0
+    assert np.hypot(x[-1], y[-1]) < 2e-4
+    assert abs(angle[-1]) < np.radians(1.3)
+
+
+def test_nut_breaks_away_at_the_stated_torque_and_then_runs_as_its_clamp_slackens() -> None:
+    model = spec_of("open_wrench").compile()
+    runs, clamp = (float(model.joint(name).frictionloss[0]) for name in ("nut", "clamp"))
+    run = run_of_own_path("open_wrench")
+    nut, moment = run.joints[:, 0], moment_about_axis(run)
+    assert runs + clamp == pytest.approx(0.30)
+    breaks = int(np.argmax(nut > np.radians(0.3)))
+    assert moment[breaks] == pytest.approx(runs + clamp, rel=0.1)
+    for degrees in (10, 20, 30, 45, 55):
+        tick = int(np.argmax(nut > np.radians(degrees)))
+        expected = runs + clamp * (1 - np.radians(degrees) / SLACKENED) ** 3
+        assert moment[tick - 20 : tick + 20].mean() == pytest.approx(expected, rel=0.1), degrees
+
+
+def test_seated_again_the_wrench_turns_the_nut_on() -> None:
+    model, data = scene_with_handle("open_wrench")
+    sixth = np.pi / 3
+    data.joint("nut").qpos[0] = sixth
+    data.joint("clamp").qpos[0] = SLACKENED / 4 * (1 - (1 - sixth / SLACKENED) ** 4)
+    run = moved_through(model, data, swung(20.0))
+    # less the play of 1.3 degrees
+    assert np.degrees(run.joints[-1, 0] - sixth) == pytest.approx(20.0 - 1.3, abs=0.7)
+
+
+@pytest.mark.parametrize(("asked", "wall", "stop"), [(75, "wall_end", 67), (-12, "wall_start", -5)])
+def test_walls_leave_room_for_little_more_than_a_sixth_of_a_turn(
+    asked: float, wall: str, stop: float
+) -> None:
+    model, data = scene_with_handle("open_wrench")
+    run = moved_through(model, data, swung(asked / 2, asked, asked))
+    assert run.touched[wall][-1]
+    assert np.degrees(run.joints[-1, 4]) == pytest.approx(stop, abs=0.6)
