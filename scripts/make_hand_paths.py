@@ -47,6 +47,9 @@ TREMOR_BAND = (8.0, 12.0, 0.02e-3, 0.3e-3)
 
 SINES_PER_BAND = 8
 
+SWING, TURN_ROUND = 0.2, 0.11
+"""Time of a blow's movement down, and when within it the movement up begins, in s."""
+
 
 @dataclass(frozen=True, slots=True)
 class Reach:
@@ -98,6 +101,46 @@ def reaching(*reaches: Reach) -> Callable[[Array], Array]:
         return total
 
     return motion
+
+
+def swinging(lever: float, *reaches: Reach) -> Callable[[Array], Array]:
+    """Returns the motion of a handle that turns about an upright axis beside it.
+
+    Args:
+        lever: From the axis to the handle's start along x, in m.
+        reaches: What the hand adds: the angle about z swings the position along, x is away from
+            the axis, the rest stays as it is.
+    """
+    turning = reaching(*reaches)
+
+    def motion(times: Array) -> Array:
+        total = turning(times)
+        angle, radius = total[:, 5], lever + total[:, 0]
+        total[:, 0] = radius * np.cos(angle) - lever
+        total[:, 1] += radius * np.sin(angle)
+        return total
+
+    return motion
+
+
+def blows(first: float, interval: float, depths: tuple[float, ...]) -> tuple[Reach, ...]:
+    """Returns blows straight down, each from 30 mm above the start and back to there.
+
+    Down and up overlap, so that the hand turns round at speed: what a wrist does when it strikes.
+
+    Args:
+        first: When the first swing begins, in s.
+        interval: From one swing to the next, in s.
+        depths: How far below the start the hand would go without turning round, in mm.
+    """
+    lift = 30.0
+    reaches = [Reach(first - 0.6, 0.6, (0, 0, lift))]
+    for k, depth in enumerate(depths):
+        start = first + k * interval
+        reaches.append(Reach(start, SWING, (0, 0, -lift - depth)))
+        reaches.append(Reach(start + TURN_ROUND, SWING, (0, 0, lift + depth)))
+    reaches.append(Reach(first + len(depths) * interval, 0.6, (0, 0, -lift)))
+    return tuple(reaches)
 
 
 def figure_eight(times: Array) -> Array:
@@ -230,6 +273,50 @@ PATHS = {
         ),
         axes=(1, 1, 1, 1, 1, 1),
         seed=5,
+    ),
+    # Press the closed drawer home, pull it open to 2.5 mm beyond the stop (9 N with the friction),
+    # hold, push it closed again.
+    "drawer": HandPath(
+        reaching(
+            Reach(0.4, 0.6, (-3.0, 0, 0)),
+            Reach(1.2, 0.8, (5.0, 0, 0)),
+            Reach(2.0, 1.6, (200.0, 0, 0)),
+            Reach(4.6, 1.8, (-205.0, 0, 0)),
+            Reach(6.8, 0.8, (3.0, 0, 0)),
+        ),
+        axes=(1, 1, 1, 1, 1, 1),
+        seed=5,
+    ),
+    # Lift the hammer, seven blows, each 1 mm deeper than the one before, and put it back.
+    "hammer": HandPath(
+        reaching(*blows(1.2, 0.8, (24.5, 25.55, 26.6, 27.65, 28.7, 29.75, 30.8))),
+        axes=(1, 1, 1, 1, 1, 1),
+        seed=6,
+    ),
+    # Twice: back over the teeth by 50 degrees, forward by 50 degrees with the gear.
+    "ratchet": HandPath(
+        swinging(
+            0.1,
+            Reach(0.4, 1.5, degrees=(0, 0, 50.0)),
+            Reach(2.2, 1.5, degrees=(0, 0, -50.0)),
+            Reach(4.1, 1.5, degrees=(0, 0, 50.0)),
+            Reach(5.9, 1.5, degrees=(0, 0, -50.0)),
+        ),
+        axes=(1, 1, 1, 1, 1, 1),
+        seed=7,
+    ),
+    # Turn the nut by a sixth of a turn, pull the wrench off, swing back, seat it on the next flats.
+    "open_wrench": HandPath(
+        swinging(
+            0.1,
+            Reach(0.3, 2.1, degrees=(0, 0, 62.0)),
+            Reach(2.45, 0.4, degrees=(0, 0, -1.5)),
+            Reach(2.8, 0.7, (24.0, 0, 0)),
+            Reach(3.5, 1.6, degrees=(0, 0, -60.5)),
+            Reach(5.6, 1.7, (-24.0, 0, 0)),
+        ),
+        axes=(1, 1, 0, 0, 0, 1),
+        seed=8,
     ),
 }
 """The path of every scene. Each reaching motion adds up to zero, so that the hand ends where it

@@ -7,7 +7,7 @@ NumPy and SciPy: so this is a reference for the package, not a repetition of it.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -79,6 +79,7 @@ class Run:
     work: Array  # |f·δx| + |τ·δφ| summed, in J
     touched: dict[str, NDArray[np.bool_]]  # per geom other than the tool's: in contact in tick k
     deepest: Array
+    joints: Array  # qpos
     warnings: int
     data: Any
 
@@ -110,6 +111,7 @@ def run_along(model: Any, data: Any, handle: Array, turn: Rotation) -> Run:
     count = len(handle)
     tool, matrix = np.empty((count + 1, 3)), np.empty((count + 1, 9))
     energy, deepest = np.empty(count + 1), np.zeros(count)
+    joints = np.empty((count, model.nq))
     tool[0], matrix[0], energy[0] = (
         data.site_xpos[site],
         data.site_xmat[site],
@@ -124,6 +126,7 @@ def run_along(model: Any, data: Any, handle: Array, turn: Rotation) -> Run:
             deepest[k] = -data.contact.dist.min()
             for geom in np.unique(data.contact.geom):
                 touched[names[geom]][k] = True
+        joints[k] = data.qpos
         energy[k + 1] = stored_energy(model, data)
         tool[k + 1], matrix[k + 1] = data.site_xpos[site], data.site_xmat[site]
 
@@ -147,6 +150,7 @@ def run_along(model: Any, data: Any, handle: Array, turn: Rotation) -> Run:
         work=np.cumsum(np.abs(by_force) + np.abs(by_torque)),
         touched=touched,
         deepest=deepest,
+        joints=joints,
         warnings=sum(warning.number for warning in data.warning),
         data=data,
     )
@@ -169,7 +173,7 @@ def run_of_own_path(name: str) -> Run:
 
 
 def moved_through(
-    model: Any, data: Any, poses: list[tuple[float, tuple[float, ...], tuple[float, ...]]]
+    model: Any, data: Any, poses: Sequence[tuple[float, tuple[float, ...], tuple[float, ...]]]
 ) -> Run:
     """Moves the handle smoothly through (seconds, offset in m, rotation vector) and stops there."""
     last = np.zeros(6)
