@@ -13,7 +13,7 @@ from hapticbridge.bridge import Bridge
 from hapticbridge.clock import SimulatedClock
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Hand, Motion, SimulatedDevice
-from hapticbridge.errors import StudyError
+from hapticbridge.errors import DeviceError, StudyError
 from hapticbridge.guard import Limits
 from hapticbridge.passivity import SampledLoop, WorstHand, minimum_damping
 from hapticbridge.rendering import METHODS
@@ -182,6 +182,42 @@ def test_device_is_exact_between_uneven_ticks(point_mass: ClosedLoop) -> None:
     swing = math.sqrt(stiffness / mass - decay**2)
     expected = np.exp(-decay * time) * (np.cos(swing * time) + decay / swing * np.sin(swing * time))
     assert outcome.records["device_position"][:, 0] == pytest.approx(1e-4 * expected, abs=1e-12)
+
+
+@pytest.mark.parametrize("delay", [0, 1, 5])
+def test_a_delay_is_as_long_where_the_device_moves_in_parts(
+    point_mass: ClosedLoop, delay: int
+) -> None:
+    """So few drops that none happens: the device is moved in sixteenths, ticks come on time."""
+    outcomes = [
+        point_mass.run(
+            SimulatedDevice(hand=None, delay=delay),
+            Coupling(800, 0.2, 0.5, 1e-4),
+            METHODS["implicit"],
+            ticks=1500,
+            knock=KNOCK,
+            timing=timing,
+            keep_records=True,
+        )
+        for timing in (None, Timing(drops=1e-15))
+    ]
+    even, parts = outcomes
+    assert even.is_stable == parts.is_stable == (delay < 5)
+    count = min(even.ticks, parts.ticks)
+    assert count > 100
+    for name in ("device_position", "wrench_on_tool"):
+        expected = even.records[name][:count]
+        scale = np.abs(expected).max()
+        assert parts.records[name][:count] == pytest.approx(expected, abs=1e-6 * scale)
+
+
+def test_a_delay_that_does_not_fit_into_parts_of_a_period_is_refused(
+    point_mass: ClosedLoop,
+) -> None:
+    with pytest.raises(DeviceError, match="at most 6"):
+        point_mass.run(
+            SimulatedDevice(delay=7), COUPLING, METHODS["implicit"], timing=Timing(drops=0.1)
+        )
 
 
 def test_intervals_are_whole_parts_that_add_up_to_the_time() -> None:

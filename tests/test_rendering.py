@@ -19,7 +19,7 @@ from hapticbridge.bridge import Bridge
 from hapticbridge.certificate import needed_damping
 from hapticbridge.clock import SimulatedClock
 from hapticbridge.coupling import Coupling
-from hapticbridge.device import DeviceInfo
+from hapticbridge.device import DeviceInfo, Motion, SimulatedDevice
 from hapticbridge.errors import CouplingError, DeviceError, HapticBridgeError, SceneError
 from hapticbridge.guard import Limits
 from hapticbridge.kernel.state import Binding, RunParameters
@@ -27,6 +27,7 @@ from hapticbridge.kernel.step import OK, after_step, before_step
 from hapticbridge.recording import read_recording
 from hapticbridge.rendering import IMPLICIT, METHODS, method_named, prepare
 from hapticbridge.scene import load_scene
+from hapticbridge.study.closed_loop import ClosedLoop, Timing
 
 COUPLING = Coupling(2000.0, 2.0, 2.0, 2e-3)
 FREE = Limits(force=100.0, torque=10.0, ramp=0.0)
@@ -331,6 +332,47 @@ def test_meter_and_audit_agree_on_the_tick_of_a_kick_in_all_directions(tmp_path:
     assert report.port == "device"
 
 
+FREE_MASS_AND_MOCAP = FREE_MASS.replace(
+    '<body name="tool"', '<body name="far" mocap="true" pos="0 1 0"/><body name="tool"'
+)
+
+
+def test_moved_mocap_body_that_touches_nothing_does_no_work_under_a_weld(tmp_path: Path) -> None:
+    """The handle's own weld is the coupling's port, not the external one."""
+    scene = tmp_path / "far.xml"
+    scene.write_text(FREE_MASS_AND_MOCAP.format(mass=0.1))
+    summaries = [
+        recorded(
+            tmp_path / f"{is_moved}.mcap",
+            scene,
+            duration=0.3,
+            method="weld",
+            on_tick=(lambda bridge, k: bridge.set_input(mocap={"far": [0, 1 + 1e-4 * k, 0]}))
+            if is_moved
+            else None,
+        )
+        for is_moved in (False, True)
+    ]
+    still, moved = summaries
+    assert moved.energies["coupling_work"] != 0
+    assert moved.energies["external_work"] == 0
+    assert moved.energies == still.energies
+
+
+def test_weld_affords_no_slack_and_is_told_by_its_stiffest_axis() -> None:
+    """No coupling law, so no proof that would afford one; the device must bear the largest."""
+    flat = FREE_MASS.format(mass=0.1).replace(
+        'type="sphere" size="0.01"', 'type="box" size="0.05 0.005 0.005"'
+    )
+    run = rendered("weld", COUPLING, waved(50), flat)
+    assert run.ledger.slack == 0
+    felt = run.parameters.felt
+    assert felt is not None
+    largest = 0.1 / 3 * (0.05**2 + 0.005**2)
+    assert felt.rotational_stiffness == pytest.approx(largest * 2000 / 0.05, rel=1e-6)
+    assert felt.rotational_damping == pytest.approx(largest * 2 / 0.05, rel=1e-6)
+
+
 # --- direct
 
 
@@ -389,6 +431,64 @@ def test_geometry_decides_for_a_massless_tool_and_not_behind_a_coupling(
         assert f"{limit:.3g} m" in report.conditions[0]
     if verdict == "active":
         assert report.port == "device"
+
+
+WALL = """
+<mujoco>
+  <option gravity="0 0 0"/>
+  <worldbody>
+    <geom type="box" size="0.01 0.1 0.1" pos="0.07 0 0"/>
+    <body name="tool"><freejoint/><geom type="sphere" size="0.01" mass="0.1"/>
+      <site name="grip"/></body>
+  </worldbody>
+</mujoco>"""
+
+
+@pytest.mark.parametrize("is_moved", [False, True])
+def test_a_jump_in_a_pause_does_not_hide_what_the_device_is_given(
+    is_moved: bool, tmp_path: Path
+) -> None:
+    """1 cm in one period would burn b δp²/T = 0.2 J, which no damping in a pause has burnt."""
+    scene, path, motion = (tmp_path / name for name in ("wall.xml", "run.mcap", "push.csv"))
+    scene.write_text(WALL)
+    motion.write_text("t,x,y,z\n0,0,0,0\n1,0.06,0,0\n4,0.06,0,0\n")
+    device = SimulatedDevice(path=str(motion), force_limit=1e3)
+    with Bridge(
+        scene,
+        device,
+        COUPLING,
+        method="direct",
+        contact_stiffness=2e5,
+        clock=SimulatedClock(),
+        recording=path,
+        limits=Limits(force=1e3, torque=0.5, ramp=0.0),
+    ) as bridge:
+        bridge.run(0.2)
+        if is_moved:
+            device.stepper[0]["position"][0, 1] += 0.01
+        summary = bridge.run(2.0)
+    report = audit(path)
+    assert report.resimulation == "bit for bit"
+    assert (summary.verdict, report.verdict) == ("active", "active")
+    assert summary.fault == (report.tick, report.port)
+    assert report.port == "device"
+
+
+@pytest.mark.parametrize("timing", [None, Timing(drops=0.5, seed=0)])
+def test_a_knock_or_missed_ticks_burn_nothing_that_was_not_burnt(timing: Timing | None) -> None:
+    """A knock of 1 cm would count as 0.2 J burnt, far more than the device is given."""
+    motion = np.zeros((3, 3))
+    motion[1:, 0] = 0.06
+    outcome = ClosedLoop(load(WALL)).run(
+        SimulatedDevice(path=Motion([0.0, 1.0, 4.0], motion)),
+        Coupling(2e5, 0.0, 0.0, 0.0),
+        METHODS["direct"],
+        ticks=2000,
+        knock=np.array([0, 1e-2, 0, 0, 0, 0]),
+        timing=timing,
+    )
+    assert outcome.fault is not None
+    assert outcome.fault[1] == "device"
 
 
 @pytest.mark.parametrize(
