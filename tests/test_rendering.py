@@ -356,16 +356,9 @@ def test_model_with_another_weld_than_its_method_wants_is_refused() -> None:
 def test_meter_and_audit_scale_alike_what_the_scene_gives_up(method: str, tmp_path: Path) -> None:
     """Force returns half as large for a handle that moves thrice as far: gained times 1/6."""
     path = tmp_path / "run.mcap"
-    summary = recorded(
-        path,
-        "peg_in_hole",
-        "simulated",
-        duration=1.6,
-        method=method,
-        scale=3.0,
-        force_scale=0.5,
-        **({"contact_stiffness": 2e4} if method == "direct" else {}),
-    )
+    options: dict[str, Any] = {"contact_stiffness": 2e4} if method == "direct" else {}
+    options |= {"method": method, "scale": 3.0, "force_scale": 0.5}
+    summary = recorded(path, "peg_in_hole", "simulated", duration=1.6, **options)
     report = audit(path)
     assert report.resimulation == "bit for bit"
     assert (report.tick, report.port) == (summary.fault or (None, ""))

@@ -123,7 +123,7 @@ def test_default_coupling_is_certified_with_any_number_of_substeps(
         coupling = default_coupling(info, period, *scales, laws)
         conditions = device_conditions(info, coupling, period, *scales, laws)
         assert all(c.needed <= 0.85 * c.available * (1 + 1e-6) for c in conditions)
-        assert laws == 2 or conditions[0].needed == pytest.approx(0.85 * info.damping)
+        assert laws == 2 or conditions[0].needed == pytest.approx(0.85 * 2.0)
 
 
 def test_a_bridge_without_a_coupling_asked_for_is_certified_with_substeps() -> None:
