@@ -30,8 +30,9 @@ from hapticbridge.errors import HapticBridgeError, RecordingError, SafetyTrip, S
 from hapticbridge.guard import Limits, limits_for, refuse_stretched_start, trip_reason
 from hapticbridge.inputs import Write, apply_writes, input_writes
 from hapticbridge.jit import direct
+from hapticbridge.kernel.parameters import checked_substeps
 from hapticbridge.kernel.state import Binding, RunParameters, rotation_numbers
-from hapticbridge.kernel.step import HELD, OK, after_step, before_step, publish
+from hapticbridge.kernel.step import OK, after_step, before_step, publish
 from hapticbridge.ledger import Ledger
 from hapticbridge.provenance import attachments, describe_run
 from hapticbridge.recording import TAIL, Recorder, Ring
@@ -70,7 +71,8 @@ class Bridge:
         scene: A loaded scene, a name, or a path to MJCF.
         device: A device, or what ``open_device`` understands.
         coupling: K and B; None chooses the stiffest safe one for the device's damping (80 % of the
-            bound, B = b/4; for a device of unknown damping, that of the default simulated one).
+            bound, B = b/4, less where substeps need it; for a device of unknown damping, that of
+            the default simulated one).
         rate: Ticks per second, 1 to 1e6.
         substeps: MuJoCo steps per tick, 1 to 100. With more than one the mean of their wrenches
             is sent, and the device needs another damping: ``certificate.needed_damping``.
@@ -115,14 +117,16 @@ class Bridge:
         self.device = device_for(self.scene, device) if isinstance(device, str) else device
         self.period = period_of(rate)
         self._scales = scale, scale if force_scale is None else force_scale
-        self.coupling = coupling or default_coupling(self.device.info, self.period, *self._scales)
-        self._limits = limits_for(self.device.info, limits)
         self._method = method_named(method)
+        self._substeps = checked_substeps(substeps)
+        self.coupling = coupling or default_coupling(
+            self.device.info, self.period, *self._scales, self.laws
+        )
+        self._limits = limits_for(self.device.info, limits)
         refuse_unknowing(self._method, is_real=self.device.info.is_real, i_know=i_know)
         self._contact_stiffness = contact_stiffness_of(
             self._method, self.coupling, contact_stiffness
         )
-        self._substeps = substeps
         self._axes = rotation_numbers(np.eye(3) if axes is None else axes)
         self._is_absolute = absolute
         self._path = Path(recording) if recording is not None else None
@@ -278,7 +282,7 @@ class Bridge:
     @property
     def laws(self) -> int:
         """How often per tick the wrench on the tool is computed."""
-        return 1 if self._method.scheme == HELD else self._substeps
+        return self._method.laws(self._substeps)
 
     @property
     def ledger(self) -> Ledger:
@@ -288,6 +292,10 @@ class Bridge:
     def latest_records(self, count: int) -> NDArray[np.void]:
         """Returns copies of the newest records (``TICK_DTYPE``), oldest first."""
         return self._ring.latest(count)
+
+    def conditions(self) -> tuple[str, ...]:
+        """Returns what is to be said of device and method, one sentence each; known once open."""
+        return condition_sentences(self.device.info, self.parameters, self._method)
 
     def summary(self) -> Summary:
         """Returns what the run was so far."""
@@ -308,9 +316,10 @@ class Bridge:
             method=method.name,
             about=method.about,
             hazard=method.hazard,
+            coupling=self.coupling,
             felt=self.parameters.felt,
             fault=ledger.fault,
-            conditions=condition_sentences(info, self.parameters, method),
+            conditions=self.conditions(),
             is_certified=is_run_certified(conditions, method),
             stopped_by=self._stopped_by,
             recording=self._path,

@@ -14,9 +14,10 @@ from typing import Any
 
 import mujoco
 
+from hapticbridge.arguments import Arguments
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import DeviceError, SceneError, choices
-from hapticbridge.kernel.parameters import RunParameters
+from hapticbridge.kernel.parameters import RunParameters, checked_substeps
 from hapticbridge.kernel.state import WELD_NAME
 from hapticbridge.kernel.step import COUPLED, DIRECT, HELD, WELD
 from hapticbridge.scene import Scene
@@ -64,6 +65,10 @@ class Method:
         )
         return step
 
+    def laws(self, substeps: int) -> int:
+        """Returns how often per tick the wrench on the tool is computed."""
+        return 1 if self.scheme == HELD else substeps
+
     @property
     def has_law(self) -> bool:
         """Whether the coupling law gives the wrench, so that the device condition proves safety."""
@@ -76,7 +81,7 @@ class Method:
 
     @property
     def has_coupling(self) -> bool:
-        """Whether anything elastic lies between handle and tool, so that there is a slack."""
+        """Whether anything elastic lies between handle and tool."""
         return self.scheme != DIRECT
 
     def gains(self, coupling: Coupling, period: float) -> tuple[Gains, Gains]:
@@ -171,6 +176,8 @@ _INTEGRATORS = {
 }
 
 
+_ARGUMENTS = Arguments(SceneError)
+
 MEASURED_AGAIN = 1e-6
 """Relative difference at which a weld measured again is another one; no unit. Probing by 1e-6 m
 leaves 1e-10 of rounding, another processor hardly more."""
@@ -206,7 +213,8 @@ def contact_stiffness_of(
     """Returns K_c in N/m for ``RunParameters``: as asked, or the coupling's K; 0 for others.
 
     Raises:
-        SceneError: It is not finite and > 0, or the method has no contact springs of its own.
+        SceneError: It is not finite, not > 0 or beyond 1e-30 to 1e30, or the method has no contact
+            springs of its own.
     """
     if method.has_coupling:
         if contact_stiffness is not None:
@@ -216,9 +224,7 @@ def contact_stiffness_of(
             )
         return 0.0
     stiffness = coupling.stiffness if contact_stiffness is None else contact_stiffness
-    if not math.isfinite(stiffness) or stiffness <= 0:
-        raise SceneError(f"contact stiffness is {stiffness!r} N/m; it must be finite and > 0")
-    return float(stiffness)
+    return _ARGUMENTS.number("contact stiffness", stiffness, "N/m", least=0.0, is_open=True)
 
 
 def check_scene(model: mujoco.MjModel, grip: str, method: Method) -> None:
@@ -261,8 +267,12 @@ def prepare(
         for ``RunParameters.felt``.
 
     Raises:
-        SceneError: Period or substeps are out of range, or the scene does not suit the method.
+        SceneError: Period, substeps or a magnitude of the coupling are out of range (1e-30 to
+            1e30), or the scene does not suit the method.
     """
+    checked_substeps(substeps, SceneError)
+    for item in fields(Coupling):
+        _ARGUMENTS.number(f"coupling {item.name.replace('_', ' ')}", getattr(coupling, item.name))
     check_scene(scene.model, scene.grip, method)
     scene.set_weld(coupling if method.scheme == WELD else None)
     scene.set_timestep(period, substeps)

@@ -26,6 +26,7 @@ class Summary:
         method: How the tool was rendered.
         about: What that means, in a sentence.
         hazard: What it may do on a real device, in a sentence; empty for ``implicit``.
+        coupling: The coupling asked for.
         felt: The coupling that the tool was truly held by, where it is not the one asked for (a
             weld: the stiffest axis, as measured at the start).
         fault: Tick and port (``environment`` or ``device``) of the first fault, or None.
@@ -50,6 +51,7 @@ class Summary:
     method: str
     about: str
     hazard: str
+    coupling: Coupling
     felt: Coupling | None
     fault: tuple[int, str] | None
     conditions: tuple[str, ...]

@@ -210,6 +210,7 @@ def test_run_says_what_a_method_is_and_may_do(call: Called) -> None:
     assert "geometry decides" in out
     assert "5000 N/m" in out
     assert "L <= 2 sqrt(b_theta / (T K_c))" in " ".join(err.split())
+    assert "geometry decides" in " ".join(err.split()).split("warning:")[-1]  # before the run
     code, out, err = call(*command)
     assert code == 0, err
     assert "method" not in out + err
@@ -219,6 +220,8 @@ def test_run_tells_how_stiff_a_weld_truly_is(call: Called) -> None:
     command = ("run", "point_mass", "--fast", "--duration", 0.1, "--stiffness", 1000)
     _, out, err = call(*command, "--method", "weld")
     told = " ".join(out.split())
+    assert "the weld is 2000 N/m" in " ".join(err.split())  # told before there is force
+    assert "device damping" in " ".join(err.split())
     assert "the weld is 2000 N/m" in told, err  # 0.1 kg · 1000 / (1 − 0.95)
     assert "asked for: 1000" in told
 

@@ -5,15 +5,18 @@ from __future__ import annotations
 import math
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
+from typing import Any
 
 import numpy as np
 import pytest
 
 from hapticbridge.bridge import Bridge
+from hapticbridge.certificate import default_coupling, device_conditions, is_certified
 from hapticbridge.clock import SimulatedClock
 from hapticbridge.coupling import Coupling
-from hapticbridge.device import Hand, Motion, SimulatedDevice
-from hapticbridge.errors import StudyError
+from hapticbridge.device import Hand, Motion, SimulatedDevice, random_hand
+from hapticbridge.device.simulated import HAND_RANGES
+from hapticbridge.errors import DeviceError, StudyError
 from hapticbridge.guard import Limits
 from hapticbridge.passivity import SampledLoop, WorstHand, minimum_damping
 from hapticbridge.rendering import METHODS
@@ -184,6 +187,42 @@ def test_device_is_exact_between_uneven_ticks(point_mass: ClosedLoop) -> None:
     assert outcome.records["device_position"][:, 0] == pytest.approx(1e-4 * expected, abs=1e-12)
 
 
+@pytest.mark.parametrize("delay", [0, 1, 5])
+def test_a_delay_is_as_long_where_the_device_moves_in_parts(
+    point_mass: ClosedLoop, delay: int
+) -> None:
+    """So few drops that none happens: the device is moved in sixteenths, ticks come on time."""
+    outcomes = [
+        point_mass.run(
+            SimulatedDevice(hand=None, delay=delay),
+            Coupling(800, 0.2, 0.5, 1e-4),
+            METHODS["implicit"],
+            ticks=1500,
+            knock=KNOCK,
+            timing=timing,
+            keep_records=True,
+        )
+        for timing in (None, Timing(drops=1e-15))
+    ]
+    even, parts = outcomes
+    assert even.is_stable == parts.is_stable == (delay < 5)
+    count = min(even.ticks, parts.ticks)
+    assert count > 100
+    for name in ("device_position", "wrench_on_tool"):
+        expected = even.records[name][:count]
+        scale = np.abs(expected).max()
+        assert parts.records[name][:count] == pytest.approx(expected, abs=1e-6 * scale)
+
+
+def test_a_delay_that_does_not_fit_into_parts_of_a_period_is_refused(
+    point_mass: ClosedLoop,
+) -> None:
+    with pytest.raises(DeviceError, match="at most 6"):
+        point_mass.run(
+            SimulatedDevice(delay=7), COUPLING, METHODS["implicit"], timing=Timing(drops=0.1)
+        )
+
+
 def test_intervals_are_whole_parts_that_add_up_to_the_time() -> None:
     ticks = 50_000
     jittered = Timing(jitter=0.5, seed=2).intervals(ticks)
@@ -228,3 +267,75 @@ def test_timing_out_of_range_is_refused(name: str, bad: float) -> None:
 def test_too_short_a_run_is_refused(point_mass: ClosedLoop) -> None:
     with pytest.raises(StudyError, match="ticks is 49"):
         point_mass.run(SimulatedDevice(), COUPLING, METHODS["implicit"], ticks=49)
+
+
+@pytest.mark.parametrize("bad", ["x", None, True])
+@pytest.mark.parametrize("name", ["jitter", "drops", "seed"])
+def test_timing_that_is_no_number_is_refused(name: str, bad: Any) -> None:
+    with pytest.raises(StudyError, match=f"{name} is "):
+        Timing(**(asdict(Timing()) | {name: bad}))
+
+
+@pytest.mark.parametrize("seed", [-1, 1.5])
+def test_seed_that_is_no_whole_number_is_refused(seed: Any) -> None:
+    with pytest.raises(StudyError, match="seed is "):
+        Timing(seed=seed)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"ticks": 100.5}, "ticks is 100.5"),
+        ({"knock": np.zeros(3)}, "knock has shape"),
+        ({"knock": np.full(6, np.nan)}, "knock is nan"),
+        ({"knock": "x"}, "knock is 'x'"),
+    ],
+)
+def test_bad_arguments_of_a_run_are_refused(
+    point_mass: ClosedLoop, changes: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(StudyError, match=message):
+        point_mass.run(SimulatedDevice(), COUPLING, METHODS["implicit"], **changes)
+
+
+@pytest.mark.parametrize(
+    ("jitter", "most"), [(0.0, 0), (0.06, 0), (0.0625, 1), (0.13, 2), (0.9, 14)]
+)
+def test_no_tick_is_later_than_jitter_says(jitter: float, most: int) -> None:
+    timing = Timing(jitter=jitter, seed=5)
+    late = np.cumsum(timing.intervals(5000) - PARTS)
+    assert (late.min(), late.max()) == (0, most)
+    assert most <= jitter * PARTS
+    assert timing.is_even == (most == 0)
+    assert np.bincount(late) == pytest.approx(np.full(most + 1, 5000 / (most + 1)), rel=0.2)
+
+
+def test_random_hands_are_the_same_for_the_same_seed_and_within_their_ranges() -> None:
+    hands = [random_hand(seed) for seed in range(200)]
+    assert hands[3] == random_hand(3)
+    assert hands[3] != hands[4]
+    for name, (least, most) in HAND_RANGES.items():
+        values = np.array([getattr(hand, name) for hand in hands])
+        assert least <= values.min() < 1.3 * least * (most / least) ** 0.05
+        assert most >= values.max() > most / 1.3 / (most / least) ** 0.05
+    with pytest.raises(DeviceError, match="seed is -1"):
+        random_hand(-1)
+
+
+def test_no_random_passive_hand_turns_a_certified_coupling_unstable_or_active(
+    point_mass: ClosedLoop,
+) -> None:
+    info = SimulatedDevice().info
+    coupling = default_coupling(info, T)
+    assert is_certified(device_conditions(info, coupling, T, 1.0, 1.0))
+    for seed in range(50):
+        outcome = point_mass.run(
+            SimulatedDevice(hand=random_hand(seed), path=STILL),
+            coupling,
+            METHODS["implicit"],
+            ticks=6000,  # its windows hold most of a swing of the slowest hand
+            knock=np.array([1e-3, -5e-4, 2e-4, 0.02, 0.01, -0.02]),
+        )
+        assert outcome.is_stable, seed
+        assert outcome.last_force < 1e-3 * outcome.peak_force, seed
+        assert (outcome.environment, outcome.fault) == ("strict", None), seed

@@ -9,24 +9,25 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
-from audit_cases import ScriptedDevice, recorded, rewritten
+from audit_cases import ScriptedDevice, recorded, rewritten, without_model
 from kernel_runs import T, live, load, samples_of, sines, wrench_law
 from rendering_runs import FREE_MASS, SLOT, Rotor, rendered, sway
 from scipy.spatial.transform import Rotation
 
 from hapticbridge.audit import audit
 from hapticbridge.bridge import Bridge
-from hapticbridge.certificate import needed_damping
+from hapticbridge.certificate import needed_damping, run_conditions
 from hapticbridge.clock import SimulatedClock
 from hapticbridge.coupling import Coupling
-from hapticbridge.device import DeviceInfo
+from hapticbridge.device import DeviceInfo, Motion, SimulatedDevice
 from hapticbridge.errors import CouplingError, DeviceError, HapticBridgeError, SceneError
 from hapticbridge.guard import Limits
 from hapticbridge.kernel.state import Binding, RunParameters
 from hapticbridge.kernel.step import OK, after_step, before_step
 from hapticbridge.recording import read_recording
-from hapticbridge.rendering import IMPLICIT, METHODS, method_named, prepare
+from hapticbridge.rendering import IMPLICIT, METHODS, check_prepared, method_named, prepare
 from hapticbridge.scene import load_scene
+from hapticbridge.study.closed_loop import ClosedLoop, Timing
 
 COUPLING = Coupling(2000.0, 2.0, 2.0, 2e-3)
 FREE = Limits(force=100.0, torque=10.0, ramp=0.0)
@@ -292,6 +293,86 @@ def test_weld_carries_changes_over_and_comes_off_again() -> None:
     assert (scene.model.body_mass == plain.body_mass).all()
 
 
+def test_weld_carries_over_what_was_changed_in_the_scenes_own_constraints() -> None:
+    own = '<equality><weld name="own" body1="tool" body2="world" active="false"/></equality>'
+    text = FREE_MASS.format(mass=0.05).replace("</mujoco>", own + "</mujoco>")
+    scene = load(text)
+    scene.model.eq_solref[0] = 0.05, 0.7
+    scene.model.eq_data[0, 0] = 0.25
+    scene.model.body_mass[scene.model.body("tool").id] = 0.2
+    mujoco.mj_setConst(scene.model, scene.data)
+    inertia = scene.model.stat.meaninertia
+    for method, count in (("weld", 2), ("implicit", 1)):
+        prepare(scene, COUPLING, T, 1, method_named(method))
+        assert scene.model.neq == count
+        assert scene.model.equality("own").solref.tolist() == [0.05, 0.7]
+        assert scene.model.equality("own").data[0] == 0.25
+        assert scene.model.stat.meaninertia == inertia
+        if method == "weld":
+            assert scene.model.equality("handle_weld").solref.tolist() == [-2000, -2]
+
+
+@pytest.mark.parametrize("name", ["weld", "implicit", "explicit"])
+def test_stiffness_beyond_all_magnitudes_is_refused(name: str) -> None:
+    with pytest.raises(SceneError, match="between 1e-30 and 1e\\+30"):
+        prepare(load(FREE_MASS.format(mass=0.05)), Coupling(1e300, 0, 0, 0), T, 1, METHODS[name])
+
+
+def test_a_device_that_bears_a_weld_is_still_not_called_certified() -> None:
+    """Nothing proves b >= KT/2 + B enough for it; where that fails, it is refuted."""
+    text = FREE_MASS.format(mass=0.01)
+    for stiffness, expected in ((10.0, None), (1e6, False)):
+        with Bridge(
+            load(text),
+            Rotor(damping=1.0),
+            Coupling(stiffness, 0.0, 0.0, 0.0),
+            clock=SimulatedClock(),
+            method="weld",
+        ) as bridge:
+            assert bridge.run(0.01).is_certified is expected
+            assert len(bridge.conditions()) == 2
+
+
+def test_a_tool_without_coupling_has_no_condition_on_the_device() -> None:
+    for method, count in (("direct", 0), ("implicit", 2)):
+        with Bridge("peg_in_hole", clock=SimulatedClock(), method=method) as bridge:
+            found = run_conditions(bridge.device.info, bridge.parameters, bridge.method)
+            assert len(found) == count
+
+
+def test_model_with_another_weld_than_its_method_wants_is_refused() -> None:
+    scene = load(FREE_MASS.format(mass=0.05))
+    run = rendered("implicitfast", COUPLING, waved(2), scene)
+    welded = rendered("weld", COUPLING, waved(2), FREE_MASS.format(mass=0.05))
+    check_prepared(scene.model, run.parameters, METHODS["implicitfast"])
+    check_prepared(welded.scene.model, welded.parameters, METHODS["weld"])
+    with pytest.raises(SceneError, match="weld to the handle"):
+        check_prepared(scene.model, welded.parameters, METHODS["weld"])
+    with pytest.raises(SceneError, match="weld to the handle"):
+        check_prepared(welded.scene.model, run.parameters, METHODS["implicitfast"])
+
+
+@pytest.mark.parametrize("method", ["weld", "direct"])
+def test_meter_and_audit_scale_alike_what_the_scene_gives_up(method: str, tmp_path: Path) -> None:
+    """Force returns half as large for a handle that moves thrice as far: gained times 1/6."""
+    path = tmp_path / "run.mcap"
+    options: dict[str, Any] = {"contact_stiffness": 2e4} if method == "direct" else {}
+    options |= {"method": method, "scale": 3.0, "force_scale": 0.5}
+    summary = recorded(path, "peg_in_hole", "simulated", duration=1.6, **options)
+    report = audit(path)
+    assert report.resimulation == "bit for bit"
+    assert (report.tick, report.port) == (summary.fault or (None, ""))
+
+
+def test_geometry_touching_within_a_margin_pushes_on_nothing() -> None:
+    """A contact that MuJoCo reports before touch has a negative depth."""
+    text = SLOT.format(half=0.02).replace("<geom solref", '<geom margin="0.01" solref')
+    samples = samples_of(np.array([[0.0, 0, 0], [1e-3, 0, 0]]))
+    run = rendered("direct", COUPLING, samples, text, contact_stiffness=500.0)
+    assert run.ticks["contacts"][1] == 4
+    assert run.ticks["wrench_on_tool"][:, 0] == pytest.approx([0, 2 * 500 * 1e-3], abs=1e-9)
+
+
 def test_weld_refuses_a_tool_whose_joints_block_an_axis() -> None:
     with pytest.raises(SceneError, match="1 of 6"):
         prepare(load_scene("virtual_wall"), COUPLING, T, 1, method_named("weld"))
@@ -329,6 +410,47 @@ def test_meter_and_audit_agree_on_the_tick_of_a_kick_in_all_directions(tmp_path:
     assert report.verdict == "active"
     assert summary.fault == (report.tick, report.port)
     assert report.port == "device"
+
+
+FREE_MASS_AND_MOCAP = FREE_MASS.replace(
+    '<body name="tool"', '<body name="far" mocap="true" pos="0 1 0"/><body name="tool"'
+)
+
+
+def test_moved_mocap_body_that_touches_nothing_does_no_work_under_a_weld(tmp_path: Path) -> None:
+    """The handle's own weld is the coupling's port, not the external one."""
+    scene = tmp_path / "far.xml"
+    scene.write_text(FREE_MASS_AND_MOCAP.format(mass=0.1))
+    summaries = [
+        recorded(
+            tmp_path / f"{is_moved}.mcap",
+            scene,
+            duration=0.3,
+            method="weld",
+            on_tick=(lambda bridge, k: bridge.set_input(mocap={"far": [0, 1 + 1e-4 * k, 0]}))
+            if is_moved
+            else None,
+        )
+        for is_moved in (False, True)
+    ]
+    still, moved = summaries
+    assert moved.energies["coupling_work"] != 0
+    assert moved.energies["external_work"] == 0
+    assert moved.energies == still.energies
+
+
+def test_weld_affords_no_slack_and_is_told_by_its_stiffest_axis() -> None:
+    """No coupling law, so no proof that would afford one; the device must bear the largest."""
+    flat = FREE_MASS.format(mass=0.1).replace(
+        'type="sphere" size="0.01"', 'type="box" size="0.05 0.005 0.005"'
+    )
+    run = rendered("weld", COUPLING, waved(50), flat)
+    assert run.ledger.slack == 0
+    felt = run.parameters.felt
+    assert felt is not None
+    largest = 0.1 / 3 * (0.05**2 + 0.005**2)
+    assert felt.rotational_stiffness == pytest.approx(largest * 2000 / 0.05, rel=1e-6)
+    assert felt.rotational_damping == pytest.approx(largest * 2 / 0.05, rel=1e-6)
 
 
 # --- direct
@@ -391,6 +513,64 @@ def test_geometry_decides_for_a_massless_tool_and_not_behind_a_coupling(
         assert report.port == "device"
 
 
+WALL = """
+<mujoco>
+  <option gravity="0 0 0"/>
+  <worldbody>
+    <geom type="box" size="0.01 0.1 0.1" pos="0.07 0 0"/>
+    <body name="tool"><freejoint/><geom type="sphere" size="0.01" mass="0.1"/>
+      <site name="grip"/></body>
+  </worldbody>
+</mujoco>"""
+
+
+@pytest.mark.parametrize("is_moved", [False, True])
+def test_a_jump_in_a_pause_does_not_hide_what_the_device_is_given(
+    is_moved: bool, tmp_path: Path
+) -> None:
+    """1 cm in one period would burn b δp²/T = 0.2 J, which no damping in a pause has burnt."""
+    scene, path, motion = (tmp_path / name for name in ("wall.xml", "run.mcap", "push.csv"))
+    scene.write_text(WALL)
+    motion.write_text("t,x,y,z\n0,0,0,0\n1,0.06,0,0\n4,0.06,0,0\n")
+    device = SimulatedDevice(path=str(motion), force_limit=1e3)
+    with Bridge(
+        scene,
+        device,
+        COUPLING,
+        method="direct",
+        contact_stiffness=2e5,
+        clock=SimulatedClock(),
+        recording=path,
+        limits=Limits(force=1e3, torque=0.5, ramp=0.0),
+    ) as bridge:
+        bridge.run(0.2)
+        if is_moved:
+            device.stepper[0]["position"][0, 1] += 0.01
+        summary = bridge.run(2.0)
+    report = audit(path)
+    assert report.resimulation == "bit for bit"
+    assert (summary.verdict, report.verdict) == ("active", "active")
+    assert summary.fault == (report.tick, report.port)
+    assert report.port == "device"
+
+
+@pytest.mark.parametrize("timing", [None, Timing(drops=0.5, seed=0)])
+def test_a_knock_or_missed_ticks_burn_nothing_that_was_not_burnt(timing: Timing | None) -> None:
+    """A knock of 1 cm would count as 0.2 J burnt, far more than the device is given."""
+    motion = np.zeros((3, 3))
+    motion[1:, 0] = 0.06
+    outcome = ClosedLoop(load(WALL)).run(
+        SimulatedDevice(path=Motion([0.0, 1.0, 4.0], motion)),
+        Coupling(2e5, 0.0, 0.0, 0.0),
+        METHODS["direct"],
+        ticks=2000,
+        knock=np.array([0, 1e-2, 0, 0, 0, 0]),
+        timing=timing,
+    )
+    assert outcome.fault is not None
+    assert outcome.fault[1] == "device"
+
+
 @pytest.mark.parametrize(
     ("scene", "message"),
     [
@@ -408,7 +588,7 @@ def test_massless_tool_refuses_a_scene_in_which_more_moves(scene: str, message: 
         prepare(loaded, COUPLING, T, 1, method_named("direct"))
 
 
-@pytest.mark.parametrize("stiffness", [0.0, -1.0, math.nan, math.inf])
+@pytest.mark.parametrize("stiffness", [0.0, -1.0, math.nan, math.inf, 1e-31, 1e308])
 def test_bad_contact_stiffness_is_refused(stiffness: float) -> None:
     with pytest.raises(SceneError, match="contact stiffness"):
         Bridge("peg_in_hole", "simulated", method="direct", contact_stiffness=stiffness)
@@ -509,6 +689,29 @@ def test_mean_over_substeps_does_the_work_of_the_single_wrenches(substeps: int) 
     assert sent == pytest.approx(work_on_handle, rel=1e-9)
 
 
+@pytest.mark.parametrize("substeps", [2, 4])
+def test_torque_over_substeps_is_the_mean_of_the_single_laws(substeps: int) -> None:
+    """About one axis: J ω̇ = K_r φ + B_r (turn of the handle per time − ω), step by step."""
+    count, inertia = 300, 0.4 * 0.05 * 0.01**2
+    stiff = Coupling(2000.0, 2.0, 2e-2, 1e-4)
+    angle = 0.2 * np.sin(2 * np.pi * 3 * T * np.arange(1, count + 1))
+    turning = Rotation.from_rotvec(angle[:, None] * [0, 0, 1])
+    run = rendered("implicit", stiff, samples_of(np.zeros((count, 3)), turning), substeps=substeps)
+    h, k_, b_ = T / substeps, stiff.rotational_stiffness, stiff.rotational_damping
+    step = np.diff(angle, prepend=0.0) / substeps
+    x = v = position = 0.0
+    for k in range(count):
+        mean = 0.0
+        for _ in range(substeps):
+            position += step[k]
+            v = (inertia * v / h + k_ * (position - x) + b_ * step[k] / h) / (
+                inertia / h + k_ * h + b_
+            )
+            x += h * v
+            mean += (k_ * (position - x) + b_ * (step[k] / h - v)) / substeps
+        assert run.ticks["wrench_on_tool"][k, 5] == pytest.approx(mean, abs=1e-8)
+
+
 def test_needed_damping_with_one_law_is_that_of_the_theory_and_grows_with_the_delay() -> None:
     assert needed_damping(COUPLING, T) == pytest.approx(3.0, rel=1e-12)
     undamped = Coupling(2000.0, 0.0, 2.0, 0.0)
@@ -555,6 +758,28 @@ def test_audit_says_what_a_mean_leaves_unchecked(tmp_path: Path) -> None:
     assert "re-simulation alone" in report.unchecked
     recorded(path, "peg_in_hole", "simulated", duration=0.2)
     assert audit(path).unchecked == ""
+
+
+@pytest.mark.parametrize(
+    ("method", "substeps", "verdict"),
+    [
+        ("direct", 1, "invalid"),
+        ("weld", 1, "invalid"),
+        ("implicit", 4, "invalid"),
+        ("implicit", 1, "passive"),
+    ],
+)
+def test_what_only_a_resimulation_confirms_is_not_called_passive_without_one(
+    method: str, substeps: int, verdict: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "run.mcap"
+    recorded(path, "point_mass", duration=0.1, method=method, substeps=substeps)
+    assert audit(path).verdict == "passive"
+    bare = rewritten(without_model(read_recording(path)), tmp_path / "bare.mcap")
+    report = audit(bare)
+    assert report.verdict == verdict
+    assert "not re-simulated" in report.resimulation
+    assert verdict == "passive" or "not re-simulated" in report.reason
 
 
 # --- what the audit refuses

@@ -164,6 +164,7 @@ class Balance:
                 parameters,
                 np.cumsum(device_work),
                 stored - ticks["actuator_work"] - ticks["external_work"],
+                resumed,
             ),
         )
 
@@ -171,10 +172,10 @@ class Balance:
 def _slack_gains(parameters: RunParameters) -> tuple[float, float]:
     """Returns K + B/T and K_r + B_r/T of the coupling that the tool was held by.
 
-    With n laws a tick only half of K/n + B/T counts; without a coupling nothing does.
+    With n laws a tick only half of K/n + B/T counts; without a coupling law nothing does.
     """
-    coupling = parameters.felt or parameters.coupling
-    if not parameters.has_law and parameters.felt is None:
+    coupling = parameters.coupling
+    if not parameters.has_law:
         return 0.0, 0.0
     n, share = parameters.laws, 1.0 if parameters.laws == 1 else SLACK_SHARE
     linear = coupling.stiffness / n + coupling.damping / parameters.period
@@ -183,9 +184,16 @@ def _slack_gains(parameters: RunParameters) -> tuple[float, float]:
 
 
 def _kicked(
-    ticks: NDArray[np.void], parameters: RunParameters, given: Array, gained: Array
+    ticks: NDArray[np.void],
+    parameters: RunParameters,
+    given: Array,
+    gained: Array,
+    resumed: Array,
 ) -> Array:
-    """Returns Σ w·δp − Σ b‖δp‖²/T + (S − S_start − works), the last in the device's scale."""
+    """Returns Σ w·δp − Σ b‖δp‖²/T + (S − S_start − works), the last in the device's scale.
+
+    A jump before the first tick or in a pause burns nothing: it took an unknown time.
+    """
     if parameters.has_law or parameters.device_damping is None:
         return np.zeros(len(ticks))
     start = np.array(parameters.device_start)
@@ -193,6 +201,7 @@ def _kicked(
     turned = turns(ticks["device_quaternion"], start[3:])
     burnt = parameters.device_damping * np.sum(moved**2, axis=1)
     burnt += (parameters.device_rotational_damping or 0.0) * np.sum(turned**2, axis=1)
+    burnt = np.where(since_start(ticks, resumed) > 0, burnt, 0.0)
     ratio = parameters.force_scale / parameters.scale
     return np.asarray(given - np.cumsum(burnt) / parameters.period + ratio * gained)
 

@@ -37,6 +37,8 @@ FOREIGN_TOLERANCE = 1e-9
 vector instructions round differently. Larger would hide tampering, smaller would refuse honest
 recordings."""
 
+NOT_RUN = "not re-simulated"
+
 _TIMING = int(TickFlag.OVERRUN | TickFlag.DROPPED_BEFORE)
 
 
@@ -58,6 +60,11 @@ class Replay:
     difference: float = 0.0
 
     @property
+    def has_run(self) -> bool:
+        """Whether there was a re-simulation."""
+        return not self.agreement.startswith(NOT_RUN)
+
+    @property
     def disagrees(self) -> bool:
         """Whether the recording is not what the scene does under the recorded motion."""
         return self.tick is not None
@@ -71,7 +78,7 @@ def replay(recording: Recording, parameters: RunParameters) -> Replay:
     """
     reason = _obstacle(recording)
     if reason:
-        return Replay(f"not re-simulated: {reason}")
+        return Replay(f"{NOT_RUN}: {reason}")
     model = _model(recording, parameters)
     data = mujoco.MjData(model)
     # an error inside the C symbol would end the process, so MuJoCo takes its first step in Python

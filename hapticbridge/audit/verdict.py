@@ -46,7 +46,8 @@ class AuditReport:
         ticks: Number of records.
         duration: Their number times the period, in s.
         conditions: The device condition per kind of axis, as sentences.
-        unchecked: What records alone do not tell and only the re-simulation confirms, or nothing.
+        unchecked: What records alone do not tell and only the re-simulation confirms, or nothing;
+            without a re-simulation such a recording is not called passive but invalid.
         energies: Energies at the end, in J.
         events: How many events of each kind.
     """
@@ -147,6 +148,8 @@ def audit(path: str | Path, *, strict: bool = False) -> AuditReport:
         )
         return _invalid(facts, Fault(reason, outcome.tick, outcome.field))
     report = _judged(facts, balance, strict=strict)
+    if report.verdict == "passive" and report.unchecked and not outcome.has_run:
+        report = _invalid(facts, Fault(outcome.agreement))
     trips = [event.get("tick") for event in recording.events if event.get("event") == "trip"]
     tripped = f"; the guard tripped at tick {trips[0]}" if trips else ""
     unchecked = f"; {report.unchecked}" if report.unchecked else ""

@@ -22,7 +22,7 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo, device_for
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.guard import Limits
-from hapticbridge.rendering import IMPLICIT
+from hapticbridge.rendering import IMPLICIT, method_named
 from hapticbridge.scene import load_scene, settings_from
 from hapticbridge.summary import Summary
 
@@ -132,12 +132,14 @@ class Run:
         with ExitStack() as stack:
             with err.status("preparing (the first run on a machine compiles for about 20 s) …"):
                 stack.enter_context(bridge)
+            if not self.as_json:
+                _announce_measured(bridge)
             summary = bridge.run(self.duration)
         if self.as_json:
             values = asdict(summary) | {"verdict": summary.verdict}
             out.print_json(json.dumps(values | {"recording": str(self.record or "") or None}))
         else:
-            _print_summary(summary, bridge.coupling, bridge.laws)
+            _print_summary(summary, bridge.laws)
         is_good = summary.verdict == "passive" and summary.is_certified is not False
         return 0 if is_good else 1
 
@@ -145,7 +147,8 @@ class Run:
         """Returns the default coupling with what the user asked for put in its place."""
         asked = {field.name: getattr(self, field.name) for field in fields(Coupling)}
         given = {name: value for name, value in asked.items() if value is not None}
-        return replace(default_coupling(info, period_of(self.rate), *scales), **given)
+        laws = method_named(self.method).laws(self.substeps)
+        return replace(default_coupling(info, period_of(self.rate), *scales, laws), **given)
 
 
 def _announce(bridge: Bridge, scales: tuple[float, float]) -> None:
@@ -161,13 +164,24 @@ def _announce(bridge: Bridge, scales: tuple[float, float]) -> None:
         err.print(f"method {bridge.method.name}: {escape(bridge.method.about)}")
         err.print(f"[yellow]warning:[/yellow] {escape(bridge.method.hazard)}")
     if not bridge.method.has_law:
-        return  # what must be known of a weld is measured, and told, when it has run
+        return  # told when the scene is prepared and the weld measured: ``_announce_measured``
     conditions = device_conditions(
         bridge.device.info, coupling, bridge.period, *scales, bridge.laws
     )
     for condition in conditions:
         if not condition.holds:
             err.print(f"[yellow]warning:[/yellow] {condition.sentence()}")
+
+
+def _announce_measured(bridge: Bridge) -> None:
+    """Says what the device must bear where no coupling law tells it, before any force is on."""
+    if bridge.method.has_law:
+        return
+    felt = bridge.parameters.felt
+    if felt is not None:
+        err.print(_true_weld(felt, bridge.coupling))
+    for sentence in bridge.conditions():
+        err.print(f"[yellow]warning:[/yellow] {escape(sentence)}")
 
 
 def _true_weld(felt: Coupling, asked: Coupling) -> str:
@@ -179,7 +193,7 @@ def _true_weld(felt: Coupling, asked: Coupling) -> str:
     )
 
 
-def _print_summary(summary: Summary, asked: Coupling, laws: int) -> None:
+def _print_summary(summary: Summary, laws: int) -> None:
     table = Table(show_header=False, box=None, pad_edge=False)
     table.add_row("ran", f"{summary.duration:.3f} s, {summary.ticks} ticks ({summary.stopped_by})")
     skipped = f" ({summary.skipped} deadlines skipped)" if summary.skipped else ""
@@ -199,7 +213,7 @@ def _print_summary(summary: Summary, asked: Coupling, laws: int) -> None:
     if summary.method != IMPLICIT.name:
         out.print(f"method {escape(summary.method)}: {escape(summary.about)}")
     if summary.felt is not None:
-        out.print(_true_weld(summary.felt, asked))
+        out.print(_true_weld(summary.felt, summary.coupling))
     if summary.is_certified is None and summary.conditions:
         for sentence in summary.conditions:
             out.print(escape(sentence))

@@ -9,5 +9,6 @@ from hapticbridge.device.motion import Motion as Motion
 from hapticbridge.device.motion_csv import read_motion as read_motion
 from hapticbridge.device.simulated import Hand as Hand
 from hapticbridge.device.simulated import SimulatedDevice as SimulatedDevice
+from hapticbridge.device.simulated import random_hand as random_hand
 from hapticbridge.device.trajectory import ReplayDevice as ReplayDevice
 from hapticbridge.device.trajectory import TrajectoryDevice as TrajectoryDevice

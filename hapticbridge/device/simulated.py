@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from hapticbridge.arguments import Arguments
 from hapticbridge.device.base import DeviceInfo, checked_number, checked_period
 from hapticbridge.device.handheld import (
     FREE,
@@ -73,6 +74,40 @@ class Hand:
 
 
 _DEFAULT_HAND = Hand()
+
+HAND_RANGES = {
+    "mass": (0.05, 2.0),
+    "damping": (0.5, 50.0),
+    "stiffness": (10.0, 2000.0),
+    "rotational_inertia": (1e-4, 1e-2),
+    "rotational_damping": (2e-3, 0.2),
+    "rotational_stiffness": (0.1, 10.0),
+}
+"""Between which hands are drawn, in the units of ``Hand``: from two fingers that hardly hold to an
+arm that grips hard, around the measured arm of the defaults. Every one of them is passive."""
+
+
+def random_hand(seed: int) -> Hand:
+    """Returns a random passive hand, the same for the same seed.
+
+    Every value is drawn by itself, evenly in its logarithm, from its ``HAND_RANGES``.
+
+    Args:
+        seed: >= 0.
+
+    Raises:
+        DeviceError: The seed is not a whole number >= 0.
+    """
+    Arguments(DeviceError).whole("seed", seed, least=0, most=2**63 - 1)
+    generator = np.random.default_rng(seed)
+    return Hand(
+        **{
+            name: float(np.exp(generator.uniform(np.log(least), np.log(most))))
+            for name, (least, most) in HAND_RANGES.items()
+        }
+    )
+
+
 _NO_HAND = Hand(
     mass=0.0,
     damping=0.0,
@@ -215,20 +250,27 @@ class SimulatedDevice:
         self._written: NDArray[np.float64] = self._states["written"][0]
         self._is_started = False
 
-    def start(self, period: float) -> NDArray[np.void]:
+    def start(self, period: float, parts: int = 1) -> NDArray[np.void]:
         """Puts the device at rest at the origin, and compiles what the loop will call.
 
         Args:
             period: The loop's period in s, finite and > 0.
+            parts: In how many steps the device is moved through it, for ticks that come at parts of
+                a period; the delay stays what it is in whole periods.
 
         Returns:
             The pose before the first tick, shape (1,), ``SAMPLE_DTYPE``.
 
         Raises:
             DeviceError: The period is not, is too long for a stiff hand with friction, or is not
-                the one that a worst hand is tuned to.
+                the one that a worst hand is tuned to; the delay is more than 100 parts.
         """
-        period = checked_period(period)
+        period = checked_period(period) / parts
+        if self._delay * parts > MAX_DELAY:
+            raise DeviceError(
+                f"delay = {self._delay} samples: where ticks come at parts of a period, it must be "
+                f"at most {MAX_DELAY // parts}"
+            )
         state = np.zeros((), STATE_DTYPE)
         state["period"] = period
         state["holder"] = ON_A_LINE if self._lines[0] else FREE if self.hand is None else IN_A_HAND
@@ -243,7 +285,7 @@ class SimulatedDevice:
         state["quaternion"][0] = state["target_quaternion"][0] = 1.0
         state["resolution"] = self.info.resolution
         state["rotational_resolution"] = self._rotational_resolution
-        state["delay"] = self._delay
+        state["delay"] = self._delay * parts
         state["translation"] = sampled_axis(period, **self._translation)
         state["rotation"] = sampled_axis(period, **self._rotation)
         self._states[0] = state

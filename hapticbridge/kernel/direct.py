@@ -44,7 +44,7 @@ def tool_map(model: mujoco.MjModel, site_id: int) -> tuple[NDArray[np.float64], 
     ``qpos0`` of the three joints (3).
 
     Args:
-        model: A scene that ``scene.checks.check_direct`` accepts.
+        model: A scene that ``scene.methods.check_massless_tool`` accepts.
         site_id: The grip.
     """
     body_id = int(model.site_bodyid[site_id])

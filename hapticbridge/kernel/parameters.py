@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from hapticbridge.arguments import Arguments
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import HapticBridgeError
 from hapticbridge.kernel.step import COUPLED, DIRECT, HELD, WELD
@@ -19,6 +20,15 @@ environment active sooner."""
 
 MOST_SUBSTEPS = 100
 """MuJoCo steps per tick at most; more would not fit into any period that can be felt."""
+
+
+def checked_substeps(substeps: int, error: type[HapticBridgeError] = HapticBridgeError) -> int:
+    """Returns a number of MuJoCo steps per tick, 1 to ``MOST_SUBSTEPS``.
+
+    Raises:
+        HapticBridgeError: It is not; of the kind asked for.
+    """
+    return Arguments(error).whole("substeps", substeps, least=1, most=MOST_SUBSTEPS)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -42,7 +52,7 @@ class RunParameters:
         device_start: Device pose of the same form before the first tick.
         scheme: How the wrench reaches the tool, one of ``kernel.step``'s four.
         felt: The coupling that the tool is really held by, where it is not ``coupling`` (a weld);
-            the slack is counted with it.
+            the device condition is judged by it.
         contact_stiffness: K_c in N/m per contact of a tool without mass, > 0 for it, else 0.
         device_damping: b of the device in N s/m, None where unknown. Where no coupling law leaves
             a slack, what the device was given is held against what this damping burns.
@@ -72,7 +82,8 @@ class RunParameters:
     device_rotational_damping: float | None = None
 
     def __post_init__(self) -> None:
-        positive = ("period", "substeps", "scale", "force_scale", "force_limit", "torque_limit")
+        checked_substeps(self.substeps)
+        positive = ("period", "scale", "force_scale", "force_limit", "torque_limit")
         for name in positive:
             value = getattr(self, name)
             if not math.isfinite(value) or value <= 0:
@@ -102,10 +113,6 @@ class RunParameters:
                 raise HapticBridgeError(f"{name} is {pose!r}; it must be 7 finite numbers")
             if abs(math.hypot(*pose[3:]) - 1) > 1e-9:
                 raise HapticBridgeError(f"{name} is {pose!r}; its quaternion must have norm 1")
-        if not isinstance(self.substeps, int) or self.substeps > MOST_SUBSTEPS:
-            raise HapticBridgeError(
-                f"substeps is {self.substeps!r}; it must be a whole number, 1 to {MOST_SUBSTEPS}"
-            )
         rotation = np.asarray(self.axes, dtype=np.float64)
         if rotation.shape != (9,) or not (
             np.allclose(rotation.reshape(3, 3) @ rotation.reshape(3, 3).T, np.eye(3), atol=1e-12)
@@ -129,14 +136,15 @@ class RunParameters:
     def slack_gains(self) -> tuple[float, float]:
         """Returns gain g in N/m and its rotational counterpart in N m/rad: slack = Σ ½ g ‖δx_k‖².
 
-        g = K + B/T with one law a tick, half of K/n + B/T with n > 1; zero for a tool without mass,
-        which has no coupling. With several laws a tick, ½‖δx_i‖²_{K + nB/T} per law would be
-        affordable at no device damping where B = 0; half of it is (``certificate.needed_damping``),
-        and of the motions δx_i the records only tell their sum, over which uniform motion is least.
+        g = K + B/T with one law a tick, half of K/n + B/T with n > 1; zero where no coupling law
+        gives the wrench (a weld, a tool without mass): the proof that affords a slack needs one.
+        With several laws a tick, ½‖δx_i‖²_{K + nB/T} per law would be affordable at no device
+        damping where B = 0; half of it is (``certificate.needed_damping``), and of the motions δx_i
+        the records only tell their sum, over which uniform motion is least.
         """
-        if self.scheme == DIRECT:
+        if not self.has_law:
             return 0.0, 0.0
-        coupling = self.felt or self.coupling
+        coupling = self.coupling
         share = 1.0 if self.laws == 1 else SLACK_SHARE
         return (
             share * (coupling.stiffness / self.laws + coupling.damping / self.period),

@@ -22,6 +22,7 @@ from hapticbridge.kernel.native import (
     mj_make_constraint,
     pointer_at,
 )
+from hapticbridge.kernel.weld import EQUALITY
 from hapticbridge.pose import add, cross, dot, rotation_between
 
 # kinds of constraint rows (mjtConstraint) as plain integers: the compiler reads no enumeration
@@ -191,16 +192,15 @@ def _mocap_work(state: NDArray[np.void]) -> float:
     s = state[0]
     force = floats(pointer_at(s.efc_force), ints(s.nefc, 1)[0])
     residual = floats(pointer_at(s.efc_pos), force.size)
+    kinds, ids = ints(pointer_at(s.efc_type), force.size), ints(pointer_at(s.efc_id), force.size)
     work = 0.0
     if ints(s.ne, 1)[0] == s.equality_rows:
         before = floats(s.equality_before, s.equality_rows)
         for i in range(s.equality_rows):
-            work -= force[i] * (residual[i] - before[i])
+            # the handle's weld is the coupling's port: its residual changes with the handle
+            if not (kinds[i] == EQUALITY and ids[i] == s.weld_id):
+                work -= force[i] * (residual[i] - before[i])
     if s.ntendon > 0:
-        kinds, ids = (
-            ints(pointer_at(s.efc_type), force.size),
-            ints(pointer_at(s.efc_id), force.size),
-        )
         lengths, tendon_before = floats(s.ten_length, s.ntendon), floats(s.tendon_before, s.ntendon)
         ranges = floats(s.tendon_range, 2 * s.ntendon)
         for i in range(force.size):

@@ -124,8 +124,10 @@ def before_step(
         turned = rotation_between(quaternion_of(s.device_quaternion), quaternion)
         w = s.wrench_on_device
         s.device_energy += dot((w[0], w[1], w[2]), moved) + dot((w[3], w[4], w[5]), turned)
-        s.device_burnt += s.device_damping / s.period * dot(moved, moved)
-        s.device_burnt += s.device_rotational_damping / s.period * dot(turned, turned)
+        if s.tick > s.ramp_start:
+            # before the first tick and in a pause nobody knows how long the device took to move
+            s.device_burnt += s.device_damping / s.period * dot(moved, moved)
+            s.device_burnt += s.device_rotational_damping / s.period * dot(turned, turned)
         store_vector(s.device_position, position)
         store_quaternion(s.device_quaternion, quaternion)
 

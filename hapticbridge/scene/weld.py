@@ -18,7 +18,7 @@ PROBE = 1e-6
 """Displacement in m, angle in rad and velocity in m/s and rad/s by which the weld is measured: the
 constraint is linear in them as long as the angle's sine is the angle."""
 
-_NOT_CARRIED = ("eq_", "name", "text", "tuple", "paths")
+_NOT_CARRIED = ("name", "text", "tuple", "paths")
 
 
 def add_weld(spec: mujoco.MjSpec, grip: str) -> None:
@@ -73,22 +73,35 @@ def check_weldable(model: mujoco.MjModel, grip: str) -> None:
 def carry_over(old: mujoco.MjModel, new: mujoco.MjModel) -> None:
     """Copies everything from a model to one that differs by equality constraints alone.
 
-    What was changed after loading (masses, contact parameters) would be lost in a compilation.
+    What was changed after loading (masses, contact parameters, gains of the scene's own equality
+    constraints) would be lost in a compilation. The weld is the last row of the equalities, so the
+    rows before it are the same constraints in both.
     """
     for name in dir(old):
         if name.startswith(("_", *_NOT_CARRIED)):
             continue
         value = getattr(old, name)
-        if isinstance(value, np.ndarray) and value.shape == getattr(new, name).shape:
-            getattr(new, name)[...] = value
-    for name in dir(old.opt):
+        if not isinstance(value, np.ndarray):
+            continue
+        target = getattr(new, name)
+        if name.startswith("eq_"):
+            count = min(old.neq, new.neq)
+            target[:count] = value[:count]
+        elif value.shape == target.shape:
+            target[...] = value
+    for part in ("opt", "stat"):
+        _copy_values(getattr(old, part), getattr(new, part))
+
+
+def _copy_values(old: object, new: object) -> None:
+    for name in dir(old):
         if name.startswith("_"):
             continue
-        value = getattr(old.opt, name)
+        value = getattr(old, name)
         if isinstance(value, np.ndarray):
-            getattr(new.opt, name)[...] = value
+            getattr(new, name)[...] = value
         elif not callable(value):
-            setattr(new.opt, name, value)
+            setattr(new, name, value)
 
 
 def measured_weld(model: mujoco.MjModel, grip: str) -> Coupling:

@@ -15,6 +15,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticbridge.arguments import Arguments
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import SimulatedDevice
 from hapticbridge.device.handheld import STATE_DTYPE as DEVICE_DTYPE
@@ -55,18 +56,25 @@ LEAST_TICKS = 50
 the fewest that show one."""
 
 
+MOST_TICKS = 10**9
+"""Ticks of a run at most: beyond, its signal alone would not fit into memory."""
+
+_ARGUMENTS = Arguments(StudyError)
+
+
 @dataclass(frozen=True, slots=True)
 class Timing:
     """When ticks happen, as a share of the period and without unit.
 
     Attributes:
         jitter: Every tick is late by a random share in [0, jitter] of the period, 0 <= jitter < 1,
-            in sixteenths.
+            in whole sixteenths, of which every one up to jitter is equally likely; below 1/16 no
+            tick is late.
         drops: Share of ticks that are missed, 0 <= drops < 1: the wrench is held on.
         seed: Of the random numbers.
 
     Raises:
-        StudyError: A value is out of range.
+        StudyError: A value is no number or out of range.
     """
 
     jitter: float = 0.0
@@ -75,20 +83,21 @@ class Timing:
 
     def __post_init__(self) -> None:
         for name in ("jitter", "drops"):
-            value = getattr(self, name)
-            if not 0 <= value < 1:
+            value = _ARGUMENTS.number(name, getattr(self, name), least=0.0)
+            if not value < 1:
                 raise StudyError(f"{name} is {value!r}; it must be a share, 0 <= {name} < 1")
+            object.__setattr__(self, name, value)
+        _ARGUMENTS.whole("seed", self.seed, least=0, most=2**63 - 1)
 
     @property
     def is_even(self) -> bool:
         """Whether every tick comes on time."""
-        return self.jitter == 0 and self.drops == 0
+        return self.jitter < 1 / PARTS and self.drops == 0
 
     def intervals(self, ticks: int) -> NDArray[np.int64]:
         """Returns the time before each tick in sixteenths of the period, shape (ticks,)."""
         generator = np.random.default_rng(self.seed)
-        late = np.floor(generator.uniform(0, self.jitter * PARTS + 1, ticks)).astype(np.int64)
-        late = np.minimum(late, PARTS - 1)
+        late = generator.integers(0, int(self.jitter * PARTS) + 1, ticks)
         missed = generator.geometric(1 - self.drops, ticks) - 1 if self.drops else 0
         return np.asarray(PARTS * (1 + missed) + np.diff(late, prepend=0), dtype=np.int64)
 
@@ -99,7 +108,8 @@ class LoopOutcome:
 
     Attributes:
         ticks: How many were done; fewer than asked where it diverged.
-        is_stable: Whether what a knock left falls from the fourth to the last fifth of the run.
+        is_stable: Whether what a knock left falls from the fourth to the last fifth of the run. A
+            tool that was thrown out of contact decays too: ``fault`` tells of the energy it got.
         environment: ``strict``, ``within slack`` or ``active``.
         created: The largest Σ E_k so far at any tick, in J: > 0 where (14) is violated.
         slack_share: Largest share of the slack that was used, without unit.
@@ -157,20 +167,24 @@ class ClosedLoop:
             period: T in s.
             ticks: How many, >= 50.
             substeps: MuJoCo steps per tick.
-            knock: Displacement of the device before the first tick, shape (6,), in m and rad.
+            knock: Displacement of the device before the first tick, shape (6,), in m and rad; no
+                number is beyond 1e30.
             timing: Late and missed ticks; None: every one on time.
             keep_records: Whether to return the records.
 
         Raises:
             HapticBridgeError: A value is out of range, or the method cannot render the scene.
         """
-        if ticks < LEAST_TICKS:
-            raise StudyError(f"ticks is {ticks}; it must be {LEAST_TICKS} or more")
+        _ARGUMENTS.whole("ticks", ticks, least=LEAST_TICKS, most=MOST_TICKS)
+        if knock is not None:
+            knock = _ARGUMENTS.numbers("knock", knock, "m or rad")
+            if knock.shape != (6,):
+                raise StudyError(f"knock has shape {knock.shape}; it must be 6 numbers")
         scene = self.scene
         felt = prepare(scene, coupling, period, substeps, method)
         is_even = timing is None or timing.is_even
         sample = np.zeros(1, SAMPLE_DTYPE)
-        sample[:] = device.start(period if is_even else period / PARTS)
+        sample[:] = device.start(period, 1 if is_even else PARTS)
         start = tuple(float(v) for v in (*sample[0]["position"], *sample[0]["quaternion"]))
         parameters = RunParameters(
             grip=scene.grip,
@@ -235,9 +249,13 @@ def _run(
         # the first sample is the start: no time passes before it
         for _ in range(intervals[k] if k > 0 else 1):
             next_sample(devices, motion, sample)
+        elapsed = devices[0].period * intervals[k]
         for substep in range(s.substeps):
+            burnt = s.device_burnt
             if before_step(state, sample, row, substep) != OK:
                 return k
+            if elapsed != s.period:  # the kernel takes every tick to be one period long
+                s.device_burnt = burnt + (s.device_burnt - burnt) * s.period / elapsed
             advance(state)
             if after_step(state, row, substep) != OK:
                 return k
