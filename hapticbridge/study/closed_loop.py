@@ -167,7 +167,7 @@ class ClosedLoop:
         if ticks < LEAST_TICKS:
             raise StudyError(f"ticks is {ticks}; it must be {LEAST_TICKS} or more")
         scene = self.scene
-        felt = prepare(scene, coupling, period, substeps, method)
+        felt = prepare(scene, coupling, period, substeps, method, warns=False)
         is_even = timing is None or timing.is_even
         sample = np.zeros(1, SAMPLE_DTYPE)
         sample[:] = device.start(period if is_even else period / PARTS)
