@@ -16,12 +16,8 @@ from hapticbridge.errors import SceneError
 from hapticbridge.rendering import METHODS, prepare
 from hapticbridge.scene import load_scene, scene_names
 from hapticbridge.scene.contact_check import check_contacts, contact_settings
-from hapticbridge.scene.contact_rule import (
-    SUGGESTED,
-    contact_concerns,
-    contact_numbers,
-    suggested_solref,
-)
+from hapticbridge.scene.contact_concerns import contact_concerns, suggested_solref
+from hapticbridge.scene.contact_rule import SUGGESTED, contact_numbers
 
 H = 1e-3
 SOLIMP = (0.9, 0.95, 0.001)
@@ -175,6 +171,15 @@ def test_defaults_that_nobody_chose_are_mentioned_only_when_asked(tmp_path: Path
     said = " ".join(concerns_of(path, is_thorough=True))
     assert "is soft" in said
     assert "geom 'tip' with geom 'floor'" in said
+
+
+def test_approximate_diagonal_of_a_model_is_mentioned_when_asked(tmp_path: Path) -> None:
+    loaded = load_scene(scene(tmp_path, floor=GOOD, tip=GOOD))
+    assert check_contacts(loaded.model, loaded.grip, is_thorough=True) == []
+    loaded.model.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_DIAGEXACT)
+    assert check_contacts(loaded.model, loaded.grip) == []
+    (said,) = check_contacts(loaded.model, loaded.grip, is_thorough=True)
+    assert "approximate diagonal" in said
 
 
 def test_the_global_override_is_what_counts(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.scene.contact_rule import contact_concerns
+from hapticbridge.scene.contact_concerns import contact_concerns
 
 
 class ContactSetting(NamedTuple):

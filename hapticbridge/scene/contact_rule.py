@@ -24,7 +24,7 @@ friction 0 and 0.42, recorded and random hands with up to 30 N) under integrator
 the elliptic cone at 1 kHz, draws the lines on top, and counts where rule and runs differ.
 
 The pyramidal cone is worse the lower the friction is. With MuJoCo's defaults for the rest, pegs
-created up to 8.1 times the slack (16 of 36 runs of the map active, all without friction).
+created up to 8.1 times the slack (16 of 36 runs of the map active).
 
 One contact alone is kinder: a mass on a wall stays within the slack at nearly every setting. Beyond
 what was measured (other shapes, lighter tools, stiffer couplings, other periods) the rule is a
@@ -57,7 +57,7 @@ STIFFEST = 4.0
 LARGEST_IMPEDANCE = 0.91
 """d up to which the lines of the slack hold, no unit: 0.9 as shipped, whatever it rises to within
 1 mm. At 0.95 throughout tools of 0.1 kg used 1.07 of the slack at κ = 1.2 and τ = 15 h; at 0.99
-1.4 at κ = 1.5 and τ = 32 h. The line of strict runs held at both."""
+1.4 at κ = 1.5 and τ = 32 h; the line of strict runs held there (timeconst 4 h, dampratio 8)."""
 
 SHALLOW = 1e-4
 """Depth in m at which the impedance counts: where a push begins and most of it is felt."""
@@ -68,14 +68,6 @@ SLACK_STEPS = 30.0
 
 HEAVY_SLACK_STEPS = 3.8
 """The same for tools of 0.1 kg and more: the shipped scenes' setting."""
-
-LOW_FRICTION = 0.4
-"""Coefficient below which a pyramidal cone is called a risk, no unit. In the map no run at 0.42 was
-active with MuJoCo's default ``solref``, and without friction most were; 0.1 is in the tests."""
-
-SOFT_STEPS = 10.0
-"""timeconst·dampratio/h beyond which a contact is called soft: 25 times softer than at 2 h, some
-0.3 mm under 3 N on a 0.1 kg peg, more than its clearance."""
 
 REFERENCE_STEPS = 2.0
 """timeconst·dampratio/h of the shipped scenes, to which softness is compared."""
@@ -190,77 +182,3 @@ def _impedances(solimp: Sequence[float]) -> tuple[float, float]:
     else:
         rise = 1 - (1 - share) ** power / (1 - middle) ** (power - 1)
     return start + rise * (last - start), last
-
-
-def suggested_solref(timestep: float) -> str:
-    """Returns the attribute that is strict at a time step in s: timeconst h/2, dampratio 8."""
-    return f'solref="{SUGGESTED[0] * timestep:g} {SUGGESTED[1]:g}"'
-
-
-def contact_concerns(
-    solref: Sequence[float],
-    solimp: Sequence[float],
-    timestep: float,
-    *,
-    cone: Literal["elliptic", "pyramidal"] = "elliptic",
-    diagexact: bool = True,
-    refsafe: bool = True,
-    condim: int = 3,
-    friction: float = 1.0,
-    only_active: bool = False,
-) -> list[str]:
-    """Says what a contact setting risks, one clause each; nothing where it is as recommended.
-
-    Args:
-        solref: As ``contact_numbers`` takes it.
-        solimp: Likewise.
-        timestep: h in s.
-        cone: Of friction; it matters for condim > 1 and a friction below 0.4 only.
-        diagexact: Whether MuJoCo's exact diagonal is on; without it more runs of the map's shipped
-            setting create energy.
-        refsafe: As ``contact_numbers`` takes it.
-        condim: Of the contact; 1 is without friction.
-        friction: Coefficient of sliding.
-        only_active: Leave out what is not likely to go beyond the slack.
-
-    Returns:
-        Clauses that go after "the contact of …": what is wrong, the risk, what to write instead.
-
-    Raises:
-        SceneError: As ``contact_numbers``.
-    """
-    numbers = contact_numbers(solref, solimp, timestep, refsafe=refsafe)
-    steps, instead = numbers.relaxation, suggested_solref(timestep)
-    concerns = []
-    if numbers.grade == "active" and numbers.is_too_stiff:
-        concerns.append(
-            f"is stiffer than was seen to stay passive (impedance {numbers.impedance:.3g}, "
-            f"stiffness {numbers.stiffness:.3g} inertia/step²; at most {LARGEST_IMPEDANCE:g} and "
-            f"{STIFFEST:g}) and may create more energy than the coupling's slack allows; write "
-            f'{instead} and solimp="0.9 0.95 0.001"'
-        )
-    elif numbers.grade == "active":
-        concerns.append(
-            f"relaxes within {steps:.2g} time steps (2 d_w timeconst dampratio²) and may create "
-            f"more energy than the coupling's slack allows; write {instead}, or at least a "
-            f"relaxation of {HEAVY_SLACK_STEPS:g} steps"
-        )
-    if cone == "pyramidal" and condim > 1 and friction < LOW_FRICTION:
-        concerns.append(
-            f"has a pyramidal cone and a friction of {friction:g}, below {LOW_FRICTION:g}, and may "
-            "create several times the energy that the coupling's slack allows; write "
-            'cone="elliptic" in <option>, or condim="1" for no friction'
-        )
-    if only_active:
-        return concerns
-    if numbers.grade != "strict" and not diagexact:
-        concerns.append(
-            "is solved with MuJoCo's approximate diagonal, with which more runs created energy; "
-            'write <flag diagexact="enable"/> in <option>'
-        )
-    if numbers.resolved > SOFT_STEPS * (1 + ROUNDING):
-        concerns.append(
-            f"is soft: a steady force sinks in {numbers.softness:.3g} times as deep as with "
-            f'solref="{REFERENCE_STEPS * timestep:g} 1"; write {instead} unless that is meant'
-        )
-    return concerns

@@ -95,7 +95,7 @@ def read(table: Table) -> Finding:
             if column == 0:
                 axes.set_ylabel("dampratio")
     found = [searched(table, name) for name in TREATMENTS if np.any(table["treatment"] == name)]
-    draw_search(below.add_subplot(below.add_gridspec(1, 2, width_ratios=(1, 0.7))[0]), found)
+    draw_search(below.add_subplot(below.add_gridspec(1, 2, width_ratios=(1, 1.22))[0]), found)
     below.suptitle(
         "The search on the peg: 30, 100 and 300 g, K = 1000 and 6000 N/m, friction 0 and 0.42,\n"
         "one recorded and two random hands",

@@ -53,11 +53,15 @@ class Treatment:
 
     @property
     def static_depth(self) -> float:
-        """How deep a steady force sinks in, over what it does as shipped: (1 − d₀) d_w²/(d₀² k)."""
-        inverse_root = self.numbers.resolved * self._step
-        depth = (1 - self.solimp[0]) * (self.solimp[1] * inverse_root / self.solimp[0]) ** 2
-        first, last, _ = SHIPPED_SOLIMP
-        return depth / ((1 - first) * (last * 0.002 / first) ** 2)
+        """How deep a steady force sinks in, over what it does as shipped: (1 − d) d_w²/(d² k)."""
+        depth = self._depth(self.numbers, self.solimp[1], self._step)
+        shipped = contact_numbers((0.002, 1.0), SHIPPED_SOLIMP, PERIOD)
+        return depth / self._depth(shipped, SHIPPED_SOLIMP[1], PERIOD)
+
+    @staticmethod
+    def _depth(numbers: ContactNumbers, last: float, step: float) -> float:
+        impedance = numbers.impedance
+        return (1 - impedance) * (last * numbers.resolved * step / impedance) ** 2
 
     @property
     def numbers(self) -> ContactNumbers:
