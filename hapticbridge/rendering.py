@@ -21,6 +21,7 @@ from hapticbridge.kernel.parameters import RunParameters, checked_substeps
 from hapticbridge.kernel.state import WELD_NAME
 from hapticbridge.kernel.step import COUPLED, DIRECT, HELD, WELD
 from hapticbridge.scene import Scene
+from hapticbridge.scene.contact_check import warn_of_contacts
 from hapticbridge.scene.methods import check_massless_tool, check_metered
 from hapticbridge.scene.weld import check_weldable, measured_weld
 
@@ -251,6 +252,7 @@ def prepare(
     period: float,
     substeps: int,
     method: Method = IMPLICIT,
+    warns: bool = True,
 ) -> Coupling | None:
     """Makes a scene render a coupling by a method: integrator, gains, timestep, and a reset.
 
@@ -261,6 +263,7 @@ def prepare(
         period: T in s.
         substeps: MuJoCo steps per tick.
         method: How.
+        warns: Whether to warn of contacts that may create energy at this time step.
 
     Returns:
         The coupling that the tool is really held by, where it is not the one asked for (a weld);
@@ -277,6 +280,8 @@ def prepare(
     scene.set_weld(coupling if method.scheme == WELD else None)
     scene.set_timestep(period, substeps)
     scene.model.opt.integrator = _INTEGRATORS[method.integrator]
+    if warns and method.scheme == COUPLED:
+        warn_of_contacts(scene.model, scene.grip, scene.path)
     scene.set_gains(*method.gains(coupling, period))
     felt = measured_weld(scene.model, scene.grip) if method.scheme == WELD else None
     scene.reset()

@@ -17,6 +17,7 @@ from hapticbridge.rendering import METHODS
 from hapticbridge.scene.contact_rule import SUGGESTED
 from hapticbridge.study.maps import contact, contact_search
 from hapticbridge.study.maps.contact import CONTACT, evaluate, points
+from hapticbridge.study.maps.contact_agreement import agreement, exceptions
 from hapticbridge.study.maps.contact_rigs import peg_runs, wall_runs
 from hapticbridge.study.maps.contact_treatments import PERIOD, SHIPPED, TREATMENTS, Treatment
 from hapticbridge.study.maps.rigs import loop_in, set_tool_mass
@@ -123,6 +124,74 @@ def test_map_at_reduced_resolution_agrees_with_the_rule(
     assert shipped["active"] > 0
     assert damped["strict"] == damped["runs"]
     assert "least deep is 'damped: 0.0005 8'" in files.finding.paragraph
+
+
+def test_treatments_reach_the_model_whatever_was_set_before() -> None:
+    model = loop_in("virtual_wall", "contact").scene.model
+    exact = int(mujoco.mjtEnableBit.mjENBL_DIAGEXACT)
+    safe = int(mujoco.mjtDisableBit.mjDSBL_REFSAFE)
+    for treatment in [*TREATMENTS.values(), Treatment()]:
+        treatment.apply(model, 0.3)
+        assert set(model.geom_condim.tolist()) == {treatment.condim}
+        assert bool(model.opt.enableflags & exact) == treatment.diagexact
+        assert bool(model.opt.disableflags & safe) != treatment.refsafe
+        assert model.opt.cone == (treatment.cone == "elliptic")
+        assert tuple(model.opt.o_solref) == treatment.solref
+        assert tuple(model.opt.o_solimp[:3]) == treatment.solimp
+        assert model.opt.o_friction[0] == 0.3
+
+
+class Rows(dict[str, Any]):
+    """The part of a table that the comparison needs."""
+
+    def select(self, rows: Any) -> Rows:
+        return Rows({name: values[rows] for name, values in self.items()})
+
+
+@pytest.mark.parametrize(
+    ("name", "mass", "measured", "is_worse"),
+    [
+        (SHIPPED, 0.03, "active", False),
+        (SHIPPED, 0.1, "active", True),
+        (SHIPPED, 0.1, "within slack", False),
+        ("0.00025 8", 0.03, "active", True),
+        ("damped: 0.0005 8", 0.1, "within slack", True),
+        ("damped: 0.0005 8", 0.1, "strict", False),
+        ("impedance 0.99 throughout", 0.3, "active", False),
+        ("pyramidal cone", 0.3, "active", False),
+        ("diagexact off", 0.3, "active", False),
+        ("implicitfast", 0.3, "active", False),
+    ],
+)
+def test_only_runs_worse_than_the_rule_says_are_exceptions(
+    name: str, mass: float, measured: str, is_worse: bool
+) -> None:
+    row: Any = Rows(
+        treatment=np.array([name]),
+        mass=np.array([mass]),
+        active=np.array([int(measured == "active")]),
+        within_slack=np.array([int(measured == "within slack")]),
+    )
+    assert bool(exceptions(row)) == is_worse
+
+
+def test_regions_of_the_rule_are_told_apart_on_the_grid() -> None:
+    # τ = 60.8, 30.4, 15.2 and 1.9 h; what promises nothing is abrupt
+    steps, ratio = [0.5, 0.25, 2.0, 1.0], [8.0, 8.0, 2.0, 1.0]
+    table: Any = Rows(
+        rig=np.array(["peg"] * 4),
+        steps=np.array(steps),
+        dampratio=np.array(ratio),
+        active=np.array([0, 0, 0, 1]),
+        within_slack=np.array([0, 1, 0, 0]),
+    )
+    found = agreement(table)
+    assert {name: one["cells"] for name, one in found.items()} == {
+        "strict": 1,
+        "relaxed": 2,
+        "abrupt": 1,
+    }
+    assert found["relaxed"]["within_slack"] == found["abrupt"]["active"] == 1
 
 
 def wall_depths(treatment: Treatment) -> Any:

@@ -10,7 +10,6 @@ import numpy as np
 
 from hapticbridge.errors import SceneError
 from hapticbridge.kernel.state import COUPLING_ACTUATORS
-from hapticbridge.scene.contact_check import check_contacts
 from hapticbridge.scene.source import SourceFile, read_elements
 
 MAXIMUM_START_PENETRATION = 1e-4
@@ -132,7 +131,7 @@ def check_model(model: mujoco.MjModel, grip: str) -> list[str]:
                 )
     for name in COUPLING_ACTUATORS:
         _check_coupling_actuator(model, name)
-    warnings = check_contacts(model, grip)
+    warnings = []
     if np.any(model.geom_surfacevel):
         warnings.append(
             "a geom's surfacevel does work on the scene that no port meters; the environment may "

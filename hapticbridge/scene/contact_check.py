@@ -2,59 +2,80 @@
 
 from __future__ import annotations
 
+import itertools
+import warnings
 from collections.abc import Iterator
-from typing import Literal, NamedTuple
+from functools import cache
+from typing import NamedTuple
 
 import mujoco
+import numpy as np
+from numpy.typing import NDArray
 
-from hapticbridge.scene.contact_rule import contact_concerns
-
-USUAL_PERIOD = 1e-3
-"""The bridge's default period in s. A scene runs at the rate that the user asks for, not at the
-time step of its file; MuJoCo's default of 2 ms is taken for no opinion."""
-
-Cone = Literal["elliptic", "pyramidal"]
+from hapticbridge.scene.contact_concerns import contact_concerns
 
 
-class _Setting(NamedTuple):
+class ContactSetting(NamedTuple):
+    """What MuJoCo gives a contact: solref, solimp, condim, and the coefficient of sliding."""
+
     solref: tuple[float, ...]
     solimp: tuple[float, ...]
     condim: int
     friction: float
 
 
+class _Say(NamedTuple):
+    """What one geom has to say in the mixture; the fields are MuJoCo's."""
+
+    priority: int
+    solmix: float
+    solref: tuple[float, ...]
+    solimp: tuple[float, ...]
+    condim: int
+    friction: float
+
+
+def warn_of_contacts(model: mujoco.MjModel, grip: str, scene: object) -> None:
+    """Warns of contacts that are likely to create more energy than the slack allows.
+
+    Args:
+        model: The compiled scene with the time step that it will run at.
+        grip: Name of the site on the tool.
+        scene: Its path, for the sentence.
+    """
+    for concern in check_contacts(model, grip):
+        warnings.warn(f"scene '{scene}': {concern}", UserWarning, stacklevel=3)
+
+
 def check_contacts(model: mujoco.MjModel, grip: str, *, is_thorough: bool = False) -> list[str]:
     """Returns what ``contact_concerns`` says about the contacts that the tool can have.
 
-    A geom is judged by its own setting; where two are of equal priority MuJoCo mixes them, and the
-    mixture of two good settings is taken as good. Geoms whose priority yields to every partner's
-    have no say and are passed over. The global override, where it is on, is judged instead.
+    Flexes, and the ``solreffriction`` of pairs, are not looked at.
 
     Args:
-        model: The compiled scene; settings are judged by its time step, or by 1 ms if that is less.
+        model: The compiled scene with the time step that it will run at.
         grip: Name of the site on the tool.
         is_thorough: Whether to say too where a contact is soft or solved with the approximate
             diagonal: MuJoCo's defaults, for which nobody asked. Otherwise only what is likely to
             create more energy than the slack allows.
     """
     option = model.opt
-    timestep = min(float(option.timestep), USUAL_PERIOD)
-    is_elliptic = option.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
-    cone: Cone = "elliptic" if is_elliptic else "pyramidal"
-    is_exact = bool(option.enableflags & mujoco.mjtEnableBit.mjENBL_DIAGEXACT)
-    where: dict[_Setting, list[str]] = {}
-    for name, setting in _settings(model, grip):
-        where.setdefault(setting, []).append(name)
+    where: dict[ContactSetting, list[str]] = {}
+    for first, second, setting in contact_settings(model, grip):
+        names = f"{_geom_name(model, first)} with {_geom_name(model, second)}"
+        where.setdefault(setting, []).append(names)
+    step = float(option.timestep)
     return [
-        f"the contact of {names[0]}{_others(len(names) - 1)} (solref "
-        f'"{setting.solref[0]:g} {setting.solref[1]:g}", time step {timestep:g} s) {concern}'
+        f"the contact of {names[0]}{_others(len(names) - 1)} (solref {_words(setting.solref)}, "
+        f"solimp {_words(setting.solimp[:3])}, time step {step:g} s) {concern}"
         for setting, names in where.items()
         for concern in contact_concerns(
             setting.solref,
             setting.solimp,
-            timestep,
-            cone=cone,
-            diagexact=is_exact,
+            step,
+            cone="elliptic" if option.cone == mujoco.mjtCone.mjCONE_ELLIPTIC else "pyramidal",
+            diagexact=bool(option.enableflags & mujoco.mjtEnableBit.mjENBL_DIAGEXACT),
+            refsafe=not option.disableflags & mujoco.mjtDisableBit.mjDSBL_REFSAFE,
             condim=setting.condim,
             friction=setting.friction,
             only_active=not is_thorough,
@@ -62,48 +83,125 @@ def check_contacts(model: mujoco.MjModel, grip: str, *, is_thorough: bool = Fals
     ]
 
 
-def _others(count: int) -> str:
-    return f" and {count} more" if count else ""
+def contact_settings(model: mujoco.MjModel, grip: str) -> Iterator[tuple[int, int, ContactSetting]]:
+    """Yields geoms that may collide, one of the tool at least, with their contact's setting.
 
+    The tool is all that moves with the grip: the bodies below one child of the world. Whether two
+    geoms are ever near each other is not asked.
 
-def _settings(model: mujoco.MjModel, grip: str) -> Iterator[tuple[str, _Setting]]:
-    root = model.body_rootid[model.site(grip).bodyid[0]]
-    can_touch = [g for g in range(model.ngeom) if model.geom_contype[g] | model.geom_conaffinity[g]]
-    tool = [g for g in can_touch if model.body_rootid[model.geom_bodyid[g]] == root]
-    others = [g for g in can_touch if model.body_rootid[model.geom_bodyid[g]] != root]
-    # a tool of several links may touch itself too; such scenes are judged by the same settings
-    for mine, theirs in ((tool, others), (others, tool)):
-        if not theirs:
-            continue
-        priority = int(model.geom_priority[theirs].min())
-        smoothest = float(model.geom_friction[theirs, 0].min())
-        for g in mine:
-            if model.geom_priority[g] >= priority:
-                # of two geoms the rougher counts
-                friction = max(smoothest, float(model.geom_friction[g, 0]))
-                solref, solimp = model.geom_solref[g], model.geom_solimp[g]
-                condim = int(model.geom_condim[g])
-                yield _geom_name(model, g), _setting(model, solref, solimp, condim, friction)
+    Args:
+        model: The compiled scene.
+        grip: Name of the site on the tool.
+    """
+    disable = mujoco.mjtDisableBit
+    if model.opt.disableflags & (disable.mjDSBL_CONTACT | disable.mjDSBL_CONSTRAINT):
+        return
+    is_tool = model.body_rootid[model.geom_bodyid] == model.body_rootid[model.site(grip).bodyid[0]]
+    paired = set()
     for p in range(model.npair):
         first, second = int(model.pair_geom1[p]), int(model.pair_geom2[p])
-        if root in (model.body_rootid[model.geom_bodyid[g]] for g in (first, second)):
-            name = f"pair {_geom_name(model, first)} and {_geom_name(model, second)}"
-            solref, solimp = model.pair_solref[p], model.pair_solimp[p]
-            condim, friction = int(model.pair_dim[p]), float(model.pair_friction[p, 0])
-            yield name, _setting(model, solref, solimp, condim, friction)
+        paired.add(frozenset((first, second)))
+        if is_tool[first] or is_tool[second]:
+            setting = ContactSetting(
+                _floats(model.pair_solref[p]),
+                _floats(model.pair_solimp[p]),
+                int(model.pair_dim[p]),
+                float(model.pair_friction[p, 0]),
+            )
+            yield first, second, _overridden(model, setting)
+    mixed = cache(_mixed)  # geoms of one class say the same
+    says = [_say(model, g) for g in range(model.ngeom)]
+    excluded = _excluded(model)
+    for first in np.flatnonzero(is_tool).tolist():
+        for second in np.flatnonzero(_partners(model, first)).tolist():
+            bodies = frozenset(model.geom_bodyid[[first, second]].tolist())
+            is_seen = is_tool[second] and second < first
+            if is_seen or bodies in excluded or frozenset((first, second)) in paired:
+                continue
+            yield first, second, _overridden(model, mixed(says[first], says[second]))
 
 
-def _setting(
-    model: mujoco.MjModel, solref: object, solimp: object, condim: int, friction: float
-) -> _Setting:
+def _partners(model: mujoco.MjModel, geom: int) -> NDArray[np.bool_]:
+    """Tells which geoms pass MuJoCo's filters of masks, welded bodies, and parents."""
+    meets = (model.geom_contype[geom] & model.geom_conaffinity) | (
+        model.geom_contype & model.geom_conaffinity[geom]
+    )
+    # bodies without joints between them are one
+    group = model.body_weldid[model.geom_bodyid]
+    parent = model.body_weldid[model.body_parentid[group]]
+    can_meet = (meets != 0) & (group != group[geom])
+    if not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_FILTERPARENT:
+        is_near = (parent == group[geom]) | (group == parent[geom])
+        # the world is no parent in this
+        can_meet &= ~is_near | (group == 0) | (group[geom] == 0)
+    return np.asarray(can_meet, dtype=bool)
+
+
+def _excluded(model: mujoco.MjModel) -> set[frozenset[int]]:
+    return {frozenset((int(s) >> 16, int(s) & 0xFFFF)) for s in model.exclude_signature}
+
+
+def _mixed(one: _Say, other: _Say) -> ContactSetting:
+    """Mixes as MuJoCo's ``mj_contactParam`` does."""
+    if one.priority != other.priority:
+        sole = max(one, other, key=lambda say: say.priority)
+        return ContactSetting(sole.solref, sole.solimp, sole.condim, sole.friction)
+    least = mujoco.mjMINVAL
+    if one.solmix >= least and other.solmix >= least:
+        share = one.solmix / (one.solmix + other.solmix)
+    elif one.solmix < least and other.solmix < least:
+        share = 0.5
+    else:
+        share = 0.0 if one.solmix < least else 1.0
+
+    def blend(a: tuple[float, ...], b: tuple[float, ...]) -> tuple[float, ...]:
+        return tuple(share * x + (1 - share) * y for x, y in zip(a, b, strict=True))
+
+    if one.solref[0] > 0 and other.solref[0] > 0:
+        solref = blend(one.solref, other.solref)
+    else:
+        solref = tuple(itertools.starmap(min, zip(one.solref, other.solref, strict=True)))
+    return ContactSetting(
+        solref,
+        blend(one.solimp, other.solimp),
+        max(one.condim, other.condim),
+        max(one.friction, other.friction),
+    )
+
+
+def _say(model: mujoco.MjModel, geom: int) -> _Say:
+    return _Say(
+        int(model.geom_priority[geom]),
+        float(model.geom_solmix[geom]),
+        _floats(model.geom_solref[geom]),
+        _floats(model.geom_solimp[geom]),
+        int(model.geom_condim[geom]),
+        float(model.geom_friction[geom, 0]),
+    )
+
+
+def _overridden(model: mujoco.MjModel, setting: ContactSetting) -> ContactSetting:
     option = model.opt
-    if option.enableflags & mujoco.mjtEnableBit.mjENBL_OVERRIDE:
-        solref, solimp, friction = option.o_solref, option.o_solimp, float(option.o_friction[0])
-    return _Setting(_floats(solref), _floats(solimp), condim, friction)
+    if not option.enableflags & mujoco.mjtEnableBit.mjENBL_OVERRIDE:
+        return setting
+    return ContactSetting(
+        _floats(option.o_solref),
+        _floats(option.o_solimp),
+        setting.condim,
+        float(option.o_friction[0]),
+    )
 
 
-def _floats(values: object) -> tuple[float, ...]:
-    return tuple(float(v) for v in values)  # type: ignore[attr-defined]
+def _floats(values: NDArray[np.float64]) -> tuple[float, ...]:
+    return tuple(values.tolist())
+
+
+def _words(values: tuple[float, ...]) -> str:
+    return f'"{" ".join(f"{value:g}" for value in values)}"'
+
+
+def _others(count: int) -> str:
+    return f" and {count} more" if count else ""
 
 
 def _geom_name(model: mujoco.MjModel, geom_id: int) -> str:

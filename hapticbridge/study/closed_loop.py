@@ -181,7 +181,7 @@ class ClosedLoop:
             if knock.shape != (6,):
                 raise StudyError(f"knock has shape {knock.shape}; it must be 6 numbers")
         scene = self.scene
-        felt = prepare(scene, coupling, period, substeps, method)
+        felt = prepare(scene, coupling, period, substeps, method, warns=False)
         is_even = timing is None or timing.is_even
         sample = np.zeros(1, SAMPLE_DTYPE)
         sample[:] = device.start(period, 1 if is_even else PARTS)

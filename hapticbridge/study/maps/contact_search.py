@@ -52,8 +52,19 @@ def searched(table: Table, name: str) -> dict[str, Any]:
     }
 
 
+COLUMNS = (
+    ("most energy\nmade, J", 0.34, "created", 1.0, ".1e"),
+    ("depth, mm:\nmedian", 0.66, "median_depth", 1e3, ".2f"),
+    ("\nlargest", 0.9, "largest_depth", 1e3, ".2f"),
+    ("steady depth,\n× shipped", 1.28, "static_depth", 1.0, ".3g"),
+    ("\nτ, ms", 1.5, "relaxation", 1e3, ".3g"),
+)
+"""Of figures beside the bars: heading, right edge as a share of the bars' width, what stands there,
+its factor and format. The steady depth is computed, the others are measured."""
+
+
 def draw_search(axes: Axes, found: Sequence[Mapping[str, Any]]) -> None:
-    """Draws a bar a treatment, runs by verdict, with depths beside it."""
+    """Draws a bar a treatment, runs by verdict, with what they came to in columns beside it."""
     places = np.arange(len(found))[::-1]
     left = np.zeros(len(found))
     for verdict, colour in zip(VERDICTS[:3], COLOURS[:3], strict=True):
@@ -61,19 +72,14 @@ def draw_search(axes: Axes, found: Sequence[Mapping[str, Any]]) -> None:
         axes.barh(places, width, left=left, color=colour, height=0.8)
         left = left + width
     most = max(left.max(), 1.0)
-    for place, one in zip(places, found, strict=True):
-        text = f"{1e3 * one['median_depth']:.2f}   {1e3 * one['largest_depth']:.2f}"
-        text += f"   {one['static_depth']:.3g}   {1e3 * one['relaxation']:.3g}"
-        axes.text(1.02 * most, place, text, va="center", size=8)
-        axes.text(0.01 * most, place, f"{one['created']:.1e} J", va="center", size=7)
-    heading = "depth, mm: median,\nlargest; steady, ×; τ, ms"
-    axes.text(1.02 * most, len(found) + 0.2, heading, va="center", size=8)
+    beside = axes.get_yaxis_transform()
+    for heading, share, name, factor, form in COLUMNS:
+        edge = 1 + share
+        axes.text(edge, len(found) - 0.3, heading, transform=beside, size=7, ha="right")
+        for place, one in zip(places, found, strict=True):
+            text = format(factor * one[name], form)
+            axes.text(edge, place, text, transform=beside, size=8, ha="right", va="center")
     axes.set_yticks(places, [one["treatment"] for one in found], size=8)
-    axes.set_xlim(0, 1.33 * most)
-    axes.set_ylim(-0.6, len(found) + 1.2)
-    axes.set_xlabel("runs by verdict, and the most energy that one created")
-    axes.set_title(
-        "The search on the peg: 30, 100 and 300 g, K = 1000 and 6000 N/m, friction 0 and 0.42,\n"
-        "one recorded and two random hands",
-        fontsize="small",
-    )
+    axes.set_xlim(0, most)
+    axes.set_ylim(-0.6, len(found) - 0.4)
+    axes.set_xlabel("runs by verdict")

@@ -49,25 +49,33 @@ class Treatment:
     @property
     def relaxation(self) -> float:
         """τ in s: how long the contact takes to come back after a push, as b/k."""
-        return self._numbers.relaxation * self._step
+        return self.numbers.relaxation * self._step
 
     @property
     def static_depth(self) -> float:
-        """How deep a steady force sinks in, over what it does as shipped: (1 − d₀) d_w²/(d₀² k)."""
-        inverse_root = self._numbers.resolved * self._step
-        if not self.refsafe:
-            inverse_root = self.solref[0] * self.solref[1]
-        depth = (1 - self.solimp[0]) * (self.solimp[1] * inverse_root / self.solimp[0]) ** 2
-        first, last, _ = SHIPPED_SOLIMP
-        return depth / ((1 - first) * (last * 0.002 / first) ** 2)
+        """How deep a steady force sinks in, over what it does as shipped: (1 − d) d_w²/(d² k)."""
+        depth = self._depth(self.numbers, self.solimp[1], self._step)
+        shipped = contact_numbers((0.002, 1.0), SHIPPED_SOLIMP, PERIOD)
+        return depth / self._depth(shipped, SHIPPED_SOLIMP[1], PERIOD)
+
+    @staticmethod
+    def _depth(numbers: ContactNumbers, last: float, step: float) -> float:
+        impedance = numbers.impedance
+        return (1 - impedance) * (last * numbers.resolved * step / impedance) ** 2
+
+    @property
+    def numbers(self) -> ContactNumbers:
+        """What the rule sees of it."""
+        return contact_numbers(self.solref, self.solimp, self._step, refsafe=self.refsafe)
+
+    @property
+    def is_ruled(self) -> bool:
+        """Whether the rule is about it: implicit, elliptic, with the exact diagonal."""
+        return self.method == "implicit" and self.cone == "elliptic" and self.diagexact
 
     @property
     def _step(self) -> float:
         return PERIOD / self.substeps
-
-    @property
-    def _numbers(self) -> ContactNumbers:
-        return contact_numbers(self.solref, self.solimp, self._step)
 
     def apply(self, model: mujoco.MjModel, friction: float) -> None:
         """Sets a model's contacts through MuJoCo's global override; needs no compilation."""
@@ -114,6 +122,16 @@ TREATMENTS: Mapping[str, Treatment] = {
     "no friction (condim 1)": Treatment(condim=1),
     "impedance 0.5 throughout": Treatment(solimp=(0.5, 0.5, 0.001)),
     "impedance 0.99 throughout": Treatment(solimp=(0.99, 0.99, 0.001)),
+    "impedance 0.999 throughout": Treatment(solimp=(0.999, 0.999, 0.001)),
+    "0.002 2, impedance 0.95": Treatment((0.002, 2.0), (0.95, 0.95, 0.001)),
+    "0.002 2, impedance 0.99": Treatment((0.002, 2.0), (0.99, 0.99, 0.001)),
+    "0.004 2, impedance 0.99": Treatment((0.004, 2.0), (0.99, 0.99, 0.001)),
+    "0.004 8, impedance 0.99": Treatment((0.004, 8.0), (0.99, 0.99, 0.001)),
+    "0.000125 8, imp. 0.999": Treatment((0.000125, 8.0), (0.999, 0.999, 0.001)),
+    "0.002 1, imp. 0.9 to 0.99": Treatment(solimp=(0.9, 0.99, 0.001)),
+    "damped, imp. 0 to 0.99 at once": Treatment((0.0005, 8.0), (0.0001, 0.99, 0.00001)),
+    "0.0005 4": Treatment((0.0005, 4.0)),
+    "0.00025 8": Treatment((0.00025, 8.0)),
     "timeconst T: 0.001 1": Treatment((0.001, 1.0)),
     "0.003 1": Treatment((0.003, 1.0)),
     "0.002 1.5": Treatment((0.002, 1.5)),
