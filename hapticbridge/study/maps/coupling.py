@@ -206,7 +206,7 @@ def read(table: Table) -> Finding:
         has_law = METHODS[name].has_law
         _draw_theory(axes, THEORIES[name], has_wall=has_law)
         found = limits.select(limits["method"] == name)
-        axes.plot(found["damping"], found["limit"], "o", color="black", ms=4, mfc="white")
+        axes.plot(found["damping"], found.numbers("limit"), "o", color="black", ms=4, mfc="white")
         title = name if has_law else f"{name}: free tool and tapping only"
         axes.set_title(title, fontsize="medium")
         below = mine["stiffness"] < 2 * (DEVICE_DAMPING - mine["damping"]) / PERIOD
@@ -224,9 +224,9 @@ def read(table: Table) -> Finding:
             predicted = np.asarray(maximum_stiffness(DEVICE_DAMPING, PERIOD, found["damping"]))
             boundary[name] |= {
                 "damping": found["damping"].tolist(),
-                "measured_on_wall": found["limit"].tolist(),
+                "measured_on_wall": found.numbers("limit").tolist(),
                 "predicted_6": predicted.tolist(),
-                "largest_deviation": agreement(found["limit"], predicted),
+                "largest_deviation": agreement(found.numbers("limit"), predicted),
             }
     for axes in panels:
         axes.set_xlim(*DAMPING)

@@ -104,15 +104,16 @@ def read(table: Table) -> Finding:
     behind = limits.select(limits["method"] == "implicit")
     bound = float(maximum_stiffness(DEVICE_DAMPING, PERIOD, ROTATIONAL_DAMPING))
     predicted = length_limit(direct["stiffness"])
+    lengths_found, stiffness_found = direct.numbers("limit"), behind.numbers("limit")
     figure = new_figure(8, 4.6)
     left, right = figure.subplots(1, 2, sharex=True)
     _draw_cells(left, table, "direct")
     _draw_cells(right, table, "implicit")
     lengths = np.geomspace(*LENGTH, 100)
     left.plot(1e3 * lengths, contact_stiffness_limit(lengths), color="black", lw=1.8)
-    left.plot(1e3 * direct["limit"], direct["stiffness"], "o", color="black", ms=4, mfc="white")
+    left.plot(1e3 * lengths_found, direct["stiffness"], "o", color="black", ms=4, mfc="white")
     right.axhline(bound, color="#1a5fb4", lw=1.8, ls="--")
-    right.plot(1e3 * behind["length"], behind["limit"], "o", color="black", ms=4, mfc="white")
+    right.plot(1e3 * behind["length"], stiffness_found, "o", color="black", ms=4, mfc="white")
     left.set_title("direct: no coupling", fontsize="medium")
     right.set_title("implicit: behind the coupling", fontsize="medium")
     left.set_ylabel("contact stiffness K_c (N/m)")
@@ -138,24 +139,24 @@ def read(table: Table) -> Finding:
     )
     return Finding(
         figure,
-        _paragraph(direct, predicted, behind["limit"], bound),
+        _paragraph(direct, predicted, behind.numbers("limit"), bound),
         {
             "period": PERIOD,
             "device_rotational_damping": DEVICE_DAMPING,
             "direct": {
                 "contact_stiffness": direct["stiffness"].tolist(),
-                "measured_length": direct["limit"].tolist(),
+                "measured_length": direct.numbers("limit").tolist(),
                 "predicted_length": predicted.tolist(),
-                "largest_deviation": agreement(direct["limit"], predicted),
+                "largest_deviation": agreement(direct.numbers("limit"), predicted),
             },
             "implicit": {
                 "coupling_rotational_damping": ROTATIONAL_DAMPING,
                 "length": behind["length"].tolist(),
-                "measured_rotational_stiffness": behind["limit"].tolist(),
+                "measured_rotational_stiffness": behind.numbers("limit").tolist(),
                 "predicted_6": bound,
-                "largest_deviation": agreement(behind["limit"], bound),
+                "largest_deviation": agreement(behind.numbers("limit"), bound),
                 "largest_over_smallest": (
-                    float(behind["limit"].max() / behind["limit"].min()) if len(behind) else None
+                    float(stiffness_found.max() / stiffness_found.min()) if len(behind) else None
                 ),
             },
         },
@@ -170,7 +171,7 @@ def _paragraph(
 ) -> str:
     said = []
     if len(direct):
-        length, contact = 1e3 * direct["limit"], direct["stiffness"]
+        length, contact = 1e3 * direct.numbers("limit"), direct["stiffness"]
         soft, stiff = int(contact.argmin()), int(contact.argmax())
         said.append(
             f"Rendered directly, a peg is stable up to {length[soft]:.3g} mm with contacts of "
