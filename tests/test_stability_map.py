@@ -124,6 +124,17 @@ def test_the_table_is_kept_even_if_reading_it_fails(tmp_path: Path) -> None:
     assert (tmp_path / "unread.csv").read_text(encoding="utf-8").count("\n") == 5
 
 
+@pytest.mark.parametrize("what", ["mujoco", "sources"])
+def test_parts_of_other_code_or_another_mujoco_are_refused(tmp_path: Path, what: str) -> None:
+    with ThreadPoolExecutor(1) as pool:
+        run_map(SQUARES, tmp_path, executor=pool)
+        manifest = tmp_path / "squares.parts" / "sweep.json"
+        found = json.loads(manifest.read_text(encoding="utf-8"))
+        manifest.write_text(json.dumps(found | {what: "older"}), encoding="utf-8")
+        with pytest.raises(StudyError, match="other sources or another MuJoCo"):
+            run_map(SQUARES, tmp_path, executor=pool)
+
+
 def test_an_unstable_loop_is_unstable_whatever_its_environment() -> None:
     names = np.array(["strict", "active", "within slack", "strict"], dtype=object)
     numbers = verdict_numbers([True, True, True, False], names)

@@ -292,7 +292,7 @@ def _paragraph(boundary: Mapping[str, Any]) -> str:
         else:
             text += f"with the handle held still unstable at {unstable} points"
         if heaviest is not None:
-            text += f", up to {1e3 * heaviest:.3g} g"
+            text += f"; the heaviest limit searched for is {1e3 * heaviest:.3g} g"
         text += f"; below (6) unstable at {mine['unstable_below_6']} of {mine['points_below_6']}"
         text += f" points; most energy created where stable {mine['most_created']:.2g} J"
         said.append(text)
