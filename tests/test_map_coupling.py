@@ -22,6 +22,7 @@ from hapticbridge.study.maps.coupling import (
     points,
 )
 from hapticbridge.study.maps.stability_map import Point
+from hapticbridge.study.table import Outcome, Table, table_of
 
 
 def cell(method: str, stiffness: float, damping: float) -> Point:
@@ -67,6 +68,94 @@ def test_position_explicit_coupling_is_named_active_below_the_bound() -> None:
     assert float(found["slack_share"]) > 1
     assert float(found["created"]) > 0
     assert evaluate(cell("implicit", 1500.0, 0.6))["created"] == 0.0
+
+
+def test_weld_is_judged_by_its_device_port_and_has_no_wall_without_contact() -> None:
+    # on a wall the hand is given what neither the scene gave up nor the damping burns
+    found = evaluate(cell("weld", 1500.0, 0.6))
+    assert "stable_on_wall" not in found
+    assert found["fault_port"] == "device"
+    assert 0 < int(found["fault_tick"]) < 2000
+    assert found["stable_tapping"] is False
+    twin = evaluate(cell("implicit", 1500.0, 0.6))
+    assert (twin["fault_tick"], twin["fault_port"]) == (-1, "")
+    assert twin["stable_tapping"] is True
+
+
+def test_explicit_stays_within_its_slack_where_implicitfast_is_at_fault() -> None:
+    explicit = evaluate(cell("explicit", 1500.0, 0.6))
+    assert explicit["environment"] == "within slack"
+    assert explicit["fault_tick"] == -1
+    fast = evaluate(cell("implicitfast", 1500.0, 0.6))
+    assert fast["fault_port"] == "environment"
+    assert fast["fault_tick"] == 25
+
+
+def made_up(rows: list[dict[str, float | str | bool]]) -> Table:
+    """Returns a table as a map's points would leave it."""
+    given: list[Point] = []
+    done = []
+    for row in rows:
+        names = ("what", "method", "stiffness", "damping")
+        given.append({name: row[name] for name in names})
+        done.append(Outcome({k: v for k, v in row.items() if k not in names}))
+    return table_of(given, done)
+
+
+def ran(
+    method: str, stiffness: float, damping: float, **other: float | str | bool
+) -> dict[str, float | str | bool]:
+    """Returns a row of a run in which nothing went wrong, but for what is said."""
+    row: dict[str, float | str | bool] = {
+        "what": "cell",
+        "method": method,
+        "stiffness": stiffness,
+        "damping": damping,
+        "stable_free": True,
+        "stable_tapping": True,
+        "environment": "strict",
+        "fault_tick": -1,
+        "fault_port": "",
+        "slack_share": 0.0,
+        "peak_force": 3.0,
+    }
+    if method != "weld":
+        row["stable_on_wall"] = True
+    return row | other
+
+
+def test_boundary_counts_each_way_to_fail_and_only_below_the_bound() -> None:
+    # (6) is at 4000 N/m for B = 0 and at 2000 N/m for B = 1: three of four points lie below
+    grid = [(1000.0, 0.0), (3000.0, 0.0), (1000.0, 1.0), (3000.0, 1.0)]
+    rows = [ran("implicit", k, b) for k, b in grid]
+    rows[3] |= {"stable_on_wall": False}
+    rows += [
+        ran("implicitfast", 1000.0, 0.0, stable_on_wall=False),
+        ran("implicitfast", 3000.0, 0.0, stable_free=False),
+        ran("implicitfast", 1000.0, 1.0, environment="active", fault_port="environment"),
+        ran("implicitfast", 3000.0, 1.0, environment="active", fault_port="environment"),
+    ]
+    rows += [ran("explicit", k, b, environment="within slack", slack_share=0.4) for k, b in grid]
+    rows += [ran("weld", k, b) for k, b in grid]
+    rows[13] |= {"stable_tapping": False, "fault_port": "device", "fault_tick": 7}
+    rows.append({"what": "limit", "method": "implicit", "stiffness": 0.0, "damping": 0.0})
+    rows[-1]["limit"] = 4040.0
+    finding = COUPLING.read(made_up(rows))
+    found = finding.boundary["methods"]
+    assert found["implicit"]["runs_below_6"] == 3
+    assert found["implicit"]["passive_share_below_6"] == 1.0
+    assert found["implicit"]["largest_deviation"] == pytest.approx(0.01)
+    assert found["implicitfast"]["passive_share_below_6"] == 0.0
+    assert found["implicitfast"]["environment_faults_below_6"] == 1
+    assert found["explicit"]["passive_share_below_6"] == 1.0
+    assert found["weld"]["passive_share_below_6"] == pytest.approx(2 / 3)
+    assert found["weld"]["device_faults_below_6"] == 1
+    said = finding.paragraph
+    assert "within 1 % of K = 2 (b − B)/T" in said
+    assert "'weld' is stable and passive at 67 % of the points below (6)" in said
+    assert "at fault the device port at 1 of 3" in said
+    assert "no port at fault and 40 % of the slack used" in said
+    assert "'explicit:rk4': no point could be computed below (6)" in said
 
 
 def test_points_are_a_grid_for_every_method_and_about_as_many_as_asked() -> None:

@@ -24,6 +24,7 @@ from hapticbridge.study.maps.falling_rod import (
 from hapticbridge.study.maps.restitution import RESTITUTION, RESTITUTION_LAWS, evaluate, points
 from hapticbridge.study.maps.stability_map import Point, run_map
 from hapticbridge.study.sweep import sweep
+from hapticbridge.study.table import Outcome, table_of
 
 GAINING: Point = {
     "setting": "bouncy, implicitfast",
@@ -106,6 +107,35 @@ def test_newtons_law_is_the_nearest_to_what_rebounds() -> None:
 def test_an_unknown_setting_is_refused_with_the_choices() -> None:
     with pytest.raises(StudyError, match=r"'rubber'.*hard spring"):
         drop("rubber", 1.0, 0.5, 0.0)
+
+
+def test_a_law_is_named_only_with_a_lead_and_the_share_that_gained_is_counted() -> None:
+    given: list[Point] = []
+    done = []
+    for setting, newton, first_gain in (("scenes", -0.19, -1), ("hard spring", -0.11, 4)):
+        for row in range(4):
+            given.append({"setting": setting, "friction": 0.75, "slide": 0.8, "angle": 0.1 + row})
+            values = {"inelastic": -0.3, "newton": newton, "poisson": -0.2, "stronge": -0.25}
+            done.append(
+                Outcome(
+                    values
+                    | {
+                        "energy_change": -0.1,
+                        "restitution": 0.5,
+                        "own_restitution": 0.6 + 0.01 * row,
+                        "first_gain": first_gain if row == 0 else -1,
+                    }
+                )
+            )
+    finding = RESTITUTION.read(table_of(given, done))
+    found = finding.boundary["settings"]
+    assert found["scenes"]["nearest_law"] is None  # 0.09 against 0.10 is no lead
+    assert found["hard spring"]["nearest_law"] == "newton"
+    assert found["hard spring"]["share_that_gained"] == 0.25
+    assert found["scenes"]["share_that_gained"] == 0.0
+    assert "nearest by more than 20 % is none in 1, Newton in 1" in finding.paragraph
+    assert "largest e of a slanted rod is 0.63" in finding.paragraph
+    assert "by -0.11 J at most, with 'hard spring'" in finding.paragraph
 
 
 def test_the_map_says_what_its_table_holds(tmp_path: Path) -> None:

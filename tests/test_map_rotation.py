@@ -20,6 +20,7 @@ from hapticbridge.study.maps.tumbling import (
     free_creation,
     gyroscopic_speed,
 )
+from hapticbridge.study.table import Outcome, table_of
 
 SOFT = 2.0
 
@@ -112,10 +113,54 @@ def test_the_map_says_what_its_table_holds(tmp_path: Path) -> None:
         files = run_map(ROTATION, tmp_path, points=120, executor=executor)
     assert files.failed == 0
     boundary = files.finding.boundary
-    assert boundary["fastest_passive"]["implicit"] > boundary["fastest_passive"]["explicit"]
+    assert boundary["fastest_passive"]["implicit"] > 0
+    assert boundary["fastest_passive"]["explicit"] is None
+    assert "'explicit' is passive at every angle at no speed shown" in files.finding.paragraph
     assert boundary["cut"]["speed_measured"] == pytest.approx(cut_speed(SOFT), rel=0.02)
     assert "passes the cut" in files.finding.paragraph
     assert files.picture.stat().st_size > 10_000
+
+
+def test_boundary_and_paragraph_follow_from_a_made_up_table() -> None:
+    good: dict[str, float | int | bool | str] = {
+        "ticks": TICKS,
+        "environment": "strict",
+        "created": 0.0,
+        "crossed": -1,
+        "torque_jump": 0.1,
+    }
+    runs: list[tuple[str, str, float, float, dict[str, float | str]]] = [
+        ("cell", "implicit", SOFT, 0.0, {}),
+        ("cell", "implicit", SOFT, 20.0, {}),
+        ("cell", "implicit", SOFT, 40.0, {"environment": "within slack"}),
+        # a run that diverged is no passive one, whatever its ledger said until then
+        ("cell", "implicit", SOFT, 60.0, {"ticks": TICKS - 1}),
+        ("cell", "implicit", SOFT, 100.0, {"environment": "active", "crossed": 9}),
+        ("cell", "explicit", SOFT, 0.0, {}),
+        ("cell", "explicit", SOFT, 20.0, {"environment": "active"}),
+        ("line", "implicit", 0.0, 20.0, {"created": 1.1 * free_creation(20.0)}),
+        ("line", "implicit", 0.0, 40.0, {"created": 1.1 * free_creation(40.0)}),
+        ("line", "implicit", 0.0, 60.0, {"created": 0.0}),
+        ("cut", "implicit", SOFT, 80.0, {"crossed": 5, "torque_jump": 12.0, "created": 0.5}),
+        ("cut", "implicit", SOFT, 50.0, {"torque_jump": 99.0, "created": 9.0}),
+    ]
+    names = ("what", "method", "rotational_stiffness", "speed", "angle")
+    given: list[Point] = [dict(zip(names, (*run[:4], 0.0), strict=True)) for run in runs]
+    finding = ROTATION.read(table_of(given, [Outcome(good | run[4]) for run in runs]))
+    found = finding.boundary
+    assert found["fastest_passive"]["implicit"] == 40.0
+    assert found["fastest_passive"]["explicit"] is None
+    assert found["share_strict_below"]["implicit"] == 0.75
+    assert found["first_passed"] == dict.fromkeys(found["first_passed"]) | {"implicit": 100.0}
+    assert found["translation_only"]["grows_up_to"] == 40.0
+    assert found["cut"]["torque_jump"] == 12.0
+    assert found["cut"]["created"] == 0.5
+    said = finding.paragraph
+    assert "'implicit' is passive, strictly or within its slack, at every angle up to 40" in said
+    assert "strict in 75 % of its runs below 64.4 rad/s" in said
+    assert "its angle first passes π at 100 rad/s" in said
+    assert "and more the faster up to 40 rad/s" in said
+    assert "'weld': no point could be computed" in said
 
 
 def test_the_grid_has_about_as_many_points_as_asked() -> None:

@@ -87,6 +87,54 @@ def test_too_few_points_and_a_file_for_a_folder_are_refused(tmp_path: Path) -> N
         run_map(SQUARES, blocker)
 
 
+def test_a_million_points_are_the_most(tmp_path: Path) -> None:
+    with pytest.raises(StudyError, match="1000000 at most"):
+        run_map(SQUARES, tmp_path, points=1_000_001)
+
+
+def test_a_file_that_cannot_be_written_is_noticed_before_the_sweep(tmp_path: Path) -> None:
+    (tmp_path / "squares.png").mkdir()
+    calls.clear()
+    with ThreadPoolExecutor(1) as pool, pytest.raises(StudyError, match=r"squares\.png"):
+        run_map(SQUARES, tmp_path, executor=pool)
+    assert not calls
+    assert not (tmp_path / "squares.csv").exists()
+
+
+def read_nothing(table: Table) -> Finding:
+    return Finding(new_figure(4, 3), "", {"a": [float("nan"), 1.0], "b": {"c": float("inf")}})
+
+
+def read_badly(table: Table) -> Finding:
+    raise ZeroDivisionError
+
+
+def test_json_has_none_for_what_is_no_number(tmp_path: Path) -> None:
+    unknown = StabilityMap("unknown", "", 4, points, square, read_nothing)
+    with ThreadPoolExecutor(1) as pool:
+        files = run_map(unknown, tmp_path, executor=pool)
+    said = json.loads(files.boundary.read_text(encoding="utf-8"))
+    assert said["boundary"] == {"a": [None, 1.0], "b": {"c": None}}
+
+
+def test_the_table_is_kept_even_if_reading_it_fails(tmp_path: Path) -> None:
+    unread = StabilityMap("unread", "", 4, points, square, read_badly)
+    with ThreadPoolExecutor(1) as pool, pytest.raises(ZeroDivisionError):
+        run_map(unread, tmp_path, executor=pool)
+    assert (tmp_path / "unread.csv").read_text(encoding="utf-8").count("\n") == 5
+
+
+@pytest.mark.parametrize("what", ["mujoco", "sources"])
+def test_parts_of_other_code_or_another_mujoco_are_refused(tmp_path: Path, what: str) -> None:
+    with ThreadPoolExecutor(1) as pool:
+        run_map(SQUARES, tmp_path, executor=pool)
+        manifest = tmp_path / "squares.parts" / "sweep.json"
+        found = json.loads(manifest.read_text(encoding="utf-8"))
+        manifest.write_text(json.dumps(found | {what: "older"}), encoding="utf-8")
+        with pytest.raises(StudyError, match="other sources or another MuJoCo"):
+            run_map(SQUARES, tmp_path, executor=pool)
+
+
 def test_an_unstable_loop_is_unstable_whatever_its_environment() -> None:
     names = np.array(["strict", "active", "within slack", "strict"], dtype=object)
     numbers = verdict_numbers([True, True, True, False], names)

@@ -4,8 +4,9 @@ A folder holds the manifest ``sweep.json`` and parts ``part-DIGEST.csv`` or ``pa
 A part holds rows: ``point`` (the point's key), the parameters, the results, ``kinds`` (a letter for
 each result's type, ``-`` where it is missing) and ``error``.
 
-DIGEST is a digest of the file's bytes, keyed with the function and the package's version. A part is
-believed only if it matches. So a file that was cut, changed, or computed by another function is
+DIGEST is a digest of the file's bytes, keyed with the function, the package's
+version and sources, and MuJoCo's version. A part is believed only if it matches.
+So a file that was cut, changed, or computed by another function is
 passed over, whatever its name, and nothing depends on the order in which a disk writes.
 """
 
@@ -18,6 +19,7 @@ import json
 import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -45,6 +47,8 @@ class ResultFolder:
             "layout": _LAYOUT,
             "function": function,
             "hapticbridge": version("hapticbridge"),
+            "mujoco": version("mujoco"),
+            "sources": _sources(),
         }
         self._secret = hashlib.sha256(json.dumps(self._identity).encode()).digest()
         try:
@@ -138,7 +142,8 @@ class ResultFolder:
             raise StudyError(
                 f"{self.path}: holds a sweep of {others['function']!s:.200} by hapticbridge "
                 f"{others['hapticbridge']!s:.40}, not of {self._identity['function']!s:.200} by "
-                f"{self._identity['hapticbridge']}; {anew}"
+                f"{self._identity['hapticbridge']}, or by other sources or another MuJoCo than "
+                f"now; {anew}"
             )
 
     def _write(self, name: str, data: bytes) -> None:
@@ -152,6 +157,17 @@ class ResultFolder:
             draft.replace(self.path / name)
         except OSError as error:
             raise StudyError(f"{self.path}: cannot be written ({error.strerror})") from None
+
+
+@cache
+def _sources() -> str:
+    """Returns a digest of the package's sources and shipped scenes: what decides the results."""
+    digest = hashlib.blake2b(digest_size=16)
+    package = Path(__file__).parents[1]
+    for path in sorted(package.rglob("*")):
+        if path.suffix in {".py", ".xml"}:
+            digest.update(str(path.relative_to(package)).encode() + b"\0" + path.read_bytes())
+    return digest.hexdigest()
 
 
 def _rows(data: bytes, form: str) -> list[tuple[str, Outcome]]:

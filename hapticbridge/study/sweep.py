@@ -50,8 +50,9 @@ def sweep(
 
     With a folder, what is done is kept there, a part a task, each written whole or not at all. A
     sweep with the same folder and function takes the points it finds from there and computes the
-    others. The function is known by its name and hapticbridge's version: after a change of its
-    code take another folder. Failed points are kept too, and not tried again. One sweep at a time
+    others. The function is known by its name, hapticbridge's version and sources, and
+    MuJoCo's version; after a change of other code take another folder.
+    Failed points are kept too, and not tried again. One sweep at a time
     may use a folder.
 
     What goes wrong: a point whose function raises gets a row with the ``error``. So does a point

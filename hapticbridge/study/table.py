@@ -64,6 +64,12 @@ class Table:
                 f"the table has no column {name!r:.60}; it has {choices(self.columns)}"
             ) from None
 
+    def numbers(self, name: str) -> NDArray[np.float64]:
+        """Returns a column of numbers; NaN throughout where no point returned such a result."""
+        if name not in self.columns:
+            return np.full(len(self), np.nan)
+        return np.asarray(self.columns[name], dtype=np.float64)
+
     def __len__(self) -> int:
         return len(self.columns["error"])
 

@@ -8,6 +8,7 @@ from typing import Any
 import mujoco
 import numpy as np
 from matplotlib.axes import Axes
+from numpy.typing import NDArray
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Motion, SimulatedDevice
@@ -15,6 +16,7 @@ from hapticbridge.passivity import WorstHand, maximum_stiffness
 from hapticbridge.picture import new_figure
 from hapticbridge.rendering import METHODS
 from hapticbridge.study.closed_loop import ClosedLoop, LoopOutcome
+from hapticbridge.study.maps.bisection import agreement, largest_stable, per_cent
 from hapticbridge.study.maps.free_tool import felt, worst_angle
 from hapticbridge.study.maps.rigs import free_tool_and_wall, loop_in, set_tool_mass
 from hapticbridge.study.maps.stability_map import Finding, Point, StabilityMap
@@ -38,7 +40,7 @@ WALL_MASS = 1e6
 limit is (6) to within T (KT/2 + B)/(2 m) = 1e-9; a lighter one drifts, which is no decay."""
 
 STABLE = ("stable_on_wall", "stable_free", "stable_tapping")
-"""Columns that must all be true where a loop is stable."""
+"""Columns that must all be true where a loop is stable; one that was not measured is left out."""
 
 TICKS = 2000
 KNOCK = np.array([1e-4, 0.0, 0.0, 0.0, 0.0, 0.0])
@@ -57,10 +59,6 @@ THEORIES: Mapping[str, str] = {
 coupling's: its hand is that of the nominal K and B. On a heavy tool it is stiffer by the mass, so
 for it there is no wall without contact."""
 
-BOUNDED = 50.0
-"""Force in N beyond which the hand that taps is thrown back: its 0.65 kg meet the wall at 0.07 m/s,
-which through the stiffest coupling here is 8 N."""
-
 STIFFNESS = (100.0, 20_000.0)
 """Range of K in N/m, even in its logarithm: from soft to five times the bound at B = 0."""
 
@@ -71,8 +69,9 @@ DAMPING = (0.0, 3.0)
 CONTOUR = 41
 """Points along each axis from which the free tool's bound is drawn; more make it smoother."""
 
-LIMIT_WIDTH = 2e-3
-"""Relative width at which the search for a limit of K ends: a fifth of what it is compared to."""
+SEARCHED = (1.0, 200_000.0)
+"""Range of K in N/m in which a limit on a wall is searched: far beyond the picture's on both sides,
+and the same for every B."""
 
 
 def _touching() -> Motion:
@@ -112,15 +111,20 @@ def points(count: int) -> Sequence[Point]:
 def evaluate(point: Point) -> Mapping[str, float | str | bool]:
     """Runs one coupling three times for 2 s, or finds the largest K that is stable on a wall.
 
-    A wall and a free tool, each with its worst hand, say whether the loop is stable; an ordinary
-    hand that taps a wall says what the environment creates, and whether it is thrown back.
+    A wall and a free tool, each with its worst hand, say whether the loop is stable. A wall without
+    contact exists only where there is a coupling law: for the weld it is not run, and the value is
+    missing. An ordinary hand that taps a wall says what the environment creates, and whether the
+    device is given what nobody pays for: its run fails where it diverges, or where the first fault
+    is the device's port. ``fault_tick`` and ``fault_port`` name the first fault, −1 and nothing if
+    there is none.
     """
     name, damping = str(point["method"]), float(point["damping"])
     if point["what"] == "limit":
         return {"limit": _limit_on_wall(name, damping)}
     coupling = _coupling(float(point["stiffness"]), damping)
-    has_law = METHODS[name].has_law
-    is_stable_on_wall = not has_law or _worst_hand(name, coupling, None).is_stable
+    on_wall: dict[str, bool] = {}
+    if METHODS[name].has_law:
+        on_wall = {"stable_on_wall": _worst_hand(name, coupling, None).is_stable}
     is_stable_free = _worst_hand(name, coupling, TOOL_MASS).is_stable
     touch = _tool().run(
         SimulatedDevice(damping=DEVICE_DAMPING, path=PATH),
@@ -129,10 +133,12 @@ def evaluate(point: Point) -> Mapping[str, float | str | bool]:
         period=PERIOD,
         ticks=TICKS,
     )
-    return {
-        "stable_on_wall": is_stable_on_wall,
+    tick, port = touch.fault or (-1, "")
+    return on_wall | {
         "stable_free": is_stable_free,
-        "stable_tapping": touch.ticks == TICKS and touch.peak_force < BOUNDED,
+        "stable_tapping": touch.ticks == TICKS and port != "device",
+        "fault_tick": tick,
+        "fault_port": port,
         "environment": touch.environment,
         "created": touch.created,
         "slack_share": touch.slack_share,
@@ -177,16 +183,11 @@ def _make_heavy(model: mujoco.MjModel) -> None:
 
 def _limit_on_wall(name: str, damping: float) -> float:
     """Returns the largest K in N/m at which the wall's worst hand is stable; 0 for none."""
-    lower, upper = STIFFNESS[0] / 100, 10 * STIFFNESS[1]
-    if not _worst_hand(name, _coupling(lower, damping), None).is_stable:
-        return 0.0
-    while upper > lower * (1 + LIMIT_WIDTH):
-        middle = (lower * upper) ** 0.5
-        if _worst_hand(name, _coupling(middle, damping), None).is_stable:
-            lower = middle
-        else:
-            upper = middle
-    return float((lower * upper) ** 0.5)
+
+    def is_stable(stiffness: float) -> bool:
+        return _worst_hand(name, _coupling(stiffness, damping), None).is_stable
+
+    return largest_stable(is_stable, *SEARCHED).middle
 
 
 def read(table: Table) -> Finding:
@@ -195,28 +196,37 @@ def read(table: Table) -> Finding:
     limits = table.select(table["what"] == "limit")
     figure = new_figure(8, 6.4)
     panels = figure.subplots(2, 3, sharex=True, sharey=True).ravel()
-    shares: dict[str, float] = {}
+    shares: dict[str, float | None] = {}
     boundary: dict[str, dict[str, Any]] = {}
     for axes, name in zip(panels, THEORIES, strict=True):
         mine = cells.select(cells["method"] == name)
-        is_stable = np.logical_and.reduce([mine[column].astype(bool) for column in STABLE])
+        is_stable = _is_stable(mine)
         verdict = verdict_numbers(is_stable, mine["environment"])
         draw_verdicts(axes, mine["damping"], mine["stiffness"], verdict, log_y=True)
-        _draw_theory(axes, THEORIES[name])
+        has_law = METHODS[name].has_law
+        _draw_theory(axes, THEORIES[name], has_wall=has_law)
         found = limits.select(limits["method"] == name)
-        axes.plot(found["damping"], found["limit"], "o", color="black", ms=4, mfc="white")
-        axes.set_title(name, fontsize="medium")
+        axes.plot(found["damping"], found.numbers("limit"), "o", color="black", ms=4, mfc="white")
+        title = name if has_law else f"{name}: free tool and tapping only"
+        axes.set_title(title, fontsize="medium")
         below = mine["stiffness"] < 2 * (DEVICE_DAMPING - mine["damping"]) / PERIOD
         passive = verdict <= VERDICTS.index("within slack")
-        shares[name] = float(np.mean(passive[below])) if below.any() else float("nan")
-        boundary[name] = {"passive_share_below_6": shares[name]}
+        shares[name] = float(np.mean(passive[below])) if below.any() else None
+        boundary[name] = {
+            "passive_share_below_6": shares[name],
+            "runs_below_6": int(below.sum()),
+            "environment_faults_below_6": int((mine["fault_port"][below] == "environment").sum()),
+            "device_faults_below_6": int((mine["fault_port"][below] == "device").sum()),
+            "most_slack_used_below_6": float(mine["slack_share"][below].max(initial=0.0)),
+            "largest_tapping_force_below_6": float(mine["peak_force"][below].max(initial=0.0)),
+        }
         if len(found):
             predicted = np.asarray(maximum_stiffness(DEVICE_DAMPING, PERIOD, found["damping"]))
             boundary[name] |= {
                 "damping": found["damping"].tolist(),
-                "measured_on_wall": found["limit"].tolist(),
+                "measured_on_wall": found.numbers("limit").tolist(),
                 "predicted_6": predicted.tolist(),
-                "largest_deviation": float(np.abs(found["limit"] / predicted - 1).max()),
+                "largest_deviation": agreement(found.numbers("limit"), predicted),
             }
     for axes in panels:
         axes.set_xlim(*DAMPING)
@@ -234,34 +244,69 @@ def read(table: Table) -> Finding:
         figure,
         [
             ("(6): K = 2 (b − B)/T", "black", "-"),
-            ("(7) at low frequency", "black", ":"),
+            ("(7), Tustin's rule, at low frequency", "black", ":"),
             (f"free tool of {1e3 * TOOL_MASS:g} g by this method", "#1a5fb4", "--"),
             ("measured limit on a wall", "black", "o"),
         ],
     )
-    worst = boundary["implicit"]["largest_deviation"]
-    others = "; ".join(
-        f"{name} {100 * share:.0f} %" for name, share in shares.items() if name != "implicit"
-    )
     return Finding(
         figure,
-        f"On a wall the worst hand turns 'implicit' unstable within {100 * worst:.2g} % of "
-        f"K = 2 (b − B)/T, eq. (6). Below that line 'implicit' is stable and passive at "
-        f"{100 * shares['implicit']:.0f} % of the points, also with a tool of "
-        f"{1e3 * TOOL_MASS:g} g in and out of contact; the others there: {others}.",
+        _paragraph(boundary),
         {"period": PERIOD, "device_damping": DEVICE_DAMPING, "methods": boundary},
     )
 
 
-def _draw_theory(axes: Axes, theory: str) -> None:
+def _is_stable(cells: Table) -> NDArray[np.bool_]:
+    """Returns where no run that was measured failed; a missing value is no measurement."""
+    is_stable = np.ones(len(cells), dtype=bool)
+    for column in STABLE:
+        if column in cells.columns:
+            value = cells[column].astype(np.float64)
+            is_stable &= np.isnan(value) | (value == 1)
+    return is_stable
+
+
+def _paragraph(boundary: Mapping[str, Any]) -> str:
+    worst = boundary["implicit"].get("largest_deviation")
+    said = [
+        f"On a wall the worst hand turns 'implicit' unstable {per_cent(worst)} of "
+        "K = 2 (b − B)/T, eq. (6)"
+    ]
+    for name, mine in boundary.items():
+        if not mine["runs_below_6"]:
+            said.append(f"'{name}': no point could be computed below (6)")
+            continue
+        text = (
+            f"'{name}' is stable and passive at {100 * mine['passive_share_below_6']:.0f} % of the "
+            "points below (6)"
+        )
+        faults = [
+            f"the {port} port at {mine[f'{port}_faults_below_6']}"
+            for port in ("environment", "device")
+            if mine[f"{port}_faults_below_6"]
+        ]
+        if faults:
+            text += f"; the hand that taps finds at fault {' and '.join(faults)} of "
+            text += f"{mine['runs_below_6']}"
+        else:
+            text += "; the hand that taps finds no port at fault"
+            if mine["most_slack_used_below_6"] > 0:
+                text += f" and {100 * mine['most_slack_used_below_6']:.0f} % of the slack used"
+        said.append(text)
+    return ". ".join(said) + ". The table holds tick and port of every first fault."
+
+
+def _draw_theory(axes: Axes, theory: str, *, has_wall: bool) -> None:
+    """Draws what was measured against: (6) and (7) only where a wall was."""
     damping = np.linspace(DAMPING[0], DAMPING[1], 121)
     below = damping[damping < DEVICE_DAMPING]
-    axes.plot(below, maximum_stiffness(DEVICE_DAMPING, PERIOD, below), color="black", lw=1.8)
-    # (7) as θ → 0: (K T)² = 2 b (K T + 2 B)
     b = DEVICE_DAMPING
-    axes.plot(
-        damping, (b + np.sqrt(b**2 + 4 * b * damping)) / PERIOD, color="black", ls=":", lw=1.5
-    )
+    if has_wall:
+        axes.plot(below, maximum_stiffness(b, PERIOD, below), color="black", lw=1.8)
+        # (7) as θ → 0: (K T)² = 2 b (K T + 2 B)
+        axes.plot(
+            damping, (b + np.sqrt(b**2 + 4 * b * damping)) / PERIOD, color="black", ls=":", lw=1.5
+        )
     grid_b, grid_k = np.meshgrid(np.linspace(*DAMPING, CONTOUR), np.geomspace(*STIFFNESS, CONTOUR))
     needed = np.array(
         [

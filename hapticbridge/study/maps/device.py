@@ -127,7 +127,8 @@ def read(table: Table) -> Finding:
         f"in encoder steps, peak to peak: {largest}. With a damper, a hand that shakes the device "
         f"across one encoder step "
         f"needs f_c = K Δ/2 + B Δ/T within {100 * error:.2g} %, while one that only presses lets "
-        f"it rest at {dampers['needed_at_rest'].max():.2f} K Δ and less.",
+        f"it rest from {dampers['needed_at_rest'].min():.3g} to "
+        f"{dampers['needed_at_rest'].max():.3g} K Δ on, depending on B.",
         {
             "period": PERIOD,
             "stiffness": STIFFNESS,
@@ -167,7 +168,7 @@ def _edge(values: NDArray[np.float64], is_bad: NDArray[np.bool_]) -> dict[str, f
 
 
 def _draw_regions(axes: Axes, cells: Table) -> float:
-    """Colours the regions, marks cycles by size, and returns the share that theory names alike."""
+    """Colours the regions and returns the share that theory names alike."""
     number = np.array([REGIONS.index(name) for name in cells["region"]])
     beta, sigma = np.unique(cells["beta"]), np.unique(cells["sigma"])
     grid = np.full((sigma.size, beta.size), np.nan)

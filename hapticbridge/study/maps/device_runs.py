@@ -10,6 +10,7 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.device import Hand, Motion, SimulatedDevice
 from hapticbridge.rendering import METHODS
 from hapticbridge.study.closed_loop import LoopOutcome
+from hapticbridge.study.maps.bisection import largest_stable
 from hapticbridge.study.maps.rigs import loop_in, set_tool_mass
 
 PERIOD = 1e-3
@@ -54,6 +55,9 @@ rises nor falls."""
 DIVERGED = 3.0
 """Multiple of the knock beyond which motion has diverged, without unit; a free device overshoots at
 most to its start."""
+
+FRICTION = (0.01, 10.0)
+"""Range of σ in which that at which a pressed device rests is searched."""
 
 DAMPED = 4.0
 """b in N s/m while B is varied, above K T/2 + B throughout."""
@@ -148,16 +152,14 @@ def _make_heavy(model: mujoco.MjModel) -> None:
 
 
 def friction_to_rest(damping: float) -> float:
-    """Returns the least σ at which a pressed device comes to rest, by bisection."""
+    """Returns the least σ at which a pressed device comes to rest: above the largest at which not.
+
+    0 where it rests at the least that is tried, inf where it never does.
+    """
     beta = DAMPED / (STIFFNESS * PERIOD)
-    lower, upper = 0.0, 2.0
-    while upper - lower > 0.02:
-        middle = (lower + upper) / 2
-        if settle(beta, middle, 0.0, damping)[0] == "rest":
-            upper = middle
-        else:
-            lower = middle
-    return (lower + upper) / 2
+    return largest_stable(
+        lambda sigma: settle(beta, sigma, 0.0, damping)[0] != "rest", *FRICTION
+    ).middle
 
 
 def shaken(damping: float) -> float:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from hapticbridge.passivity import maximum_stiffness
 from hapticbridge.picture import new_figure
+from hapticbridge.study.maps.bisection import agreement, largest_stable, per_cent
 from hapticbridge.study.maps.fitting_peg import (
     DEVICE_DAMPING,
     PERIOD,
@@ -33,9 +34,6 @@ CONTACT_STIFFNESS = (10.0, 1e6)
 
 ROTATIONAL_STIFFNESS = (0.1, 10.0)
 """Range of K_r in N m/rad, even in its logarithm, about the bound of 3 N m/rad."""
-
-LIMIT_WIDTH = 2e-3
-"""Relative width at which the search for a limit ends: far below the 15 % that are promised."""
 
 LIMITS_AMONG = 60
 """One limit is searched for every so many cells; a search takes about a dozen runs."""
@@ -80,10 +78,15 @@ def evaluate(point: Point) -> Mapping[str, float | int | str | bool]:
     )
     if point["what"] == "limit":
         if name == "direct":
-            return {"limit": _largest(LENGTH, lambda found: is_stable(name, found, stiffness))}
-        return {
-            "limit": _largest(ROTATIONAL_STIFFNESS, lambda found: is_stable(name, length, found))
-        }
+            found = largest_stable(
+                lambda value: is_stable(name, value, stiffness), LENGTH[0] / 4, 4 * LENGTH[1]
+            )
+        else:
+            lower, upper = ROTATIONAL_STIFFNESS
+            found = largest_stable(
+                lambda value: is_stable(name, length, value), lower / 4, 4 * upper
+            )
+        return {"limit": found.middle}
     outcome = run(name, length, stiffness)
     return {
         "stable": has_calmed(outcome, name, length, stiffness),
@@ -94,15 +97,6 @@ def evaluate(point: Point) -> Mapping[str, float | int | str | bool]:
     }
 
 
-def _largest(within: tuple[float, float], is_good: Callable[[float], bool]) -> float:
-    """Returns the largest value at which a run is stable, searched a factor 4 beyond a range."""
-    lower, upper = within[0] / 4, 4 * within[1]
-    while upper > lower * (1 + LIMIT_WIDTH):
-        middle = (lower * upper) ** 0.5
-        lower, upper = (middle, upper) if is_good(middle) else (lower, middle)
-    return float((lower * upper) ** 0.5)
-
-
 def read(table: Table) -> Finding:
     """Draws contact or coupling stiffness over the length, with the limits on top."""
     limits = table.select(table["what"] == "limit")
@@ -110,15 +104,16 @@ def read(table: Table) -> Finding:
     behind = limits.select(limits["method"] == "implicit")
     bound = float(maximum_stiffness(DEVICE_DAMPING, PERIOD, ROTATIONAL_DAMPING))
     predicted = length_limit(direct["stiffness"])
+    lengths_found, stiffness_found = direct.numbers("limit"), behind.numbers("limit")
     figure = new_figure(8, 4.6)
     left, right = figure.subplots(1, 2, sharex=True)
     _draw_cells(left, table, "direct")
     _draw_cells(right, table, "implicit")
     lengths = np.geomspace(*LENGTH, 100)
     left.plot(1e3 * lengths, contact_stiffness_limit(lengths), color="black", lw=1.8)
-    left.plot(1e3 * direct["limit"], direct["stiffness"], "o", color="black", ms=4, mfc="white")
+    left.plot(1e3 * lengths_found, direct["stiffness"], "o", color="black", ms=4, mfc="white")
     right.axhline(bound, color="#1a5fb4", lw=1.8, ls="--")
-    right.plot(1e3 * behind["length"], behind["limit"], "o", color="black", ms=4, mfc="white")
+    right.plot(1e3 * behind["length"], stiffness_found, "o", color="black", ms=4, mfc="white")
     left.set_title("direct: no coupling", fontsize="medium")
     right.set_title("implicit: behind the coupling", fontsize="medium")
     left.set_ylabel("contact stiffness K_c (N/m)")
@@ -144,46 +139,57 @@ def read(table: Table) -> Finding:
     )
     return Finding(
         figure,
-        _paragraph(direct["limit"], predicted, behind["limit"], bound),
+        _paragraph(direct, predicted, behind.numbers("limit"), bound),
         {
             "period": PERIOD,
             "device_rotational_damping": DEVICE_DAMPING,
             "direct": {
                 "contact_stiffness": direct["stiffness"].tolist(),
-                "measured_length": direct["limit"].tolist(),
+                "measured_length": direct.numbers("limit").tolist(),
                 "predicted_length": predicted.tolist(),
-                "largest_deviation": _deviation(direct["limit"], predicted),
+                "largest_deviation": agreement(direct.numbers("limit"), predicted),
             },
             "implicit": {
                 "coupling_rotational_damping": ROTATIONAL_DAMPING,
                 "length": behind["length"].tolist(),
-                "measured_rotational_stiffness": behind["limit"].tolist(),
+                "measured_rotational_stiffness": behind.numbers("limit").tolist(),
                 "predicted_6": bound,
-                "largest_deviation": _deviation(behind["limit"], np.asarray(bound)),
-                "largest_over_smallest": float(behind["limit"].max() / behind["limit"].min()),
+                "largest_deviation": agreement(behind.numbers("limit"), bound),
+                "largest_over_smallest": (
+                    float(stiffness_found.max() / stiffness_found.min()) if len(behind) else None
+                ),
             },
         },
     )
 
 
-def _deviation(measured: NDArray[np.float64], predicted: NDArray[np.float64]) -> float:
-    return float(np.abs(measured / predicted - 1).max())
-
-
 def _paragraph(
-    lengths: NDArray[np.float64],
+    direct: Table,
     predicted: NDArray[np.float64],
     stiffness: NDArray[np.float64],
     bound: float,
 ) -> str:
-    return (
-        f"Rendered directly, a peg is stable up to a length of {1e3 * lengths.min():.3g} to "
-        f"{1e3 * lengths.max():.3g} mm, the less the stiffer its contacts are: within "
-        f"{100 * _deviation(lengths, predicted):.2g} % of L = 2 √(b_θ/(T K_c)). Behind the "
-        f"coupling the largest K_r lies between {stiffness.min():.4g} and {stiffness.max():.4g} "
-        f"N m/rad over all lengths, within {100 * _deviation(stiffness, np.asarray(bound)):.2g} % "
-        f"of the {bound:.3g} N m/rad of eq. (6), which does not know L."
-    )
+    said = []
+    if len(direct):
+        length, contact = 1e3 * direct.numbers("limit"), direct["stiffness"]
+        soft, stiff = int(contact.argmin()), int(contact.argmax())
+        said.append(
+            f"Rendered directly, a peg is stable up to {length[soft]:.3g} mm with contacts of "
+            f"{contact[soft]:.3g} N/m and up to {length[stiff]:.3g} mm with {contact[stiff]:.3g} "
+            f"N/m: {per_cent(agreement(direct['limit'], predicted))} of L = 2 √(b_θ/(T K_c))."
+        )
+    else:
+        said.append("Rendered directly, no point could be computed.")
+    if stiffness.size:
+        said.append(
+            f"Behind the coupling the largest K_r lies between {stiffness.min():.4g} and "
+            f"{stiffness.max():.4g} N m/rad over all lengths, "
+            f"{per_cent(agreement(stiffness, bound))} of the {bound:.3g} N m/rad of eq. (6), which "
+            "does not know L."
+        )
+    else:
+        said.append("Behind the coupling, no point could be computed.")
+    return " ".join(said)
 
 
 def _draw_cells(axes: Axes, table: Table, name: str) -> None:

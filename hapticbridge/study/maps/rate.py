@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import mujoco
@@ -16,9 +16,13 @@ from hapticbridge.passivity import SampledLoop, WorstHand, maximum_stiffness, mi
 from hapticbridge.picture import new_figure
 from hapticbridge.rendering import METHODS
 from hapticbridge.study.closed_loop import PARTS, LoopOutcome, Timing
+from hapticbridge.study.maps.bisection import WIDTH, agreement, largest_stable
 from hapticbridge.study.maps.rigs import STILL, loop_in, set_tool_mass
 from hapticbridge.study.maps.stability_map import Finding, Point, StabilityMap
 from hapticbridge.study.table import Table
+
+THEORY_WIDTH = WIDTH / 100
+"""Relative width of the search for what theory says: far below that of a measurement."""
 
 DEVICE_DAMPING = 2.0
 """b in N s/m, that of the default simulated device."""
@@ -52,12 +56,10 @@ TICKS = 2000
 KNOCK = np.array([1e-4, 0.0, 0.0, 0.0, 0.0, 0.0])
 """Displacement that starts a run, in m."""
 
-LIMIT_WIDTH = 5e-3
-"""Relative width at which the search for a limit of K ends; finer takes longer."""
-
-SOFTEST, STIFFEST = 0.02, 50.0
-"""Ends of the search, as shares of 2 b/T, without unit: delay and lost ticks take a factor of 11,
-an ordinary hand gives four."""
+SEARCHED = (10.0, 1e5)
+"""Ends of every search for K in N/m, at every period alike: what is expected lies between 100 and
+20 000, and nothing expected goes into it. A softer wall decays too slowly for a run, and at a much
+stiffer one the worst hand is tuned to another failure than the first."""
 
 
 def points(count: int) -> Sequence[Point]:
@@ -80,24 +82,24 @@ def points(count: int) -> Sequence[Point]:
 def evaluate(point: Point) -> Mapping[str, float | str | bool]:
     """Searches for the largest K that is stable, and measures how uneven the ticks were."""
     period, delay, share = float(point["period"]), int(point["delay"]), float(point["share"])
-    unit = 2 * DEVICE_DAMPING / period
     if point["what"] == "delay":
 
         def is_stable(stiffness: float) -> bool:
             return worst_hand(stiffness, period, delay).is_stable
 
-        return {"limit": _limit(is_stable, unit), "mean": period, "longest": period, "balance": 1.0}
+        limit = largest_stable(is_stable, *SEARCHED).middle
+        return {"limit": limit, "mean": period, "longest": period, "balance": 1.0}
 
     timings = [_timing(str(point["what"]), share, seed) for seed in range(SEEDS)]
     intervals = np.concatenate([timing.intervals(TICKS) for timing in timings]) / PARTS
     name = str(point["hand"])
     return {
-        "limit": _limit(
+        "limit": largest_stable(
             lambda stiffness: all(
                 finite_hand(name, stiffness, timing).is_stable for timing in timings
             ),
-            unit,
-        ),
+            *SEARCHED,
+        ).middle,
         "mean": float(period * intervals.mean()),
         "longest": float(period * intervals.max()),
         "balance": float(intervals.sum() / np.square(intervals).sum()),
@@ -144,14 +146,6 @@ def _make_heavy(model: mujoco.MjModel) -> None:
     set_tool_mass(model, "tool", WALL_MASS)
 
 
-def _limit(is_stable: Callable[[float], bool], unit: float) -> float:
-    lower, upper = SOFTEST * unit, STIFFEST * unit
-    while upper > lower * (1 + LIMIT_WIDTH):
-        middle = (lower * upper) ** 0.5
-        lower, upper = (middle, upper) if is_stable(middle) else (lower, middle)
-    return float((lower * upper) ** 0.5)
-
-
 def wall_limit(period: float, delay: int) -> float:
     """Returns the largest K in N/m on a wall for any hand: ``minimum_damping`` solved for K.
 
@@ -167,11 +161,7 @@ def wall_limit(period: float, delay: int) -> float:
         coupling = Coupling(stiffness, DAMPING, 0.0, 0.0)
         return minimum_damping(coupling, period, delay=delay) < DEVICE_DAMPING
 
-    lower, upper = SOFTEST * DEVICE_DAMPING / period, 2 * DEVICE_DAMPING / period
-    while upper > lower * (1 + LIMIT_WIDTH / 100):
-        middle = (lower * upper) ** 0.5
-        lower, upper = (middle, upper) if is_enough(middle) else (lower, middle)
-    return float((lower * upper) ** 0.5)
+    return largest_stable(is_enough, *SEARCHED, THEORY_WIDTH).middle
 
 
 def read(table: Table) -> Finding:
@@ -231,7 +221,7 @@ def _draw_delays(axes: Axes, rows: Table) -> dict[str, Any]:
             "period": period.tolist(),
             "measured": mine["limit"].tolist(),
             "predicted": predicted.tolist(),
-            "worst_ratio_error": float(np.abs(mine["limit"] / predicted - 1).max()),
+            "worst_ratio_error": agreement(mine["limit"], predicted),
             "slope": float(np.polyfit(np.log(period), np.log(mine["limit"]), 1)[0]),
         }
     axes.plot([], [], "o", color="black", mfc="white", label="measured, worst hand")

@@ -22,6 +22,7 @@ from hapticbridge.study.maps.falling_rod import (
     restitution_of,
 )
 from hapticbridge.study.maps.stability_map import Finding, Point, StabilityMap
+from hapticbridge.study.maps.verdicts import MISSING, say_missing
 from hapticbridge.study.table import Table
 
 RESTITUTION_LAWS: tuple[Law, ...] = ("newton", "poisson", "stronge")
@@ -34,6 +35,10 @@ SHOWN = 0.75
 """The friction coefficient whose curves are drawn, that of the example in which Newton gains."""
 
 DRAWN = ("scenes", "bouncy, implicitfast")
+
+LEAD = 0.2
+"""Share by which a law must be nearer to MuJoCo than the second to be named the nearest, without
+unit; with less, laws that a soft contact cannot tell apart would be named by chance."""
 
 COLOURS = {"inelastic": "#7f7f7f", "newton": "#c0504d", "poisson": "#1a5fb4", "stronge": "#2e8b57"}
 """Of the laws; ``inelastic`` is any of them with e = 0."""
@@ -83,7 +88,8 @@ def _by_law(law: Law, angle: float, friction: float, slide: float, restitution: 
 
 def read(table: Table) -> Finding:
     """Draws the energy over the angle, and how far each law is from MuJoCo."""
-    by_setting = {name: _summary(table.select(table["setting"] == name)) for name in SETTINGS}
+    groups = {name: table.select(table["setting"] == name) for name in SETTINGS}
+    by_setting = {name: _summary(mine) for name, mine in groups.items() if len(mine)}
     figure = new_figure(8, 7.2)
     panels = figure.subplots(2, 2, gridspec_kw={"height_ratios": [1, 1.1]})
     for axes, name in zip(panels[0], DRAWN, strict=True):
@@ -112,7 +118,7 @@ def _summary(mine: Table) -> Summary:
     return {
         "restitution": float(mine["restitution"][0]),
         "rms_distance_to_law": distances,
-        "nearest_law": min(distances, key=distances.__getitem__),
+        "nearest_law": _nearest(distances),
         "largest_energy_change": float(measured.max()),
         "largest_by_newton": float(mine["newton"].max()),
         "share_that_gained": float(np.mean(mine["first_gain"] >= 0)),
@@ -123,9 +129,18 @@ def _summary(mine: Table) -> Summary:
     }
 
 
+def _nearest(distances: Mapping[str, float]) -> str | None:
+    """Returns the law that leads the second by more than ``LEAD``; None where none does."""
+    first, second = sorted(distances, key=distances.__getitem__)[:2]
+    return first if distances[first] < (1 - LEAD) * distances[second] else None
+
+
 def _draw_curves(axes: Axes, table: Table, name: str) -> None:
     rows = (table["setting"] == name) & (table["friction"] == SHOWN) & (table["slide"] == SLIDE)
     mine = table.select(rows)
+    if not len(mine):
+        say_missing(axes)
+        return
     angle = np.degrees(mine["angle"])
     styles = {"inelastic": ":", "newton": "-", "poisson": "--", "stronge": "-."}
     for law, colour in COLOURS.items():
@@ -161,18 +176,20 @@ def _draw_gains(axes: Axes, by_setting: Mapping[str, Summary]) -> None:
         0.36,
         color=COLOURS["newton"],
     )
-    axes.set_yticks(place, [])
+    axes.set_yticks(place, [name.replace(", ", ",\n", 1) for name in by_setting], fontsize="small")
     axes.invert_yaxis()
     axes.axvline(0.0, color="black", lw=0.6)
     axes.set_xlabel("largest change of energy (J)\nblack: MuJoCo, red: Newton")
 
 
 def _paragraph(by_setting: Mapping[str, Summary]) -> str:
-    usual = by_setting["scenes"]
+    if not by_setting:
+        return f"{MISSING.capitalize()}."
     nearest = [row["nearest_law"] for row in by_setting.values()]
     counts = {law: nearest.count(law) for law in dict.fromkeys(nearest)}
+    names = {None: "none", "inelastic": "the inelastic one"}
     likeness = ", ".join(
-        f"{'the inelastic one' if law == 'inelastic' else law.capitalize()} in {count}"
+        f"{names.get(law) or str(law).capitalize()} in {count}"
         for law, count in sorted(counts.items(), key=lambda pair: -pair[1])
     )
     gains = [
@@ -180,19 +197,31 @@ def _paragraph(by_setting: Mapping[str, Summary]) -> str:
         for name, row in by_setting.items()
         if row["largest_energy_change"] > 0
     ]
+    said = _of_the_scenes(by_setting["scenes"]) if "scenes" in by_setting else ""
+    own = max(by_setting, key=lambda name: by_setting[name]["largest_own_restitution"])
+    by_newton = max(by_setting, key=lambda name: by_setting[name]["largest_by_newton"])
+    said += (
+        f"Of the {len(by_setting)} settings the law that is nearest by more than {100 * LEAD:.0f} "
+        f"% is {likeness}. The largest e of a slanted rod is "
+        f"{by_setting[own]['largest_own_restitution']:.2g}, with '{own}', whose upright rod has "
+        f"{by_setting[own]['restitution']:.2g}; Newton's law changes the energy by "
+        f"{by_setting[by_newton]['largest_by_newton']:+.2g} J at most, with '{by_newton}'. "
+    )
+    if gains:
+        return f"{said}Kinetic energy is created with {', '.join(gains)}."
+    return f"{said}No setting created kinetic energy."
+
+
+def _of_the_scenes(usual: Summary) -> str:
     distances = usual["rms_distance_to_law"]
-    said = (
+    return (
         f"With the contact of the scenes a rod that falls upright comes back with e = "
         f"{usual['restitution']:.2g}, and at any angle and friction its energy changes by "
         f"{usual['largest_energy_change']:+.2g} J at most. Laws of impact with that e are "
         f"{1e3 * min(distances[law] for law in RESTITUTION_LAWS):.2g} to "
         f"{1e3 * max(distances[law] for law in RESTITUTION_LAWS):.2g} mJ away (RMS), e = 0 "
-        f"{1e3 * distances['inelastic']:.2g} mJ. Of the {len(by_setting)} settings the nearest law "
-        f"is {likeness}. "
+        f"{1e3 * distances['inelastic']:.2g} mJ. "
     )
-    if gains:
-        return f"{said}Kinetic energy is created with {', '.join(gains)}."
-    return f"{said}No setting created kinetic energy."
 
 
 RESTITUTION = StabilityMap(

@@ -19,7 +19,7 @@ from hapticbridge.study.maps.tumbling import (
     free_creation,
     gyroscopic_speed,
 )
-from hapticbridge.study.maps.verdicts import draw_verdicts, verdict_legend, verdict_numbers
+from hapticbridge.study.maps.verdicts import MISSING, draw_verdicts, verdict_legend, verdict_numbers
 from hapticbridge.study.table import Table
 
 SOFT, HARD = 2.0, 20.0
@@ -197,66 +197,111 @@ def _boundary(table: Table) -> dict[str, Any]:
     ratio = free["created"][told] / predicted[told]
     cuts = table.select((table["what"] == "cut") & (table["method"] == "implicit"))
     passed = cuts.select(cuts["crossed"] >= 0)
-    limit = table.select(table["what"] == "limit")["limit"]
+    limit = table.select(table["what"] == "limit").numbers("limit")
     return {
         "period": PERIOD,
         "rotational_stiffness": SOFT,
         "gyroscopic_speed": gyroscopic_speed(SOFT),
         "fastest_passive": {name: _fastest(cells, name) for name in METHODS_SHOWN},
         "share_strict_below": {name: _strict_share(cells, name) for name in METHODS_SHOWN},
+        "first_passed": {name: _first_passed(cells, name) for name in METHODS_SHOWN},
         "translation_only": {
             "speed": free["speed"].tolist(),
             "created": free["created"].tolist(),
             "predicted": predicted.tolist(),
+            "grows_up_to": _grows_up_to(free),
+            "compared_up_to": float(free["speed"][told].max()) if told.any() else None,
             "largest_deviation": float(np.abs(ratio - 1).max()) if ratio.size else None,
         },
         "cut": {
             "speed_measured": float(limit[0]) if limit.size else None,
             "speed_predicted": cut_speed(SOFT),
-            "torque_jump": float(passed["torque_jump"].max(initial=0.0)),
+            "torque_jump": float(passed["torque_jump"].max()) if len(passed) else None,
             "torque_jump_predicted": 2 * np.pi * SOFT,
-            "created": float(passed["created"].max(initial=0.0)),
+            "created": float(passed["created"].max()) if len(passed) else None,
         },
     }
 
 
-def _fastest(cells: Table, method: str) -> float:
-    """Returns the speed in rad/s up to which a method is passive at every angle, 0 for none."""
+def _grows_up_to(free: Table) -> float | None:
+    """Returns the speed in rad/s up to which more is created at every faster point."""
+    if not len(free):
+        return None
+    falls = np.flatnonzero(np.diff(free["created"]) <= 0)
+    return float(free["speed"][falls[0] if falls.size else -1])
+
+
+def _first_passed(cells: Table, method: str) -> float | None:
+    """Returns the slowest speed in rad/s at which the angle passed π in a run; None for none."""
+    mine = cells.select((cells["method"] == method) & (cells["crossed"] >= 0))
+    return float(mine["speed"].min()) if len(mine) else None
+
+
+def _fastest(cells: Table, method: str) -> float | None:
+    """Returns the speed in rad/s up to which a method is passive at every angle; None for none."""
     mine = cells.select(cells["method"] == method)
     is_good = (mine["environment"] != "active") & (mine["ticks"] == TICKS)
     bad = mine["speed"][~is_good].min(initial=np.inf)
-    return float(mine["speed"][mine["speed"] < bad].max(initial=0.0))
+    # at rest nothing moves and nothing can be created: that is no speed
+    good = mine["speed"][(mine["speed"] < bad) & (mine["speed"] > 0)]
+    return float(good.max()) if good.size else None
 
 
-def _strict_share(cells: Table, method: str) -> float:
+def _strict_share(cells: Table, method: str) -> float | None:
     """Returns the share of strict runs below ``gyroscopic_speed``."""
     rows = (cells["method"] == method) & (cells["speed"] < gyroscopic_speed(SOFT))
-    return float(np.mean(cells["environment"][rows] == "strict"))
+    return float(np.mean(cells["environment"][rows] == "strict")) if rows.any() else None
 
 
 def _paragraph(boundary: Mapping[str, Any]) -> str:
-    passive, strict = boundary["fastest_passive"], boundary["share_strict_below"]
+    said = [_of_method(name, boundary) for name in METHODS_SHOWN]
     free, cut = boundary["translation_only"], boundary["cut"]
-    others = "; ".join(
-        f"'{name}' {passive[name]:.3g} rad/s" for name in METHODS_SHOWN if name != "implicit"
+    if free["speed"]:
+        usual = int(np.argmin(np.abs(np.asarray(free["speed"]) - TOLD_AT)))
+        text = (
+            f"Coupled in translation alone, the tool creates {free['created'][usual]:.2g} J in 1 s "
+            f"at {free['speed'][usual]:.3g} rad/s, and more the faster up to "
+            f"{free['grows_up_to']:.3g} rad/s"
+        )
+        if free["largest_deviation"] is not None:
+            text += (
+                f"; up to {free['compared_up_to']:.3g} rad/s, where that is little next to its "
+                f"own energy, it is ½T²|ω × Iω|²/I a step "
+                f"within {100 * free['largest_deviation']:.2g} %"
+            )
+        said.append(text)
+    if cut["speed_measured"] is not None:
+        said.append(
+            f"A sudden turn passes the cut at π at {cut['speed_measured']:.4g} rad/s, predicted "
+            f"{cut['speed_predicted']:.4g} rad/s"
+        )
+    if cut["torque_jump"] is not None:
+        said.append(
+            f"Behind the cut the torque of 'implicit' flips by {cut['torque_jump']:.3g} N m within "
+            f"a tick, and it creates {cut['created']:.2g} J at most"
+        )
+    return f"With K_r = {SOFT:g} N m/rad: " + ". ".join(said) + "."
+
+
+def _of_method(name: str, boundary: Mapping[str, Any]) -> str:
+    fastest, strict = boundary["fastest_passive"][name], boundary["share_strict_below"][name]
+    passed = boundary["first_passed"][name]
+    if strict is None:
+        return f"'{name}': {MISSING}"
+    if fastest is None:
+        text = f"'{name}' is passive at every angle at no speed shown"
+    else:
+        text = f"'{name}' is passive, strictly or within its slack, at every angle up to "
+        text += f"{fastest:.3g} rad/s"
+    text += (
+        f", strict in {100 * strict:.0f} % of its runs below {boundary['gyroscopic_speed']:.3g} "
+        "rad/s, where the gyroscopic torque reaches what the spring gives at π"
+        if name == METHODS_SHOWN[0]
+        else f", strict in {100 * strict:.0f} %"
     )
-    deviation, found = free["largest_deviation"], cut["speed_measured"]
-    told = "" if deviation is None else f", within {100 * deviation:.2g} % of ½T²|ω × Iω|²/I a step"
-    usual = int(np.argmin(np.abs(np.asarray(free["speed"]) - TOLD_AT)))
-    searched = "" if found is None else f"at {found:.4g} rad/s, "
-    return (
-        f"With K_r = {SOFT:g} N m/rad 'implicit' is passive, strictly or within its slack, at "
-        f"every angle up to {passive['implicit']:.3g} rad/s; from "
-        f"{boundary['gyroscopic_speed']:.3g} rad/s on the spring cannot hold the tumbling tool. "
-        f"Below that {100 * strict['implicit']:.0f} % of its runs are strict. The others, in the "
-        f"same sense: {others}. Coupled in translation alone, the tool creates "
-        f"{free['created'][usual]:.2g} J in 1 s at {free['speed'][usual]:.3g} rad/s, and more "
-        f"the faster{told} while that is little next to its own energy. A sudden turn passes the "
-        f"cut at π {searched}predicted "
-        f"{cut['speed_predicted']:.4g} rad/s: the torque then flips by "
-        f"{cut['torque_jump']:.3g} N m within a tick; what 'implicit' creates there "
-        f"is {cut['created']:.2g} J."
-    )
+    if passed is None:
+        return f"{text}; its angle passes π in no run"
+    return f"{text}; its angle first passes π at {passed:.3g} rad/s"
 
 
 ROTATION = StabilityMap(

@@ -21,6 +21,7 @@ from hapticbridge.ledger import Ledger
 from hapticbridge.rendering import METHODS, prepare
 from hapticbridge.scene import Scene
 from hapticbridge.study.closed_loop import UNLIMITED
+from hapticbridge.study.maps.bisection import largest_stable
 from hapticbridge.study.maps.rigs import loop_in, scene_of
 from hapticbridge.study.maps.tumbling import INERTIA, MIDDLE, OBLIQUE, PERIOD, TICKS
 from hapticbridge.tick import SAMPLE_DTYPE, TICK_DTYPE
@@ -33,9 +34,6 @@ STIFFNESS, DAMPING = 2000.0, 0.5
 
 ROTATIONAL_DAMPING = 5e-4
 """B_r in N m s/rad; none where K_r = 0."""
-
-LIMIT_WIDTH = 1e-3
-"""Relative width at which the search for the speed of the cut ends."""
 
 DIVERGED = 1e3
 """Kinetic energy in J that ends a run: ten times what the tool has at 200 rad/s, so that it has
@@ -150,14 +148,9 @@ def sudden(method: str, stiffness: float, speed: float) -> Spin:
 
 def speed_of_cut(method: str, stiffness: float) -> float:
     """Returns the speed in rad/s, 1 to 1000, at which a sudden turn winds the angle past π."""
-    lower, upper = 1.0, 1000.0
-    while upper > lower * (1 + LIMIT_WIDTH):
-        middle = (lower * upper) ** 0.5
-        if sudden(method, stiffness, middle).crossed < 0:
-            lower = middle
-        else:
-            upper = middle
-    return float((lower * upper) ** 0.5)
+    return largest_stable(
+        lambda speed: sudden(method, stiffness, speed).crossed < 0, 1.0, 1000.0
+    ).middle
 
 
 def _load() -> Scene:

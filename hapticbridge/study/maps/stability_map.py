@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
@@ -17,6 +18,10 @@ from hapticbridge.study.sweep import sweep
 from hapticbridge.study.table import Table
 
 Point = dict[str, float | int | str | bool]
+
+LEAST_POINTS, MOST_POINTS = 4, 1_000_000
+"""Fewest and most points of a map: with fewer there is no grid, and a million take hours to days
+and a gigabyte."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,7 +98,7 @@ def run_map(
     Args:
         stability_map: Which.
         folder: Made if missing.
-        points: About how many, >= 4; None for the map's own number.
+        points: About how many, 4 to 1 000 000; None for the map's own number.
         form: Of table and parts: ``csv`` or ``parquet`` (needs the extra ``tables``).
         executor: Where points are computed; by default a pool of processes.
         scheduler: Address of a dask.distributed cluster instead.
@@ -102,9 +107,14 @@ def run_map(
     Raises:
         StudyError: The folder, the workers or the number cannot be used, or every point failed.
     """
-    if points is not None and points < 4:
-        raise StudyError(f"points is {points}; a map needs 4 or more")
+    if points is not None and not LEAST_POINTS <= points <= MOST_POINTS:
+        raise StudyError(
+            f"points is {points}; a map needs {LEAST_POINTS} or more, and {MOST_POINTS} at most"
+        )
     name = stability_map.name
+    files = {end: folder / f"{name}.{end}" for end in ("png", form, "json")}
+    for path in files.values():
+        _check_writable(path)
     table = sweep(
         stability_map.evaluate,
         stability_map.points(points or stability_map.default_points),
@@ -114,19 +124,12 @@ def run_map(
         scheduler=scheduler,
         progress=progress,
     )
+    table.write(files[form])  # first: it is what cost the time
     failed = int(table.failed.sum())
     if failed == len(table):
         raise StudyError(f"map '{name}': no point could be computed; first: {table['error'][0]}")
     finding = stability_map.read(table.select(~table.failed))
-    files = MapFiles(
-        picture=folder / f"{name}.png",
-        table=folder / f"{name}.{form}",
-        boundary=folder / f"{name}.json",
-        finding=finding,
-        failed=failed,
-    )
-    write_picture(finding.figure, files.picture)
-    table.write(files.table)
+    write_picture(finding.figure, files["png"])
     said = {
         "map": name,
         "about": stability_map.about,
@@ -135,8 +138,37 @@ def run_map(
         "paragraph": finding.paragraph,
         "boundary": finding.boundary,
     }
+    text = json.dumps(_known(said), indent=2, allow_nan=False)
     try:
-        files.boundary.write_text(json.dumps(said, indent=2) + "\n", encoding="utf-8")
+        files["json"].write_text(text + "\n", encoding="utf-8")
     except OSError as error:
-        raise StudyError(f"cannot write '{files.boundary}': {error.strerror}") from None
-    return files
+        raise StudyError(f"cannot write '{files['json']}': {error.strerror}") from None
+    return MapFiles(files["png"], files[form], files["json"], finding, failed)
+
+
+def _known(value: Any) -> Any:
+    """Returns a value for JSON, which knows neither NaN nor infinity: they become None."""
+    if isinstance(value, Mapping):
+        return {key: _known(inner) for key, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [_known(inner) for inner in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def _check_writable(path: Path) -> None:
+    """Refuses a file that could not be written, before the sweep; leaves the disk as it was.
+
+    A folder that is missing or none is the sweep's to make or refuse.
+    """
+    if not path.parent.is_dir():
+        return
+    is_new = not path.exists()
+    try:
+        with path.open("ab"):
+            pass
+        if is_new:
+            path.unlink()
+    except OSError as error:
+        raise StudyError(f"cannot write '{path}': {error.strerror}") from None

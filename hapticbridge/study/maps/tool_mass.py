@@ -17,6 +17,7 @@ from hapticbridge.passivity import WorstHand, maximum_stiffness
 from hapticbridge.picture import new_figure
 from hapticbridge.rendering import METHODS
 from hapticbridge.study.closed_loop import LoopOutcome
+from hapticbridge.study.maps.bisection import WIDTH, agreement, largest_stable
 from hapticbridge.study.maps.free_tool import NAMES, felt, least_mass, worst_angle
 from hapticbridge.study.maps.rigs import loop_in, set_tool_mass
 from hapticbridge.study.maps.stability_map import Finding, Point, StabilityMap
@@ -64,9 +65,6 @@ def _swinging() -> Motion:
 
 
 PATH = _swinging()
-
-LIMIT_WIDTH = 5e-3
-"""Relative width at which the search for a limit in mass ends; finer takes longer."""
 
 LIMITS = 9
 """Values of K per method at which the limits in mass are searched."""
@@ -157,7 +155,7 @@ def _limit(name: str, stiffness: float, *, is_held: bool) -> Mapping[str, float 
             is_held or worst_hand(name, stiffness, mass).is_stable
         )
 
-    return _change(is_stable, LIMIT_WIDTH)
+    return _change(is_stable, WIDTH)
 
 
 def predicted_limit(name: str, stiffness: float, *, is_held: bool) -> Mapping[str, float | bool]:
@@ -180,19 +178,16 @@ def predicted_limit(name: str, stiffness: float, *, is_held: bool) -> Mapping[st
         needed = worst_angle(name, stiffness, DAMPING, mass, PERIOD)[1]
         return np.isfinite(needed) if is_held else needed < DEVICE_DAMPING
 
-    return _change(is_stable, LIMIT_WIDTH / 10)
+    return _change(is_stable, WIDTH / 10)
 
 
 def _change(is_stable: Callable[[float], bool], width: float) -> Mapping[str, float | bool]:
-    lower, upper = MASS
-    first, last = is_stable(lower), is_stable(upper)
+    first, last = (is_stable(mass) for mass in MASS)
     found = {"limit": float("nan"), "stable_if_light": first, "stable_if_heavy": last}
     if first == last:
         return found
-    while upper > lower * (1 + width):
-        middle = (lower * upper) ** 0.5
-        lower, upper = (middle, upper) if is_stable(middle) == first else (lower, middle)
-    return found | {"limit": float((lower * upper) ** 0.5)}
+    bracket = largest_stable(lambda mass: is_stable(mass) == first, *MASS, width)
+    return found | {"limit": bracket.middle}
 
 
 def read(table: Table) -> Finding:
@@ -266,8 +261,6 @@ def _compare(name: str, rows: Table, *, is_held: bool) -> dict[str, Any]:
     """Returns the limits that were found beside theory's; None where there is none."""
     predicted = [predicted_limit(name, float(k), is_held=is_held) for k in rows["stiffness"]]
     theory = np.array([p["limit"] for p in predicted], dtype=np.float64)
-    ratio = rows["limit"] / theory
-    known = np.isfinite(ratio)
     same = np.array(
         [
             p["stable_if_light"] == light and p["stable_if_heavy"] == heavy
@@ -281,7 +274,7 @@ def _compare(name: str, rows: Table, *, is_held: bool) -> dict[str, Any]:
         "stiffness": rows["stiffness"].tolist(),
         "measured_mass": [float(m) if np.isfinite(m) else None for m in rows["limit"]],
         "predicted_mass": [float(m) if np.isfinite(m) else None for m in theory],
-        "worst_ratio_error": float(np.abs(ratio[known] - 1).max()) if known.any() else None,
+        "worst_ratio_error": agreement(rows["limit"], theory),
         "disagreements": int((~same).sum()),
     }
 
@@ -299,7 +292,7 @@ def _paragraph(boundary: Mapping[str, Any]) -> str:
         else:
             text += f"with the handle held still unstable at {unstable} points"
         if heaviest is not None:
-            text += f", up to {1e3 * heaviest:.3g} g"
+            text += f"; the heaviest limit searched for is {1e3 * heaviest:.3g} g"
         text += f"; below (6) unstable at {mine['unstable_below_6']} of {mine['points_below_6']}"
         text += f" points; most energy created where stable {mine['most_created']:.2g} J"
         said.append(text)

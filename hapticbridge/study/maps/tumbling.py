@@ -28,9 +28,10 @@ def cut_speed(stiffness: float) -> float:
 
 
 def gyroscopic_speed(stiffness: float) -> float:
-    """Returns the speed in rad/s at which no angle below π holds a tool that tumbles.
+    """Returns the speed in rad/s from which on the gyroscopic torque can exceed the spring's.
 
-    The gyroscopic torque |ω × Iω| reaches ½ (I_z − I_x) ω², the spring gives π K_r at most.
+    The gyroscopic torque |ω × Iω| reaches ½ (I_z − I_x) ω² in the worst attitude, the spring gives
+    π K_r at most. A tool passes that attitude quickly: its angle passes π at higher speeds only.
     """
     return float(np.sqrt(2 * np.pi * stiffness / (INERTIA.max() - INERTIA.min())))
 

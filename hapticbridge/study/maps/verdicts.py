@@ -14,6 +14,9 @@ from numpy.typing import ArrayLike, NDArray
 VERDICTS = ("strict", "within slack", "active", "unstable")
 """From safe to unsafe. The first three are the environment's; ``unstable`` is the loop's."""
 
+MISSING = "no point could be computed"
+"""What a picture or a paragraph says where every point of a group failed."""
+
 COLOURS = ("#a8d5ba", "#f4e3a1", "#f0a868", "#c0504d")
 """Of the verdicts; told apart by lightness as well as by hue."""
 
@@ -42,7 +45,16 @@ def draw_verdicts(
         verdict: From ``verdict_numbers``.
         log_x: Whether x is even in its logarithm.
         log_y: Whether y is.
+
+    Without a run the axes say that no point could be computed.
     """
+    if log_x:
+        axes.set_xscale("log")
+    if log_y:
+        axes.set_yscale("log")
+    if not len(x):
+        say_missing(axes)
+        return
     columns, rows = np.unique(x), np.unique(y)
     cells = np.full((rows.size, columns.size), np.nan)
     cells[np.searchsorted(rows, y), np.searchsorted(columns, x)] = verdict
@@ -55,10 +67,11 @@ def draw_verdicts(
         vmax=len(VERDICTS) - 0.5,
         rasterized=True,
     )
-    if log_x:
-        axes.set_xscale("log")
-    if log_y:
-        axes.set_yscale("log")
+
+
+def say_missing(axes: Axes) -> None:
+    """Writes into axes that there is nothing to show, because every point of a group failed."""
+    axes.text(0.5, 0.5, MISSING, ha="center", va="center", transform=axes.transAxes)
 
 
 def _edges(centres: NDArray[np.float64], *, is_log: bool) -> NDArray[np.float64]:
