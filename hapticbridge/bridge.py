@@ -31,8 +31,9 @@ from hapticbridge.guard import Limits, limits_for, refuse_stretched_start, trip_
 from hapticbridge.inputs import Write, apply_writes, input_writes
 from hapticbridge.jit import direct
 from hapticbridge.kernel.parameters import checked_substeps
+from hapticbridge.kernel.publish import publish
 from hapticbridge.kernel.state import Binding, RunParameters, rotation_numbers
-from hapticbridge.kernel.step import OK, after_step, before_step, publish
+from hapticbridge.kernel.step import OK, after_step, before_step
 from hapticbridge.ledger import Ledger
 from hapticbridge.provenance import attachments, describe_run
 from hapticbridge.recording import TAIL, Recorder, Ring

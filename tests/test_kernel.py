@@ -36,15 +36,13 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.errors import HapticBridgeError, SceneError
 from hapticbridge.kernel import native
 from hapticbridge.kernel.handle import handle_pose
+from hapticbridge.kernel.publish import HEAD, TAIL, publish
 from hapticbridge.kernel.step import (
     BAD_RESULT,
     BAD_SAMPLE,
-    HEAD,
     OK,
-    TAIL,
     after_step,
     before_step,
-    publish,
     simulate,
 )
 from hapticbridge.scene import load_scene

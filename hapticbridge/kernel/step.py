@@ -1,7 +1,7 @@
-"""The tick's arithmetic: before MuJoCo's step, after it, and the hand-over of the record.
+"""The tick's arithmetic: before MuJoCo's step, and after it.
 
 The live loop calls ``before_step``, MuJoCo through its Python bindings, ``after_step`` and
-``publish``; the re-simulation calls ``simulate``, which inlines the same functions around
+``publish.publish``; the re-simulation calls ``simulate``, which inlines the same functions around
 ``advance``, MuJoCo by its C symbol.
 """
 
@@ -28,7 +28,7 @@ from hapticbridge.kernel.meter import (
     refresh_energies,
     refresh_grip,
 )
-from hapticbridge.kernel.native import floats, ints, mj_fwd_position, mj_step, release_fence
+from hapticbridge.kernel.native import floats, ints, mj_fwd_position, mj_step
 from hapticbridge.kernel.ports import meter_ports, note_moved_mocap_bodies
 from hapticbridge.kernel.weld import weld_wrench
 from hapticbridge.pose import (
@@ -61,9 +61,6 @@ constraint; or not at all, because the tool has no mass and is where the handle 
 
 LARGEST_CONTROL = 1e10
 """mjMAXVAL, in N and N m. Beyond it the run has diverged anyway."""
-
-HEAD, TAIL = 0, 1
-"""Cursors of the ring: records written, records read."""
 
 
 @compiled
@@ -339,34 +336,6 @@ def after_step(state: NDArray[np.void], row: NDArray[np.void], substep: int) -> 
     _record(state, row)
     s.tick += 1
     return OK
-
-
-@compiled
-def publish(
-    row: NDArray[np.void],
-    ring: NDArray[np.void],
-    cursors: NDArray[np.int64],
-    deadline_ns: int,
-    wake_ns: int,
-    read_ns: int,
-    write_ns: int,
-    flags: int,
-) -> bool:
-    """Completes the record with its times and hands it to the ring (single producer).
-
-    Returns:
-        False if the ring is full; nothing was written then, and the call can be repeated.
-    """
-    head = cursors[HEAD]
-    if head - cursors[TAIL] >= ring.size:
-        return False
-    r = row[0]
-    r.deadline_ns, r.wake_ns, r.read_ns, r.write_ns = deadline_ns, wake_ns, read_ns, write_ns
-    r.flags |= flags
-    ring[head % ring.size] = r
-    release_fence()
-    cursors[HEAD] = head + 1
-    return True
 
 
 @compiled_for_threads
