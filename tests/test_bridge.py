@@ -15,7 +15,6 @@ from audit_cases import TAP, ScriptedDevice, recorded
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from hapticbridge import bridge as bridge_module
 from hapticbridge.audit import audit
 from hapticbridge.bridge import Bridge
 from hapticbridge.clock import SimulatedClock
@@ -24,6 +23,7 @@ from hapticbridge.device import open_device
 from hapticbridge.errors import DeviceError, HapticBridgeError, SafetyTrip, SceneError
 from hapticbridge.guard import Limits
 from hapticbridge.recording import Recorder, Ring, read_recording
+from hapticbridge.recording import stream as stream_module
 from hapticbridge.scene import Scene, load_scene
 from hapticbridge.tick import CLOCK_FIELDS, TICK_DTYPE, TickFlag
 
@@ -503,7 +503,7 @@ def test_full_ring_drops_rows_in_real_time_and_the_audit_calls_the_gap(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "run.mcap"
-    monkeypatch.setattr(bridge_module, "RING_SECONDS", 0.064)
+    monkeypatch.setattr(stream_module, "RING_SECONDS", 0.064)
     rings: list[Ring] = []
     shared = Ring.shared
 
@@ -514,7 +514,7 @@ def test_full_ring_drops_rows_in_real_time_and_the_audit_calls_the_gap(
     monkeypatch.setattr(Ring, "shared", kept)
     device = ScriptedDevice(sway)
     with Bridge("point_mass", device, recording=path, clock=SlowClock({})) as bridge:
-        recorder = bridge._recorder
+        recorder = bridge._stream.recorder
         assert isinstance(recorder, Recorder)
         pid = recorder._process.pid
         os.kill(pid, signal.SIGSTOP)
@@ -540,7 +540,7 @@ def test_full_ring_drops_rows_in_real_time_and_the_audit_calls_the_gap(
 def test_full_ring_loses_nothing_in_simulated_time(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(bridge_module, "RING_SECONDS", 0.008)
+    monkeypatch.setattr(stream_module, "RING_SECONDS", 0.008)
     summary = recorded(tmp_path / "run.mcap", "point_mass", duration=0.3)
     assert summary.dropped == 0
     assert audit(tmp_path / "run.mcap").ticks == 300
@@ -704,7 +704,7 @@ def test_a_free_mass_is_strict_with_substeps_too(substeps: int) -> None:
 
 def test_a_stop_ends_a_run_whose_recorder_stalls(tmp_path: Path) -> None:
     with fast("point_mass", recording=tmp_path / "run.mcap") as bridge:
-        recorder = bridge._recorder
+        recorder = bridge._stream.recorder
         assert isinstance(recorder, Recorder)
         pid = recorder._process.pid
         os.kill(pid, signal.SIGSTOP)
