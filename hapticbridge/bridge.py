@@ -164,7 +164,7 @@ class Bridge:
             DeviceError: The device failed; likewise.
             HapticBridgeError: The bridge is not open, or the duration is out of range.
         """
-        last, code = self._last_tick(duration), OK
+        last, code, read = self._last_tick(duration), OK, 0
         self._resume()
         state, row = self._binding.state, self._binding.row
         model, data, substeps = self.scene.model, self.scene.data, range(self._substeps)
@@ -184,9 +184,10 @@ class Bridge:
                     if inputs:
                         self._apply_inputs()
                     read_device(sample)
-                    read = now()
+                    read_before, read = read, now()
+                    elapsed = 1e-9 * (read - read_before)
                     for substep in substeps:
-                        code = before(state, sample, row, substep)
+                        code = before(state, sample, row, substep, elapsed)
                         if code != OK:
                             break
                         step(model, data)
@@ -325,7 +326,7 @@ class Bridge:
         """Gets the machine code of the tick ready, so that the first one is not late."""
         state, row, sample = self._binding.state, self._binding.row, self._sample
         rows, cursors = self._stream.rows, self._stream.cursors
-        self._before_step = direct(before_step, state, sample, row, 0)
+        self._before_step = direct(before_step, state, sample, row, 0, 0.0)
         self._after_step = direct(after_step, state, row, 0)
         self._publish = direct(publish, row, rows, cursors, 0, 0, 0, 0, 0)
 

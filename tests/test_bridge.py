@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from audit_cases import TAP, ScriptedDevice, recorded
+from audit_cases import TAP, ScriptedDevice, SlowClock, recorded
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -466,23 +466,6 @@ def test_error_of_the_users_own_code_stops_the_run_the_same_way(tmp_path: Path) 
 
 
 # --- time
-
-
-class SlowClock(SimulatedClock):
-    """A real clock's behaviour on a machine that stalls: some deadlines are skipped."""
-
-    is_lossless = False
-
-    def __init__(self, stalls: dict[int, int]) -> None:
-        super().__init__()
-        self._stalls = stalls
-        self._count = 0
-
-    def wait(self) -> tuple[int, int, int]:
-        skipped = self._stalls.get(self._count, 0)
-        self._count += 1
-        self._now += (1 + skipped) * self._period
-        return self._now, self._now, skipped
 
 
 def test_overruns_are_flagged_counted_and_pass_the_audit(tmp_path: Path) -> None:

@@ -93,7 +93,7 @@ def test_compiled_advance_equals_the_python_binding(name: str, substeps: int) ->
     binding = Binding(scene.model, scene.data, run.parameters)
     for k in range(len(samples)):
         for substep in range(substeps):
-            assert before_step(binding.state, samples[k : k + 1], binding.row, substep) == OK
+            assert before_step(binding.state, samples[k : k + 1], binding.row, substep, T) == OK
             method.step(scene.model, scene.data)
             assert after_step(binding.state, binding.row, substep) == OK
         assert binding.row[0].tobytes() == run.ticks[k].tobytes()
@@ -243,7 +243,7 @@ def test_wrench_of_the_weld_is_what_moves_the_tool() -> None:
     binding = Binding(model, data, run.parameters)
     jacobian = np.zeros((6, model.nv))
     for k in range(len(samples)):
-        assert before_step(binding.state, samples[k : k + 1], binding.row, 0) == OK
+        assert before_step(binding.state, samples[k : k + 1], binding.row, 0, T) == OK
         mujoco.mj_step(model, data)
         mujoco.mj_jacSite(model, data, jacobian[:3], jacobian[3:], model.site("grip").id)
         on_joints = data.qfrc_constraint.copy()
@@ -654,7 +654,7 @@ def test_ports_of_a_separate_arm_close_to_its_dissipation(method: str) -> None:
         scene.data.ctrl[0 if scene.model.actuator(0).name == "m" else -1] = 0.0
         scene.data.ctrl[scene.model.actuator_ctrladr[scene.model.actuator("m").id]] = math.sin(k)
         scene.data.qfrc_applied[6] = math.cos(0.1 * k)
-        assert before_step(binding.state, still, binding.row, 0) == OK
+        assert before_step(binding.state, still, binding.row, 0, T) == OK
         chosen.step(scene.model, scene.data)
         assert after_step(binding.state, binding.row, 0) == OK
         left -= 0.1 * (scene.data.qvel[6] - speed) ** 2

@@ -94,7 +94,11 @@ def _show_handle(state: NDArray[np.void], substep: int) -> None:
 
 @compiled
 def before_step(
-    state: NDArray[np.void], sample: NDArray[np.void], row: NDArray[np.void], substep: int
+    state: NDArray[np.void],
+    sample: NDArray[np.void],
+    row: NDArray[np.void],
+    substep: int,
+    elapsed: float,
 ) -> int:
     """Takes a device sample into the scene: the handle's pose, and its velocity as ``ctrl``.
 
@@ -102,6 +106,17 @@ def before_step(
     reaches in the last. The control of the coupling's actuators is the handle's velocity in the
     handle's own axes, R_hᵀ δh/T and R_hᵀ δφ_h/T: a mocap body has no velocity of its own. Where
     the wrench is applied and held, the control is the wrench of the tick before, in those axes.
+
+    Over a time t, the device's damper burns ∫ b v² >= b ‖δp‖²/t for every motion that ends δp away.
+    Where deadlines were missed t is longer than T, and T would count more than was burnt.
+
+    Args:
+        state: The bound state.
+        sample: One device sample.
+        row: The bound record.
+        substep: Which of the tick's.
+        elapsed: Time since the sample before it in s. One below T counts as T: that counts less
+            than was burnt, and an uneven time stamp must not count more.
 
     Returns:
         ``OK`` or ``BAD_SAMPLE``; in the latter case nothing was changed.
@@ -123,8 +138,9 @@ def before_step(
         s.device_energy += dot((w[0], w[1], w[2]), moved) + dot((w[3], w[4], w[5]), turned)
         if s.tick > s.ramp_start:
             # before the first tick and in a pause nobody knows how long the device took to move
-            s.device_burnt += s.device_damping / s.period * dot(moved, moved)
-            s.device_burnt += s.device_rotational_damping / s.period * dot(turned, turned)
+            interval = max(elapsed, s.period)
+            s.device_burnt += s.device_damping / interval * dot(moved, moved)
+            s.device_burnt += s.device_rotational_damping / interval * dot(turned, turned)
         store_vector(s.device_position, position)
         store_quaternion(s.device_quaternion, quaternion)
 
@@ -362,7 +378,8 @@ def simulate(
     s = state[0]
     for k in range(samples.size):
         for substep in range(s.substeps):
-            if before_step(state, samples[k : k + 1], row, substep) != OK:
+            # when the device was asked decides no record, only what the live loop's meter says
+            if before_step(state, samples[k : k + 1], row, substep, s.period) != OK:
                 return k
             advance(state)
             if after_step(state, row, substep) != OK:

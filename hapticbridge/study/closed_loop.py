@@ -240,11 +240,8 @@ def _run(
             next_sample(devices, motion, sample)
         elapsed = devices[0].period * intervals[k]
         for substep in range(s.substeps):
-            burnt = s.device_burnt
-            if before_step(state, sample, row, substep) != OK:
+            if before_step(state, sample, row, substep, elapsed) != OK:
                 return k
-            if elapsed != s.period:  # the kernel takes every tick to be one period long
-                s.device_burnt = burnt + (s.device_burnt - burnt) * s.period / elapsed
             advance(state)
             if after_step(state, row, substep) != OK:
                 return k

@@ -68,7 +68,7 @@ class ImplicitMass:
         parameters = run_parameters(
             scene, coupling, IMPLICIT, self._sample, period=period, felt=None
         )
-        self._scene = scene
+        self._scene, self._period = scene, period
         self._binding = Binding(scene.model, scene.data, parameters)
 
     def tick(self, handle: float) -> NDArray[np.void]:
@@ -79,7 +79,7 @@ class ImplicitMass:
         """
         self._sample["position"][0, 0] = handle
         state, row = self._binding.state, self._binding.row
-        if before_step(state, self._sample, row, 0) != OK:
+        if before_step(state, self._sample, row, 0, self._period) != OK:
             raise SceneError(f"the handle's position {handle!r} m is not finite")
         mujoco.mj_step(self._scene.model, self._scene.data)
         if after_step(state, row, 0) != OK:
