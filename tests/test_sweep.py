@@ -8,8 +8,11 @@ import functools
 import json
 import math
 import os
+import signal
+import socket
 import subprocess
 import sys
+import threading
 from collections import Counter, deque
 from collections.abc import Callable
 from concurrent.futures import BrokenExecutor, Executor, Future, ThreadPoolExecutor
@@ -23,6 +26,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from hapticbridge.errors import StudyError
+from hapticbridge.signals import holding_interrupts
 from hapticbridge.study.points import Point, grid, plain, point_key
 from hapticbridge.study.results import ResultFolder
 from hapticbridge.study.sweep import Chunk, _Shift, sweep
@@ -176,6 +180,7 @@ def test_a_sweep_that_was_killed_goes_on_and_computes_nothing_twice(
         program, capture_output=True, timeout=60, start_new_session=True, check=False
     )
     assert killed.returncode == code, killed.stderr
+    assert marker == "kill" or not killed.stderr
     folder = scratch / "parts"
     kept = len(parts(folder))
     assert 0 < kept < len(functions.COUNTED)
@@ -187,6 +192,39 @@ def test_a_sweep_that_was_killed_goes_on_and_computes_nothing_twice(
     assert sum(often.values()) - len(functions.COUNTED) <= len(functions.COUNTED) - kept
     assert sum(count > 1 for count in often.values()) <= 2 * (os.cpu_count() or 1)
     assert resumed.equals(serial(functions.counted, functions.COUNTED))
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
+def test_ctrl_c_while_workers_start_ends_them_without_a_word(scratch: Path) -> None:
+    (scratch / "start").touch()
+    program = [sys.executable, functions.__file__]
+    stopped = subprocess.run(
+        program, capture_output=True, timeout=60, start_new_session=True, check=False
+    )
+    assert not (scratch / "start").exists()
+    assert (stopped.returncode, stopped.stdout, stopped.stderr) == (77, b"", b"")
+    assert parts(scratch / "parts") == []
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
+def test_interrupts_are_held_for_a_while_and_then_arrive() -> None:
+    def is_held() -> bool:
+        return signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, ())
+
+    done, end = [], threading.Event()
+    other = threading.Thread(target=end.wait)  # takes the signal that the main thread holds back
+    other.start()
+    try:
+        with pytest.raises(KeyboardInterrupt), holding_interrupts():
+            assert is_held()
+            with holding_interrupts():
+                os.kill(os.getpid(), signal.SIGINT)
+            done.append("all of it")
+    finally:
+        end.set()
+        other.join()
+    assert done
+    assert not is_held()
 
 
 def test_a_worker_that_is_killed_once_costs_nothing(scratch: Path) -> None:
@@ -293,6 +331,20 @@ def test_parts_that_were_cut_changed_or_come_from_elsewhere_are_computed_again(
     fresh = computed(scratch) - before
     assert sum(fresh.values()) == 3
     assert set(lost) <= set(fresh)
+
+
+def test_what_a_killed_sweep_was_writing_is_removed_and_nothing_else(scratch: Path) -> None:
+    folder = scratch / "parts"
+    again = functools.partial(
+        sweep, functions.counted, functions.COUNTED, folder=folder, executor=Inline(), chunk=4
+    )
+    again()
+    kept = sorted(folder.iterdir())
+    (folder / f".draft-4711-{kept[0].name}").write_bytes(b"poi")
+    (folder / ".draft-4711-sweep.json").touch()
+    (folder / "my.draft-notes").touch()
+    again()
+    assert sorted(folder.iterdir()) == sorted([*kept, folder / "my.draft-notes"])
 
 
 def test_other_points_reuse_those_that_are_known(scratch: Path) -> None:
@@ -453,11 +505,18 @@ def test_what_is_not_installed_is_named_with_the_command_that_installs_it(
 
 
 def test_a_scheduler_that_does_not_answer_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("distributed")
+    """Nobody listens, there is no such protocol, or somebody listens and says nothing."""
+    distributed = pytest.importorskip("distributed")
     monkeypatch.setattr("hapticbridge.study.workers._PATIENCE", 0.2)
-    for address in ("tcp://127.0.0.1:1", "nonsense://x"):
-        with pytest.raises(StudyError, match="no dask scheduler answers"):
-            sweep(functions.bound, POINTS, scheduler=address)
+    # a client that was refused is given up after 10 s, with a traceback that nobody can catch
+    monkeypatch.setattr(distributed, "Client", None)
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        port = silent.getsockname()[1]
+        for address in ("tcp://127.0.0.1:1", "nonsense://x", f"tcp://127.0.0.1:{port}"):
+            with pytest.raises(StudyError, match="no dask scheduler answers") as refusal:
+                sweep(functions.bound, POINTS, scheduler=address)
+            assert address in str(refusal.value)
+            assert "()" not in str(refusal.value)
 
 
 def test_few_tasks_are_in_flight_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
