@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticbridge.audit import AuditReport, audit
 from hapticbridge.bridge import Bridge
 from hapticbridge.clock import SimulatedClock
 from hapticbridge.coupling import Coupling
@@ -187,3 +188,7 @@ class SlowClock(SimulatedClock):
 
     def now(self) -> int:
         return self._now + self._lateness
+
+
+def verdict_of(recording: Recording, folder: Path, **parts: Any) -> AuditReport:
+    return audit(rewritten(recording, folder / "tampered.mcap", **parts))
