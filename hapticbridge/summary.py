@@ -90,7 +90,7 @@ class Summary:
         """Reads the summary of a run out of the kernel's state and the loop's counters.
 
         Args:
-            state: ``kernel.state.STATE_DTYPE``, one element.
+            state: ``kernel.layout.STATE_DTYPE``, one element.
             parameters: Of the run.
             info: The device.
             method: How the tool was rendered.

@@ -22,7 +22,8 @@ from hapticbridge.device.handheld import STATE_DTYPE as DEVICE_DTYPE
 from hapticbridge.device.handheld import next_sample
 from hapticbridge.errors import StudyError
 from hapticbridge.jit import compiled_for_threads, direct
-from hapticbridge.kernel.state import STATE_DTYPE, Binding
+from hapticbridge.kernel.layout import STATE_DTYPE
+from hapticbridge.kernel.state import Binding
 from hapticbridge.kernel.step import OK, advance, after_step, before_step
 from hapticbridge.ledger import Ledger
 from hapticbridge.passivity.stability import decays
