@@ -191,6 +191,17 @@ SERVO = """
   <actuator>{actuator}</actuator>
 </mujoco>"""
 
+WALL = """
+<mujoco>
+  <option gravity="0 0 0"/>
+  <worldbody>
+    <geom type="box" size="0.01 0.1 0.1" pos="0.07 0 0"/>
+    <body name="tool"><freejoint/><geom type="sphere" size="0.01" mass="0.1"/>
+      <site name="grip"/></body>
+  </worldbody>
+</mujoco>"""
+"""A wall 5 cm before a ball."""
+
 
 def waved(count: int = 300) -> Any:
     """A hand that moves and turns about all axes."""

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 from audit_cases import ScriptedDevice, SlowClock
+from rendering_runs import WALL
 
 from hapticbridge.audit import AuditReport, audit
 from hapticbridge.bridge import Bridge
@@ -23,15 +24,7 @@ B = 2.0
 STEPS, STEP = 60, 2e-5
 """How often it steps into the spring, and again out of it, and how far in m."""
 
-TOUCHING = """
-<mujoco>
-  <option gravity="0 0 0"/>
-  <worldbody>
-    <geom type="box" size="0.01 0.1 0.1" pos="0.02 0 0"/>
-    <body name="tool"><freejoint/><geom type="sphere" size="0.01" mass="0.1"/>
-      <site name="grip"/></body>
-  </worldbody>
-</mujoco>"""
+TOUCHING = WALL.replace('pos="0.07 0 0"', 'pos="0.02 0 0"')
 
 
 def pushed(folder: Path, stiffness: float, clock: SlowClock) -> tuple[Summary, AuditReport]:

@@ -16,6 +16,7 @@ from rendering_runs import (
     SERVO,
     SLOT,
     TURNED_TOOL,
+    WALL,
     Rotor,
     rendered,
 )
@@ -105,17 +106,6 @@ def test_geometry_decides_for_a_massless_tool_and_not_behind_a_coupling(
         assert f"{limit:.3g} m" in report.conditions[0]
     if verdict == "active":
         assert report.port == "device"
-
-
-WALL = """
-<mujoco>
-  <option gravity="0 0 0"/>
-  <worldbody>
-    <geom type="box" size="0.01 0.1 0.1" pos="0.07 0 0"/>
-    <body name="tool"><freejoint/><geom type="sphere" size="0.01" mass="0.1"/>
-      <site name="grip"/></body>
-  </worldbody>
-</mujoco>"""
 
 
 @pytest.mark.parametrize("is_moved", [False, True])
