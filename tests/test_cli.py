@@ -227,6 +227,18 @@ def test_trip_is_exit_code_3(call: Called, monkeypatch: pytest.MonkeyPatch) -> N
     assert "safety trip: tick 7: [/b]" in err
 
 
+@pytest.mark.parametrize("where", ["tyro.cli", "hapticbridge.cli.stability.run_map"])
+def test_ctrl_c_is_one_word_and_exit_code_130(
+    where: str, call: Called, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(*_arguments: object, **_named: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(where, interrupted)
+    code, out, err = call("stability", "rate")
+    assert (code, out, err.strip()) == (130, "", "interrupted")
+
+
 def test_active_and_invalid_recordings_are_exit_code_1(
     call: Called, run_file: Path, tmp_path: Path
 ) -> None:
