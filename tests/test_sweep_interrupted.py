@@ -119,18 +119,19 @@ def test_interrupts_are_held_for_a_while_and_then_arrive() -> None:
     def is_held() -> bool:
         return signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, ())
 
-    done, end = [], threading.Event()
-    other = threading.Thread(target=end.wait)  # takes the signal that the main thread holds back
+    def interrupt() -> None:
+        gate.wait()
+        signal.raise_signal(signal.SIGINT)  # this thread takes what the main thread holds back
+
+    done, gate = [], threading.Event()
+    other = threading.Thread(target=interrupt)
     other.start()
-    try:
-        with pytest.raises(KeyboardInterrupt), holding_interrupts():
-            assert is_held()
-            with holding_interrupts():
-                os.kill(os.getpid(), signal.SIGINT)
-            done.append("all of it")
-    finally:
-        end.set()
-        other.join()
+    with pytest.raises(KeyboardInterrupt), holding_interrupts():
+        assert is_held()
+        with holding_interrupts():
+            gate.set()
+            other.join()
+        done.append("all of it")
     assert done
     assert not is_held()
 
