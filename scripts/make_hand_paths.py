@@ -318,6 +318,32 @@ PATHS = {
         axes=(1, 1, 0, 0, 0, 1),
         seed=8,
     ),
+    # Close the pliers until the wire is just not touched, hold, crush it, hold, let go; close them
+    # again, less far: they meet the wire later than before.
+    "pliers": HandPath(
+        swinging(
+            0.1,
+            Reach(0.4, 1.2, degrees=(0, 0, -5.3)),
+            Reach(2.2, 1.6, degrees=(0, 0, -4.2)),
+            Reach(4.4, 1.1, degrees=(0, 0, 9.5)),
+            Reach(5.6, 0.9, degrees=(0, 0, -8.5)),
+            Reach(6.9, 0.9, degrees=(0, 0, 8.5)),
+        ),
+        axes=(1, 1, 1, 1, 1, 1),
+        seed=9,
+    ),
+    # Push the key in past three pins, on to 1 mm beyond its shoulder (2.4 N), turn it by 92
+    # degrees, hold it at the stop, turn it back, pull it out.
+    "lock": HandPath(
+        reaching(
+            Reach(0.4, 2.2, (-17.0, 0, 0)),
+            Reach(2.9, 1.4, degrees=(-92.0, 0, 0)),
+            Reach(4.8, 1.2, degrees=(92.0, 0, 0)),
+            Reach(6.1, 1.6, (17.0, 0, 0)),
+        ),
+        axes=(1, 1, 1, 1, 1, 1),
+        seed=10,
+    ),
 }
 """The path of every scene. Each reaching motion adds up to zero, so that the hand ends where it
 began."""

@@ -23,6 +23,8 @@ HANDS = [
     ("peg_in_hole", {}, -0.045),
     ("round_peg", {}, 0.0),
     ("round_peg", {}, -0.045),
+    ("pliers", {}, 0.0),
+    ("lock", {}, 0.0),
 ]
 """Scene, parameters, and by how much the hand goes up in m before it is random: into the hole."""
 
