@@ -176,13 +176,13 @@ def test_a_wire_that_is_too_strong_holds() -> None:
 # --- lock -----------------------------------------------------------------------------------------
 
 SEATED = -0.0165  # m, of the hand: half a millimetre beyond the key's shoulder
-SHARE = 15.0  # degrees that a hand turns to try; the lock lets it or not
+TRIED = 15.0  # degrees that a hand turns to try; the lock lets it or not
 
 
 def tried(pushed: float = SEATED, **values: float) -> tuple[float, float]:
     """Pushes the key in, turns the hand by 15 degrees; returns plug in degrees, torque in N m."""
     model, data = scene_with("lock", **values)
-    still, turned = (0.0, 0.0, 0.0), (-np.radians(SHARE), 0.0, 0.0)
+    still, turned = (0.0, 0.0, 0.0), (-np.radians(TRIED), 0.0, 0.0)
     place = (pushed, 0.0, 0.0)
     run = moved_through(
         model, data, [(1.0, place, still), (0.2, place, still), (0.7, place, turned)]
@@ -241,14 +241,14 @@ def test_wrong_key_is_stopped_before_ten_degrees_by_one_pair_of_pins(error: floa
 @pytest.mark.parametrize("error", [-0.1e-3, 0.0, 0.1e-3])
 def test_key_within_the_tolerance_turns(error: float) -> None:
     plug, torque = tried(bitting_error=error)
-    assert plug == pytest.approx(SHARE, abs=0.5)
+    assert plug == pytest.approx(TRIED, abs=0.5)
     assert torque < 0.02
 
 
 def test_wider_clearance_forgives_more() -> None:
     wide, _ = tried(bitting_error=0.2e-3, clearance=0.15e-3)
     narrow, _ = tried(bitting_error=0.2e-3, clearance=0.05e-3)
-    assert wide == pytest.approx(SHARE, abs=0.5)
+    assert wide == pytest.approx(TRIED, abs=0.5)
     assert narrow < 2.0
 
 
