@@ -1,4 +1,4 @@
-"""The scenes of hand tools: each does its task on its own hand path, and bears a random hand."""
+"""The scenes of hand tools: each does its task on its own hand path."""
 
 from __future__ import annotations
 
@@ -11,31 +11,23 @@ from model_runs import B_R as ROTATIONAL_DAMPING
 from model_runs import K_R as ROTATIONAL_STIFFNESS
 from model_runs import (
     MODELS,
-    Array,
     B,
     K,
-    Run,
     moved_through,
     run_of_own_path,
     scene_with_handle,
     spec_of,
 )
-from scipy.spatial.transform import Rotation
+from tool_runs import moment_about_axis, windows_of_blows
 
 from hapticbridge.audit import audit
 from hapticbridge.bridge import Bridge
 from hapticbridge.clock import SimulatedClock
 from hapticbridge.coupling import Coupling
-from hapticbridge.device import Motion, SimulatedDevice
-from hapticbridge.rendering import METHODS
 from hapticbridge.scene import load_scene
-from hapticbridge.study.closed_loop import ClosedLoop
 
 SCENES = ("drawer", "hammer", "open_wrench", "ratchet")
 COUPLING = Coupling(K, B, ROTATIONAL_STIFFNESS, ROTATIONAL_DAMPING)
-
-SEEDS = 20
-FORCE_LIMIT = 10.0  # of the simulated device, in N
 
 
 @pytest.mark.parametrize("name", SCENES)
@@ -56,40 +48,6 @@ def test_task_in_the_bridge_is_passive_and_without_a_warning(name: str, tmp_path
     assert report.verdict == "passive"
     # the bridge and the run without the package end alike: what follows is true of both
     assert scene.data.qpos == pytest.approx(run_of_own_path(name).joints[-1], abs=2e-4)
-
-
-def random_hand(seed: int) -> Motion:
-    """Smooth motion of at most 3 cm and 45 degrees from its start, 0.2 to 1 Hz, for 5 s."""
-    generator = np.random.default_rng(seed)
-    times = np.linspace(0.0, 5.0, 501)
-    motion = np.zeros((len(times), 6))
-    for axis in range(6):
-        frequencies = generator.uniform(0.2, 1.0, 6)
-        phases = generator.uniform(0.0, 2 * np.pi, 6)
-        motion[:, axis] = np.sin(2 * np.pi * np.outer(times, frequencies) + phases).sum(axis=1)
-    start = np.clip(2 * times, 0.0, 1.0)
-    motion = (motion - motion[0]) * (start**3 * (10 - 15 * start + 6 * start**2))[:, None]
-    motion[:, :3] *= 0.03 / np.linalg.norm(motion[:, :3], axis=1).max()
-    motion[:, 3:] *= np.radians(45.0) / np.linalg.norm(motion[:, 3:], axis=1).max()
-    turn = Rotation.from_rotvec(motion[:, 3:]).as_quat(scalar_first=True)
-    return Motion(times, motion[:, :3], turn)
-
-
-@pytest.mark.parametrize("name", SCENES)
-def test_twenty_random_hands_stay_finite_passive_and_below_the_force_limit(name: str) -> None:
-    loop = ClosedLoop(load_scene(name))
-    met = 0
-    for seed in range(SEEDS):
-        device = SimulatedDevice(path=random_hand(seed))
-        outcome = loop.run(device, COUPLING, METHODS["implicit"], ticks=5000, keep_records=True)
-        assert outcome.ticks == 5000, seed
-        assert np.isfinite(outcome.records["wrench_on_tool"]).all(), seed
-        assert outcome.environment in {"strict", "within slack"}, seed
-        assert outcome.fault is None, seed
-        assert outcome.peak_force < FORCE_LIMIT, seed
-        met += bool(outcome.records["contacts"].any())
-    # otherwise nothing but the coupling was tried; a drawer is held by its friction most times
-    assert met >= (1 if name == "drawer" else 10)
 
 
 # --- drawer ---------------------------------------------------------------------------------------
@@ -130,23 +88,9 @@ BLOWS = 7
 HAMMER, DRIVEN = 0.24, 0.051  # in kg: head and handle, nail and the wood that moves with it
 
 
-def blow_windows() -> list[tuple[int, int]]:
-    """The last tick before each impact, and the tick in which the nail has stopped."""
-    run = run_of_own_path("hammer")
-    depth = -run.joints[:, 0]
-    starts = np.flatnonzero(run.touched["nail"][1:] & ~run.touched["nail"][:-1]).tolist()
-    ends = [*starts[1:], len(depth) - 1]
-    # it stops within 10 µm of where it stays until the next blow: beyond that it only creeps
-    stops = [
-        start + int(np.argmax(depth[start:end] > depth[end] - 1e-5))
-        for start, end in zip(starts, ends, strict=True)
-    ]
-    return list(zip(starts, stops, strict=True))
-
-
 def test_seven_blows_drive_the_nail_deeper_one_by_one() -> None:
     depth = -run_of_own_path("hammer").joints[:, 0]
-    windows = blow_windows()
+    windows = windows_of_blows(run_of_own_path("hammer"))
     assert len(windows) == BLOWS
     advances = [depth[stop] - depth[start] for start, stop in windows]
     assert all(0.7e-3 < advance < 1.8e-3 for advance in advances)
@@ -160,7 +104,7 @@ def test_nail_goes_in_by_what_the_energy_balance_of_the_blows_says() -> None:
     friction = spec_of("hammer").compile().dof_frictionloss[0]
     height = run.joints[:, 3]
     work = left = 0.0
-    for start, stop in blow_windows():
+    for start, stop in windows_of_blows(run_of_own_path("hammer")):
         advance = run.joints[start, 0] - run.joints[stop, 0]
         speed = (height[start] - height[start - 1]) / 1e-3
         impact = 0.5 * HAMMER * DRIVEN / (HAMMER + DRIVEN) * speed**2
@@ -187,12 +131,6 @@ def test_a_push_within_ten_newtons_does_not_drive_the_nail() -> None:
 # --- ratchet --------------------------------------------------------------------------------------
 
 TOOTH = 2 * np.pi / 24
-
-
-def moment_about_axis(run: Run) -> Array:
-    """Moment of the coupling's wrench about the world's z axis, in N m."""
-    moment: Array = np.cross(run.tool, run.force)[:, 2] + run.torque[:, 2]
-    return moment
 
 
 def test_pawl_clicks_three_times_a_stroke_on_the_free_way() -> None:
