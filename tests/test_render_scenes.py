@@ -29,8 +29,7 @@ def test_a_scene_is_drawn_or_the_missing_renderer_is_named(tmp_path: Path) -> No
     done = render("virtual_wall", "--out", tmp_path, "--gallery", tmp_path / "all.png")
     if done.returncode:
         assert done.returncode == 2
-        assert done.stderr.startswith("nothing can be drawn off-screen here: ")
-        assert "libosmesa6" in done.stderr
+        assert "works here, so nothing can be drawn off-screen; on Debian: apt" in done.stderr
         return
     assert done.stdout in {f"drawn with {name}: virtual_wall\n" for name in ("egl", "osmesa")}
     with Image.open(tmp_path / "virtual_wall.png") as picture:
@@ -47,7 +46,7 @@ def test_a_scene_is_drawn_or_the_missing_renderer_is_named(tmp_path: Path) -> No
 def test_a_renderer_that_does_not_work_is_named_in_one_sentence(tmp_path: Path) -> None:
     done = render("virtual_wall", "--out", tmp_path, MUJOCO_GL="disable")
     assert done.returncode == 2
-    assert "MUJOCO_GL=disable does not work" in done.stderr
+    assert "MUJOCO_GL=disable does not work here, so" in done.stderr
     assert done.stderr.count("\n") == 1
     assert not list(tmp_path.iterdir())
 
