@@ -23,7 +23,7 @@ ROOT = Path(__file__).resolve().parents[1]
 WIDTH, HEIGHT = 640, 400
 """Of a scene's picture, in pixels."""
 
-COLUMNS, GALLERY_WIDTH, GAP, LABEL = 3, 800, 6, 22
+COLUMNS, GALLERY_WIDTH, GAP, LABEL = 4, 800, 6, 22
 """Of the picture of all scenes: pictures in a row; width, space between and height of a name, in
 pixels."""
 

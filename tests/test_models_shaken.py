@@ -29,9 +29,14 @@ HANDS: list[tuple[str, dict[str, float], float, int]] = [
     ("hammer", {}, 0.0, 1000),
     ("open_wrench", {}, 0.0, 30000),
     ("ratchet", {}, 0.0, 30000),
+    ("pliers", {}, 0.0, 2000),
+    ("lock", {}, 0.0, 2000),
+    ("screwdriver", {}, -0.002, 30000),
+    ("hex_key", {}, -0.002, 30000),
 ]
-"""Scene, parameters, by how much the hand goes up in m before it is random (into the hole), and
-how many ticks of the twenty runs there is a contact at least: otherwise nothing was tried."""
+"""Scene, parameters, by how much the hand goes up in m before it is random (into the hole, or to
+press a tool that starts seated), and how many ticks of the twenty runs there is a contact at least:
+otherwise nothing was tried."""
 
 PARAMETERS = [
     (name, parameter)

@@ -11,8 +11,16 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
-from model_runs import MODELS, K, Run, T, moved_through, run_along_own_path, scene_with_handle
-from tool_runs import moment_about_axis
+from model_runs import (
+    MODELS,
+    K,
+    Run,
+    T,
+    moment_about_axis,
+    moved_through,
+    run_along_own_path,
+    scene_with_handle,
+)
 
 from hapticbridge.scene.parameters import apply_parameters
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -13,12 +12,14 @@ from model_runs import (
     MODELS,
     B,
     K,
+    Run,
+    moment_about_axis,
     moved_through,
     run_of_own_path,
     scene_with_handle,
     spec_of,
+    swung,
 )
-from tool_runs import moment_about_axis, windows_of_blows
 
 from hapticbridge.audit import audit
 from hapticbridge.bridge import Bridge
@@ -116,6 +117,19 @@ BLOWS = 7
 HAMMER, DRIVEN = 0.24, 0.051  # in kg: head and handle, nail and the wood that moves with it
 
 
+def windows_of_blows(run: Run) -> list[tuple[int, int]]:
+    """The last tick before each impact on the nail, and the tick in which the nail has stopped."""
+    depth = -run.joints[:, 0]
+    starts = np.flatnonzero(run.touched["nail"][1:] & ~run.touched["nail"][:-1]).tolist()
+    ends = [*starts[1:], len(depth) - 1]
+    # it stops within 10 µm of where it stays until the next blow: beyond that it only creeps
+    stops = [
+        start + int(np.argmax(depth[start:end] > depth[end] - 1e-5))
+        for start, end in zip(starts, ends, strict=True)
+    ]
+    return list(zip(starts, stops, strict=True))
+
+
 def test_seven_blows_drive_the_nail_deeper_one_by_one() -> None:
     depth = -run_of_own_path("hammer").joints[:, 0]
     windows = windows_of_blows(run_of_own_path("hammer"))
@@ -193,17 +207,6 @@ def test_free_way_costs_a_small_part_of_the_drive() -> None:
 # --- open wrench ----------------------------------------------------------------------------------
 
 SLACKENED = np.radians(65.0)
-
-
-def swung(*angles: float) -> list[tuple[float, tuple[float, ...], tuple[float, ...]]]:
-    """Poses of a handle 100 mm from the nut, from angle to angle in degrees, half a second each."""
-    poses: list[tuple[float, tuple[float, ...], tuple[float, ...]]] = []
-    for begin, end in pairwise((0.0, *angles)):
-        # in short chords, because moved_through goes straight from pose to pose
-        for angle in np.radians(np.linspace(begin, end, 11)[1:]):
-            offset = (0.1 * (np.cos(angle) - 1), 0.1 * np.sin(angle), 0.0)
-            poses.append((0.05, offset, (0.0, 0.0, float(angle))))
-    return poses
 
 
 def test_nut_turns_by_a_sixth_and_stays_while_the_wrench_is_seated_again() -> None:
