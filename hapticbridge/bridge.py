@@ -120,9 +120,11 @@ class Bridge:
         self._scales = scale, scale if force_scale is None else force_scale
         self._method = method_named(method)
         self._substeps = checked_substeps(substeps)
-        self.coupling = coupling or default_coupling(
-            self.device.info, self.period, *self._scales, self.laws
+        step = self.period / self._substeps
+        self.coupling = coupling or self._method.rendered(
+            default_coupling(self.device.info, self.period, *self._scales, self.laws), step
         )
+        self._used = self._method.used(self.coupling, step)
         self._limits = limits_for(self.device.info, limits)
         refuse_unknowing(self._method, is_real=self.device.info.is_real, i_know=i_know)
         self._contact_stiffness = contact_stiffness_of(
@@ -333,7 +335,7 @@ class Bridge:
         self.scene.claim()
         resources.callback(self.scene.release)
         scene, clock, info = self.scene, self.clock, self.device.info
-        felt = prepare(scene, self.coupling, self.period, self._substeps, self._method)
+        felt = prepare(scene, self._used, self.period, self._substeps, self._method)
         self._sample[:] = self.device.start(self.period)
         self.parameters = self._parameters(felt)
         self._binding = Binding(scene.model, scene.data, self.parameters)
@@ -370,7 +372,7 @@ class Bridge:
             grip=self.scene.grip,
             period=self.period,
             substeps=self._substeps,
-            coupling=self.coupling,
+            coupling=self._used,
             scale=self._scales[0],
             force_scale=self._scales[1],
             axes=self._axes,

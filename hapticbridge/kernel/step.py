@@ -22,6 +22,12 @@ from hapticbridge.kernel.handle import (
     store_vector,
     vector_of,
 )
+from hapticbridge.kernel.lossless import (
+    apply_carried,
+    finish_lossless,
+    implicit_half,
+    is_near,
+)
 from hapticbridge.kernel.meter import (
     add_coupling_work,
     judge_environment,
@@ -48,16 +54,17 @@ from hapticbridge.pose import (
 )
 
 # flags as plain integers: the compiler cannot read an enumeration
-FORCE_LIMITED, RAMPING, CONTACT, TRIP = 4, 16, 64, 512
+FORCE_LIMITED, RAMPING, CONTACT, TRIP, MIDPOINT = 4, 16, 64, 512, 1024
 
 OK, BAD_SAMPLE, BAD_RESULT = 0, 1, 2
 """What a kernel function returns: go on, the device's sample is not finite, the simulation's
 result is not finite."""
 
-COUPLED, HELD, WELD, DIRECT = 0, 1, 2, 3
+COUPLED, HELD, WELD, DIRECT, LOSSLESS = 0, 1, 2, 3, 4
 """How the wrench reaches the tool (``scheme``): by the coupling's actuators, which compute it while
 MuJoCo steps; by the same actuators as the wrench of the tick before, held; by an equality
-constraint; or not at all, because the tool has no mass and is where the handle is."""
+constraint; not at all, because the tool has no mass and is where the handle is; or half by the
+actuators and half carried over from the step before (``kernel.lossless``)."""
 
 LARGEST_CONTROL = 1e10
 """mjMAXVAL, in N and N m. Beyond it the run has diverged anyway."""
@@ -87,6 +94,8 @@ def _show_handle(state: NDArray[np.void], substep: int) -> None:
         store_vector(ctrl[0:3], rotated(to_handle, (w[0], w[1], w[2])))
         store_vector(ctrl[3:6], rotated(to_handle, (w[3], w[4], w[5])))
         return
+    if s.scheme == LOSSLESS:
+        apply_carried(state)
     rate = 1.0 / s.period
     store_vector(ctrl[0:3], scaled(rate, rotated(to_handle, vector_of(s.handle_step))))
     store_vector(ctrl[3:6], scaled(rate, rotated(to_handle, vector_of(s.handle_turn))))
@@ -234,8 +243,13 @@ def _wrench_of_step(
     Brings the tool's pose and, at the end of the tick, the energies up to date on the way.
     """
     s = state[0]
-    applied = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
-    if s.scheme == WELD:
+    applied = half = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    near = False
+    if s.scheme == LOSSLESS:  # while everything is still as the step had it
+        near = is_near(state)
+        if s.is_midpoint:
+            half = implicit_half(state)
+    elif s.scheme == WELD:
         applied = weld_wrench(state)  # in the Jacobians of the step's start, as the step had them
     elif s.scheme == DIRECT:
         applied = balance_contacts(state)
@@ -249,11 +263,16 @@ def _wrench_of_step(
     orientation = canonical(quaternion_of(floats(s.site_xquat + 32 * grip, 4)))
     moved = subtract(position, vector_of(s.tool_position))
     turned = rotation_between(quaternion_of(s.tool_quaternion), orientation)
-    if s.scheme <= HELD:
+    if s.has_law:
         handle = (vector_of(s.handle_position), quaternion_of(s.handle_quaternion))
         if not is_last:
             handle = _handle_in_scene(state)
         applied = _law(state, handle, (position, orientation), moved, turned)
+        if s.scheme == LOSSLESS:
+            torque = finish_lossless(
+                state, applied[0], applied[1], half, near, orientation, moved, turned
+            )
+            applied = applied[0], torque
     store_vector(s.tool_position, position)
     store_quaternion(s.tool_quaternion, orientation)
     return applied[0], applied[1], moved, turned
@@ -264,7 +283,7 @@ def _record(state: NDArray[np.void], row: NDArray[np.void]) -> None:
     """Copies what the tick computed into its record."""
     s, r = state[0], row[0]
     r.flags = s.flags
-    r.contacts = ints(s.ncon, 1)[0]
+    r.contacts = s.active_contacts
     # without islands MuJoCo counts its iterations as those of island 0
     islands = max(ints(s.nisland, 1)[0], 1)
     iterations = ints(s.solver_niter, min(islands, 20))
@@ -299,6 +318,7 @@ def after_step(state: NDArray[np.void], row: NDArray[np.void], substep: int) -> 
     is_last = substep + 1 == s.substeps
     if s.laws == 1 and not is_last:
         return OK
+    was_midpoint = s.is_midpoint != 0
     force, torque, moved, turned = _wrench_of_step(state, substep, is_last)
     add_coupling_work(state, force, torque, moved, turned)
     if s.laws > 1:
@@ -317,7 +337,7 @@ def after_step(state: NDArray[np.void], row: NDArray[np.void], substep: int) -> 
     if not is_last:
         return OK
     judge_environment(state, moved, turned)
-    s.flags = 0
+    s.flags = MIDPOINT if was_midpoint else 0
     square = dot(force, force) + dot(torque, torque)
     # MuJoCo ignores a control beyond its limit, so a wrench that is to be applied must stay below
     if not math.isfinite(square + s.environment_energy) or (
@@ -328,7 +348,9 @@ def after_step(state: NDArray[np.void], row: NDArray[np.void], substep: int) -> 
             s.wrench_on_device[i] = 0.0
         return BAD_RESULT
     _render(state, force, torque)
-    if ints(s.ncon, 1)[0] > 0:
+    if s.scheme != LOSSLESS:  # there a contact may be near without a force
+        s.active_contacts = ints(s.ncon, 1)[0]
+    if s.active_contacts > 0:
         s.flags |= CONTACT
     s.peak_force = max(s.peak_force, norm(force))
     s.peak_torque = max(s.peak_torque, norm(torque))

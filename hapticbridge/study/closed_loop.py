@@ -181,6 +181,7 @@ class ClosedLoop:
             if knock.shape != (6,):
                 raise StudyError(f"knock has shape {knock.shape}; it must be 6 numbers")
         scene = self.scene
+        coupling = method.used(coupling, period / substeps)
         felt = prepare(scene, coupling, period, substeps, method, warns=False)
         is_even = timing is None or timing.is_even
         sample = np.zeros(1, SAMPLE_DTYPE)
