@@ -17,9 +17,9 @@ import mujoco
 from hapticbridge.arguments import Arguments
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import DeviceError, SceneError, choices
+from hapticbridge.kernel.lossless import REACH
 from hapticbridge.kernel.parameters import RunParameters, checked_substeps
 from hapticbridge.kernel.state import WELD_NAME
-from hapticbridge.kernel.lossless import REACH
 from hapticbridge.kernel.step import COUPLED, DIRECT, HELD, LOSSLESS, WELD
 from hapticbridge.scene import Scene
 from hapticbridge.scene.contact_check import warn_of_contacts
@@ -99,7 +99,6 @@ class Method:
         k, b = coupling.stiffness, coupling.damping
         kr, br = coupling.rotational_stiffness, coupling.rotational_damping
         return (b, k, b + k * more), (br, kr, br + kr * more)
-
 
     def used(self, coupling: Coupling, timestep: float) -> Coupling:
         """Returns the coupling whose law and gains make a tool feel like the one asked for.

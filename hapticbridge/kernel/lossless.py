@@ -1,8 +1,8 @@
-"""The lossless coupling: half of the wrench solved implicitly, half carried over from the last step.
+"""The lossless coupling: half of the wrench solved implicitly, half carried over.
 
 With K/2 and B'/2 in MuJoCo's implicit step and the other half of the last wrench applied, a tool
-away from contact keeps the midpoint rule's energy balance to rounding, and is second order. MuJoCo's
-velocity u is then half a wrench late; the velocity whose energy is balanced is
+away from contact keeps the midpoint rule's energy balance to rounding, and is second order.
+MuJoCo's velocity u is then half a wrench late; the velocity whose energy is balanced is
 
     v_k = u_k + (T/2) M⁻¹ [2 J_kᵀ r_k − c(q_k, u_k) + p_k],      S_k = ½ v_kᵀ M v_k + potential
 
@@ -12,8 +12,8 @@ passive and applied forces. In the step after it
     qfrc_applied = J_kᵀ r_k + c(q_k, u_k) − c(q_k, v_k)
 
 puts the bias at v where MuJoCo takes it at u. In contact half of a wrench that is a step late would
-create energy, so the tool changes over to the implicit form before it touches, and back after it has
-been free for a while; both ways keep S.
+create energy, so the tool changes over to the implicit form, with the same B', before it touches,
+and back after it has been free for a while; both ways keep S.
 
 The trees that the tool does not belong to are MuJoCo's alone: for them v = u.
 """
@@ -54,10 +54,10 @@ from hapticbridge.pose import (
 LIMIT_JOINT = 3  # mjtConstraint as a plain integer: the compiler reads no enumeration
 
 HOLD_TICKS = 5
-"""Ticks without anything near before the tool is lossless again, no unit. In twelve random hands on a
-wall 5 and 20 changed over equally often, in a peg's hole 17 and 10 times in 5 s; the largest jump of
-the wrench is that of the implicit form with both. More keeps the implicit form's damping longer after
-a contact: tapping on a wall errs by 33 µm at 5 ticks and by 48 µm at 20."""
+"""Ticks without anything near before the tool is lossless again, no unit. In twelve random hands on
+a wall 5 and 20 changed over equally often, in a peg's hole 17 and 10 times in 5 s; the largest jump
+of the wrench is that of the implicit form with both. More keeps the implicit form's damping longer
+after a contact: tapping on a wall errs by 33 µm at 5 ticks and by 48 µm at 20."""
 
 REACH = 5e-4
 """Distance in m at which something is near: how far a tool at 0.5 m/s comes in a tick of 1 ms. Less
@@ -132,9 +132,7 @@ def midpoint_torque(state: NDArray[np.void], tool: Quaternion, turned: Vector) -
     turn = (s.handle_turn[0], s.handle_turn[1], s.handle_turn[2])
     handles = scaled(0.5, add(rotated(to_after, turn), rotated(to_before, turn)))
     rate = (s.rotational_damping + 0.5 * s.period * s.rotational_stiffness) / s.period
-    spring = scaled(
-        0.5 * s.rotational_stiffness, add(after, (before[0], before[1], before[2]))
-    )
+    spring = scaled(0.5 * s.rotational_stiffness, add(after, (before[0], before[1], before[2])))
     damper = scaled(rate, subtract(handles, rotated(to_after, turned)))
     return rotated(tool, add(spring, damper))
 
@@ -162,21 +160,22 @@ def is_near(state: NDArray[np.void]) -> bool:
     Contacts within ``REACH`` are there without a force, because the geoms' gap says so.
     """
     s = state[0]
-    found, s.active_contacts = s.is_never_free != 0, 0
+    found = bool(s.is_never_free)
+    s.active_contacts = 0
     contacts = pointer_at(s.contact)
     for c in range(ints(s.ncon, 1)[0]):
         contact = contacts + s.contact_size * c
         s.active_contacts += ints(contact + s.contact_row, 1)[0] >= 0
         for geom in ints(contact + s.contact_geoms, 2):
             # a flex is no geom
-            found = found or geom < 0 or ints(s.geom_in_tree, s.ngeom)[geom] != 0
+            found = found or geom < 0 or bool(ints(s.geom_in_tree, s.ngeom)[geom])
     count = ints(s.nefc, 1)[0]
     kinds, ids = ints(pointer_at(s.efc_type), count), ints(pointer_at(s.efc_id), count)
     for row in range(count):
         if kinds[row] == LIMIT_TENDON:
             found = True
         if kinds[row] == LIMIT_JOINT:
-            found = found or ints(s.joint_in_tree, s.njnt)[ids[row]] != 0
+            found = found or bool(ints(s.joint_in_tree, s.njnt)[ids[row]])
     return found
 
 

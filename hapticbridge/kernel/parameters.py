@@ -107,8 +107,8 @@ class RunParameters:
             )
         if self.scheme == LOSSLESS and self.substeps != 1:
             raise HapticBridgeError(
-                f"substeps is {self.substeps!r}; a lossless coupling carries half of a tick's wrench "
-                "over to the next, so it must be 1"
+                f"substeps is {self.substeps!r}; a lossless coupling carries half of a tick's "
+                "wrench over to the next, so it must be 1"
             )
         if self.ramp_ticks < 0:
             raise HapticBridgeError(f"ramp_ticks is {self.ramp_ticks}; it must be >= 0")
