@@ -22,7 +22,7 @@ from hapticbridge.device.handheld import STATE_DTYPE as DEVICE_DTYPE
 from hapticbridge.device.handheld import next_sample
 from hapticbridge.errors import StudyError
 from hapticbridge.jit import compiled_for_threads, direct
-from hapticbridge.kernel.parameters import RunParameters
+from hapticbridge.kernel.parameters import RunParameters, checked_substeps
 from hapticbridge.kernel.state import STATE_DTYPE, Binding
 from hapticbridge.kernel.step import OK, advance, after_step, before_step
 from hapticbridge.ledger import Ledger
@@ -181,7 +181,7 @@ class ClosedLoop:
             if knock.shape != (6,):
                 raise StudyError(f"knock has shape {knock.shape}; it must be 6 numbers")
         scene = self.scene
-        coupling = method.used(coupling, period / substeps)
+        coupling = method.used(coupling, period / checked_substeps(substeps, StudyError))
         felt = prepare(scene, coupling, period, substeps, method, warns=False)
         is_even = timing is None or timing.is_even
         sample = np.zeros(1, SAMPLE_DTYPE)
