@@ -19,8 +19,8 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.errors import DeviceError, SceneError, choices
 from hapticbridge.kernel.lossless import REACH
 from hapticbridge.kernel.parameters import RunParameters, checked_substeps
+from hapticbridge.kernel.scheme import COUPLED, DIRECT, HELD, LOSSLESS, WELD
 from hapticbridge.kernel.state import WELD_NAME
-from hapticbridge.kernel.step import COUPLED, DIRECT, HELD, LOSSLESS, WELD
 from hapticbridge.scene import Scene
 from hapticbridge.scene.contact_check import warn_of_contacts
 from hapticbridge.scene.methods import check_massless_tool, check_metered
@@ -40,7 +40,7 @@ class Method:
         about: What it is, in one sentence.
         hazard: What it may do on a real device, in one sentence; empty where nothing more than the
             device condition is to be said.
-        scheme: How the wrench reaches the tool, as the kernel counts (``kernel.step.COUPLED`` …).
+        scheme: How the wrench reaches the tool, as the kernel counts (``kernel.scheme.COUPLED`` …).
         integrator: MuJoCo's, by the name that MJCF gives it.
         discretization: How the coupling's damper is discretised, as the bounds call it; ``none``
             where no coupling law gives the wrench.
@@ -340,7 +340,7 @@ def prepare(
     scene.set_reach(REACH if method.scheme == LOSSLESS else 0.0)
     if warns and method.scheme in (COUPLED, LOSSLESS):
         warn_of_contacts(scene.model, scene.grip, scene.path)
-    scene.set_gains(*method.gains(coupling, period))
+    scene.set_gains(*method.gains(method.used(coupling, period / substeps), period))
     felt = measured_weld(scene.model, scene.grip) if method.scheme == WELD else None
     scene.reset()
     return felt
