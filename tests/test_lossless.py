@@ -67,7 +67,7 @@ def scene_of(xml: str, folder: Path) -> Scene:
 def bound(scene: Scene, method: str, asked: Coupling, period: float) -> Binding:
     """Returns a kernel bound to a scene at its start, rendering what is asked for."""
     used = METHODS[method].used(asked, period)
-    prepare(scene, used, period, 1, METHODS[method], warns=False)
+    prepare(scene, asked, period, 1, METHODS[method], warns=False)
     parameters = RunParameters(
         grip=scene.grip,
         period=period,
@@ -311,7 +311,7 @@ def test_work_of_an_applied_force_is_metered_and_balanced(tmp_path: Path) -> Non
     for k in range(1000):
         if k in (50, 200):  # set, and set again to another value, as a user's input would
             scene.data.qfrc_applied[0] = 2.0 if k == 50 else -1.0
-        assert before_step(state, sample, row, 0) == OK
+        assert before_step(state, sample, row, 0, T) == OK
         mujoco.mj_step(scene.model, scene.data)
         assert after_step(state, row, 0) == OK
         assert abs(float(row["environment_energy"][0])) < 1e-5
