@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.kernel.state import RunParameters
+from hapticbridge.tick import TickFlag
 
 Array = NDArray[np.float64]
 
@@ -52,6 +53,17 @@ def steps(values: Array, start: Array) -> Array:
 def turns(values: Array, start: Array) -> Array:
     """Returns the rotation vectors from each orientation's predecessor to it."""
     return turn_between(np.concatenate([start[None], values[:-1]]), values)
+
+
+def product_conjugate(values: Array, start: Array) -> Array:
+    """Returns q_k ⊗ q_{k−1}⁻¹ over rows (n, 4), with q_{−1} = start."""
+    return quaternion_product(values, conjugate(np.concatenate([start[None], values[:-1]])))
+
+
+def rotate(q: Array, v: Array) -> Array:
+    """Returns R(q) v over rows, q (n, 4) and v (n, 3)."""
+    pure = np.concatenate([np.zeros((len(v), 1)), v], axis=1)
+    return quaternion_product(quaternion_product(q, pure), conjugate(q))[:, 1:]
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,6 +130,17 @@ class Balance:
         torque = coupling.rotational_stiffness * twist + coupling.rotational_damping / period * (
             handle_turn - tool_turn
         )
+
+        is_midpoint = (ticks["flags"] & int(TickFlag.MIDPOINT)) != 0
+        if np.any(is_midpoint):
+            # the turn that takes the tool from the tick before to this one carries what was then
+            carried = product_conjugate(ticks["tool_quaternion"], tool_start[3:])
+            before = turn_between(tool_start[3:], handle_start[3:])
+            spring = 0.5 * (twist + rotate(carried, np.vstack([before[None], twist[:-1]])))
+            midway = 0.5 * (handle_turn + rotate(carried, handle_turn)) - tool_turn
+            rate = coupling.rotational_damping / period + 0.5 * coupling.rotational_stiffness
+            midpoint = coupling.rotational_stiffness * spring + rate * midway
+            torque = np.where(is_midpoint[:, None], midpoint, torque)
 
         recorded = ticks["wrench_on_tool"]
         law = np.concatenate([force, torque], axis=1)
