@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -101,7 +102,7 @@ def kicked(path: Path, damping: float | None = None) -> np.ndarray:
     ],
 )
 def test_a_device_that_bears_the_coupling_is_never_kicked(
-    seed: int, limit: float, options: dict[str, float], tmp_path: Path
+    seed: int, limit: float, options: dict[str, Any], tmp_path: Path
 ) -> None:
     path = tmp_path / "run.mcap"
     device = SimulatedDevice(damping=10.0, path=random_motion(seed, 1.0))

@@ -77,9 +77,8 @@ class Balance:
         device_throughput: The same with absolute values.
         environment_energy: S_k − S_start − works, with ``coupling_work`` from here, (n,) in J.
         slack: Σ ½‖δx‖²_{K+B/T} + ½‖δφ‖²_{K_r+B_r/T}, (n,) in J.
-        kicked: What the device was given beyond what its damping burns, and beyond what scene and
-            coupling gave up, (n,) in J; zero where the damping is unknown, or several laws a tick
-            leave only their mean on record.
+        kicked: What the device was given beyond what its damping burns and scene and coupling
+            give up, (n,) in J; zero for an unknown damping, or several laws a tick.
     """
 
     wrench_on_tool: Array
