@@ -190,6 +190,8 @@ def test_what_is_read_is_what_the_table_says() -> None:
     assert "T = 1 to 2 ms" in said
     assert "to the power 0.000" in said or "to the power -0.000" in said
     assert said.count("at 0.5 a free device keeps 75 % of its stiffness (3000 N/m)") == 2
+    assert said.count("2b ΣT/ΣT² = 2667 by the balance of energy, 4000 at the mean") == 2
+    assert said.count("and 1000 at the longest") == 2
     assert said.count("an ordinary hand is stable up to 9000 N/m") == 2
     assert "Delay of 1, 2, 3, 4 samples: no point could be computed" in said
 
@@ -215,9 +217,11 @@ def test_what_failed_is_left_out_and_named() -> None:
 
 
 def test_a_search_without_an_end_is_no_comparison() -> None:
-    nowhere = [even(1e-3, 0, 0.0), even(2e-3, 0, float("inf")), uneven("drops", "no hand", 0, 0.0)]
-    found = read(written(nowhere))
+    ends = [even(1e-3, 0, 0.0), even(2e-3, 0, float("inf"))]
+    found = read(written([*ends, uneven("drops", "no hand", 0, 0.0)]))
     assert found.boundary["by_delay"]["0"]["slope"] is None
+    some = read(written([*ends, even(1e-3, 0, 700.0), even(4e-3, 0, 175.0)]))
+    assert some.boundary["by_delay"]["0"]["slope"] == pytest.approx(-1)
     assert "a free device bears (0 N/m)" in found.paragraph
 
 
