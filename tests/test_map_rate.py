@@ -164,7 +164,7 @@ FULL = [
         for share in (0.0, 0.5)
     ),
     *(
-        uneven(what, "ordinary hand", share, 9000.0)
+        uneven(what, "ordinary hand", share, 12_000 - 6000 * share)
         for what in ("jitter", "drops")
         for share in (0.0, 0.5)
     ),
