@@ -94,7 +94,7 @@ def test_half_of_all_ticks_lost_costs_a_free_device_two_thirds_of_its_stiffness(
     assert finite_hand("ordinary hand", 0.97 * full, lost).is_stable
 
 
-def test_uneven_ticks_are_told_by_three_periods() -> None:
+def test_uneven_ticks_are_told_by_three_periods_and_an_ordinary_hand_bears_more() -> None:
     told = unevenness([1e-3, 1e-3, 2e-3])
     assert told == pytest.approx({"mean": 4e-3 / 3, "longest": 2e-3, "balanced": 6e-3 / 4})
     point: Point = {"what": "drops", "hand": "no hand", "period": 1e-3, "delay": 0, "share": 0.5}
@@ -102,6 +102,8 @@ def test_uneven_ticks_are_told_by_three_periods() -> None:
     # geometric gaps: E[T] = T/(1 − p), E[T²]/E[T] = T (1 + p)/(1 − p)
     assert found["mean"] == pytest.approx(2e-3, rel=0.05)
     assert found["balanced"] == pytest.approx(3e-3, rel=0.05)
+    held = evaluate(point | {"hand": "ordinary hand"})
+    assert held["limit"] > 3 * found["limit"]  # an ordinary hand takes its share of the energy
     longest = max(Timing(drops=0.5, seed=s).intervals(TICKS).max() for s in range(SEEDS))
     assert found["longest"] == pytest.approx(1e-3 * longest / PARTS)
 
