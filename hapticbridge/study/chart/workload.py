@@ -1,0 +1,67 @@
+"""What is simulated at every point of a chart, and what it is compared with."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+from hapticbridge.coupling import Coupling
+from hapticbridge.study.chart.score import Score
+from hapticbridge.study.chart.setting import Setting
+
+
+@dataclass(frozen=True, slots=True)
+class Panel:
+    """One comparison of a workload: a picture of its own.
+
+    Attributes:
+        key: In tables.
+        title: What is compared, in a few words.
+        reference: What the error is counted from, in a sentence.
+        is_truth: Whether the reference is independent of the simulation. If not, an error says
+            how far a method has converged, and not how far it is from the truth.
+    """
+
+    key: str
+    title: str
+    reference: str
+    is_truth: bool = True
+
+
+class Run(Protocol):
+    """A workload at one setting, which can be run again and again."""
+
+    seconds: float
+    """Simulated time in s."""
+
+    def go(self) -> float:
+        """Runs it from the start; returns the processor time in s of the simulation alone."""
+
+    def scores(self) -> Mapping[str, Score]:
+        """Judges the last run, by ``Panel.key``."""
+
+
+class Workload(Protocol):
+    """What is simulated.
+
+    Attributes:
+        name: What the command line calls it.
+        about: One sentence.
+        panels: At least one; the first is what the recommendation goes by.
+        coupling: K and B asked for.
+        has_contact: Whether anything can touch.
+    """
+
+    name: str
+    about: str
+    panels: Sequence[Panel]
+    coupling: Coupling
+    has_contact: bool
+
+    def run(self, setting: Setting) -> Run:
+        """Prepares a point.
+
+        Raises:
+            HapticBridgeError: The method cannot render this.
+        """
