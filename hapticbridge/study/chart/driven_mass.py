@@ -15,7 +15,7 @@ from hapticbridge.scene import load_scene
 from hapticbridge.study.chart.scene_run import SceneRun, Stage, Stages, Take
 from hapticbridge.study.chart.score import Score, diverged, score_of
 from hapticbridge.study.chart.setting import Setting
-from hapticbridge.study.chart.workload import Panel, Run
+from hapticbridge.study.chart.workload import Panel, References, Run
 from hapticbridge.tick import TICK_DTYPE
 
 MASS, INERTIA = 0.1, 9e-6
@@ -114,6 +114,7 @@ class DrivenMass:
     about = "a free mass moved and turned by the handle, without contact"
     panels: Sequence[Panel] = (PANEL,)
     has_contact = False
+    references: References | None = None
 
     def __init__(self, coupling: Coupling, grid: float) -> None:
         self.coupling = coupling

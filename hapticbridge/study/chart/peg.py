@@ -15,7 +15,7 @@ from hapticbridge.study.chart.rigid_peg import resting_peg
 from hapticbridge.study.chart.scene_run import SceneRun, Stage, Stages, Take
 from hapticbridge.study.chart.score import Score, diverged, score_of
 from hapticbridge.study.chart.setting import Setting
-from hapticbridge.study.chart.workload import Panel, Run
+from hapticbridge.study.chart.workload import Panel, References, Run
 from hapticbridge.tick import TICK_DTYPE
 
 SETTLED = Panel(
@@ -72,7 +72,8 @@ class PegInHole:
         self._stages = Stages(
             lambda: Stage(load_scene("peg_in_hole", friction=0.0), peg_path, duration, coupling)
         )
-        self.references = OwnReferences(self._stages, grid, finest, MOVING_TIME, refinement)
+        self._limits = OwnReferences(self._stages, grid, finest, MOVING_TIME, refinement)
+        self.references: References | None = self._limits
 
     def run(self, setting: Setting) -> Run:
         """Prepares a point."""
@@ -80,7 +81,7 @@ class PegInHole:
 
     def _judge(self, takes: Sequence[Take]) -> Mapping[str, Score]:
         (take,) = takes
-        return {SETTLED.key: self.settled(take), MOVING.key: self.references.score(take)}
+        return {SETTLED.key: self.settled(take), MOVING.key: self._limits.score(take)}
 
     def settled(self, take: Take) -> Score:
         """Compares where the peg rests at the end of each hold with the rigid optimum."""

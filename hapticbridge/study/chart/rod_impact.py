@@ -10,13 +10,15 @@ from numpy.typing import NDArray
 
 from hapticbridge.check.felt import WEBER
 from hapticbridge.coupling import Coupling
+from hapticbridge.errors import StudyError
+from hapticbridge.kernel.scheme import DIRECT, WELD
 from hapticbridge.mechanics import ImpactBody, resolve_impact
 from hapticbridge.scene import Scene
 from hapticbridge.study.chart.scene_run import SceneRun, Stage, Stages, Take
 from hapticbridge.study.chart.score import Score, Verdict, diverged
 from hapticbridge.study.chart.setting import Setting
 from hapticbridge.study.chart.spinning_body import still
-from hapticbridge.study.chart.workload import Panel, Run
+from hapticbridge.study.chart.workload import Panel, References, Run
 from hapticbridge.study.maps.rigs import scene_of
 
 MASS, LENGTH = 0.1, 0.2
@@ -41,8 +43,8 @@ DURATION = 0.024
 """In s of each fall. A contact as soft as those of the shipped scenes ends within 20 ms; in that
 time the rod turns by 3 degrees at most, and a rigid impact takes none."""
 
-COUPLING = Coupling(0.0, 0.0, 0.0, 0.0)
-"""The rod falls alone."""
+COUPLING = Coupling(1e-9, 0.0, 0.0, 0.0)
+"""The rod falls alone: a coupling must have a stiffness, and 1e-9 N/m over 10 mm is nothing."""
 
 PANEL = Panel(
     "impact",
@@ -117,6 +119,7 @@ class RodImpact:
     about = "a rod taps the floor at four angles, with friction"
     panels: Sequence[Panel] = (PANEL,)
     has_contact = True
+    references: References | None = None
 
     def __init__(self, coupling: Coupling, grid: float, mass: float = MASS) -> None:
         self.coupling = coupling
@@ -129,7 +132,13 @@ class RodImpact:
         )
 
     def run(self, setting: Setting) -> Run:
-        """Prepares a point."""
+        """Prepares a point.
+
+        Raises:
+            StudyError: The method does without the tool's own dynamics.
+        """
+        if setting.method.scheme in (WELD, DIRECT):
+            raise StudyError(f"method '{setting.method.name}' lets no tool fall by itself")
         return SceneRun(self._stages.for_method(setting), setting, self._judge)
 
     def _judge(self, takes: Sequence[Take]) -> Mapping[str, Score]:

@@ -46,6 +46,8 @@ class Setting:
         substeps: MuJoCo steps per tick.
         contact: One of ``CONTACTS``.
         iterations: The most that MuJoCo's solver may take; None as the scene says.
+        engine: Who simulates; another than ``MUJOCO`` is set as its documentation advises, and
+            holds the coupling's force as method ``explicit`` does.
     """
 
     method: Method
@@ -53,6 +55,7 @@ class Setting:
     substeps: int = 1
     contact: str = SHIPPED
     iterations: int | None = None
+    engine: str = MUJOCO
 
     @property
     def timestep(self) -> float:
@@ -62,7 +65,8 @@ class Setting:
     @property
     def label(self) -> str:
         """The setting in words, what is usual left out."""
-        parts = [self.method.name, f"{1e3 * self.period:g} ms"]
+        who = self.method.name if self.engine == MUJOCO else f"{self.engine}, held force"
+        parts = [who, f"{1e3 * self.period:g} ms"]
         if self.substeps > 1:
             parts.append(f"{self.substeps} substeps")
         if self.contact != SHIPPED:

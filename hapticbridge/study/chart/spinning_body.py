@@ -13,12 +13,13 @@ from scipy.integrate import solve_ivp
 from hapticbridge.check.felt import FORCE_FLOOR, LEVER
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import StudyError
+from hapticbridge.kernel.scheme import DIRECT, WELD
 from hapticbridge.mechanics import integrate_rotation
 from hapticbridge.scene import Scene
 from hapticbridge.study.chart.scene_run import SceneRun, Stage, Stages, Take
 from hapticbridge.study.chart.score import Score, diverged, score_of
 from hapticbridge.study.chart.setting import Setting
-from hapticbridge.study.chart.workload import Panel, Run
+from hapticbridge.study.chart.workload import Panel, References, Run
 from hapticbridge.study.maps.rigs import scene_of
 from hapticbridge.tick import TICK_DTYPE
 
@@ -39,8 +40,8 @@ COUPLING = Coupling(1000.0, 1.0, 0.0, 0.0)
 FELT_STIFFNESS = 1.0
 """K_r in N m/rad, that of the other workloads: what an error of angle would be felt through."""
 
-FINE_STEP = 1e-5
-"""T in s of the reference: the midpoint rule's error, some (ωT)²/12 of the angle, is 1e-7 rad."""
+FINE_STEP = 2e-6
+"""T in s of the reference: the midpoint rule's error, some (ωT)²/12 of the angle, is some 1e-9 rad."""
 
 PANEL = Panel(
     "torque-free",
@@ -131,6 +132,7 @@ class SpinningBody:
     about = "a body with three moments of inertia tumbles freely, held in its place by the coupling"
     panels: Sequence[Panel] = (PANEL,)
     has_contact = False
+    references: References | None = None
 
     def __init__(self, coupling: Coupling, grid: float, mass: float = MASS) -> None:
         if coupling.rotational_stiffness or coupling.rotational_damping:
@@ -148,7 +150,13 @@ class SpinningBody:
         )
 
     def run(self, setting: Setting) -> Run:
-        """Prepares a point."""
+        """Prepares a point.
+
+        Raises:
+            StudyError: The method does without the tool's own dynamics.
+        """
+        if setting.method.scheme in (WELD, DIRECT):
+            raise StudyError(f"method '{setting.method.name}' lets no tool turn by itself")
         return SceneRun(self._stages.for_method(setting), setting, self._judge)
 
     def _judge(self, takes: Sequence[Take]) -> Mapping[str, Score]:

@@ -42,6 +42,13 @@ class Run(Protocol):
         """Judges the last run, by ``Panel.key``."""
 
 
+class References(Protocol):
+    """What each method converges to."""
+
+    def disagreement(self) -> dict[str, float]:
+        """Returns how far each limit lies from the first method's in JND, by method."""
+
+
 class Workload(Protocol):
     """What is simulated.
 
@@ -51,6 +58,7 @@ class Workload(Protocol):
         panels: At least one; the first is what the recommendation goes by.
         coupling: K and B asked for.
         has_contact: Whether anything can touch.
+        references: The methods' own limits, where a panel compares with them.
     """
 
     name: str
@@ -58,6 +66,7 @@ class Workload(Protocol):
     panels: Sequence[Panel]
     coupling: Coupling
     has_contact: bool
+    references: References | None
 
     def run(self, setting: Setting) -> Run:
         """Prepares a point.

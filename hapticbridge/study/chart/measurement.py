@@ -1,0 +1,78 @@
+"""A point of a chart: what was set, what it cost, how wrong it was."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+
+from hapticbridge.coupling import Coupling
+from hapticbridge.study.chart.score import PASSIVE, Score
+from hapticbridge.study.chart.setting import (
+    CONTACTS,
+    PYRAMIDAL,
+    SHIPPED,
+    SOFT_SOLREF,
+    SOLIMP,
+    Setting,
+)
+from hapticbridge.study.chart.timing import Cost
+
+
+@dataclass(frozen=True, slots=True)
+class Measurement:
+    """One point in one panel.
+
+    Attributes:
+        panel: Key of the panel.
+        setting: How it was simulated.
+        cost: What it cost.
+        score: How wrong it was.
+    """
+
+    panel: str
+    setting: Setting
+    cost: Cost
+    score: Score
+
+    @property
+    def is_sound(self) -> bool:
+        """Whether the environment was passive and the run stayed in contact."""
+        return self.score.verdict in PASSIVE
+
+    def cells(self, workload: str, coupling: Coupling) -> dict[str, object]:
+        """Returns the row of a table: every choice, every number."""
+        setting, method = self.setting, self.setting.method
+        used = method.used(coupling, setting.timestep)
+        in_steps = CONTACTS[setting.contact]
+        if setting.contact in (SHIPPED, PYRAMIDAL):
+            contact = ("scene", "scene")
+        elif in_steps is None:
+            contact = (_numbers(SOFT_SOLREF), _numbers(SOLIMP))
+        else:
+            contact = (_numbers((in_steps[0] * setting.timestep, in_steps[1])), _numbers(SOLIMP))
+        return {
+            "workload": workload,
+            "panel": self.panel,
+            "engine": setting.engine,
+            "method": method.name,
+            "integrator": method.integrator,
+            "period_s": setting.period,
+            "substeps": setting.substeps,
+            "timestep_s": setting.timestep,
+            "contact": setting.contact,
+            "solref": contact[0],
+            "solimp": contact[1],
+            "cone": "pyramidal" if setting.contact == PYRAMIDAL else "scene",
+            "solver_iterations": "scene" if setting.iterations is None else setting.iterations,
+            "stiffness": coupling.stiffness,
+            "damping": coupling.damping,
+            "rotational_stiffness": coupling.rotational_stiffness,
+            "rotational_damping": coupling.rotational_damping,
+            "damping_used": used.damping,
+            "rotational_damping_used": used.rotational_damping,
+            **{f"cost_{name}": value for name, value in asdict(self.cost).items()},
+            **{f"error_{name}": value for name, value in asdict(self.score).items()},
+        }
+
+
+def _numbers(values: tuple[float, ...]) -> str:
+    return " ".join(f"{value:g}" for value in values)

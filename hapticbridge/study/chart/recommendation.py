@@ -1,0 +1,84 @@
+"""What to use: the cheapest point that is fast enough, right enough and sound, in words."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from hapticbridge.study.chart.measurement import Measurement
+
+RATE = 1000.0
+"""Hz that is asked for."""
+
+JND = 1.0
+"""Error in just noticeable differences that is allowed."""
+
+SHARE = 0.5
+"""Share of a core that the simulation may take; the rest is for the device and for waking up."""
+
+TOLERANCE = 1e-9
+"""Relative: 1/(1 ms) is 1000 Hz but for rounding."""
+
+
+def recommended(points: Sequence[Measurement]) -> Measurement | None:
+    """Returns the point to use, None where there is none.
+
+    Of the points at ``RATE`` or above, with an error below ``JND``, a passive environment, at most
+    ``SHARE`` of a core and no hazard on a real device (``Method.hazard``): the cheapest; and where
+    the costs of several lie within its spread, the most accurate of these.
+    """
+    fit = [each for each in points if _is_fast(each) and not _objections(each)]
+    if not fit:
+        return None
+    cheapest = min(fit, key=lambda each: each.cost.median)
+    alike = [each for each in fit if each.cost.median <= cheapest.cost.high]
+    return min(alike, key=lambda each: (each.score.felt, each.cost.median))
+
+
+def recommendation(points: Sequence[Measurement], machine: str) -> str:
+    """Says what to use, or which point is nearest and what is wrong with it.
+
+    Args:
+        points: Of one panel.
+        machine: In words.
+    """
+    best = recommended(points)
+    goal = f"For {RATE / 1000:g} kHz on this machine ({machine}) and an error below one JND"
+    if best is not None:
+        return f"{goal}, use {best.setting.label}: {_numbers(best)}."
+    fast = [each for each in points if _is_fast(each) and np.isfinite(each.score.felt)]
+    if not fast:
+        return f"{goal}, nothing was tried that runs at this rate."
+    nearest = min(fast, key=lambda each: (len(_objections(each)), each.score.felt))
+    return (
+        f"{goal}, no point does it all. Nearest is {nearest.setting.label}: {_numbers(nearest)}; "
+        f"but {' and '.join(_objections(nearest))}."
+    )
+
+
+def _is_fast(each: Measurement) -> bool:
+    return each.setting.period * RATE <= 1 + TOLERANCE
+
+
+def _objections(each: Measurement) -> list[str]:
+    """Returns what speaks against a point, in words."""
+    found = []
+    if not each.score.felt < JND:
+        found.append(f"its error is {each.score.felt:.2g} JND")
+    if not each.is_sound:
+        created = each.score.created
+        more = f" ({created:.2g} J created)" if created > 0 and np.isfinite(created) else ""
+        found.append(f"its environment is {each.score.verdict}{more}")
+    if each.cost.median > SHARE:
+        found.append(f"it takes {100 * each.cost.median:.0f} % of a core")
+    if each.setting.method.hazard:
+        found.append("it may kick on a real device")
+    return found
+
+
+def _numbers(each: Measurement) -> str:
+    return (
+        f"an error of {each.score.felt:.2g} JND at {1e6 * each.cost.median * each.setting.period:.3g} "
+        f"µs a tick, {100 * each.cost.median:.2g} % of a core"
+    )
