@@ -13,6 +13,7 @@ import mujoco
 import tyro
 from rich.markup import escape
 
+from hapticbridge.cli.chart import ChartCommand
 from hapticbridge.cli.judge import Audit, Repair
 from hapticbridge.cli.run import Run
 from hapticbridge.cli.scenes import Scenes
@@ -26,6 +27,7 @@ Command = (
     | Annotated[Audit, tyro.conf.subcommand("audit")]
     | Annotated[Scenes, tyro.conf.subcommand("scenes")]
     | Annotated[Stability, tyro.conf.subcommand("stability")]
+    | Annotated[ChartCommand, tyro.conf.subcommand("chart")]
     | Annotated[Repair, tyro.conf.subcommand("repair")]
     | Annotated[Zwidth, tyro.conf.subcommand("zwidth")]
     | Annotated[Bound, tyro.conf.subcommand("bound")]

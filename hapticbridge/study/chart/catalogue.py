@@ -9,7 +9,6 @@ from hapticbridge.study.chart import driven_mass, peg, rod_impact, scene_motion,
 from hapticbridge.study.chart.workload import Workload
 
 
-
 @dataclass(frozen=True, slots=True)
 class Extent:
     """What a chart's time steps mean to a workload.

@@ -66,9 +66,9 @@ def convergence_orders(points: Sequence[Measurement]) -> dict[str, float]:
     """
     series: dict[str, list[tuple[float, float]]] = {}
     for each in points:
-        setting = each.setting
-        if setting.substeps == 1 and setting.contact == SHIPPED and setting.iterations is None:
-            series.setdefault(who(setting), []).append((setting.period, each.score.felt))
+        if each.is_usual:
+            value = (each.setting.period, each.score.felt)
+            series.setdefault(who(each.setting), []).append(value)
     found = {}
     for name, values in series.items():
         period, felt = np.array(sorted(values)[:ORDER_POINTS]).T

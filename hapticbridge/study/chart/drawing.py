@@ -13,7 +13,6 @@ from hapticbridge.study.chart.chart import Chart, who
 from hapticbridge.study.chart.measurement import Measurement
 from hapticbridge.study.chart.recommendation import JND, recommended
 from hapticbridge.study.chart.score import Verdict
-from hapticbridge.study.chart.setting import SHIPPED
 from hapticbridge.study.chart.workload import Panel
 
 WIDTH, HEIGHT = 8.0, 5.6
@@ -73,9 +72,9 @@ def _draw_panel(axes: Axes, chart: Chart, panel: Panel, colours: dict[str, str])
     for name, colour in colours.items():
         mine = [each for each in points if who(each.setting) == name]
         order = orders.get(name, float("nan"))
-        told = f"{name} (order {order:.1f})" if np.isfinite(order) else name
+        told = f"{name} (order {order + 0.0:.1f})" if np.isfinite(order) else name
         axes.plot([], [], "-", color=colour, lw=2, label=told)
-        line = [each for each in mine if is_usual(each)]
+        line = [each for each in mine if each.is_usual]
         axes.plot(
             [each.cost.median for each in line],
             [drawn_error(each) for each in line],
@@ -90,7 +89,7 @@ def _draw_panel(axes: Axes, chart: Chart, panel: Panel, colours: dict[str, str])
     best = recommended(points)
     if best is not None:
         axes.plot(
-            best.cost.median, drawn_error(best), "*", ms=17, mfc="none", mec="black", mew=1.3,
+            best.cost.median, drawn_error(best), "*", ms=13, mfc="none", mec="black", mew=1.3,
             label="recommended for 1 kHz", zorder=5,
         )  # fmt: skip
     axes.axhline(JND, color="black", ls="--", lw=0.9)
@@ -114,12 +113,6 @@ def _draw_panel(axes: Axes, chart: Chart, panel: Panel, colours: dict[str, str])
     axes.legend(fontsize="x-small", loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
 
 
-def is_usual(each: Measurement) -> bool:
-    """Whether nothing but method and period was chosen: the points that a line joins."""
-    setting = each.setting
-    return setting.substeps == 1 and setting.contact == SHIPPED and setting.iterations is None
-
-
 def _draw_point(axes: Axes, each: Measurement, colour: str) -> None:
     mark, is_filled, _ = MARKS[each.score.verdict]
     cost = each.cost
@@ -130,7 +123,7 @@ def _draw_point(axes: Axes, each: Measurement, colour: str) -> None:
         fmt=mark,
         color=colour,
         mfc=colour if is_filled else "white",
-        ms=5.5 if is_usual(each) else 3.5,
+        ms=5.5 if each.is_usual else 3.5,
         elinewidth=0.6,
         alpha=0.9,
     )

@@ -38,6 +38,13 @@ class Measurement:
         """Whether the environment was passive and the run stayed in contact."""
         return self.score.verdict in PASSIVE
 
+    @property
+    def is_usual(self) -> bool:
+        """Whether nothing but method and period was chosen."""
+        setting = self.setting
+        is_plain = setting.contact == SHIPPED and setting.iterations is None
+        return is_plain and setting.substeps == 1
+
     def cells(self, workload: str, coupling: Coupling) -> dict[str, object]:
         """Returns the row of a table: every choice, every number."""
         setting, method = self.setting, self.setting.method

@@ -122,7 +122,7 @@ def fine_records(
         raise StudyError(f"no reference for '{setting.method.name}': {error}") from None
     kept, rows = np.zeros(count, TICK_DTYPE), np.zeros(every, TICK_DTYPE)
     for k in range(count):
-        times = setting.period * np.arange(k * every + 1, (k + 1) * every + 1)
+        times = setting.period * np.arange(k * every + 1.0, (k + 1) * every + 1)
         if simulate(binding.state, stage.samples_at(times), binding.row, rows) < every:
             return None
         kept[k] = rows[-1]

@@ -17,6 +17,9 @@ JND = 1.0
 SHARE = 0.5
 """Share of a core that the simulation may take; the rest is for the device and for waking up."""
 
+ALIKE = 0.02
+"""Relative difference of two errors that decides nothing, no unit."""
+
 TOLERANCE = 1e-9
 """Relative: 1/(1 ms) is 1000 Hz but for rounding."""
 
@@ -25,15 +28,18 @@ def recommended(points: Sequence[Measurement]) -> Measurement | None:
     """Returns the point to use, None where there is none.
 
     Of the points at ``RATE`` or above, with an error below ``JND``, a passive environment, at most
-    ``SHARE`` of a core and no hazard on a real device (``Method.hazard``): the cheapest; and where
-    the costs of several lie within its spread, the most accurate of these.
+    ``SHARE`` of a core and no hazard on a real device (``Method.hazard``): the cheapest; where the
+    costs of several lie within its spread, the most accurate of these; and where errors are the
+    same within ``ALIKE``, one with the usual contacts and solver.
     """
     fit = [each for each in points if _is_fast(each) and not _objections(each)]
     if not fit:
         return None
     cheapest = min(fit, key=lambda each: each.cost.median)
     alike = [each for each in fit if each.cost.median <= cheapest.cost.high]
-    return min(alike, key=lambda each: (each.score.felt, each.cost.median))
+    least = min(each.score.felt for each in alike)
+    best = [each for each in alike if each.score.felt <= (1 + ALIKE) * least]
+    return min(best, key=lambda each: (not each.is_usual, each.score.felt, each.cost.median))
 
 
 def recommendation(points: Sequence[Measurement], machine: str) -> str:
@@ -78,7 +84,8 @@ def _objections(each: Measurement) -> list[str]:
 
 
 def _numbers(each: Measurement) -> str:
+    tick = 1e6 * each.cost.median * each.setting.period
     return (
-        f"an error of {each.score.felt:.2g} JND at {1e6 * each.cost.median * each.setting.period:.3g} "
-        f"µs a tick, {100 * each.cost.median:.2g} % of a core"
+        f"an error of {each.score.felt:.2g} JND at {tick:.3g} µs a tick, "
+        f"{100 * each.cost.median:.2g} % of a core"
     )

@@ -101,7 +101,7 @@ class Stage:
         """Returns the handle's poses at T, 2T, … as ``SAMPLE_DTYPE``."""
         if period not in self._samples:
             ticks = round(self.duration / period)
-            self._samples[period] = self.samples_at(period * np.arange(1, ticks + 1))
+            self._samples[period] = self.samples_at(period * np.arange(1.0, ticks + 1))
         return self._samples[period]
 
     def samples_at(self, times: NDArray[np.float64]) -> NDArray[np.void]:
@@ -154,9 +154,7 @@ class Stage:
         )
         return Binding(scene.model, scene.data, parameters)
 
-    def _take(
-        self, setting: Setting, binding: Binding, rows: NDArray[np.void], ticks: int
-    ) -> Take:
+    def _take(self, setting: Setting, binding: Binding, rows: NDArray[np.void], ticks: int) -> Take:
         warnings = self._scene.data.warning
         is_bad = any(warnings[int(kind)].number > 0 for kind in _BAD)
         return Take(

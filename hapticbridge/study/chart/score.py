@@ -10,9 +10,7 @@ from numpy.typing import NDArray
 
 from hapticbridge.check.felt import felt_error
 
-Verdict = Literal[
-    "strict", "within slack", "active", "lost contact", "diverged", "not metered"
-]
+Verdict = Literal["strict", "within slack", "active", "lost contact", "diverged", "not metered"]
 """Of the environment (``Ledger.environment``), or what else became of the run. ``not metered``:
 another engine, whose energy nobody counted."""
 

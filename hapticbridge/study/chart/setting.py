@@ -103,9 +103,7 @@ class ShippedOptions:
         model.opt.cone = (
             mujoco.mjtCone.mjCONE_PYRAMIDAL if setting.contact == PYRAMIDAL else self.cone
         )
-        model.opt.iterations = (
-            self.iterations if setting.iterations is None else setting.iterations
-        )
+        model.opt.iterations = self.iterations if setting.iterations is None else setting.iterations
         in_steps = CONTACTS[setting.contact]
         if in_steps is not None:
             model.geom_solref[:] = (in_steps[0] * setting.timestep, in_steps[1])

@@ -41,7 +41,7 @@ FELT_STIFFNESS = 1.0
 """K_r in N m/rad, that of the other workloads: what an error of angle would be felt through."""
 
 FINE_STEP = 2e-6
-"""T in s of the reference: the midpoint rule's error, some (ωT)²/12 of the angle, is some 1e-9 rad."""
+"""T in s of the reference. The midpoint rule errs by some (ωT)²/12 of the angle: some 1e-9 rad."""
 
 PANEL = Panel(
     "torque-free",
@@ -110,10 +110,12 @@ def orientations_by_dop853(grid: float, count: int) -> NDArray[np.float64]:
 
     times = grid * np.arange(1, count + 1)
     start = np.array([1.0, 0.0, 0.0, 0.0, *SPIN])
-    found = solve_ivp(
-        rate, (0.0, times[-1]), start, "DOP853", t_eval=times, rtol=1e-12, atol=1e-13
-    ).y[:4].T
-    return np.where(found[:, :1] < 0, -found, found)
+    found = (
+        solve_ivp(rate, (0.0, times[-1]), start, "DOP853", t_eval=times, rtol=1e-12, atol=1e-13)
+        .y[:4]
+        .T
+    )
+    return np.asarray(np.where(found[:, :1] < 0, -found, found))
 
 
 class SpinningBody:
