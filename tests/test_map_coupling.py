@@ -12,8 +12,8 @@ import pytest
 from hapticbridge.coupling import Coupling
 from hapticbridge.passivity import environment_minimum_damping, maximum_stiffness
 from hapticbridge.study.maps import run_map
-from hapticbridge.study.maps.coupling import (
-    COUPLING,
+from hapticbridge.study.maps.coupling import COUPLING
+from hapticbridge.study.maps.coupling_runs import (
     DEVICE_DAMPING,
     PERIOD,
     THEORIES,

@@ -11,7 +11,7 @@ import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor
 from multiprocessing.connection import wait
 from typing import Any
@@ -20,6 +20,11 @@ from hapticbridge.errors import StudyError
 
 _IN_FLIGHT = 64
 """Tasks in flight where the number of workers is not known: more workers than that would idle."""
+
+_ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+"""Set for the sweep's own processes unless the user did: there is one a core already. With more,
+the idle threads of OpenBLAS spin for 0.1 s after every matrix exponential, which is one a
+closed-loop run; the map ``contact`` took twice as long."""
 
 _PATIENCE = 5.0
 """Seconds for a dask scheduler to answer and to have a worker; a local one takes 0.05 s."""
@@ -116,7 +121,8 @@ class ProcessWorkers(Workers):
     def _probe(self) -> None:
         """Makes sure that a process starts and knows the function, before any point is blamed."""
         try:
-            self.executor.submit(callable, self._function).result()
+            with _environment(_ONE_THREAD):  # libraries read it as they load; all start here
+                self.executor.submit(callable, self._function).result()
         except (BrokenExecutor, OSError):
             self.close()
             raise StudyError(
@@ -196,6 +202,18 @@ def hired(
         yield workers
     finally:
         workers.close()
+
+
+@contextlib.contextmanager
+def _environment(variables: Mapping[str, str]) -> Iterator[None]:
+    """Sets environment variables that are not set yet, for the processes that start meanwhile."""
+    missing = {name: value for name, value in variables.items() if name not in os.environ}
+    os.environ.update(missing)
+    try:
+        yield
+    finally:
+        for name in missing:
+            os.environ.pop(name, None)
 
 
 def _start_process() -> None:

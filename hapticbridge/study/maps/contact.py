@@ -15,11 +15,7 @@ from matplotlib.patches import Patch
 from hapticbridge.picture import new_figure
 from hapticbridge.scene.contact_rule import contact_numbers
 from hapticbridge.study.maps.contact_agreement import LINES, agreement, exceptions, is_in, verdicts
-from hapticbridge.study.maps.contact_rigs import (
-    peg_runs,
-    summary,
-    wall_runs,
-)
+from hapticbridge.study.maps.contact_rigs import peg_runs, summary, until_active, wall_runs
 from hapticbridge.study.maps.contact_search import SEARCH_MASSES, draw_search, search, searched
 from hapticbridge.study.maps.contact_treatments import (
     PERIOD,
@@ -70,13 +66,16 @@ def _point(rig: str, name: str, method: str, **numbers: float) -> Point:
 
 
 def evaluate(point: Point) -> Mapping[str, float | int]:
-    """Runs a setting with light and heavy tools, with and without friction, and several hands."""
+    """Runs a setting with light and heavy tools, with and without friction, and several hands.
+
+    The worst run is the verdict of a cell, so its runs end with the first that is active.
+    """
     if point["rig"] == "search":
         return search(str(point["treatment"]), float(point["mass"]))
     solref = float(point["steps"]) * PERIOD, float(point["dampratio"])
     treatment = Treatment(solref, method=str(point["method"]))
     runs = wall_runs if point["rig"] == "wall" else peg_runs
-    return summary(runs(treatment, float(point["stiffness"])))
+    return summary(until_active(runs(treatment, float(point["stiffness"]))))
 
 
 def read(table: Table) -> Finding:

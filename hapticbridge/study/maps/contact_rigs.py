@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 
@@ -44,10 +44,10 @@ DEPTH_EVERY = 20
 costs as much as five ticks."""
 
 WALL_RUNS = tuple(itertools.product((0.01, 0.05, 0.2), (0, 1)))
-"""Tool mass in kg and hand."""
+"""Tool mass in kg and hand, the most often active first."""
 
 PEG_RUNS = tuple(itertools.product((0.03, 0.1), (0.0, 0.42), (1, 2)))
-"""Tool mass in kg, friction and hand (0 is the recorded one, others are seeds)."""
+"""Tool mass in kg, friction and hand (0 is the recorded one, others are seeds), likewise."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,34 +90,47 @@ def summary(runs: Sequence[ContactRun]) -> dict[str, float | int]:
     }
 
 
+def until_active(runs: Iterable[ContactRun]) -> list[ContactRun]:
+    """Returns runs to the first that is active: no later one can make their verdict worse.
+
+    Given runs that are made as they are asked for, no later one is made.
+    """
+    made = []
+    for run in runs:
+        made.append(run)
+        if run.environment == "active":
+            break
+    return made
+
+
 def wall_runs(
     treatment: Treatment, stiffness: float, cases: Iterable[tuple[float, int]] = WALL_RUNS
-) -> list[ContactRun]:
-    """Runs masses (kg) against a wall with hands (0 slow and deep, 1 fast) at K in N/m."""
+) -> Iterator[ContactRun]:
+    """Runs masses (kg) against a wall with hands (0 slow and deep, 1 fast) at K in N/m.
+
+    Every run is made when it is asked for.
+    """
     loop = loop_in("virtual_wall", "contact")
-    treatment.apply(loop.scene.model, 0.0)
     coupling = Coupling(stiffness, WALL_DAMPING, 1.0, 1e-3)  # the rail lets nothing turn
-    found = []
     for mass, hand in cases:
+        treatment.apply(loop.scene.model, 0.0)
         _set_mass(loop, "tool", mass)
         device = _device(coupling, _tapping((3.0, 6.0)[hand]), Hand(stiffness=2000.0, damping=25.0))
         records, run = _run(loop, device, coupling, treatment, 1000)
         # the face is 10 mm from where the tool's surface starts
         depth = max(0.0, float(records["tool_position"][:, 0].max()) - 0.01)
-        found.append(replace(run, depth=depth))
-    return found
+        yield replace(run, depth=depth)
 
 
 def peg_runs(
     treatment: Treatment,
     stiffness: float,
     cases: Iterable[tuple[float, float, int]] = PEG_RUNS,
-) -> list[ContactRun]:
-    """Runs pegs by mass (kg), friction and hand in the hole at K in N/m."""
+) -> Iterator[ContactRun]:
+    """Runs pegs by mass (kg), friction and hand in the hole at K in N/m, as ``wall_runs`` does."""
     loop = loop_in("peg_in_hole", "contact", _start_in_hole)
     per_k, rotational_damping = PEG_ROTATION
     coupling = Coupling(stiffness, PEG_DAMPING, per_k * stiffness, rotational_damping)
-    found = []
     for mass, friction, hand in cases:
         treatment.apply(loop.scene.model, friction)
         _set_mass(loop, "peg", mass)
@@ -125,8 +138,7 @@ def peg_runs(
         device = _device(coupling, path, holder)
         ticks = int(path.duration / PERIOD)
         records, run = _run(loop, device, coupling, treatment, ticks)
-        found.append(replace(run, depth=_depth(loop, records)))
-    return found
+        yield replace(run, depth=_depth(loop, records))
 
 
 def _run(
