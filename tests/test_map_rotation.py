@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hapticbridge.study.maps.rotation import ROTATION, evaluate, points
+from hapticbridge.study.maps.rotation import ROTATION
+from hapticbridge.study.maps.rotation_runs import evaluate, points
 from hapticbridge.study.maps.spinning_tool import coupling_of, speed_of_cut, spin, sudden
 from hapticbridge.study.maps.stability_map import Point, run_map
 from hapticbridge.study.maps.tumbling import (

@@ -43,7 +43,7 @@ def _cells_below(cells: Table) -> dict[str, Any]:
     below = cells["stiffness"] < 2 * (DEVICE_DAMPING - cells["damping"]) / PERIOD
     mine = cells.select(below)
     is_passive = verdicts_of(mine) <= VERDICTS.index("within slack")
-    ports = mine["fault_port"] if len(mine) else np.empty(0, dtype=object)
+    ports = mine.texts("fault_port")
     return {
         "passive_share_below_6": float(np.mean(is_passive)) if len(mine) else None,
         "runs_below_6": len(mine),

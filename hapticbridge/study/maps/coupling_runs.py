@@ -192,4 +192,4 @@ def verdicts_of(cells: Table) -> NDArray[np.int64]:
     for column in STABLE:
         value = cells.numbers(column)
         is_stable &= np.isnan(value) | (value == 1)
-    return verdict_numbers(is_stable, cells["environment"] if len(cells) else np.empty(0, object))
+    return verdict_numbers(is_stable, cells.texts("environment"))
