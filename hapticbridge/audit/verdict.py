@@ -112,6 +112,11 @@ def audit(path: str | Path, *, strict: bool = False) -> AuditReport:
     try:
         parameters = parameters_of(recording.meta)
         info, method = _device_and_method(recording, parameters)
+        parameters = replace(
+            parameters,
+            device_damping=info.damping,
+            device_rotational_damping=info.rotational_damping,
+        )
         facts |= _device_facts(info, parameters, method)
     except RecordingError as error:
         return _invalid(facts, Fault(str(error)))
@@ -290,7 +295,9 @@ def _judged(facts: dict[str, Any], balance: Balance, *, strict: bool) -> AuditRe
     unstrict = created > rounding
     active = created > balance.slack + rounding
     share = float(np.max(np.where(unstrict, created / (balance.slack + rounding), 0.0)))
-    kicked = balance.kicked > rounding
+    # a device that meets its condition needs no watch behind a coupling law: that is the proof
+    is_watched = facts["certified"] is not True
+    kicked = is_watched & (balance.kicked > rounding)
     if kicked.any() and not (active & (np.arange(len(active)) <= np.argmax(kicked))).any():
         tick = int(np.argmax(kicked))
         excess = float(balance.kicked[tick])
@@ -299,7 +306,7 @@ def _judged(facts: dict[str, Any], balance: Balance, *, strict: bool) -> AuditRe
             verdict="active",
             environment="within slack" if unstrict.any() else "strict",
             reason=f"from tick {tick} the device is given {excess:.3g} J more than its damping "
-            "burns and the scene gives up",
+            "burns and scene and coupling give up",
             tick=tick,
             port="device",
             joules=excess,
