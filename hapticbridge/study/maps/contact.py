@@ -12,7 +12,7 @@ from hapticbridge.study.maps.contact_picture import DAMPING_RATIO, PANELS, STEPS
 from hapticbridge.study.maps.contact_rigs import peg_runs, summary, until_active, wall_runs
 from hapticbridge.study.maps.contact_search import SEARCH_MASSES, search, searched
 from hapticbridge.study.maps.contact_treatments import PERIOD, SHIPPED, TREATMENTS, Treatment
-from hapticbridge.study.maps.stability_map import Finding, Point, StabilityMap
+from hapticbridge.study.maps.stability_map import Finding, Point, StabilityMap, computed
 from hapticbridge.study.maps.verdicts import MISSING
 from hapticbridge.study.table import Table
 
@@ -54,7 +54,12 @@ def evaluate(point: Point) -> Mapping[str, float | int]:
 
 
 def read(table: Table) -> Finding:
-    """Draws verdicts over timeconst and dampratio with the rule on top, and the search below."""
+    """Draws verdicts over timeconst and dampratio with the rule on top, and the search below.
+
+    Raises:
+        StudyError: No point was computed at all.
+    """
+    table = computed(table, "contact")
     found = [searched(table, name) for name in TREATMENTS if np.any(table["treatment"] == name)]
     rule, worse = agreement(table), exceptions(table)
     said = [_of_rule(rule, len(worse)), _of_fast(table), _of_search(found), _of_shipped(found)]

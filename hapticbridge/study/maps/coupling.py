@@ -19,13 +19,18 @@ from hapticbridge.study.maps.coupling_runs import (
     points,
     verdicts_of,
 )
-from hapticbridge.study.maps.stability_map import Finding, StabilityMap
+from hapticbridge.study.maps.stability_map import Finding, StabilityMap, computed
 from hapticbridge.study.maps.verdicts import MISSING, VERDICTS
 from hapticbridge.study.table import Table
 
 
 def read(table: Table) -> Finding:
-    """Draws K against B by method, with the bounds on top, and compares the limits with (6)."""
+    """Draws K against B by method, with the bounds on top, and compares the limits with (6).
+
+    Raises:
+        StudyError: No point was computed at all.
+    """
+    table = computed(table, "coupling")
     boundary = {
         name: _cells_below(of_method(table, "cell", name))
         | _limits(of_method(table, "limit", name))

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
 from hapticbridge.passivity import maximum_stiffness
 from hapticbridge.picture import new_figure
@@ -78,19 +81,29 @@ def _draw_theory(axes: Axes, theory: str, *, has_wall: bool) -> None:
         axes.plot(
             damping, (b + np.sqrt(b**2 + 4 * b * damping)) / PERIOD, color="black", ls=":", lw=1.5
         )
-    grid_b, grid_k = np.meshgrid(np.linspace(*DAMPING, CONTOUR), np.geomspace(*STIFFNESS, CONTOUR))
-    needed = np.array(
-        [
-            worst_angle(theory, stiffness, own, TOOL_MASS, PERIOD)[1]
-            for stiffness, own in zip(grid_k.flat, grid_b.flat, strict=True)
-        ]
-    ).reshape(grid_k.shape)
     axes.contour(
-        grid_b,
-        grid_k,
-        np.minimum(needed, 10 * b),
+        np.linspace(*DAMPING, CONTOUR),
+        np.geomspace(*STIFFNESS, CONTOUR),
+        np.minimum(_needed(theory), 10 * b),
         levels=[b],
         colors=THEORY_COLOUR,
         linestyles="--",
         linewidths=1.5,
+    )
+
+
+@cache
+def _needed(theory: str) -> NDArray[np.float64]:
+    """Returns the device damping in N s/m that a free tool needs, rows of K by columns of B.
+
+    Kept, because methods share theories.
+    """
+    return np.array(
+        [
+            [
+                worst_angle(theory, k, b, TOOL_MASS, PERIOD)[1]
+                for b in np.linspace(*DAMPING, CONTOUR)
+            ]
+            for k in np.geomspace(*STIFFNESS, CONTOUR)
+        ]
     )

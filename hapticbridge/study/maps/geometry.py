@@ -24,7 +24,7 @@ from hapticbridge.study.maps.fitting_peg import (
     run,
 )
 from hapticbridge.study.maps.palette import THEORY_COLOUR
-from hapticbridge.study.maps.stability_map import Finding, Point, StabilityMap
+from hapticbridge.study.maps.stability_map import Finding, Point, StabilityMap, computed
 from hapticbridge.study.maps.verdicts import (
     MISSING,
     draw_verdicts,
@@ -108,7 +108,12 @@ def evaluate(point: Point) -> Mapping[str, float | int | str | bool]:
 
 
 def read(table: Table) -> Finding:
-    """Draws contact or coupling stiffness over the length, with the limits on top."""
+    """Draws contact or coupling stiffness over the length, with the limits on top.
+
+    Raises:
+        StudyError: No point was computed at all.
+    """
+    table = computed(table, "geometry")
     limits = table.select(table["what"] == "limit")
     direct = limits.select(limits["method"] == "direct")
     behind = limits.select(limits["method"] == "implicit")
@@ -163,7 +168,8 @@ def _paragraph(boundary: Mapping[str, Any]) -> str:
     else:
         said = f"Rendered directly, {MISSING}. "
     if behind["largest"] is None:
-        return f"{said}Behind the coupling, {MISSING if not behind['length'] else 'no limit'}."
+        nothing = "no limit was found" if behind["length"] else MISSING
+        return f"{said}Behind the coupling, {nothing}."
     return said + (
         f"Behind the coupling the largest K_r lies between {behind['smallest']:.4g} and "
         f"{behind['largest']:.4g} N m/rad over all lengths, "

@@ -19,7 +19,7 @@ from hapticbridge.study.maps.falling_rod import (
     restitution_of,
 )
 from hapticbridge.study.maps.restitution_picture import COLOURS, SLIDE, Summary, draw
-from hapticbridge.study.maps.stability_map import Finding, Point, StabilityMap
+from hapticbridge.study.maps.stability_map import Finding, Point, StabilityMap, computed
 from hapticbridge.study.maps.verdicts import MISSING
 from hapticbridge.study.table import Table
 
@@ -74,7 +74,12 @@ def _by_law(law: Law, angle: float, friction: float, slide: float, restitution: 
 
 
 def read(table: Table) -> Finding:
-    """Draws the energy over the angle, and how far each law is from MuJoCo."""
+    """Draws the energy over the angle, and how far each law is from MuJoCo.
+
+    Raises:
+        StudyError: No point was computed at all.
+    """
+    table = computed(table, "restitution")
     groups = {name: table.select(table["setting"] == name) for name in SETTINGS}
     by_setting = {name: _summary(mine) for name, mine in groups.items() if len(mine)}
     return Finding(draw(table, by_setting), _paragraph(by_setting), {"settings": by_setting})
@@ -106,8 +111,6 @@ def _nearest(distances: Mapping[str, float]) -> str | None:
 def _paragraph(by_setting: Mapping[str, Summary]) -> str:
     missing = [f"'{name}'" for name in SETTINGS if name not in by_setting]
     said = f"With {', '.join(missing)} {MISSING}. " if missing else ""
-    if not by_setting:
-        return said.rstrip()
     nearest = [row["nearest_law"] for row in by_setting.values()]
     counts = {law: nearest.count(law) for law in dict.fromkeys(nearest)}
     names = {None: "none", "inelastic": "the inelastic one"}

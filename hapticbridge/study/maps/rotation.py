@@ -9,7 +9,7 @@ import numpy as np
 
 from hapticbridge.study.maps.rotation_picture import draw
 from hapticbridge.study.maps.rotation_runs import METHODS_SHOWN, SOFT, evaluate, points
-from hapticbridge.study.maps.stability_map import Finding, StabilityMap
+from hapticbridge.study.maps.stability_map import Finding, StabilityMap, computed
 from hapticbridge.study.maps.tumbling import (
     INERTIA,
     PERIOD,
@@ -30,7 +30,12 @@ below what changes the motion."""
 
 
 def read(table: Table) -> Finding:
-    """Draws verdicts over speed and angle, creation over speed, and the jump at the cut."""
+    """Draws verdicts over speed and angle, creation over speed, and the jump at the cut.
+
+    Raises:
+        StudyError: No point was computed at all.
+    """
+    table = computed(table, "rotation")
     boundary = _boundary(table)
     return Finding(draw(table), _paragraph(boundary), boundary)
 
@@ -112,21 +117,29 @@ def _strict_share(cells: Table, method: str) -> float | None:
 
 def _paragraph(boundary: Mapping[str, Any]) -> str:
     said = [_of_method(name, boundary) for name in METHODS_SHOWN]
-    free, cut = boundary["translation_only"], boundary["cut"]
-    if free["speed"]:
-        usual = int(np.argmin(np.abs(np.asarray(free["speed"]) - TOLD_AT)))
-        text = (
-            f"Coupled in translation alone, the tool creates {free['created'][usual]:.2g} J in 1 s "
-            f"at {free['speed'][usual]:.3g} rad/s, and more the faster up to "
-            f"{free['grows_up_to']:.3g} rad/s"
-        )
-        if free["largest_deviation"] is not None:
-            text += (
-                f"; up to {free['compared_up_to']:.3g} rad/s, where that is little next to its "
-                f"own energy, it is ½T²|ω × Iω|²/I a step "
-                f"within {100 * free['largest_deviation']:.2g} %"
-            )
-        said.append(text)
+    said += [_of_translation(boundary["translation_only"]), *_of_cut(boundary["cut"])]
+    return f"With K_r = {SOFT:g} N m/rad: " + ". ".join(said) + "."
+
+
+def _of_translation(free: Mapping[str, Any]) -> str:
+    if not free["speed"]:
+        return f"In translation alone {MISSING}"
+    usual = int(np.argmin(np.abs(np.asarray(free["speed"]) - TOLD_AT)))
+    text = (
+        f"Coupled in translation alone, the tool creates {free['created'][usual]:.2g} J in 1 s "
+        f"at {free['speed'][usual]:.3g} rad/s, and more the faster up to "
+        f"{free['grows_up_to']:.3g} rad/s"
+    )
+    if free["largest_deviation"] is None:
+        return text
+    return (
+        f"{text}; up to {free['compared_up_to']:.3g} rad/s, where that is little next to its "
+        f"own energy, it is ½T²|ω × Iω|²/I a step within {100 * free['largest_deviation']:.2g} %"
+    )
+
+
+def _of_cut(cut: Mapping[str, Any]) -> list[str]:
+    said = []
     if cut["speed_measured"] is not None:
         said.append(
             f"A sudden turn passes the cut at π at {cut['speed_measured']:.4g} rad/s, predicted "
@@ -137,13 +150,15 @@ def _paragraph(boundary: Mapping[str, Any]) -> str:
             f"Behind the cut the torque of 'implicit' flips by {cut['torque_jump']:.3g} N m within "
             f"a tick, and it creates {cut['created']:.2g} J at most"
         )
-    at_weld = cut["largest_torque_jump"]["weld"]
-    if at_weld is not None and at_weld > cut["torque_jump_predicted"]:
+    jumps = cut["largest_torque_jump"]
+    if all(jump is None for jump in jumps.values()):
+        said.append(f"Of sudden turns {MISSING}")
+    if (jumps["weld"] or 0.0) > cut["torque_jump_predicted"]:
         said.append(
             "The gains of a 'weld' are those of the translation; where its angle passes π its "
-            f"torque jumps by up to {at_weld:.1g} N m"
+            f"torque jumps by up to {jumps['weld']:.1g} N m"
         )
-    return f"With K_r = {SOFT:g} N m/rad: " + ". ".join(said) + "."
+    return said
 
 
 def _of_method(name: str, boundary: Mapping[str, Any]) -> str:
