@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
+from numpy.typing import NDArray
 
 from hapticbridge.picture import new_figure
 from hapticbridge.scene.contact_rule import contact_numbers
@@ -32,6 +34,11 @@ PANELS = (
     ("peg", "implicit", (1000.0, 6000.0), "peg in the hole, discrete"),
 )
 """Rig, method, K in N/m and title."""
+
+CONTOUR = 160
+"""Points along each axis from which the rule's lines are drawn; more make them smoother."""
+
+Array = NDArray[np.float64]
 
 
 def draw(table: Table, found: Sequence[Mapping[str, Any]]) -> Figure:
@@ -82,15 +89,11 @@ def _draw_panel(axes: Axes, table: Table, rig: str, method: str, stiffness: floa
     is_mine = (table["rig"] == rig) & (table["method"] == method)
     mine = table.select(is_mine & (table["stiffness"] == stiffness))
     draw_verdicts(axes, mine["steps"], mine["dampratio"], verdicts(mine), log_x=True, log_y=True)
-    steps, ratio = np.meshgrid(np.geomspace(*STEPS, 160), np.geomspace(*DAMPING_RATIO, 160))
-    numbers = [
-        contact_numbers((s * PERIOD, d), SHIPPED_SOLIMP, PERIOD)
-        for s, d in zip(steps.flat, ratio.flat, strict=True)
-    ]
-    lines: dict[str, Any] = {"linewidths": 1.5, "colors": "black"}
-    for name, style, _ in LINES:
-        is_above = np.reshape([is_in(name, n) for n in numbers], steps.shape)
-        axes.contour(steps, ratio, is_above, levels=[0.5], linestyles=style, **lines)
+    steps, ratio, regions = _rule()
+    for (_, style, _), is_above in zip(LINES, regions, strict=True):
+        axes.contour(
+            steps, ratio, is_above, levels=[0.5], linestyles=style, linewidths=1.5, colors="black"
+        )
     axes.plot(2.0, 1.0, "o", color="black", mfc="white", ms=5)
     axes.annotate(
         "as shipped",
@@ -103,3 +106,20 @@ def _draw_panel(axes: Axes, table: Table, rig: str, method: str, stiffness: floa
     )
     axes.set_xlim(*STEPS)
     axes.set_ylim(*DAMPING_RATIO)
+
+
+@cache
+def _rule() -> tuple[Array, Array, list[Array]]:
+    """Returns timeconst/T, dampratio, and where each line's region of the rule is.
+
+    The regions have a row a dampratio. Kept, because every panel shows the same.
+    """
+    steps, ratio = (np.geomspace(*ends, CONTOUR) for ends in (STEPS, DAMPING_RATIO))
+    numbers = [
+        [contact_numbers((s * PERIOD, d), SHIPPED_SOLIMP, PERIOD) for s in steps] for d in ratio
+    ]
+    regions = [
+        np.array([[is_in(name, one) for one in row] for row in numbers], dtype=np.float64)
+        for name, _, _ in LINES
+    ]
+    return steps, ratio, regions
