@@ -28,7 +28,7 @@ from hapticbridge.study.results import ResultFolder
 from hapticbridge.study.sweep import Chunk, _Shift, sweep
 from hapticbridge.study.table import Outcome, Table
 from hapticbridge.study.task import WORKER_DIED
-from hapticbridge.study.workers import Workers
+from hapticbridge.study.workers import Workers, cores
 
 POINTS = grid(stiffness=[1000, 3000.0, 1e4 / 3], damping=np.linspace(0.1, 0.3, 3), tool="peg")
 
@@ -126,6 +126,21 @@ def test_the_table_holds_what_a_plain_loop_gives() -> None:
         assert table["needed"][row] == expected["needed"]
         assert table["verdict"][row] == expected["verdict"]
         np.testing.assert_equal(table["limit"][row], expected["limit"])
+
+
+def test_own_processes_get_one_blas_thread_each_unless_the_user_says_otherwise(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.delenv("OPENBLAS_NUM_THREADS", raising=False)
+    alone = sweep(functions.blas_threads, grid(n=[0]))
+    assert alone["asked"][0] == "1"
+    assert "OPENBLAS_NUM_THREADS" not in os.environ
+    monkeypatch.setenv("OPENBLAS_NUM_THREADS", "2")
+    told = sweep(functions.blas_threads, grid(n=[0]))
+    assert told["asked"][0] == "2"
+    assert os.environ["OPENBLAS_NUM_THREADS"] == "2"
+    if alone["threads"][0] and cores() > 1:
+        assert alone["threads"][0] < told["threads"][0]
 
 
 def test_every_executor_gives_the_same_bits(tmp_path: Path) -> None:
