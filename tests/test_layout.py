@@ -18,7 +18,7 @@ ORDER = (
     ("guard", "recording", "certificate"),
     ("provenance", "summary"),
     ("bridge", "audit"),
-    ("report", "study"),
+    ("report", "study", "check"),
     ("cli",),
 )
 RANK = {name: rank for rank, names in enumerate(ORDER) for name in names}

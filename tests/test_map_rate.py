@@ -94,7 +94,7 @@ def test_half_of_all_ticks_lost_costs_a_free_device_two_thirds_of_its_stiffness(
     assert finite_hand("ordinary hand", 0.97 * full, lost).is_stable
 
 
-def test_uneven_ticks_are_told_by_three_periods() -> None:
+def test_uneven_ticks_are_told_by_three_periods_and_an_ordinary_hand_bears_more() -> None:
     told = unevenness([1e-3, 1e-3, 2e-3])
     assert told == pytest.approx({"mean": 4e-3 / 3, "longest": 2e-3, "balanced": 6e-3 / 4})
     point: Point = {"what": "drops", "hand": "no hand", "period": 1e-3, "delay": 0, "share": 0.5}
@@ -102,6 +102,8 @@ def test_uneven_ticks_are_told_by_three_periods() -> None:
     # geometric gaps: E[T] = T/(1 − p), E[T²]/E[T] = T (1 + p)/(1 − p)
     assert found["mean"] == pytest.approx(2e-3, rel=0.05)
     assert found["balanced"] == pytest.approx(3e-3, rel=0.05)
+    held = evaluate(point | {"hand": "ordinary hand"})
+    assert held["limit"] > 3 * found["limit"]  # an ordinary hand takes its share of the energy
     longest = max(Timing(drops=0.5, seed=s).intervals(TICKS).max() for s in range(SEEDS))
     assert found["longest"] == pytest.approx(1e-3 * longest / PARTS)
 
@@ -164,7 +166,7 @@ FULL = [
         for share in (0.0, 0.5)
     ),
     *(
-        uneven(what, "ordinary hand", share, 9000.0)
+        uneven(what, "ordinary hand", share, 12_000 - 6000 * share)
         for what in ("jitter", "drops")
         for share in (0.0, 0.5)
     ),
@@ -190,6 +192,8 @@ def test_what_is_read_is_what_the_table_says() -> None:
     assert "T = 1 to 2 ms" in said
     assert "to the power 0.000" in said or "to the power -0.000" in said
     assert said.count("at 0.5 a free device keeps 75 % of its stiffness (3000 N/m)") == 2
+    assert said.count("2b ΣT/ΣT² = 2667 by the balance of energy, 4000 at the mean") == 2
+    assert said.count("and 1000 at the longest") == 2
     assert said.count("an ordinary hand is stable up to 9000 N/m") == 2
     assert "Delay of 1, 2, 3, 4 samples: no point could be computed" in said
 
@@ -215,9 +219,11 @@ def test_what_failed_is_left_out_and_named() -> None:
 
 
 def test_a_search_without_an_end_is_no_comparison() -> None:
-    nowhere = [even(1e-3, 0, 0.0), even(2e-3, 0, float("inf")), uneven("drops", "no hand", 0, 0.0)]
-    found = read(written(nowhere))
+    ends = [even(1e-3, 0, 0.0), even(2e-3, 0, float("inf"))]
+    found = read(written([*ends, uneven("drops", "no hand", 0, 0.0)]))
     assert found.boundary["by_delay"]["0"]["slope"] is None
+    some = read(written([*ends, even(1e-3, 0, 700.0), even(4e-3, 0, 175.0)]))
+    assert some.boundary["by_delay"]["0"]["slope"] == pytest.approx(-1)
     assert "a free device bears (0 N/m)" in found.paragraph
 
 

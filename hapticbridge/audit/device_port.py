@@ -20,6 +20,8 @@ def burnt_by_damping(
 ) -> Array:
     """Returns Σ b‖δp‖²/T, the least that the device's damping burns, (n,) in J.
 
+    Dry friction is not counted: an encoder's steps do not tell how far the device slid.
+
     Args:
         parameters: The run's; the damping is known.
         moved: δp of each tick, (n, 3) in m.

@@ -37,7 +37,7 @@ class AuditReport:
             unknown or its motion is prescribed.
         reason: The verdict in a sentence.
         tick: First tick at fault, or None.
-        port: The port or field at fault.
+        port: The port at fault, ``environment`` or ``device``, or the field.
         joules: Energy at fault: created beyond what is allowed, or the mismatch.
         slack_share: Largest share of the slack that was used, 0 if strict.
         resimulation: ``bit for bit``, ``within 1e-9 (other processor)``, ``disagrees`` or ``not
@@ -92,7 +92,9 @@ def audit(path: str | Path, *, strict: bool = False) -> AuditReport:
 
     Structure (checksums, schema, contiguous ticks, finite numbers, digest), the wrench against the
     coupling law, energies recomputed from poses and wrenches, the device condition, and, where the
-    versions match, a re-simulation that must agree bit for bit.
+    versions match, a re-simulation that must agree bit for bit. Unless the device condition proves
+    the device's port, it is judged by what happened: the verdict is ``active`` from the tick on at
+    which the device was given more than its damping burns and scene and coupling give up.
 
     Args:
         path: The recording.

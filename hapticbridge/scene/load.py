@@ -24,6 +24,25 @@ from hapticbridge.scene.weld import add_weld, carry_over, set_weld_gains
 START_KEYFRAME = "home"
 
 
+@dataclass(frozen=True, slots=True)
+class SceneSource:
+    """A scene as its file says, with its parameters set and nothing put into it.
+
+    Attributes:
+        path: The MJCF file.
+        spec: MuJoCo's specification of it.
+        sources: The original bytes of the file, its includes and its assets.
+        parameters: Value of each of the scene's parameters, in the unit that its file names.
+        concerns: What will run otherwise than the file says, a clause each.
+    """
+
+    path: Path
+    spec: mujoco.MjSpec
+    sources: tuple[SourceFile, ...]
+    parameters: dict[str, float]
+    concerns: tuple[str, ...] = ()
+
+
 @dataclass(slots=True)
 class Scene:
     """A compiled scene with its handle, ready to be stepped.
@@ -169,6 +188,20 @@ def load_scene(path_or_name: str | Path, grip: str = "grip", **parameters: float
     Warns:
         UserWarning: The scene will run, but not quite as its file says.
     """
+    return compile_scene(read_scene(path_or_name, **parameters), grip, stacklevel=3)
+
+
+def read_scene(path_or_name: str | Path, **parameters: float) -> SceneSource:
+    """Reads a scene without putting anything into it: what ``compile_scene`` makes a scene of.
+
+    Args:
+        path_or_name: An MJCF file, or one of ``scene_names()``.
+        **parameters: Values of the scene's parameters.
+
+    Raises:
+        SceneError: The scene cannot be read or has an option that does not belong under a bridge,
+            or has no such parameter or not of that value.
+    """
     path = scene_path(path_or_name)
     try:
         spec = mujoco.MjSpec.from_file(str(path))
@@ -178,19 +211,43 @@ def load_scene(path_or_name: str | Path, grip: str = "grip", **parameters: float
     concerns = check_options(spec)
     check_numbers(sources)
     values = apply_parameters(spec, path, parameters)
+    return SceneSource(path, spec, sources, values, tuple(concerns))
+
+
+def compile_scene(
+    source: SceneSource, grip: str = "grip", *, warns: bool = True, stacklevel: int = 2
+) -> Scene:
+    """Puts handle and coupling into a scene that was read, and compiles it.
+
+    Args:
+        source: What ``read_scene`` returned, or the same with a changed specification; it stays as
+            it is.
+        grip: Name of the site on the tool.
+        warns: Whether to say what will run otherwise than the file says.
+        stacklevel: Whose line the warnings name.
+
+    Raises:
+        SceneError: The scene cannot be compiled or put behind a device; says why.
+
+    Warns:
+        UserWarning: The scene will run, but not quite as its file says.
+    """
+    path, spec = source.path, source.spec.copy()
     attach_handle(spec, grip)
     set_options(spec)
     try:
-        model = _compiled(spec, sources)
-        concerns += check_model(model, grip)
+        model = _compiled(spec, source.sources)
+        concerns = [*source.concerns, *check_model(model, grip)]
         seat_handle(model, grip)
-        scene = Scene(path, grip, model, mujoco.MjData(model), sources, values, spec)
+        data, values = mujoco.MjData(model), dict(source.parameters)
+        scene = Scene(path, grip, model, data, source.sources, values, spec)
         scene.reset()
     except (ValueError, OSError, MemoryError, mujoco.FatalError) as error:
         raise SceneError(f"cannot compile scene '{path}': {_sentence(error)}") from None
     check_start(model, scene.data, grip)
-    for concern in concerns:
-        warnings.warn(f"scene '{path}': {concern}", UserWarning, stacklevel=2)
+    if warns:
+        for concern in concerns:
+            warnings.warn(f"scene '{path}': {concern}", UserWarning, stacklevel=stacklevel)
     return scene
 
 

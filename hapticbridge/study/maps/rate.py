@@ -121,7 +121,8 @@ def _of_uneven(what: str, mine: Mapping[str, Any]) -> str:
         said.append(f"no hand: {MISSING}")
     else:
         first, last = free["measured"][0], free["measured"][-1]
-        kept = f"keeps {100 * last / first:.0f} % of its stiffness" if first > 0 else "bears"
+        is_known = 0 < first < np.inf and last < np.inf
+        kept = f"keeps {100 * last / first:.0f} % of its stiffness" if is_known else "bears"
         said.append(
             f"at {free['share'][-1]:g} a free device {kept} ({last:.0f} N/m), against "
             f"2b ΣT/ΣT² = {free['at_balanced'][-1]:.0f} by the balance of energy, "

@@ -1,0 +1,116 @@
+"""Leads a scene through a motion as the bridge would, and keeps what the hand would feel.
+
+The hand does not yield: the handle is where the motion says, whatever the force. So two versions of
+a scene can be compared tick by tick, and what differs between their wrenches is their doing.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticbridge.coupling import Coupling
+from hapticbridge.errors import SceneError
+from hapticbridge.kernel.parameters import RunParameters
+from hapticbridge.kernel.state import Binding
+from hapticbridge.kernel.step import simulate
+from hapticbridge.ledger import Ledger
+from hapticbridge.rendering import prepare
+from hapticbridge.scene import Scene
+from hapticbridge.tick import TICK_DTYPE
+
+_UNLIMITED = 1e30
+"""Force in N and torque in N m that are cut: none, because the force itself is compared."""
+
+_IDENTITY = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rehearsal:
+    """What a scene did under a motion.
+
+    Attributes:
+        records: One per tick, ``TICK_DTYPE``; ``wrench_on_tool`` is what the hand would feel.
+        environment: ``strict``, ``within slack`` or ``active``.
+        slack_share: Largest share of the slack that was used, without unit.
+        fault: Tick and port of the first fault, or None.
+        warnings: How often MuJoCo warned.
+        seconds: Processor time of the run in s: MuJoCo's step and the bridge's arithmetic.
+    """
+
+    records: NDArray[np.void]
+    environment: str
+    slack_share: float
+    fault: tuple[int, str] | None
+    warnings: int
+    seconds: float
+
+
+def rehearse(
+    scene: Scene,
+    samples: NDArray[np.void],
+    coupling: Coupling,
+    period: float,
+    substeps: int = 1,
+) -> Rehearsal:
+    """Runs the scene from its start, one tick per sample.
+
+    Args:
+        scene: Changed in place: reset, with the coupling's gains and the time step set.
+        samples: Poses counted from the first, ``SAMPLE_DTYPE``, as ``samples_of`` returns them.
+        coupling: K and B.
+        period: T in s.
+        substeps: MuJoCo steps per tick.
+
+    Raises:
+        SceneError: A value is out of range, or a result is not finite; says at which tick.
+    """
+    parameters = rehearsal_parameters(scene, coupling, period, substeps)
+    binding = Binding(scene.model, scene.data, parameters)
+    rows = np.zeros(samples.size, TICK_DTYPE)
+    start = time.process_time()
+    done = simulate(binding.state, samples, binding.row, rows)
+    seconds = time.process_time() - start
+    if done < samples.size:
+        raise SceneError(
+            f"scene '{scene.name}' is not finite after tick {done} of {samples.size} of the motion"
+        )
+    ledger = Ledger.of(binding.state)
+    return Rehearsal(
+        records=rows,
+        environment=ledger.environment,
+        slack_share=ledger.slack_share,
+        fault=ledger.fault,
+        warnings=sum(int(warning.number) for warning in scene.data.warning),
+        seconds=seconds,
+    )
+
+
+def rehearsal_parameters(
+    scene: Scene, coupling: Coupling, period: float, substeps: int = 1
+) -> RunParameters:
+    """Puts a scene to its start for a rehearsal, and returns what ``Binding`` needs.
+
+    Raises:
+        SceneError: A value is out of range.
+    """
+    prepare(scene, coupling, period, substeps, warns=False)
+    # an error inside the C symbol would end the process, so MuJoCo takes its first step in Python
+    mujoco.mj_step(scene.model, scene.data)
+    scene.reset()
+    return RunParameters(
+        grip=scene.grip,
+        period=period,
+        substeps=substeps,
+        coupling=coupling,
+        force_limit=_UNLIMITED,
+        torque_limit=_UNLIMITED,
+        ramp_ticks=0,
+        device_origin=_IDENTITY,
+        handle_origin=scene.grip_pose(),
+        device_start=_IDENTITY,
+    )
