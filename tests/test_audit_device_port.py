@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from audit_cases import recorded
+from audit_cases import ScriptedDevice, recorded
 from random_hands import random_motion
 
 from hapticbridge.audit.balance import Balance
@@ -74,11 +74,62 @@ def test_the_balance_is_the_identity_behind_the_bound() -> None:
     assert given + kept[last] == pytest.approx(-squares, rel=1e-12)
 
 
-def kicked(path: Path, damping: float | None = None) -> np.ndarray:
+def kept(
+    run: RunParameters, stretch: list[float], passed: float = 1.0, work: float = 0.0
+) -> list[float]:
+    """Returns what was kept after each tick from the start, of a spring along x."""
+    count = len(stretch)
+    e = np.zeros((count, 3))
+    e[:, 0] = stretch
+    none = np.zeros((count, 3))
+    energy = kept_behind_a_law(
+        run,
+        stretch=(e, none),
+        stretched=(none, none),
+        work=(np.full(count, work), np.zeros(count)),
+        passed=(np.full(count, passed), np.ones(count)),
+        since_start=np.arange(count, dtype=np.float64),
+    )
+    return [float(value) for value in energy]
+
+
+def test_a_spring_that_is_limited_stores_force_times_length_beyond_the_limit() -> None:
+    # K = 2000 N/m: 1 N at 0.5 mm, 0.5 N at 0.25 mm
+    for run, spring in (
+        (replace(RUN, force_limit=1.0), 0.25e-3 + 1.5e-3),
+        (replace(RUN, force_limit=1.0, force_scale=2.0), 0.0625e-3 + 0.5 * 1.75e-3),
+        (RUN, 4e-3),
+    ):
+        assert kept(run, [0.0, 2e-3]) == pytest.approx([0.0, spring])
+
+
+def test_a_force_that_rises_finds_the_spring_stretched() -> None:
+    run = replace(RUN, ramp_ticks=1)  # half of the force in the first tick
+    assert kept(run, [1e-3, 1e-3]) == pytest.approx([0.0, 0.0], abs=1e-15)
+    assert kept(run, [1e-3, 2e-3]) == pytest.approx([0.0, 0.5 * (4e-3 - 1e-3)])
+
+
+def test_work_counts_as_far_as_its_force_reached_the_device() -> None:
+    assert kept(RUN, [0.0, 0.0, 0.0], passed=0.25, work=8.0) == [0.0, 2.0, 4.0]
+
+
+def test_half_the_force_is_half_the_energy(tmp_path: Path) -> None:
+    lost = []
+    for force_scale in (1.0, 0.5):
+        path = tmp_path / f"{force_scale}.mcap"
+        device = ScriptedDevice(lambda k: (1e-5 * k, 0, 1e-5 * k, 1, 0, 0, 0))
+        coupling = Coupling(1000.0, 0.5, 1.0, 5e-4)
+        recorded(path, "point_mass", device, coupling, duration=0.2, force_scale=force_scale)
+        lost.append(kicked(path, 0.0, 0.0))
+    assert np.abs(lost[0]).max() > 1e-6
+    np.testing.assert_allclose(lost[1], 0.5 * lost[0], rtol=1e-9, atol=1e-15)
+
+
+def kicked(path: Path, damping: float | None = None, rotational: float = 1.0) -> np.ndarray:
     """Returns what the device of a recording was given beyond what is paid for, in J."""
     recording = read_recording(path)
     parameters = replace(
-        parameters_of(recording.meta), device_damping=damping, device_rotational_damping=1.0
+        parameters_of(recording.meta), device_damping=damping, device_rotational_damping=rotational
     )
     starts = {name: meta_start(recording.meta, name) for name in STARTS}
     resumed = [e["tick"] for e in recording.events if e["event"] == "resume"]

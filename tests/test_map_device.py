@@ -16,7 +16,7 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.errors import StudyError
 from hapticbridge.scene import load_scene
 from hapticbridge.study.closed_loop import LoopOutcome
-from hapticbridge.study.maps.device import DEVICE, read
+from hapticbridge.study.maps.device import DEVICE, evaluate, read
 from hapticbridge.study.maps.device_runs import (
     LARGE,
     PERIOD,
@@ -46,6 +46,14 @@ def test_what_a_device_does_is_named_as_theory_names_its_region(
     beta: float, sigma: float, region: str
 ) -> None:
     assert region_of(settle(beta, sigma, 0.0)[0], settle(beta, sigma, LARGE)[0]) == region
+
+
+def test_a_knock_that_grows_slowly_diverges() -> None:
+    what, last, run = settle(0.49, 0.3, LARGE)
+    assert what == "diverges"
+    # it grew by less than a factor of two in its last third
+    steps = run.records["device_position"][-2000:-1000, 0] / RESOLUTION
+    assert 1.02 * np.ptp(steps) < last < 2 * np.ptp(steps)
 
 
 def test_a_bounded_cycle_goes_to_and_fro_across_one_encoder_step() -> None:
@@ -128,6 +136,31 @@ def test_the_audit_names_the_device_that_has_too_little_damping(
     assert report.tick == (1 if port else None)
 
 
+@pytest.mark.parametrize(
+    ("small", "large", "region", "size"),
+    [
+        (("cycle", 1.0), ("falls", 50.0), "bounded limit cycle", 1.0),
+        (("rest", 0.0), ("cycle", 7.0), "bounded limit cycle", 7.0),
+        (("rest", 0.0), ("diverges", 99.0), "locally stable", 0.0),
+    ],
+)
+def test_a_cell_tells_the_size_of_the_cycle_that_was_seen(
+    small: tuple[str, float],
+    large: tuple[str, float],
+    region: str,
+    size: float,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    run = settle(1.0, 1.0, 0.0)[2]
+
+    def settled(beta: float, sigma: float, knock: float) -> tuple[str, float, LoopOutcome]:
+        return (*(large if knock else small), run)
+
+    monkeypatch.setattr("hapticbridge.study.maps.device.settle", settled)
+    got = evaluate({"what": "cell", "beta": 1.0, "sigma": 1.0, "damping": 0.0})
+    assert (got["region"], got["cycle"], got["last_range"]) == (region, size, large[1])
+
+
 def cell(beta: float, sigma: float, small: str, large: str, size: float) -> Row:
     point: Point = {"what": "cell", "beta": beta, "sigma": sigma, "damping": 0.0}
     return point, {
@@ -155,6 +188,7 @@ CELLS = [
     cell(0.9, 0.8, "rest", "rest", 0.0),
     cell(0.6, 0.3, "cycle", "cycle", 5.0),
     cell(0.9, 0.3, "rest", "rest", 0.0),  # theory: bounded limit cycle
+    cell(1.5, 1.6, "rest", "rest", 0.0),
 ]
 DAMPERS = [damper(0.0, 0.5, 0.4), damper(1.0, 1.1, 0.6)]  # theory: 0.5 and 1
 
@@ -163,12 +197,12 @@ def test_what_is_read_is_what_the_table_says() -> None:
     found = read(written(CELLS + DAMPERS))
     regions, friction = found.boundary["regions"], found.boundary["friction"]
     assert regions["points"] == {
-        "passive": 2,
+        "passive": 3,
         "locally stable": 1,
         "bounded limit cycle": 3,
         "unstable": 2,
     }
-    assert regions["agreement"] == 5 / 8
+    assert regions["agreement"] == 6 / 9
     assert regions["measured_edges"] == {
         "beta": {"last": 0.6, "first": 0.9},
         "sigma": {"last": 0.3, "first": 0.8},
@@ -177,7 +211,7 @@ def test_what_is_read_is_what_the_table_says() -> None:
     assert friction["predicted"] == [0.5, 1.0]
     assert friction["worst_ratio_error"] == pytest.approx(0.1)
     said = found.paragraph
-    assert "at 62 % of the points: passive 2, locally stable 1, bounded limit cycle 3" in said
+    assert "at 67 % of the points: passive 3, locally stable 1, bounded limit cycle 3" in said
     assert "ends at β = 0.60 to 0.90" in said
     assert "from σ = 0.30 to 0.80 on" in said
     assert "the largest bounded limit cycle is 7, the median one 5" in said
