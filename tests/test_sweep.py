@@ -143,6 +143,15 @@ def test_own_processes_get_one_blas_thread_each_unless_the_user_says_otherwise(
         assert alone["threads"][0] < told["threads"][0]
 
 
+def test_a_result_that_no_point_gave_is_missing_or_empty() -> None:
+    table = serial()
+    assert np.isnan(table.numbers("mass")).all()
+    assert list(table.texts("verdict")) == list(table["verdict"])
+    assert list(table.texts("colour")) == [""] * len(table)
+    with pytest.raises(StudyError, match="no column 'colour'"):
+        table["colour"]
+
+
 def test_every_executor_gives_the_same_bits(tmp_path: Path) -> None:
     expected = serial()
     with ThreadPoolExecutor(3) as threads:
