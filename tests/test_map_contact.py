@@ -256,6 +256,16 @@ def test_boundary_and_paragraph_follow_from_a_made_up_table() -> None:
     assert "strict in 3 of 5 runs and uses up to 0.75 of the slack, at 0.30 and at most" in said
 
 
+def test_a_rule_that_does_not_hold_is_said_not_to() -> None:
+    rows: list[Row] = [
+        (at, counted("active") if at["rig"] == "peg" and at["stiffness"] == 1000.0 else got)
+        for at, got in WRITTEN
+    ]
+    said = CONTACT.read(written(rows)).paragraph
+    assert "The rule did not hold everywhere: on the peg's grid 1 of 2 settings" in said
+    assert "1 of 2 that it has within the slack for 30 g stayed there, and 2 of 2 for" in said
+
+
 @pytest.mark.parametrize("rig", ["peg", "search", "wall"])
 def test_a_rig_that_fails_is_named_and_the_others_are_read(rig: str) -> None:
     rows: list[Row] = [(at, "E" if at["rig"] == rig else got) for at, got in WRITTEN]
