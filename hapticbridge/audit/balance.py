@@ -150,8 +150,7 @@ class Balance:
         position, orientation = _handle(ticks, parameters)
         stored = ticks["kinetic"] + ticks["potential"] - start_energy
         created = stored - coupling_work - ticks["actuator_work"] - ticks["external_work"]
-        # without a law all that the scene took up counts as kept
-        kept = coupling_work
+        kept = coupling_work  # without a law, all that the scene took up
         if parameters.has_law:
             kept = kept_behind_a_law(
                 parameters,
@@ -203,7 +202,7 @@ def _kicked(
     kept: Array,
     resumed: Array,
 ) -> Array:
-    """Returns Σ w·δp − Σ b‖δp‖²/T + Σ E_k + what was kept, the last two in the device's scale."""
+    """Returns Σ w·δp − Σ b‖δp‖²/t + Σ E_k + what was kept, the last two in the device's scale."""
     if parameters.device_damping is None or (parameters.has_law and parameters.laws > 1):
         return np.zeros(len(ticks))
     start = np.array(parameters.device_start)
@@ -211,6 +210,7 @@ def _kicked(
         parameters,
         steps(ticks["device_position"], start[:3]),
         turns(ticks["device_quaternion"], start[3:]),
+        np.diff(ticks["read_ns"], prepend=0) * 1e-9,
         since_start(ticks, resumed) > 0,
     )
     return np.asarray(given - burnt + parameters.force_scale / parameters.scale * (created + kept))

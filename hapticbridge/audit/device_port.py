@@ -16,22 +16,30 @@ Array = NDArray[np.float64]
 
 
 def burnt_by_damping(
-    parameters: RunParameters, moved: Array, turned: Array, is_running: NDArray[np.bool_]
+    parameters: RunParameters,
+    moved: Array,
+    turned: Array,
+    interval: Array,
+    is_running: NDArray[np.bool_],
 ) -> Array:
-    """Returns Σ b‖δp‖²/T, the least that the device's damping burns, (n,) in J.
+    """Returns Σ b‖δp‖²/t, the least that the device's damping burns, (n,) in J.
 
-    Dry friction is not counted: an encoder's steps do not tell how far the device slid.
+    t is the time between two samples, T at least: a damper that moves by δp within t burns no less
+    than at constant speed, and a missed deadline makes t longer. Dry friction is not counted: an
+    encoder's steps do not tell how far the device slid.
 
     Args:
         parameters: The run's; the damping is known.
         moved: δp of each tick, (n, 3) in m.
         turned: Its rotation vectors, (n, 3) in rad.
+        interval: t as recorded, (n,) in s.
         is_running: Where the tick's duration is known: a jump before the first tick or in a pause
             took an unknown time, and burns nothing here.
     """
     burnt = (parameters.device_damping or 0.0) * np.sum(moved**2, axis=1)
     burnt += (parameters.device_rotational_damping or 0.0) * np.sum(turned**2, axis=1)
-    return np.asarray(np.cumsum(np.where(is_running, burnt, 0.0)) / parameters.period)
+    time = np.maximum(interval, parameters.period)
+    return np.asarray(np.cumsum(np.where(is_running, burnt / time, 0.0)))
 
 
 def ramp_share(parameters: RunParameters, since_start: Array) -> Array:

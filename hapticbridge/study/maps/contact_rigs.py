@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Hand, Motion, SimulatedDevice
+from hapticbridge.guard import UNLIMITED
 from hapticbridge.rendering import METHODS
-from hapticbridge.study.closed_loop import UNLIMITED, ClosedLoop
+from hapticbridge.study.closed_loop import ClosedLoop
 from hapticbridge.study.maps.contact_hands import random_push, recorded, tapping
 from hapticbridge.study.maps.contact_treatments import PERIOD, Treatment
 from hapticbridge.study.maps.rigs import loop_in, set_tool_mass
@@ -179,8 +180,8 @@ def _device(coupling: Coupling, path: Motion, hand: Hand) -> SimulatedDevice:
         * (coupling.rotational_stiffness * half + coupling.rotational_damping),
         hand=hand,
         path=path,
-        force_limit=UNLIMITED,
-        torque_limit=UNLIMITED,
+        force_limit=UNLIMITED.force,
+        torque_limit=UNLIMITED.torque,
     )
 
 

@@ -8,9 +8,10 @@ from numpy.typing import NDArray
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import SimulatedDevice
+from hapticbridge.guard import UNLIMITED
 from hapticbridge.passivity import WorstHand
 from hapticbridge.rendering import METHODS
-from hapticbridge.study.closed_loop import UNLIMITED, LoopOutcome
+from hapticbridge.study.closed_loop import LoopOutcome
 from hapticbridge.study.maps.rigs import loop_in
 
 PERIOD = 1e-3
@@ -67,8 +68,8 @@ def device_and_coupling(name: str, stiffness: float) -> tuple[SimulatedDevice, C
         rotational_damping=DEVICE_DAMPING,
         hand=WorstHand(damping, nyquist, PERIOD),
         rotational_hand=WorstHand(DEVICE_DAMPING, nyquist, PERIOD),
-        force_limit=UNLIMITED,
-        torque_limit=UNLIMITED,
+        force_limit=UNLIMITED.force,
+        torque_limit=UNLIMITED.torque,
     )
     return device, coupling
 
