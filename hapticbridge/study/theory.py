@@ -39,8 +39,8 @@ of the region, the damping needed); more shows more of what lies far outside and
 TITLE_WIDTH = 95
 """Characters of a title's line that fit into 8 inches; more would be cut off."""
 
-_COLOURS = ("#1a5fb4", "#b3261e", "#2e7d32", "#8e44ad", "#c77700", "#5f6368")
-_STYLES = ("-", "--", "-.", ":", (0, (5, 1)), (0, (1, 1)))
+_COLOURS = ("#1a5fb4", "#b3261e", "#2e7d32", "#8e44ad", "#c77700", "#5f6368", "#0b7285", "#d6336c")
+_STYLES = ("-", "--", "-.", ":", (0, (5, 1)), (0, (1, 1)), "-.", (0, (4, 4)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
