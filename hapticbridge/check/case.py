@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -18,8 +19,16 @@ from hapticbridge.check.places import Places
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo, Motion, SimulatedDevice
 from hapticbridge.device.motion import lissajous
-from hapticbridge.errors import SceneError
+from hapticbridge.errors import DeviceError, SceneError
 from hapticbridge.scene import Scene, SceneSource, compile_scene
+
+DEFAULT_PERIOD = 1e-3
+"""T in s of ``hapticbridge run`` by itself."""
+
+LARGEST_WORKSPACE = 0.4
+"""Edge in m of the cube that a device reaches where nobody says: the makers of table-top devices
+state from 0.1 m (Novint Falcon) to 0.4 m (Force Dimension delta.3), so what does not fit in here
+fits none of them. The simulated device has no walls."""
 
 DEFAULT_SECONDS = 5.0
 """How long the default hand motion is followed, in s: it has its full size after 2 s."""
@@ -45,6 +54,8 @@ class Case:
         motion_name: Whose motion it is, in words.
         samples: The motion, one sample per tick.
         refused: Bodies whose inertia MuJoCo refuses, with what it says; something stands in for it.
+        workspace: Edge of the cube in m that the device reaches.
+        is_rate_given: Whether somebody asked for this period, and not the default.
         observation: What the motion showed; None where it did not end.
         motion_fault: Why it did not end.
     """
@@ -60,6 +71,8 @@ class Case:
     motion_name: str
     samples: NDArray[np.void]
     refused: dict[int, str]
+    workspace: float
+    is_rate_given: bool
     observation: Observation | None = None
     motion_fault: str = ""
 
@@ -74,8 +87,9 @@ def open_case(
     grip: str = "grip",
     *,
     coupling: Coupling | None = None,
-    period: float = 1e-3,
+    period: float | None = None,
     scale: float = 1.0,
+    workspace: float = LARGEST_WORKSPACE,
     motion: str | Path | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Case:
@@ -85,8 +99,9 @@ def open_case(
         source: What ``read_scene`` returned; it stays as it is.
         grip: Name of the site on the tool.
         coupling: K and B; None takes the default of the simulated device.
-        period: T in s.
+        period: T in s; None takes ``DEFAULT_PERIOD``.
         scale: Handle motion per device motion.
+        workspace: Edge of the cube that the device reaches, in m, > 0.
         motion: A CSV file or a recording; None takes ``NAME.csv`` beside the scene, or else the
             hand motion that ``hapticbridge run`` would make.
         progress: Called with ticks done and to do.
@@ -97,6 +112,9 @@ def open_case(
         DeviceError: The motion cannot be read, or the period or scale is out of range.
         RecordingError: Likewise.
     """
+    if not math.isfinite(workspace) or workspace <= 0:
+        raise DeviceError(f"workspace is {workspace!r} m; it must be finite and > 0")
+    is_rate_given, period = period is not None, DEFAULT_PERIOD if period is None else period
     info = SimulatedDevice().info
     coupling = coupling or default_coupling(info, period, scale, scale)
     scene, refused = _compiled(source, grip)
@@ -107,7 +125,19 @@ def open_case(
     samples = samples_of(chosen, period)
     places = Places(source, scene.model)
     case = Case(
-        source, scene, places, info, coupling, period, scale, chosen, name, samples, refused
+        source=source,
+        scene=scene,
+        places=places,
+        info=info,
+        coupling=coupling,
+        period=period,
+        scale=scale,
+        motion=chosen,
+        motion_name=name,
+        samples=samples,
+        refused=refused,
+        workspace=workspace,
+        is_rate_given=is_rate_given,
     )
     scene.set_timestep(period)
     try:

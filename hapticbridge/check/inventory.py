@@ -10,15 +10,16 @@ from numpy.typing import NDArray
 
 from hapticbridge.check.observation import ROW_KINDS, Observation
 from hapticbridge.check.places import Place, Places
+from hapticbridge.check.reach import reached_trees
 from hapticbridge.kernel.state import COUPLING_ACTUATORS, HANDLE
 from hapticbridge.scene.contact_check import meeting_pairs
 
 VISUAL = "only visual"
 TOOL = "of the tool"
-MEETS_TOOL = "meets the tool"
-MEETS_OTHER = "meets something else"
-MOVING = "moves, meets nothing"
-FIXED = "fixed, meets nothing"
+MEETS_TOOL = "that meet the tool"
+MEETS_OTHER = "that meet something else"
+MOVING = "moving that meet nothing"
+FIXED = "fixed that meet nothing"
 USES = (TOOL, MEETS_TOOL, MEETS_OTHER, MOVING, FIXED, VISUAL)
 """What a geom is there for, in the order in which it is printed."""
 
@@ -51,6 +52,9 @@ class Inventory:
         possible_pairs: Pairs of geoms that may collide.
         met_pairs: Those that did in the motion; None without one.
         rows: By kind, largest and median number of constraint rows in a step; None without motion.
+        stiffness: Least and largest stiffness in N/m that a contact of the tool amounted to under a
+            force that can be felt; None without such a contact.
+        deepest: How deep the tool was in something at most, in m; 0 without a contact.
         actuators: The scene's own.
         equalities: Equality constraints.
         tendons: Tendons.
@@ -67,6 +71,8 @@ class Inventory:
     possible_pairs: int
     met_pairs: int | None
     rows: dict[str, tuple[int, float]] | None
+    stiffness: tuple[float, float] | None
+    deepest: float
     actuators: int
     equalities: int
     tendons: int
@@ -91,6 +97,13 @@ def take_inventory(
     possible = {(min(a, b), max(a, b)) for a, b, _ in meeting_pairs(model)}
     met = possible if observation is None else set(observation.meetings)
     uses = _uses(model, is_tool, possible, met)
+    of_tool = is_tool[model.geom_bodyid]
+    felt = [
+        meeting
+        for pair, meeting in (observation.meetings if observation else {}).items()
+        if of_tool[list(pair)].any()
+    ]
+    carried = [meeting for meeting in felt if np.isfinite(meeting.softest)]
     names = [model.actuator(i).name for i in range(model.nactuator)]
     return Inventory(
         bodies=int(own.sum()),
@@ -103,11 +116,24 @@ def take_inventory(
         possible_pairs=len(possible),
         met_pairs=None if observation is None else len(met),
         rows=None if observation is None else _rows(observation),
+        stiffness=(
+            min(meeting.softest for meeting in carried),
+            max(meeting.stiffest for meeting in carried),
+        )
+        if carried
+        else None,
+        deepest=max((meeting.deepest for meeting in felt), default=0.0),
         actuators=sum(name not in COUPLING_ACTUATORS for name in names),
         equalities=int(model.neq),
         tendons=int(model.ntendon),
         idle=_idle(model, tool, places, uses, met, "" if observation is None else " in the motion"),
     )
+
+
+def geom_uses(model: mujoco.MjModel) -> list[str]:
+    """Returns what every geom is there for, as far as masks and pairs tell: for no tool."""
+    possible = {(min(a, b), max(a, b)) for a, b, _ in meeting_pairs(model)}
+    return _uses(model, np.zeros(model.nbody, dtype=bool), possible, possible)
 
 
 def _uses(
@@ -173,7 +199,7 @@ def _idle(
     A fixed body hands nothing on: two things on one table do not feel each other through it.
     """
     tree = model.body_treeid
-    reached = _reached_trees(model, tool, met)
+    reached = reached_trees(model, tool, met)
     idle = [
         Idle(places.body(body), f"never meets the tool, directly or not{when}")
         for body in range(1, model.nbody)
@@ -193,48 +219,3 @@ def _idle(
             still = "fixed and never met" if group < 0 else "never meets anything"
             idle.append(Idle(places.geom(geom), f"{still}{when}"))
     return tuple(idle)
-
-
-def _reached_trees(model: mujoco.MjModel, tool: int, met: set[tuple[int, int]]) -> set[int]:
-    """Returns the kinematic trees that the tool's own is joined to, step by step."""
-    tree = model.body_treeid
-    links = [{int(tree[model.geom_bodyid[geom]]) for geom in pair} for pair in met]
-    links += [_trees_of_equality(model, equality) for equality in range(model.neq)]
-    links += [_trees_of_tendon(model, tendon) for tendon in range(model.ntendon)]
-    links = [link - {-1} for link in links]
-    reached = {tool}
-    while new := {t for link in links if link & reached for t in link} - reached:
-        reached |= new
-    return reached
-
-
-def _trees_of_equality(model: mujoco.MjModel, equality: int) -> set[int]:
-    kind, objects = mujoco.mjtEq, (model.eq_obj1id[equality], model.eq_obj2id[equality])
-    form, tree = int(model.eq_type[equality]), model.body_treeid
-    ids = [int(each) for each in objects if each >= 0]
-    if form == kind.mjEQ_JOINT:
-        return {int(tree[model.jnt_bodyid[each]]) for each in ids}
-    if form == kind.mjEQ_TENDON:
-        return {t for each in ids for t in _trees_of_tendon(model, each)}
-    if form not in (kind.mjEQ_CONNECT, kind.mjEQ_WELD):  # of flexes, whose bodies are many
-        return set(range(model.ntree))
-    if model.eq_objtype[equality] == mujoco.mjtObj.mjOBJ_SITE:
-        ids = [int(model.site_bodyid[each]) for each in ids]
-    return {int(tree[each]) for each in ids}
-
-
-def _trees_of_tendon(model: mujoco.MjModel, tendon: int) -> set[int]:
-    wrap, tree = mujoco.mjtWrap, model.body_treeid
-    bodies = {
-        wrap.mjWRAP_JOINT: model.jnt_bodyid,
-        wrap.mjWRAP_SITE: model.site_bodyid,
-        wrap.mjWRAP_SPHERE: model.geom_bodyid,
-        wrap.mjWRAP_CYLINDER: model.geom_bodyid,
-    }
-    start = int(model.tendon_adr[tendon])
-    parts = range(start, start + int(model.tendon_num[tendon]))
-    return {
-        int(tree[bodies[kind][model.wrap_objid[part]]])
-        for part in parts
-        if (kind := mujoco.mjtWrap(int(model.wrap_type[part]))) in bodies
-    }

@@ -34,6 +34,9 @@ ROW_KINDS: dict[str, tuple[int, ...]] = {
 LEAST_FORCE = 0.05
 """Normal force in N from which a contact's stiffness is kept: below, it is not felt."""
 
+POSTURES = 100
+"""How many postures are kept; a motion of 8 s passes a hole in more than two of them."""
+
 PROGRESS_EVERY = 500
 """Ticks between two reports of progress."""
 
@@ -46,13 +49,16 @@ class Meeting:
         ticks: In how many ticks they were in contact.
         deepest: How deep one was in the other at most, in m; negative where they never overlapped.
         force: Largest normal force in N of one contact.
-        softest: Least stiffness in N/m of one contact under at least ``LEAST_FORCE``; inf if none.
+        inertia: Least that MuJoCo saw at one of their contacts, in kg, the coupling's share of
+            h B + h² K included; inf if no contact carried ``LEAST_FORCE``.
+        softest: Least stiffness in N/m of such a contact; inf if none.
         stiffest: The largest; 0 if none.
     """
 
     ticks: int = 0
     deepest: float = -np.inf
     force: float = 0.0
+    inertia: float = np.inf
     softest: float = np.inf
     stiffest: float = 0.0
 
@@ -63,6 +69,7 @@ class Observation:
 
     Attributes:
         meetings: By the ids of two geoms, the smaller first.
+        postures: ``qpos`` at times spread over the motion, shape (n, nq).
         rows: By kind, how many constraint rows each tick had.
         force: Force on the tool in N, its norm in each tick.
         full_ticks: In how many ticks the solver stopped at its limit of iterations.
@@ -72,6 +79,7 @@ class Observation:
     """
 
     meetings: dict[tuple[int, int], Meeting]
+    postures: NDArray[np.float64]
     rows: dict[str, NDArray[np.int64]]
     force: NDArray[np.float64]
     full_ticks: int
@@ -105,6 +113,7 @@ def observe(
     after = direct(after_step, state, row, 0)
     meetings: dict[tuple[int, int], Meeting] = {}
     types = np.zeros((samples.size, len(_TYPE.__members__)), np.int64)
+    postures, every = [], max(samples.size // POSTURES, 1)
     force, full = np.zeros(samples.size), 0
     for k in range(samples.size):
         if before(state, samples[k : k + 1], row, 0) != OK:
@@ -120,11 +129,14 @@ def observe(
         iterations = data.solver_niter[: max(data.nisland, 1)]
         full += bool(data.nefc) and bool(iterations.max(initial=0) >= model.opt.iterations)
         force[k] = float(np.linalg.norm(row["wrench_on_tool"][0, :3]))
+        if k % every == 0:
+            postures.append(data.qpos.copy())
         if progress is not None and k % PROGRESS_EVERY == 0:
             progress(k, samples.size)
     ledger = Ledger.of(state)
     return Observation(
         meetings=meetings,
+        postures=np.array(postures),
         rows={kind: types[:, list(those)].sum(axis=1) for kind, those in ROW_KINDS.items()},
         force=force,
         full_ticks=full,
@@ -168,7 +180,10 @@ def _note_contacts(
             spring, damper, impedance = data.efc_KBIP[adr, :3]
             spring *= impedance
             implicit = 1.0 + step * damper + step**2 * spring
-            felt = count * float(spring / (data.efc_R[adr] * implicit))
+            regular = float(data.efc_R[adr]) * implicit
+            inertia = (1.0 - impedance) / (impedance * regular)
+            meeting.inertia = min(meeting.inertia, inertia)
+            felt = count * float(spring) / regular
             meeting.softest = min(meeting.softest, felt)
             meeting.stiffest = max(meeting.stiffest, felt)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -108,9 +108,13 @@ class Places:
             or Place(self._main, 0, "<option>")
         )
 
-    def attribute(self, tags: Iterable[str], attribute: str, value: str) -> Place | None:
-        """Returns the first of some elements that has an attribute of that value."""
-        return self._first(tuple(tags), lambda element: element.attributes.get(attribute) == value)
+    def with_attribute(self, attribute: str) -> Place | None:
+        """Returns the first element that has an attribute, of whatever tag."""
+        for file, elements in self._files:
+            for element in elements:
+                if attribute in element.attributes:
+                    return Place(file, element.line, _describe(element))
+        return None
 
     def attributes_at(self, place: Place) -> dict[str, str]:
         """Returns what is written at a place itself, without the defaults that reach it."""
