@@ -10,7 +10,7 @@ import numpy as np
 from hapticbridge.check.case import Case
 from hapticbridge.check.clearance import clearances
 from hapticbridge.check.contact_stiffness import constraint_stiffness, depth_under
-from hapticbridge.check.faults import Fault, others
+from hapticbridge.check.faults import Fault, length, number, others
 from hapticbridge.check.places import Place
 from hapticbridge.scene.checks import MAXIMUM_START_PENETRATION
 from hapticbridge.scene.contact_check import ContactSetting, settings_among, tool_geoms
@@ -43,7 +43,7 @@ def contact_faults(case: Case) -> Iterator[Fault]:
         pair = min(first, second), max(first, second)
         if is_tool[first] or is_tool[second] or pair in meetings:
             where.setdefault(setting, []).append(pair)
-    push = push_of(case)
+    push, cone_told = push_of(case), False
     rooms = _rooms(case, [pair for pairs in where.values() for pair in pairs])
     for setting, pairs in where.items():
         place, also = _place(case, pairs[0], setting)
@@ -61,6 +61,9 @@ def contact_faults(case: Case) -> Iterator[Fault]:
         ):
             clause, _, change = concern.partition("; write ")
             is_cone = "pyramidal" in clause
+            if is_cone and cone_told:  # one word changes it for all
+                continue
+            cone_told |= is_cone
             yield Fault(
                 "pyramidal cone" if is_cone else "not passive",
                 case.places.option("cone") if is_cone else place,
@@ -108,13 +111,14 @@ def _soft(
         setting.solref, setting.solimp, inertia_of(case, pair), step, depths[pair]
     )
     is_default = np.allclose(setting.solref, MUJOCO_SOLREF)
+    default = "MuJoCo's default " if is_default else ""
     sentence = (
         f"the contact of {_names(case, [pair])}{others(len(pairs) - 1)} amounts to "
-        f"{stiffness:.3g} N/m ({'MuJoCo’s default ' if is_default else ''}solref "
-        f"{_numbers(setting.solref)}): {push:.3g} N sink in by {1e6 * depths[pair]:.3g} µm"
+        f"{number(stiffness)} N/m ({default}solref "
+        f"{_numbers(setting.solref)}): {number(push)} N sink in by {length(depths[pair])}"
     )
     if pair in rooms:
-        sentence += f", into a clearance of {1e6 * rooms[pair]:.3g} µm"
+        sentence += f", into a clearance of {length(rooms[pair])}"
     change = f'solref="{REFERENCE_STEPS * step:g} 1" solimp="0.9 0.95 0.001"'
     if numbers.resolved <= REFERENCE_STEPS * (1 + ROUNDING):
         change = (
@@ -184,8 +188,8 @@ def start_faults(case: Case) -> Iterator[Fault]:
         yield Fault(
             "starts in contact",
             case.places.geom(mover),
-            f"{_names(case, [(first, second)])} overlap by {-1e3 * contact.dist:.3g} mm at the "
-            f"start; more than {1e3 * MAXIMUM_START_PENETRATION:g} mm release energy that nobody "
+            f"{_names(case, [(first, second)])} overlap by {length(-contact.dist)} at the "
+            f"start; more than {length(MAXIMUM_START_PENETRATION)} release energy that nobody "
             "meters",
             _moved_out(case, body, out),
         )

@@ -17,6 +17,7 @@ from hapticbridge.check.cost import Cost, measure_cost
 from hapticbridge.check.drawing import draw_cost
 from hapticbridge.check.faults import Fault
 from hapticbridge.check.inventory import Inventory, take_inventory
+from hapticbridge.check.observation import quiet
 from hapticbridge.check.rules import find_faults
 from hapticbridge.cli.check_words import print_case, print_cost, print_faults, print_inventory
 from hapticbridge.cli.terminal import err, plain, print_json
@@ -84,7 +85,7 @@ class Check:
         inventory = take_inventory(case.model, self.grip, case.places, case.observation)
         faults, cost = find_faults(case), None
         if case.observation is not None:
-            with _progress("timing it") as show:
+            with _progress("timing it") as show, quiet():
                 cost = measure_cost(
                     case.scene, case.samples, case.coupling, case.period, progress=show
                 )
