@@ -132,7 +132,7 @@ def measure_cost(
         contact=contact,
         all_ticks=all_ticks,
         stages=medians,
-        highest_rate=TICK_SHARE / all_ticks.p99,
+        highest_rate=float(np.divide(TICK_SHARE, all_ticks.p99)),
         by_contacts=growth_of(contacts_of, time_of),
         by_rows=growth_of(np.concatenate(rows), time_of),
     )
