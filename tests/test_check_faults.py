@@ -166,6 +166,44 @@ def test_narrow_clearance_is_told_even_of_the_shipped_contact(
         assert room == pytest.approx(1e6 * clearance, rel=0.05)  # of postures, none quite straight
 
 
+@pytest.mark.parametrize(
+    ("floor", "tool", "place"),
+    [
+        ('solref="0.002 1"', 'solref="0.03 1"', "geom 'ball'"),
+        ('solref="0.03 1"', 'solref="0.002 1"', "geom 'floor'"),
+        ('solref="0.03 1"', 'solref="0.03 1"', "geom 'ball'"),
+        ('solref="0.03 1" priority="1"', 'solref="0.03 1"', "geom 'floor'"),
+        ('solref="0.002 1"', 'solref="-400000 -1000"', "geom 'ball'"),  # the stiffer is at fault
+        ('solref="-400000 -1000"', 'solref="0.002 1"', "geom 'floor'"),
+    ],
+)
+def test_geom_whose_setting_spoils_the_mean_is_named(
+    tmp_path: Path, floor: str, tool: str, place: str
+) -> None:
+    text = mjcf(
+        GOOD_OPTION,
+        body=f'<body name="tool" pos="0 0 0.05"><freejoint/><geom name="ball" size="0.01" '
+        f'mass="0.1" {tool}/><site name="grip"/></body>',
+        world=f'<geom name="floor" type="plane" size="1 1 1" {floor}/>',
+    )
+    found = [f for f in faults_of(written(tmp_path, text)) if f.place.element.startswith("geom")]
+    assert [fault.place.element for fault in found] == [place]
+    assert ("geom 'floor'" in found[0].change) == (floor == tool)
+
+
+def test_explicit_pair_is_named_instead_of_its_geoms(tmp_path: Path) -> None:
+    text = mjcf(
+        GOOD_OPTION,
+        GOOD_CONTACT,
+        '<contact><pair name="rest" geom1="floor" geom2="ball" solref="0.03 1"/></contact>',
+        body='<body name="tool" pos="0 0 0.05"><freejoint/><geom name="ball" size="0.01" '
+        'mass="0.1"/><site name="grip"/></body>',
+        world='<geom name="floor" type="plane" size="1 1 1"/>',
+    )
+    (fault,) = faults_of(written(tmp_path, text))
+    assert (fault.kind, fault.place.element) == ("soft contact", "pair 'rest'")
+
+
 def test_creep_of_dry_friction_is_mujocos() -> None:
     mass, loss = 0.3, 2.0
     model = mujoco.MjModel.from_xml_string(

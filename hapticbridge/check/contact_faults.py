@@ -46,7 +46,7 @@ def contact_faults(case: Case) -> Iterator[Fault]:
     push, cone_told = push_of(case), False
     rooms = _rooms(case, [pair for pairs in where.values() for pair in pairs])
     for setting, pairs in where.items():
-        place, also = _place(case, pairs[0], setting)
+        place, also = _place(case, pairs[0], is_soft=False)
         names = _names(case, pairs)
         if fault := _soft(case, setting, pairs, push, rooms):
             yield fault
@@ -126,7 +126,7 @@ def _soft(
             "larger clearance"
         )
     kind = "default contact" if is_default else "soft contact"
-    place, also = _place(case, pair, setting)
+    place, also = _place(case, pair, is_soft=True)
     return Fault(kind, place, sentence, change + also)
 
 
@@ -207,10 +207,10 @@ def _moved_out(case: Case, body: int, out: np.ndarray) -> str:
     return f"pos=\"{position}\" in body '{name}' (moved by {by} mm)"
 
 
-def _place(case: Case, pair: tuple[int, int], setting: ContactSetting) -> tuple[Place, str]:
+def _place(case: Case, pair: tuple[int, int], *, is_soft: bool) -> tuple[Place, str]:
     """Returns where to change a contact's setting, and what else must say the same.
 
-    That is an explicit pair, else the geom whose own solref is nearest to the contact's; the
+    That is an explicit pair, else the geom whose own solref is the softer (or the stiffer); the
     tool's, where both say the same, and then the other must change too: MuJoCo takes the mean.
     """
     model = case.model
@@ -218,12 +218,23 @@ def _place(case: Case, pair: tuple[int, int], setting: ContactSetting) -> tuple[
         if {int(model.pair_geom1[p]), int(model.pair_geom2[p])} == set(pair):
             return case.places.pair(p), ""
     is_tool = tool_geoms(model, case.scene.grip)
-    off = [float(np.abs(model.geom_solref[geom] - setting.solref).sum()) for geom in pair]
-    if off[0] == off[1]:
+    if model.geom_priority[pair[0]] != model.geom_priority[pair[1]]:
+        return case.places.geom(max(pair, key=lambda geom: model.geom_priority[geom])), ""
+    softness = [_softness(model.geom_solref[geom]) for geom in pair]
+    if softness[0] == softness[1]:
         mine, other = pair if is_tool[pair[0]] else pair[::-1]
         also = case.places.geom(other)
         return case.places.geom(mine), f" there and at {also.file}:{also.line}, {also.element}"
-    return case.places.geom(pair[off.index(min(off))]), ""
+    extreme = max(softness) if is_soft else min(softness)
+    return case.places.geom(pair[softness.index(extreme)]), ""
+
+
+def _softness(solref: np.ndarray) -> float:
+    """Returns timeconst · dampratio in s, for either format."""
+    first, second = (float(value) for value in solref)
+    if first > 0 and second > 0:
+        return first * second
+    return 1.0 / np.sqrt(-first) if first < 0 else np.inf
 
 
 def _names(case: Case, pairs: list[tuple[int, int]]) -> str:
