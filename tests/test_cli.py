@@ -479,7 +479,7 @@ def test_scenes_are_listed_with_what_they_are(call: Called) -> None:
     code, out, _ = call("scenes")
     assert code == 0
     for name in scene_names():
-        assert re.search(rf"{name} +[1-9] +\d +\S", out)
+        assert re.search(rf"{name} +[1-9] +\d+ +\S", out)
 
 
 def test_calling_the_command_line_leaves_warnings_as_they_were(call: Called) -> None:
