@@ -13,6 +13,7 @@ from hapticbridge.check.constraint_faults import creep_speed
 from hapticbridge.check.contact_stiffness import constraint_stiffness, depth_under
 from hapticbridge.check.faults import Fault, length, number, weight
 from hapticbridge.check.geometry_faults import dent_of, mesh_of
+from hapticbridge.check.inertia import body_inertia, joint_inertia
 from hapticbridge.check.rules import find_faults
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import DeviceError, SceneError
@@ -153,11 +154,18 @@ def test_peg_sinks_deeper_than_its_clearance_with_mujocos_default(tmp_path: Path
     assert depth == pytest.approx(depth_under(push, *settings, least, 1e-3), rel=0.01)
 
 
-@pytest.mark.parametrize(("clearance", "is_told"), [(0.2e-3, False), (0.05e-3, True)])
-def test_narrow_clearance_is_told_even_of_the_shipped_contact(
-    clearance: float, is_told: bool
+@pytest.mark.parametrize(
+    ("solref", "clearance", "is_told"),
+    [
+        ("0.005 1", 0.8e-3, False),
+        ("0.005 1", 0.2e-3, True),
+        ("0.002 1", 0.05e-3, False),  # too narrow, but no stiffer contact is passive
+    ],
+)
+def test_contact_softer_than_it_need_be_is_told_in_a_narrow_clearance(
+    tmp_path: Path, solref: str, clearance: float, is_told: bool
 ) -> None:
-    source = read_scene("peg_in_hole", clearance=clearance)
+    source = read_scene(peg_with(tmp_path, solref), clearance=clearance)
     faults = find_faults(open_case(source))
     assert ("soft contact" in kinds(faults)) == is_told
     if is_told:
@@ -202,6 +210,30 @@ def test_explicit_pair_is_named_instead_of_its_geoms(tmp_path: Path) -> None:
     )
     (fault,) = faults_of(written(tmp_path, text))
     assert (fault.kind, fault.place.element) == ("soft contact", "pair 'rest'")
+
+
+def test_inertia_of_joint_and_body_has_their_armature() -> None:
+    model = mujoco.MjModel.from_xml_string(
+        """<mujoco><worldbody>
+          <body name="nail"><joint type="slide" axis="0 0 1" armature="0.1"/>
+            <geom size="0.01" mass="0.0005"/></body>
+          <body name="door" pos="1 0 0"><joint type="hinge" axis="0 0 1" armature="0.2"/>
+            <inertial pos="0.5 0 0" mass="2" diaginertia="0.1 0.1 0.1"/></body>
+          <body name="ball" pos="2 0 0"><freejoint/><geom size="0.1" mass="3"/></body>
+          <body name="post" pos="3 0 0"><geom size="0.1" mass="3"/></body>
+        </worldbody></mujoco>"""
+    )
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    about_hinge = 0.2 + 0.1 + 2 * 0.5**2
+    assert joint_inertia(model, data, 0) == pytest.approx(0.1005)
+    assert joint_inertia(model, data, 1) == pytest.approx(about_hinge)
+    found = {name: body_inertia(model, data, model.body(name).id) for name in
+             ("nail", "door", "ball", "post")}  # fmt: skip
+    assert found["nail"] == pytest.approx(0.1005)
+    assert found["door"] == pytest.approx(about_hinge / 0.5**2)
+    assert found["ball"] == pytest.approx(3.0)
+    assert found["post"] == np.inf
 
 
 def test_creep_of_dry_friction_is_mujocos() -> None:

@@ -10,6 +10,7 @@ import numpy as np
 from hapticbridge.check.case import Case
 from hapticbridge.check.contact_stiffness import constraint_stiffness, depth_under
 from hapticbridge.check.faults import Fault, length, number
+from hapticbridge.check.inertia import joint_inertia
 from hapticbridge.scene.contact_concerns import SOFT_STEPS
 from hapticbridge.scene.contact_rule import REFERENCE_STEPS, ROUNDING, contact_numbers, impedance_at
 
@@ -27,6 +28,7 @@ def constraint_faults(case: Case) -> Iterator[Fault]:
     Args:
         case: The scene under check.
     """
+    case.scene.reset()
     yield from _limits(case)
     yield from _equalities(case)
     yield from _frictions(case)
@@ -62,7 +64,7 @@ def _limits(case: Case) -> Iterator[Fault]:
         if not _is_soft(case, solref, solimp):
             continue
         place, dof = case.places.joint(joint), int(model.jnt_dofadr[joint])
-        inertia = 1.0 / float(model.dof_invweight0[dof])
+        inertia = joint_inertia(model, case.scene.data, dof)
         is_slide = model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE
         yield Fault(
             "soft limit",
@@ -104,7 +106,8 @@ def _frictions(case: Case) -> Iterator[Fault]:
     for dof in np.flatnonzero(model.dof_frictionloss > 0).tolist():
         joint, solref = int(model.dof_jntid[dof]), model.dof_solref[dof]
         solimp, loss = model.dof_solimp[dof], float(model.dof_frictionloss[dof])
-        speed = creep_speed(CREEP_LOAD * loss, solref, solimp, 1.0 / model.dof_invweight0[dof])
+        inertia = joint_inertia(model, case.scene.data, dof)
+        speed = creep_speed(CREEP_LOAD * loss, solref, solimp, inertia)
         is_slide = model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE
         if joint in told or speed <= (FASTEST_CREEP if is_slide else FASTEST_TURN):
             continue

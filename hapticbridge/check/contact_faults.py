@@ -11,6 +11,7 @@ from hapticbridge.check.case import Case
 from hapticbridge.check.clearance import clearances
 from hapticbridge.check.contact_stiffness import constraint_stiffness, depth_under
 from hapticbridge.check.faults import Fault, length, number, others
+from hapticbridge.check.inertia import body_inertia
 from hapticbridge.check.places import Place
 from hapticbridge.scene.checks import MAXIMUM_START_PENETRATION
 from hapticbridge.scene.contact_check import ContactSetting, settings_among, tool_geoms
@@ -44,6 +45,7 @@ def contact_faults(case: Case) -> Iterator[Fault]:
         if is_tool[first] or is_tool[second] or pair in meetings:
             where.setdefault(setting, []).append(pair)
     push, cone_told = push_of(case), False
+    case.scene.reset()
     rooms = _rooms(case, [pair for pairs in where.values() for pair in pairs])
     for setting, pairs in where.items():
         place, also = _place(case, pairs[0], is_soft=False)
@@ -102,8 +104,10 @@ def _soft(
         pair: depth_under(push, setting.solref, setting.solimp, inertia_of(case, pair), step)
         for pair in pairs
     }
-    tight = [pair for pair in pairs if depths[pair] > rooms.get(pair, np.inf)]
     numbers = contact_numbers(setting.solref, setting.solimp, step)
+    if numbers.resolved <= REFERENCE_STEPS * (1 + ROUNDING):
+        return None  # as stiff as any that was seen to be passive with light tools
+    tight = [pair for pair in pairs if depths[pair] > rooms.get(pair, np.inf)]
     if not tight and numbers.resolved <= SOFT_STEPS * (1 + ROUNDING):
         return None
     pair = max(tight or pairs, key=lambda each: depths[each])
@@ -120,11 +124,6 @@ def _soft(
     if pair in rooms:
         sentence += f", into a clearance of {length(rooms[pair])}"
     change = f'solref="{REFERENCE_STEPS * step:g} 1" solimp="0.9 0.95 0.001"'
-    if numbers.resolved <= REFERENCE_STEPS * (1 + ROUNDING):
-        change = (
-            "more mass or armature where the contact is (its stiffness grows with them), or a "
-            "larger clearance"
-        )
     kind = "default contact" if is_default else "soft contact"
     place, also = _place(case, pair, is_soft=True)
     return Fault(kind, place, sentence, change + also)
@@ -133,8 +132,8 @@ def _soft(
 def inertia_of(case: Case, pair: tuple[int, int]) -> float:
     """Returns the inertia in kg that the contact of two geoms has, the least that was seen.
 
-    Where they did not meet it is that of their centres: 1/m = Σ 1/m_i, with MuJoCo's mean inverse
-    weights of the bodies, plus the coupling's share h B + h² K at the tool.
+    Where they did not meet it is that of their centres at the start: 1/m = Σ 1/m_i, plus the
+    coupling's share h B + h² K at the tool.
     """
     model = case.model
     seen = case.observation.meetings.get(pair) if case.observation else None
@@ -144,9 +143,8 @@ def inertia_of(case: Case, pair: tuple[int, int]) -> float:
     step, inverse = float(model.opt.timestep), 0.0
     share = step * case.coupling.damping + step**2 * case.coupling.stiffness
     for geom in pair:
-        weight = float(model.body_invweight0[model.geom_bodyid[geom], 0])
-        if weight > 0:
-            inverse += 1.0 / (1.0 / weight + (share if is_tool[geom] else 0.0))
+        inertia = body_inertia(model, case.scene.data, int(model.geom_bodyid[geom]))
+        inverse += 1.0 / (inertia + (share if is_tool[geom] else 0.0))
     return 1.0 / inverse if inverse > 0 else _TYPICAL_INERTIA
 
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from hapticbridge.check.case import Case
 from hapticbridge.check.faults import Fault, length, number, others, weight
+from hapticbridge.check.inertia import body_inertia
 
 WATER = 1000.0
 """Density in kg/m³ that MuJoCo gives a geom that says neither mass nor density."""
@@ -86,9 +87,10 @@ def _says_nothing(case: Case, geom: int, written: Any) -> bool:
 def _contact_ratios(case: Case) -> Iterator[Fault]:
     """Compares what met: the inertia that a push on a body meets, armature included."""
     model, told = case.model, set()
+    case.scene.reset()
     for pair in case.observation.meetings if case.observation else ():
         bodies = [int(model.geom_bodyid[geom]) for geom in pair]
-        inverse = [float(model.body_invweight0[body, 0]) for body in bodies]
+        inverse = [1.0 / body_inertia(model, case.scene.data, body) for body in bodies]
         key = frozenset(bodies)
         if min(inverse) <= 0 or max(inverse) <= LARGEST_RATIO * min(inverse) or key in told:
             continue

@@ -128,6 +128,7 @@ def _facts(
 ) -> dict[str, object]:
     return {
         "scene": str(case.source.path),
+        "parameters": case.source.parameters,
         "motion": {"name": case.motion_name, "seconds": case.motion.duration},
         "coupling": asdict(case.coupling),
         "period_s": case.period,
