@@ -112,14 +112,14 @@ def observe(
     """
     binding = Binding(scene.model, scene.data, rehearsal_parameters(scene, coupling, period))
     model, data, state, row = scene.model, scene.data, binding.state, binding.row
-    before = direct(before_step, state, samples[:1], row, 0)
+    before = direct(before_step, state, samples[:1], row, 0, period)
     after = direct(after_step, state, row, 0)
     meetings: dict[tuple[int, int], Meeting] = {}
     types = np.zeros((samples.size, len(_TYPE.__members__)), np.int64)
     postures, every = [], max(samples.size // POSTURES, 1)
     force, full = np.zeros(samples.size), 0
     for k in range(samples.size):
-        if before(state, samples[k : k + 1], row, 0) != OK:
+        if before(state, samples[k : k + 1], row, 0, period) != OK:
             raise _not_finite(scene, k, samples.size)
         mujoco.mj_step(model, data)
         if after(state, row, 0) != OK:
