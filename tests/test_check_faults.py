@@ -5,7 +5,17 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
-from check_scenes import CUP_DEPTH, CUP_ROOM, PLANTS, Plant, bench, cup_obj, hand_rows, line_of
+from check_scenes import (
+    CUP_DEPTH,
+    CUP_ROOM,
+    PLANTS,
+    START,
+    Plant,
+    bench,
+    cup_obj,
+    hand_rows,
+    line_of,
+)
 from outside_scenes import mjcf
 
 from hapticbridge.check.case import Case, open_case
@@ -27,6 +37,8 @@ GOOD_OPTION = (
     '<flag diagexact="enable"/></option>'
 )
 GOOD_CONTACT = '<default><geom solref="0.002 1" solimp="0.9 0.95 0.001"/></default>'
+
+KEY = f'<key name="home" qpos="{START}"/>'
 
 
 def case_of(scene: Path, **options: object) -> Case:
@@ -329,6 +341,17 @@ def test_cup_is_as_deep_and_as_empty_as_it_was_made() -> None:
     assert 0.3 * CUP_DEPTH < dent <= CUP_DEPTH
 
 
+def test_contact_that_created_energy_is_named_with_a_setting_that_does_not(tmp_path: Path) -> None:
+    source = read_scene("peg_in_hole", clearance=1e-3)
+    (fault,) = find_faults(open_case(source))
+    assert fault.kind == "energy created"
+    assert "% of the coupling's slack, which covers it" in fault.sentence
+    change = fault.change.split(" there")[0]
+    assert change == 'solref="0.0005 8"'
+    mended = read_scene(peg_with(tmp_path, "0.0005 8"), clearance=1e-3)
+    assert find_faults(open_case(mended)) == ()
+
+
 def test_motion_that_does_not_end_is_a_fault_and_no_error(tmp_path: Path) -> None:
     text = mjcf(
         GOOD_OPTION,
@@ -343,6 +366,15 @@ def test_motion_that_does_not_end_is_a_fault_and_no_error(tmp_path: Path) -> Non
     assert case.observation is None
     (fault,) = (fault for fault in find_faults(case) if fault.kind == "motion not finished")
     assert "not finite after tick" in fault.sentence
+
+
+def test_start_beyond_all_numbers_is_named_at_its_keyframe(tmp_path: Path) -> None:
+    plant = Plant("start not finite", "<!-- keys -->", f"<keyframe>{KEY}</keyframe>")
+    assert "start not finite" not in kinds(faults_of(bench(tmp_path / "near", plant)))
+    far = Plant(plant.kind, plant.old, plant.new.replace("0 0 0.03", "0 0 1e12"))
+    scene = bench(tmp_path / "far", far)
+    (fault,) = (fault for fault in faults_of(scene) if fault.kind == far.kind)
+    assert (fault.place.file, fault.place.line) == line_of(far, scene)
 
 
 def test_unmetered_work_is_named_where_it_is_written(tmp_path: Path) -> None:
