@@ -5,9 +5,8 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
-from check_scenes import bench
+from check_scenes import GOOD_CONTACT, GOOD_OPTION, bench, case_of, written
 from outside_scenes import mjcf
-from test_check_faults import GOOD_CONTACT, GOOD_OPTION, case_of, written
 
 from hapticbridge.check.inventory import (
     FIXED,
