@@ -231,6 +231,27 @@ def test_every_geom_is_found_on_its_line(tmp_path: Path) -> None:
         assert name in text
 
 
+def test_geoms_without_a_name_in_an_included_file_are_told_apart(tmp_path: Path) -> None:
+    (tmp_path / "parts.xml").write_text(
+        """<mujoco>
+          <default><geom condim="3"/></default>
+          <worldbody>
+            <geom size="0.01" pos="1 0 0"/>
+            <geom name="named" size="0.01"/>
+            <geom size="0.01" pos="2 0 0"/>
+          </worldbody>
+        </mujoco>""",
+        encoding="utf-8",
+    )
+    case = case_of(written(tmp_path, mjcf('<include file="parts.xml"/>', GOOD_OPTION)))
+    model = case.model
+    found = {float(model.geom_pos[g, 0]): case.places.geom(g) for g in range(3)}
+    assert [(found[x].file, found[x].line) for x in (1.0, 2.0)] == [
+        ("parts.xml", 4),
+        ("parts.xml", 6),
+    ]
+
+
 def test_places_of_a_repeated_element_are_the_line_that_repeats_it() -> None:
     source = read_scene("round_peg")
     places = Places(source, case_of(scene_path("round_peg")).model)
