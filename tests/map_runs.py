@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 import hapticbridge as hb
 from hapticbridge.audit import AuditReport
-from hapticbridge.device import SimulatedDevice
+from hapticbridge.device import SimulatedDevice, TrajectoryDevice
 from hapticbridge.guard import Limits
 from hapticbridge.scene import Scene
 
@@ -21,7 +21,7 @@ and not held by the guard. Give it to the device as its own limits."""
 
 def recorded_and_audited(
     scene: Scene | str,
-    device: SimulatedDevice,
+    device: SimulatedDevice | TrajectoryDevice,
     coupling: hb.Coupling,
     method: str,
     period: float,
@@ -41,13 +41,13 @@ def recorded_and_audited(
         period: T in s.
         ticks: How many are run; a run that trips the guard ends before.
         tmp_path: Where the recording goes.
-        knock: Displacement of the device before the first tick, shape (6,), in m and rad.
+        knock: Displacement of a simulated device before the first tick, shape (6,), m and rad.
         name: Of the recording, without its ending.
     """
     path = tmp_path / f"{name}.mcap"
 
     def displace(tick: int) -> None:
-        if tick == 0 and knock is not None:
+        if tick == 0 and knock is not None and isinstance(device, SimulatedDevice):
             device.displace(knock)
 
     info = device.info

@@ -14,6 +14,7 @@ import tyro
 from rich.markup import escape
 
 from hapticbridge.cli.chart import ChartCommand
+from hapticbridge.cli.check import Check
 from hapticbridge.cli.judge import Audit, Repair
 from hapticbridge.cli.run import Run
 from hapticbridge.cli.scenes import Scenes
@@ -26,6 +27,7 @@ Command = (
     Annotated[Run, tyro.conf.subcommand("run")]
     | Annotated[Audit, tyro.conf.subcommand("audit")]
     | Annotated[Scenes, tyro.conf.subcommand("scenes")]
+    | Annotated[Check, tyro.conf.subcommand("check")]
     | Annotated[Stability, tyro.conf.subcommand("stability")]
     | Annotated[ChartCommand, tyro.conf.subcommand("chart")]
     | Annotated[Repair, tyro.conf.subcommand("repair")]

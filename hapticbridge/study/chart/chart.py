@@ -46,8 +46,12 @@ class Chart:
         return [each for each in self.measurements if each.panel == panel.key]
 
     def front(self, panel: Panel) -> list[Measurement]:
-        """Returns the Pareto front of a panel's sound points, cheapest first."""
-        points = [each for each in self.of(panel) if each.is_sound]
+        """Returns the Pareto front, cheapest first.
+
+        Of the points that are sound and render the coupling that was asked for: a weld, or a tool
+        that is where the handle is, renders another one, however well it converges.
+        """
+        points = [each for each in self.of(panel) if each.is_sound and each.setting.method.has_law]
         chosen = pareto_front(
             [each.cost.median for each in points], [each.score.felt for each in points]
         )

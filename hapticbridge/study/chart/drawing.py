@@ -72,7 +72,7 @@ def _draw_panel(axes: Axes, chart: Chart, panel: Panel, colours: dict[str, str])
     for name, colour in colours.items():
         mine = [each for each in points if who(each.setting) == name]
         order = orders.get(name, float("nan"))
-        told = f"{name} (order {order + 0.0:.1f})" if np.isfinite(order) else name
+        told = f"{name} (order {round(order, 1) + 0.0:.1f})" if np.isfinite(order) else name
         axes.plot([], [], "-", color=colour, lw=2, label=told)
         line = [each for each in mine if each.is_usual]
         axes.plot(
@@ -138,7 +138,7 @@ def _draw_front(axes: Axes, front: Sequence[Measurement]) -> None:
         where="post",
         color="black",
         lw=1.2,
-        label="Pareto front (passive points)",
+        label="Pareto front (passive)",
     )
 
 

@@ -14,7 +14,6 @@ from hapticbridge.study.chart.drawing import (
     MARKS,
     colours_of,
     drawn_error,
-    is_usual,
 )
 from hapticbridge.study.chart.measurement import Measurement
 from hapticbridge.study.chart.recommendation import JND, recommendation, recommended
@@ -166,7 +165,7 @@ def panel_page(chart: Chart, panel: Panel) -> PanelPage:
             for each in front
         ],
         orders={
-            name: f"{order + 0.0:.2f}"
+            name: f"{round(order, 2) + 0.0:.2f}"
             for name, order in chart.orders(panel).items()
             if math.isfinite(order)
         },
