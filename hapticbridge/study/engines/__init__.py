@@ -5,6 +5,7 @@ from hapticbridge.study.engines.base import Engine as Engine
 from hapticbridge.study.engines.base import Setting as Setting
 from hapticbridge.study.engines.base import Simulation as Simulation
 from hapticbridge.study.engines.base import Wrench as Wrench
+from hapticbridge.study.engines.from_scene import task_from_scene as task_from_scene
 from hapticbridge.study.engines.library import Engines as Engines
 from hapticbridge.study.engines.library import available_engines as available_engines
 from hapticbridge.study.engines.library import engine_names as engine_names
