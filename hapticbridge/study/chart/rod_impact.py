@@ -6,13 +6,12 @@ from collections.abc import Callable, Mapping, Sequence
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from hapticbridge.check.felt import WEBER
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import StudyError
 from hapticbridge.kernel.scheme import DIRECT, WELD
-from hapticbridge.mechanics import ImpactBody, resolve_impact
+from hapticbridge.mechanics import Impact, ImpactBody, resolve_impact
 from hapticbridge.scene import Scene
 from hapticbridge.study.chart.scene_run import SceneRun, Stage, Stages, Take
 from hapticbridge.study.chart.score import Score, Verdict, diverged
@@ -65,7 +64,7 @@ _ROD = f"""
       <joint type="slide" axis="1 0 0"/>
       <joint type="slide" axis="0 0 1"/>
       <joint type="hinge" axis="0 1 0"/>
-      <inertial pos="0 0 0" mass="{{mass!r}}" diaginertia="{INERTIA!r} {INERTIA!r} 1e-6"/>
+      <inertial pos="0 0 0" mass="{MASS!r}" diaginertia="{INERTIA!r} {INERTIA!r} 1e-6"/>
       <geom name="tip" type="sphere" size="{TIP!r}" pos="{-LENGTH / 2!r} 0 0" mass="0"/>
       <site name="grip"/>
     </body>
@@ -73,9 +72,9 @@ _ROD = f"""
 </mujoco>"""
 
 
-def rod_scene(mass: float = MASS) -> Scene:
+def rod_scene() -> Scene:
     """Returns rod and floor as a scene, the rod far above."""
-    return scene_of(_ROD.format(mass=mass))
+    return scene_of(_ROD)
 
 
 def falls_at(angle: float) -> Callable[[Scene], None]:
@@ -90,20 +89,12 @@ def falls_at(angle: float) -> Callable[[Scene], None]:
     return put
 
 
-def rigid_impulses() -> NDArray[np.float64]:
-    """Returns (P_t, P_n) of each fall in N s, shape (4, 2), by mechanics' inelastic impact."""
+def rigid_impacts() -> Impact:
+    """Returns the four impacts of a rigid rod that does not rebound, by mechanics."""
     angle = np.array(ANGLES)
     arm = np.stack([-LENGTH / 2 * np.cos(angle), -LENGTH / 2 * np.sin(angle) - TIP], axis=-1)
     rod = ImpactBody(np.full(angle.size, MASS), np.full(angle.size, INERTIA), arm)
-    return resolve_impact(rod, [SLIDE, -APPROACH], FRICTION, 0.0).impulse
-
-
-def rigid_energy_changes() -> NDArray[np.float64]:
-    """Returns the change of kinetic energy of each fall in J, shape (4,)."""
-    angle = np.array(ANGLES)
-    arm = np.stack([-LENGTH / 2 * np.cos(angle), -LENGTH / 2 * np.sin(angle) - TIP], axis=-1)
-    rod = ImpactBody(np.full(angle.size, MASS), np.full(angle.size, INERTIA), arm)
-    return resolve_impact(rod, [SLIDE, -APPROACH], FRICTION, 0.0).energy_change
+    return resolve_impact(rod, [SLIDE, -APPROACH], FRICTION, 0.0)
 
 
 class RodImpact:
@@ -112,7 +103,6 @@ class RodImpact:
     Args:
         coupling: Ignored but for its name in tables: none acts.
         grid: Longest period T in s; the falls last a multiple of it.
-        mass: Of the rod in kg, in the simulation alone.
     """
 
     name = "rod_impact"
@@ -121,15 +111,12 @@ class RodImpact:
     has_contact = True
     references: References | None = None
 
-    def __init__(self, coupling: Coupling, grid: float, mass: float = MASS) -> None:
+    def __init__(self, coupling: Coupling, grid: float) -> None:
         self.coupling = coupling
-        self._impulses, self._changes = rigid_impulses(), rigid_energy_changes()
-        self._mass = mass
+        self._rigid = rigid_impacts()
         duration = grid * max(1, round(DURATION / grid))
         starts = [falls_at(angle) for angle in ANGLES]
-        self._stages = Stages(
-            lambda: Stage(rod_scene(mass), still, duration, coupling, starts=starts)
-        )
+        self._stages = Stages(lambda: Stage(rod_scene(), still, duration, coupling, starts=starts))
 
     def run(self, setting: Setting) -> Run:
         """Prepares a point.
@@ -146,18 +133,18 @@ class RodImpact:
         if any(take.has_diverged for take in takes):
             return {PANEL.key: diverged(created)}
         velocities = np.array([take.velocity[:3] for take in takes])
-        impulses = self._mass * (velocities[:, :2] - (SLIDE, -APPROACH))
-        error = np.linalg.norm(impulses - self._impulses, axis=1)
-        exact = np.linalg.norm(self._impulses, axis=1)
+        impulses = MASS * (velocities[:, :2] - (SLIDE, -APPROACH))
+        error = np.linalg.norm(impulses - self._rigid.impulse, axis=1)
+        exact = np.linalg.norm(self._rigid.impulse, axis=1)
         kinetic = 0.5 * (
-            self._mass * np.sum(velocities[:, :2] ** 2, axis=1) + INERTIA * velocities[:, 2] ** 2
+            MASS * np.sum(velocities[:, :2] ** 2, axis=1) + INERTIA * velocities[:, 2] ** 2
         )
-        before = 0.5 * self._mass * (SLIDE**2 + APPROACH**2)
+        before = 0.5 * MASS * (SLIDE**2 + APPROACH**2)
         has_touched = all(np.any(take.records["contacts"] > 0) for take in takes)
         return {
             PANEL.key: Score(
                 felt=float(np.sqrt(np.mean((error / (WEBER * exact)) ** 2))),
-                energy=float(np.max(np.abs(kinetic - before - self._changes))),
+                energy=float(np.max(np.abs(kinetic - before - self._rigid.energy_change))),
                 created=created,
                 verdict=_worst(takes) if has_touched else "lost contact",
             )

@@ -56,7 +56,7 @@ _BODY = f"""
   <worldbody>
     <body name="tool">
       <freejoint/>
-      <inertial pos="0 0 0" mass="{{mass!r}}" diaginertia="{" ".join(map(repr, INERTIA))}"/>
+      <inertial pos="0 0 0" mass="{MASS!r}" diaginertia="{" ".join(map(repr, INERTIA))}"/>
       <geom type="sphere" size="0.01" mass="0" contype="0" conaffinity="0"/>
       <site name="grip"/>
     </body>
@@ -64,9 +64,9 @@ _BODY = f"""
 </mujoco>"""
 
 
-def spinning_scene(mass: float = MASS) -> Scene:
+def spinning_scene() -> Scene:
     """Returns the body as a scene, at rest."""
-    return scene_of(_BODY.format(mass=mass))
+    return scene_of(_BODY)
 
 
 def set_spinning(scene: Scene) -> None:
@@ -124,7 +124,6 @@ class SpinningBody:
     Args:
         coupling: K and B; without K_r and B_r, or there would be a torque.
         grid: Longest period T in s.
-        mass: Of the body in kg, in the simulation alone.
 
     Raises:
         StudyError: The coupling would turn the body.
@@ -136,7 +135,7 @@ class SpinningBody:
     has_contact = False
     references: References | None = None
 
-    def __init__(self, coupling: Coupling, grid: float, mass: float = MASS) -> None:
+    def __init__(self, coupling: Coupling, grid: float) -> None:
         if coupling.rotational_stiffness or coupling.rotational_damping:
             raise StudyError("the spinning body must be free to turn: K_r and B_r must be 0")
         self.coupling = coupling
@@ -146,9 +145,7 @@ class SpinningBody:
         self._reference["tool_quaternion"] = exact_orientations(grid, count)
         self._energy = 0.5 * float(np.sum(np.array(INERTIA) * np.square(SPIN)))
         self._stages = Stages(
-            lambda: Stage(
-                spinning_scene(mass), still, grid * count, coupling, starts=(set_spinning,)
-            )
+            lambda: Stage(spinning_scene(), still, grid * count, coupling, starts=(set_spinning,))
         )
 
     def run(self, setting: Setting) -> Run:
