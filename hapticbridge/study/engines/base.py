@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import NamedTuple, Protocol
 
 from hapticbridge.pose import Quaternion, Vector
@@ -26,6 +26,12 @@ class Contacts(NamedTuple):
 
     points: int
     depth: float
+
+    @classmethod
+    def of(cls, depths: Iterable[float]) -> Contacts:
+        """Returns what points of these depths in m, negative where they are apart, come to."""
+        touching = [depth for depth in depths if depth >= 0]
+        return cls(len(touching), max(touching, default=0.0))
 
 
 class Setting(NamedTuple):

@@ -9,9 +9,19 @@ from typing import NamedTuple
 from hapticbridge.errors import StudyError, choices
 from hapticbridge.study.engines.base import Engine
 
-_MODULES: dict[str, str] = {}
-"""In which module of this package an engine is: each has ``engines() -> tuple[Engine, ...]``, which
-raises ImportError or StudyError where the library cannot be had."""
+_PACKAGE = "hapticbridge.study.engines"
+
+_MODULES = {
+    "mujoco": "mujoco_engine",
+    "ode": "ode_engine",
+    "physx": "sapien_engine",
+    "pybullet": "pybullet_engine",
+    "pybullet_dantzig": "pybullet_engine",
+    "drake_point": "drake_engine",
+    "drake_hydroelastic": "drake_engine",
+}
+"""In which module an engine is: each has ``engines()``, and cannot be imported, or raises
+StudyError there, where its library is not installed."""
 
 
 class Engines(NamedTuple):
@@ -51,6 +61,12 @@ def open_engine(name: str) -> Engine:
     """
     if name not in _MODULES:
         raise StudyError(f"no engine '{name}'; engines: {choices(_MODULES)}")
-    module = import_module(f"hapticbridge.study.engines.{_MODULES[name]}")
+    try:
+        module = import_module(f"{_PACKAGE}.{_MODULES[name]}")
+    except ImportError as error:
+        # what a library needs of the system (as libGL) may be missing where it is installed
+        raise StudyError(
+            f"engine '{name}' is not installed ({error}): pip install hapticbridge[peers]"
+        ) from None
     found: tuple[Engine, ...] = module.engines()
     return next(engine for engine in found if engine.name == name)

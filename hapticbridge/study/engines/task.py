@@ -123,7 +123,7 @@ class Shape:
             )
         if self.size:
             _ARGUMENTS.numbers(f"{self.kind} size", self.size, "m", least=0, is_open=True)
-        check_pose("shape", Pose(self.position, self.quaternion))
+        check_pose("shape", self.pose)
         if (self.vertices is None) == (self.kind == "mesh"):
             raise StudyError("a mesh has vertices, and no other shape has")
         if self.vertices is not None:
@@ -132,6 +132,11 @@ class Shape:
                 raise StudyError(
                     f"mesh vertices have shape {points.shape}; they must be (n, 3) with n >= 4"
                 )
+
+    @property
+    def pose(self) -> Pose:
+        """Position and axes as one."""
+        return Pose(self.position, self.quaternion)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
