@@ -88,14 +88,14 @@ def test_wrong_mass_shows_as_a_worse_point(monkeypatch: pytest.MonkeyPatch) -> N
         return scene
 
     monkeypatch.setattr(driven_mass, "load_scene", heavier)
-    wrong = score(driven_mass.DrivenMass(COUPLING, GRID), "explicit", 5e-4)
+    wrong = score(driven_mass.DrivenMass(COUPLING, GRID, FINE[-1]), "explicit", 5e-4)
     assert wrong.felt > 5 * right.felt
     assert wrong.felt > 1
 
 
 def test_coupling_that_would_turn_the_spinning_body_is_refused() -> None:
     with pytest.raises(Exception, match="free to turn"):
-        spinning_body.SpinningBody(COUPLING, GRID)
+        spinning_body.SpinningBody(COUPLING, GRID, FINE[-1])
 
 
 def test_methods_without_dynamics_of_the_tool_can_neither_spin_nor_fall() -> None:

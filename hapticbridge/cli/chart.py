@@ -20,10 +20,14 @@ from hapticbridge.study.chart import (
     chosen_periods,
     measure_chart,
     open_workload,
+    peer_settings,
     prepared_files,
     settings_for,
     write_chart,
 )
+from hapticbridge.study.engines.library import available_engines, open_engine
+
+ALL = "all"
 
 QUICK_REPEATS, REPEATS = 3, 7
 
@@ -45,6 +49,8 @@ class ChartCommand:
     """Rendering methods; by default all of them."""
     steps: tuple[float, ...] | None = None
     """Time steps in ms, all of which divide the longest; by default 4, 2, 1, 0.5, 0.25, 0.125."""
+    engines: tuple[str, ...] = ()
+    """Other engines on the same work (extra 'peers'), or 'all' that are installed."""
     out: Path = Path("chart")
     """Folder to write to."""
     quick: bool = False
@@ -60,6 +66,7 @@ class ChartCommand:
             workload = open_workload(self.scene, Extent(periods[0], periods[-1]))
         paths = prepared_files(self.out, workload.name)
         settings = settings_for(methods, periods, has_contact=workload.has_contact)
+        settings += peer_settings(self._peers(), periods)
         with _progress(f"chart {workload.name}") as show:
             chart = measure_chart(
                 workload,
@@ -73,6 +80,17 @@ class ChartCommand:
         else:
             _print(files)
         return 0
+
+    def _peers(self) -> list[str]:
+        """Returns the engines that are asked for and installed; says which are not."""
+        if self.engines == (ALL,):
+            found = available_engines()
+            for reason in found.missing.values():
+                err.print(plain(reason))
+            return list(found.available)
+        for name in self.engines:
+            open_engine(name)
+        return list(self.engines)
 
 
 @contextmanager

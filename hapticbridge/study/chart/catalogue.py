@@ -30,10 +30,10 @@ def open_workload(name: str, extent: Extent) -> Workload:
     """
     grid, finest = extent.grid, extent.finest
     known: dict[str, Callable[[], Workload]] = {
-        "point_mass": lambda: driven_mass.DrivenMass(scene_motion.COUPLING, grid),
+        "point_mass": lambda: driven_mass.DrivenMass(scene_motion.COUPLING, grid, finest),
         "peg_in_hole": lambda: peg.PegInHole(peg.COUPLING, grid, finest),
         "rod_impact": lambda: rod_impact.RodImpact(rod_impact.COUPLING, grid),
-        "spinning_body": lambda: spinning_body.SpinningBody(spinning_body.COUPLING, grid),
+        "spinning_body": lambda: spinning_body.SpinningBody(spinning_body.COUPLING, grid, finest),
     }
     if name in known:
         return known[name]()

@@ -10,12 +10,14 @@ import mujoco
 import numpy as np
 
 from hapticbridge.errors import HapticBridgeError, StudyError
+from hapticbridge.study.chart.engine_run import EngineRun
 from hapticbridge.study.chart.front import pareto_front
 from hapticbridge.study.chart.measurement import Measurement
 from hapticbridge.study.chart.score import Score
-from hapticbridge.study.chart.setting import MUJOCO, SHIPPED, Setting
+from hapticbridge.study.chart.setting import OWN, SHIPPED, Setting
 from hapticbridge.study.chart.timing import REPEATS, interleaved_costs, machine, one_core
 from hapticbridge.study.chart.workload import Panel, Run, Workload
+from hapticbridge.study.engines.library import open_engine
 
 ORDER_POINTS = 3
 """How many of the smallest steps an order of convergence is fitted to."""
@@ -85,7 +87,7 @@ def convergence_orders(points: Sequence[Measurement]) -> dict[str, float]:
 
 def who(setting: Setting) -> str:
     """Returns the method's name, or the engine's where it is another."""
-    return setting.method.name if setting.engine == MUJOCO else setting.engine
+    return setting.method.name if setting.engine == OWN else setting.engine
 
 
 def measure_chart(
@@ -121,7 +123,7 @@ def measure_chart(
         for index, setting in enumerate(settings):
             tell(index)
             try:
-                run = workload.run(setting)
+                run = _opened(workload, setting)
                 runs.append((setting, run, dict(run.scores())))
             except HapticBridgeError as error:
                 skipped.setdefault(who(setting), str(error))
@@ -148,6 +150,12 @@ def measure_chart(
     return Chart(workload, measurements, skipped, where, label, tuple(_notes(workload)))
 
 
+def _opened(workload: Workload, setting: Setting) -> Run:
+    if setting.engine == OWN:
+        return workload.run(setting)
+    return EngineRun(open_engine(setting.engine), workload.peer_work(), setting)
+
+
 def _baseline(settings: Sequence[Setting]) -> int:
     """Returns the index of ``implicit`` at the period nearest to 1 ms, or what comes nearest."""
 
@@ -155,7 +163,7 @@ def _baseline(settings: Sequence[Setting]) -> int:
         setting = settings[index]
         is_plain = setting.substeps == 1 and setting.contact == SHIPPED
         return (
-            setting.engine != MUJOCO or setting.method.name != "implicit",
+            setting.engine != OWN or setting.method.name != "implicit",
             not (is_plain and setting.iterations is None),
             abs(np.log(setting.period / 1e-3)),
         )

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from hapticbridge.coupling import Coupling
 from hapticbridge.mechanics.coupled_mass import exact_mass_response
 from hapticbridge.scene import load_scene
+from hapticbridge.study.chart.engine_run import PeerWork, work_of
 from hapticbridge.study.chart.scene_run import SceneRun, Stage, Stages, Take
 from hapticbridge.study.chart.score import Score, diverged, score_of
 from hapticbridge.study.chart.setting import Setting
@@ -108,6 +109,7 @@ class DrivenMass:
     Args:
         coupling: K and B.
         grid: Longest period T in s; records are compared at its multiples.
+        finest: Shortest in s.
     """
 
     name = "point_mass"
@@ -116,18 +118,24 @@ class DrivenMass:
     has_contact = False
     references: References | None = None
 
-    def __init__(self, coupling: Coupling, grid: float) -> None:
+    def __init__(self, coupling: Coupling, grid: float, finest: float) -> None:
         self.coupling = coupling
         self._grid = grid
         self._reference = exact_records(coupling, grid)
-        duration = grid * self._reference.size
+        self._finest = finest
+        self._duration = grid * self._reference.size
         self._stages = Stages(
-            lambda: Stage(load_scene("point_mass"), handle_path, duration, coupling)
+            lambda: Stage(load_scene("point_mass"), handle_path, self._duration, coupling)
         )
 
     def run(self, setting: Setting) -> Run:
         """Prepares a point."""
         return SceneRun(self._stages.for_method(setting), setting, self._judge)
+
+    def peer_work(self) -> PeerWork:
+        """Describes the mass to other engines."""
+        scene = load_scene("point_mass")
+        return work_of(scene, handle_path, self._duration, self._finest, self.coupling, self._judge)
 
     def _judge(self, takes: Sequence[Take]) -> Mapping[str, Score]:
         (take,) = takes

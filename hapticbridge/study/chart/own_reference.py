@@ -13,7 +13,7 @@ from hapticbridge.kernel.step import simulate
 from hapticbridge.rendering import Method
 from hapticbridge.study.chart.scene_run import Stage, Stages, Take
 from hapticbridge.study.chart.score import NAN, Score, diverged, score_of
-from hapticbridge.study.chart.setting import Setting
+from hapticbridge.study.chart.setting import OWN, Setting
 from hapticbridge.tick import TICK_DTYPE
 
 REFINEMENT = 32
@@ -72,6 +72,8 @@ class OwnReferences:
 
     def score(self, take: Take) -> Score:
         """Compares the first part of a take with the same method at the small step."""
+        if take.setting.engine != OWN:
+            return Score(felt=NAN, verdict="not metered")
         reference = self.of(take.setting.method)
         if take.has_diverged:
             return diverged(take.created)

@@ -8,7 +8,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from hapticbridge.coupling import Coupling
-from hapticbridge.scene import load_scene
+from hapticbridge.scene import Scene, load_scene
+from hapticbridge.study.chart.engine_run import PeerWork, work_of
 from hapticbridge.study.chart.own_reference import REFINEMENT, OwnReferences
 from hapticbridge.study.chart.peg_path import DURATION, JUDGED, POSES, end_of_hold, peg_path
 from hapticbridge.study.chart.rigid_peg import resting_peg
@@ -39,6 +40,10 @@ MOVING_TIME = 0.9
 """In s: into the hole, and 0.1 s into the hold against the wall."""
 
 
+def _scene() -> Scene:
+    return load_scene("peg_in_hole", friction=0.0)
+
+
 class PegInHole:
     """The workload.
 
@@ -67,17 +72,19 @@ class PegInHole:
         turned = Rotation.from_rotvec([each.rotation for each in resting])
         self._reference["tool_quaternion"] = turned.as_quat(canonical=True)[:, [3, 0, 1, 2]]
         self._reference["wrench_on_tool"] = [each.wrench for each in resting]
-        duration = grid * round(DURATION / grid)
-        # exactly 0 would leave MuJoCo's cone without a wall
-        self._stages = Stages(
-            lambda: Stage(load_scene("peg_in_hole", friction=0.0), peg_path, duration, coupling)
-        )
+        self._finest = finest
+        self._duration = grid * round(DURATION / grid)
+        self._stages = Stages(lambda: Stage(_scene(), peg_path, self._duration, coupling))
         self._limits = OwnReferences(self._stages, grid, finest, MOVING_TIME, refinement)
         self.references: References | None = self._limits
 
     def run(self, setting: Setting) -> Run:
         """Prepares a point."""
         return SceneRun(self._stages.for_method(setting), setting, self._judge)
+
+    def peer_work(self) -> PeerWork:
+        """Describes the peg to other engines."""
+        return work_of(_scene(), peg_path, self._duration, self._finest, self.coupling, self._judge)
 
     def _judge(self, takes: Sequence[Take]) -> Mapping[str, Score]:
         (take,) = takes

@@ -13,6 +13,7 @@ from hapticbridge.errors import StudyError
 from hapticbridge.kernel.scheme import DIRECT, WELD
 from hapticbridge.mechanics import Impact, ImpactBody, resolve_impact
 from hapticbridge.scene import Scene
+from hapticbridge.study.chart.engine_run import PeerWork
 from hapticbridge.study.chart.scene_run import SceneRun, Stage, Stages, Take
 from hapticbridge.study.chart.score import Score, Verdict, diverged
 from hapticbridge.study.chart.setting import Setting
@@ -127,6 +128,14 @@ class RodImpact:
         if setting.method.scheme in (WELD, DIRECT):
             raise StudyError(f"method '{setting.method.name}' lets no tool fall by itself")
         return SceneRun(self._stages.for_method(setting), setting, self._judge)
+
+    def peer_work(self) -> PeerWork:
+        """Refuses: other engines are given free tools alone.
+
+        Raises:
+            StudyError: Always.
+        """
+        raise StudyError("a rod that moves in a plane is not described to other engines")
 
     def _judge(self, takes: Sequence[Take]) -> Mapping[str, Score]:
         created = max(take.created for take in takes)

@@ -15,6 +15,7 @@ from hapticbridge.errors import StudyError
 from hapticbridge.kernel.step import simulate
 from hapticbridge.rendering import IMPLICIT
 from hapticbridge.scene import load_scene
+from hapticbridge.study.chart.engine_run import PeerWork
 from hapticbridge.study.chart.own_reference import OwnReferences
 from hapticbridge.study.chart.scene_run import Path, SceneRun, Stage, Stages, Take
 from hapticbridge.study.chart.score import Score
@@ -98,6 +99,17 @@ class SceneMotion:
     def run(self, setting: Setting) -> Run:
         """Prepares a point."""
         return SceneRun(self._stages.for_method(setting), setting, self._judge)
+
+    def peer_work(self) -> PeerWork:
+        """Refuses: convergence to a method's own limit means nothing across engines.
+
+        Raises:
+            StudyError: Always.
+        """
+        raise StudyError(
+            f"scene '{self.name}' has no reference that is true for every engine; charts with "
+            "other engines: 'point_mass', 'peg_in_hole', 'spinning_body'"
+        )
 
     def _judge(self, takes: Sequence[Take]) -> Mapping[str, Score]:
         (take,) = takes

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from hapticbridge.rendering import Method
 from hapticbridge.scene import Scene
 
-MUJOCO = "mujoco"
-"""The engine of the bridge itself; other engines carry their own names."""
+OWN = "hapticbridge"
+"""The bridge itself, in its compiled loop around MuJoCo; other engines carry their own names, and
+MuJoCo as any other engine is called ``mujoco``."""
 
 SHIPPED = "as shipped"
 """The contact setting that the scene's file names."""
@@ -46,7 +47,7 @@ class Setting:
         substeps: MuJoCo steps per tick.
         contact: One of ``CONTACTS``.
         iterations: The most that MuJoCo's solver may take; None as the scene says.
-        engine: Who simulates; another than ``MUJOCO`` is set as its documentation advises, and
+        engine: Who simulates; another than ``OWN`` is set as its documentation advises, and
             holds the coupling's force as method ``explicit`` does.
     """
 
@@ -55,7 +56,7 @@ class Setting:
     substeps: int = 1
     contact: str = SHIPPED
     iterations: int | None = None
-    engine: str = MUJOCO
+    engine: str = OWN
 
     @property
     def timestep(self) -> float:
@@ -65,7 +66,7 @@ class Setting:
     @property
     def label(self) -> str:
         """The setting in words, what is usual left out."""
-        who = self.method.name if self.engine == MUJOCO else f"{self.engine}, held force"
+        who = self.method.name if self.engine == OWN else f"{self.engine}, held force"
         parts = [who, f"{1e3 * self.period:g} ms"]
         if self.substeps > 1:
             parts.append(f"{self.substeps} substeps")

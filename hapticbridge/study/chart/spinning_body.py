@@ -16,10 +16,12 @@ from hapticbridge.errors import StudyError
 from hapticbridge.kernel.scheme import DIRECT, WELD
 from hapticbridge.mechanics import integrate_rotation
 from hapticbridge.scene import Scene
+from hapticbridge.study.chart.engine_run import PeerWork, work_of
 from hapticbridge.study.chart.scene_run import SceneRun, Stage, Stages, Take
 from hapticbridge.study.chart.score import Score, diverged, score_of
 from hapticbridge.study.chart.setting import Setting
 from hapticbridge.study.chart.workload import Panel, References, Run
+from hapticbridge.study.engines.task import Velocity
 from hapticbridge.study.maps.rigs import scene_of
 from hapticbridge.tick import TICK_DTYPE
 
@@ -124,6 +126,7 @@ class SpinningBody:
     Args:
         coupling: K and B; without K_r and B_r, or there would be a torque.
         grid: Longest period T in s.
+        finest: Shortest in s.
 
     Raises:
         StudyError: The coupling would turn the body.
@@ -135,11 +138,12 @@ class SpinningBody:
     has_contact = False
     references: References | None = None
 
-    def __init__(self, coupling: Coupling, grid: float) -> None:
+    def __init__(self, coupling: Coupling, grid: float, finest: float) -> None:
         if coupling.rotational_stiffness or coupling.rotational_damping:
             raise StudyError("the spinning body must be free to turn: K_r and B_r must be 0")
         self.coupling = coupling
         self._grid = grid
+        self._finest = finest
         count = round(DURATION / grid)
         self._reference = np.zeros(count, TICK_DTYPE)
         self._reference["tool_quaternion"] = exact_orientations(grid, count)
@@ -157,6 +161,13 @@ class SpinningBody:
         if setting.method.scheme in (WELD, DIRECT):
             raise StudyError(f"method '{setting.method.name}' lets no tool turn by itself")
         return SceneRun(self._stages.for_method(setting), setting, self._judge)
+
+    def peer_work(self) -> PeerWork:
+        """Describes the body to other engines, with its spin."""
+        duration = self._grid * self._reference.size
+        work = work_of(spinning_scene(), still, duration, self._finest, self.coupling, self._judge)
+        spin = Velocity(angular=SPIN)
+        return replace(work, task=replace(work.task, start_velocity=spin))
 
     def _judge(self, takes: Sequence[Take]) -> Mapping[str, Score]:
         (take,) = takes

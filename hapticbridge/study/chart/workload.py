@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from hapticbridge.coupling import Coupling
+from hapticbridge.study.chart.engine_run import PeerWork
 from hapticbridge.study.chart.score import Score
 from hapticbridge.study.chart.setting import Setting
 
@@ -73,4 +74,11 @@ class Workload(Protocol):
 
         Raises:
             HapticBridgeError: The method cannot render this.
+        """
+
+    def peer_work(self) -> PeerWork:
+        """Returns the same work for other engines.
+
+        Raises:
+            StudyError: It cannot be described to them.
         """
