@@ -146,3 +146,21 @@ def test_methods_agree_on_where_the_moving_peg_goes_in_the_limit() -> None:
     apart = references.disagreement()
     assert apart["explicit"] < 0.3
     assert apart["weld"] > 3  # another stiffness than was asked for: converged, and not to the same
+
+
+@pytest.mark.parametrize("method", ["implicit", "compensated", "implicitfast", "explicit"])
+def test_sliding_block_converges_to_the_closed_form(method: str) -> None:
+    workload = open_workload("sliding_block", Extent(GRID, FINE[-1]))
+    coarse, fine = (score(workload, method, period) for period in (1e-3, 2.5e-4))
+    assert fine.felt < coarse.felt / 2
+    assert fine.position_peak < 3e-5
+    assert fine.verdict == "strict"
+
+
+def test_reference_of_a_scene_is_said_to_be_no_truth() -> None:
+    workload = open_workload("virtual_wall", Extent(GRID, 1e-3))
+    assert not workload.panels[0].is_truth
+    found = [score(workload, "implicit", period).felt for period in (4e-3, 1e-3)]
+    assert found[1] < found[0]
+    with pytest.raises(Exception, match="no reference that is true for every engine"):
+        workload.peer_work()

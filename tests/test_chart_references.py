@@ -13,7 +13,7 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.errors import StudyError
 from hapticbridge.mechanics import ImpactBody, resolve_impact
 from hapticbridge.scene import load_scene
-from hapticbridge.study.chart import driven_mass, rod_impact, spinning_body
+from hapticbridge.study.chart import driven_mass, rod_impact, sliding_block, spinning_body
 from hapticbridge.study.chart.peg import COUPLING as PEG_COUPLING
 from hapticbridge.study.chart.peg_path import (
     DURATION,
@@ -182,3 +182,33 @@ def test_path_of_the_peg_starts_at_home_and_rests_at_every_pose() -> None:
         rotated = Rotation.from_quat(turns[-1, [1, 2, 3, 0]]).as_rotvec()
         np.testing.assert_allclose(rotated, turn, atol=1e-12)
     assert len(POSES) * RAMP < DURATION
+
+
+def test_sliding_block_in_closed_form_is_what_a_solver_with_an_event_finds() -> None:
+    coupling, mass = sliding_block.COUPLING, sliding_block.MASS
+    limit = sliding_block.FRICTION * mass * sliding_block.GRAVITY
+
+    def place_and_speed(time: float) -> tuple[float, float]:
+        place = float(sliding_block.handle_place(np.array([time]))[0])
+        return place, sliding_block.SPEED * min(time / sliding_block.EASE, 1.0)
+
+    # Coulomb's friction regularised far below what is compared, and solved stiffly
+    def rate(time: float, state: np.ndarray) -> list[float]:
+        place, speed = place_and_speed(time)
+        pull = coupling.stiffness * (place - state[0]) + coupling.damping * (speed - state[1])
+        return [state[1], (pull - limit * np.tanh(state[1] / 1e-7)) / mass]
+
+    times = 2e-3 * np.arange(1.0, 101.0)
+    found = solve_ivp(
+        rate, (0.0, times[-1]), [0.0, 0.0], "Radau", t_eval=times, rtol=1e-8, atol=1e-12
+    ).y
+    place, force = sliding_block.exact_sliding(coupling, times)
+    np.testing.assert_allclose(place, found[0], atol=2e-8)
+    before = times < sliding_block.breakaway(coupling)
+    assert force[before].max() < limit < force[~before][:3].max()
+
+
+def test_block_that_would_break_away_too_early_or_never_is_refused() -> None:
+    for stiffness in (1e5, 10.0):
+        with pytest.raises(StudyError, match="the block breaks away at"):
+            sliding_block.SlidingBlock(Coupling(stiffness, 1.0, 0.0, 0.0), GRID)

@@ -36,9 +36,9 @@ QUICK_REPEATS, REPEATS = 3, 7
 class ChartCommand:
     """Chart what every way to simulate a scene costs against how wrong it is.
 
-    The scene is point_mass, peg_in_hole, rod_impact or spinning_body, which have references of
-    their own, or any scene with a hand path beside it, which is compared with finer steps. Writes
-    SCENE.png, .svg, .csv, .json and .html into the folder. Example:
+    The scene is point_mass, peg_in_hole, rod_impact, sliding_block or spinning_body, which have
+    references of their own, or any scene with a hand path beside it, which is compared with finer
+    steps. Writes SCENE.png, .svg, .csv, .json and .html into the folder. Example:
 
         hapticbridge chart peg_in_hole --out charts
     """

@@ -5,7 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from hapticbridge.study.chart import driven_mass, peg, rod_impact, scene_motion, spinning_body
+from hapticbridge.study.chart import (
+    driven_mass,
+    peg,
+    rod_impact,
+    scene_motion,
+    sliding_block,
+    spinning_body,
+)
 from hapticbridge.study.chart.workload import Workload
 
 
@@ -33,6 +40,7 @@ def open_workload(name: str, extent: Extent) -> Workload:
         "point_mass": lambda: driven_mass.DrivenMass(scene_motion.COUPLING, grid, finest),
         "peg_in_hole": lambda: peg.PegInHole(peg.COUPLING, grid, finest),
         "rod_impact": lambda: rod_impact.RodImpact(rod_impact.COUPLING, grid),
+        "sliding_block": lambda: sliding_block.SlidingBlock(sliding_block.COUPLING, grid),
         "spinning_body": lambda: spinning_body.SpinningBody(spinning_body.COUPLING, grid, finest),
     }
     if name in known:

@@ -22,6 +22,9 @@ from hapticbridge.study.engines.library import open_engine
 ORDER_POINTS = 3
 """How many of the smallest steps an order of convergence is fitted to."""
 
+RESOLVED = 1e-5
+"""Error in JND below which a reference's own error may count: no order is fitted to it."""
+
 
 @dataclass(frozen=True, slots=True)
 class Chart:
@@ -68,7 +71,8 @@ def convergence_orders(points: Sequence[Measurement]) -> dict[str, float]:
     """Fits felt ~ T^p to the smallest steps of each method, all else as usual.
 
     Returns:
-        p by method or engine; nan where there are fewer than three points or no error.
+        p by method or engine; nan where there are fewer than three points, or an error is below
+        ``RESOLVED``.
     """
     series: dict[str, list[tuple[float, float]]] = {}
     for each in points:
@@ -78,7 +82,8 @@ def convergence_orders(points: Sequence[Measurement]) -> dict[str, float]:
     found = {}
     for name, values in series.items():
         period, felt = np.array(sorted(values)[:ORDER_POINTS]).T
-        is_clear = period.size == ORDER_POINTS and np.isfinite(felt).all() and (felt > 0).all()
+        is_clear = period.size == ORDER_POINTS and np.isfinite(felt).all()
+        is_clear = bool(is_clear and (felt > RESOLVED).all())
         found[name] = (
             float(np.polyfit(np.log(period), np.log(felt), 1)[0]) if is_clear else float("nan")
         )

@@ -87,7 +87,7 @@ class EngineRun:
         simulation = self._engine.open(self._work.task, self._setting.period)
         try:
             begin = time.thread_time()
-            for pose in self._poses:
+            for pose in self._poses[: self._ticks]:
                 simulation.step(pose.position, pose.quaternion)
             return time.thread_time() - begin
         finally:
@@ -97,12 +97,16 @@ class EngineRun:
         """Runs it once more with every tick written down, and judges it."""
         simulation = self._engine.open(self._work.task, self._setting.period)
         try:
-            return self._work.judge([self._take(simulation)])
+            take = self._take(simulation)
         finally:
             simulation.close()
+        # a run that diverged is timed as far as it came
+        self._ticks = max(1, take.records.size)
+        self.seconds = self._ticks * self._setting.period
+        return self._work.judge([take])
 
     def _take(self, simulation: Simulation) -> Take:
-        rows = np.zeros(self._ticks, TICK_DTYPE)
+        rows = np.zeros(len(self._poses), TICK_DTYPE)
         done = 0
         for pose in self._poses:
             simulation.step(pose.position, pose.quaternion)
@@ -113,7 +117,7 @@ class EngineRun:
         return Take(
             setting=self._setting,
             records=rows[:done],
-            has_diverged=done < self._ticks,
+            has_diverged=done < rows.size,
             environment="not metered",
             created=float("nan"),
             velocity=np.array([*velocity.linear, *velocity.angular]),
@@ -127,9 +131,11 @@ def _write(row: NDArray[np.void], simulation: Simulation, grip: Pose) -> bool:
     row["tool_position"] = pose.position
     row["tool_quaternion"] = pose.quaternion
     row["wrench_on_tool"] = (*wrench.force, *wrench.torque)
-    row["contacts"] = simulation.contacts().points
     values = np.concatenate([row["tool_position"][0], row["wrench_on_tool"][0]])
-    return bool(np.isfinite(values).all() and np.abs(row["tool_position"]).max() < FARTHEST)
+    if not (np.isfinite(values).all() and np.abs(row["tool_position"]).max() < FARTHEST):
+        return False  # an engine asked for contacts of such a pose may raise
+    row["contacts"] = simulation.contacts().points
+    return True
 
 
 def peer_settings(engines: Sequence[str], periods: Sequence[float]) -> list[Setting]:

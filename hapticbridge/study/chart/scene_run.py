@@ -128,7 +128,8 @@ class Stage:
             binding = self.bound(setting, start)
             begin = time.thread_time()
             done = simulate(binding.state, samples, binding.row, rows)
-            seconds += time.thread_time() - begin
+            # what diverged counts as if it had gone on
+            seconds += (time.thread_time() - begin) * samples.size / max(done, 1)
             if judge is not None:
                 judge(self._take(setting, binding, rows[:done], samples.size))
         return seconds
