@@ -25,9 +25,15 @@ from hapticbridge.study.chart import (
     settings_for,
     write_chart,
 )
+from hapticbridge.study.chart.work import measure_work
+from hapticbridge.study.chart.work_files import write_work
 from hapticbridge.study.engines.library import available_engines, open_engine
 
 ALL = "all"
+
+WORK = "work"
+QUICK_SIZE = 30
+"""Largest scene of a quick chart of work."""
 
 QUICK_REPEATS, REPEATS = 3, 7
 
@@ -60,6 +66,8 @@ class ChartCommand:
 
     def execute(self) -> int:
         """Measures the chart; returns the exit code."""
+        if self.scene == WORK:
+            return self._execute_work()
         periods = chosen_periods(self.steps, is_quick=self.quick)
         methods = chosen_methods(self.methods)
         with err.status("preparing references …"):
@@ -79,6 +87,18 @@ class ChartCommand:
             out.print_json(json.dumps(files.said))
         else:
             _print(files)
+        return 0
+
+    def _execute_work(self) -> int:
+        prepared_files(self.out, WORK)
+        with _progress(f"chart {WORK}") as show:
+            chart = measure_work(most=QUICK_SIZE if self.quick else None, progress=show)
+        paths, said = write_work(chart, self.out)
+        if self.as_json:
+            out.print_json(json.dumps(said))
+        else:
+            out.print(plain(said["paragraph"]))
+        err.print("wrote " + ", ".join(plain(str(path)) for path in paths.values()))
         return 0
 
     def _peers(self) -> list[str]:

@@ -37,6 +37,7 @@ MARKS: dict[Verdict, tuple[str, bool, str]] = {
 COLOURS = (
     "#1a5fb4", "#2e8b57", "#b3261e", "#e08a00", "#7b4fa6", "#008b8b", "#8c564b", "#d1578f",
     "#6b6b00", "#404040", "#4aa3ff", "#9bbb59", "#ff7f50", "#c71585",
+    "#00c5a0", "#a0522d", "#5f6b8a", "#d4b000",
 )  # fmt: skip
 
 

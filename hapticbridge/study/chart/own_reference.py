@@ -73,7 +73,7 @@ class OwnReferences:
     def score(self, take: Take) -> Score:
         """Compares the first part of a take with the same method at the small step."""
         if take.setting.engine != OWN:
-            return Score(felt=NAN, verdict="not metered")
+            return Score(felt=NAN)  # not on the chart
         reference = self.of(take.setting.method)
         if take.has_diverged:
             return diverged(take.created)
