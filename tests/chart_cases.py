@@ -39,6 +39,11 @@ class FakeRun:
         self._times = list(times)
         self.calls = 0
 
+    @property
+    def chosen(self) -> Mapping[str, str | int]:
+        """Returns no choice."""
+        return {}
+
     def go(self) -> float:
         """Returns the next of its times."""
         self.calls += 1

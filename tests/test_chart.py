@@ -197,6 +197,7 @@ def test_files_hold_every_setting_and_the_page_needs_nothing_else(
     assert len(rows) == 6
     assert {row["method"] for row in rows} == {"implicit", "explicit"}
     assert {float(row["period_s"]) for row in rows} == {0.02, 2e-3, 1e-3}
+    assert {row["solver_iterations"] for row in rows} == {"100"}
     assert all(row["machine"] and float(row["cost_median"]) > 0 for row in rows)
     said = json.loads(files.paths["json"].read_text(encoding="utf-8"))
     assert said["panels"][0]["reference_is_truth"] is True
@@ -248,3 +249,20 @@ def test_command_draws_a_chart(tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert "For 1 kHz on this machine" in printed.out
     names = {path.name for path in tmp_path.iterdir()}
     assert names == {f"point_mass.{ending}" for ending in ("png", "svg", "csv", "json", "html")}
+
+
+def test_table_says_what_contacts_and_solver_really_were() -> None:
+    workload = open_workload("rod_impact", Extent(4e-3, 1e-3))
+    settings = [
+        Setting(METHODS["implicit"], 1e-3, contact=contact, iterations=iterations)
+        for contact, iterations in (
+            ("as shipped", None),
+            ("damped", None),
+            ("soft", None),
+            ("pyramidal cone", 5),
+        )
+    ]
+    chosen = [each.chosen for each in measure_chart(workload, settings, repeats=1).measurements]
+    assert [each["solref"] for each in chosen] == ["0.002 1", "0.0005 8", "0.02 1", "0.002 1"]
+    assert [each["cone"] for each in chosen] == ["elliptic"] * 3 + ["pyramidal"]
+    assert [each["solver_iterations"] for each in chosen] == [100, 100, 100, 5]

@@ -90,6 +90,8 @@ def test_peers_are_points_at_every_step_and_only_where_the_reference_is_true() -
     assert point.score.verdict == "not metered"
     assert point.score.felt < 0.5
     assert not point.is_sound
+    assert "implicitfast" in str(point.chosen["engine_settings"])
+    assert "documentation" in str(point.chosen["engine_settings"])
 
 
 def test_workloads_that_other_engines_cannot_be_given_are_left_out_with_a_sentence() -> None:

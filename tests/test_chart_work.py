@@ -14,14 +14,8 @@ from scipy.spatial import ConvexHull
 from hapticbridge.check.growth import Spread
 from hapticbridge.cli import main
 from hapticbridge.errors import StudyError
-from hapticbridge.study.chart.work import (
-    USUAL,
-    VARIANTS,
-    Work,
-    WorkChart,
-    growth_exponent,
-    measure_work,
-)
+from hapticbridge.study.chart.tick_times import USUAL, VARIANTS
+from hapticbridge.study.chart.work import Work, WorkChart, growth_exponent, measure_work
 from hapticbridge.study.chart.work_files import paragraph, write_work
 from hapticbridge.study.chart.work_scenes import (
     FAMILIES,

@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cache
 
 import mujoco
 import numpy as np
 
 from hapticbridge.errors import HapticBridgeError, StudyError
-from hapticbridge.study.chart.engine_run import EngineRun
+from hapticbridge.study.chart.engine_run import EngineRun, PeerWork
 from hapticbridge.study.chart.front import pareto_front
 from hapticbridge.study.chart.measurement import Measurement
 from hapticbridge.study.chart.score import Score
@@ -124,11 +125,12 @@ def measure_chart(
 
     runs: list[tuple[Setting, Run, dict[str, Score]]] = []
     skipped: dict[str, str] = {}
+    peer_work = cache(workload.peer_work)
     with _silent_mujoco(), one_core() as core:
         for index, setting in enumerate(settings):
             tell(index)
             try:
-                run = _opened(workload, setting)
+                run = _opened(workload, setting, peer_work)
                 runs.append((setting, run, dict(run.scores())))
             except HapticBridgeError as error:
                 skipped.setdefault(who(setting), str(error))
@@ -147,9 +149,9 @@ def measure_chart(
         where = machine(core)
     tell(total)
     measurements = tuple(
-        Measurement(panel.key, setting, cost, scores[panel.key])
+        Measurement(panel.key, setting, cost, scores[panel.key], run.chosen)
         for panel in workload.panels
-        for (setting, _, scores), cost in zip(runs, costs, strict=True)
+        for (setting, run, scores), cost in zip(runs, costs, strict=True)
         # what another engine converges to is no error of its own
         if panel.is_truth or setting.engine == OWN
     )
@@ -157,10 +159,10 @@ def measure_chart(
     return Chart(workload, measurements, skipped, where, label, tuple(_notes(workload)))
 
 
-def _opened(workload: Workload, setting: Setting) -> Run:
+def _opened(workload: Workload, setting: Setting, peer_work: Callable[[], PeerWork]) -> Run:
     if setting.engine == OWN:
         return workload.run(setting)
-    return EngineRun(open_engine(setting.engine), workload.peer_work(), setting)
+    return EngineRun(open_engine(setting.engine), peer_work(), setting)
 
 
 def _baseline(settings: Sequence[Setting]) -> int:

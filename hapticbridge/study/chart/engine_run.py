@@ -82,6 +82,21 @@ class EngineRun:
         self._poses = work.task.handle_poses(setting.period, self._ticks)[1:]
         self.seconds = work.duration
 
+    @property
+    def chosen(self) -> Mapping[str, str | int]:
+        """What the engine was set to, and which page of its documentation advises it."""
+        told = "; ".join(
+            f"{name}: {setting.value} ({setting.source})"
+            for name, setting in self._engine.settings.items()
+        )
+        return {
+            "solref": "",
+            "solimp": "",
+            "cone": "",
+            "solver_iterations": "",
+            "engine_settings": f"{self._engine.name} {self._engine.version}; {told}",
+        }
+
     def go(self) -> float:
         """Runs it; returns the processor time in s of the steps."""
         simulation = self._engine.open(self._work.task, self._setting.period)

@@ -13,6 +13,7 @@ from typing import Any
 
 from hapticbridge.errors import StudyError
 from hapticbridge.picture import write_picture
+from hapticbridge.provenance import versions
 from hapticbridge.study.chart.chart import Chart
 from hapticbridge.study.chart.drawing import draw_chart
 from hapticbridge.study.chart.page import chart_page
@@ -95,7 +96,9 @@ def table_of(chart: Chart) -> str:
         for each in chart.measurements
     ]
     text = io.StringIO()
-    writer = csv.DictWriter(text, rows[0], lineterminator="\n")
+    # other engines have a column of their own
+    names = dict.fromkeys(name for row in rows for name in row)
+    writer = csv.DictWriter(text, names, restval="", lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
     return text.getvalue()
@@ -122,6 +125,7 @@ def summary_of(chart: Chart) -> dict[str, Any]:
         "workload": chart.workload.name,
         "about": chart.workload.about,
         "machine": chart.machine,
+        "versions": versions(),
         "baseline": chart.baseline,
         "notes": list(chart.notes),
         "skipped": chart.skipped,

@@ -2,18 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.study.chart.score import PASSIVE, Score
-from hapticbridge.study.chart.setting import (
-    CONTACTS,
-    PYRAMIDAL,
-    SHIPPED,
-    SOFT_SOLREF,
-    SOLIMP,
-    Setting,
-)
+from hapticbridge.study.chart.setting import SHIPPED, Setting
 from hapticbridge.study.chart.timing import Cost
 
 
@@ -26,12 +20,14 @@ class Measurement:
         setting: How it was simulated.
         cost: What it cost.
         score: How wrong it was.
+        chosen: Contacts and solver as the engine got them, by name.
     """
 
     panel: str
     setting: Setting
     cost: Cost
     score: Score
+    chosen: Mapping[str, str | int] = field(default_factory=dict)
 
     @property
     def is_sound(self) -> bool:
@@ -49,13 +45,6 @@ class Measurement:
         """Returns the row of a table: every choice, every number."""
         setting, method = self.setting, self.setting.method
         used = method.used(coupling, setting.timestep)
-        in_steps = CONTACTS[setting.contact]
-        if setting.contact in (SHIPPED, PYRAMIDAL):
-            contact = ("scene", "scene")
-        elif in_steps is None:
-            contact = (_numbers(SOFT_SOLREF), _numbers(SOLIMP))
-        else:
-            contact = (_numbers((in_steps[0] * setting.timestep, in_steps[1])), _numbers(SOLIMP))
         return {
             "workload": workload,
             "panel": self.panel,
@@ -66,10 +55,7 @@ class Measurement:
             "substeps": setting.substeps,
             "timestep_s": setting.timestep,
             "contact": setting.contact,
-            "solref": contact[0],
-            "solimp": contact[1],
-            "cone": "pyramidal" if setting.contact == PYRAMIDAL else "scene",
-            "solver_iterations": "scene" if setting.iterations is None else setting.iterations,
+            **self.chosen,
             "stiffness": coupling.stiffness,
             "damping": coupling.damping,
             "rotational_stiffness": coupling.rotational_stiffness,
@@ -79,7 +65,3 @@ class Measurement:
             **{f"cost_{name}": value for name, value in asdict(self.cost).items()},
             **{f"error_{name}": value for name, value in asdict(self.score).items()},
         }
-
-
-def _numbers(values: tuple[float, ...]) -> str:
-    return " ".join(f"{value:g}" for value in values)

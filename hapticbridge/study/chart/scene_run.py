@@ -93,6 +93,11 @@ class Stage:
         self._rows = np.zeros(0, TICK_DTYPE)
 
     @property
+    def shipped(self) -> ShippedOptions:
+        """Contacts and solver as the scene's file says them."""
+        return self._shipped
+
+    @property
     def seconds(self) -> float:
         """Simulated time of all takes in s."""
         return self.duration * len(self._starts)
@@ -178,6 +183,11 @@ class SceneRun:
     def __init__(self, stage: Stage, setting: Setting, judge: Judge) -> None:
         self._stage, self._setting, self._judge = stage, setting, judge
         self.seconds = stage.seconds
+
+    @property
+    def chosen(self) -> Mapping[str, str | int]:
+        """Contacts and solver of this point, for a table."""
+        return self._stage.shipped.chosen(self._setting)
 
     def go(self) -> float:
         """Runs it; returns the processor time in s."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import mujoco
@@ -19,12 +20,13 @@ SHIPPED = "as shipped"
 """The contact setting that the scene's file names."""
 
 PYRAMIDAL = "pyramidal cone"
+SOFT = "soft"
 
 CONTACTS: dict[str, tuple[float, float] | None] = {
     SHIPPED: None,
     "2 steps": (2.0, 1.0),
     "damped": (0.5, 8.0),
-    "soft": None,
+    SOFT: None,
     PYRAMIDAL: None,
 }
 """Contact settings by name; a pair is (timeconst in time steps, dampratio). ``2 steps`` is what the
@@ -96,6 +98,26 @@ class ShippedOptions:
             int(model.opt.iterations),
         )
 
+    def chosen(self, setting: Setting) -> dict[str, str | int]:
+        """Returns contacts and solver of a point as MuJoCo gets them, for a table."""
+        solref, solimp = _different(self.solref), _different(self.solimp)
+        in_steps = CONTACTS[setting.contact]
+        if in_steps is not None:
+            solref = _numbers((in_steps[0] * setting.timestep, in_steps[1]))
+        elif setting.contact == SOFT:
+            solref = _numbers(SOFT_SOLREF)
+        if setting.contact not in (SHIPPED, PYRAMIDAL):
+            solimp = _numbers(SOLIMP)
+        is_pyramidal = setting.contact == PYRAMIDAL or self.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL
+        return {
+            "solref": solref,
+            "solimp": solimp,
+            "cone": "pyramidal" if is_pyramidal else "elliptic",
+            "solver_iterations": (
+                self.iterations if setting.iterations is None else setting.iterations
+            ),
+        }
+
     def apply(self, scene: Scene, setting: Setting) -> None:
         """Gives the scene's model the contacts and the solver that a setting asks for."""
         model = scene.model
@@ -109,6 +131,15 @@ class ShippedOptions:
         if in_steps is not None:
             model.geom_solref[:] = (in_steps[0] * setting.timestep, in_steps[1])
             model.geom_solimp[:] = SOLIMP
-        elif setting.contact == "soft":
+        elif setting.contact == SOFT:
             model.geom_solref[:] = SOFT_SOLREF
             model.geom_solimp[:] = SOLIMP
+
+
+def _numbers(values: Iterable[float]) -> str:
+    return " ".join(f"{value:g}" for value in values)
+
+
+def _different(rows: NDArray[np.float64]) -> str:
+    """Returns the rows that differ, in words."""
+    return " / ".join(dict.fromkeys(_numbers(row) for row in rows.tolist()))

@@ -17,7 +17,8 @@ from matplotlib.figure import Figure
 from hapticbridge.check.cost import TICK_SHARE
 from hapticbridge.errors import StudyError
 from hapticbridge.picture import new_figure, write_picture
-from hapticbridge.study.chart.work import USUAL, Work, WorkChart
+from hapticbridge.study.chart.tick_times import USUAL
+from hapticbridge.study.chart.work import Work, WorkChart
 from hapticbridge.study.chart.work_scenes import FAMILIES, Family
 
 RATE = 1000.0

@@ -36,6 +36,10 @@ class Run(Protocol):
     seconds: float
     """Simulated time in s."""
 
+    @property
+    def chosen(self) -> Mapping[str, str | int]:
+        """Contacts and solver as the engine got them: the same columns for every point."""
+
     def go(self) -> float:
         """Runs it from the start; returns the processor time in s of the simulation alone."""
 
