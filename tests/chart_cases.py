@@ -21,11 +21,12 @@ def made_up(
     spread: float = 0.0,
     contact: str = SHIPPED,
     substeps: int = 1,
+    iterations: int | None = None,
 ) -> Measurement:
     """Returns a point of panel ``panel`` that costs and errs as said."""
     return Measurement(
         "panel",
-        Setting(METHODS[method], period, substeps=substeps, contact=contact),
+        Setting(METHODS[method], period, substeps, contact, iterations),
         Cost(cost, cost * (1 - spread), cost * (1 + spread), 1.0, 1.0, 1.0, 3),
         Score(felt=felt, created=0.0, verdict=verdict),
     )

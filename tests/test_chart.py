@@ -92,6 +92,22 @@ def test_flawed_point_is_not_recommended_but_named_with_its_flaw(flawed: object,
     assert recommended([flawed, good]) is good  # type: ignore[list-item]
 
 
+def test_error_that_grows_at_a_smaller_step_is_called_luck() -> None:
+    lucky, finer = made_up(0.01, 0.2), made_up(0.02, 3.0, period=5e-4)
+    assert recommended([lucky, finer]) is None
+    assert "it is luck" in recommendation([lucky, finer], "a machine")
+    assert recommended([lucky, made_up(0.02, 0.4, period=5e-4)]) is lucky
+    # another method's error at a smaller step says nothing of this one
+    assert recommended([lucky, made_up(0.02, 3.0, period=5e-4, method="lossless")]) is lucky
+
+
+def test_solver_that_is_cut_short_is_not_recommended() -> None:
+    short = made_up(0.01, 0.2, iterations=1)
+    assert recommended([short]) is None
+    assert "its solver is cut short" in recommendation([short], "a machine")
+    assert recommended([short, made_up(0.02, 0.3)]) is not short
+
+
 def test_slower_than_a_kilohertz_is_never_recommended() -> None:
     slow = made_up(0.001, 0.1, period=2e-3)
     assert recommended([slow]) is None

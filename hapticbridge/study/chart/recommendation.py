@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -27,12 +28,13 @@ TOLERANCE = 1e-9
 def recommended(points: Sequence[Measurement]) -> Measurement | None:
     """Returns the point to use, None where there is none.
 
-    Of the points at ``RATE`` or above, with an error below ``JND``, a passive environment, at most
-    ``SHARE`` of a core and no hazard on a real device (``Method.hazard``): the cheapest; where the
-    costs of several lie within its spread, the most accurate of these; and where errors are the
-    same within ``ALIKE``, one with the usual contacts and solver.
+    Of the points at ``RATE`` or above, with an error below ``JND`` here and at every smaller step, a
+    passive environment, a solver that runs to its tolerance, at most ``SHARE`` of a core and no
+    hazard on a real device (``Method.hazard``): the cheapest; where the costs of several lie within
+    its spread, the most accurate of these; and where errors are the same within ``ALIKE``, one with
+    the usual contacts.
     """
-    fit = [each for each in points if _is_fast(each) and not _objections(each)]
+    fit = [each for each in points if _is_fast(each) and not _objections(each, points)]
     if not fit:
         return None
     cheapest = min(fit, key=lambda each: each.cost.median)
@@ -56,10 +58,10 @@ def recommendation(points: Sequence[Measurement], machine: str) -> str:
     fast = [each for each in points if _is_fast(each) and np.isfinite(each.score.felt)]
     if not fast:
         return f"{goal}, nothing was tried that runs at this rate."
-    nearest = min(fast, key=lambda each: (len(_objections(each)), each.score.felt))
+    nearest = min(fast, key=lambda each: (len(_objections(each, points)), each.score.felt))
     return (
         f"{goal}, no point does it all. Nearest is {nearest.setting.label}: {_numbers(nearest)}; "
-        f"but {' and '.join(_objections(nearest))}."
+        f"but {' and '.join(_objections(nearest, points))}."
     )
 
 
@@ -67,11 +69,31 @@ def _is_fast(each: Measurement) -> bool:
     return each.setting.period * RATE <= 1 + TOLERANCE
 
 
-def _objections(each: Measurement) -> list[str]:
+def steady_error(each: Measurement, points: Sequence[Measurement]) -> float:
+    """Returns the largest error in JND at this and at every smaller step, all else alike.
+
+    An error that grows again when the step shrinks was small by luck.
+    """
+    setting = each.setting
+    alike = [
+        other.score.felt
+        for other in points
+        if other.setting.period <= setting.period
+        and replace(other.setting, period=setting.period) == setting
+    ]
+    return max(alike, default=each.score.felt)
+
+
+def _objections(each: Measurement, points: Sequence[Measurement]) -> list[str]:
     """Returns what speaks against a point, in words."""
     found = []
+    steady = steady_error(each, points)
     if not each.score.felt < JND:
         found.append(f"its error is {each.score.felt:.2g} JND")
+    elif not steady < JND:
+        found.append(f"its error grows to {steady:.2g} JND at a smaller step, so it is luck")
+    if each.setting.iterations is not None:
+        found.append("its solver is cut short")
     if not each.is_sound:
         created = each.score.created
         more = f" ({created:.2g} J created)" if created > 0 and np.isfinite(created) else ""
