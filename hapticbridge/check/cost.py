@@ -36,7 +36,7 @@ def processor_costs(first: Draft, second: Draft, motion: Motion) -> tuple[float,
     """Runs two versions side by side: processor time in s per second of motion.
 
     MuJoCo's step with the bridge's arithmetic, nothing else of the machine: the thread's own clock.
-    The first pass is for warming up, unless it alone takes longer than ``PATIENCE``.
+    The first pass is for warming up, unless there is no patience for three.
 
     Raises:
         SceneError: A version does not compile, or a result is not finite.
@@ -45,9 +45,9 @@ def processor_costs(first: Draft, second: Draft, motion: Motion) -> tuple[float,
     passes: list[NDArray[np.float64]] = []
     start = time.thread_time()
     while len(passes) <= REPEATS:
-        if len(passes) > 1 and (time.thread_time() - start) * (1 + 1 / len(passes)) > PATIENCE:
-            break
         passes.append(_one_pass(stages))
+        if (time.thread_time() - start) * (1 + 1 / len(passes)) > PATIENCE:
+            break
     kept = passes[1:] if len(passes) > 2 else passes
     seconds = np.median(kept, axis=0).sum(axis=1)
     return float(seconds[0] / motion.duration), float(seconds[1] / motion.duration)

@@ -101,6 +101,11 @@ def name_everything(spec: mujoco.MjSpec) -> None:
                 taken.add(name)
 
 
+def model_of(spec: mujoco.MjSpec) -> mujoco.MjModel:
+    """Compiles a specification on its way: it stays as it is, and its start is not judged."""
+    return spec.copy().compile()
+
+
 def census(spec: mujoco.MjSpec) -> tuple[int, ...]:
     """Counts what refers to bodies, joints and geoms: MuJoCo deletes it along with them."""
     kinds = (

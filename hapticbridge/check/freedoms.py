@@ -8,7 +8,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.check.draft import Draft, census
+from hapticbridge.check.draft import Draft, census, model_of
+from hapticbridge.check.frames import IDENTITY, matrix_of, pose_in, rotation_vector
 from hapticbridge.check.simplifications import OTHER_MOTIONS, Simplification
 from hapticbridge.check.witness import Witness
 
@@ -48,7 +49,8 @@ def freedom_simplifications(draft: Draft, seen: Witness) -> list[Simplification]
 
 def _fixed(names: list[str], seen: Witness) -> Simplification:
     def fix(spec: mujoco.MjSpec, keys: Keys) -> bool:
-        return any([_fix(spec, keys, name, seen) for name in names])
+        fixed = [_fix(spec, keys, name, seen) for name in names]
+        return any(fixed)
 
     what = f"'{names[0]}'" if len(names) == 1 else f"{len(names)} joints"
     return Simplification(
@@ -94,7 +96,7 @@ def _replaced(name: str, slides: list[int], hinges: list[int], seen: Witness) ->
         body, start = joint.parent, seen.start[name]
         _place(spec, body, seen.pose[body.name])
         spec.delete(joint)
-        turn = _matrix(start[3:])
+        turn = matrix_of(start[3:])
         new = [(f"{name}_{_AXES[a]}", _SLIDE, a) for a in slides]
         new += [(f"{name}_turn_{_AXES[a]}", _HINGE, a) for a in hinges]
         for new_name, kind, axis in new:
@@ -143,34 +145,19 @@ def _add_joint(body: mujoco.MjsBody, name: str, kind: mujoco.mjtJoint, axis: Arr
 
 def _in_world(position: Array, velocity: Array, start: Array) -> tuple[Array, Array]:
     """Returns displacement and rotation vector from the start, and velocity, in the world frame."""
-    inverse, turn, vector = np.zeros(4), np.zeros(4), np.zeros(3)
-    mujoco.mju_negQuat(inverse, start[3:])
-    mujoco.mju_mulQuat(turn, position[3:], inverse)
-    mujoco.mju_quat2Vel(vector, turn, 1.0)
-    spin = _matrix(position[3:]) @ velocity[3:]  # MuJoCo holds it in the body's frame
+    vector = rotation_vector(start[3:], position[3:])
+    spin = matrix_of(position[3:]) @ velocity[3:]  # MuJoCo holds it in the body's frame
     return np.concatenate([position[:3] - start[:3], vector]), np.concatenate([velocity[:3], spin])
-
-
-def _matrix(quaternion: Array) -> Array:
-    matrix = np.zeros(9)
-    mujoco.mju_quat2Mat(matrix, quaternion)
-    return matrix.reshape(3, 3)
 
 
 def _place(spec: mujoco.MjSpec, body: mujoco.MjsBody, pose: Array) -> None:
     """Puts a body to a pose in its parent's frame, whatever frame it is written in."""
-    body.pos, body.quat = np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])
+    body.pos, body.quat = np.zeros(3), IDENTITY
     body.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
-    model = _compiled(spec)
+    model = model_of(spec)
     at = model.body(body.name).id
-    position, turn, inverse_position, inverse = np.zeros(3), np.zeros(4), np.zeros(3), np.zeros(4)
-    mujoco.mju_negPose(inverse_position, inverse, model.body_pos[at], model.body_quat[at])
-    mujoco.mju_mulPose(position, turn, inverse_position, inverse, pose[:3], pose[3:])
-    body.pos, body.quat = position, turn
-
-
-def _compiled(spec: mujoco.MjSpec) -> mujoco.MjModel:
-    return spec.copy().compile()
+    written = pose_in(np.concatenate([model.body_pos[at], model.body_quat[at]]), pose)
+    body.pos, body.quat = written[:3], written[3:]
 
 
 def _edit_joints(draft: Draft, change: Callable[[mujoco.MjSpec, Keys], bool]) -> bool:
@@ -185,7 +172,7 @@ def _edit_joints(draft: Draft, change: Callable[[mujoco.MjSpec, Keys], bool]) ->
 
 
 def _read_keys(spec: mujoco.MjSpec) -> Keys:
-    model = _compiled(spec)
+    model = model_of(spec)
     ends = [*model.jnt_qposadr[1:], model.nq], [*model.jnt_dofadr[1:], model.nv]
     return [
         {
@@ -203,7 +190,7 @@ def _write_keys(spec: mujoco.MjSpec, keys: Keys) -> None:
     bare = spec.copy()
     for key in list(bare.keys):
         bare.delete(key)
-    model = bare.compile()
+    model = model_of(bare)
     order = [model.joint(j).name for j in range(model.njnt)]
     for key, values in zip(spec.keys, keys, strict=True):
         key.qpos = np.concatenate([np.zeros(0), *(values[name][0] for name in order)])

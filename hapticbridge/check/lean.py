@@ -25,7 +25,7 @@ from hapticbridge.check.simplifications import (
     rate_simplifications,
     solver_simplifications,
 )
-from hapticbridge.check.trial import FAILS, MAY_GO, Judge, Trial
+from hapticbridge.check.trial import FAILS, MAY_GO, SAVES_NOTHING, Judge, Trial
 from hapticbridge.check.witness import witness
 from hapticbridge.device import Motion
 from hapticbridge.errors import HapticBridgeError, SceneError
@@ -131,7 +131,9 @@ def _search(judge: Judge, simpler: list[Simplification], progress: Progress | No
             progress(k, total, each.name)
         if (found := _tried(judge, each, judge.original)) is not None:
             alone.append((each, found[1]))
-    order = [pair for pair in alone if pair[1].verdict == MAY_GO]
+    # what saves little of the whole may save much of what is left
+    order = [pair for pair in alone if pair[1].verdict in (MAY_GO, SAVES_NOTHING)]
+    order = [pair for pair in order if (pair[1].cost or 0.0) < 1.0 + judge.least_saving]
     order.sort(key=lambda pair: pair[1].cost or 0.0)
     best, share, together = judge.original, 1.0, []
     for k, (each, _) in enumerate(order):

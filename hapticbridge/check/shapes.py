@@ -6,17 +6,15 @@ from pathlib import PurePath
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
-from hapticbridge.check.draft import Draft
+from hapticbridge.check.draft import Draft, model_of
+from hapticbridge.check.frames import IDENTITY, matrix_of, quaternion_of
+from hapticbridge.check.primitive import Primitive, best_primitive
 from hapticbridge.check.simplifications import PICTURE, Simplification, collides, paired_geoms
 
 HULL_CORNERS = (64, 32, 16, 8)
 """Corners that a convex hull keeps at most, as tried."""
 
-_GEOM = mujoco.mjtGeom
-PRIMITIVES = (_GEOM.mjGEOM_BOX, _GEOM.mjGEOM_CYLINDER, _GEOM.mjGEOM_CAPSULE, _GEOM.mjGEOM_SPHERE)
-"""What a mesh may become. An ellipsoid is left out: its contacts cost as much as a mesh's."""
 
 
 def shape_simplifications() -> list[Simplification]:
@@ -52,7 +50,7 @@ def _drop_visual_geoms(draft: Draft) -> bool:
 def _hull(count: int) -> Simplification:
     def limit(draft: Draft) -> bool:
         spec = draft.spec
-        corners = _hull_corners(draft)
+        corners = _hull_corners(spec)
         meshes = [mesh for mesh in spec.meshes if corners.get(_name(mesh), 0) > count]
         changed = {_name(mesh) for mesh in meshes}
         _keep_inertia(
@@ -67,12 +65,12 @@ def _hull(count: int) -> Simplification:
     )
 
 
-def _hull_corners(draft: Draft) -> dict[str, int]:
+def _hull_corners(spec: mujoco.MjSpec) -> dict[str, int]:
     """Returns how many corners the hulls of the colliding meshes have."""
-    meshes = {geom.meshname for geom in _mesh_geoms(draft.spec)}
+    meshes = {geom.meshname for geom in _mesh_geoms(spec)}
     if not meshes:
         return {}
-    model = draft.compiled().model
+    model = model_of(spec)
     adr = {name: int(model.mesh_graphadr[model.mesh(name).id]) for name in meshes}
     # a graph begins with its number of corners
     return {name: int(model.mesh_graph[start]) for name, start in adr.items() if start >= 0}
@@ -83,7 +81,7 @@ def _mesh_geoms(spec: mujoco.MjSpec) -> list[mujoco.MjsGeom]:
     return [
         geom
         for geom in spec.geoms
-        if geom.type == _GEOM.mjGEOM_MESH and (collides(geom) or geom.name in paired)
+        if geom.type == mujoco.mjtGeom.mjGEOM_MESH and (collides(geom) or geom.name in paired)
     ]
 
 
@@ -98,56 +96,47 @@ def _fit_primitives(draft: Draft) -> bool:
     if not names:
         return False
     _keep_inertia(spec, {spec.geom(name).parent.name for name in names})
-    model = draft.compiled().model
-    corners = {name: _corners(model, name) for name in names}
-    best = dict.fromkeys(names, (np.inf, PRIMITIVES[0]))
-    for kind in PRIMITIVES:
-        trial = draft.copy()
-        for name in names:
-            trial.spec.geom(name).type = kind
-        fitted = trial.compiled().model
-        for name in names:
-            error = float(np.abs(_outside(fitted, name, kind, corners[name])).max())
-            best[name] = min(best[name], (error, kind), key=lambda pair: pair[0])
-    for name, (_, kind) in best.items():
-        spec.geom(name).type = kind
+    model = model_of(spec)
+    fits = {name: _fit(model, name) for name in names}
+    for name in names:
+        geom = spec.geom(name)
+        geom.type, geom.size = fits[name].kind, fits[name].size
+        _forget_mesh(spec, geom)
+        geom.pos, geom.quat = np.zeros(3), IDENTITY
+        geom.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
+    for mesh in [mesh for mesh in spec.meshes if not _is_used(spec, mesh)]:
+        spec.delete(mesh)
+    # where a geom is written in a frame, its pose counts from there
+    frames = model_of(spec)
+    for name in names:
+        geom, at = spec.geom(name), frames.geom(name).id
+        turn = matrix_of(frames.geom_quat[at])
+        geom.pos = turn.T @ (fits[name].position - frames.geom_pos[at])
+        geom.quat = quaternion_of(turn.T @ fits[name].axes)
     return True
 
 
-def _corners(model: mujoco.MjModel, name: str) -> NDArray[np.float64]:
-    """Returns the vertices of a mesh geom in its body's frame, in m."""
+def _forget_mesh(spec: mujoco.MjSpec, geom: mujoco.MjsGeom) -> None:
+    """Takes the mesh off a geom and its classes, from which a written file would get it back."""
+    geom.meshname = ""
+    for default in (geom.classname, spec.default):
+        if default is not None:
+            default.geom.meshname = ""
+
+
+def _is_used(spec: mujoco.MjSpec, mesh: mujoco.MjsMesh) -> bool:
+    return any(geom.meshname == _name(mesh) for geom in spec.geoms)
+
+
+def _fit(model: mujoco.MjModel, name: str) -> Primitive:
+    """Fits a mesh geom in its body's frame, along the mesh's own axes and its axes of inertia."""
     geom = model.geom(name).id
     mesh = int(model.geom_dataid[geom])
     start, count = int(model.mesh_vertadr[mesh]), int(model.mesh_vertnum[mesh])
-    vertices = np.asarray(model.mesh_vert[start : start + count], dtype=np.float64)
-    return vertices @ _matrix(model.geom_quat[geom]).T + model.geom_pos[geom]
-
-
-def _matrix(quaternion: NDArray[np.float64]) -> NDArray[np.float64]:
-    matrix = np.zeros(9)
-    mujoco.mju_quat2Mat(matrix, quaternion)
-    return matrix.reshape(3, 3)
-
-
-def _outside(
-    model: mujoco.MjModel, name: str, kind: mujoco.mjtGeom, points: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Returns how far points lie outside a primitive's surface, in m; negative inside."""
-    geom = model.geom(name).id
-    size = model.geom_size[geom]
-    local = (points - model.geom_pos[geom]) @ _matrix(model.geom_quat[geom])
-    if kind == _GEOM.mjGEOM_SPHERE:
-        return np.asarray(np.linalg.norm(local, axis=1) - size[0])
-    if kind == _GEOM.mjGEOM_CAPSULE:
-        local[:, 2] -= np.clip(local[:, 2], -size[1], size[1])
-        return np.asarray(np.linalg.norm(local, axis=1) - size[0])
-    if kind == _GEOM.mjGEOM_CYLINDER:
-        radial = np.linalg.norm(local[:, :2], axis=1) - size[0]
-        beyond = np.stack([radial, np.abs(local[:, 2]) - size[1]], axis=1)
-    else:
-        beyond = np.abs(local) - size
-    outside = np.linalg.norm(np.maximum(beyond, 0.0), axis=1)
-    return np.asarray(outside + np.minimum(beyond.max(axis=1), 0.0))
+    inertia = matrix_of(model.geom_quat[geom])
+    points = np.asarray(model.mesh_vert[start : start + count], np.float64) @ inertia.T
+    own = inertia @ matrix_of(model.mesh_quat[mesh]).T
+    return best_primitive(points + model.geom_pos[geom], (own, inertia))
 
 
 def _keep_inertia(spec: mujoco.MjSpec, bodies: set[str]) -> None:

@@ -12,6 +12,7 @@ from hapticbridge.check.witness import Witness
 
 
 OTHER_MOTIONS, PICTURE = "other motions may need it", "it is for the picture"
+"""What a simplification may lose that a hand in one motion cannot tell."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,10 +53,8 @@ def solver_simplifications(seen: Witness) -> list[Simplification]:
             _relax_tolerance,
         )
     ]
-    for count in ITERATIONS:
-        if count < seen.solver_iterations:
-            simpler.append(_iterations(count, seen.solver_iterations))
-    return simpler
+    used = seen.solver_iterations
+    return simpler + [_iterations(count, used) for count in ITERATIONS if count < used]
 
 
 def _iterations(count: int, used: int) -> Simplification:

@@ -16,6 +16,9 @@ LEAST_SAVING = 0.03
 itself differs by up to 1 % on a machine at work; where it differs by more, three times that counts.
 A larger share keeps more in the scene."""
 
+CLEARLY_MORE = 1.2
+"""Cost over that of what it must beat, without unit, at which one run is enough to see it."""
+
 _ENVIRONMENTS = ("strict", "within slack", "active")
 
 MAY_GO, IS_FELT, SAVES_NOTHING = "may go", "is felt", "saves nothing"
@@ -31,7 +34,8 @@ class Trial:
         sentence: What it does, or why it failed.
         verdict: ``MAY_GO`` or why not: one of the constants of this module.
         loses: What else goes, see ``Simplification``.
-        cost: Processor time over that of the original, without unit; None where it failed.
+        cost: Processor time over that of the original, without unit, from a single run where it is
+            refused for another reason; None where it failed.
         felt: What a hand would feel; None where it failed.
         environment: ``strict``, ``within slack`` or ``active``.
         warnings: How often MuJoCo warned.
@@ -110,16 +114,20 @@ class Judge:
         needed = needed_damping(
             draft.setting.coupling, draft.setting.period, draft.setting.substeps
         )
-        before, after = self._cost(base or self.original, draft, self.motion)
         verdict = self._refusal(done, felt, needed)
-        if not verdict:
+        cost = done.seconds / (self.seconds * self.motion.duration)
+        if not verdict and cost > CLEARLY_MORE * share:
+            verdict = SAVES_NOTHING
+        if not verdict:  # what is refused anyway need not be measured well
+            before, after = self._cost(base or self.original, draft, self.motion)
             verdict = MAY_GO if after <= (1.0 - self.least_saving) * before else SAVES_NOTHING
+            cost = share * after / before
         return Trial(
             name=name,
             sentence=sentence,
             verdict=verdict,
             loses=loses,
-            cost=share * after / before,
+            cost=cost,
             felt=felt,
             environment=done.environment,
             warnings=done.warnings,

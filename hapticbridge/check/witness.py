@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.check.draft import Draft
+from hapticbridge.check.frames import pose_in, rotation_vector
 from hapticbridge.check.rehearsal import rehearsal_parameters
 from hapticbridge.device import Motion
 from hapticbridge.kernel.state import Binding
@@ -84,9 +85,8 @@ def witness(draft: Draft, motion: Motion) -> Witness:
         simulate(binding.state, samples[k : k + 1], binding.row, row)
         seen.solver_iterations = max(seen.solver_iterations, int(row["solver_iterations"][0]))
         if data.ncon:
-            seen.near |= {
-                frozenset((names[a], names[b])) for a, b in data.contact.geom.tolist() if a >= 0 <= b
-            }
+            touching = [pair for pair in data.contact.geom.tolist() if min(pair) >= 0]
+            seen.near |= {frozenset((names[a], names[b])) for a, b in touching}
         if k % every == 0:
             pairs = _look_at_pairs(model, data, pairs, names, seen.near)
             for name, values in _joint_values(model, data).items():
@@ -137,16 +137,11 @@ def _joint_values(
 
 
 def _poses(model: mujoco.MjModel, data: mujoco.MjData) -> dict[str, NDArray[np.float64]]:
-    poses = {}
-    for b in range(1, model.nbody):
-        parent = model.body_parentid[b]
-        inverse_position, inverse, pose = np.zeros(3), np.zeros(4), np.zeros(7)
-        mujoco.mju_negPose(inverse_position, inverse, data.xpos[parent], data.xquat[parent])
-        mujoco.mju_mulPose(
-            pose[:3], pose[3:], inverse_position, inverse, data.xpos[b], data.xquat[b]
-        )
-        poses[model.body(b).name] = pose
-    return poses
+    world = [np.concatenate([data.xpos[b], data.xquat[b]]) for b in range(model.nbody)]
+    return {
+        model.body(b).name: pose_in(world[model.body_parentid[b]], world[b])
+        for b in range(1, model.nbody)
+    }
 
 
 def _width(model: mujoco.MjModel, joint: int) -> int:
@@ -158,8 +153,5 @@ def _width(model: mujoco.MjModel, joint: int) -> int:
 def _way(start: NDArray[np.float64], now: NDArray[np.float64]) -> NDArray[np.float64]:
     if start.size == 1:
         return now - start
-    inverse, turn, vector = np.zeros(4), np.zeros(4), np.zeros(3)
-    mujoco.mju_negQuat(inverse, start[-4:])
-    mujoco.mju_mulQuat(turn, now[-4:], inverse)
-    mujoco.mju_quat2Vel(vector, turn, 1.0)
+    vector = rotation_vector(start[-4:], now[-4:])
     return vector if start.size == 4 else np.concatenate([now[:3] - start[:3], vector])
