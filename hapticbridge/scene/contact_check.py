@@ -93,10 +93,22 @@ def contact_settings(model: mujoco.MjModel, grip: str) -> Iterator[tuple[int, in
         model: The compiled scene.
         grip: Name of the site on the tool.
     """
-    is_tool = model.body_rootid[model.geom_bodyid] == model.body_rootid[model.site(grip).bodyid[0]]
+    yield from settings_among(model, tool_geoms(model, grip))
+
+
+def tool_geoms(model: mujoco.MjModel, grip: str) -> NDArray[np.bool_]:
+    """Tells of every geom whether it is of the tool: whether it moves with the grip."""
+    root = model.body_rootid[model.site(grip).bodyid[0]]
+    return np.asarray(model.body_rootid[model.geom_bodyid] == root, dtype=bool)
+
+
+def settings_among(
+    model: mujoco.MjModel, among: NDArray[np.bool_] | None = None
+) -> Iterator[tuple[int, int, ContactSetting]]:
+    """Yields geoms that may collide with their contact's setting; ``among`` as in the pairs."""
     mixed = cache(_mixed)  # geoms of one class say the same
     says = [_say(model, g) for g in range(model.ngeom)]
-    for first, second, pair in meeting_pairs(model, is_tool):
+    for first, second, pair in meeting_pairs(model, among):
         if pair < 0:
             setting = mixed(says[first], says[second])
         else:

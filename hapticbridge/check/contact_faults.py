@@ -1,0 +1,231 @@
+"""Faults of contacts: too soft, too stiff, too slippery, with a margin, or there from the start."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import mujoco
+import numpy as np
+
+from hapticbridge.check.case import Case
+from hapticbridge.check.clearance import clearances
+from hapticbridge.check.contact_stiffness import constraint_stiffness, depth_under
+from hapticbridge.check.faults import Fault, others
+from hapticbridge.check.places import Place
+from hapticbridge.scene.checks import MAXIMUM_START_PENETRATION
+from hapticbridge.scene.contact_check import ContactSetting, settings_among, tool_geoms
+from hapticbridge.scene.contact_concerns import SOFT_STEPS, contact_concerns
+from hapticbridge.scene.contact_rule import REFERENCE_STEPS, ROUNDING, contact_numbers
+
+LEAST_PUSH = 1.0
+"""Force in N that a contact is tested with at least: a light touch. A motion that touches nothing
+stretches the coupling by nothing, and says nothing about what the contact must bear."""
+
+MUJOCO_SOLREF = (0.02, 1.0)
+"""What a geom has that says nothing."""
+
+_TYPICAL_INERTIA = 0.1  # kg; only of pairs of which neither side moves by itself
+
+
+def contact_faults(case: Case) -> Iterator[Fault]:
+    """Yields what is wrong with the settings of contacts that the hand can feel.
+
+    Looked at are the contacts that the tool can have, and those that any two things had.
+
+    Args:
+        case: The scene under check.
+    """
+    model, option = case.model, case.model.opt
+    meetings = case.observation.meetings if case.observation else {}
+    is_tool = tool_geoms(model, case.scene.grip)
+    where: dict[ContactSetting, list[tuple[int, int]]] = {}
+    for first, second, setting in settings_among(model):
+        pair = min(first, second), max(first, second)
+        if is_tool[first] or is_tool[second] or pair in meetings:
+            where.setdefault(setting, []).append(pair)
+    push = push_of(case)
+    rooms = _rooms(case, [pair for pairs in where.values() for pair in pairs])
+    for setting, pairs in where.items():
+        place, also = _place(case, pairs[0], setting)
+        names = _names(case, pairs)
+        if fault := _soft(case, setting, pairs, push, rooms):
+            yield fault
+        for concern in contact_concerns(
+            setting.solref,
+            setting.solimp,
+            float(option.timestep),
+            cone="elliptic" if option.cone == mujoco.mjtCone.mjCONE_ELLIPTIC else "pyramidal",
+            condim=setting.condim,
+            friction=setting.friction,
+            only_active=True,
+        ):
+            clause, _, change = concern.partition("; write ")
+            is_cone = "pyramidal" in clause
+            yield Fault(
+                "pyramidal cone" if is_cone else "not passive",
+                case.places.option("cone") if is_cone else place,
+                f"the contact of {names} (solref {_numbers(setting.solref)}) {clause}",
+                change if is_cone else change + also,
+            )
+
+
+def push_of(case: Case) -> float:
+    """Returns the force in N that contacts are tested with.
+
+    It is the coupling's largest in the motion, within ``LEAST_PUSH`` and what the device can give.
+    """
+    largest = float(case.observation.force.max()) if case.observation else 0.0
+    return min(max(largest, LEAST_PUSH), max(case.info.force_limit, LEAST_PUSH))
+
+
+def _rooms(case: Case, pairs: list[tuple[int, int]]) -> dict[tuple[int, int], float]:
+    if case.observation is None:
+        return {}
+    is_tool = tool_geoms(case.model, case.scene.grip)
+    mine = [pair for pair in pairs if is_tool[pair[0]] != is_tool[pair[1]]]
+    return clearances(case.model, mine, is_tool, case.observation.postures)
+
+
+def _soft(
+    case: Case,
+    setting: ContactSetting,
+    pairs: list[tuple[int, int]],
+    push: float,
+    rooms: dict[tuple[int, int], float],
+) -> Fault | None:
+    """Says how deep a push sinks in, where the setting is soft or a clearance is less deep."""
+    step = float(case.model.opt.timestep)
+    depths = {
+        pair: depth_under(push, setting.solref, setting.solimp, inertia_of(case, pair), step)
+        for pair in pairs
+    }
+    tight = [pair for pair in pairs if depths[pair] > rooms.get(pair, np.inf)]
+    numbers = contact_numbers(setting.solref, setting.solimp, step)
+    if not tight and numbers.resolved <= SOFT_STEPS * (1 + ROUNDING):
+        return None
+    pair = max(tight or pairs, key=lambda each: depths[each])
+    stiffness = constraint_stiffness(
+        setting.solref, setting.solimp, inertia_of(case, pair), step, depths[pair]
+    )
+    is_default = np.allclose(setting.solref, MUJOCO_SOLREF)
+    sentence = (
+        f"the contact of {_names(case, [pair])}{others(len(pairs) - 1)} amounts to "
+        f"{stiffness:.3g} N/m ({'MuJoCo’s default ' if is_default else ''}solref "
+        f"{_numbers(setting.solref)}): {push:.3g} N sink in by {1e6 * depths[pair]:.3g} µm"
+    )
+    if pair in rooms:
+        sentence += f", into a clearance of {1e6 * rooms[pair]:.3g} µm"
+    change = f'solref="{REFERENCE_STEPS * step:g} 1" solimp="0.9 0.95 0.001"'
+    if numbers.resolved <= REFERENCE_STEPS * (1 + ROUNDING):
+        change = (
+            "more mass or armature where the contact is (its stiffness grows with them), or a "
+            "larger clearance"
+        )
+    kind = "default contact" if is_default else "soft contact"
+    place, also = _place(case, pair, setting)
+    return Fault(kind, place, sentence, change + also)
+
+
+def inertia_of(case: Case, pair: tuple[int, int]) -> float:
+    """Returns the inertia in kg that the contact of two geoms has, the least that was seen.
+
+    Where they did not meet it is that of their centres: 1/m = Σ 1/m_i, with MuJoCo's mean inverse
+    weights of the bodies, plus the coupling's share h B + h² K at the tool.
+    """
+    model = case.model
+    seen = case.observation.meetings.get(pair) if case.observation else None
+    if seen is not None and np.isfinite(seen.inertia):
+        return seen.inertia
+    is_tool = tool_geoms(model, case.scene.grip)
+    step, inverse = float(model.opt.timestep), 0.0
+    share = step * case.coupling.damping + step**2 * case.coupling.stiffness
+    for geom in pair:
+        weight = float(model.body_invweight0[model.geom_bodyid[geom], 0])
+        if weight > 0:
+            inverse += 1.0 / (1.0 / weight + (share if is_tool[geom] else 0.0))
+    return 1.0 / inverse if inverse > 0 else _TYPICAL_INERTIA
+
+
+def margin_faults(case: Case) -> Iterator[Fault]:
+    """Yields geoms and pairs whose contacts push before they touch."""
+    model, places = case.model, case.places
+    meeting = {geom for first, second, _ in settings_among(model) for geom in (first, second)}
+    found = [(places.geom(geom), float(model.geom_margin[geom])) for geom in sorted(meeting)]
+    found += [(places.pair(p), float(model.pair_margin[p])) for p in range(model.npair)]
+    for place, margin in found:
+        if margin > 0:
+            yield Fault(
+                "margin",
+                place,
+                f"{place.element} has a margin of {1e3 * margin:g} mm: it pushes that far before "
+                "it is touched, and the force jumps where it begins",
+                'margin="0"',
+            )
+
+
+def start_faults(case: Case) -> Iterator[Fault]:
+    """Yields geoms that are inside each other at the start: energy that nobody meters."""
+    case.scene.reset()
+    model, data = case.model, case.scene.data
+    seen = set()
+    for contact in data.contact:
+        first, second = (int(geom) for geom in contact.geom)
+        if (
+            first < 0
+            or second < 0
+            or (first, second) in seen
+            or contact.dist >= -MAXIMUM_START_PENETRATION
+        ):
+            continue
+        seen.add((first, second))
+        mover = second if model.body_treeid[model.geom_bodyid[second]] >= 0 else first
+        body = int(model.geom_bodyid[mover])
+        out = -contact.dist * contact.frame[:3] * (1 if mover == second else -1)
+        yield Fault(
+            "starts in contact",
+            case.places.geom(mover),
+            f"{_names(case, [(first, second)])} overlap by {-1e3 * contact.dist:.3g} mm at the "
+            f"start; more than {1e3 * MAXIMUM_START_PENETRATION:g} mm release energy that nobody "
+            "meters",
+            _moved_out(case, body, out),
+        )
+
+
+def _moved_out(case: Case, body: int, out: np.ndarray) -> str:
+    model = case.model
+    by = " ".join(f"{value:.4g}" for value in 1e3 * out)
+    has_home = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_KEY, "home") >= 0
+    name = model.body(body).name or body
+    if has_home or model.body_parentid[body] != 0:
+        start = "keyframe 'home'" if has_home else "its pos"
+        return f"move body '{name}' in {start} by {by} mm"
+    position = " ".join(f"{value:.6g}" for value in model.body_pos[body] + 1.01 * out)
+    return f"pos=\"{position}\" in body '{name}' (moved by {by} mm)"
+
+
+def _place(case: Case, pair: tuple[int, int], setting: ContactSetting) -> tuple[Place, str]:
+    """Returns where to change a contact's setting, and what else must say the same.
+
+    That is an explicit pair, else the geom whose own solref is nearest to the contact's; the
+    tool's, where both say the same, and then the other must change too: MuJoCo takes the mean.
+    """
+    model = case.model
+    for p in range(model.npair):
+        if {int(model.pair_geom1[p]), int(model.pair_geom2[p])} == set(pair):
+            return case.places.pair(p), ""
+    is_tool = tool_geoms(model, case.scene.grip)
+    off = [float(np.abs(model.geom_solref[geom] - setting.solref).sum()) for geom in pair]
+    if off[0] == off[1]:
+        mine, other = pair if is_tool[pair[0]] else pair[::-1]
+        also = case.places.geom(other)
+        return case.places.geom(mine), f" there and at {also.file}:{also.line}, {also.element}"
+    return case.places.geom(pair[off.index(min(off))]), ""
+
+
+def _names(case: Case, pairs: list[tuple[int, int]]) -> str:
+    first, second = (case.places.geom(geom).element for geom in pairs[0])
+    return f"{first} with {second}{others(len(pairs) - 1)}"
+
+
+def _numbers(values: tuple[float, ...]) -> str:
+    return f'"{" ".join(f"{value:g}" for value in values)}"'
