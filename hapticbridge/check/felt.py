@@ -65,9 +65,7 @@ class FeltError:
     @property
     def peak(self) -> float:
         """Largest momentary difference, in the same thresholds; reported, never judged by."""
-        return max(
-            self.force_peak / self.force_threshold, self.torque_peak / self.torque_threshold
-        )
+        return max(self.force_peak / self.force_threshold, self.torque_peak / self.torque_threshold)
 
 
 def felt_error(original: NDArray[np.void], variant: NDArray[np.void]) -> FeltError:

@@ -15,10 +15,10 @@ import mujoco
 
 from hapticbridge.arguments import Arguments
 from hapticbridge.certificate import UNKNOWN_DAMPING
-from hapticbridge.check.side_by_side import CostMeter, processor_costs
 from hapticbridge.check.draft import Draft, Setting, name_everything
 from hapticbridge.check.freedoms import freedom_simplifications
 from hapticbridge.check.shapes import shape_simplifications
+from hapticbridge.check.side_by_side import CostMeter, processor_costs
 from hapticbridge.check.simplifications import (
     Simplification,
     contact_simplifications,

@@ -112,11 +112,12 @@ def _comment(lean: Lean, before: str) -> str:
     """Says what was changed; XML allows no two dashes in a row within a comment."""
     source, setting, result = lean.draft.source, lean.draft.setting, lean.result
     felt = 0.0 if result.felt is None else result.felt.felt
+    judge, cost = lean.judge, 100.0 * (result.cost or 1.0)
     lines = [
         "",
         f"  Made leaner from {source.path.name} by 'hapticbridge check': in a motion of "
-        f"{lean.judge.motion.duration:g} s it costs {100 * (result.cost or 1.0):.0f} % of that scene, "
-        f"and differs by {felt:.2g} just noticeable differences (allowed: {lean.judge.budget:g}).",
+        f"{judge.motion.duration:g} s it costs {cost:.0f} % of that scene,",
+        f"  and differs by {felt:.2g} just noticeable differences (allowed: {judge.budget:g}).",
         *(f"  Taken: {trial.name} ({trial.sentence})." for trial in lean.together),
     ]
     if setting != lean.judge.original.setting:

@@ -6,6 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.ticker import FuncFormatter
 
 from hapticbridge.check.lean import Lean
 from hapticbridge.check.trial import IS_FELT, MAY_GO, SAVES_NOTHING, Trial
@@ -56,6 +57,7 @@ def draw_lean(lean: Lean, name: str) -> Figure:
                 alpha=0.8,
             )
     _write_names(axes, points)
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.set_xlabel("cost (processor time, % of the scene as it is)")
     axes.set_ylabel("felt error (just noticeable differences)")
     axes.set_title(f"{name}: what could go without being felt", loc="left", fontsize=11)

@@ -80,9 +80,7 @@ def _candidates(
                 yield _GEOM.mjGEOM_CAPSULE, size, position, axes, local
 
 
-def _error(
-    kind: mujoco.mjtGeom, size: Array, local: Array, volume: float, radius: float
-) -> float:
+def _error(kind: mujoco.mjtGeom, size: Array, local: Array, volume: float, radius: float) -> float:
     outside = np.abs(signed_distance(kind, size, local)).max()
     return float(outside / radius + abs(_volume(kind, size) / volume - 1.0))
 

@@ -16,7 +16,6 @@ HULL_CORNERS = (64, 32, 16, 8)
 """Corners that a convex hull keeps at most, as tried."""
 
 
-
 def shape_simplifications() -> list[Simplification]:
     """Returns what may be left out of shapes; masses and inertias stay as they were compiled."""
     return [
@@ -53,9 +52,7 @@ def _hull(count: int) -> Simplification:
         corners = _hull_corners(spec)
         meshes = [mesh for mesh in spec.meshes if corners.get(_name(mesh), 0) > count]
         changed = {_name(mesh) for mesh in meshes}
-        _keep_inertia(
-            spec, {geom.parent.name for geom in spec.geoms if geom.meshname in changed}
-        )
+        _keep_inertia(spec, {geom.parent.name for geom in spec.geoms if geom.meshname in changed})
         for mesh in meshes:
             mesh.maxhullvert = count
         return bool(meshes)

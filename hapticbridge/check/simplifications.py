@@ -10,8 +10,7 @@ import mujoco
 from hapticbridge.check.draft import Draft
 from hapticbridge.check.witness import Witness
 
-
-OTHER_MOTIONS, PICTURE = "other motions may need it", "it is for the picture"
+OTHER_MOTIONS, PICTURE = "in this motion", "with the picture"
 """What a simplification may lose that a hand in one motion cannot tell."""
 
 

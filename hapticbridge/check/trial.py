@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from hapticbridge.certificate import needed_damping
-from hapticbridge.check.side_by_side import CostMeter
 from hapticbridge.check.draft import Draft
 from hapticbridge.check.felt import FeltError, felt_error
 from hapticbridge.check.rehearsal import Rehearsal
+from hapticbridge.check.side_by_side import CostMeter
 from hapticbridge.device import Motion
 
 LEAST_SAVING = 0.03

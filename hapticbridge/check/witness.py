@@ -127,9 +127,7 @@ def _distance(model: mujoco.MjModel, data: mujoco.MjData, a: int, b: int) -> flo
     return float(mujoco.mj_geomDistance(model, data, a, b, 2.0 * CLEARANCE, None))
 
 
-def _joint_values(
-    model: mujoco.MjModel, data: mujoco.MjData
-) -> dict[str, NDArray[np.float64]]:
+def _joint_values(model: mujoco.MjModel, data: mujoco.MjData) -> dict[str, NDArray[np.float64]]:
     return {
         model.joint(j).name: np.array(data.qpos[model.joint(j).qposadr[0] :][: _width(model, j)])
         for j in range(model.njnt)
