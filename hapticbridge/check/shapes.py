@@ -37,6 +37,7 @@ def shape_simplifications() -> list[Simplification]:
 def _drop_visual_geoms(draft: Draft) -> bool:
     spec = draft.spec
     left = spec.copy()
+    left.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO
     left.discard_visual()  # knows what sensors, tendons and the like refer to
     kept = {geom.name for geom in left.geoms}
     dropped = [geom for geom in spec.geoms if geom.name not in kept]
@@ -137,14 +138,21 @@ def _fit(model: mujoco.MjModel, name: str) -> Primitive:
 
 
 def _keep_inertia(spec: mujoco.MjSpec, bodies: set[str]) -> None:
-    """Writes down the inertia that some bodies have from their geoms."""
-    compiler = spec.compiler
-    if compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE:
-        for body in spec.bodies:  # what stands there is overruled; what is adopted must not be
-            body.explicitinertial = False
-        compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO
-    if compiler.settotalmass > 0:  # all are scaled together, so all must keep their proportion
+    """Writes down the inertia that some bodies have from their geoms, as compiled.
+
+    MuJoCo's own ``adopt_inertial`` refuses a scene whose geoms overrule what is written.
+    """
+    compiler, model = spec.compiler, model_of(spec)
+    is_forced = compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
+    if is_forced or compiler.settotalmass > 0:  # one is overruled or scaled together with all
         bodies = {body.name for body in spec.bodies}
+        compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO
+    unwritten = mujoco.MjSpec().worldbody.add_body()
     for body in spec.bodies:
-        if body.name in bodies and body.parent is not None and body.name != "world":
-            spec.adopt_inertial(body)
+        at = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, body.name)
+        if body.name not in bodies or at <= 0 or not model.body_mass[at]:
+            continue
+        body.explicitinertial, body.mass = True, model.body_mass[at]
+        body.ipos, body.iquat = model.body_ipos[at], model.body_iquat[at]
+        body.inertia, body.fullinertia = model.body_inertia[at], unwritten.fullinertia
+        body.ialt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT

@@ -19,6 +19,8 @@ A larger share keeps more in the scene."""
 CLEARLY_MORE = 1.2
 """Cost over that of what it must beat, without unit, at which one run is enough to see it."""
 
+_ROUNDING = 1e-9  # relative, of a sum of products
+
 _ENVIRONMENTS = ("strict", "within slack", "active")
 
 MAY_GO, IS_FELT, SAVES_NOTHING = "may go", "is felt", "saves nothing"
@@ -145,6 +147,6 @@ class Judge:
             return WARNS
         if ranks[0] > ranks[1]:
             return CREATES
-        if needed > bearable:
+        if needed > bearable * (1.0 + _ROUNDING):
             return NOT_BORNE
         return IS_FELT if felt.felt > self.budget else ""
