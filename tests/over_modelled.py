@@ -53,7 +53,8 @@ def tessellated_box(
     corner = np.arange((GRID + 1) ** 2).reshape(GRID + 1, GRID + 1)
     a, b, c, d = corner[:-1, :-1], corner[1:, :-1], corner[1:, 1:], corner[:-1, 1:]
     quads = np.stack([a, b, c, a, c, d], axis=-1).reshape(-1, 3)
-    vertices, faces = [], []
+    vertices: list[NDArray[np.float64]] = []
+    faces: list[NDArray[np.intp]] = []
     for axis in range(3):
         for side in (-1.0, 1.0):
             point = np.zeros((*u.shape, 3))
@@ -64,4 +65,4 @@ def tessellated_box(
             faces.append((quads if side > 0 else quads[:, ::-1]) + len(faces) * u.size)
             vertices.append(point.reshape(-1, 3))
     unique, index = np.unique(np.round(np.vstack(vertices), 12), axis=0, return_inverse=True)
-    return unique, index.reshape(-1)[np.vstack(faces)]
+    return unique.astype(np.float64), index.reshape(-1)[np.vstack(faces)].astype(np.intp)

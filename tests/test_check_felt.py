@@ -64,7 +64,7 @@ def test_spring_seven_percent_stiffer_is_one_just_noticeable_difference(tmp_path
 
 def test_difference_below_the_absolute_threshold_is_not_felt_however_small_the_force() -> None:
     faint = np.full((100, 3), [1e-3, 0.0, 0.0])
-    felt = felt_error(records(faint), records(faint + [FORCE_FLOOR / 2, 0.0, 0.0]))
+    felt = felt_error(records(faint), records(faint + np.array([FORCE_FLOOR / 2, 0, 0])))
     assert felt.felt == pytest.approx(0.5)
     assert felt.force_threshold == FORCE_FLOOR
 

@@ -304,7 +304,8 @@ def test_rate_goes_down_only_as_far_as_device_and_hand_allow(tmp_path: Path) -> 
     weak = tried(draft, slow, "half the rate", damping=0.5)
     assert weak is not None
     # K T + B = 0.4 + 0.2
-    assert (weak.verdict, weak.needed_damping) == (NOT_BORNE, pytest.approx(0.6))
+    assert weak.verdict == NOT_BORNE
+    assert weak.needed_damping == pytest.approx(0.6)
     assert verdict(draft, slow, "half the rate", damping=0.6) == MAY_GO
 
 
@@ -337,18 +338,15 @@ def test_best_primitive_of_a_primitive_is_itself(turn: Rotation) -> None:
     kinds, frame = mujoco.mjtGeom, turn.as_matrix()
     angle = np.linspace(0.0, 2 * np.pi, 64, endpoint=False)
     ring = 0.01 * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
-    cylinder = np.vstack([ring + [0, 0, 0.03], ring - [0, 0, 0.03]])
+    cylinder = np.vstack([ring + np.array([0, 0, 0.03]), ring - np.array([0, 0, 0.03])])
     ball = np.vstack([0.5 * BALL, -0.5 * BALL])
-    caps = [
-        half * [1, 1, np.sign(side)] + [0, 0, side]
-        for side in (0.03, -0.03)
-        for half in [np.abs(ball) * np.sign(ball) * [1, 1, 0] + np.abs(ball) * [0, 0, 1]]
-    ]
+    upper = ball * np.array([1, 1, 0]) + np.abs(ball) * np.array([0, 0, 1])
+    upper[:, 2] += 0.03
     for points, kind in (
         (BOX, kinds.mjGEOM_BOX),
         (cylinder, kinds.mjGEOM_CYLINDER),
         (ball, kinds.mjGEOM_SPHERE),
-        (np.vstack(caps), kinds.mjGEOM_CAPSULE),
+        (np.vstack([upper, -upper]), kinds.mjGEOM_CAPSULE),
     ):
         moved = points @ frame.T + [0.1, -0.2, 0.3]
         found = best_primitive(moved, [frame])

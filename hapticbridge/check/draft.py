@@ -106,20 +106,20 @@ def model_of(spec: mujoco.MjSpec) -> mujoco.MjModel:
     return spec.copy().compile()
 
 
-def census(spec: mujoco.MjSpec) -> tuple[int, ...]:
-    """Counts what refers to bodies, joints and geoms: MuJoCo deletes it along with them."""
+def census(model: mujoco.MjModel) -> tuple[int, ...]:
+    """Counts what refers to bodies, joints and geoms: MuJoCo leaves it out along with them."""
     kinds = (
-        spec.actuators,
-        spec.sensors,
-        spec.equalities,
-        spec.tendons,
-        spec.pairs,
-        spec.excludes,
-        spec.tuples,
-        spec.skins,
-        spec.flexes,
-        spec.sites,
-        spec.cameras,
-        spec.lights,
+        "sensor",
+        "actuator",
+        "eq",
+        "tendon",
+        "pair",
+        "exclude",
+        "tuple",
+        "skin",
+        "flex",
+        "site",
+        "cam",
+        "light",
     )
-    return tuple(len(list(kind)) for kind in kinds)
+    return tuple(int(getattr(model, f"n{kind}")) for kind in kinds)

@@ -162,17 +162,25 @@ def _place(spec: mujoco.MjSpec, body: mujoco.MjsBody, pose: Array) -> None:
 
 def _edit_joints(draft: Draft, change: Callable[[mujoco.MjSpec, Keys], bool]) -> bool:
     """Changes joints and carries the keyframes over; refuses where something refers to them."""
-    spec = draft.spec.copy()
-    before, keys = census(spec), _read_keys(spec)
-    if not change(spec, keys) or census(spec) != before:
+    spec, before = draft.spec.copy(), model_of(draft.spec)
+    keys = _read_keys(before)
+    if not change(spec, keys):
         return False
-    _write_keys(spec, keys)
+    bare = spec.copy()
+    for key in list(bare.keys):
+        bare.delete(key)
+    after = model_of(bare)
+    if census(after) != census(before):
+        return False
+    order = [after.joint(j).name for j in range(after.njnt)]
+    for key, values in zip(spec.keys, keys, strict=True):
+        key.qpos = np.concatenate([np.zeros(0), *(values[name][0] for name in order)])
+        key.qvel = np.concatenate([np.zeros(0), *(values[name][1] for name in order)])
     draft.source = draft.with_spec(spec)
     return True
 
 
-def _read_keys(spec: mujoco.MjSpec) -> Keys:
-    model = model_of(spec)
+def _read_keys(model: mujoco.MjModel) -> Keys:
     ends = [*model.jnt_qposadr[1:], model.nq], [*model.jnt_dofadr[1:], model.nv]
     return [
         {
@@ -184,14 +192,3 @@ def _read_keys(spec: mujoco.MjSpec) -> Keys:
         }
         for k in range(model.nkey)
     ]
-
-
-def _write_keys(spec: mujoco.MjSpec, keys: Keys) -> None:
-    bare = spec.copy()
-    for key in list(bare.keys):
-        bare.delete(key)
-    model = model_of(bare)
-    order = [model.joint(j).name for j in range(model.njnt)]
-    for key, values in zip(spec.keys, keys, strict=True):
-        key.qpos = np.concatenate([np.zeros(0), *(values[name][0] for name in order)])
-        key.qvel = np.concatenate([np.zeros(0), *(values[name][1] for name in order)])

@@ -104,6 +104,7 @@ def _point_to_assets(spec: mujoco.MjSpec, source: SceneSource, folder: Path) -> 
         sides = [moved(str(side), str(spec.texturedir)) for side in texture.cubefiles]
         for k, side in enumerate(sides):
             texture.cubefiles[k] = side
+    spec.modelfiledir = str(folder)
     spec.meshdir = spec.texturedir = ""
     spec.strippath = False
 
