@@ -7,7 +7,6 @@
 
 from __future__ import annotations
 
-import time
 from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
@@ -17,47 +16,27 @@ from types import TracebackType
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hapticbridge.certificate import (
-    condition_sentences,
-    default_coupling,
-    is_run_certified,
-    run_conditions,
-)
+from hapticbridge.certificate import condition_sentences, default_coupling
 from hapticbridge.clock import Clock, RealClock, period_of
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Device, device_for
-from hapticbridge.errors import HapticBridgeError, RecordingError, SafetyTrip, SceneError
+from hapticbridge.errors import HapticBridgeError, SafetyTrip, SceneError
 from hapticbridge.guard import Limits, limits_for, refuse_stretched_start, trip_reason
 from hapticbridge.inputs import Write, apply_writes, input_writes
 from hapticbridge.jit import direct
 from hapticbridge.kernel.parameters import checked_substeps
 from hapticbridge.kernel.publish import publish
-from hapticbridge.kernel.state import Binding, RunParameters, rotation_numbers
+from hapticbridge.kernel.state import Binding
 from hapticbridge.kernel.step import OK, after_step, before_step
 from hapticbridge.ledger import Ledger
 from hapticbridge.provenance import attachments, describe_run
-from hapticbridge.recording import TAIL, Recorder, Ring
-from hapticbridge.rendering import (
-    Method,
-    contact_stiffness_of,
-    method_named,
-    prepare,
-    refuse_unknowing,
-)
+from hapticbridge.recording.stream import RecordStream
+from hapticbridge.rendering import contact_stiffness_of, method_named, prepare, refuse_unknowing
 from hapticbridge.scene import Scene, load_scene
 from hapticbridge.signals import stopping_on_signals
 from hapticbridge.summary import Summary
 from hapticbridge.tick import SAMPLE_DTYPE, TickFlag
-
-RING_SECONDS, MOST_RECORDS = 8.0, 1 << 16
-"""How far the recorder may fall behind before a record is lost, in s and in records of 400 bytes;
-a trip hands the last second of them to whoever catches it."""
-
-NOBODY_READS = 1 << 62
-"""Tail of a ring without a recorder: it is never full and keeps the newest records."""
-
-RING_POLL = 1e-3
-"""How often a run in simulated time looks whether the recorder made room, in s."""
+from hapticbridge.workspace import Workspace, run_parameters
 
 _NO_FORCE = np.zeros(6)
 
@@ -117,27 +96,26 @@ class Bridge:
         self.scene = scene if isinstance(scene, Scene) else load_scene(scene)
         self.device = device_for(self.scene, device) if isinstance(device, str) else device
         self.period = period_of(rate)
-        self._scales = scale, scale if force_scale is None else force_scale
-        self._method = method_named(method)
+        self.method = method_named(method)
         self._substeps = checked_substeps(substeps)
+        self._workspace = Workspace.of(scale, force_scale, axes, is_absolute=absolute)
         self.coupling = coupling or default_coupling(
-            self.device.info, self.period, *self._scales, self.laws
+            self.device.info,
+            self.period,
+            self._workspace.scale,
+            self._workspace.force_scale,
+            self.laws,
         )
         self._limits = limits_for(self.device.info, limits)
-        refuse_unknowing(self._method, is_real=self.device.info.is_real, i_know=i_know)
-        self._contact_stiffness = contact_stiffness_of(
-            self._method, self.coupling, contact_stiffness
-        )
-        self._axes = rotation_numbers(np.eye(3) if axes is None else axes)
-        self._is_absolute = absolute
+        refuse_unknowing(self.method, is_real=self.device.info.is_real, i_know=i_know)
+        contact_stiffness_of(self.method, self.coupling, contact_stiffness)  # refused here already
+        self._contact_stiffness = contact_stiffness
         self._path = Path(recording) if recording is not None else None
         self._is_live = live
         self.clock = clock or RealClock()
         self._sample = np.zeros(1, SAMPLE_DTYPE)
         self._inputs: deque[list[Write]] = deque()
-        self._recorder: Recorder | None = None
-        self._tick = self._overruns = self._skipped = self._dropped = 0
-        self._lost = 0  # flag of the next record if the one before it was lost
+        self._tick = self._overruns = self._skipped = 0
         self._stopped_by = ""
         self._is_open = False
 
@@ -164,7 +142,7 @@ class Bridge:
             reason=reason,
             overruns=self._overruns,
             skipped=self._skipped,
-            dropped=self._dropped,
+            dropped=self._stream.dropped,
         )
         self._resources.__exit__(kind, error, traceback)
 
@@ -186,16 +164,16 @@ class Bridge:
             DeviceError: The device failed; likewise.
             HapticBridgeError: The bridge is not open, or the duration is out of range.
         """
-        last, code = self._last_tick(duration), OK
+        last, code, read = self._last_tick(duration), OK, 0
         self._resume()
         state, row = self._binding.state, self._binding.row
         model, data, substeps = self.scene.model, self.scene.data, range(self._substeps)
-        records, cursors = self._ring.rows, self._ring.cursors
+        stream, records, cursors = self._stream, self._stream.rows, self._stream.cursors
         sample, wrench = self._sample, row["wrench_on_device"][0]
         before, after, hand_over = self._before_step, self._after_step, self._publish
         read_device, write_device = self.device.read, self.device.write
         clock, wait, now = self.clock, self.clock.wait, self.clock.now
-        inputs, step = self._inputs, self._method.step
+        inputs, step = self._inputs, self.method.step
         with stopping_on_signals(self._stop_on_signal):
             clock.start(round(self.period * 1e9))
             try:
@@ -206,9 +184,10 @@ class Bridge:
                     if inputs:
                         self._apply_inputs()
                     read_device(sample)
-                    read = now()
+                    read_before, read = read, now()
+                    elapsed = 1e-9 * (read - read_before)
                     for substep in substeps:
-                        code = before(state, sample, row, substep)
+                        code = before(state, sample, row, substep, elapsed)
                         if code != OK:
                             break
                         step(model, data)
@@ -217,13 +196,12 @@ class Bridge:
                         break
                     write_device(wrench)
                     write = now()
-                    flags = self._lost | (self._overrun(skipped) if skipped else 0)
+                    flags = stream.lost | (self._overrun(skipped) if skipped else 0)
                     while not hand_over(row, records, cursors, deadline, wake, read, write, flags):
-                        self._lost = self._ring_is_full()
-                        if self._lost:
+                        if not stream.makes_room(may_wait=not self._stopped_by):
                             break
                     else:
-                        self._lost = 0
+                        stream.lost = 0
                     self._tick += 1
             finally:
                 write_device(_NO_FORCE)
@@ -261,9 +239,9 @@ class Bridge:
         Raises:
             SceneError: A name does not exist or has the wrong count of numbers.
         """
-        if not self._method.meters_inputs:
+        if not self.method.meters_inputs:
             raise SceneError(
-                f"method '{self._method.name}' cannot meter the work of inputs; use 'implicit'"
+                f"method '{self.method.name}' cannot meter the work of inputs; use 'implicit'"
             )
         self._inputs.append(
             input_writes(
@@ -276,14 +254,9 @@ class Bridge:
         )
 
     @property
-    def method(self) -> Method:
-        """How the tool is rendered."""
-        return self._method
-
-    @property
     def laws(self) -> int:
         """How often per tick the wrench on the tool is computed."""
-        return self._method.laws(self._substeps)
+        return self.method.laws(self._substeps)
 
     @property
     def ledger(self) -> Ledger:
@@ -292,36 +265,23 @@ class Bridge:
 
     def latest_records(self, count: int) -> NDArray[np.void]:
         """Returns copies of the newest records (``TICK_DTYPE``), oldest first."""
-        return self._ring.latest(count)
+        return self._stream.latest(count)
 
     def conditions(self) -> tuple[str, ...]:
         """Returns what is to be said of device and method, one sentence each; known once open."""
-        return condition_sentences(self.device.info, self.parameters, self._method)
+        return condition_sentences(self.device.info, self.parameters, self.method)
 
     def summary(self) -> Summary:
         """Returns what the run was so far."""
-        state, ledger = self._binding.state, self.ledger
-        info, method = self.device.info, self._method
-        conditions = run_conditions(info, self.parameters, method)
-        return Summary(
+        return Summary.of(
+            self._binding.state,
+            self.parameters,
+            self.device.info,
+            self.method,
             ticks=self._tick,
-            duration=self._tick * self.period,
             overruns=self._overruns,
             skipped=self._skipped,
-            dropped=self._dropped,
-            peak_force=float(state["peak_force"][0]),
-            peak_torque=float(state["peak_torque"][0]),
-            energies=ledger.energies(),
-            environment=ledger.environment,
-            slack_share=ledger.slack_share,
-            method=method.name,
-            about=method.about,
-            hazard=method.hazard,
-            coupling=self.coupling,
-            felt=self.parameters.felt,
-            fault=ledger.fault,
-            conditions=self.conditions(),
-            is_certified=is_run_certified(conditions, method),
+            dropped=self._stream.dropped,
             stopped_by=self._stopped_by,
             recording=self._path,
         )
@@ -332,66 +292,41 @@ class Bridge:
             raise HapticBridgeError("a bridge is entered once; make a new one for another run")
         self.scene.claim()
         resources.callback(self.scene.release)
-        scene, clock, info = self.scene, self.clock, self.device.info
-        felt = prepare(scene, self.coupling, self.period, self._substeps, self._method)
+        scene, clock, info, method = self.scene, self.clock, self.device.info, self.method
+        felt = prepare(scene, self.coupling, self.period, self._substeps, method)
         self._sample[:] = self.device.start(self.period)
-        self.parameters = self._parameters(felt)
-        self._binding = Binding(scene.model, scene.data, self.parameters)
-        refuse_stretched_start(self._binding.state, self._limits)
-        is_read = self._path is not None or self._is_live
-        capacity = min(round(RING_SECONDS / self.period), MOST_RECORDS)
-        self._ring = Ring.shared(capacity) if is_read else Ring.local(capacity)
-        resources.callback(self._ring.close)
-        self._compile()
-        if not is_read:
-            self._ring.cursors[TAIL] = NOBODY_READS
-            return
-        meta = describe_run(
+        self.parameters = run_parameters(
             scene,
-            self.parameters,
-            self._binding,
-            method=self._method.name,
-            device=info,
-            clock=clock.name,
-        )
-        self._recorder = Recorder(
-            self._ring, self._path, meta, attachments(scene), live=self._is_live
-        )
-        resources.callback(self._recorder.close)
-        self._recorder.wait_until_ready()
-        self._event("start")
-
-    def _parameters(self, felt: Coupling | None) -> RunParameters:
-        first = self._sample[0]
-        start = tuple(float(v) for v in (*first["position"], *first["quaternion"]))
-        grip = self.scene.grip_pose()
-        identity = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
-        return RunParameters(
-            grip=self.scene.grip,
+            self.coupling,
+            method,
+            self._sample,
             period=self.period,
-            substeps=self._substeps,
-            coupling=self.coupling,
-            scale=self._scales[0],
-            force_scale=self._scales[1],
-            axes=self._axes,
-            force_limit=self._limits.force,
-            torque_limit=self._limits.torque,
-            ramp_ticks=self._limits.ramp_ticks(self.period),
-            device_origin=identity if self._is_absolute else start,
-            handle_origin=identity if self._is_absolute else grip,
-            device_start=start,
-            scheme=self._method.scheme,
             felt=felt,
+            substeps=self._substeps,
+            info=info,
+            limits=self._limits,
+            workspace=self._workspace,
             contact_stiffness=self._contact_stiffness,
-            device_damping=self.device.info.damping,
-            device_rotational_damping=self.device.info.rotational_damping,
         )
+        self._binding = binding = Binding(scene.model, scene.data, self.parameters)
+        refuse_stretched_start(binding.state, self._limits)
+        self._stream = RecordStream(
+            self._path, self.period, live=self._is_live, is_lossless=clock.is_lossless
+        )
+        resources.callback(self._stream.close)
+        self._compile()
+        if self._stream.is_read:
+            meta = describe_run(
+                scene, self.parameters, binding, method=method.name, device=info, clock=clock.name
+            )
+            self._stream.start(meta, attachments(scene))
+            self._event("start")
 
     def _compile(self) -> None:
         """Gets the machine code of the tick ready, so that the first one is not late."""
         state, row, sample = self._binding.state, self._binding.row, self._sample
-        rows, cursors = self._ring.rows, self._ring.cursors
-        self._before_step = direct(before_step, state, sample, row, 0)
+        rows, cursors = self._stream.rows, self._stream.cursors
+        self._before_step = direct(before_step, state, sample, row, 0, 0.0)
         self._after_step = direct(after_step, state, row, 0)
         self._publish = direct(publish, row, rows, cursors, 0, 0, 0, 0, 0)
 
@@ -423,22 +358,10 @@ class Bridge:
         self._skipped += skipped
         return int(TickFlag.OVERRUN)
 
-    def _ring_is_full(self) -> int:
-        """Waits for room where time is simulated; else counts the record as lost."""
-        recorder = self._recorder
-        if recorder is None or not recorder.is_alive():
-            raise RecordingError("the recorder ended in mid-run; the recording stops there")
-        if self.clock.is_lossless and not self._stopped_by:
-            time.sleep(RING_POLL)
-            return 0
-        self._dropped += 1
-        return int(TickFlag.DROPPED_BEFORE)
-
     def _trip(self, reason: str) -> None:
         self._stopped_by = "trip"
         self._event("trip", reason=reason)
-        raise SafetyTrip(reason, self._ring.latest(round(1.0 / self.period)))
+        raise SafetyTrip(reason, self._stream.latest(round(1.0 / self.period)))
 
     def _event(self, event: str, **details: object) -> None:
-        if self._recorder is not None:
-            self._recorder.event({"event": event, "tick": self._tick, **details}, self.clock.now())
+        self._stream.event(event, self._tick, self.clock.now(), **details)

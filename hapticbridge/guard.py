@@ -46,6 +46,10 @@ class Limits:
         return round(self.ramp / period)
 
 
+UNLIMITED = Limits(force=1e30, torque=1e30, ramp=0.0)
+"""Of runs that nobody feels: no force of a simulation that is still finite comes near."""
+
+
 def limits_for(info: DeviceInfo, limits: Limits | None) -> Limits:
     """Returns the limits of a run: those asked for, or the device's own.
 

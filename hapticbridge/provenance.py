@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import HapticBridgeError, RecordingError
+from hapticbridge.kernel.scheme import WELD
 from hapticbridge.kernel.state import Binding, RunParameters
-from hapticbridge.kernel.step import WELD
 from hapticbridge.recording import Attachment
 from hapticbridge.rendering import Method, method_named
 from hapticbridge.scene import Scene

@@ -18,8 +18,8 @@ from hapticbridge.arguments import Arguments
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import DeviceError, SceneError, choices
 from hapticbridge.kernel.parameters import RunParameters, checked_substeps
+from hapticbridge.kernel.scheme import COUPLED, DIRECT, HELD, WELD
 from hapticbridge.kernel.state import WELD_NAME
-from hapticbridge.kernel.step import COUPLED, DIRECT, HELD, WELD
 from hapticbridge.scene import Scene
 from hapticbridge.scene.contact_check import warn_of_contacts
 from hapticbridge.scene.methods import check_massless_tool, check_metered
@@ -39,7 +39,7 @@ class Method:
         about: What it is, in one sentence.
         hazard: What it may do on a real device, in one sentence; empty where nothing more than the
             device condition is to be said.
-        scheme: How the wrench reaches the tool, as the kernel counts (``kernel.step.COUPLED`` …).
+        scheme: How the wrench reaches the tool, as the kernel counts (``kernel.scheme.COUPLED`` …).
         integrator: MuJoCo's, by the name that MJCF gives it.
         discretization: How the coupling's damper is discretised, as the bounds call it; ``none``
             where no coupling law gives the wrench.

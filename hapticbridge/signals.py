@@ -1,4 +1,4 @@
-"""SIGINT and SIGTERM as a wish to stop, for as long as a loop runs."""
+"""SIGINT and SIGTERM as a wish to stop while a loop runs, or held back for a moment."""
 
 from __future__ import annotations
 
@@ -31,3 +31,31 @@ def stopping_on_signals(stop: Callable[[], None]) -> Iterator[None]:
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)
+
+
+@contextmanager
+def holding_interrupts() -> Iterator[None]:
+    """Holds Ctrl-C back from the main thread, and from processes that this thread starts meanwhile.
+
+    It arrives at the end. A process begins with what its parent's thread holds back, so an
+    interrupt cannot end it in the middle of its imports, with a traceback; it has to unblock SIGINT
+    itself. In the parent that is not enough, because any other thread may take the signal and hand
+    it to the main one: there, a handler notes it.
+    """
+    noted: list[int] = []
+    before = signal.getsignal(signal.SIGINT)  # None if it is not Python's
+    is_ours = before is not None and threading.current_thread() is threading.main_thread()
+    if is_ours:
+        signal.signal(signal.SIGINT, lambda number, _frame: noted.append(number))
+    has_masks = hasattr(signal, "pthread_sigmask")  # all but Windows
+    if has_masks:
+        held = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        if has_masks:
+            signal.pthread_sigmask(signal.SIG_SETMASK, held)
+        if is_ours:
+            signal.signal(signal.SIGINT, before)
+        if noted:
+            signal.raise_signal(signal.SIGINT)

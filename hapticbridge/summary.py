@@ -5,7 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticbridge.certificate import condition_sentences, is_run_certified, run_conditions
 from hapticbridge.coupling import Coupling
+from hapticbridge.device import DeviceInfo
+from hapticbridge.kernel.parameters import RunParameters
+from hapticbridge.ledger import Ledger
+from hapticbridge.rendering import Method
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,3 +71,57 @@ class Summary:
     def verdict(self) -> str:
         """``passive`` (strict or within slack, and no kick of the device) or ``active``."""
         return "active" if self.fault is not None else "passive"
+
+    @classmethod
+    def of(
+        cls,
+        state: NDArray[np.void],
+        parameters: RunParameters,
+        info: DeviceInfo,
+        method: Method,
+        *,
+        ticks: int,
+        overruns: int,
+        skipped: int,
+        dropped: int,
+        stopped_by: str,
+        recording: Path | None,
+    ) -> Summary:
+        """Reads the summary of a run out of the kernel's state and the loop's counters.
+
+        Args:
+            state: ``kernel.layout.STATE_DTYPE``, one element.
+            parameters: Of the run.
+            info: The device.
+            method: How the tool was rendered.
+            ticks: Ticks that were done.
+            overruns: Ticks that started a period or more after their deadline.
+            skipped: Deadlines that were skipped for it.
+            dropped: Records that were lost.
+            stopped_by: What ended the run.
+            recording: The file, if one was written.
+        """
+        ledger = Ledger.of(state)
+        conditions = run_conditions(info, parameters, method)
+        return cls(
+            ticks=ticks,
+            duration=ticks * parameters.period,
+            overruns=overruns,
+            skipped=skipped,
+            dropped=dropped,
+            peak_force=float(state["peak_force"][0]),
+            peak_torque=float(state["peak_torque"][0]),
+            energies=ledger.energies(),
+            environment=ledger.environment,
+            slack_share=ledger.slack_share,
+            method=method.name,
+            about=method.about,
+            hazard=method.hazard,
+            coupling=parameters.coupling,
+            felt=parameters.felt,
+            fault=ledger.fault,
+            conditions=condition_sentences(info, parameters, method),
+            is_certified=is_run_certified(conditions, method),
+            stopped_by=stopped_by,
+            recording=recording,
+        )

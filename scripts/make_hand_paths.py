@@ -318,6 +318,71 @@ PATHS = {
         axes=(1, 1, 0, 0, 0, 1),
         seed=8,
     ),
+    # Close the pliers until the wire is just not touched, hold, crush it, hold, let go; close them
+    # again, less far: they meet the wire later than before.
+    "pliers": HandPath(
+        swinging(
+            0.1,
+            Reach(0.4, 1.2, degrees=(0, 0, -5.3)),
+            Reach(2.2, 1.6, degrees=(0, 0, -4.2)),
+            Reach(4.4, 1.1, degrees=(0, 0, 9.5)),
+            Reach(5.6, 0.9, degrees=(0, 0, -8.5)),
+            Reach(6.9, 0.9, degrees=(0, 0, 8.5)),
+        ),
+        axes=(1, 1, 1, 1, 1, 1),
+        seed=9,
+    ),
+    # Push the key in past three pins, on to 1 mm beyond its shoulder (2.4 N), turn it by 92
+    # degrees, hold it at the stop, turn it back, pull it out.
+    "lock": HandPath(
+        reaching(
+            Reach(0.4, 2.2, (-17.0, 0, 0)),
+            Reach(2.9, 1.4, degrees=(-92.0, 0, 0)),
+            Reach(4.8, 1.2, degrees=(92.0, 0, 0)),
+            Reach(6.1, 1.6, (17.0, 0, 0)),
+        ),
+        axes=(1, 1, 1, 1, 1, 1),
+        seed=10,
+    ),
+    # Press the tip into the recess and turn by a quarter; lift it out, turn back, seat it on the
+    # next arms; turn the second quarter, lift, turn back and seat it again.
+    "screwdriver": HandPath(
+        reaching(
+            Reach(0.2, 0.5, (0, 0, -1.6)),
+            Reach(0.6, 1.7, degrees=(0, 0, 93.1)),
+            Reach(2.3, 0.3, degrees=(0, 0, -3.1)),
+            Reach(2.5, 0.5, (0, 0, 6.6)),
+            Reach(2.9, 1.1, degrees=(0, 0, -90.0)),
+            Reach(3.9, 0.5, (0, 0, -6.4)),
+            Reach(4.3, 1.6, degrees=(0, 0, 93.0)),
+            Reach(5.9, 0.3, degrees=(0, 0, -3.0)),
+            Reach(6.1, 0.5, (0, 0, 6.6)),
+            Reach(6.5, 1.0, degrees=(0, 0, -90.0)),
+            Reach(7.4, 0.5, (0, 0, -5.2)),
+        ),
+        axes=(1, 1, 1, 1, 1, 1),
+        seed=9,
+    ),
+    # Turn the screw by a sixth of a turn; lift the key out bend first, or a soft hand would not get
+    # it out before it swings back; seat it on the next flats; the same again.
+    "hex_key": HandPath(
+        swinging(
+            0.06,
+            Reach(0.2, 0.5, (0, 0, -1.0)),
+            Reach(0.6, 1.7, degrees=(0, 0, 63.0)),
+            Reach(2.3, 0.3, degrees=(-1.6, 2.7, -3.0)),
+            Reach(2.5, 0.5, (0, 0, 9.0)),
+            Reach(2.9, 1.1, degrees=(1.6, -2.7, -60.0)),
+            Reach(3.9, 0.5, (0, 0, -8.7)),
+            Reach(4.3, 1.6, degrees=(0, 0, 63.0)),
+            Reach(5.9, 0.3, degrees=(-1.6, 2.7, -3.0)),
+            Reach(6.1, 0.5, (0, 0, 9.0)),
+            Reach(6.5, 1.0, degrees=(1.6, -2.7, -60.0)),
+            Reach(7.4, 0.5, (0, 0, -8.3)),
+        ),
+        axes=(1, 1, 1, 1, 1, 1),
+        seed=10,
+    ),
 }
 """The path of every scene. Each reaching motion adds up to zero, so that the hand ends where it
 began."""

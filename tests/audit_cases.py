@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticbridge.audit import AuditReport, audit
 from hapticbridge.bridge import Bridge
 from hapticbridge.clock import SimulatedClock
 from hapticbridge.coupling import Coupling
@@ -160,3 +161,34 @@ class ScriptedDevice:
         sample["position"][0] = pose[:3]
         sample["quaternion"][0] = pose[3:]
         sample["buttons"] = 0
+
+
+class SlowClock(SimulatedClock):
+    """A real clock's behaviour on a machine that stalls: deadlines are skipped, or met late.
+
+    Args:
+        stalls: How many deadlines are skipped before a tick, by the tick's number.
+        late: Ticks that begin late, by a share of the period below 1.
+    """
+
+    is_lossless = False
+
+    def __init__(self, stalls: Mapping[int, int], late: Mapping[int, float] | None = None) -> None:
+        super().__init__()
+        self._stalls = stalls
+        self._late = late or {}
+        self._count = self._lateness = 0
+
+    def wait(self) -> tuple[int, int, int]:
+        skipped = self._stalls.get(self._count, 0)
+        self._lateness = round(self._late.get(self._count, 0.0) * self._period)
+        self._count += 1
+        self._now += (1 + skipped) * self._period
+        return self._now, self.now(), skipped
+
+    def now(self) -> int:
+        return self._now + self._lateness
+
+
+def verdict_of(recording: Recording, folder: Path, **parts: Any) -> AuditReport:
+    return audit(rewritten(recording, folder / "tampered.mcap", **parts))

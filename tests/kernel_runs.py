@@ -181,7 +181,7 @@ def go_on(
         if on_tick is not None:
             on_tick(k, data)
         for substep in range(run.parameters.substeps):
-            assert before_step(state, samples[k : k + 1], row, substep) == OK
+            assert before_step(state, samples[k : k + 1], row, substep, T) == OK
             mujoco.mj_step(model, data)
             assert after_step(state, row, substep) == OK
         rows[k] = row[0]

@@ -9,6 +9,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -187,3 +188,20 @@ def moved_through(
     return run_along(
         model, data, data.mocap_pos[0] + motion[:, :3], Rotation.from_rotvec(motion[:, 3:])
     )
+
+
+def swung(*angles: float) -> list[tuple[float, tuple[float, ...], tuple[float, ...]]]:
+    """Poses of a handle 100 mm from a z axis, angle to angle in degrees, half a second each."""
+    poses: list[tuple[float, tuple[float, ...], tuple[float, ...]]] = []
+    for begin, end in pairwise((0.0, *angles)):
+        # in short chords, because moved_through goes straight from pose to pose
+        for angle in np.radians(np.linspace(begin, end, 11)[1:]):
+            offset = (0.1 * (np.cos(angle) - 1), 0.1 * np.sin(angle), 0.0)
+            poses.append((0.05, offset, (0.0, 0.0, float(angle))))
+    return poses
+
+
+def moment_about_axis(run: Run) -> Array:
+    """Moment of the coupling's wrench about the world's z axis, in N m."""
+    moment: Array = np.cross(run.tool, run.force)[:, 2] + run.torque[:, 2]
+    return moment

@@ -5,11 +5,13 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from kernel_runs import IDENTITY, Array, Run, T, load, run_of, samples_of
+from kernel_runs import IDENTITY, Array, Run, T, load, run_of, samples_of, sines
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo
+from hapticbridge.guard import Limits
 from hapticbridge.kernel.state import Binding, RunParameters
 from hapticbridge.kernel.step import simulate
 from hapticbridge.rendering import contact_stiffness_of, method_named, prepare
@@ -157,3 +159,50 @@ class Rotor:
 
     def close(self) -> None:
         pass
+
+
+COUPLING = Coupling(2000.0, 2.0, 2.0, 2e-3)
+
+
+FREE = Limits(force=100.0, torque=10.0, ramp=0.0)
+
+
+TURNED_TOOL = """
+<mujoco>
+  <option gravity="0 0 0"/>
+  <worldbody>
+    <body name="tool" euler="10 20 30"><freejoint/>
+      <geom type="box" size="0.01 0.02 0.03" mass="0.1" contype="0" conaffinity="0"/>
+      <site name="grip" pos="0.02 0.01 0" euler="40 0 10"/>
+    </body>
+  </worldbody>
+</mujoco>"""
+
+
+SERVO = """
+<mujoco>
+  <option gravity="0 0 0"/>
+  <worldbody>
+    <body name="tool"><freejoint/><geom size="0.01" mass="0.1"/><site name="grip"/></body>
+    <body name="arm" pos="0.2 0 0" gravcomp="{gravcomp}"><joint name="arm" type="slide"/>
+      <geom size="0.01" mass="0.2"/></body>
+    <body name="plate" mocap="{mocap}" pos="0 0 1"/>
+  </worldbody>
+  <actuator>{actuator}</actuator>
+</mujoco>"""
+
+WALL = """
+<mujoco>
+  <option gravity="0 0 0"/>
+  <worldbody>
+    <geom type="box" size="0.01 0.1 0.1" pos="0.07 0 0"/>
+    <body name="tool"><freejoint/><geom type="sphere" size="0.01" mass="0.1"/>
+      <site name="grip"/></body>
+  </worldbody>
+</mujoco>"""
+"""A wall 5 cm before a ball."""
+
+
+def waved(count: int = 300) -> Any:
+    """A hand that moves and turns about all axes."""
+    return samples_of(sines(count, 0.02, 3.0), Rotation.from_rotvec(sines(count, 0.3, 2.0)))

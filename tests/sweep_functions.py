@@ -92,6 +92,10 @@ def plus(point: Mapping[str, float], more: float) -> dict[str, Value]:
     return {"sum": point["n"] + more}
 
 
+if __name__ == "__mp_main__" and once("start"):  # a worker that starts imports the program
+    os.killpg(os.getpgid(0), signal.SIGINT)
+    threading.Event().wait(0.1)  # Python looks at signals now and then
+
 if __name__ == "__main__":
     try:
         sweep(counted, COUNTED, folder=scratch() / "parts", chunk=1)

@@ -15,8 +15,8 @@ from scipy.spatial.transform import Rotation
 
 from hapticbridge.check.draft import Draft, Setting, name_everything
 from hapticbridge.check.freedoms import freedom_simplifications
-from hapticbridge.check.lean import quiet_mujoco
 from hapticbridge.check.motion import motion_for
+from hapticbridge.check.observation import quiet
 from hapticbridge.check.primitive import best_primitive, signed_distance
 from hapticbridge.check.shapes import shape_simplifications
 from hapticbridge.check.simplifications import (
@@ -96,7 +96,7 @@ def tried(
     draft: Draft, motion: Motion, name: str, budget: float = 1.0, damping: float = 2.0
 ) -> Trial | None:
     """Returns how a simplification was judged; None where there was nothing to change."""
-    with quiet_mujoco():
+    with quiet():
         judge = Judge(draft, motion, budget, damping, half_price)
         each, changed = all_of(draft, motion)[name], draft.copy()
         if not each.edit(changed):

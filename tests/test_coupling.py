@@ -118,7 +118,7 @@ def _by_substep(scene: str, samples: np.ndarray, coupling: Coupling, substeps: i
     grip = model.site("grip").id
     for k in range(len(run.ticks)):
         tick, substep = divmod(k, substeps)
-        before_step(binding.state, samples[tick : tick + 1], binding.row, substep)
+        before_step(binding.state, samples[tick : tick + 1], binding.row, substep, T)
         mujoco.mj_step(model, data)
         after_step(binding.state, binding.row, substep)
         row = run.ticks[k]
@@ -177,7 +177,7 @@ def _with_world_frame_control(run: Run, samples: np.ndarray) -> Run:
     run.ticks = np.zeros(len(samples), TICK_DTYPE)
     steps = np.diff(samples["position"], axis=0, prepend=np.zeros((1, 3)))
     for k in range(len(samples)):
-        before_step(state, samples[k : k + 1], row, 0)
+        before_step(state, samples[k : k + 1], row, 0, T)
         data.ctrl[first : first + 3] = steps[k] / T
         mujoco.mj_step(run.scene.model, data)
         after_step(state, row, 0)
@@ -244,7 +244,7 @@ def test_handle_moves_uniformly_over_the_substeps_and_arrives_in_the_last() -> N
     samples = samples_of(np.array([[0.004, 0.0, 0.0]]), turn)
     positions, quaternions = [run.handle_start[:3]], [run.handle_start[3:]]
     for substep in range(4):
-        before_step(binding.state, samples, binding.row, substep)
+        before_step(binding.state, samples, binding.row, substep, T)
         positions.append(scene.data.mocap_pos[0].copy())
         quaternions.append(scene.data.mocap_quat[0].copy())
     steps = np.diff(positions, axis=0)

@@ -133,7 +133,7 @@ def test_bad_sample_is_refused_and_changes_nothing(field: str, value: tuple[floa
     before = np.zeros(mujoco.mj_stateSize(scene.model, spec))
     after = before.copy()
     mujoco.mj_getState(scene.model, scene.data, before, spec)
-    assert before_step(binding.state, samples, binding.row, 0) == BAD_SAMPLE
+    assert before_step(binding.state, samples, binding.row, 0, T) == BAD_SAMPLE
     mujoco.mj_getState(scene.model, scene.data, after, spec)
     assert (binding.state.tobytes(), binding.row.tobytes()) == (state, row)
     assert before.tobytes() == after.tobytes()
@@ -156,7 +156,7 @@ def test_any_sample_is_either_refused_or_gives_finite_control(values: list[float
     binding, _ = bind(scene)
     samples = at_rest(1)
     samples["position"], samples["quaternion"] = values[:3], values[3:]
-    code = before_step(binding.state, samples, binding.row, 0)
+    code = before_step(binding.state, samples, binding.row, 0, T)
     with np.errstate(over="ignore", invalid="ignore"):
         square = np.square(values)
         is_valid = np.isfinite(square.sum()) and square[3:].sum() > 0.25
@@ -171,7 +171,7 @@ def test_quaternion_of_another_length_or_sign_is_the_same_rotation() -> None:
     binding, _ = bind(scene)
     samples = at_rest(1)
     samples["quaternion"] = (-1.0, -1.0, 0.0, 0.0)
-    assert before_step(binding.state, samples, binding.row, 0) == OK
+    assert before_step(binding.state, samples, binding.row, 0, T) == OK
     expected = np.sqrt([0.5, 0.5, 0, 0])
     assert binding.row["device_quaternion"][0] == pytest.approx(expected, abs=1e-15)
 
@@ -183,7 +183,7 @@ def test_diverged_scene_gives_zero_wrench_and_a_trip(value: float) -> None:
     run = go_on(run_of(scene, binding, parameters), samples_of(sines(30)))
     assert np.abs(binding.row["wrench_on_device"]).max() > 0
     recorded = binding.row.copy()
-    assert before_step(binding.state, samples_of(sines(31)[30:]), binding.row, 0) == OK
+    assert before_step(binding.state, samples_of(sines(31)[30:]), binding.row, 0, T) == OK
     mujoco.mj_step(scene.model, scene.data)
     scene.data.qpos[0] = value
     assert after_step(binding.state, binding.row, 0) == BAD_RESULT

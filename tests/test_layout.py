@@ -16,7 +16,7 @@ ORDER = (
     ("rendering",),
     ("ledger", "inputs", "device"),
     ("guard", "recording", "certificate"),
-    ("provenance", "summary"),
+    ("provenance", "summary", "workspace"),
     ("bridge", "audit"),
     ("report", "study", "check"),
     ("cli",),

@@ -22,7 +22,16 @@ from model_runs import (
     spec_of,
 )
 
-TOOL_SCENES = ("drawer", "hammer", "open_wrench", "ratchet")
+TOOL_SCENES = (
+    "drawer",
+    "hammer",
+    "hex_key",
+    "lock",
+    "open_wrench",
+    "pliers",
+    "ratchet",
+    "screwdriver",
+)
 CONTACT_SCENES = ("virtual_wall", "planar_peg", "peg_in_hole", "round_peg", *TOOL_SCENES)
 SCENES = ("point_mass", *CONTACT_SCENES)
 

@@ -23,8 +23,13 @@ HANDS = [
     ("peg_in_hole", {}, -0.045),
     ("round_peg", {}, 0.0),
     ("round_peg", {}, -0.045),
+    ("pliers", {}, 0.0),
+    ("lock", {}, 0.0),
+    ("screwdriver", {}, -0.002),
+    ("hex_key", {}, -0.002),
 ]
-"""Scene, parameters, and by how much the hand goes up in m before it is random: into the hole."""
+"""Scene, parameters, and by how much the hand goes up in m before it is random: into the hole,
+or to press a tool that starts seated."""
 
 
 @pytest.mark.parametrize(("name", "values", "first"), HANDS, ids=str)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -11,14 +10,14 @@ from model_runs import B_R as ROTATIONAL_DAMPING
 from model_runs import K_R as ROTATIONAL_STIFFNESS
 from model_runs import (
     MODELS,
-    Array,
     B,
     K,
-    Run,
+    moment_about_axis,
     moved_through,
     run_of_own_path,
     scene_with_handle,
     spec_of,
+    swung,
 )
 from scipy.spatial.transform import Rotation
 
@@ -189,12 +188,6 @@ def test_a_push_within_ten_newtons_does_not_drive_the_nail() -> None:
 TOOTH = 2 * np.pi / 24
 
 
-def moment_about_axis(run: Run) -> Array:
-    """Moment of the coupling's wrench about the world's z axis, in N m."""
-    moment: Array = np.cross(run.tool, run.force)[:, 2] + run.torque[:, 2]
-    return moment
-
-
 def test_pawl_clicks_three_times_a_stroke_on_the_free_way() -> None:
     gear, handle, pawl = run_of_own_path("ratchet").joints.T
     fallen = np.flatnonzero((pawl[1:] < 0.06) & (pawl[:-1] >= 0.06))
@@ -227,17 +220,6 @@ def test_free_way_costs_a_small_part_of_the_drive() -> None:
 # --- open wrench ----------------------------------------------------------------------------------
 
 SLACKENED = np.radians(65.0)
-
-
-def swung(*angles: float) -> list[tuple[float, tuple[float, ...], tuple[float, ...]]]:
-    """Poses of a handle 100 mm from the nut, from angle to angle in degrees, half a second each."""
-    poses: list[tuple[float, tuple[float, ...], tuple[float, ...]]] = []
-    for begin, end in pairwise((0.0, *angles)):
-        # in short chords, because moved_through goes straight from pose to pose
-        for angle in np.radians(np.linspace(begin, end, 11)[1:]):
-            offset = (0.1 * (np.cos(angle) - 1), 0.1 * np.sin(angle), 0.0)
-            poses.append((0.05, offset, (0.0, 0.0, float(angle))))
-    return poses
 
 
 def test_nut_turns_by_a_sixth_and_stays_while_the_wrench_is_seated_again() -> None:

@@ -190,9 +190,11 @@ def _kicked(
     gained: Array,
     resumed: Array,
 ) -> Array:
-    """Returns Σ w·δp − Σ b‖δp‖²/T + (S − S_start − works), the last in the device's scale.
+    """Returns Σ w·δp − Σ b‖δp‖²/t + (S − S_start − works), the last in the device's scale.
 
-    A jump before the first tick or in a pause burns nothing: it took an unknown time.
+    t is the time between two samples, T at least: a damper that moves by δp within t burns no less
+    than at constant speed, and a missed deadline makes t longer. A jump before the first tick or in
+    a pause burns nothing: it took an unknown time.
     """
     if parameters.has_law or parameters.device_damping is None:
         return np.zeros(len(ticks))
@@ -202,8 +204,9 @@ def _kicked(
     burnt = parameters.device_damping * np.sum(moved**2, axis=1)
     burnt += (parameters.device_rotational_damping or 0.0) * np.sum(turned**2, axis=1)
     burnt = np.where(since_start(ticks, resumed) > 0, burnt, 0.0)
+    interval = np.maximum(np.diff(ticks["read_ns"], prepend=0) * 1e-9, parameters.period)
     ratio = parameters.force_scale / parameters.scale
-    return np.asarray(given - np.cumsum(burnt) / parameters.period + ratio * gained)
+    return np.asarray(given - np.cumsum(burnt / interval) + ratio * gained)
 
 
 def _handle(ticks: NDArray[np.void], parameters: RunParameters) -> tuple[Array, Array]:

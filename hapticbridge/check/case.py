@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from hapticbridge.certificate import default_coupling
 from hapticbridge.check.motion import motion_for, samples_of
-from hapticbridge.check.observation import Observation, observe
+from hapticbridge.check.observation import Observation, observe, quiet
 from hapticbridge.check.places import Places
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo, Motion, SimulatedDevice
@@ -141,7 +141,9 @@ def open_case(
     )
     scene.set_timestep(period)
     try:
-        return replace(case, observation=observe(scene, samples, coupling, period, progress))
+        with quiet():
+            seen = observe(scene, samples, coupling, period, progress)
+        return replace(case, observation=seen)
     except (SceneError, mujoco.FatalError) as error:
         return replace(case, motion_fault=" ".join(str(error).split()))
 

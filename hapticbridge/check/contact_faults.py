@@ -10,7 +10,8 @@ import numpy as np
 from hapticbridge.check.case import Case
 from hapticbridge.check.clearance import clearances
 from hapticbridge.check.contact_stiffness import constraint_stiffness, depth_under
-from hapticbridge.check.faults import Fault, others
+from hapticbridge.check.faults import Fault, length, number, others
+from hapticbridge.check.inertia import body_inertia
 from hapticbridge.check.places import Place
 from hapticbridge.scene.checks import MAXIMUM_START_PENETRATION
 from hapticbridge.scene.contact_check import ContactSetting, settings_among, tool_geoms
@@ -43,10 +44,11 @@ def contact_faults(case: Case) -> Iterator[Fault]:
         pair = min(first, second), max(first, second)
         if is_tool[first] or is_tool[second] or pair in meetings:
             where.setdefault(setting, []).append(pair)
-    push = push_of(case)
+    push, cone_told = push_of(case), False
+    case.scene.reset()
     rooms = _rooms(case, [pair for pairs in where.values() for pair in pairs])
     for setting, pairs in where.items():
-        place, also = _place(case, pairs[0], setting)
+        place, also = _place(case, pairs[0], is_soft=False)
         names = _names(case, pairs)
         if fault := _soft(case, setting, pairs, push, rooms):
             yield fault
@@ -61,6 +63,9 @@ def contact_faults(case: Case) -> Iterator[Fault]:
         ):
             clause, _, change = concern.partition("; write ")
             is_cone = "pyramidal" in clause
+            if is_cone and cone_told:  # one word changes it for all
+                continue
+            cone_told |= is_cone
             yield Fault(
                 "pyramidal cone" if is_cone else "not passive",
                 case.places.option("cone") if is_cone else place,
@@ -99,8 +104,10 @@ def _soft(
         pair: depth_under(push, setting.solref, setting.solimp, inertia_of(case, pair), step)
         for pair in pairs
     }
-    tight = [pair for pair in pairs if depths[pair] > rooms.get(pair, np.inf)]
     numbers = contact_numbers(setting.solref, setting.solimp, step)
+    if numbers.resolved <= REFERENCE_STEPS * (1 + ROUNDING):
+        return None  # as stiff as any that was seen to be passive with light tools
+    tight = [pair for pair in pairs if depths[pair] > rooms.get(pair, np.inf)]
     if not tight and numbers.resolved <= SOFT_STEPS * (1 + ROUNDING):
         return None
     pair = max(tight or pairs, key=lambda each: depths[each])
@@ -108,29 +115,25 @@ def _soft(
         setting.solref, setting.solimp, inertia_of(case, pair), step, depths[pair]
     )
     is_default = np.allclose(setting.solref, MUJOCO_SOLREF)
+    default = "MuJoCo's default " if is_default else ""
     sentence = (
         f"the contact of {_names(case, [pair])}{others(len(pairs) - 1)} amounts to "
-        f"{stiffness:.3g} N/m ({'MuJoCo’s default ' if is_default else ''}solref "
-        f"{_numbers(setting.solref)}): {push:.3g} N sink in by {1e6 * depths[pair]:.3g} µm"
+        f"{number(stiffness)} N/m ({default}solref "
+        f"{_numbers(setting.solref)}): {number(push)} N sink in by {length(depths[pair])}"
     )
     if pair in rooms:
-        sentence += f", into a clearance of {1e6 * rooms[pair]:.3g} µm"
+        sentence += f", into a clearance of {length(rooms[pair])}"
     change = f'solref="{REFERENCE_STEPS * step:g} 1" solimp="0.9 0.95 0.001"'
-    if numbers.resolved <= REFERENCE_STEPS * (1 + ROUNDING):
-        change = (
-            "more mass or armature where the contact is (its stiffness grows with them), or a "
-            "larger clearance"
-        )
     kind = "default contact" if is_default else "soft contact"
-    place, also = _place(case, pair, setting)
+    place, also = _place(case, pair, is_soft=True)
     return Fault(kind, place, sentence, change + also)
 
 
 def inertia_of(case: Case, pair: tuple[int, int]) -> float:
     """Returns the inertia in kg that the contact of two geoms has, the least that was seen.
 
-    Where they did not meet it is that of their centres: 1/m = Σ 1/m_i, with MuJoCo's mean inverse
-    weights of the bodies, plus the coupling's share h B + h² K at the tool.
+    Where they did not meet it is that of their centres at the start: 1/m = Σ 1/m_i, plus the
+    coupling's share h B + h² K at the tool.
     """
     model = case.model
     seen = case.observation.meetings.get(pair) if case.observation else None
@@ -140,9 +143,8 @@ def inertia_of(case: Case, pair: tuple[int, int]) -> float:
     step, inverse = float(model.opt.timestep), 0.0
     share = step * case.coupling.damping + step**2 * case.coupling.stiffness
     for geom in pair:
-        weight = float(model.body_invweight0[model.geom_bodyid[geom], 0])
-        if weight > 0:
-            inverse += 1.0 / (1.0 / weight + (share if is_tool[geom] else 0.0))
+        inertia = body_inertia(model, case.scene.data, int(model.geom_bodyid[geom]))
+        inverse += 1.0 / (inertia + (share if is_tool[geom] else 0.0))
     return 1.0 / inverse if inverse > 0 else _TYPICAL_INERTIA
 
 
@@ -184,8 +186,8 @@ def start_faults(case: Case) -> Iterator[Fault]:
         yield Fault(
             "starts in contact",
             case.places.geom(mover),
-            f"{_names(case, [(first, second)])} overlap by {-1e3 * contact.dist:.3g} mm at the "
-            f"start; more than {1e3 * MAXIMUM_START_PENETRATION:g} mm release energy that nobody "
+            f"{_names(case, [(first, second)])} overlap by {length(-contact.dist)} at the "
+            f"start; more than {length(MAXIMUM_START_PENETRATION)} release energy that nobody "
             "meters",
             _moved_out(case, body, out),
         )
@@ -203,10 +205,10 @@ def _moved_out(case: Case, body: int, out: np.ndarray) -> str:
     return f"pos=\"{position}\" in body '{name}' (moved by {by} mm)"
 
 
-def _place(case: Case, pair: tuple[int, int], setting: ContactSetting) -> tuple[Place, str]:
+def _place(case: Case, pair: tuple[int, int], *, is_soft: bool) -> tuple[Place, str]:
     """Returns where to change a contact's setting, and what else must say the same.
 
-    That is an explicit pair, else the geom whose own solref is nearest to the contact's; the
+    That is an explicit pair, else the geom whose own solref is the softer (or the stiffer); the
     tool's, where both say the same, and then the other must change too: MuJoCo takes the mean.
     """
     model = case.model
@@ -214,12 +216,23 @@ def _place(case: Case, pair: tuple[int, int], setting: ContactSetting) -> tuple[
         if {int(model.pair_geom1[p]), int(model.pair_geom2[p])} == set(pair):
             return case.places.pair(p), ""
     is_tool = tool_geoms(model, case.scene.grip)
-    off = [float(np.abs(model.geom_solref[geom] - setting.solref).sum()) for geom in pair]
-    if off[0] == off[1]:
+    if model.geom_priority[pair[0]] != model.geom_priority[pair[1]]:
+        return case.places.geom(max(pair, key=lambda geom: model.geom_priority[geom])), ""
+    softness = [_softness(model.geom_solref[geom]) for geom in pair]
+    if softness[0] == softness[1]:
         mine, other = pair if is_tool[pair[0]] else pair[::-1]
         also = case.places.geom(other)
         return case.places.geom(mine), f" there and at {also.file}:{also.line}, {also.element}"
-    return case.places.geom(pair[off.index(min(off))]), ""
+    extreme = max(softness) if is_soft else min(softness)
+    return case.places.geom(pair[softness.index(extreme)]), ""
+
+
+def _softness(solref: np.ndarray) -> float:
+    """Returns timeconst · dampratio in s, for either format."""
+    first, second = (float(value) for value in solref)
+    if first > 0 and second > 0:
+        return first * second
+    return 1.0 / np.sqrt(-first) if first < 0 else np.inf
 
 
 def _names(case: Case, pairs: list[tuple[int, int]]) -> str:

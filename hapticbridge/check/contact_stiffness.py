@@ -20,10 +20,11 @@ def constraint_stiffness(
 ) -> float:
     """Returns the stiffness that a contact, limit or equality constraint amounts to at rest.
 
-        K_c = m k d²/(1 − d),    k d_w² = 1/(timeconst dampratio)²  or  −solref[0], at most 1/h²
+        K_c = m k d²/(1 − d),
+        k = min(1/(d_w timeconst dampratio)², 1/(d h²))    or    −solref[0]/d_w²
 
     with the inertia m that MuJoCo sees there, the impedance d at that depth, and d_w from the width
-    of ``solimp`` on; what the step h cannot resolve is softened as flag ``refsafe`` does.
+    of ``solimp`` on. The second term of the minimum is what the step h resolves (flag ``refsafe``).
 
     Args:
         solref: (timeconst in s, dampratio), or (−stiffness in 1/s², −damping in 1/s).
@@ -40,8 +41,10 @@ def constraint_stiffness(
     """
     impedance, last = impedance_at(solimp, depth), impedance_at(solimp, math.inf)
     first, second = float(solref[0]), float(solref[1])
-    spring = 1.0 / (first * second) ** 2 if first > 0 and second > 0 else max(-first, 0.0)
-    spring = min(spring, 1.0 / timestep**2) / last**2
+    if first > 0 and second > 0:
+        spring = min(1.0 / (last * first * second) ** 2, 1.0 / (impedance * timestep**2))
+    else:
+        spring = max(-first, 0.0) / last**2
     return inertia * spring * impedance**2 / (1.0 - impedance)
 
 

@@ -10,7 +10,6 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.bridge import NOBODY_READS
 from hapticbridge.check.growth import Growth, Spread, growth_of
 from hapticbridge.check.rehearsal import rehearsal_parameters
 from hapticbridge.coupling import Coupling
@@ -20,6 +19,7 @@ from hapticbridge.kernel.publish import publish
 from hapticbridge.kernel.state import Binding
 from hapticbridge.kernel.step import OK, after_step, before_step
 from hapticbridge.recording import TAIL, Ring
+from hapticbridge.recording.stream import NOBODY_READS
 from hapticbridge.scene import Scene
 
 _TIMER = mujoco.mjtTimer
@@ -132,7 +132,7 @@ def measure_cost(
         contact=contact,
         all_ticks=all_ticks,
         stages=medians,
-        highest_rate=TICK_SHARE / all_ticks.p99,
+        highest_rate=float(np.divide(TICK_SHARE, all_ticks.p99)),
         by_contacts=growth_of(contacts_of, time_of),
         by_rows=growth_of(np.concatenate(rows), time_of),
     )
@@ -149,7 +149,7 @@ def _time_ticks(
     binding = Binding(scene.model, scene.data, rehearsal_parameters(scene, coupling, period))
     state, row, ring = binding.state, binding.row, Ring.local(_RING)
     ring.cursors[TAIL] = NOBODY_READS
-    before = direct(before_step, state, samples[:1], row, 0)
+    before = direct(before_step, state, samples[:1], row, 0, period)
     after = direct(after_step, state, row, 0)
     hand_over = direct(publish, row, ring.rows, ring.cursors, 0, 0, 0, 0, 0)
     step, model, data = mujoco.mj_step, scene.model, scene.data
@@ -159,7 +159,7 @@ def _time_ticks(
     singles = [samples[k : k + 1] for k in range(samples.size)]
     for k, sample in enumerate(singles):
         begin = clock()
-        code = before(state, sample, row, 0)
+        code = before(state, sample, row, 0, period)
         step(model, data)
         code = max(code, after(state, row, 0))
         hand_over(row, records, cursors, begin, begin, begin, begin, 0)
@@ -181,7 +181,7 @@ def _time_stages(
     contacts = np.zeros(samples.size, np.int64)
     durations = data.timer.duration
     for k in range(samples.size):
-        before_step(state, samples[k : k + 1], row, 0)
+        before_step(state, samples[k : k + 1], row, 0, period)
         earlier = durations.copy()  # energies are refreshed after the step, by stages with timers
         mujoco.mj_step(model, data)
         spent[k] = durations - earlier

@@ -68,7 +68,7 @@ def draw_cost(cost: Cost, title: str) -> Figure:
             label=f"{1e6 * base:.3g} µs + {1e6 * per_one:.2g} µs per row",
         )
     growth.set_xlabel("constraint rows in the tick")
-    growth.set_ylabel("µs")
+    growth.set_ylabel("median time per tick in µs")
     growth.set_ylim(0.0, 1.15e6 * max(seconds for _, _, seconds in steps))
     rate = math.floor(cost.highest_rate)
     growth.set_title(f"how it grows; up to {rate:,} Hz", fontsize="medium")

@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
 from hapticbridge.check.case import Case
-from hapticbridge.check.faults import Fault
+from hapticbridge.check.faults import Fault, length, number, weight
 from hapticbridge.check.inventory import VISUAL, geom_uses
+from hapticbridge.check.places import Place
 
 LARGEST_TOOL, HEAVIEST_TOOL = 3.0, 50.0
 """Length in m and mass in kg beyond which no hand holds a tool: its units are taken for others."""
@@ -45,9 +46,9 @@ def _units(case: Case) -> Iterator[Fault]:
     mass, extent = float(model.body_mass[mine].sum()), float(_tool_extent(case).max())
     found = []
     if extent > LARGEST_TOOL:
-        found.append(f"is {extent:.3g} m long")
+        found.append(f"is {length(extent)} long")
     if mass > HEAVIEST_TOOL:
-        found.append(f"weighs {mass:.3g} kg")
+        found.append(f"weighs {weight(mass)}")
     if not found:
         return
     meshes = [
@@ -83,13 +84,13 @@ def _dented_meshes(case: Case) -> Iterator[Fault]:
             continue
         place = case.places.geom(geom)
         mesh_place = case.places.mesh(mesh)
-        more = f" and {1e6 * filled:.3g} cm³ of air are filled" if filled > 0 else ""
+        more = f" and {number(1e6 * filled)} cm³ of air are filled" if filled > 0 else ""
         yield Fault(
             "mesh not convex",
             place,
             f"{place.element} collides with {mesh_place.element} ({mesh_place.file}:"
             f"{mesh_place.line}), which is not convex: MuJoCo takes its hull, so that a dent or "
-            f"hole {1e3 * dent:.3g} mm deep is closed{more}",
+            f"hole {length(dent)} deep is closed{more}",
             'contype="0" conaffinity="0", and convex pieces or primitives that collide instead',
         )
 
@@ -147,8 +148,8 @@ def _far_grip(case: Case) -> Iterator[Fault]:
     yield Fault(
         "far grip",
         place,
-        f"{place.element}, the grip, is {1e3 * distance:.3g} mm from the tool's centre of mass, "
-        f"and the tool is {1e3 * extent:.3g} mm large: every push turns it about a point in the "
+        f"{place.element}, the grip, is {length(distance)} from the tool's centre of mass, "
+        f"and the tool is {length(extent)} large: every push turns it about a point in the "
         "air",
         f'pos="{local}" (the centre of mass)',
     )
@@ -162,10 +163,10 @@ def _workspace(case: Case) -> Iterator[Fault]:
     scale = case.scale * extent / case.workspace
     yield Fault(
         "workspace",
-        case.places.option("mujoco"),
-        f"{case.motion_name} moves the handle by {1e3 * extent * case.scale:.3g} mm, which is "
-        f"{1e3 * extent:.3g} mm of the device at scale {case.scale:g}; it reaches "
-        f"{1e3 * case.workspace:.3g} mm",
+        Place(case.motion_name, 0, "the motion"),
+        f"{case.motion_name} moves the handle by {length(extent * case.scale)}, which is "
+        f"{length(extent)} of the device at scale {case.scale:g}; it reaches "
+        f"{length(case.workspace)}",
         f"a smaller scene, or run it with --scale {np.ceil(100 * scale) / 100:g}",
     )
 

@@ -7,16 +7,14 @@ together must stay under the budget.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-
-import mujoco
 
 from hapticbridge.arguments import Arguments
 from hapticbridge.certificate import UNKNOWN_DAMPING
 from hapticbridge.check.draft import Draft, Setting, name_everything
 from hapticbridge.check.freedoms import freedom_simplifications
+from hapticbridge.check.observation import quiet
 from hapticbridge.check.shapes import shape_simplifications
 from hapticbridge.check.side_by_side import CostMeter, processor_costs
 from hapticbridge.check.simplifications import (
@@ -33,6 +31,18 @@ from hapticbridge.scene import SceneSource
 
 Progress = Callable[[int, int, str], None]
 """Called with what is done, what there is to do at most, and what is being tried."""
+
+
+_ARGUMENTS = Arguments(SceneError)
+
+
+def checked_budget(budget: float) -> float:
+    """Returns a felt error in just noticeable differences that may be allowed.
+
+    Raises:
+        SceneError: It is not finite and > 0.
+    """
+    return _ARGUMENTS.number("budget", budget, "JND", least=0.0, is_open=True)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -87,9 +97,8 @@ def find_lean(
         SceneError: The scene cannot be run, the motion is shorter than a tick, or a number is out
             of range.
     """
-    arguments = Arguments(SceneError)
-    budget = arguments.number("budget", budget, "JND", least=0.0, is_open=True)
-    damping = arguments.number("device damping", device_damping, "N s/m", least=0.0)
+    budget = checked_budget(budget)
+    damping = _ARGUMENTS.number("device damping", device_damping, "N s/m", least=0.0)
     if motion.duration < setting.period:
         raise SceneError(
             f"the motion lasts {motion.duration:g} s, less than one tick of {setting.period:g} s"
@@ -97,20 +106,9 @@ def find_lean(
     spec = source.spec.copy()
     name_everything(spec)
     original = Draft(replace(source, spec=spec), grip, setting)
-    with quiet_mujoco():
+    with quiet():
         judge = Judge(original, motion, budget, damping, cost)
         return _search(judge, _simplifications(original, motion), progress)
-
-
-@contextmanager
-def quiet_mujoco() -> Iterator[None]:
-    """Keeps MuJoCo from printing: variants that make it warn are tried on purpose, and counted."""
-    before = mujoco.get_mju_user_warning()
-    mujoco.set_mju_user_warning(lambda message: None)
-    try:
-        yield
-    finally:
-        mujoco.set_mju_user_warning(before)
 
 
 def _simplifications(original: Draft, motion: Motion) -> list[Simplification]:
@@ -144,6 +142,8 @@ def _search(judge: Judge, simpler: list[Simplification], progress: Progress | No
             best, share = found[0], found[1].cost or share
             together.append(found[1])
     result = judge.judge("lean", "all that was taken", best)
+    if not together:
+        result = replace(result, cost=1.0)  # not measured against itself
     if progress is not None:
         progress(total, total, "")
     return Lean(judge, best, tuple(trial for _, trial in alone), tuple(together), result)

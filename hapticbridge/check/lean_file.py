@@ -8,7 +8,8 @@ from pathlib import Path, PurePath
 import mujoco
 
 from hapticbridge.check.draft import Draft
-from hapticbridge.check.lean import Lean, quiet_mujoco
+from hapticbridge.check.lean import Lean
+from hapticbridge.check.observation import quiet
 from hapticbridge.check.trial import Trial
 from hapticbridge.errors import SceneError
 from hapticbridge.scene import SceneSource, read_scene
@@ -64,7 +65,7 @@ def write_lean(lean: Lean, path: Path, *, overwrite: bool = False) -> Trial:
         reason = getattr(error, "strerror", None) or " ".join(str(error).split())
         raise SceneError(f"cannot write the scene to '{path}': {reason}") from None
     written = Draft(read_scene(path), lean.draft.grip, setting)
-    with quiet_mujoco():
+    with quiet():
         return judge.judge("written", "the scene as it was read back from its file", written)
 
 

@@ -9,12 +9,27 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter
 
 from hapticbridge.check.lean import Lean
-from hapticbridge.check.trial import IS_FELT, MAY_GO, SAVES_NOTHING, Trial
+from hapticbridge.check.trial import (
+    CREATES,
+    IS_FELT,
+    MAY_GO,
+    NOT_BORNE,
+    SAVES_NOTHING,
+    WARNS,
+    Trial,
+)
 from hapticbridge.picture import new_figure
 
-_COLOURS = {MAY_GO: "#26a269", SAVES_NOTHING: "#5e5c64", IS_FELT: "#c01c28"}
-_OTHER, _PATH = "#a51d2d", "#1a5fb4"
-_MARKERS = {MAY_GO: "o", SAVES_NOTHING: "s", IS_FELT: "^"}
+_COLOURS = {
+    MAY_GO: "#26a269",
+    SAVES_NOTHING: "#5e5c64",
+    IS_FELT: "#c01c28",
+    CREATES: "#c64600",
+    WARNS: "#986a44",
+    NOT_BORNE: "#813d9c",
+}
+_MARKERS = {MAY_GO: "o", SAVES_NOTHING: "s", IS_FELT: "^", CREATES: "X", WARNS: "P", NOT_BORNE: "v"}
+_PATH = "#1a5fb4"
 
 LINEAR = 0.01
 """JND below which the scale is even, so that what is not felt at all can be shown."""
@@ -51,8 +66,8 @@ def draw_lean(lean: Lean, name: str) -> Figure:
             axes.plot(
                 100.0 * _cost(trial),
                 _felt(trial),
-                _MARKERS.get(trial.verdict, "X"),
-                color=_COLOURS.get(trial.verdict, _OTHER),
+                _MARKERS[trial.verdict],
+                color=_COLOURS[trial.verdict],
                 markersize=6,
                 alpha=0.8,
             )
@@ -95,7 +110,7 @@ def _write_names(axes: Axes, points: list[tuple[str, Trial, str]]) -> None:
     order = sorted(points, key=lambda point: (_felt(point[1]), -_cost(point[1])))
     heights = np.linspace(0.0, 1.0, len(order)) if len(order) > 1 else np.array([0.5])
     for height, (name, trial, kind) in zip(heights, order, strict=True):
-        colour = _PATH if kind else _COLOURS.get(trial.verdict, _OTHER)
+        colour = _PATH if kind else _COLOURS[trial.verdict]
         axes.annotate(
             name,
             xy=(100.0 * _cost(trial), _felt(trial)),
@@ -114,8 +129,8 @@ def _legend(points: list[tuple[str, Trial, str]], lean: Lean) -> list[Line2D]:
         Line2D(
             [],
             [],
-            marker=_MARKERS.get(verdict, "X"),
-            color=_COLOURS.get(verdict, _OTHER),
+            marker=_MARKERS[verdict],
+            color=_COLOURS[verdict],
             linestyle="",
             label=f"alone: {verdict}",
         )

@@ -9,7 +9,8 @@ import mujoco
 import numpy as np
 
 from hapticbridge.check.case import Case
-from hapticbridge.check.faults import Fault, others
+from hapticbridge.check.faults import Fault, length, number, others, weight
+from hapticbridge.check.inertia import body_inertia
 
 WATER = 1000.0
 """Density in kg/m³ that MuJoCo gives a geom that says neither mass nor density."""
@@ -66,8 +67,8 @@ def _of_water(case: Case) -> Iterator[Fault]:
             "visual geom with mass" if visual else "density of water",
             place,
             f"{place.element}{others(len(those) - 1)} has neither mass nor density and so "
-            f"{made} ({WATER:g} kg/m³); {name} weighs {_weight(mass)} with it",
-            'mass="0"' if visual else f'mass="{mass:.3g}", or what it really weighs',
+            f"{made} ({WATER:g} kg/m³); {name} weighs {weight(mass)} with it",
+            'mass="0"' if visual else f'mass="{number(mass)}", or what it really weighs',
         )
 
 
@@ -83,16 +84,13 @@ def _says_nothing(case: Case, geom: int, written: Any) -> bool:
     )
 
 
-def _weight(mass: float) -> str:
-    return f"{mass:.3g} kg" if mass >= 0.1 else f"{1e3 * mass:.3g} g"
-
-
 def _contact_ratios(case: Case) -> Iterator[Fault]:
     """Compares what met: the inertia that a push on a body meets, armature included."""
     model, told = case.model, set()
+    case.scene.reset()
     for pair in case.observation.meetings if case.observation else ():
         bodies = [int(model.geom_bodyid[geom]) for geom in pair]
-        inverse = [float(model.body_invweight0[body, 0]) for body in bodies]
+        inverse = [1.0 / body_inertia(model, case.scene.data, body) for body in bodies]
         key = frozenset(bodies)
         if min(inverse) <= 0 or max(inverse) <= LARGEST_RATIO * min(inverse) or key in told:
             continue
@@ -102,10 +100,10 @@ def _contact_ratios(case: Case) -> Iterator[Fault]:
         yield Fault(
             "mass ratio",
             light,
-            f"{light.element} ({_weight(1 / max(inverse))}) meets {heavy.element} "
-            f"({_weight(1 / min(inverse))}), 1 to {max(inverse) / min(inverse):.3g}: the contact "
-            "is as stiff as the lighter one allows, and the heavier sinks in",
-            f'mass="{least:.3g}" or more, or armature="{least:.3g}" on its joint',
+            f"{light.element} ({weight(1 / max(inverse))}) meets {heavy.element} "
+            f"({weight(1 / min(inverse))}), 1 to {number(max(inverse) / min(inverse))}: the "
+            "contact is as stiff as the lighter one allows, and the heavier sinks in",
+            f'mass="{number(least)}" or more, or armature="{number(least)}" on its joint',
         )
 
 
@@ -126,8 +124,8 @@ def _load_ratios(case: Case) -> Iterator[Fault]:
             yield Fault(
                 "mass ratio",
                 place,
-                f"{place.element} ({_weight(own)}) carries {name} ({_weight(load)}), "
-                f"1 to {load / own:.3g}: its motion is computed from small differences",
+                f"{place.element} ({weight(own)}) carries {name} ({weight(load)}), "
+                f"1 to {number(load / own)}: its motion is computed from small differences",
                 f'mass="{load / LARGEST_RATIO:.3g}" or more in it',
             )
 
@@ -153,8 +151,8 @@ def _sag(case: Case) -> Iterator[Fault]:
             springs[model.jnt_dofadr[joint]] = float(np.ravel(model.jnt_stiffness[joint])[0])
     mine = jacobian[:, dofs]
     stiffness = mine.T @ (gains[:, None] * mine) + np.diag(springs[dofs])
-    weight = (data.qfrc_gravcomp - bias)[dofs]
-    moved = np.linalg.lstsq(stiffness, weight, rcond=1e-9)[0]
+    pulls = (data.qfrc_gravcomp - bias)[dofs]
+    moved = np.linalg.lstsq(stiffness, pulls, rcond=1e-9)[0]
     sag = float(np.linalg.norm(mine[:3] @ moved))
     if sag <= LARGEST_SAG:
         return
@@ -164,7 +162,7 @@ def _sag(case: Case) -> Iterator[Fault]:
     yield Fault(
         "heavy tool",
         case.places.body(root),
-        f"the tool weighs {_weight(mass)}; what of it the hand carries, {pull:.3g} N, stretches "
-        f"the coupling of {coupling.stiffness:.4g} N/m by {1e3 * sag:.3g} mm at rest",
+        f"the tool weighs {weight(mass)}; what of it the hand carries, {number(pull)} N, stretches "
+        f"the coupling of {coupling.stiffness:.4g} N/m by {length(sag)} at rest",
         'gravcomp="1" in the body and those below it, or less mass',
     )

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 import mujoco
@@ -30,6 +31,8 @@ ROW_KINDS: dict[str, tuple[int, ...]] = {
     "equality": (int(_TYPE.mjCNSTR_EQUALITY),),
 }
 """Kinds of constraint rows by the names that a scene's author knows, and MuJoCo's types."""
+
+_PYRAMIDAL = int(_TYPE.mjCNSTR_CONTACT_PYRAMIDAL)
 
 LEAST_FORCE = 0.05
 """Normal force in N from which a contact's stiffness is kept: below, it is not felt."""
@@ -109,14 +112,14 @@ def observe(
     """
     binding = Binding(scene.model, scene.data, rehearsal_parameters(scene, coupling, period))
     model, data, state, row = scene.model, scene.data, binding.state, binding.row
-    before = direct(before_step, state, samples[:1], row, 0)
+    before = direct(before_step, state, samples[:1], row, 0, period)
     after = direct(after_step, state, row, 0)
     meetings: dict[tuple[int, int], Meeting] = {}
     types = np.zeros((samples.size, len(_TYPE.__members__)), np.int64)
     postures, every = [], max(samples.size // POSTURES, 1)
     force, full = np.zeros(samples.size), 0
     for k in range(samples.size):
-        if before(state, samples[k : k + 1], row, 0) != OK:
+        if before(state, samples[k : k + 1], row, 0, period) != OK:
             raise _not_finite(scene, k, samples.size)
         mujoco.mj_step(model, data)
         if after(state, row, 0) != OK:
@@ -146,6 +149,17 @@ def observe(
     )
 
 
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Keeps MuJoCo's warnings from being printed, and from a file MUJOCO_LOG.TXT: they are kept."""
+    before = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(lambda _message: None)
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(before)
+
+
 def _note_contacts(
     data: mujoco.MjData, step: float, meetings: dict[tuple[int, int], Meeting]
 ) -> None:
@@ -160,32 +174,31 @@ def _note_contacts(
     and 1/A the inertia that the contact really has. So f/r = k d/(R (1 + h b + h² k d)) is the
     stiffness that it amounts to. With a pyramidal cone 2 (dim − 1) rows share the normal force.
     """
+    contacts, rows = data.contact, data.efc_type
+    addresses, dims, depths = contacts.efc_address.tolist(), contacts.dim, (-contacts.dist).tolist()
     seen = set()
-    for contact in data.contact:
-        first, second = sorted(int(geom) for geom in contact.geom)
-        adr = int(contact.efc_address)
-        if first < 0 or adr < 0:  # a flex, or too far away to act
+    for k, (one, other) in enumerate(contacts.geom.tolist()):
+        adr = addresses[k]
+        if min(one, other) < 0 or adr < 0:  # a flex, or too far away to act
             continue
-        meeting = meetings.setdefault((first, second), Meeting())
-        if (first, second) not in seen:
-            seen.add((first, second))
+        pair = min(one, other), max(one, other)
+        meeting = meetings.setdefault(pair, Meeting())
+        if pair not in seen:
+            seen.add(pair)
             meeting.ticks += 1
-        count = 1
-        if data.efc_type[adr] == _TYPE.mjCNSTR_CONTACT_PYRAMIDAL:
-            count = 2 * (int(contact.dim) - 1)
+        count = 2 * (int(dims[k]) - 1) if rows[adr] == _PYRAMIDAL else 1
         normal = float(data.efc_force[adr : adr + count].sum())
-        meeting.deepest = max(meeting.deepest, -float(contact.dist))
+        meeting.deepest = max(meeting.deepest, depths[k])
         meeting.force = max(meeting.force, normal)
         if normal >= LEAST_FORCE:
-            spring, damper, impedance = data.efc_KBIP[adr, :3]
+            spring, damper, impedance, _ = data.efc_KBIP[adr].tolist()
             spring *= impedance
-            implicit = 1.0 + step * damper + step**2 * spring
-            regular = float(data.efc_R[adr]) * implicit
+            regular = float(data.efc_R[adr]) * (1.0 + step * damper + step**2 * spring)
+            stiffness = count * spring / regular
             inertia = (1.0 - impedance) / (impedance * regular)
             meeting.inertia = min(meeting.inertia, inertia)
-            felt = count * float(spring) / regular
-            meeting.softest = min(meeting.softest, felt)
-            meeting.stiffest = max(meeting.stiffest, felt)
+            meeting.softest = min(meeting.softest, stiffness)
+            meeting.stiffest = max(meeting.stiffest, stiffness)
 
 
 def _warnings(data: mujoco.MjData) -> dict[str, int]:

@@ -15,7 +15,11 @@ def reached_trees(model: mujoco.MjModel, tool: int, met: set[tuple[int, int]]) -
     """
     tree = model.body_treeid
     links = [{int(tree[model.geom_bodyid[geom]]) for geom in pair} for pair in met]
-    links += [_trees_of_equality(model, equality) for equality in range(model.neq)]
+    links += [
+        _trees_of_equality(model, equality)
+        for equality in range(model.neq)
+        if model.eq_active0[equality]
+    ]
     links += [_trees_of_tendon(model, tendon) for tendon in range(model.ntendon)]
     links = [link - {-1} for link in links]
     reached = {tool}

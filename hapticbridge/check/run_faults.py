@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from hapticbridge.check.case import Case
-from hapticbridge.check.faults import Fault
+from hapticbridge.check.faults import Fault, number
 
 ITERATIONS = 100
 """MuJoCo's own limit on the solver's iterations; Newton's takes 1 to 8 in the shipped scenes."""
@@ -43,10 +43,12 @@ def run_faults(case: Case) -> Iterator[Fault]:
             "see what it says",
         )
     if seen.environment != "strict":
+        used = f"{number(100 * seen.slack_share)} % of the coupling's slack, which covers it"
+        if seen.environment == "active":
+            used = "more than the coupling's slack covers"
         yield Fault(
             "energy created",
             option("integrator"),
-            f"contacts or joints created energy in the motion: {seen.environment}, "
-            f"{100 * seen.slack_share:.3g} % of the slack used",
-            "the contact settings named here; if none is, a heavier tool or --stiffness lower",
+            f"contacts or joints created energy in the motion: {used}",
+            "the contact settings named here; if none is, a heavier tool",
         )

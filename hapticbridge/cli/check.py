@@ -18,10 +18,11 @@ from hapticbridge.check.cost import Cost, measure_cost
 from hapticbridge.check.drawing import draw_cost
 from hapticbridge.check.faults import Fault
 from hapticbridge.check.inventory import Inventory, take_inventory
-from hapticbridge.check.lean import Lean
+from hapticbridge.check.lean import Lean, checked_budget
 from hapticbridge.check.lean_file import check_target, write_lean
 from hapticbridge.check.lean_picture import draw_lean
 from hapticbridge.check.lean_table import lean_facts, write_table
+from hapticbridge.check.observation import quiet
 from hapticbridge.check.rules import find_faults
 from hapticbridge.check.trial import MAY_GO, SAVES_NOTHING, Trial
 from hapticbridge.cli.check_lean import look_for_lean, print_lean, print_written
@@ -30,6 +31,7 @@ from hapticbridge.cli.terminal import err, plain, print_json
 from hapticbridge.clock import period_of
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import SimulatedDevice
+from hapticbridge.errors import SceneError
 from hapticbridge.picture import check_ending, write_picture
 from hapticbridge.scene import read_scene, settings_from
 
@@ -86,6 +88,7 @@ class Check:
         """Checks and prints; returns the exit code."""
         if self.plot is not None:
             check_ending(self.plot)
+        checked_budget(self.budget)
         source = read_scene(self.scene, **settings_from(self.settings))
         if self.write is not None:
             check_target(source, self.write, overwrite=self.overwrite)
@@ -104,7 +107,7 @@ class Check:
         inventory = take_inventory(case.model, self.grip, case.places, case.observation)
         faults, cost = find_faults(case), None
         if case.observation is not None:
-            with _progress("timing it") as show:
+            with _progress("timing it") as show, quiet():
                 cost = measure_cost(
                     case.scene, case.samples, case.coupling, case.period, progress=show
                 )
@@ -114,7 +117,7 @@ class Check:
             print_cost(cost)
             print_faults(faults)
         is_lean_asked = self.lean or self.write is not None or self.table is not None
-        lean = look_for_lean(case, self.budget) if is_lean_asked else None
+        lean = self._looked_for(case) if is_lean_asked else None
         written = None if lean is None else self._told(lean)
         if self.as_json:
             facts = _facts(case, inventory, faults, cost)
@@ -123,7 +126,15 @@ class Check:
             write_picture(figure, self.plot)
             err.print(f"wrote {plain(str(self.plot))}")
         is_worse = written is not None and written.verdict not in (MAY_GO, SAVES_NOTHING)
-        return 1 if faults or is_worse else 0
+        return 1 if faults or is_worse or (is_lean_asked and lean is None) else 0
+
+    def _looked_for(self, case: Case) -> Lean | None:
+        """Looks for what could go; None, and a sentence, where the scene must be mended first."""
+        try:
+            return look_for_lean(case, self.budget)
+        except SceneError as error:
+            err.print(f"what could go cannot be said: {plain(str(error))}")
+            return None
 
     def _told(self, lean: Lean) -> Trial | None:
         """Prints and writes what was found; returns the written scene's trial."""
@@ -174,6 +185,7 @@ def _facts(
 ) -> dict[str, object]:
     return {
         "scene": str(case.source.path),
+        "parameters": case.source.parameters,
         "motion": {"name": case.motion_name, "seconds": case.motion.duration},
         "coupling": asdict(case.coupling),
         "period_s": case.period,

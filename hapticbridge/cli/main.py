@@ -39,23 +39,23 @@ USAGE_ERROR, SAFETY_TRIP = 2, 3
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs ``hapticbridge``; returns the exit code.
 
-    0 done, 1 done with a negative verdict, 2 bad input or usage, 3 safety trip.
+    0 done, 1 done with a negative verdict, 2 bad input or usage, 3 safety trip, 130 interrupted.
     """
     if (sys.argv[1:] if arguments is None else list(arguments)) == ["--version"]:
         out.print(f"hapticbridge {version('hapticbridge')}, MuJoCo {mujoco.mj_versionString()}")
         return 0
-    command = tyro.cli(
-        Command,
-        prog="hapticbridge",
-        description="Feel a MuJoCo scene through a haptic device.",
-        args=arguments,
-        config=(
-            tyro.conf.OmitSubcommandPrefixes,
-            tyro.conf.FlagCreatePairsOff,
-            tyro.conf.DisallowNone,
-        ),
-    )
     try:
+        command = tyro.cli(
+            Command,
+            prog="hapticbridge",
+            description="Feel a MuJoCo scene through a haptic device.",
+            args=arguments,
+            config=(
+                tyro.conf.OmitSubcommandPrefixes,
+                tyro.conf.FlagCreatePairsOff,
+                tyro.conf.DisallowNone,
+            ),
+        )
         with _warnings_in_a_sentence():
             return int(command.execute())
     except SafetyTrip as trip:

@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from hapticbridge.device.base import Device
+from hapticbridge.device.hand import Hand
 from hapticbridge.device.motion_csv import read_motion
-from hapticbridge.device.simulated import Hand, SimulatedDevice
+from hapticbridge.device.simulated import SimulatedDevice
 from hapticbridge.device.trajectory import ReplayDevice, TrajectoryDevice
 from hapticbridge.errors import DeviceError, choices
 from hapticbridge.scene import Scene

@@ -75,7 +75,7 @@ def judge_environment(state: NDArray[np.void], moved: Vector, turned: Vector) ->
 
     Where there is no coupling law (a weld, a tool without mass), the environment may satisfy (14)
     and the device still be kicked: there, what it was given is held against what its damping burns,
-    b ‖δp_k‖²/T a tick at least, and against what the scene gave up.
+    b ‖δp_k‖² over the time between two samples at least, and against what the scene gave up.
     """
     s = state[0]
     s.slack += 0.5 * s.slack_stiffness * dot(moved, moved)

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from hapticbridge.arguments import Arguments
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import HapticBridgeError
-from hapticbridge.kernel.step import COUPLED, DIRECT, HELD, WELD
+from hapticbridge.kernel.scheme import COUPLED, DIRECT, HELD, WELD
 
 SLACK_SHARE = 0.5
 """Share of ½‖δx_i‖²_{K + nB/T} that counts as slack where n > 1 laws are computed in a tick; no
@@ -50,7 +50,7 @@ class RunParameters:
         device_origin: Device pose (x, y, z, qw, qx, qy, qz) that maps to ``handle_origin``.
         handle_origin: Handle pose of the same form, in the scene.
         device_start: Device pose of the same form before the first tick.
-        scheme: How the wrench reaches the tool, one of ``kernel.step``'s four.
+        scheme: How the wrench reaches the tool, one of ``kernel.scheme``'s four.
         felt: The coupling that the tool is really held by, where it is not ``coupling`` (a weld);
             the device condition is judged by it.
         contact_stiffness: K_c in N/m per contact of a tool without mass, > 0 for it, else 0.

@@ -1,8 +1,4 @@
-"""Everything a tick reads and writes, as one preallocated record.
-
-One structured array of one element crosses from Python into the compiled functions: unpacking a
-single array costs 0.1 µs, unpacking forty would cost more than MuJoCo's step.
-"""
+"""The kernel's state bound to a model and its data: addresses, sizes, parameters, the start."""
 
 from __future__ import annotations
 
@@ -13,10 +9,11 @@ from numpy.typing import NDArray
 from hapticbridge.kernel import native
 from hapticbridge.kernel.direct import balance_contacts, tool_map
 from hapticbridge.kernel.handle import handle_pose
+from hapticbridge.kernel.layout import STATE_DTYPE
 from hapticbridge.kernel.meter import refresh_energies
 from hapticbridge.kernel.parameters import RunParameters as RunParameters  # noqa: PLC0414
 from hapticbridge.kernel.parameters import rotation_numbers as rotation_numbers  # noqa: PLC0414
-from hapticbridge.kernel.step import DIRECT, WELD
+from hapticbridge.kernel.scheme import DIRECT, WELD
 from hapticbridge.tick import TICK_DTYPE
 
 HANDLE = "handle"
@@ -29,158 +26,6 @@ COUPLING_ACTUATORS = tuple(
     f"coupling_{kind}_{axis}" for kind in ("force", "torque") for axis in ("x", "y", "z")
 )
 """Names of the six actuators that couple the grip to the handle, in the order of a wrench."""
-
-_POINTERS = (
-    "qpos",
-    "qvel",
-    "qacc",
-    "ctrl",
-    "mocap_pos",
-    "mocap_quat",
-    "site_xpos",
-    "site_xquat",
-    "energy",
-    "solver_niter",
-    "xipos",
-    "ten_length",
-    "qfrc_actuator",
-    "qfrc_applied",
-    "qfrc_gravcomp",
-    "xfrc_applied",
-    "actuator_force",
-    "moment_rownnz",
-    "moment_rowadr",
-    "moment_colind",
-    "actuator_moment",
-    "outadr",
-    "outnum",
-    "ncon",
-    "nisland",
-    "nefmA",
-    "efm_aid",
-    "efm_as",
-    "efm_ak",
-    "ne",
-    "nefc",
-    "efc_type",
-    "efc_id",
-    "efc_pos",
-    "efc_force",
-    "contact",
-    "passive_gravcomp_dofs",
-    "geom_bodyid",
-    "body_mocap",
-    "tendon_range",
-    "mocap_previous",
-    "mocap_shift",
-    "equality_before",
-    "tendon_before",
-    "scratch",
-    "tool_map",
-    "tool_qpos",
-    "geom_is_tool",
-)
-
-_COUNTS = (
-    "nv",
-    "nbody",
-    "ngeom",
-    "nmocap",
-    "ntendon",
-    "equality_capacity",
-    "contact_size",
-    "contact_distance",
-    "contact_point",
-    "contact_frame",
-    "contact_geoms",
-    "contact_dim",
-    "contact_row",
-    "scheme",
-    "substeps",
-    "laws",
-    "handle_mocap_id",
-    "handle_site_id",
-    "grip_site_id",
-    "weld_id",
-    "tool_map_size",
-    "watches_device",
-    "coupling_actuator_id",
-    "coupling_output_adr",
-    "coupling_ctrl_adr",
-    "has_actuators",
-    "has_gravity_compensation",
-    "has_tendons_or_flexes",
-    "ramp_ticks",
-)
-
-_PARAMETERS = (
-    "period",
-    "timestep",
-    "stiffness",
-    "damping",
-    "rotational_stiffness",
-    "rotational_damping",
-    "slack_stiffness",
-    "slack_rotational_stiffness",
-    "contact_stiffness",
-    "device_damping",
-    "device_rotational_damping",
-    "scale",
-    "force_scale",
-    "force_limit",
-    "torque_limit",
-)
-
-_POSES = ("device", "handle", "tool")
-
-_RUNNING_COUNTS = (
-    "tick",
-    "ramp_start",
-    "flags",
-    "mocap_has_moved",
-    "equality_rows",
-    "first_unstrict",
-    "first_active",
-    "first_kick",
-)
-
-_RUNNING = (
-    "kinetic",
-    "potential",
-    "start_energy",
-    "coupling_work",
-    "actuator_work",
-    "external_work",
-    "environment_energy",
-    "device_energy",
-    "device_burnt",
-    "throughput",
-    "slack",
-    "slack_share",
-    "peak_force",
-    "peak_torque",
-)
-
-STATE_DTYPE = np.dtype(
-    [("model", "<i8"), ("data", "<i8")]
-    + [(name, "<i8") for name in _POINTERS + _COUNTS]
-    + [(name, "<f8") for name in _PARAMETERS]
-    + [
-        ("axes", "<f8", 9),
-        ("axes_quaternion", "<f8", 4),
-        ("device_origin", "<f8", 7),
-        ("handle_origin", "<f8", 7),
-    ]
-    + [(f"{name}_position", "<f8", 3) for name in _POSES]
-    + [(f"{name}_quaternion", "<f8", 4) for name in _POSES]
-    + [("handle_step", "<f8", 3), ("handle_turn", "<f8", 3)]
-    + [(name, "<f8", 6) for name in ("wrench_on_tool", "motion", "wrench_on_device")]
-    + [(name, "<i8") for name in _RUNNING_COUNTS]
-    + [(name, "<f8") for name in _RUNNING]
-)
-"""Addresses, sizes, parameters, the previous tick's poses, and the energies so far. Poses are
-(x, y, z, qw, qx, qy, qz); ``axes`` is the row-major rotation from the device's frame to the
-scene's, ``axes_quaternion`` the same as a quaternion."""
 
 
 class Binding:

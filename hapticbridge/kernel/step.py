@@ -13,9 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.jit import compiled, compiled_for_threads
-from hapticbridge.kernel.direct import balance_contacts, place_tool
+from hapticbridge.kernel.direct import place_tool
 from hapticbridge.kernel.handle import (
-    device_from_scene,
     handle_pose,
     quaternion_of,
     store_quaternion,
@@ -25,15 +24,12 @@ from hapticbridge.kernel.handle import (
 from hapticbridge.kernel.meter import (
     add_coupling_work,
     judge_environment,
-    refresh_energies,
-    refresh_grip,
 )
 from hapticbridge.kernel.native import floats, ints, mj_fwd_position, mj_step
 from hapticbridge.kernel.ports import meter_ports, note_moved_mocap_bodies
-from hapticbridge.kernel.weld import weld_wrench
+from hapticbridge.kernel.scheme import DIRECT, HELD
+from hapticbridge.kernel.wrench import render, wrench_of_step
 from hapticbridge.pose import (
-    Quaternion,
-    Vector,
     add,
     canonical,
     conjugate,
@@ -48,16 +44,11 @@ from hapticbridge.pose import (
 )
 
 # flags as plain integers: the compiler cannot read an enumeration
-FORCE_LIMITED, RAMPING, CONTACT, TRIP = 4, 16, 64, 512
+CONTACT, TRIP = 64, 512
 
 OK, BAD_SAMPLE, BAD_RESULT = 0, 1, 2
 """What a kernel function returns: go on, the device's sample is not finite, the simulation's
 result is not finite."""
-
-COUPLED, HELD, WELD, DIRECT = 0, 1, 2, 3
-"""How the wrench reaches the tool (``scheme``): by the coupling's actuators, which compute it while
-MuJoCo steps; by the same actuators as the wrench of the tick before, held; by an equality
-constraint; or not at all, because the tool has no mass and is where the handle is."""
 
 LARGEST_CONTROL = 1e10
 """mjMAXVAL, in N and N m. Beyond it the run has diverged anyway."""
@@ -94,7 +85,11 @@ def _show_handle(state: NDArray[np.void], substep: int) -> None:
 
 @compiled
 def before_step(
-    state: NDArray[np.void], sample: NDArray[np.void], row: NDArray[np.void], substep: int
+    state: NDArray[np.void],
+    sample: NDArray[np.void],
+    row: NDArray[np.void],
+    substep: int,
+    elapsed: float,
 ) -> int:
     """Takes a device sample into the scene: the handle's pose, and its velocity as ``ctrl``.
 
@@ -102,6 +97,17 @@ def before_step(
     reaches in the last. The control of the coupling's actuators is the handle's velocity in the
     handle's own axes, R_hᵀ δh/T and R_hᵀ δφ_h/T: a mocap body has no velocity of its own. Where
     the wrench is applied and held, the control is the wrench of the tick before, in those axes.
+
+    Over a time t, the device's damper burns ∫ b v² >= b ‖δp‖²/t for every motion that ends δp away.
+    Where deadlines were missed t is longer than T, and T would count more than was burnt.
+
+    Args:
+        state: The bound state.
+        sample: One device sample.
+        row: The bound record.
+        substep: Which of the tick's.
+        elapsed: Time since the sample before it in s. One below T counts as T: that counts less
+            than was burnt, and an uneven time stamp must not count more.
 
     Returns:
         ``OK`` or ``BAD_SAMPLE``; in the latter case nothing was changed.
@@ -123,8 +129,9 @@ def before_step(
         s.device_energy += dot((w[0], w[1], w[2]), moved) + dot((w[3], w[4], w[5]), turned)
         if s.tick > s.ramp_start:
             # before the first tick and in a pause nobody knows how long the device took to move
-            s.device_burnt += s.device_damping / s.period * dot(moved, moved)
-            s.device_burnt += s.device_rotational_damping / s.period * dot(turned, turned)
+            interval = max(elapsed, s.period)
+            s.device_burnt += s.device_damping / interval * dot(moved, moved)
+            s.device_burnt += s.device_rotational_damping / interval * dot(turned, turned)
         store_vector(s.device_position, position)
         store_quaternion(s.device_quaternion, quaternion)
 
@@ -150,69 +157,6 @@ def before_step(
 
 
 @compiled
-def _limited(v: Vector, limit: float) -> tuple[Vector, bool]:
-    length = norm(v)
-    if length > limit:
-        return scaled(limit / length, v), True
-    return v, False
-
-
-@compiled
-def _law(
-    state: NDArray[np.void],
-    handle: tuple[Vector, Quaternion],
-    tool: tuple[Vector, Quaternion],
-    moved: Vector,
-    turned: Vector,
-) -> tuple[Vector, Vector]:
-    """The coupling's force and torque on the tool, over one of the tick's ``laws``."""
-    s = state[0]
-    share, rate = 1.0 / s.laws, s.laws / s.period
-    stretch = subtract(handle[0], tool[0])
-    twist = rotation_between(tool[1], handle[1])
-    force = add(
-        scaled(s.stiffness, stretch),
-        scaled(s.damping * rate, subtract(scaled(share, vector_of(s.handle_step)), moved)),
-    )
-    torque = add(
-        scaled(s.rotational_stiffness, twist),
-        scaled(
-            s.rotational_damping * rate,
-            subtract(scaled(share, vector_of(s.handle_turn)), turned),
-        ),
-    )
-    return force, torque
-
-
-@compiled
-def _handle_in_scene(state: NDArray[np.void]) -> tuple[Vector, Quaternion]:
-    """The handle's pose as the step that just ended had it."""
-    s = state[0]
-    m = s.handle_mocap_id
-    position = vector_of(floats(s.mocap_pos + 24 * m, 3))
-    return position, canonical(quaternion_of(floats(s.mocap_quat + 32 * m, 4)))
-
-
-@compiled
-def _render(state: NDArray[np.void], force: Vector, torque: Vector) -> None:
-    """Turns the wrench on the tool into the one on the device: scale, limit by norm, start ramp."""
-    s = state[0]
-    on_device = scaled(-s.force_scale, device_from_scene(s.axes, force))
-    torque_on_device = scaled(-s.force_scale / s.scale, device_from_scene(s.axes, torque))
-    on_device, is_limited = _limited(on_device, s.force_limit)
-    torque_on_device, is_torque_limited = _limited(torque_on_device, s.torque_limit)
-    if is_limited or is_torque_limited:
-        s.flags |= FORCE_LIMITED
-    since_start = s.tick - s.ramp_start
-    if since_start < s.ramp_ticks:
-        s.flags |= RAMPING
-        ramp = (since_start + 1.0) / (s.ramp_ticks + 1.0)
-        on_device, torque_on_device = scaled(ramp, on_device), scaled(ramp, torque_on_device)
-    store_vector(s.wrench_on_device[0:3], on_device)
-    store_vector(s.wrench_on_device[3:6], torque_on_device)
-
-
-@compiled
 def advance(state: NDArray[np.void]) -> None:
     """MuJoCo's part of a substep, by C symbol: what ``Method.step`` is in Python.
 
@@ -223,40 +167,6 @@ def advance(state: NDArray[np.void]) -> None:
         mj_fwd_position(s.model, s.data)
     else:
         mj_step(s.model, s.data)
-
-
-@compiled
-def _wrench_of_step(
-    state: NDArray[np.void], substep: int, is_last: bool
-) -> tuple[Vector, Vector, Vector, Vector]:
-    """Returns the wrench on the tool and the tool's motion since the last time it was asked.
-
-    Brings the tool's pose and, at the end of the tick, the energies up to date on the way.
-    """
-    s = state[0]
-    applied = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
-    if s.scheme == WELD:
-        applied = weld_wrench(state)  # in the Jacobians of the step's start, as the step had them
-    elif s.scheme == DIRECT:
-        applied = balance_contacts(state)
-    if s.scheme != DIRECT:
-        if is_last:
-            refresh_energies(state)
-        else:
-            refresh_grip(state)
-    grip = s.grip_site_id
-    position = vector_of(floats(s.site_xpos + 24 * grip, 3))
-    orientation = canonical(quaternion_of(floats(s.site_xquat + 32 * grip, 4)))
-    moved = subtract(position, vector_of(s.tool_position))
-    turned = rotation_between(quaternion_of(s.tool_quaternion), orientation)
-    if s.scheme <= HELD:
-        handle = (vector_of(s.handle_position), quaternion_of(s.handle_quaternion))
-        if not is_last:
-            handle = _handle_in_scene(state)
-        applied = _law(state, handle, (position, orientation), moved, turned)
-    store_vector(s.tool_position, position)
-    store_quaternion(s.tool_quaternion, orientation)
-    return applied[0], applied[1], moved, turned
 
 
 @compiled
@@ -299,7 +209,7 @@ def after_step(state: NDArray[np.void], row: NDArray[np.void], substep: int) -> 
     is_last = substep + 1 == s.substeps
     if s.laws == 1 and not is_last:
         return OK
-    force, torque, moved, turned = _wrench_of_step(state, substep, is_last)
+    force, torque, moved, turned = wrench_of_step(state, substep, is_last)
     add_coupling_work(state, force, torque, moved, turned)
     if s.laws > 1:
         share = 1.0 / s.laws
@@ -327,7 +237,7 @@ def after_step(state: NDArray[np.void], row: NDArray[np.void], substep: int) -> 
         for i in range(6):
             s.wrench_on_device[i] = 0.0
         return BAD_RESULT
-    _render(state, force, torque)
+    render(state, force, torque)
     if ints(s.ncon, 1)[0] > 0:
         s.flags |= CONTACT
     s.peak_force = max(s.peak_force, norm(force))
@@ -362,7 +272,8 @@ def simulate(
     s = state[0]
     for k in range(samples.size):
         for substep in range(s.substeps):
-            if before_step(state, samples[k : k + 1], row, substep) != OK:
+            # when the device was asked decides no record, only what the live loop's meter says
+            if before_step(state, samples[k : k + 1], row, substep, s.period) != OK:
                 return k
             advance(state)
             if after_step(state, row, substep) != OK:

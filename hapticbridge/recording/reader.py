@@ -1,4 +1,4 @@
-"""Reads a recording, whole, cut or damaged, and mends a cut one.
+"""Reads a recording, whole, cut or damaged.
 
 Reading is vectorised: a run of messages on ``/tick`` inside a chunk is one structured view, so
 ten minutes at 1 kHz (600 000 records) take about a second.
@@ -19,7 +19,6 @@ from hapticbridge.errors import RecordingError
 from hapticbridge.recording import format as layout
 from hapticbridge.recording.container import MAGIC, Block, Container, DamageError, Fields
 from hapticbridge.recording.format import Attachment
-from hapticbridge.recording.writer import RecordingWriter
 from hapticbridge.tick import TICK_DTYPE
 
 _MESSAGE_DTYPE = np.dtype(
@@ -37,7 +36,6 @@ _RECORD_HEAD = 9
 _MESSAGE_HEAD = _MESSAGE_DTYPE.fields["payload"][1]  # type: ignore[index]
 _TICK_LENGTH = _MESSAGE_DTYPE.itemsize - _RECORD_HEAD
 _CDR = int.from_bytes(layout.CDR_HEADER, "little")
-_REPAIR_BATCH = 4096
 
 
 @dataclass(frozen=True)
@@ -208,10 +206,11 @@ def read_recording(path: str | Path) -> Recording:
         RecordingError: There is no such file, it cannot be read, or it is not a recording of
             this version.
     """
-    return _read(Path(path))[0]
+    return read_with_attachments(Path(path))[0]
 
 
-def _read(path: Path) -> tuple[Recording, list[Attachment]]:
+def read_with_attachments(path: Path) -> tuple[Recording, list[Attachment]]:
+    """As ``read_recording``, with the attachments as they stand in the file, in their order."""
     container = Container(_load(path))
     contents = _Contents(container.problems)
     contents.add_block(container.summary())
@@ -265,62 +264,3 @@ def _load(path: Path) -> bytes:
         what = "it is empty" if not data else "it does not start with the MCAP magic"
         raise RecordingError(f"{path} is not an MCAP file: {what}")
     return data
-
-
-def repair(path: str | Path, output: str | Path) -> Recording:
-    """Writes a cut recording again as a whole one.
-
-    Metadata, attachments, and all whole records and events are kept; an event ``repaired`` says
-    what was done, and the digest is that of what is left.
-
-    Args:
-        path: A recording that was cut.
-        output: The new file; it must not exist.
-
-    Returns:
-        The new recording, as read back.
-
-    Raises:
-        RecordingError: The recording cannot be read or is not cut, or the output exists or cannot
-            be written.
-    """
-    path, output = Path(path), Path(output)
-    recording, attachments = _read(path)
-    if not recording.is_cut:
-        raise RecordingError(f"{path} is not cut: there is nothing to repair")
-    epoch = recording.meta.get(layout.EPOCH_KEY, "")
-    writer = RecordingWriter(
-        output,
-        recording.meta,
-        attachments,
-        int(epoch) if epoch.isascii() and epoch.isdigit() and len(epoch) < 20 else 0,
-        exclusive=True,
-    )
-    try:
-        _rewrite(writer, recording)
-    except RecordingError:
-        output.unlink(missing_ok=True)
-        raise
-    return read_recording(output)
-
-
-def _rewrite(writer: RecordingWriter, recording: Recording) -> None:
-    for start in range(0, recording.ticks.size, _REPAIR_BATCH):
-        writer.write_ticks(recording.ticks[start : start + _REPAIR_BATCH])
-    for event in recording.events:
-        writer.write_event(event, _time(event))
-    deadlines = recording.ticks["deadline_ns"][-1:].tolist()
-    last = max([*deadlines, *map(_time, recording.events)], default=0)
-    made = {
-        "event": "repaired",
-        "source": recording.path.name,
-        "ticks": int(recording.ticks.size),
-        "problems": list(recording.problems),
-    }
-    writer.write_event(made, last)
-    writer.close()
-
-
-def _time(event: dict[str, Any]) -> int:
-    time = event.get("time_ns")
-    return time if isinstance(time, int) and abs(time) < 2**63 else 0

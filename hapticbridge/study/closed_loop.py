@@ -22,14 +22,15 @@ from hapticbridge.device.handheld import STATE_DTYPE as DEVICE_DTYPE
 from hapticbridge.device.handheld import next_sample
 from hapticbridge.errors import StudyError
 from hapticbridge.jit import compiled_for_threads, direct
-from hapticbridge.kernel.parameters import RunParameters
-from hapticbridge.kernel.state import STATE_DTYPE, Binding
+from hapticbridge.kernel.layout import STATE_DTYPE
+from hapticbridge.kernel.state import Binding
 from hapticbridge.kernel.step import OK, advance, after_step, before_step
 from hapticbridge.ledger import Ledger
 from hapticbridge.passivity.stability import decays
-from hapticbridge.rendering import Method, contact_stiffness_of, prepare
+from hapticbridge.rendering import Method, prepare
 from hapticbridge.scene import Scene
 from hapticbridge.tick import SAMPLE_DTYPE, TICK_DTYPE
+from hapticbridge.workspace import run_parameters
 
 PARTS = 16
 """Parts of a period in which jitter is counted. The device is exact between any two of them; more
@@ -38,9 +39,6 @@ parts resolve jitter finer and cost a device step each."""
 LEVER = 0.05
 """Length in m that turns a torque into a force, so that one signal shows both diverge: half the
 width of a hand. It weighs the two against each other and decides nothing."""
-
-UNLIMITED = 1e30
-"""Force in N and torque in N m at which a run is cut: never, because it ends at ``HUGE`` before."""
 
 HUGE = 1e5
 """Signal in N at which a run has diverged beyond doubt and ends, before MuJoCo's own limit on
@@ -185,23 +183,15 @@ class ClosedLoop:
         is_even = timing is None or timing.is_even
         sample = np.zeros(1, SAMPLE_DTYPE)
         sample[:] = device.start(period, 1 if is_even else PARTS)
-        start = tuple(float(v) for v in (*sample[0]["position"], *sample[0]["quaternion"]))
-        parameters = RunParameters(
-            grip=scene.grip,
+        parameters = run_parameters(
+            scene,
+            coupling,
+            method,
+            sample,
             period=period,
-            substeps=substeps,
-            coupling=coupling,
-            force_limit=UNLIMITED,
-            torque_limit=UNLIMITED,
-            ramp_ticks=0,
-            device_origin=start,
-            handle_origin=scene.grip_pose(),
-            device_start=start,
-            scheme=method.scheme,
             felt=felt,
-            contact_stiffness=contact_stiffness_of(method, coupling, None),
-            device_damping=device.info.damping,
-            device_rotational_damping=device.info.rotational_damping,
+            substeps=substeps,
+            info=device.info,
         )
         binding = Binding(scene.model, scene.data, parameters)
         if knock is not None:
@@ -251,11 +241,8 @@ def _run(
             next_sample(devices, motion, sample)
         elapsed = devices[0].period * intervals[k]
         for substep in range(s.substeps):
-            burnt = s.device_burnt
-            if before_step(state, sample, row, substep) != OK:
+            if before_step(state, sample, row, substep, elapsed) != OK:
                 return k
-            if elapsed != s.period:  # the kernel takes every tick to be one period long
-                s.device_burnt = burnt + (s.device_burnt - burnt) * s.period / elapsed
             advance(state)
             if after_step(state, row, substep) != OK:
                 return k

@@ -12,6 +12,7 @@ passed over, whatever its name, and nothing depends on the order in which a disk
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import hashlib
 import io
@@ -30,6 +31,7 @@ from hapticbridge.study.table import Outcome, csv_bytes, parquet_bytes, pyarrow
 
 MANIFEST = "sweep.json"
 _LAYOUT = 1
+_DRAFT = ".draft-"
 _PART = re.compile(r"part-([0-9a-f]{32})\.(csv|parquet)")
 
 
@@ -58,6 +60,7 @@ class ResultFolder:
         except OSError as error:
             raise StudyError(f"{self.path}: cannot be made ({error.strerror})") from None
         self._refuse_others()
+        self._remove_drafts()
 
     def describe(self, parameters: Sequence[str], results: Sequence[str], count: int) -> None:
         """Writes the manifest.
@@ -146,10 +149,16 @@ class ResultFolder:
                 f"now; {anew}"
             )
 
+    def _remove_drafts(self) -> None:
+        """Removes what a sweep that was killed was about to write."""
+        for path in self.path.glob(f"{_DRAFT}*"):
+            with contextlib.suppress(OSError):  # it only takes room
+                path.unlink()
+
     def _write(self, name: str, data: bytes) -> None:
         """Writes a file under its name only when all of it is on the disk."""
         try:
-            draft = self.path / f".draft-{os.getpid()}-{name}"
+            draft = self.path / f"{_DRAFT}{os.getpid()}-{name}"
             with draft.open("wb") as file:
                 file.write(data)
                 file.flush()

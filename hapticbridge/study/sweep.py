@@ -12,6 +12,7 @@ from concurrent.futures import wait as wait_for
 from typing import Any
 
 from hapticbridge.errors import StudyError
+from hapticbridge.signals import holding_interrupts
 from hapticbridge.study.points import Point, checked_points
 from hapticbridge.study.results import ResultFolder
 from hapticbridge.study.table import Outcome, Table, check_format, table_of
@@ -207,13 +208,14 @@ class _Shift:
 
     def _wind_up(self) -> None:
         """Cancels what waits and keeps what is done; nothing here hides the first error."""
-        for future in self._running:
-            future.cancel()
-        self._workers.stop()
-        for future, chunk in self._running.items():
-            if future.done() and not future.cancelled() and future.exception() is None:
-                with contextlib.suppress(Exception):
-                    self._keep(chunk, future.result())
+        with holding_interrupts():  # a second Ctrl-C would lose what the first one keeps
+            for future in self._running:
+                future.cancel()
+            self._workers.stop()
+            for future, chunk in self._running.items():
+                if future.done() and not future.cancelled() and future.exception() is None:
+                    with contextlib.suppress(Exception):
+                        self._keep(chunk, future.result())
 
 
 def _cut(points: Chunk, size: int) -> Iterator[Chunk]:

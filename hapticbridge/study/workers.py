@@ -5,6 +5,7 @@ The three differ in how many tasks to keep in flight and in what happens when a 
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import importlib
 import multiprocessing
@@ -12,17 +13,27 @@ import os
 import signal
 import threading
 from collections.abc import Callable, Iterator
-from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor
+from concurrent.futures import (
+    BrokenExecutor,
+    Executor,
+    Future,
+    ProcessPoolExecutor,
+    ThreadPoolExecutor,
+)
 from multiprocessing.connection import wait
 from typing import Any
 
 from hapticbridge.errors import StudyError
+from hapticbridge.signals import holding_interrupts
 
 _IN_FLIGHT = 64
 """Tasks in flight where the number of workers is not known: more workers than that would idle."""
 
-_PATIENCE = 5.0
-"""Seconds for a dask scheduler to answer and to have a worker; a local one takes 0.05 s."""
+_PATIENCE = 3.0
+"""Seconds for a dask scheduler to answer; a local one takes 0.05 s. Shorter refuses a far one."""
+
+_WORKERS_PATIENCE = 5.0
+"""Seconds for a dask scheduler to have a worker: one that was just started takes 2 s."""
 
 
 def cores() -> int:
@@ -95,6 +106,11 @@ class ProcessWorkers(Workers):
         super().__init__(self._pool(), depth=2 * self._count)
         self._probe()
 
+    def submit(self, task: Callable[..., Any], *arguments: object) -> Future[Any]:
+        """See ``Workers.submit``; a pool starts its processes one by one, as tasks come."""
+        with holding_interrupts():
+            return super().submit(task, *arguments)
+
     def restart(self) -> None:
         """See ``Workers.restart``."""
         self.executor.shutdown(wait=True, cancel_futures=True)
@@ -116,7 +132,7 @@ class ProcessWorkers(Workers):
     def _probe(self) -> None:
         """Makes sure that a process starts and knows the function, before any point is blamed."""
         try:
-            self.executor.submit(callable, self._function).result()
+            self.submit(callable, self._function).result()
         except (BrokenExecutor, OSError):
             self.close()
             raise StudyError(
@@ -145,14 +161,19 @@ class ClusterWorkers(Workers):
                 "pip install 'hapticbridge[cluster]'"
             ) from None
         try:
+            # asked beforehand, because a client that was refused takes 10 s to be given up, and
+            # ends in a traceback; in a thread of its own, because this one may run a loop already
+            with ThreadPoolExecutor(1) as thread:
+                thread.submit(asyncio.run, _identity(distributed, scheduler)).result()
             self._client = distributed.Client(scheduler, timeout=_PATIENCE, set_as_default=False)
         except Exception as error:  # something else may listen there and answer anything
+            why = str(error) or f"nothing came within {_PATIENCE:g} s"
             raise StudyError(
-                f"no dask scheduler answers at {scheduler!r:.100} ({error!s:.200}); its address "
-                "looks like tcp://host:8786"
+                f"no dask scheduler answers at {scheduler!r:.100} ({why:.200}); its address looks "
+                "like tcp://host:8786"
             ) from None
         try:
-            self._client.wait_for_workers(1, timeout=_PATIENCE)
+            self._client.wait_for_workers(1, timeout=_WORKERS_PATIENCE)
         except OSError:
             self._client.close()
             raise StudyError(
@@ -198,9 +219,25 @@ def hired(
         workers.close()
 
 
+async def _identity(distributed: Any, scheduler: str) -> None:
+    """Asks a dask scheduler who it is.
+
+    Raises:
+        Exception: It does not answer in time, or not as a scheduler.
+    """
+    arguments = distributed.Security().get_connection_args("client")
+    async with distributed.rpc(scheduler, connection_args=arguments) as asked:
+        answer = await asyncio.wait_for(asked.identity(), _PATIENCE)
+    if answer["type"] != "Scheduler":
+        raise ValueError(f"a {answer['type']} answers there")
+
+
 def _start_process() -> None:
     """Prepares a worker process: it goes with Ctrl-C, silently, and with its parent."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
+    if hasattr(signal, "pthread_sigmask"):
+        # held back while it started; one that came meanwhile ends it here
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     threading.Thread(target=_leave_with_parent, daemon=True).start()
 
 

@@ -6,7 +6,7 @@ hand's dynamics make of it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
@@ -14,17 +14,16 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from hapticbridge.coupling import Coupling
-from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.state import Binding
 from hapticbridge.kernel.step import simulate
 from hapticbridge.ledger import Ledger
 from hapticbridge.rendering import METHODS, prepare
 from hapticbridge.scene import Scene
-from hapticbridge.study.closed_loop import UNLIMITED
 from hapticbridge.study.maps.bisection import largest_stable
 from hapticbridge.study.maps.rigs import loop_in, scene_of
 from hapticbridge.study.maps.tumbling import INERTIA, MIDDLE, OBLIQUE, PERIOD, TICKS
 from hapticbridge.tick import SAMPLE_DTYPE, TICK_DTYPE
+from hapticbridge.workspace import run_parameters
 
 MASS = 0.3
 """In kg."""
@@ -116,20 +115,11 @@ def spin(
     samples["quaternion"] = quaternions[1:]
     if spins_at_start:
         _set_spin(scene, speed * direction)
-    parameters = RunParameters(
-        grip=scene.grip,
-        period=PERIOD,
-        substeps=1,
-        coupling=coupling,
-        force_limit=UNLIMITED,
-        torque_limit=UNLIMITED,
-        ramp_ticks=0,
-        device_origin=(0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0),
-        handle_origin=scene.grip_pose(),
-        device_start=(0.0, 0.0, 0.0, *(float(value) for value in quaternions[0])),
-        scheme=chosen.scheme,
-        felt=felt,
-    )
+    first = np.zeros(1, SAMPLE_DTYPE)
+    first["quaternion"] = quaternions[0]
+    parameters = run_parameters(scene, coupling, chosen, first, period=PERIOD, felt=felt)
+    # the grip is where the device would be without the angle, not where it starts
+    parameters = replace(parameters, device_origin=(0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0))
     binding = Binding(scene.model, scene.data, parameters)
     records = np.zeros(TICKS, TICK_DTYPE)
     done = _run(binding, samples, records)

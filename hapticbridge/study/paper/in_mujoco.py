@@ -10,13 +10,14 @@ from numpy.typing import NDArray
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import SceneError
-from hapticbridge.kernel.state import Binding, RunParameters
+from hapticbridge.kernel.state import Binding
 from hapticbridge.kernel.step import OK, after_step, before_step
 from hapticbridge.passivity import WorstHand
 from hapticbridge.passivity.stability import threshold
-from hapticbridge.rendering import prepare
+from hapticbridge.rendering import IMPLICIT, prepare
 from hapticbridge.scene import load_scene
 from hapticbridge.tick import SAMPLE_DTYPE, TICK_DTYPE
+from hapticbridge.workspace import run_parameters
 
 _Array = NDArray[np.float64]
 
@@ -40,8 +41,6 @@ step with a free light tool keeps about 3e-8 N alive, which neither grows nor fa
 TOLERANCE = 1e-4
 """Relative width at which a bisection ends: less than what ``TICKS`` let one tell."""
 
-_NO_LIMIT = 1e12  # N and N m
-_POSE = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
 
 Hand = Callable[[float], float]
 """Takes the force on the device in N that is held from now on, returns the handle's next step in
@@ -64,22 +63,13 @@ class ImplicitMass:
         scene.model.body_mass[body] = mass
         mujoco.mj_setConst(scene.model, scene.data)
         prepare(scene, coupling, period, 1)
-        parameters = RunParameters(
-            grip=scene.grip,
-            period=period,
-            substeps=1,
-            coupling=coupling,
-            force_limit=_NO_LIMIT,
-            torque_limit=_NO_LIMIT,
-            ramp_ticks=0,
-            device_origin=_POSE,
-            handle_origin=scene.grip_pose(),
-            device_start=_POSE,
-        )
-        self._scene = scene
-        self._binding = Binding(scene.model, scene.data, parameters)
         self._sample = np.zeros(1, SAMPLE_DTYPE)
         self._sample["quaternion"][:, 0] = 1.0
+        parameters = run_parameters(
+            scene, coupling, IMPLICIT, self._sample, period=period, felt=None
+        )
+        self._scene, self._period = scene, period
+        self._binding = Binding(scene.model, scene.data, parameters)
 
     def tick(self, handle: float) -> NDArray[np.void]:
         """Moves the handle to a position in m and returns the tick's record, shape (1,).
@@ -89,7 +79,7 @@ class ImplicitMass:
         """
         self._sample["position"][0, 0] = handle
         state, row = self._binding.state, self._binding.row
-        if before_step(state, self._sample, row, 0) != OK:
+        if before_step(state, self._sample, row, 0, self._period) != OK:
             raise SceneError(f"the handle's position {handle!r} m is not finite")
         mujoco.mj_step(self._scene.model, self._scene.data)
         if after_step(state, row, 0) != OK:

@@ -1,0 +1,99 @@
+"""The hand that holds a simulated device: inertia, damper and spring."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+
+from hapticbridge.arguments import Arguments
+from hapticbridge.device.base import checked_number
+from hapticbridge.errors import DeviceError
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Hand:
+    """A hand on the handle: inertia that moves with it, spring and damper to a moving target.
+
+    The defaults are one measured arm at a handle; the rotational values are a guess of the same
+    character (half a swing per second, well damped).
+
+    Attributes:
+        mass: In kg, >= 0, rigidly on the handle.
+        damping: In N s/m, >= 0, against the target's velocity.
+        stiffness: In N/m, >= 0.
+        rotational_inertia: In kg m², >= 0.
+        rotational_damping: In N m s/rad, >= 0.
+        rotational_stiffness: In N m/rad, >= 0.
+
+    Raises:
+        DeviceError: A value is not finite or negative.
+    """
+
+    mass: float = 0.55
+    damping: float = 6.5
+    stiffness: float = 135.0
+    rotational_inertia: float = 1e-3
+    rotational_damping: float = 0.02
+    rotational_stiffness: float = 1.0
+
+    def __post_init__(self) -> None:
+        units = {
+            "mass": "kg",
+            "damping": "N s/m",
+            "stiffness": "N/m",
+            "rotational_inertia": "kg m²",
+            "rotational_damping": "N m s/rad",
+            "rotational_stiffness": "N m/rad",
+        }
+        for field in dataclasses.fields(self):
+            value = checked_number(
+                f"hand {field.name}", getattr(self, field.name), units[field.name]
+            )
+            object.__setattr__(self, field.name, value)
+
+
+DEFAULT_HAND = Hand()
+
+HAND_RANGES = {
+    "mass": (0.05, 2.0),
+    "damping": (0.5, 50.0),
+    "stiffness": (10.0, 2000.0),
+    "rotational_inertia": (1e-4, 1e-2),
+    "rotational_damping": (2e-3, 0.2),
+    "rotational_stiffness": (0.1, 10.0),
+}
+"""Between which hands are drawn, in the units of ``Hand``: from two fingers that hardly hold to an
+arm that grips hard, around the measured arm of the defaults. Every one of them is passive."""
+
+
+def random_hand(seed: int) -> Hand:
+    """Returns a random passive hand, the same for the same seed.
+
+    Every value is drawn by itself, evenly in its logarithm, from its ``HAND_RANGES``.
+
+    Args:
+        seed: >= 0.
+
+    Raises:
+        DeviceError: The seed is not a whole number >= 0.
+    """
+    Arguments(DeviceError).whole("seed", seed, least=0, most=2**63 - 1)
+    generator = np.random.default_rng(seed)
+    return Hand(
+        **{
+            name: float(np.exp(generator.uniform(np.log(least), np.log(most))))
+            for name, (least, most) in HAND_RANGES.items()
+        }
+    )
+
+
+NO_HAND = Hand(
+    mass=0.0,
+    damping=0.0,
+    stiffness=0.0,
+    rotational_inertia=0.0,
+    rotational_damping=0.0,
+    rotational_stiffness=0.0,
+)

@@ -1,0 +1,129 @@
+"""The wrench on the tool, and what of it reaches the device."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticbridge.jit import compiled
+from hapticbridge.kernel.direct import balance_contacts
+from hapticbridge.kernel.handle import (
+    device_from_scene,
+    quaternion_of,
+    store_quaternion,
+    store_vector,
+    vector_of,
+)
+from hapticbridge.kernel.meter import refresh_energies, refresh_grip
+from hapticbridge.kernel.native import floats
+from hapticbridge.kernel.scheme import DIRECT, HELD, WELD
+from hapticbridge.kernel.weld import weld_wrench
+from hapticbridge.pose import (
+    Quaternion,
+    Vector,
+    add,
+    canonical,
+    norm,
+    rotation_between,
+    scaled,
+    subtract,
+)
+
+FORCE_LIMITED, RAMPING = 4, 16  # TickFlag: the compiler cannot read an enumeration
+
+
+@compiled
+def _law(
+    state: NDArray[np.void],
+    handle: tuple[Vector, Quaternion],
+    tool: tuple[Vector, Quaternion],
+    moved: Vector,
+    turned: Vector,
+) -> tuple[Vector, Vector]:
+    """The coupling's force and torque on the tool, over one of the tick's ``laws``."""
+    s = state[0]
+    share, rate = 1.0 / s.laws, s.laws / s.period
+    stretch = subtract(handle[0], tool[0])
+    twist = rotation_between(tool[1], handle[1])
+    force = add(
+        scaled(s.stiffness, stretch),
+        scaled(s.damping * rate, subtract(scaled(share, vector_of(s.handle_step)), moved)),
+    )
+    torque = add(
+        scaled(s.rotational_stiffness, twist),
+        scaled(
+            s.rotational_damping * rate,
+            subtract(scaled(share, vector_of(s.handle_turn)), turned),
+        ),
+    )
+    return force, torque
+
+
+@compiled
+def _handle_in_scene(state: NDArray[np.void]) -> tuple[Vector, Quaternion]:
+    """The handle's pose as the step that just ended had it."""
+    s = state[0]
+    m = s.handle_mocap_id
+    position = vector_of(floats(s.mocap_pos + 24 * m, 3))
+    return position, canonical(quaternion_of(floats(s.mocap_quat + 32 * m, 4)))
+
+
+@compiled
+def wrench_of_step(
+    state: NDArray[np.void], substep: int, is_last: bool
+) -> tuple[Vector, Vector, Vector, Vector]:
+    """Returns the wrench on the tool and the tool's motion since the last time it was asked.
+
+    Brings the tool's pose and, at the end of the tick, the energies up to date on the way.
+    """
+    s = state[0]
+    applied = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    if s.scheme == WELD:
+        applied = weld_wrench(state)  # in the Jacobians of the step's start, as the step had them
+    elif s.scheme == DIRECT:
+        applied = balance_contacts(state)
+    if s.scheme != DIRECT:
+        if is_last:
+            refresh_energies(state)
+        else:
+            refresh_grip(state)
+    grip = s.grip_site_id
+    position = vector_of(floats(s.site_xpos + 24 * grip, 3))
+    orientation = canonical(quaternion_of(floats(s.site_xquat + 32 * grip, 4)))
+    moved = subtract(position, vector_of(s.tool_position))
+    turned = rotation_between(quaternion_of(s.tool_quaternion), orientation)
+    if s.scheme <= HELD:
+        handle = (vector_of(s.handle_position), quaternion_of(s.handle_quaternion))
+        if not is_last:
+            handle = _handle_in_scene(state)
+        applied = _law(state, handle, (position, orientation), moved, turned)
+    store_vector(s.tool_position, position)
+    store_quaternion(s.tool_quaternion, orientation)
+    return applied[0], applied[1], moved, turned
+
+
+@compiled
+def _limited(v: Vector, limit: float) -> tuple[Vector, bool]:
+    length = norm(v)
+    if length > limit:
+        return scaled(limit / length, v), True
+    return v, False
+
+
+@compiled
+def render(state: NDArray[np.void], force: Vector, torque: Vector) -> None:
+    """Turns the wrench on the tool into the one on the device: scale, limit by norm, start ramp."""
+    s = state[0]
+    on_device = scaled(-s.force_scale, device_from_scene(s.axes, force))
+    torque_on_device = scaled(-s.force_scale / s.scale, device_from_scene(s.axes, torque))
+    on_device, is_limited = _limited(on_device, s.force_limit)
+    torque_on_device, is_torque_limited = _limited(torque_on_device, s.torque_limit)
+    if is_limited or is_torque_limited:
+        s.flags |= FORCE_LIMITED
+    since_start = s.tick - s.ramp_start
+    if since_start < s.ramp_ticks:
+        s.flags |= RAMPING
+        ramp = (since_start + 1.0) / (s.ramp_ticks + 1.0)
+        on_device, torque_on_device = scaled(ramp, on_device), scaled(ramp, torque_on_device)
+    store_vector(s.wrench_on_device[0:3], on_device)
+    store_vector(s.wrench_on_device[3:6], torque_on_device)

@@ -1,0 +1,126 @@
+"""Where the device's frame lies in the scene, and with it all that decides what a run computes.
+
+The live loop, the closed-loop sweeps and the studies begin their runs here, so that one method on
+one device means the same parameters in all of them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hapticbridge.coupling import Coupling
+from hapticbridge.device import DeviceInfo
+from hapticbridge.guard import UNLIMITED, Limits
+from hapticbridge.kernel.parameters import RunParameters, rotation_numbers
+from hapticbridge.rendering import Method, contact_stiffness_of
+from hapticbridge.scene import Scene
+
+_SAME_PLACE = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Workspace:
+    """The map from the device's frame to the scene's.
+
+        h = h_0 + scale · A (p − p_0),   R_h = A R_p R_p0ᵀ Aᵀ R_h0,   w = −force_scale · Aᵀ f
+
+    p is the device's position in m, h the handle's, f the force on the tool and w that on the
+    device in N. p_0 is where the device is at the start and h_0 where the grip is, or both are
+    zero.
+
+    Attributes:
+        scale: Handle motion per device motion, without unit, finite and > 0.
+        force_scale: Force on the device per force on the tool, likewise. ``RunParameters`` refuses
+            what is out of range.
+        axes: A, row by row.
+        is_absolute: Whether the device's poses are poses in the scene.
+    """
+
+    scale: float = 1.0
+    force_scale: float = 1.0
+    axes: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+    is_absolute: bool = False
+
+    @classmethod
+    def of(
+        cls, scale: float, force_scale: float | None, axes: ArrayLike | None, *, is_absolute: bool
+    ) -> Workspace:
+        """Returns the workspace that a user asks for.
+
+        Args:
+            scale: Of motion.
+            force_scale: Of force; None takes ``scale``, which keeps power equal on both sides.
+            axes: 3 × 3 rotation; None is the identity.
+            is_absolute: Whether the device's poses are poses in the scene.
+
+        Raises:
+            HapticBridgeError: The axes are no right-handed rotation.
+        """
+        return cls(
+            scale=scale,
+            force_scale=scale if force_scale is None else force_scale,
+            axes=rotation_numbers(np.eye(3) if axes is None else axes),
+            is_absolute=is_absolute,
+        )
+
+
+SAME_FRAME = Workspace()
+"""Device and scene share axes and scale; the device starts at the grip."""
+
+
+def run_parameters(
+    scene: Scene,
+    coupling: Coupling,
+    method: Method,
+    first: NDArray[np.void],
+    *,
+    period: float,
+    felt: Coupling | None,
+    substeps: int = 1,
+    info: DeviceInfo | None = None,
+    limits: Limits = UNLIMITED,
+    workspace: Workspace = SAME_FRAME,
+    contact_stiffness: float | None = None,
+) -> RunParameters:
+    """Returns the parameters of a run that starts now.
+
+    Args:
+        scene: As ``rendering.prepare`` left it: its grip is where the handle starts.
+        coupling: What the user should feel.
+        method: How.
+        first: The device's first sample, ``SAMPLE_DTYPE``, shape (1,).
+        period: T in s.
+        felt: What ``rendering.prepare`` returned.
+        substeps: MuJoCo steps per tick.
+        info: The device, for its damping; None where nothing is known of it.
+        limits: On the wrench that is sent.
+        workspace: The map from the device's frame to the scene's.
+        contact_stiffness: K_c in N/m of a tool without mass; None takes the coupling's stiffness.
+
+    Raises:
+        HapticBridgeError: A value is out of range.
+    """
+    start = tuple(float(v) for v in (*first["position"][0], *first["quaternion"][0]))
+    return RunParameters(
+        grip=scene.grip,
+        period=period,
+        substeps=substeps,
+        coupling=coupling,
+        scale=workspace.scale,
+        force_scale=workspace.force_scale,
+        axes=workspace.axes,
+        force_limit=limits.force,
+        torque_limit=limits.torque,
+        ramp_ticks=limits.ramp_ticks(period),
+        device_origin=_SAME_PLACE if workspace.is_absolute else start,
+        handle_origin=_SAME_PLACE if workspace.is_absolute else scene.grip_pose(),
+        device_start=start,
+        scheme=method.scheme,
+        felt=felt,
+        contact_stiffness=contact_stiffness_of(method, coupling, contact_stiffness),
+        device_damping=None if info is None else info.damping,
+        device_rotational_damping=None if info is None else info.rotational_damping,
+    )

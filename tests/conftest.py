@@ -1,0 +1,96 @@
+"""What several test files are given."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from audit_cases import (
+    recorded,
+    tapped,
+)
+from cli_cases import Called
+from numpy.typing import NDArray
+from outside_scenes import (
+    hand_file,
+    mjcf,
+    scene_file,
+)
+from recording_cases import random_rows, write
+from scene_cases import GRIPPED, ticks
+
+from hapticbridge.cli import main
+from hapticbridge.recording import Recording, read_recording
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("audit")
+
+
+@pytest.fixture(scope="module")
+def tap(folder: Path) -> Recording:
+    """A peg in contact, tilted and off centre."""
+    return read_recording(tapped(folder))
+
+
+@pytest.fixture(scope="module")
+def held(folder: Path) -> Recording:
+    """The same with a device in a hand, whose motion answers to the force."""
+    path = folder / "held.mcap"
+    motion = folder / "tap.csv"
+    tapped(folder)
+    recorded(path, device=f"simulated:path={motion}", duration=0.2)
+    return read_recording(path)
+
+
+@pytest.fixture
+def scratch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("SWEEP_SCRATCH", str(tmp_path))
+    return tmp_path
+
+
+@pytest.fixture(scope="module")
+def run_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tapped(tmp_path_factory.mktemp("cli"), "run.mcap")
+
+
+@pytest.fixture
+def call(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Called:
+    """Calls the command line in this process; returns exit code, stdout and stderr."""
+    monkeypatch.setenv("COLUMNS", "200")
+
+    def called(*arguments: object) -> tuple[int, str, str]:
+        capsys.readouterr()
+        try:
+            code = main([str(argument) for argument in arguments])
+        except SystemExit as end:
+            code = end.code if isinstance(end.code, int) else 0
+        captured = capsys.readouterr()
+        return code, captured.out, captured.err
+
+    return called
+
+
+@pytest.fixture(scope="module")
+def plain_ticks(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, NDArray[np.void]]:
+    folder = tmp_path_factory.mktemp("plain")
+    hand = hand_file(folder, [(0.1, (0.01, -0.005, 0.01)), (0.1, (-0.01, 0.0, 0.0))])
+    return hand, ticks(scene_file(folder, mjcf(body=GRIPPED)), hand)
+
+
+@pytest.fixture(scope="module")
+def memory_folder() -> Any:
+    with tempfile.TemporaryDirectory() as name:
+        yield Path(name)
+
+
+@pytest.fixture(scope="module")
+def whole(memory_folder: Path) -> Path:
+    """A recording of several chunks with events between its records."""
+    path = memory_folder / "whole.mcap"
+    write(path, random_rows(1500))
+    return path

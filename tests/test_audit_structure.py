@@ -1,0 +1,131 @@
+"""Gaps, deadlines, cuts and events: what makes a file no whole record of a run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from audit_cases import (
+    recorded,
+    rewritten,
+    verdict_of,
+)
+
+from hapticbridge.audit import audit
+from hapticbridge.bridge import Bridge
+from hapticbridge.errors import RecordingError
+from hapticbridge.recording import Recording, read_recording, repair
+from hapticbridge.scene.library import scene_path
+from hapticbridge.tick import CLOCK_FIELDS, TickFlag
+
+
+@pytest.mark.parametrize("lost", [slice(70, 71), slice(0, 3), slice(50, 150)])
+def test_gap_is_named_and_invalid(tap: Recording, folder: Path, lost: slice) -> None:
+    kept = np.delete(tap.ticks, lost)
+    report = verdict_of(tap, folder, ticks=kept)
+    assert report.verdict == "invalid"
+    assert f"{lost.start - 1} is followed by {lost.stop}" in report.reason
+    assert (report.tick, report.port) == (lost.start, "tick")
+
+
+def test_swapped_and_repeated_records_are_invalid(tap: Recording, folder: Path) -> None:
+    order = np.arange(len(tap.ticks))
+    order[[80, 81]] = [81, 80]
+    assert verdict_of(tap, folder, ticks=tap.ticks[order]).verdict == "invalid"
+    twice = np.insert(np.arange(len(tap.ticks)), 80, 79)
+    assert verdict_of(tap, folder, ticks=tap.ticks[twice]).verdict == "invalid"
+
+
+def test_deadlines_must_follow_the_period_and_the_overrun_flag(
+    tap: Recording, folder: Path
+) -> None:
+    late = tap.ticks.copy()
+    for name in CLOCK_FIELDS:
+        late[name][90:] += 3_000_000
+    report = verdict_of(tap, folder, ticks=late)
+    assert (report.verdict, report.tick, report.port) == ("invalid", 90, "deadline_ns")
+    late["flags"][90] |= int(TickFlag.OVERRUN)
+    assert verdict_of(tap, folder, ticks=late).verdict == "passive"
+    for name in CLOCK_FIELDS:
+        late[name][90:] += 500_000
+    assert verdict_of(tap, folder, ticks=late).verdict == "invalid"
+
+
+def test_cut_file_is_judged_on_what_it_holds_and_says_so(tmp_path: Path) -> None:
+    whole, cut, mended = (tmp_path / name for name in ("whole.mcap", "cut.mcap", "mended.mcap"))
+    recorded(whole, "virtual_wall", duration=2.0)
+    content = whole.read_bytes()
+    cut.write_bytes(content[: int(len(content) * 0.9)])
+    report = audit(cut)
+    assert report.is_cut
+    assert report.verdict == "passive"
+    assert 0 < report.ticks < 2000
+    assert report.resimulation == "bit for bit"
+    repair(cut, mended)
+    after = audit(mended)
+    assert (after.verdict, after.is_cut, after.ticks) == ("passive", False, report.ticks)
+    assert after.events["repaired"] == 1
+
+
+def test_recording_without_a_tick_is_invalid(tap: Recording, folder: Path) -> None:
+    report = verdict_of(tap, folder, ticks=tap.ticks[:0])
+    assert (report.verdict, report.reason) == ("invalid", "the recording holds no tick")
+
+
+def test_file_that_is_no_recording_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "x.mcap"
+    path.write_text("hello")
+    with pytest.raises(RecordingError, match=r"x\.mcap is not an MCAP file"):
+        audit(path)
+
+
+def test_changed_input_event_is_found(tmp_path: Path) -> None:
+    scene = tmp_path / "scene.xml"
+    text = scene_path("point_mass").read_text()
+    scene.write_text(text)
+    path = tmp_path / "run.mcap"
+
+    def push(bridge: Bridge, tick: int) -> None:
+        if tick == 20:
+            bridge.set_input(body_wrench={"tool": [0.5, 0, 0, 0, 0, 1e-3]})
+
+    recorded(path, scene, duration=0.1, on_tick=push)
+    recording = read_recording(path)
+    assert audit(path).resimulation == "bit for bit"
+    assert recording.ticks["external_work"][-1] != 0
+    damages: tuple[dict[str, object], ...] = (
+        {"tick": 21},
+        {"tick": "20"},
+        {"tick": -1},
+        {"writes": []},
+        {"writes": [["xfrc_applied", 6, [0.5, 0, 0, 0, 0, 1.1e-3]]]},
+        {"writes": [["qpos", 0, [1.0]]]},
+        {"writes": [["ctrl", 0, 1.0]]},
+        {"writes": [["ctrl", 10**6, [1.0]]]},
+        {"writes": {"a": 1}},
+        {"writes": None},
+    )
+    for damage in damages:
+        events = [
+            event | damage if event["event"] == "input" else event for event in recording.events
+        ]
+        report = audit(rewritten(recording, tmp_path / "other.mcap", events=events))
+        assert report.verdict == "invalid", damage
+
+
+def test_clock_times_are_free_as_long_as_they_run_forwards(tap: Recording, folder: Path) -> None:
+    ticks = tap.ticks.copy()
+    for name in ("wake_ns", "read_ns", "write_ns"):
+        ticks[name][7] += 12345
+    ticks["buttons"][7] = 3
+    assert verdict_of(tap, folder, ticks=ticks).verdict == "passive"
+    ticks["wake_ns"][7] += 1
+    report = verdict_of(tap, folder, ticks=ticks)
+    assert (report.verdict, report.tick, report.port) == ("invalid", 7, "wake_ns")
+
+
+def test_records_that_are_missing_before_the_stop_are_noticed(tap: Recording, folder: Path) -> None:
+    report = verdict_of(tap, folder, ticks=tap.ticks[:-10])
+    assert report.verdict == "invalid"
+    assert "the last record is of" in report.reason

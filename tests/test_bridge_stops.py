@@ -1,0 +1,229 @@
+"""What stops or delays a run: zero force comes first, and the recording is whole."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from audit_cases import ScriptedDevice, SlowClock, recorded
+from bridge_runs import REST, fast, still, sway
+
+from hapticbridge.audit import audit
+from hapticbridge.bridge import Bridge
+from hapticbridge.errors import DeviceError, HapticBridgeError, SafetyTrip
+from hapticbridge.recording import Recorder, Ring, read_recording
+from hapticbridge.recording import stream as stream_module
+from hapticbridge.tick import TickFlag
+
+PATIENCE = 30.0
+
+
+def test_pose_that_is_not_finite_trips_with_zero_force_last(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    device = ScriptedDevice(lambda k: (np.nan, 0, 0, 1, 0, 0, 0) if k == 700 else sway(k))
+    with pytest.raises(SafetyTrip, match="tick 700: the device's pose") as caught:
+        recorded(path, "point_mass", device)
+    assert np.linalg.norm(device.writes[699]) > 0.01
+    assert all((wrench == 0).all() for wrench in device.writes[700:])
+    assert device.is_closed
+    records = caught.value.records
+    assert records["tick"].tolist() == list(range(700))
+    recording = read_recording(path)
+    assert not recording.is_cut and recording.digest == recording.computed_digest
+    assert [event["event"] for event in recording.events] == ["start", "trip", "stop"]
+    assert recording.events[1]["tick"] == 700
+    assert audit(path).verdict == "passive"
+
+
+@pytest.mark.parametrize("quaternion", [(0, 0, 0, 0), (np.inf, 0, 0, 0), (0.1, 0, 0, 0)])
+def test_quaternion_that_is_no_rotation_trips(quaternion: tuple[float, ...]) -> None:
+    device = ScriptedDevice(lambda k: (0, 0, 0, *quaternion) if k == 5 else REST)
+    with fast("point_mass", device) as bridge, pytest.raises(SafetyTrip, match="tick 5"):
+        bridge.run(0.1)
+    assert (device.writes[-1] == 0).all()
+
+
+def test_last_second_of_records_comes_with_a_trip() -> None:
+    device = ScriptedDevice(lambda k: (np.nan if k == 1500 else 0, 0, 0, 1, 0, 0, 0))
+    with fast("point_mass", device) as bridge, pytest.raises(SafetyTrip) as caught:
+        bridge.run(2.0)
+    assert caught.value.records["tick"].tolist() == list(range(500, 1500))
+
+
+def failing(message: str, tick: int, pose: Callable[[int], Any] = sway) -> Callable[[int], Any]:
+    def pose_or_fail(k: int) -> Any:
+        if k == tick:
+            raise DeviceError(message)
+        return pose(k)
+
+    return pose_or_fail
+
+
+def test_device_that_fails_to_read_gets_zero_force_and_the_recording_is_whole(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "run.mcap"
+    device = ScriptedDevice(failing("unplugged", 60))
+    with pytest.raises(DeviceError, match="unplugged"):
+        recorded(path, "point_mass", device)
+    assert (device.writes[-1] == 0).all()
+    assert device.is_closed
+    recording = read_recording(path)
+    assert not recording.is_cut
+    assert recording.events[-1]["reason"] == "DeviceError: unplugged"
+    assert (audit(path).verdict, len(recording.ticks)) == ("passive", 60)
+
+
+def test_device_that_fails_to_write_is_closed_and_the_recording_is_whole(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+
+    def fail(count: int) -> None:
+        if count > 60:
+            raise DeviceError("unplugged")
+
+    device = ScriptedDevice(sway, on_write=fail)
+    with pytest.raises(DeviceError, match="unplugged"):
+        recorded(path, "point_mass", device)
+    assert len(device.writes) > 61  # zero force was tried after the failure
+    assert (device.writes[-1] == 0).all()
+    assert device.is_closed
+    recording = read_recording(path)
+    assert not recording.is_cut
+    assert recording.events[-1]["event"] == "stop"
+    assert "unplugged" in recording.events[-1]["reason"]
+    assert audit(path).verdict == "passive"
+
+
+def test_error_of_the_users_own_code_stops_the_run_the_same_way(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    device = ScriptedDevice(sway)
+
+    def fail(_bridge: Bridge, tick: int) -> None:
+        if tick == 40:
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        recorded(path, "point_mass", device, on_tick=fail)
+    assert (device.writes[-1] == 0).all()
+    assert not read_recording(path).is_cut
+    assert audit(path).ticks == 40
+
+
+def test_overruns_are_flagged_counted_and_pass_the_audit(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    clock = SlowClock({0: 2, 50: 1, 51: 7})
+    summary = recorded(path, "virtual_wall", clock=clock, duration=0.1)
+    assert (summary.overruns, summary.skipped) == (3, 10)
+    ticks = read_recording(path).ticks
+    flagged = np.flatnonzero(ticks["flags"] & TickFlag.OVERRUN)
+    assert flagged.tolist() == [0, 50, 51]
+    assert ticks["deadline_ns"][-1] == 110_000_000
+    assert audit(path).verdict == "passive"
+    assert read_recording(path).events[-1]["overruns"] == 3
+    assert read_recording(path).events[-1]["skipped"] == 10
+
+
+def test_full_ring_drops_rows_in_real_time_and_the_audit_calls_the_gap(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "run.mcap"
+    monkeypatch.setattr(stream_module, "RING_SECONDS", 0.064)
+    rings: list[Ring] = []
+    shared = Ring.shared
+
+    def kept(capacity: int) -> Ring:
+        rings.append(shared(capacity))
+        return rings[-1]
+
+    monkeypatch.setattr(Ring, "shared", kept)
+    device = ScriptedDevice(sway)
+    with Bridge("point_mass", device, recording=path, clock=SlowClock({})) as bridge:
+        recorder = bridge._stream.recorder
+        assert isinstance(recorder, Recorder)
+        pid = recorder._process.pid
+        os.kill(pid, signal.SIGSTOP)
+
+        def resume(tick: int) -> None:
+            if tick == 100:
+                os.kill(pid, signal.SIGCONT)
+                limit = time.monotonic() + PATIENCE
+                while rings[0].pending():
+                    assert time.monotonic() < limit
+
+        summary = bridge.run(0.15, resume)
+    assert summary.dropped == 36
+    ticks = read_recording(path).ticks
+    assert ticks["tick"].tolist() == [*range(64), *range(100, 150)]
+    flagged = np.flatnonzero(ticks["flags"] & TickFlag.DROPPED_BEFORE)
+    assert ticks["tick"][flagged].tolist() == [100]
+    report = audit(path)
+    assert report.verdict == "invalid"
+    assert "63 is followed by 100" in report.reason
+
+
+def test_full_ring_loses_nothing_in_simulated_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(stream_module, "RING_SECONDS", 0.008)
+    summary = recorded(tmp_path / "run.mcap", "point_mass", duration=0.3)
+    assert summary.dropped == 0
+    assert audit(tmp_path / "run.mcap").ticks == 300
+
+
+def test_no_shared_memory_is_left_whatever_happens(tmp_path: Path) -> None:
+    def segments() -> set[str]:
+        return {ring.name for ring in made if ring.name and Path(ring.name).exists()}
+
+    made: list[Ring] = []
+    shared = Ring.shared
+    with pytest.MonkeyPatch.context() as patch:
+
+        def kept(capacity: int) -> Ring:
+            made.append(shared(capacity))
+            return made[-1]
+
+        patch.setattr(Ring, "shared", kept)
+        recorded(tmp_path / "run.mcap", "point_mass", duration=0.01)
+        assert len(made) == 1
+        assert not segments()
+        device = ScriptedDevice(still)
+        with pytest.raises(HapticBridgeError, match="does not exist"):
+            recorded(tmp_path / "no" / "run.mcap", "point_mass", device, duration=0.01)
+        assert device.is_closed
+        assert not segments()
+
+
+def test_recording_is_closed_although_the_device_cannot_be(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+
+    def fail() -> None:
+        raise DeviceError("stuck")
+
+    device = ScriptedDevice(sway, on_close=fail)
+    with pytest.raises(DeviceError, match="stuck"):
+        recorded(path, "point_mass", device, duration=0.05)
+    assert not read_recording(path).is_cut
+
+
+def test_a_stop_ends_a_run_whose_recorder_stalls(tmp_path: Path) -> None:
+    with fast("point_mass", recording=tmp_path / "run.mcap") as bridge:
+        recorder = bridge._stream.recorder
+        assert isinstance(recorder, Recorder)
+        pid = recorder._process.pid
+        os.kill(pid, signal.SIGSTOP)
+        timer = threading.Timer(1.0, bridge.stop)
+        timer.start()
+        try:
+            summary = bridge.run(1000.0)
+        finally:
+            timer.cancel()
+            os.kill(pid, signal.SIGCONT)
+    assert summary.stopped_by == "caller"
+    assert summary.ticks < 100_000

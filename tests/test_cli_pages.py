@@ -1,0 +1,142 @@
+"""Pictures and pages of a recording, also of one whose text is hostile."""
+
+from __future__ import annotations
+
+import json
+import xml.etree.ElementTree as ET
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+from audit_cases import rewritten
+from cli_cases import Called
+
+from hapticbridge.recording import Recording, read_recording
+from hapticbridge.report import draw_recording
+
+HOSTILE = "--><script>alert('x')</script>[/b] ${y} $\\frac$ & \x1b[31m"
+
+
+@pytest.fixture
+def hostile(tmp_path: Path, run_file: Path) -> Recording:
+    recording = read_recording(run_file)
+    meta = dict.fromkeys(("scene", "started", "clock"), HOSTILE)
+    meta["versions"] = json.dumps({"mujoco": HOSTILE})
+    event = {"event": HOSTILE, "reason": HOSTILE, "tick": HOSTILE, "time_ns": 0}
+    path = rewritten(
+        recording, tmp_path / "hostile.mcap", meta=meta, events=[*recording.events, event]
+    )
+    return read_recording(path)
+
+
+class Page(HTMLParser):
+    """Gathers what a page would run or fetch, and whether its tags match."""
+
+    VOID = ("meta", "br", "hr", "img", "link", "input")
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.scripts = 0
+        self.fetched: list[str] = []
+        self.text = ""
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        if tag not in self.VOID:
+            self.open.append(tag)
+        self.note(tag, attrs)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.note(tag, attrs)
+
+    def note(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.scripts += tag in ("script", "iframe", "object", "embed")
+        for name, value in attrs:
+            self.scripts += name.startswith("on")
+            if name in ("src", "href", "xlink:href", "data") and not (value or "").startswith("#"):
+                self.fetched.append(value or "")
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.text += data
+
+
+def test_page_is_whole_fetches_nothing_and_runs_nothing(
+    hostile: Recording, call: Called, tmp_path: Path
+) -> None:
+    target = tmp_path / "page.html"
+    picture_file = tmp_path / "picture.svg"
+    code, out, _ = call("audit", hostile.path, "--report", target, "--plot", picture_file)
+    assert code == 0
+    assert "<script>alert('x')</script>[/b] ${y}" in out  # printed, not taken as markup
+    assert "\x1b" not in out
+    text = target.read_text(encoding="utf-8")
+    page = Page()
+    page.feed(text)
+    page.close()
+    assert not page.open
+    assert not page.scripts
+    assert not page.fetched
+    assert "url(http" not in text and "@import" not in text
+    assert "alert('x')" in page.text
+    for told in ("passive", "2400.0 N/m", "unknown", "not re-simulated"):
+        assert told in page.text
+    picture = text[text.index("<svg") : text.index("</svg>") + 6]
+    ET.fromstring(picture)
+    assert "purl.org" not in picture  # matplotlib's own metadata
+
+
+@pytest.mark.parametrize("ending", ["PNG", "svg", "pdf"])
+def test_picture_is_written_in_the_format_of_its_ending(
+    ending: str, call: Called, run_file: Path, tmp_path: Path
+) -> None:
+    target = tmp_path / f"picture.{ending}"
+    code, _, err = call("audit", run_file, "--plot", target)
+    assert code == 0
+    assert f"wrote {target}" in err
+    magic = {"png": b"\x89PNG", "svg": b"<?xml", "pdf": b"%PDF"}[ending.lower()]
+    assert target.read_bytes().startswith(magic)
+
+
+def test_curves_keep_every_peak_of_a_long_run(run_file: Path) -> None:
+    recording = read_recording(run_file)
+    count = 20_000
+    ticks = np.zeros(count, recording.ticks.dtype)
+    ticks["tick"] = np.arange(count)
+    ticks["wrench_on_tool"][12_345, 0] = 7.0
+    ticks["wrench_on_tool"][777, 0] = -3.0
+    figure = draw_recording(Recording(**{**vars(recording), "ticks": ticks}))
+    force, position, energy = figure.axes
+    line = force.get_lines()[0]
+    values = np.asarray(line.get_ydata())
+    assert len(values) < 5000
+    assert (values.max(), values.min()) == (7.0, -3.0)
+    assert np.asarray(line.get_xdata())[values.argmax()] == pytest.approx(12.345)
+    for axes, unit in ((force, "(N)"), (position, "(mm)"), (energy, "(mJ)")):
+        assert unit in axes.get_ylabel()
+
+
+@pytest.mark.parametrize("change", ["nothing", "no tick", "no period", "huge", "bad device"])
+def test_page_of_an_invalid_recording_is_written_all_the_same(
+    change: str, call: Called, run_file: Path, tmp_path: Path
+) -> None:
+    recording = read_recording(run_file)
+    ticks, meta = recording.ticks.copy(), {}
+    if change == "no tick":
+        ticks = ticks[:0]
+    elif change == "no period":
+        meta = {"period_s": "0"}
+    elif change == "huge":
+        ticks["kinetic"][5] = 1e300
+    elif change == "bad device":
+        meta = {"device": "[1, 2", "versions": "3"}
+    path = rewritten(recording, tmp_path / "bad.mcap", ticks=ticks, meta=meta)
+    target = tmp_path / "page.html"
+    code, _, err = call("audit", path, "--report", target)
+    assert code == (0 if change == "nothing" else 1), err
+    text = target.read_text(encoding="utf-8")
+    assert ("passive" if change == "nothing" else "invalid") in text
+    assert ("<svg" in text) == (change in ("nothing", "bad device"))
