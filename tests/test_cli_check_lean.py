@@ -13,7 +13,7 @@ Capsys = pytest.CaptureFixture[str]
 
 RIVETS = "".join(
     f'<geom name="rivet_{k}" size="0.002" pos="{0.01 * k} 0.1 0" contype="0" conaffinity="0"/>'
-    for k in range(400)
+    for k in range(300)
 )
 OPTION = (
     '<option timestep="0.001" gravity="0 0 0" integrator="discrete" cone="elliptic">'
@@ -28,14 +28,14 @@ WALL = f'<geom name="wall" type="box" size="0.03 0.03 0.01" pos="0 0 -0.025" {CO
 def studded(tmp_path: Path) -> tuple[str, ...]:
     """A tool on a rail before a wall with 400 rivets that are only seen, and its hand's motion."""
     scene = scene_file(tmp_path, mjcf(OPTION, body=TOOL, world=WALL + RIVETS))
-    hand = hand_file(tmp_path, [(0.3, (0.0, 0.0, -0.008)), (0.3, (0.0, 0.0, 0.0))])
+    hand = hand_file(tmp_path, [(0.2, (0.0, 0.0, -0.008)), (0.2, (0.0, 0.0, 0.0))])
     return str(scene), "--grip", "tip", "--motion", str(hand)
 
 
 def test_check_writes_a_leaner_scene_that_runs(
     studded: tuple[str, ...], tmp_path: Path, capsys: Capsys
 ) -> None:
-    lean, picture, table = (tmp_path / name for name in ("lean.xml", "lean.png", "lean.csv"))
+    lean, picture, table = (tmp_path / name for name in ("lean.xml", "lean.png", "tried.csv"))
     files = ["--write", str(lean), "--plot", str(picture), "--table", str(table)]
     assert main(["check", *studded, *files]) == 0
     said = capsys.readouterr().out
@@ -68,6 +68,12 @@ def test_bad_input_is_refused_before_anything_is_run(
         (["--lean", "--budget", "nan"], "budget"),
         (["--write", studded[0]], "is a file of the scene itself"),
         (["--write", str(tmp_path / "lean.txt")], "must end in .xml"),
+        (["--table", str(tmp_path / "tried.txt")], "must end in .csv"),
+        (["--table", str(tmp_path / "scene.csv")], "taken for the hand's motion in 'scene.xml'"),
+        (
+            ["--write", str(tmp_path / "lean.xml"), "--table", str(tmp_path / "lean.csv")],
+            "taken for the hand's motion in 'lean.xml'",
+        ),
     ):
         assert main(["check", *studded, *extra]) == USAGE_ERROR
         captured = capsys.readouterr()

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import csv
+from collections.abc import Iterable
 from pathlib import Path
 
 from hapticbridge.check.lean import Lean
 from hapticbridge.check.trial import Trial
 from hapticbridge.errors import SceneError
+
+ENDING = ".csv"
 
 COLUMNS = (
     "step",
@@ -83,6 +86,26 @@ def lean_facts(lean: Lean, written: Trial | None = None) -> dict[str, object]:
         "substeps": lean.draft.setting.substeps,
         "written": None if written is None else trial_facts(written),
     }
+
+
+def check_table(path: Path, scenes: Iterable[Path]) -> None:
+    """Checks that a table can be written, before anything is computed for it.
+
+    Args:
+        path: The file.
+        scenes: MJCF files that are there, or will be.
+
+    Raises:
+        SceneError: Its name does not end in .csv, or it would be taken for a scene's hand motion.
+    """
+    if path.suffix.lower() != ENDING:
+        raise SceneError(f"cannot write the table to '{path}': its name must end in {ENDING}")
+    for scene in scenes:
+        if path.resolve() == scene.with_suffix(ENDING).resolve():
+            raise SceneError(
+                f"'{path}' would be taken for the hand's motion in '{scene.name}'; choose another "
+                "name"
+            )
 
 
 def write_table(lean: Lean, path: Path) -> None:

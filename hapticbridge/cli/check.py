@@ -21,7 +21,7 @@ from hapticbridge.check.inventory import Inventory, take_inventory
 from hapticbridge.check.lean import Lean, checked_budget
 from hapticbridge.check.lean_file import check_target, write_lean
 from hapticbridge.check.lean_picture import draw_lean
-from hapticbridge.check.lean_table import lean_facts, write_table
+from hapticbridge.check.lean_table import check_table, lean_facts, write_table
 from hapticbridge.check.observation import quiet
 from hapticbridge.check.rules import find_faults
 from hapticbridge.check.trial import MAY_GO, SAVES_NOTHING, Trial
@@ -92,6 +92,10 @@ class Check:
         source = read_scene(self.scene, **settings_from(self.settings))
         if self.write is not None:
             check_target(source, self.write, overwrite=self.overwrite)
+        if self.table is not None:
+            check_table(
+                self.table, [path for path in (source.path, self.write) if path is not None]
+            )
         period = None if self.rate is None else period_of(self.rate)
         with _progress("leading it through its motion") as show:
             case = open_case(
