@@ -26,7 +26,7 @@ from hapticbridge.check.lean_picture import draw_lean
 from hapticbridge.check.lean_table import lean_facts, write_table
 from hapticbridge.check.motion import motion_for
 from hapticbridge.check.shapes import shape_simplifications
-from hapticbridge.check.side_by_side import processor_costs
+from hapticbridge.check.side_by_side import CHUNKS, Stage, one_pass, processor_costs
 from hapticbridge.check.simplifications import contact_simplifications
 from hapticbridge.check.trial import IS_FELT, MAY_GO, Judge
 from hapticbridge.check.witness import witness
@@ -197,6 +197,11 @@ def test_free_tool_keeps_the_axes_that_it_uses(tmp_path: Path) -> None:
     assert PLANAR not in freedoms(draft, planar(0.004))
 
 
+def test_joints_that_replace_a_free_one_take_nothing_from_the_defaults(tmp_path: Path) -> None:
+    draft = free_draft(tmp_path, '<default><joint damping="50" stiffness="500"/></default>')
+    assert felt_of(draft, planar(), PLANAR) < 0.05
+
+
 KEYS = """<keyframe>
   <key name="home" qpos="0.01 0 0.02 0.8 0 0.6 0" qvel="0.1 0 0.2 0 0.5 0"/>
   <key name="far" qpos="0.05 0 -0.03 0.96 0 0.28 0"/>
@@ -358,6 +363,16 @@ def test_processor_time_of_more_work_is_more_and_both_are_positive() -> None:
     heavy = Draft(source, "grip", Setting(COUPLING, substeps=100))
     costs = processor_costs(light, heavy, own_motion("virtual_wall", 0.1))
     assert 0.0 < costs[0] < costs[1]
+
+
+def test_motion_is_timed_whole_and_as_it_is_rehearsed() -> None:
+    draft = Draft(read_scene("virtual_wall"), "grip", Setting(COUPLING))
+    motion = own_motion("virtual_wall", 1.2)
+    stages = [Stage(draft, motion) for _ in range(2)]
+    for _ in range(2):  # the second time from the start again
+        assert one_pass(stages).shape == (2, CHUNKS)
+    for stage in stages:
+        np.testing.assert_array_equal(stage.rows, draft.rehearsed(motion).records)
 
 
 REASONS = {

@@ -176,9 +176,10 @@ def test_what_stays_clear_of_the_tool_may_go_and_what_comes_near_stays(
 def test_plane_without_bounding_sphere_is_seen_to_be_near(tmp_path: Path) -> None:
     seen = witness(draft_of(tmp_path, ball_on_floor()), PRESS)
     assert seen.near == {frozenset(("ball", "floor"))}
+    # 1 mm below the tool, though its centre is far away
+    aside = ball_on_floor().replace('pos="0 0 -0.011"', 'pos="0.5 0 -0.011"')
     above = through((0.2, (0, 0, 0.004), NOWHERE))
-    seen = witness(draft_of(tmp_path, ball_on_floor()), above)
-    assert seen.near == {frozenset(("ball", "floor"))}  # 1 mm at the start
+    assert witness(draft_of(tmp_path, aside), above).near == {frozenset(("ball", "floor"))}
 
 
 def shipped(name: str) -> tuple[Draft, Motion]:
@@ -249,6 +250,32 @@ def test_mesh_that_is_a_primitive_becomes_one_and_a_spike_does_not(tmp_path: Pat
     assert verdict(draft_of(tmp_path, block_of_mesh(BOX)), PRESS, "primitives") == MAY_GO
     assert verdict(draft_of(tmp_path, block_of_mesh(SPIKE)), TWIST, "primitives") != MAY_GO
     assert tried(draft_of(tmp_path, ball_on_floor()), PRESS, "primitives") is None
+
+
+def test_primitive_stands_where_the_mesh_stood_in_frames_and_classes_and_files(
+    tmp_path: Path,
+) -> None:
+    numbers = " ".join(f"{value:.9g}" for value in (BOX + np.array([0.03, 0.0, 0.01])).ravel())
+    head = f"""<asset><mesh name="mesh" vertex="{numbers}"/></asset>
+      <default><default class="m"><geom type="mesh" mesh="mesh" mass="0.1"/></default></default>"""
+    tool = """<body name="tool"><freejoint/><frame pos="0.1 0 0" euler="0 0 90">
+      <geom name="block" class="m" pos="0 0.02 0" euler="0 90 0"/></frame><site name="grip"/></body>"""
+    draft = draft_of(tmp_path, mjcf(OPTION, head, body=tool))
+    changed = draft.copy()
+    assert all_of(draft, PRESS)["primitives"].edit(changed)
+    read_back = mujoco.MjSpec.from_string(changed.spec.copy().to_xml())
+    # the block's centre goes by its own turn, the frame's turn and both offsets; its edges likewise
+    own, frame = (Rotation.from_euler("xyz", a, degrees=True) for a in ((0, 90, 0), (0, 0, 90)))
+    inner = np.array([0, 0.02, 0]) + own.apply([0.03, 0, 0.01])
+    centre = np.array([0.1, 0, 0]) + frame.apply(inner)
+    extent = np.abs((frame * own).apply([0.01, 0.01, 0.02]))
+    for model in (changed.compiled().model, read_back.compile()):
+        geom = model.geom("block")
+        assert model.geom_type[geom.id] == mujoco.mjtGeom.mjGEOM_BOX
+        np.testing.assert_allclose(geom.pos, centre, atol=2e-6)
+        turn = Rotation.from_quat(geom.quat, scalar_first=True)
+        np.testing.assert_allclose(np.abs(turn.apply(geom.size)), extent, atol=2e-6)
+        assert model.nmesh == 0
 
 
 def test_what_is_only_seen_goes_and_its_mass_stays(tmp_path: Path) -> None:

@@ -42,11 +42,11 @@ def processor_costs(first: Draft, second: Draft, motion: Motion) -> tuple[float,
     Raises:
         SceneError: A version does not compile, or a result is not finite.
     """
-    stages = [_Stage(draft, motion) for draft in (first, second)]
+    stages = [Stage(draft, motion) for draft in (first, second)]
     passes: list[NDArray[np.float64]] = []
     start = time.thread_time()
     while len(passes) <= REPEATS:
-        passes.append(_one_pass(stages))
+        passes.append(one_pass(stages))
         if (time.thread_time() - start) * (1 + 1 / len(passes)) > PATIENCE:
             break
     kept = passes[1:] if len(passes) > 2 else passes
@@ -54,15 +54,23 @@ def processor_costs(first: Draft, second: Draft, motion: Motion) -> tuple[float,
     return float(seconds[0] / motion.duration), float(seconds[1] / motion.duration)
 
 
-class _Stage:
+class Stage:
+    """A version of a scene that is led through a motion stretch by stretch.
+
+    Attributes:
+        rows: What it did, ``TICK_DTYPE``.
+    """
+
     def __init__(self, draft: Draft, motion: Motion) -> None:
+        """Compiles the scene; ``reset`` before the first stretch."""
         self._scene = draft.compiled()
         self._setting = draft.setting
         self._samples = draft.samples(motion)
-        self._rows = np.zeros(self._samples.size, TICK_DTYPE)
+        self.rows = np.zeros(self._samples.size, TICK_DTYPE)
         self._edges = np.linspace(0, self._samples.size, CHUNKS + 1).astype(int)
 
     def reset(self) -> None:
+        """Puts the scene to its start."""
         setting = self._setting
         parameters = rehearsal_parameters(
             self._scene, setting.coupling, setting.period, setting.substeps
@@ -72,7 +80,7 @@ class _Stage:
     def run(self, chunk: int) -> float:
         """Runs one stretch; returns its processor time in s."""
         binding, part = self._binding, slice(self._edges[chunk], self._edges[chunk + 1])
-        rows = self._rows[part]
+        rows = self.rows[part]
         start = time.thread_time()
         done = simulate(binding.state, self._samples[part], binding.row, rows)
         seconds = time.thread_time() - start
@@ -81,8 +89,8 @@ class _Stage:
         return seconds
 
 
-def _one_pass(stages: list[_Stage]) -> NDArray[np.float64]:
-    """Returns processor time in s by version and stretch."""
+def one_pass(stages: list[Stage]) -> NDArray[np.float64]:
+    """Leads versions through the whole motion, by turns; returns s by version and stretch."""
     for stage in stages:
         stage.reset()
     return np.array([[stage.run(chunk) for stage in stages] for chunk in range(CHUNKS)]).T
