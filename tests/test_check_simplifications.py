@@ -259,7 +259,8 @@ def test_primitive_stands_where_the_mesh_stood_in_frames_and_classes_and_files(
     head = f"""<asset><mesh name="mesh" vertex="{numbers}"/></asset>
       <default><default class="m"><geom type="mesh" mesh="mesh" mass="0.1"/></default></default>"""
     tool = """<body name="tool"><freejoint/><frame pos="0.1 0 0" euler="0 0 90">
-      <geom name="block" class="m" pos="0 0.02 0" euler="0 90 0"/></frame><site name="grip"/></body>"""
+      <geom name="block" class="m" pos="0 0.02 0" euler="0 90 0"/></frame>
+      <site name="grip"/></body>"""
     draft = draft_of(tmp_path, mjcf(OPTION, head, body=tool))
     changed = draft.copy()
     assert all_of(draft, PRESS)["primitives"].edit(changed)
