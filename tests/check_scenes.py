@@ -8,6 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
+from hapticbridge.check.case import Case, open_case
+from hapticbridge.check.faults import Fault
+from hapticbridge.check.rules import find_faults
+from hapticbridge.scene import read_scene, scene_path
+
 MAIN = """<mujoco model="bench">
   <compiler angle="radian" meshdir="meshes"/>
   <option timestep="0.001" integrator="discrete" solver="Newton" iterations="100" cone="elliptic">
@@ -210,3 +215,41 @@ def line_of(plant: Plant, scene: Path) -> tuple[str, int]:
         if words in text:
             return file, text[: text.index(words)].count("\n") + 1
     raise AssertionError(plant)
+
+
+GOOD_OPTION = (
+    '<option timestep="0.001" integrator="discrete" cone="elliptic" gravity="0 0 0">'
+    '<flag diagexact="enable"/></option>'
+)
+GOOD_CONTACT = '<default><geom solref="0.002 1" solimp="0.9 0.95 0.001"/></default>'
+
+KEY = f'<key name="home" qpos="{START}"/>'
+
+
+def case_of(scene: Path, **options: object) -> Case:
+    return open_case(read_scene(scene), **options)  # type: ignore[arg-type] # by the test
+
+
+def faults_of(scene: Path, **options: object) -> tuple[Fault, ...]:
+    return find_faults(case_of(scene, **options))
+
+
+def kinds(faults: tuple[Fault, ...]) -> set[str]:
+    return {fault.kind for fault in faults}
+
+
+def written(folder: Path, text: str, motion: str = "") -> Path:
+    path = folder / "scene.xml"
+    path.write_text(text, encoding="utf-8")
+    if motion:
+        path.with_suffix(".csv").write_text(motion, encoding="utf-8")
+    return path
+
+
+def peg_with(folder: Path, solref: str) -> Path:
+    source = scene_path("peg_in_hole")
+    for file in source.parent.iterdir():
+        (folder / file.name).write_bytes(file.read_bytes())
+    path = folder / source.name
+    path.write_text(source.read_text(encoding="utf-8").replace('"0.002 1"', f'"{solref}"'))
+    return path

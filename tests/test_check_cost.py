@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -15,7 +16,7 @@ from hapticbridge.check.motion import samples_of
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Motion
 from hapticbridge.errors import SceneError
-from hapticbridge.scene import load_scene
+from hapticbridge.scene import load_scene, scene_path
 
 COUPLING = Coupling(2400, 0.5, 2.4, 5e-4)
 MICRO = 1e-6
@@ -53,11 +54,15 @@ def clock() -> Iterator[PlantedClock]:
 Plant = Callable[[PlantedClock], None]
 
 
-def cost_of_wall(clock: PlantedClock | None = None, plant: Plant | None = None) -> Cost:
+def cost_of_wall(
+    clock: PlantedClock | None = None,
+    plant: Plant | None = None,
+    wall: str | Path = "virtual_wall",
+) -> Cost:
     """Costs of a tool that is pushed 10 mm to a wall, 5 mm beyond, and back: 400 ticks."""
     times, places = [0, 0.1, 0.2, 0.3, 0.4], [0.0, 0.008, 0.015, 0.015, 0.0]
     motion = Motion(times, [(x, 0, 0) for x in places])
-    scene = load_scene("virtual_wall")
+    scene = load_scene(wall)
     samples = samples_of(motion, 1e-3)
     if clock is None:
         return measure_cost(scene, samples, COUPLING, 1e-3)
@@ -108,6 +113,19 @@ def test_planted_cost_raises_just_its_stage(
     assert set(found) == {stage}
     assert found[stage][1] == pytest.approx(microseconds)
     assert cost.contact.median == pytest.approx(microseconds * MICRO, abs=2e-9)
+
+
+def test_two_hundred_more_walls_cost_two_hundred_times_the_collision(
+    clock: PlantedClock, tmp_path: Path
+) -> None:
+    text = scene_path("virtual_wall").read_text(encoding="utf-8")
+    line = next(line for line in text.splitlines() if 'name="wall" class' in line)
+    more = "".join(line.replace('"wall" class', f'"wall{k}" class') for k in range(200))
+    crowded = tmp_path / "crowded.xml"
+    crowded.write_text(text.replace(line, line + more), encoding="utf-8")
+    found = changed(cost_of_wall(clock, plant_collision, crowded))
+    assert set(found) == {"collision"}
+    assert found["collision"][1] == pytest.approx(201 * 5.0)
 
 
 def test_rate_leaves_the_stated_share_of_the_period(clock: PlantedClock) -> None:

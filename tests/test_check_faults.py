@@ -2,18 +2,28 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import mujoco
 import numpy as np
 import pytest
-from check_scenes import CUP_DEPTH, CUP_ROOM, PLANTS, Plant, bench, cup_obj, hand_rows, line_of
+from check_scenes import (
+    GOOD_CONTACT,
+    GOOD_OPTION,
+    KEY,
+    PLANTS,
+    Plant,
+    bench,
+    case_of,
+    faults_of,
+    hand_rows,
+    kinds,
+    line_of,
+    peg_with,
+    written,
+)
 from outside_scenes import mjcf
 
-from hapticbridge.check.case import Case, open_case
-from hapticbridge.check.constraint_faults import creep_speed
-from hapticbridge.check.contact_stiffness import constraint_stiffness, depth_under
-from hapticbridge.check.faults import Fault, length, number, weight
-from hapticbridge.check.geometry_faults import dent_of, mesh_of
-from hapticbridge.check.inertia import body_inertia, joint_inertia
+from hapticbridge.check.case import open_case
+from hapticbridge.check.contact_stiffness import depth_under
+from hapticbridge.check.faults import Fault, length, weight
 from hapticbridge.check.rules import find_faults
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import DeviceError, SceneError
@@ -21,32 +31,6 @@ from hapticbridge.scene import read_scene, scene_names, scene_path
 
 CONSEQUENCES = {"energy created", "MuJoCo warning", "solver iterations"}
 """What a planted fault may lead to in the motion."""
-
-GOOD_OPTION = (
-    '<option timestep="0.001" integrator="discrete" cone="elliptic" gravity="0 0 0">'
-    '<flag diagexact="enable"/></option>'
-)
-GOOD_CONTACT = '<default><geom solref="0.002 1" solimp="0.9 0.95 0.001"/></default>'
-
-
-def case_of(scene: Path, **options: object) -> Case:
-    return open_case(read_scene(scene), **options)  # type: ignore[arg-type] # by the test
-
-
-def faults_of(scene: Path, **options: object) -> tuple[Fault, ...]:
-    return find_faults(case_of(scene, **options))
-
-
-def kinds(faults: tuple[Fault, ...]) -> set[str]:
-    return {fault.kind for fault in faults}
-
-
-def written(folder: Path, text: str, motion: str = "") -> Path:
-    path = folder / "scene.xml"
-    path.write_text(text, encoding="utf-8")
-    if motion:
-        path.with_suffix(".csv").write_text(motion, encoding="utf-8")
-    return path
 
 
 @pytest.fixture(scope="module")
@@ -79,64 +63,6 @@ def test_all_planted_faults_are_named_together(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", scene_names())
 def test_shipped_scene_has_no_fault(name: str) -> None:
     assert faults_of(scene_path(name)) == ()
-
-
-SINKS = [
-    ("0.002 1", "0.9 0.95 0.001 0.5 2", 0.1),
-    ("0.02 1", "0.9 0.95 0.001 0.5 2", 0.3),
-    ("0.0005 8", "0.9 0.95 0.001 0.5 2", 0.05),
-    ("0.005 0.7", "0.7 0.95 0.0005 0.5 2", 0.1),
-    ("-30000 -400", "0.8 0.9 0.002 0.3 1", 0.2),
-    ("-4000000 -6000", "0.5 0.9 0.001 0.5 2", 0.1),  # and this it does not
-    ("0.0005 1", "0.9 0.9 0.001 0.5 2", 0.1),  # finer than the step: MuJoCo softens it
-]
-
-
-@pytest.mark.parametrize(("solref", "solimp", "mass"), SINKS)
-def test_stiffness_and_depth_are_those_of_mujoco_at_rest(
-    solref: str, solimp: str, mass: float
-) -> None:
-    model = mujoco.MjModel.from_xml_string(
-        f"""<mujoco>{GOOD_OPTION}
-        <default><geom condim="1" solref="{solref}" solimp="{solimp}"/></default>
-        <worldbody>
-          <geom type="plane" size="1 1 1"/>
-          <body pos="0 0 0.01"><joint type="slide" axis="0 0 1"/><geom size="0.01" mass="{mass}"/>
-          </body>
-        </worldbody></mujoco>"""
-    )
-    data, force = mujoco.MjData(model), 2.0
-    data.qfrc_applied[0] = -force
-    mujoco.mj_step(model, data, nstep=4000)
-    ref, imp = ([float(word) for word in words.split()] for words in (solref, solimp))
-    depth = depth_under(force, ref, imp, mass, model.opt.timestep)
-    assert depth == pytest.approx(-data.qpos[0], rel=1e-3)
-    stiffness = constraint_stiffness(ref, imp, mass, model.opt.timestep, depth)
-    assert stiffness == pytest.approx(force / -data.qpos[0], rel=1e-3)
-
-
-def test_nothing_that_pushes_back_lets_a_force_sink_for_ever() -> None:
-    assert depth_under(1.0, (0.0, 0.0), (0.9, 0.95, 0.001), 1.0, 1e-3) == np.inf
-
-
-@pytest.mark.parametrize("name", ["virtual_wall", "drawer"])
-def test_stiffness_seen_in_a_motion_is_that_of_the_settings(name: str) -> None:
-    case = case_of(scene_path(name))
-    assert case.observation is not None
-    ((pair, seen),) = list(case.observation.meetings.items())[:1]
-    model = case.model
-    settings = model.geom_solref[pair[0]], model.geom_solimp[pair[0]]
-    shallow = constraint_stiffness(*settings, seen.inertia, 1e-3, 0.0)
-    assert seen.softest == pytest.approx(shallow, rel=0.02)
-
-
-def peg_with(folder: Path, solref: str) -> Path:
-    source = scene_path("peg_in_hole")
-    for file in source.parent.iterdir():
-        (folder / file.name).write_bytes(file.read_bytes())
-    path = folder / source.name
-    path.write_text(source.read_text(encoding="utf-8").replace('"0.002 1"', f'"{solref}"'))
-    return path
 
 
 def test_peg_sinks_deeper_than_its_clearance_with_mujocos_default(tmp_path: Path) -> None:
@@ -212,44 +138,6 @@ def test_explicit_pair_is_named_instead_of_its_geoms(tmp_path: Path) -> None:
     assert (fault.kind, fault.place.element) == ("soft contact", "pair 'rest'")
 
 
-def test_inertia_of_joint_and_body_has_their_armature() -> None:
-    model = mujoco.MjModel.from_xml_string(
-        """<mujoco><worldbody>
-          <body name="nail"><joint type="slide" axis="0 0 1" armature="0.1"/>
-            <geom size="0.01" mass="0.0005"/></body>
-          <body name="door" pos="1 0 0"><joint type="hinge" axis="0 0 1" armature="0.2"/>
-            <inertial pos="0.5 0 0" mass="2" diaginertia="0.1 0.1 0.1"/></body>
-          <body name="ball" pos="2 0 0"><freejoint/><geom size="0.1" mass="3"/></body>
-          <body name="post" pos="3 0 0"><geom size="0.1" mass="3"/></body>
-        </worldbody></mujoco>"""
-    )
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
-    about_hinge = 0.2 + 0.1 + 2 * 0.5**2
-    assert joint_inertia(model, data, 0) == pytest.approx(0.1005)
-    assert joint_inertia(model, data, 1) == pytest.approx(about_hinge)
-    found = {name: body_inertia(model, data, model.body(name).id) for name in
-             ("nail", "door", "ball", "post")}  # fmt: skip
-    assert found["nail"] == pytest.approx(0.1005)
-    assert found["door"] == pytest.approx(about_hinge / 0.5**2)
-    assert found["ball"] == pytest.approx(3.0)
-    assert found["post"] == np.inf
-
-
-def test_creep_of_dry_friction_is_mujocos() -> None:
-    mass, loss = 0.3, 2.0
-    model = mujoco.MjModel.from_xml_string(
-        f"""<mujoco>{GOOD_OPTION}<worldbody><body>
-          <joint type="slide" axis="1 0 0" frictionloss="{loss}"/><geom size="0.01" mass="{mass}"/>
-        </body></worldbody></mujoco>"""
-    )
-    data = mujoco.MjData(model)
-    data.qfrc_applied[0] = 0.5 * loss
-    mujoco.mj_step(model, data, nstep=3000)
-    speed = creep_speed(0.5 * loss, model.dof_solref[0], model.dof_solimp[0], mass)
-    assert speed == pytest.approx(data.qvel[0], rel=1e-3)
-
-
 @pytest.mark.parametrize(("mass", "is_told"), [(0.24, False), (0.25, True)])
 def test_tool_that_sags_by_more_than_a_millimetre_is_heavy(
     tmp_path: Path, mass: float, is_told: bool
@@ -318,15 +206,15 @@ def test_time_step_is_no_fault_where_the_rate_was_asked_for(tmp_path: Path) -> N
     assert "time step" not in kinds(faults_of(bench(tmp_path / "scene"), period=0.5e-3))
 
 
-def test_cup_is_as_deep_and_as_empty_as_it_was_made() -> None:
-    spec = mujoco.MjSpec.from_string(
-        '<mujoco><asset><mesh name="cup" file="cup.obj"/></asset>'
-        '<worldbody><geom type="mesh" mesh="cup"/></worldbody></mujoco>'
-    )
-    spec.assets = {"cup.obj": cup_obj().encode()}
-    dent, filled = dent_of(*mesh_of(spec.compile(), 0))
-    assert filled == pytest.approx(CUP_ROOM, rel=1e-3)
-    assert 0.3 * CUP_DEPTH < dent <= CUP_DEPTH
+def test_contact_that_created_energy_is_named_with_a_setting_that_does_not(tmp_path: Path) -> None:
+    source = read_scene("peg_in_hole", clearance=1e-3)
+    (fault,) = find_faults(open_case(source))
+    assert fault.kind == "energy created"
+    assert "% of the coupling's slack, which covers it" in fault.sentence
+    change = fault.change.split(" there")[0]
+    assert change == 'solref="0.0005 8"'
+    mended = read_scene(peg_with(tmp_path, "0.0005 8"), clearance=1e-3)
+    assert find_faults(open_case(mended)) == ()
 
 
 def test_motion_that_does_not_end_is_a_fault_and_no_error(tmp_path: Path) -> None:
@@ -345,6 +233,15 @@ def test_motion_that_does_not_end_is_a_fault_and_no_error(tmp_path: Path) -> Non
     assert "not finite after tick" in fault.sentence
 
 
+def test_start_beyond_all_numbers_is_named_at_its_keyframe(tmp_path: Path) -> None:
+    plant = Plant("start not finite", "<!-- keys -->", f"<keyframe>{KEY}</keyframe>")
+    assert "start not finite" not in kinds(faults_of(bench(tmp_path / "near", plant)))
+    far = Plant(plant.kind, plant.old, plant.new.replace("0 0 0.03", "0 0 1e12"))
+    scene = bench(tmp_path / "far", far)
+    (fault,) = (fault for fault in faults_of(scene) if fault.kind == far.kind)
+    assert (fault.place.file, fault.place.line) == line_of(far, scene)
+
+
 def test_unmetered_work_is_named_where_it_is_written(tmp_path: Path) -> None:
     option = GOOD_OPTION.replace("gravity", 'wind="1 0 0" gravity')
     (fault,) = faults_of(written(tmp_path, mjcf("\n", option, GOOD_CONTACT)))
@@ -360,9 +257,3 @@ def test_workspace_must_be_a_length(workspace: float) -> None:
 def test_what_is_no_inertia_is_an_error_of_the_scene(tmp_path: Path) -> None:
     with pytest.raises(SceneError, match="nowhere"):
         case_of(bench(tmp_path / "scene"), grip="nowhere")
-
-
-def test_numbers_are_said_as_people_read_them() -> None:
-    assert [number(v) for v in (2500.4, 0.03751, 1e7)] == ["2500", "0.0375", "10000000"]
-    assert [length(v) for v in (375e-6, 4.2e-3, 3.1)] == ["375 µm", "4.2 mm", "3.1 m"]
-    assert [weight(v) for v in (0.0354, 1.2)] == ["35.4 g", "1.2 kg"]

@@ -5,9 +5,8 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
-from check_scenes import bench
+from check_scenes import GOOD_CONTACT, GOOD_OPTION, bench, case_of, written
 from outside_scenes import mjcf
-from test_check_faults import GOOD_CONTACT, GOOD_OPTION, case_of, written
 
 from hapticbridge.check.inventory import (
     FIXED,
@@ -200,6 +199,17 @@ def test_influence_goes_through_equalities_and_tendons(
     assert named == {f"body '{name}'" for name in ("a", "b") if name not in reached}
 
 
+def test_in_a_scene_with_flexes_nothing_that_moves_is_called_idle(tmp_path: Path) -> None:
+    cloth = (
+        '<flexcomp name="cloth" type="grid" count="3 3 1" spacing=".02 .02 .02" pos="0 0 -.02" '
+        'radius=".002" mass="0.1" dim="2"><contact selfcollide="none"/>'
+        '<edge equality="true"/></flexcomp>'
+    )
+    case = case_of(written(tmp_path, mjcf(GOOD_OPTION, world=cloth)))
+    counted = take_inventory(case.model, "grip", case.places, case.observation)
+    assert not [each for each in counted.idle if each.place.element.startswith("body")]
+
+
 def test_without_a_motion_what_can_meet_counts_as_met(tmp_path: Path) -> None:
     case = case_of(bench(tmp_path / "scene"))
     counted = take_inventory(case.model, "grip", case.places)
@@ -219,6 +229,27 @@ def test_every_geom_is_found_on_its_line(tmp_path: Path) -> None:
         text = (scene.parent / place.file).read_text().splitlines()[place.line - 1]
         assert "<geom" in text
         assert name in text
+
+
+def test_geoms_without_a_name_in_an_included_file_are_told_apart(tmp_path: Path) -> None:
+    (tmp_path / "parts.xml").write_text(
+        """<mujoco>
+          <default><geom condim="3"/></default>
+          <worldbody>
+            <geom size="0.01" pos="1 0 0"/>
+            <geom name="named" size="0.01"/>
+            <geom size="0.01" pos="2 0 0"/>
+          </worldbody>
+        </mujoco>""",
+        encoding="utf-8",
+    )
+    case = case_of(written(tmp_path, mjcf('<include file="parts.xml"/>', GOOD_OPTION)))
+    model = case.model
+    found = {float(model.geom_pos[g, 0]): case.places.geom(g) for g in range(3)}
+    assert [(found[x].file, found[x].line) for x in (1.0, 2.0)] == [
+        ("parts.xml", 4),
+        ("parts.xml", 6),
+    ]
 
 
 def test_places_of_a_repeated_element_are_the_line_that_repeats_it() -> None:

@@ -13,6 +13,8 @@ what is farther away is another place in the scene."""
 OPPOSITE = -0.95
 """Cosine between the directions towards two walls from which they count as opposite: 18 degrees."""
 
+_WITHOUT_DISTANCE = [int(mujoco.mjtGeom.mjGEOM_HFIELD), int(mujoco.mjtGeom.mjGEOM_SDF)]
+
 _NO_DIRECTION = 1e-9  # m; two points nearer than this have no direction between them
 
 
@@ -38,14 +40,14 @@ def clearances(
         By pair; pairs that are no part of a clearance are left out.
     """
     data, segment = mujoco.MjData(model), np.zeros(6)
+    known = ~np.isin(model.geom_type, _WITHOUT_DISTANCE)
+    candidates = np.array([p for p in pairs if known[list(p)].all()], np.int64).reshape(-1, 2)
     rooms: dict[tuple[tuple[int, int], tuple[int, int]], float] = {}
     for posture in postures:
         data.qpos[:] = posture
         mujoco.mj_kinematics(model, data)
         near: list[tuple[tuple[int, int], float, NDArray[np.float64]]] = []
-        for first, second in pairs:
-            if _is_far(model, data, first, second):
-                continue
+        for first, second in candidates[_may_be_near(model, data, candidates)].tolist():
             distance = mujoco.mj_geomDistance(model, data, first, second, FARTHEST, segment)
             direction = segment[3:] - segment[:3]
             length = float(np.linalg.norm(direction))
@@ -66,10 +68,11 @@ def clearances(
     return found
 
 
-def _is_far(model: mujoco.MjModel, data: mujoco.MjData, first: int, second: int) -> bool:
-    if min(model.geom_rbound[first], model.geom_rbound[second]) <= 0:  # a plane
-        return bool(
-            mujoco.mjtGeom.mjGEOM_PLANE not in (model.geom_type[first], model.geom_type[second])
-        )
-    apart = float(np.linalg.norm(data.geom_xpos[first] - data.geom_xpos[second]))
-    return bool(apart > model.geom_rbound[first] + model.geom_rbound[second] + FARTHEST)
+def _may_be_near(
+    model: mujoco.MjModel, data: mujoco.MjData, pairs: NDArray[np.int64]
+) -> NDArray[np.bool_]:
+    """Tells by their bounding spheres which pairs may be within ``FARTHEST``."""
+    first, second = pairs.T
+    reach = np.where(model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE, np.inf, model.geom_rbound)
+    apart = np.linalg.norm(data.geom_xpos[first] - data.geom_xpos[second], axis=1)
+    return np.asarray(apart <= reach[first] + reach[second] + FARTHEST, dtype=bool)

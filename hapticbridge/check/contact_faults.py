@@ -1,4 +1,4 @@
-"""Faults of contacts: too soft, too stiff, too slippery, with a margin, or there from the start."""
+"""Faults of contacts' settings: too soft, too stiff, too slippery."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from hapticbridge.check.contact_stiffness import constraint_stiffness, depth_und
 from hapticbridge.check.faults import Fault, length, number, others
 from hapticbridge.check.inertia import body_inertia
 from hapticbridge.check.places import Place
-from hapticbridge.scene.checks import MAXIMUM_START_PENETRATION
 from hapticbridge.scene.contact_check import ContactSetting, settings_among, tool_geoms
 from hapticbridge.scene.contact_concerns import SOFT_STEPS, contact_concerns
 from hapticbridge.scene.contact_rule import REFERENCE_STEPS, ROUNDING, contact_numbers
@@ -49,7 +48,7 @@ def contact_faults(case: Case) -> Iterator[Fault]:
     rooms = _rooms(case, [pair for pairs in where.values() for pair in pairs])
     for setting, pairs in where.items():
         place, also = _place(case, pairs[0], is_soft=False)
-        names = _names(case, pairs)
+        names = pair_names(case, pairs)
         if fault := _soft(case, setting, pairs, push, rooms):
             yield fault
         for concern in contact_concerns(
@@ -117,7 +116,7 @@ def _soft(
     is_default = np.allclose(setting.solref, MUJOCO_SOLREF)
     default = "MuJoCo's default " if is_default else ""
     sentence = (
-        f"the contact of {_names(case, [pair])}{others(len(pairs) - 1)} amounts to "
+        f"the contact of {pair_names(case, [pair])}{others(len(pairs) - 1)} amounts to "
         f"{number(stiffness)} N/m ({default}solref "
         f"{_numbers(setting.solref)}): {number(push)} N sink in by {length(depths[pair])}"
     )
@@ -146,63 +145,6 @@ def inertia_of(case: Case, pair: tuple[int, int]) -> float:
         inertia = body_inertia(model, case.scene.data, int(model.geom_bodyid[geom]))
         inverse += 1.0 / (inertia + (share if is_tool[geom] else 0.0))
     return 1.0 / inverse if inverse > 0 else _TYPICAL_INERTIA
-
-
-def margin_faults(case: Case) -> Iterator[Fault]:
-    """Yields geoms and pairs whose contacts push before they touch."""
-    model, places = case.model, case.places
-    meeting = {geom for first, second, _ in settings_among(model) for geom in (first, second)}
-    found = [(places.geom(geom), float(model.geom_margin[geom])) for geom in sorted(meeting)]
-    found += [(places.pair(p), float(model.pair_margin[p])) for p in range(model.npair)]
-    for place, margin in found:
-        if margin > 0:
-            yield Fault(
-                "margin",
-                place,
-                f"{place.element} has a margin of {1e3 * margin:g} mm: it pushes that far before "
-                "it is touched, and the force jumps where it begins",
-                'margin="0"',
-            )
-
-
-def start_faults(case: Case) -> Iterator[Fault]:
-    """Yields geoms that are inside each other at the start: energy that nobody meters."""
-    case.scene.reset()
-    model, data = case.model, case.scene.data
-    seen = set()
-    for contact in data.contact:
-        first, second = (int(geom) for geom in contact.geom)
-        if (
-            first < 0
-            or second < 0
-            or (first, second) in seen
-            or contact.dist >= -MAXIMUM_START_PENETRATION
-        ):
-            continue
-        seen.add((first, second))
-        mover = second if model.body_treeid[model.geom_bodyid[second]] >= 0 else first
-        body = int(model.geom_bodyid[mover])
-        out = -contact.dist * contact.frame[:3] * (1 if mover == second else -1)
-        yield Fault(
-            "starts in contact",
-            case.places.geom(mover),
-            f"{_names(case, [(first, second)])} overlap by {length(-contact.dist)} at the "
-            f"start; more than {length(MAXIMUM_START_PENETRATION)} release energy that nobody "
-            "meters",
-            _moved_out(case, body, out),
-        )
-
-
-def _moved_out(case: Case, body: int, out: np.ndarray) -> str:
-    model = case.model
-    by = " ".join(f"{value:.4g}" for value in 1e3 * out)
-    has_home = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_KEY, "home") >= 0
-    name = model.body(body).name or body
-    if has_home or model.body_parentid[body] != 0:
-        start = "keyframe 'home'" if has_home else "its pos"
-        return f"move body '{name}' in {start} by {by} mm"
-    position = " ".join(f"{value:.6g}" for value in model.body_pos[body] + 1.01 * out)
-    return f"pos=\"{position}\" in body '{name}' (moved by {by} mm)"
 
 
 def _place(case: Case, pair: tuple[int, int], *, is_soft: bool) -> tuple[Place, str]:
@@ -235,7 +177,8 @@ def _softness(solref: np.ndarray) -> float:
     return 1.0 / np.sqrt(-first) if first < 0 else np.inf
 
 
-def _names(case: Case, pairs: list[tuple[int, int]]) -> str:
+def pair_names(case: Case, pairs: list[tuple[int, int]]) -> str:
+    """Returns the names of the first of some pairs of geoms, and how many more there are."""
     first, second = (case.places.geom(geom).element for geom in pairs[0])
     return f"{first} with {second}{others(len(pairs) - 1)}"
 

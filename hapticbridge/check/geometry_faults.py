@@ -25,6 +25,8 @@ FARTHEST_GRIP = 1.0
 """Distance from the grip to the tool's centre of mass over the tool's largest extent, no unit: a
 grip on the tool itself is at most at 1."""
 
+_AT_ONCE = 1000  # triangles compared with all facets of a hull: some 100 MB at 10 000 facets
+
 _SMALLEST_EXTENT = 1e-3  # m; nearer than this the grip is on any tool
 
 
@@ -121,8 +123,10 @@ def dent_of(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> tuple[fl
     except (QhullError, ValueError):  # flat: MuJoCo gives it no volume either
         return 0.0, 0.0
     triangles = vertices[faces]
-    inside = -(triangles.mean(axis=1) @ hull.equations[:, :3].T + hull.equations[:, 3])
-    dent = float(inside.min(axis=1).max(initial=0.0))
+    dent = 0.0
+    for centres in np.array_split(triangles.mean(axis=1), len(faces) // _AT_ONCE + 1):
+        inside = -(centres @ hull.equations[:, :3].T + hull.equations[:, 3])
+        dent = max(dent, float(inside.min(axis=1).max(initial=0.0)))
     edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
     is_closed = np.all(np.unique(edges, axis=0, return_counts=True)[1] == 2)
     a, b, c = triangles[:, 0], triangles[:, 1], triangles[:, 2]

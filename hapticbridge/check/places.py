@@ -59,8 +59,8 @@ class Places:
 
     def geom(self, geom_id: int) -> Place:
         """Returns the place of a geom."""
-        body = self._model.body(int(self._model.geom_bodyid[geom_id])).name or "the world"
-        return self._find(("geom",), self._spec.geoms, geom_id, self._model.geom, f" of {body}")
+        owner = self._owner(int(self._model.geom_bodyid[geom_id]))
+        return self._find(("geom",), self._spec.geoms, geom_id, self._model.geom, owner)
 
     def body(self, body_id: int) -> Place:
         """Returns the place of a body."""
@@ -68,8 +68,8 @@ class Places:
 
     def joint(self, joint_id: int) -> Place:
         """Returns the place of a joint."""
-        body = self._model.body(int(self._model.jnt_bodyid[joint_id])).name or "a body"
-        return self._find(_JOINTS, self._spec.joints, joint_id, self._model.joint, f" of {body}")
+        owner = self._owner(int(self._model.jnt_bodyid[joint_id]))
+        return self._find(_JOINTS, self._spec.joints, joint_id, self._model.joint, owner)
 
     def site(self, site_id: int) -> Place:
         """Returns the place of a site."""
@@ -125,6 +125,12 @@ class Places:
                 ):
                     return element.attributes
         return {}
+
+    def _owner(self, body_id: int) -> str:
+        if body_id == 0:
+            return " of the world"
+        name = self._model.body(body_id).name
+        return f" of body '{name}'" if name else f" of body {body_id}"
 
     def _find(
         self,

@@ -8,11 +8,15 @@ import mujoco
 def reached_trees(model: mujoco.MjModel, tool: int, met: set[tuple[int, int]]) -> set[int]:
     """Returns the kinematic trees that can influence the tool's, its own among them.
 
+    In a scene with flexes all of them count.
+
     Args:
         model: The compiled scene.
         tool: The tool's kinematic tree.
         met: Geoms that met, by their ids.
     """
+    if model.nflex:  # what touches a flex is not told by geoms
+        return set(range(model.ntree))
     tree = model.body_treeid
     links = [{int(tree[model.geom_bodyid[geom]]) for geom in pair} for pair in met]
     links += [

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from hapticbridge.check.case import Case
 from hapticbridge.check.constraint_faults import constraint_faults
-from hapticbridge.check.contact_faults import contact_faults, margin_faults, start_faults
+from hapticbridge.check.contact_faults import contact_faults
 from hapticbridge.check.faults import Fault
 from hapticbridge.check.geometry_faults import geometry_faults
 from hapticbridge.check.mass_faults import mass_faults
 from hapticbridge.check.option_faults import keyframe_faults, option_faults
 from hapticbridge.check.run_faults import run_faults
+from hapticbridge.check.start_faults import margin_faults, start_faults
 
 RULES = (
     option_faults,

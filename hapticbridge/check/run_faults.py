@@ -6,6 +6,8 @@ from collections.abc import Iterator
 
 from hapticbridge.check.case import Case
 from hapticbridge.check.faults import Fault, number
+from hapticbridge.check.observation import Observation
+from hapticbridge.scene.contact_concerns import suggested_solref
 
 ITERATIONS = 100
 """MuJoCo's own limit on the solver's iterations; Newton's takes 1 to 8 in the shipped scenes."""
@@ -43,12 +45,24 @@ def run_faults(case: Case) -> Iterator[Fault]:
             "see what it says",
         )
     if seen.environment != "strict":
-        used = f"{number(100 * seen.slack_share)} % of the coupling's slack, which covers it"
-        if seen.environment == "active":
-            used = "more than the coupling's slack covers"
-        yield Fault(
-            "energy created",
-            option("integrator"),
-            f"contacts or joints created energy in the motion: {used}",
-            "the contact settings named here; if none is, a heavier tool",
-        )
+        yield _energy_created(case, seen)
+
+
+def _energy_created(case: Case, seen: Observation) -> Fault:
+    """Names the contact that carried most: which one created the energy, no meter tells."""
+    used = f"{number(100 * seen.slack_share)} % of the coupling's slack, which covers it"
+    if seen.environment == "active":
+        used = "more than the coupling's slack covers"
+    sentence = f"contacts or joints created energy in the motion: {used}"
+    if not seen.meetings:
+        place = case.places.option("integrator")
+        return Fault("energy created", place, sentence, "slower springs and actuators")
+    pair = max(seen.meetings, key=lambda each: seen.meetings[each].force)
+    one, other = (case.places.geom(geom) for geom in pair)
+    return Fault(
+        "energy created",
+        one,
+        f"{sentence}; the largest force was between {one.element} and {other.element}",
+        f"{suggested_solref(float(case.model.opt.timestep))} there and at {other.file}:"
+        f"{other.line}, {other.element} (four times softer, and slow to come back), or more mass",
+    )

@@ -38,13 +38,13 @@ def print_inventory(inventory: Inventory) -> None:
     """Prints what the scene models."""
     out.print("\n[bold]What it models[/]")
     mass = inventory.tool_mass
+    uses = ", ".join(f"{count} {use}" for use, count in inventory.geoms.items() if count)
     lines = {
         "bodies": f"{inventory.bodies}, {inventory.moving_bodies} of them moving",
         "degrees of freedom": f"{inventory.degrees_of_freedom}, "
         f"{inventory.tool_degrees_of_freedom} of them the tool's "
         + (f"({mass:.3g} kg)" if mass >= 0.1 else f"({1e3 * mass:.3g} g)"),
-        "geoms": f"{sum(inventory.geoms.values())}: "
-        + ", ".join(f"{count} {use}" for use, count in inventory.geoms.items() if count),
+        "geoms": ": ".join(filter(None, (str(sum(inventory.geoms.values())), uses))),
     }
     if inventory.triangles:
         lines["meshes that collide"] = f"{inventory.triangles} triangles of their hulls"

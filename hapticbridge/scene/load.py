@@ -65,6 +65,7 @@ class Scene:
 
     _spec: mujoco.MjSpec | None = None
     _is_claimed: bool = False
+    _reach: float = 0.0
 
     def claim(self) -> None:
         """Reserves the scene for one bridge: two would move the same tool.
@@ -118,6 +119,17 @@ class Scene:
         if substeps < 1:
             raise SceneError(f"substeps is {substeps}; it must be 1 or more")
         self.model.opt.timestep = period / substeps
+
+    def set_reach(self, distance: float) -> None:
+        """Lets MuJoCo find contacts, without a force, from a distance in m before they touch.
+
+        It is added to the gaps that the scene's file gives.
+        """
+        if distance == self._reach:
+            return
+        self.model.geom_gap += distance - self._reach
+        self.model.pair_gap += distance - self._reach
+        self._reach = distance
 
     def set_coupling(self, coupling: Coupling) -> None:
         """Sets the gains of the coupling's actuators; needs no compilation."""
