@@ -39,6 +39,7 @@ from hapticbridge.check.trial import (
 from hapticbridge.check.witness import CLEARANCE, witness
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Motion
+from hapticbridge.errors import SceneError
 from hapticbridge.scene import read_scene
 
 COUPLING = Coupling(2400.0, 0.5, 2.4, 5e-4)
@@ -180,6 +181,15 @@ def test_plane_without_bounding_sphere_is_seen_to_be_near(tmp_path: Path) -> Non
     aside = ball_on_floor().replace('pos="0 0 -0.011"', 'pos="0.5 0 -0.011"')
     above = through((0.2, (0, 0, 0.004), NOWHERE))
     assert witness(draft_of(tmp_path, aside), above).near == {frozenset(("ball", "floor"))}
+
+
+def test_motion_that_a_scene_does_not_survive_is_refused(tmp_path: Path) -> None:
+    tool = """<body name="tool"><joint type="slide" damping="{}"/><geom size="0.01" mass="0.1"/>
+      <site name="grip"/></body>"""
+    up = through((0.3, (0, 0, 1e-3), NOWHERE))
+    with quiet(), pytest.raises(SceneError, match="not finite after tick"):
+        witness(draft_of(tmp_path, mjcf(OPTION, body=tool.format("-1e3"))), up)
+    assert witness(draft_of(tmp_path, mjcf(OPTION, body=tool.format("1"))), up).near == set()
 
 
 def shipped(name: str) -> tuple[Draft, Motion]:

@@ -12,6 +12,7 @@ from hapticbridge.check.draft import Draft
 from hapticbridge.check.frames import pose_in, rotation_vector
 from hapticbridge.check.rehearsal import rehearsal_parameters
 from hapticbridge.device import Motion
+from hapticbridge.errors import SceneError
 from hapticbridge.kernel.state import Binding
 from hapticbridge.kernel.step import simulate
 from hapticbridge.scene.contact_check import meeting_pairs
@@ -82,7 +83,8 @@ def witness(draft: Draft, motion: Motion) -> Witness:
     looks: dict[str, list[NDArray[np.float64]]] = {name: [] for name in seen.start}
     every = max(1, round(LOOK_EVERY / setting.period))
     for k in range(samples.size):
-        simulate(binding.state, samples[k : k + 1], binding.row, row)
+        if not simulate(binding.state, samples[k : k + 1], binding.row, row):
+            raise SceneError(f"scene '{scene.name}' is not finite after tick {k} of the motion")
         seen.solver_iterations = max(seen.solver_iterations, int(row["solver_iterations"][0]))
         if data.ncon:
             touching = [pair for pair in data.contact.geom.tolist() if min(pair) >= 0]
