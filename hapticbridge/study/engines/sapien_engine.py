@@ -11,9 +11,11 @@ from typing import Any
 import numpy as np
 
 with warnings.catch_warnings():
-    warnings.simplefilter("ignore")  # that no graphics card was found, which nothing here draws on
+    # that no graphics card was found, which nothing here draws on
+    warnings.simplefilter("ignore")
     import sapien
     from sapien import physx
+
 
 from hapticbridge.pose import Quaternion, Vector, product
 from hapticbridge.study.engines.base import Contacts, Engine, Setting
@@ -109,7 +111,7 @@ class SapienSimulation(HeldSimulation):
 
     def principal_pose(self) -> Pose:
         """Returns the pose of the principal axes of inertia at the centre of mass."""
-        pose = self._body.pose
+        pose = self._body.entity_pose
         (x, y, z), (w, i, j, k) = pose.p.tolist(), pose.q.tolist()
         return Pose((x, y, z), (w, i, j, k))
 
