@@ -105,6 +105,7 @@ class Bridge:
             self._workspace.scale,
             self._workspace.force_scale,
             self.laws,
+            self.method,
         )
         self._limits = limits_for(self.device.info, limits)
         refuse_unknowing(self.method, is_real=self.device.info.is_real, i_know=i_know)
@@ -252,6 +253,16 @@ class Bridge:
                 body_wrench=body_wrench,
             )
         )
+
+    @property
+    def used(self) -> Coupling:
+        """The coupling whose law gives the wrench; ``coupling`` is what should be felt."""
+        return self.method.used(self.coupling, self.period / self._substeps)
+
+    @property
+    def rendered(self) -> Coupling:
+        """What is felt: ``coupling``, but for damping that the method cannot go below."""
+        return self.method.rendered(self.used, self.period / self._substeps)
 
     @property
     def laws(self) -> int:

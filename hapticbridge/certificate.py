@@ -14,7 +14,7 @@ from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import CouplingError
 from hapticbridge.kernel.parameters import SLACK_SHARE, RunParameters, checked_substeps
 from hapticbridge.passivity import minimum_damping, stiffest_coupling
-from hapticbridge.rendering import Method
+from hapticbridge.rendering import IMPLICIT, Method
 
 UNKNOWN_DAMPING, UNKNOWN_ROTATIONAL_DAMPING = 2.0, 2e-3
 """N s/m and N m s/rad from which the default coupling follows where the device's are unknown: those
@@ -218,6 +218,7 @@ def default_coupling(
     scale: float = 1.0,
     force_scale: float = 1.0,
     laws: int = 1,
+    method: Method = IMPLICIT,
 ) -> Coupling:
     """Returns the stiffest coupling that is safe on a device: 80 % of the bound, B = b / 4.
 
@@ -230,6 +231,8 @@ def default_coupling(
         scale: Handle motion per device motion.
         force_scale: Force on the device per force on the tool.
         laws: How often per tick the wrench is computed (substeps).
+        method: How the tool is rendered. What is returned is what is felt: where the method's law
+            needs less damping than is felt, what the device has to bear is the law.
 
     Raises:
         CouplingError: The number of laws is out of range, or a scale is not finite and positive, or
@@ -243,13 +246,14 @@ def default_coupling(
     rotational *= scale / force_scale
     coupling = stiffest_coupling(damping, rotational, period)
     if checked_substeps(laws, CouplingError) == 1:
-        return coupling
+        return method.rendered(coupling, period)
     shrink = min(1.0, NEEDED_SHARE * damping / needed_damping(coupling, period, laws))
     needed = needed_damping(coupling, period, laws, "rotation")
     shrink_rotation = min(1.0, NEEDED_SHARE * rotational / needed)
-    return Coupling(
+    shrunk = Coupling(
         stiffness=shrink * coupling.stiffness,
         damping=shrink * coupling.damping,
         rotational_stiffness=shrink_rotation * coupling.rotational_stiffness,
         rotational_damping=shrink_rotation * coupling.rotational_damping,
     )
+    return method.rendered(shrunk, period / laws)

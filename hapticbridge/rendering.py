@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import mujoco
@@ -17,9 +17,16 @@ import mujoco
 from hapticbridge.arguments import Arguments
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import DeviceError, SceneError, choices
+from hapticbridge.kernel.lossless import REACH
 from hapticbridge.kernel.parameters import RunParameters, checked_substeps
-from hapticbridge.kernel.scheme import COUPLED, DIRECT, HELD, WELD
+from hapticbridge.kernel.scheme import COUPLED, DIRECT, HELD, LOSSLESS, WELD
 from hapticbridge.kernel.state import WELD_NAME
+from hapticbridge.passivity.compensation import (
+    IMPLICIT_LAG,
+    MIDPOINT_LAG,
+    felt_damping,
+    law_damping,
+)
 from hapticbridge.scene import Scene
 from hapticbridge.scene.contact_check import warn_of_contacts
 from hapticbridge.scene.methods import check_massless_tool, check_metered
@@ -45,6 +52,8 @@ class Method:
             where no coupling law gives the wrench.
         compensated: Whether the actuators get the extra K T of damping that makes the implicit
             integration of velocity alone one of position too.
+        lag: Share of K h, h the time step, that the method's integration adds to the damping, and
+            which it therefore takes off the damping asked for; no unit.
     """
 
     name: str
@@ -54,6 +63,7 @@ class Method:
     integrator: str
     discretization: str = "backward"
     compensated: bool = False
+    lag: float = 0.0
 
     @property
     def step(self) -> Callable[[Any, Any], None]:
@@ -73,7 +83,7 @@ class Method:
     @property
     def has_law(self) -> bool:
         """Whether the coupling law gives the wrench, so that the device condition proves safety."""
-        return self.scheme in (COUPLED, HELD)
+        return self.scheme in (COUPLED, HELD, LOSSLESS)
 
     @property
     def meters_inputs(self) -> bool:
@@ -89,12 +99,47 @@ class Method:
         """Returns the gains of the coupling's actuators, for forces and for torques."""
         if self.scheme == HELD:
             return (1.0, 0.0, 0.0), (1.0, 0.0, 0.0)
-        if self.scheme != COUPLED:
+        if self.scheme not in (COUPLED, LOSSLESS):
             return (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
         more = period if self.compensated else 0.0
         k, b = coupling.stiffness, coupling.damping
         kr, br = coupling.rotational_stiffness, coupling.rotational_damping
         return (b, k, b + k * more), (br, kr, br + kr * more)
+
+    def used(self, coupling: Coupling, timestep: float) -> Coupling:
+        """Returns the coupling whose law and gains make a tool feel like the one asked for.
+
+        B' = max(B − lag K h, 0), and B_r alike: the integration adds lag K h again. The device
+        needs b >= K T/2 + B', so what is taken off is also gained in stiffness.
+
+        Args:
+            coupling: What should be felt.
+            timestep: h in s, MuJoCo's.
+
+        Raises:
+            CouplingError: The time step is not finite and > 0.
+
+        References:
+            ``passivity.compensation``.
+        """
+        return self._with_damping(coupling, timestep, law_damping)
+
+    def rendered(self, used: Coupling, timestep: float) -> Coupling:
+        """Returns what a tool feels where ``used`` is the law: B = B' + lag K h."""
+        return self._with_damping(used, timestep, felt_damping)
+
+    def _with_damping(
+        self, coupling: Coupling, timestep: float, damping: Callable[..., float]
+    ) -> Coupling:
+        if self.lag == 0.0:
+            return coupling
+        k, b = coupling.stiffness, coupling.damping
+        kr, br = coupling.rotational_stiffness, coupling.rotational_damping
+        return replace(
+            coupling,
+            damping=damping(k, b, timestep, self.lag),
+            rotational_damping=damping(kr, br, timestep, self.lag),
+        )
 
 
 _CREATES = "creates energy in free motion, more the lighter the tool and the stiffer the coupling"
@@ -115,10 +160,29 @@ IMPLICIT = Method(
     integrator="discrete",
 )
 
+COMPENSATED = replace(
+    IMPLICIT,
+    name="compensated",
+    about="implicit, with the damping K T that its integration adds taken off the coupling's",
+    lag=IMPLICIT_LAG,
+)
+
+LOSSLESS_COUPLING = Method(
+    name="lossless",
+    about="half of the coupling inside MuJoCo's implicit step, half carried over from the last: a "
+    "free tool keeps its energy and is followed to second order; near contacts it is 'implicit'",
+    hazard="",
+    scheme=LOSSLESS,
+    integrator="discrete",
+    lag=MIDPOINT_LAG,
+)
+
 METHODS = {
     method.name: method
     for method in (
         IMPLICIT,
+        COMPENSATED,
+        LOSSLESS_COUPLING,
         Method(
             name="implicitfast",
             about="the same actuators under implicitfast: implicit in velocity, not in position",
@@ -280,9 +344,10 @@ def prepare(
     scene.set_weld(coupling if method.scheme == WELD else None)
     scene.set_timestep(period, substeps)
     scene.model.opt.integrator = _INTEGRATORS[method.integrator]
-    if warns and method.scheme == COUPLED:
+    scene.set_reach(REACH if method.scheme == LOSSLESS else 0.0)
+    if warns and method.scheme in (COUPLED, LOSSLESS):
         warn_of_contacts(scene.model, scene.grip, scene.path)
-    scene.set_gains(*method.gains(coupling, period))
+    scene.set_gains(*method.gains(method.used(coupling, period / substeps), period))
     felt = measured_weld(scene.model, scene.grip) if method.scheme == WELD else None
     scene.reset()
     return felt

@@ -26,6 +26,7 @@ class TickFlag(IntFlag):
         STALE_SAMPLE: The device had nothing new since the previous tick.
         TRIP: The guard stopped the run in this tick; the wrench sent is zero. A tick that is not
             finite is not recorded at all; the event ``trip`` names it.
+        MIDPOINT: The coupling was lossless in this tick: its torque follows the midpoint rule.
     """
 
     OVERRUN = 1
@@ -38,6 +39,7 @@ class TickFlag(IntFlag):
     CLUTCH = 128
     STALE_SAMPLE = 256
     TRIP = 512
+    MIDPOINT = 1024
 
 
 TICK_DTYPE = np.dtype(

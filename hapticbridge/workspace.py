@@ -14,7 +14,11 @@ from numpy.typing import ArrayLike, NDArray
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo
 from hapticbridge.guard import UNLIMITED, Limits
-from hapticbridge.kernel.parameters import RunParameters, rotation_numbers
+from hapticbridge.kernel.parameters import (
+    RunParameters,
+    checked_substeps,
+    rotation_numbers,
+)
 from hapticbridge.rendering import Method, contact_stiffness_of
 from hapticbridge.scene import Scene
 
@@ -108,7 +112,7 @@ def run_parameters(
         grip=scene.grip,
         period=period,
         substeps=substeps,
-        coupling=coupling,
+        coupling=method.used(coupling, period / checked_substeps(substeps)),
         scale=workspace.scale,
         force_scale=workspace.force_scale,
         axes=workspace.axes,

@@ -110,12 +110,13 @@ class ScriptedDevice:
         on_write: Callable[[int], None] | None = None,
         on_close: Callable[[], None] | None = None,
         strength: float = 10.0,
+        damping: float = 2.0,
     ) -> None:
         self.info = DeviceInfo(
             name="scripted",
             degrees_of_freedom=6,
             mass=0.1,
-            damping=2.0,
+            damping=damping,
             rotational_inertia=1e-4,
             rotational_damping=2e-3,
             friction=None,

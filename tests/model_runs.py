@@ -163,7 +163,10 @@ def path_of(name: str) -> Array:
 
 @functools.cache
 def run_of_own_path(name: str) -> Run:
-    model, data = scene_with_handle(name)
+    return run_along_own_path(name, *scene_with_handle(name))
+
+
+def run_along_own_path(name: str, model: Any, data: Any) -> Run:
     rows = path_of(name)
     times = np.arange(1, round(rows[-1, 0] / T) + 1) * T
     offset = np.stack([np.interp(times, rows[:, 0], rows[:, i]) for i in (1, 2, 3)], axis=1)

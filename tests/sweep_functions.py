@@ -9,6 +9,8 @@ import threading
 from collections.abc import Mapping
 from pathlib import Path
 
+import numpy as np
+
 from hapticbridge.study.points import Point, Value, grid
 from hapticbridge.study.sweep import sweep
 
@@ -27,6 +29,15 @@ def once(name: str) -> bool:
     except FileNotFoundError:
         return False
     return True
+
+
+def blas_threads(point: Mapping[str, float]) -> dict[str, Value]:
+    """Returns for how many threads OpenBLAS was asked, and how many this process has."""
+    a = np.random.default_rng(0).random((300, 300))
+    np.linalg.solve(a, a)
+    tasks = Path("/proc/self/task")
+    threads = len(list(tasks.iterdir())) if tasks.is_dir() else 0
+    return {"asked": os.environ.get("OPENBLAS_NUM_THREADS", "none"), "threads": threads}
 
 
 def bound(point: Mapping[str, float]) -> dict[str, Value]:

@@ -22,7 +22,7 @@ from hapticbridge.scene import scene_names
 from hapticbridge.scene.library import scene_path
 from hapticbridge.tick import TICK_DTYPE
 
-COMMANDS = ("run", "audit", "scenes", "repair")
+COMMANDS = ("run", "audit", "scenes", "check", "repair")
 
 
 HINGED = """<mujoco>
@@ -313,7 +313,18 @@ def test_scenes_are_listed_with_what_they_are(call: Called) -> None:
     code, out, _ = call("scenes")
     assert code == 0
     for name in scene_names():
-        assert re.search(rf"{name} +[1-9] +\d+ +\S", out)
+        assert re.search(rf"^{name} +[A-Z]", out, flags=re.MULTILINE)
+    assert re.search("^peg_in_hole .* clearance, friction, mass *$", out, flags=re.MULTILINE)
+    assert "hapticbridge scenes NAME" in out
+
+
+def test_one_scene_is_shown_with_its_size_its_file_and_what_to_type_next(call: Called) -> None:
+    code, out, _ = call("scenes", "planar_peg")
+    assert code == 0
+    assert f"1 moving body, 3 degrees of freedom; {scene_path('planar_peg')}" in out
+    assert call("scenes", "virtual_wall")[1].count("1 degree of freedom;") == 1
+    command = out.splitlines()[-1].removeprefix("next: hapticbridge ")
+    assert call(*command.split(), "--fast", "--duration", "0.1")[0] == 0
 
 
 def test_calling_the_command_line_leaves_warnings_as_they_were(call: Called) -> None:

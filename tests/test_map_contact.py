@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -10,18 +11,33 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
+from map_runs import recorded_and_audited
+from map_tables import Row, without_rows, written
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Hand, Motion, SimulatedDevice
+from hapticbridge.errors import StudyError
 from hapticbridge.rendering import METHODS
+from hapticbridge.scene import load_scene
 from hapticbridge.scene.contact_rule import SUGGESTED
 from hapticbridge.study.maps import contact, contact_search
 from hapticbridge.study.maps.contact import CONTACT, evaluate, points
 from hapticbridge.study.maps.contact_agreement import agreement, exceptions
-from hapticbridge.study.maps.contact_rigs import peg_runs, wall_runs
+from hapticbridge.study.maps.contact_picture import PANELS
+from hapticbridge.study.maps.contact_rigs import (
+    ContactRun,
+    peg_device,
+    peg_runs,
+    start_in_hole,
+    summary,
+    ticks_of,
+    until_active,
+    wall_runs,
+)
 from hapticbridge.study.maps.contact_treatments import PERIOD, SHIPPED, TREATMENTS, Treatment
 from hapticbridge.study.maps.rigs import loop_in, set_tool_mass
-from hapticbridge.study.maps.stability_map import run_map
+from hapticbridge.study.maps.stability_map import Point, run_map
+from hapticbridge.study.maps.verdicts import MISSING, VERDICTS
 
 LIGHT = [(0.03, 0.0, 1)]
 """A peg of 30 g without friction in the first random hand: the hardest case of the search."""
@@ -61,7 +77,7 @@ def test_four_substeps_with_the_rule_in_their_own_steps_are_strict_and_stiffer()
 def test_pyramidal_cone_is_active_where_friction_is_low_and_the_elliptic_one_is_not() -> None:
     slippery = [(0.03, 0.1, hand) for hand in (0, 1, 2)]
     soft = Treatment((0.02, 1.0))
-    pyramidal = peg_runs(replace(soft, cone="pyramidal"), 1000.0, slippery)
+    pyramidal = list(peg_runs(replace(soft, cone="pyramidal"), 1000.0, slippery))
     assert max(run.slack_share for run in pyramidal) > 1.5
     assert max(run.first_active for run in pyramidal) > 0
     assert {run.environment for run in peg_runs(soft, 1000.0, slippery)} == {"strict"}
@@ -88,7 +104,7 @@ def test_a_row_that_the_step_cannot_resolve_is_replaced_unless_refsafe_is_off() 
 def test_implicitfast_creates_energy_on_a_wall_where_implicit_creates_none(
     stiffness: float,
 ) -> None:
-    implicit = wall_runs(DAMPED, stiffness)
+    implicit = list(wall_runs(DAMPED, stiffness))
     assert {run.environment for run in implicit} == {"strict"}
     fast = wall_runs(replace(DAMPED, method="implicitfast"), stiffness)
     assert max(run.created for run in fast) > 1e-4
@@ -100,6 +116,189 @@ def test_bouncing_contact_is_active_on_a_wall_and_a_critically_damped_one_is_not
     assert bouncing.first_active > 0
     (damped,) = wall_runs(Treatment((0.02, 2.0)), 2000.0, [(0.05, 1)])
     assert damped.environment == "strict"
+
+
+@pytest.mark.parametrize(("ratio", "verdict"), [(3.0, "active"), (5.0, "passive")])
+def test_the_audit_of_a_bridge_names_the_tick_at_which_the_map_sees_a_contact_create(
+    ratio: float, verdict: str, tmp_path: Path
+) -> None:
+    # at timeconst T/2 a light peg is active up to dampratio 4, strict from 6 on
+    treatment = Treatment((0.5 * PERIOD, ratio))
+    (mapped,) = peg_runs(treatment, 1000.0, LIGHT)
+    ((mass, friction, hand),) = LIGHT
+    scene = load_scene("peg_in_hole")
+    start_in_hole(scene.model)
+    treatment.apply(scene.model, friction)
+    set_tool_mass(scene.model, "peg", mass)
+    mujoco.mj_setConst(scene.model, scene.data)
+    scene.reset()
+    device, coupling = peg_device(1000.0, hand)
+    with warnings.catch_warnings(record=True) as concerns:
+        warnings.simplefilter("always")
+        report = recorded_and_audited(
+            scene, device, coupling, "implicit", PERIOD, ticks_of(device), tmp_path
+        )
+    assert bool(concerns) == (verdict == "active")  # the rule for scenes sees it coming
+    assert report.resimulation == "bit for bit"
+    assert report.certified  # the device is not to blame
+    assert report.verdict == verdict
+    assert report.environment == mapped.environment
+    assert report.slack_share == pytest.approx(mapped.slack_share, rel=1e-6)
+    if verdict == "active":
+        assert (report.tick, report.port) == (mapped.first_active, "environment")
+    else:
+        assert mapped.first_active == -1
+
+
+def of(environment: str, depth: float, *, created: float = 0.0, first: int = -1) -> ContactRun:
+    return ContactRun(environment, created, 10 * created, first, 1e3 * depth, depth)
+
+
+def test_runs_end_with_the_first_that_is_active_and_are_counted_by_verdict() -> None:
+    runs = [
+        of("strict", 1e-3),
+        of("within slack", 4e-3, created=0.02),
+        of("active", 2e-3, created=0.2, first=70),
+        of("active", 9e-3, created=0.9, first=5),
+    ]
+    asked = iter(runs)
+    made = until_active(asked)
+    assert made == runs[:3]
+    assert next(asked) is runs[3]  # never made
+    found = summary(made)
+    assert (found["runs"], found["strict"], found["within_slack"], found["active"]) == (3, 1, 1, 1)
+    assert found["created"] == 0.2
+    assert found["slack_share"] == 2.0
+    assert found["first_active"] == 70
+    assert found["peak_force"] == 4.0
+    assert found["median_depth"] == 2e-3
+    assert found["largest_depth"] == 4e-3
+    assert summary(runs)["first_active"] == 5
+    assert summary(runs[:2])["first_active"] == -1
+
+
+def test_a_mass_set_before_leaves_no_trace_in_a_run() -> None:
+    (alone,) = peg_runs(Treatment(), 1000.0, LIGHT)
+    list(peg_runs(Treatment(), 1000.0, [(0.1, 0.0, 1), (0.37, 0.0, 1)]))
+    (after,) = peg_runs(Treatment(), 1000.0, LIGHT)
+    assert after == alone
+
+
+def grid_row(rig: str, method: str, k: float, setting: tuple[float, float], verdict: str) -> Row:
+    """Returns a row of the grid, of one run."""
+    point: Point = {"rig": rig, "treatment": "", "method": method, "stiffness": k}
+    steps, ratio = setting
+    return point | {"steps": steps, "dampratio": ratio, "mass": 0.0}, counted(verdict)
+
+
+def counted(*verdicts: str, depth: float = 1e-4) -> dict[str, float | int]:
+    counts = {name.replace(" ", "_"): verdicts.count(name) for name in VERDICTS[:3]}
+    return {
+        "runs": len(verdicts),
+        **counts,
+        "created": 0.01 * counts["active"],
+        "slack_share": 0.25 * len(verdicts),
+        "first_active": -1,
+        "peak_force": 1.0,
+        "median_depth": depth,
+        "largest_depth": 3 * depth,
+    }
+
+
+def search_row(name: str, mass: float, *verdicts: str, depth: float = 1e-4) -> Row:
+    point = grid_row("search", "implicit", 0.0, (0.0, 0.0), "strict")[0]
+    return point | {"treatment": name, "mass": mass}, counted(*verdicts, depth=depth)
+
+
+SETTINGS = ((0.5, 8.0), (2.0, 2.0), (1.0, 1.0))
+"""τ = 60.8, 15.2 and 1.9 steps: strict, for heavy tools alone and none by the rule."""
+
+WRITTEN = [
+    *(
+        grid_row(rig, method, k, setting, verdict)
+        for rig, method, stiffness, _ in PANELS
+        for k in stiffness
+        for setting, verdict in zip(SETTINGS, ("strict", "within slack", "active"), strict=True)
+    ),
+    search_row(SHIPPED, 0.03, "strict", "active", depth=2e-4),
+    search_row(SHIPPED, 0.3, "strict", "within slack", "strict", depth=4e-4),
+    search_row("damped: 0.0005 8", 0.03, "strict", "strict", depth=3e-4),
+    search_row("damped: 0.0005 8", 0.3, "strict", "strict", depth=5e-4),
+    search_row("MuJoCo's default 0.02 1", 0.03, "strict", depth=2e-3),
+    search_row("4 substeps, 0.002 1", 0.03, "strict", depth=1e-5),
+]
+
+
+def test_boundary_and_paragraph_follow_from_a_made_up_table() -> None:
+    finding = CONTACT.read(written(WRITTEN))
+    found = {one["treatment"]: one for one in finding.boundary["search"]}
+    shipped = found[SHIPPED]
+    assert (shipped["runs"], shipped["strict"], shipped["within_slack"]) == (5, 3, 1)
+    assert shipped["active"] == 1
+    assert shipped["created"] == 0.01
+    assert shipped["slack_share"] == 0.75
+    assert shipped["median_depth"] == pytest.approx(3e-4)
+    assert shipped["largest_depth"] == pytest.approx(12e-4)
+    rule = finding.boundary["rule"]
+    assert {name: one["cells"] for name, one in rule.items()} == {
+        "strict": 2,
+        "relaxed": 2,
+        "abrupt": 2,
+    }
+    said = finding.paragraph
+    assert "The rule held: on the peg's grid 2 of 2 settings" in said
+    assert "2 of 2 that it has within the slack for 30 g stayed there, and 2 of 2 for which" in said
+    assert "creates energy at 67 % of the settings" in said
+    assert "2 of 4 treatments are strict on the peg in every run with one step a tick" in said
+    assert "least deep is 'damped: 0.0005 8', median 0.40 mm and at most 1.50 mm, 4 times" in said
+    assert "takes 60.8 ms to come back" in said
+    assert "with substeps '4 substeps, 0.002 1' is too, at 0.01 mm" in said
+    assert "strict in 3 of 5 runs and uses up to 0.75 of the slack, at 0.30 and at most" in said
+
+
+def test_a_rule_that_does_not_hold_is_said_not_to() -> None:
+    rows: list[Row] = [
+        (at, counted("active") if at["rig"] == "peg" and at["stiffness"] == 1000.0 else got)
+        for at, got in WRITTEN
+    ]
+    said = CONTACT.read(written(rows)).paragraph
+    assert "The rule did not hold everywhere: on the peg's grid 1 of 2 settings" in said
+    assert "1 of 2 that it has within the slack for 30 g stayed there, and 2 of 2 for" in said
+
+
+@pytest.mark.parametrize("rig", ["peg", "search", "wall"])
+def test_a_rig_that_fails_is_named_and_the_others_are_read(rig: str) -> None:
+    rows: list[Row] = [(at, "E" if at["rig"] == rig else got) for at, got in WRITTEN]
+    finding = CONTACT.read(written(rows))
+    said = finding.paragraph
+    assert (f"On the peg's grid {MISSING}." in said) == (rig == "peg")
+    assert (f"In the search {MISSING}." in said) == (rig == "search")
+    assert (f"On a wall under 'implicitfast' {MISSING}." in said) == (rig == "wall")
+    assert "nan" not in said
+    texts = [MISSING in [text.get_text() for text in axes.texts] for axes in finding.figure.axes]
+    assert sum(texts) == {"peg": 2, "search": 1, "wall": 4}[rig]
+
+
+def as_if(point: Point) -> dict[str, float | int]:
+    """Returns a strict run, but fails on the peg and in the search."""
+    if point["rig"] != "wall":
+        raise StudyError("not today")
+    return counted("strict")
+
+
+def test_points_that_fail_say_why_and_do_not_stop_the_map(tmp_path: Path) -> None:
+    with ThreadPoolExecutor(1) as executor:
+        files = run_map(replace(CONTACT, evaluate=as_if), tmp_path, points=4, executor=executor)
+    assert files.failed == sum(point["rig"] != "wall" for point in points(4))
+    assert files.table.read_text(encoding="utf-8").count("StudyError: not today") == files.failed
+    assert files.picture.stat().st_size > 10_000
+
+
+def test_a_table_without_a_computed_row_is_refused() -> None:
+    with pytest.raises(StudyError, match="map 'contact': no point could be computed; first: E"):
+        CONTACT.read(written([(point, "E") for point, _ in WRITTEN]))
+    with pytest.raises(StudyError, match="map 'contact': the table has no rows"):
+        CONTACT.read(without_rows(written(WRITTEN)))
 
 
 def test_map_at_reduced_resolution_agrees_with_the_rule(

@@ -4,25 +4,33 @@ from __future__ import annotations
 
 import json
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from map_runs import NEVER, recorded_and_audited
+from map_tables import Row, without_rows, written
+from matplotlib.axes import Axes
 
 from hapticbridge.coupling import Coupling
+from hapticbridge.device import SimulatedDevice
+from hapticbridge.errors import StudyError
 from hapticbridge.passivity import environment_minimum_damping, maximum_stiffness
-from hapticbridge.study.maps import run_map
-from hapticbridge.study.maps.coupling import (
-    COUPLING,
+from hapticbridge.study.maps import MapFiles, run_map
+from hapticbridge.study.maps.coupling import COUPLING
+from hapticbridge.study.maps.coupling_runs import (
     DEVICE_DAMPING,
+    PATH,
     PERIOD,
     THEORIES,
     TOOL_MASS,
     evaluate,
     points,
 )
+from hapticbridge.study.maps.rigs import free_tool_and_wall
 from hapticbridge.study.maps.stability_map import Point
-from hapticbridge.study.table import Outcome, Table, table_of
+from hapticbridge.study.maps.verdicts import MISSING
 
 
 def cell(method: str, stiffness: float, damping: float) -> Point:
@@ -91,26 +99,38 @@ def test_explicit_stays_within_its_slack_where_implicitfast_is_at_fault() -> Non
     assert fast["fault_tick"] == 25
 
 
-def made_up(rows: list[dict[str, float | str | bool]]) -> Table:
-    """Returns a table as a map's points would leave it."""
-    given: list[Point] = []
-    done = []
-    for row in rows:
-        names = ("what", "method", "stiffness", "damping")
-        given.append({name: row[name] for name in names})
-        done.append(Outcome({k: v for k, v in row.items() if k not in names}))
-    return table_of(given, done)
+@pytest.mark.parametrize(
+    ("method", "share", "port"),
+    [
+        ("implicitfast", 1.03, "environment"),
+        ("implicitfast", 0.97, ""),
+        ("weld", 2.5, "device"),
+        ("implicit", 2.5, ""),
+    ],
+)
+def test_the_audit_of_a_bridge_names_the_tick_and_the_port_of_the_map(
+    method: str, share: float, port: str, tmp_path: Path
+) -> None:
+    # implicitfast: E_k = K δx² − ½m(Δv)² against a slack of ½ (K + B/T) δx², equal at K = B/T
+    damping = 0.6
+    stiffness = share * damping / PERIOD
+    mapped = evaluate(cell(method, stiffness, damping))
+    device = SimulatedDevice(
+        damping=DEVICE_DAMPING, path=PATH, force_limit=NEVER, torque_limit=NEVER
+    )
+    coupling = Coupling(stiffness, damping, 1.0, 1e-3)
+    report = recorded_and_audited(
+        free_tool_and_wall(), device, coupling, method, PERIOD, 500, tmp_path
+    )
+    assert report.resimulation == "bit for bit"
+    assert (report.verdict, report.port) == ("active" if port else "passive", port)
+    assert mapped["fault_port"] == port
+    assert (-1 if report.tick is None else report.tick) == mapped["fault_tick"]
 
 
-def ran(
-    method: str, stiffness: float, damping: float, **other: float | str | bool
-) -> dict[str, float | str | bool]:
+def ran(method: str, stiffness: float, damping: float, **other: float | str | bool) -> Row:
     """Returns a row of a run in which nothing went wrong, but for what is said."""
     row: dict[str, float | str | bool] = {
-        "what": "cell",
-        "method": method,
-        "stiffness": stiffness,
-        "damping": damping,
         "stable_free": True,
         "stable_tapping": True,
         "environment": "strict",
@@ -121,33 +141,55 @@ def ran(
     }
     if method != "weld":
         row["stable_on_wall"] = True
-    return row | other
+    return cell(method, stiffness, damping), row | other
+
+
+def limited(method: str, damping: float, limit: float) -> Row:
+    """Returns a row of a search on a wall."""
+    point: Point = {"what": "limit", "method": method, "stiffness": 0.0, "damping": damping}
+    return point, {"limit": limit}
 
 
 def test_boundary_counts_each_way_to_fail_and_only_below_the_bound() -> None:
     # (6) is at 4000 N/m for B = 0 and at 2000 N/m for B = 1: three of four points lie below
     grid = [(1000.0, 0.0), (3000.0, 0.0), (1000.0, 1.0), (3000.0, 1.0)]
-    rows = [ran("implicit", k, b) for k, b in grid]
-    rows[3] |= {"stable_on_wall": False}
+    rows = [ran("implicit", k, b) for k, b in grid[:3]]
+    rows += [ran("implicit", *grid[3], stable_on_wall=False)]
     rows += [
         ran("implicitfast", 1000.0, 0.0, stable_on_wall=False),
         ran("implicitfast", 3000.0, 0.0, stable_free=False),
         ran("implicitfast", 1000.0, 1.0, environment="active", fault_port="environment"),
         ran("implicitfast", 3000.0, 1.0, environment="active", fault_port="environment"),
     ]
-    rows += [ran("explicit", k, b, environment="within slack", slack_share=0.4) for k, b in grid]
-    rows += [ran("weld", k, b) for k, b in grid]
-    rows[13] |= {"stable_tapping": False, "fault_port": "device", "fault_tick": 7}
-    rows.append({"what": "limit", "method": "implicit", "stiffness": 0.0, "damping": 0.0})
-    rows[-1]["limit"] = 4040.0
-    finding = COUPLING.read(made_up(rows))
+    # what is used and felt counts below the bound alone: the last point lies above
+    used, felt = (0.4, 0.3, 0.2, 0.9), (3.0, 4.0, 5.0, 8.0)
+    rows += [
+        ran("explicit", *point, environment="within slack", slack_share=share, peak_force=force)
+        for point, share, force in zip(grid, used, felt, strict=True)
+    ]
+    rows += [ran("weld", k, b) for k, b in grid[1:]]
+    rows += [
+        ran("weld", *grid[0], stable_tapping=False, fault_port="device", fault_tick=7),
+        # at the bound itself nothing is promised any more
+        ran("implicit", 4000.0, 0.0, environment="active", fault_port="environment"),
+        ran("implicitfast:compensated", 1000.0, 0.0, stable_free=False),
+    ]
+    rows += [limited("implicit", 0.0, 4040.0), limited("implicit", 1.0, 1990.0)]
+    finding = COUPLING.read(written(rows))
     found = finding.boundary["methods"]
     assert found["implicit"]["runs_below_6"] == 3
     assert found["implicit"]["passive_share_below_6"] == 1.0
+    assert found["implicit"]["environment_faults_below_6"] == 0
+    assert found["implicit"]["damping"] == [0.0, 1.0]
+    assert found["implicit"]["measured_on_wall"] == [4040.0, 1990.0]
+    assert found["implicit"]["predicted_6"] == pytest.approx([4000.0, 2000.0])
     assert found["implicit"]["largest_deviation"] == pytest.approx(0.01)
+    assert found["implicitfast:compensated"]["passive_share_below_6"] == 0.0
     assert found["implicitfast"]["passive_share_below_6"] == 0.0
     assert found["implicitfast"]["environment_faults_below_6"] == 1
     assert found["explicit"]["passive_share_below_6"] == 1.0
+    assert found["explicit"]["most_slack_used_below_6"] == 0.4
+    assert found["explicit"]["largest_tapping_force_below_6"] == 5.0
     assert found["weld"]["passive_share_below_6"] == pytest.approx(2 / 3)
     assert found["weld"]["device_faults_below_6"] == 1
     said = finding.paragraph
@@ -178,3 +220,51 @@ def test_map_leaves_picture_table_and_boundary(tmp_path: Path) -> None:
     assert implicit["passive_share_below_6"] == 1.0
     assert np.isfinite(implicit["measured_on_wall"]).all()
     assert "within 0." in said["paragraph"]
+
+
+def as_if(point: Point) -> dict[str, float | str | bool]:
+    """Returns what a point without a fault gives, but fails for two methods and every limit."""
+    if point["what"] == "limit" or point["method"] in ("explicit", "weld"):
+        raise StudyError("not today")
+    row = ran(str(point["method"]), float(point["stiffness"]), float(point["damping"]))[1]
+    assert not isinstance(row, str)
+    return dict(row)
+
+
+def test_groups_that_fail_say_why_and_the_others_are_drawn(tmp_path: Path) -> None:
+    with ThreadPoolExecutor(1) as pool:
+        files = run_map(replace(COUPLING, evaluate=as_if), tmp_path, points=80, executor=pool)
+    limits = sum(point["what"] == "limit" for point in points(80))
+    assert files.failed == limits + 2 * 4
+    assert files.table.read_text(encoding="utf-8").count("StudyError: not today") == files.failed
+    said = files.finding.paragraph
+    assert said.startswith(f"On a wall, behind 'implicit', {MISSING}")
+    for name in THEORIES:
+        assert (f"'{name}': {MISSING} below (6)" in said) == (name in ("explicit", "weld"))
+    assert "nan" not in said
+    drawn = {axes.get_title(): [text.get_text() for text in axes.texts] for axes in panels(files)}
+    assert [title for title, texts in drawn.items() if texts == [MISSING]] == [
+        "explicit",
+        "weld: free tool and tapping only",
+    ]
+
+
+def panels(files: MapFiles) -> list[Axes]:
+    return [axes for axes in files.finding.figure.axes if axes.get_title()]
+
+
+def test_a_table_in_which_only_limits_were_found_is_read() -> None:
+    found = COUPLING.read(
+        written([limited("implicit", 0.0, 4000.0), (cell("weld", 1.0, 0.0), "E")])
+    )
+    assert found.boundary["methods"]["implicit"]["passive_share_below_6"] is None
+    assert f"'implicit': {MISSING} below (6)" in found.paragraph
+    assert "within 0.05 % of K" in found.paragraph
+
+
+def test_a_table_without_a_computed_row_is_refused() -> None:
+    rows: list[Row] = [(cell("implicit", 1000.0, 0.5), "SceneError: no")]
+    with pytest.raises(StudyError, match="map 'coupling': no point could be computed; first: Sce"):
+        COUPLING.read(written(rows))
+    with pytest.raises(StudyError, match="map 'coupling': the table has no rows"):
+        COUPLING.read(without_rows(written(rows)))

@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import pytest
+from map_runs import NEVER, recorded_and_audited
+from map_tables import Row, without_rows, written
 
+from hapticbridge.coupling import Coupling
+from hapticbridge.errors import StudyError
+from hapticbridge.scene import load_scene
 from hapticbridge.study.closed_loop import LoopOutcome
-from hapticbridge.study.maps.device import DEVICE
+from hapticbridge.study.maps.device import DEVICE, evaluate, read
 from hapticbridge.study.maps.device_runs import (
     LARGE,
     PERIOD,
@@ -17,11 +24,13 @@ from hapticbridge.study.maps.device_runs import (
     RESOLUTION,
     STIFFNESS,
     friction_to_rest,
+    make_heavy,
+    pressed_device,
     region_of,
     settle,
     shaken,
 )
-from hapticbridge.study.maps.stability_map import run_map
+from hapticbridge.study.maps.stability_map import Point, run_map
 
 
 @pytest.mark.parametrize(
@@ -37,6 +46,14 @@ def test_what_a_device_does_is_named_as_theory_names_its_region(
     beta: float, sigma: float, region: str
 ) -> None:
     assert region_of(settle(beta, sigma, 0.0)[0], settle(beta, sigma, LARGE)[0]) == region
+
+
+def test_a_knock_that_grows_slowly_diverges() -> None:
+    what, last, run = settle(0.49, 0.3, LARGE)
+    assert what == "diverges"
+    # it grew by less than a factor of two in its last third
+    steps = run.records["device_position"][-2000:-1000, 0] / RESOLUTION
+    assert 1.02 * np.ptp(steps) < last < 2 * np.ptp(steps)
 
 
 def test_a_bounded_cycle_goes_to_and_fro_across_one_encoder_step() -> None:
@@ -97,15 +114,168 @@ def test_regions_follow_from_what_the_runs_did(small: str, large: str, region: s
     assert region_of(small, large) == region
 
 
+@pytest.mark.parametrize(
+    ("beta", "verdict", "port"), [(0.45, "active", "device"), (0.55, "passive", "")]
+)
+def test_the_audit_names_the_device_that_has_too_little_damping(
+    beta: float, verdict: str, port: str, tmp_path: Path
+) -> None:
+    scene = load_scene("virtual_wall")
+    make_heavy(scene.model)
+    mujoco.mj_setConst(scene.model, scene.data)
+    knock = np.array([LARGE * RESOLUTION, 0.0, 0.0, 0.0, 0.0, 0.0])
+    device = pressed_device(beta, 0.7, NEVER)
+    coupling = Coupling(STIFFNESS, 0.0, 0.0, 0.0)
+    report = recorded_and_audited(
+        scene, device, coupling, "implicit", PERIOD, 300, tmp_path, knock=knock
+    )
+    assert (report.verdict, report.port) == (verdict, port)
+    assert (report.environment, report.resimulation) == ("strict", "bit for bit")
+    assert report.certified is (beta > 0.5)
+    # already the first swing back carries more than the knock put in
+    assert report.tick == (1 if port else None)
+
+
+@pytest.mark.parametrize(
+    ("small", "large", "region", "size"),
+    [
+        (("cycle", 1.0), ("falls", 50.0), "bounded limit cycle", 1.0),
+        (("rest", 0.0), ("cycle", 7.0), "bounded limit cycle", 7.0),
+        (("rest", 0.0), ("diverges", 99.0), "locally stable", 0.0),
+    ],
+)
+def test_a_cell_tells_the_size_of_the_cycle_that_was_seen(
+    small: tuple[str, float],
+    large: tuple[str, float],
+    region: str,
+    size: float,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    run = settle(1.0, 1.0, 0.0)[2]
+
+    def settled(beta: float, sigma: float, knock: float) -> tuple[str, float, LoopOutcome]:
+        return (*(large if knock else small), run)
+
+    monkeypatch.setattr("hapticbridge.study.maps.device.settle", settled)
+    got = evaluate({"what": "cell", "beta": 1.0, "sigma": 1.0, "damping": 0.0})
+    assert (got["region"], got["cycle"], got["last_range"]) == (region, size, large[1])
+
+
+def cell(beta: float, sigma: float, small: str, large: str, size: float) -> Row:
+    point: Point = {"what": "cell", "beta": beta, "sigma": sigma, "damping": 0.0}
+    return point, {
+        "small": small,
+        "large": large,
+        "region": region_of(small, large),
+        "cycle": size,
+        "last_range": 0.0,
+        "ticks": 6000,
+        "device_energy": 0.0,
+    }
+
+
+def damper(damping: float, needed_shaken: float, needed_at_rest: float) -> Row:
+    point: Point = {"what": "friction", "beta": 0.0, "sigma": 0.0, "damping": damping}
+    return point, {"needed_shaken": needed_shaken, "needed_at_rest": needed_at_rest}
+
+
+CELLS = [
+    cell(0.2, 0.2, "cycle", "diverges", 90.0),  # unstable, as theory says; no bounded cycle
+    cell(0.6, 0.2, "cycle", "diverges", 80.0),  # theory: bounded limit cycle
+    cell(0.9, 0.2, "cycle", "falls", 3.0),
+    cell(0.2, 0.8, "rest", "diverges", 0.0),
+    cell(0.6, 0.8, "rest", "cycle", 7.0),  # theory: passive
+    cell(0.9, 0.8, "rest", "rest", 0.0),
+    cell(0.6, 0.3, "cycle", "cycle", 5.0),
+    cell(0.9, 0.3, "rest", "rest", 0.0),  # theory: bounded limit cycle
+    cell(1.5, 1.6, "rest", "rest", 0.0),
+]
+DAMPERS = [damper(0.0, 0.5, 0.4), damper(1.0, 1.1, 0.6)]  # theory: 0.5 and 1
+
+
+def test_what_is_read_is_what_the_table_says() -> None:
+    found = read(written(CELLS + DAMPERS))
+    regions, friction = found.boundary["regions"], found.boundary["friction"]
+    assert regions["points"] == {
+        "passive": 3,
+        "locally stable": 1,
+        "bounded limit cycle": 3,
+        "unstable": 2,
+    }
+    assert regions["agreement"] == 6 / 9
+    assert regions["measured_edges"] == {
+        "beta": {"last": 0.6, "first": 0.9},
+        "sigma": {"last": 0.3, "first": 0.8},
+    }
+    assert (regions["largest_cycle_steps"], regions["median_cycle_steps"]) == (7.0, 5.0)
+    assert friction["predicted"] == [0.5, 1.0]
+    assert friction["worst_ratio_error"] == pytest.approx(0.1)
+    said = found.paragraph
+    assert "at 67 % of the points: passive 3, locally stable 1, bounded limit cycle 3" in said
+    assert "ends at β = 0.60 to 0.90" in said
+    assert "from σ = 0.30 to 0.80 on" in said
+    assert "the largest bounded limit cycle is 7, the median one 5" in said
+    assert "within 10 %" in said
+    assert "lets it rest from 0.4 to 0.6 K Δ on" in said
+
+
+def test_edges_and_cycles_that_were_not_seen_are_not_told() -> None:
+    found = read(written([CELLS[0], CELLS[3]])).boundary["regions"]
+    assert found["measured_edges"] == {"beta": None, "sigma": {"last": 0.2, "first": 0.8}}
+    assert found["largest_cycle_steps"] is None
+    said = read(written([CELLS[5], CELLS[7]])).paragraph
+    assert "Divergence ends at β = no value here" in said
+    assert "no bounded limit cycle was seen" in said
+
+
+def test_what_failed_is_left_out_and_named() -> None:
+    rows = [(point, "SceneError: no") for point, _ in DAMPERS]
+    found = read(written([*CELLS, *rows]))
+    assert found.boundary["friction"] == {}
+    assert "Friction against the damper: no point could be computed." in found.paragraph
+    found = read(written(DAMPERS))
+    assert found.boundary["regions"] == {}
+    assert found.paragraph.startswith("Regions over β and σ: no point could be computed. With a")
+
+
+def test_a_table_without_a_computed_row_is_refused() -> None:
+    with pytest.raises(StudyError, match="map 'device': the table has no rows"):
+        read(without_rows(written(CELLS)))
+    with pytest.raises(StudyError, match="no point could be computed; first: SceneError: no"):
+        read(written([(point, "SceneError: no") for point, _ in CELLS]))
+
+
+def evaluate_but_no_damper(point: Point) -> dict[str, float | str | bool]:
+    if point["what"] == "friction":
+        raise StudyError("no friction today")
+    return dict(CELLS[5][1])  # type: ignore[arg-type]
+
+
+def test_points_that_fail_say_why_and_do_not_stop_the_map(tmp_path: Path) -> None:
+    broken = replace(DEVICE, evaluate=evaluate_but_no_damper)
+    with ThreadPoolExecutor(1) as executor:
+        files = run_map(broken, tmp_path, points=9, executor=executor)
+    assert files.failed == 3
+    assert "Friction against the damper: no point could be computed" in files.finding.paragraph
+    assert files.table.read_text(encoding="utf-8").count("StudyError: no friction today") == 3
+    assert files.picture.stat().st_size > 10_000
+
+
+def few(count: int) -> list[Point]:
+    """Returns the grid and one damper."""
+    points = DEVICE.points(count)
+    return [point for point in points if point["what"] == "cell"] + [points[-1]]
+
+
 def test_the_map_is_drawn_and_says_what_was_found(tmp_path: Path) -> None:
     with ThreadPoolExecutor(2) as executor:
-        files = run_map(DEVICE, tmp_path, points=16, executor=executor)
+        files = run_map(replace(DEVICE, points=few), tmp_path, points=9, executor=executor)
     assert files.failed == 0
     assert files.picture.stat().st_size > 10_000
     said = files.finding.boundary
-    assert said["agreement"] >= 0.9
+    assert said["regions"]["agreement"] >= 0.9
     for name in ("beta", "sigma"):
-        edge = said["measured_edges"][name]
+        edge = said["regions"]["measured_edges"][name]
         assert edge["last"] < 0.5 < edge["first"]
     assert said["friction"]["shaken"] == pytest.approx(said["friction"]["predicted"], rel=1e-6)
     assert "at 100 % of the points" in files.finding.paragraph

@@ -3,15 +3,24 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import mujoco
 import numpy as np
 import pytest
+from map_runs import NEVER, recorded_and_audited
+from map_tables import Row, without_rows, written
 
+from hapticbridge.device import Hand, Motion, SimulatedDevice
+from hapticbridge.errors import StudyError
 from hapticbridge.scene import load_scene
 from hapticbridge.study.maps.fitting_peg import (
+    DEVICE_DAMPING,
+    PERIOD,
     contact_stiffness_limit,
+    device_and_coupling,
     first_growth,
     is_stable,
     length_limit,
@@ -21,6 +30,7 @@ from hapticbridge.study.maps.fitting_peg import (
 )
 from hapticbridge.study.maps.geometry import GEOMETRY, LENGTH, evaluate, points
 from hapticbridge.study.maps.stability_map import Point, run_map
+from hapticbridge.study.maps.verdicts import MISSING, VERDICTS
 
 
 def test_the_printed_limit_is_its_own_inverse() -> None:
@@ -93,6 +103,145 @@ def test_the_peg_fills_its_hole_and_touches_nothing_else() -> None:
         # each end presses on one wall, by L/2 times the angle
         np.testing.assert_allclose(contacts.dist[deep], -length / 2 * 1e-3, rtol=1e-2)
         assert sorted(np.sign(contacts.pos[deep, 2])) == [-1, -1, 1, 1]
+
+
+@pytest.mark.parametrize(
+    ("method", "share", "port"),
+    [("direct", 1.05, "device"), ("direct", 0.95, ""), ("implicit", 1.05, "")],
+)
+def test_the_audit_of_a_bridge_names_the_device_where_the_peg_is_too_long(
+    method: str, share: float, port: str, tmp_path: Path
+) -> None:
+    stiffness = 1e4
+    length = share * float(length_limit(stiffness))
+    scene = load_scene("planar_peg")
+    set_length(scene.model, length)
+    mujoco.mj_setConst(scene.model, scene.data)
+    scene.reset()
+    device, coupling = device_and_coupling(method, stiffness if method == "direct" else 2.9)
+    # next to no inertia: the damper alone is the worst hand; a feeble hand turns it by 0.01 rad
+    turned = [np.cos(0.005), 0, np.sin(0.005), 0]
+    turning = SimulatedDevice(
+        damping=device.info.damping or 0.0,
+        rotational_inertia=1e-9,
+        rotational_damping=DEVICE_DAMPING,
+        hand=Hand(
+            mass=0,
+            damping=0,
+            stiffness=0,
+            rotational_inertia=0,
+            rotational_damping=0,
+            rotational_stiffness=0.02,
+        ),
+        path=Motion([0, 0.02, 1], np.zeros((3, 3)), np.array([[1, 0, 0, 0], turned, turned])),
+        force_limit=NEVER,
+        torque_limit=NEVER,
+    )
+    report = recorded_and_audited(scene, turning, coupling, method, PERIOD, 200, tmp_path)
+    assert report.resimulation == "bit for bit"
+    assert (report.verdict, report.port) == ("active" if port else "passive", port)
+    if port:
+        # what is left of a step grows by K T/b_θ − 1 = 2 · 1.05² − 1 a tick: tenfold in 12 ticks
+        assert report.tick is not None and 12 < report.tick < 60
+    assert report.environment == "strict"
+
+
+def ran(method: str, length: float, stiffness: float, **other: float | str | bool) -> Row:
+    """Returns a row of a run in which nothing went wrong, but for what is said."""
+    point: Point = {"what": "cell", "method": method, "length": length, "stiffness": stiffness}
+    row: dict[str, float | str | bool] = {"stable": True, "environment": "strict", "created": 0.0}
+    return point, row | {"first_active": -1, "first_growth": -1} | other
+
+
+def limited(method: str, given: float, limit: float) -> Row:
+    """Returns a row of a search, at K_c for ``direct`` and at L behind the coupling."""
+    length, stiffness = (0.0, given) if method == "direct" else (given, 0.0)
+    point: Point = {"what": "limit", "method": method, "length": length, "stiffness": stiffness}
+    return point, {"limit": limit}
+
+
+WRITTEN = [
+    ran("direct", 0.01, 1e4),
+    ran("direct", 0.01, 1e5, stable=False),
+    ran("direct", 0.1, 1e4, environment="active"),
+    ran("direct", 0.1, 1e5, environment="within slack"),
+    ran("implicit", 0.01, 2.0),
+    # 28.284 mm are predicted at 10 kN/m, 282.84 mm at 100 N/m
+    limited("direct", 1e4, 1.1 * 28.284e-3),
+    limited("direct", 100.0, 0.98 * 282.84e-3),
+    limited("implicit", 0.01, 3.06),
+    limited("implicit", 0.05, 2.4),
+    limited("implicit", 0.2, 3.6),
+]
+
+
+def test_boundary_and_paragraph_follow_from_a_made_up_table() -> None:
+    found = GEOMETRY.read(written(WRITTEN))
+    direct, behind = found.boundary["direct"], found.boundary["implicit"]
+    assert direct["contact_stiffness"] == [1e4, 100.0]
+    assert direct["measured_length"] == pytest.approx([0.0311124, 0.2771832])
+    assert direct["predicted_length"] == pytest.approx([0.028284, 0.28284], rel=1e-4)
+    assert direct["largest_deviation"] == pytest.approx(0.1, rel=1e-3)
+    assert behind["length"] == [0.01, 0.05, 0.2]
+    assert behind["predicted_6"] == pytest.approx(3.0)
+    assert behind["largest_deviation"] == pytest.approx(0.2)
+    assert behind["smallest"] == 2.4
+    assert behind["largest"] == 3.6
+    assert behind["largest_over_smallest"] == pytest.approx(1.5)
+    said = found.paragraph
+    assert "up to 277 mm with contacts of 100 N/m and up to 31.1 mm with 1e+04 N/m" in said
+    assert "within 10 % of L = 2 √(b_θ/(T K_c))" in said
+    assert "between 2.4 and 3.6 N m/rad over all lengths" in said
+    left = found.figure.axes[0]
+    cells = np.asarray(left.collections[0].get_array())
+    names = [[VERDICTS[int(number)] for number in row] for row in cells]
+    assert names == [["strict", "active"], ["unstable", "within slack"]]
+
+
+def as_if(point: Point, failing: str) -> dict[str, float | str | bool]:
+    """Returns a row that was written by hand, but fails for a method."""
+    if point["method"] == failing:
+        raise StudyError("not today")
+    for at, got in WRITTEN:
+        if at["what"] == point["what"] and not isinstance(got, str):
+            return dict(got)
+    raise AssertionError
+
+
+@pytest.mark.parametrize("method", ["direct", "implicit"])
+def test_a_method_that_fails_is_named_and_the_other_is_drawn(method: str, tmp_path: Path) -> None:
+    half = [at for at in points(32) if at["method"] == method]
+    with ThreadPoolExecutor(1) as executor:
+        files = run_map(
+            replace(GEOMETRY, evaluate=partial(as_if, failing=method)),
+            tmp_path,
+            points=32,
+            executor=executor,
+        )
+    assert files.failed == len(half)
+    assert files.table.read_text(encoding="utf-8").count("StudyError: not today") == len(half)
+    where = {"direct": "Rendered directly", "implicit": "Behind the coupling"}
+    for name, words in where.items():
+        assert (f"{words}, {MISSING}" in files.finding.paragraph) == (name == method)
+    assert "nan" not in files.finding.paragraph
+    texts = [[text.get_text() for text in axes.texts] for axes in files.finding.figure.axes[:2]]
+    assert texts == [[MISSING] if name == method else [] for name in where]
+
+
+def test_a_search_without_an_end_is_no_limit() -> None:
+    rows = [limited("implicit", 0.1, 0.0), limited("implicit", 0.2, float("inf"))]
+    found = GEOMETRY.read(written(rows))
+    assert found.boundary["implicit"]["largest_over_smallest"] is None
+    assert found.paragraph.endswith("Behind the coupling, no limit was found.")
+    mixed = GEOMETRY.read(written([*rows, limited("implicit", 0.3, 3.0)]))
+    assert mixed.boundary["implicit"]["largest_over_smallest"] == 1.0
+
+
+def test_a_table_without_a_computed_row_is_refused() -> None:
+    with pytest.raises(StudyError, match="map 'geometry': no point could be computed; first: E"):
+        GEOMETRY.read(written([(point, "E") for point, _ in WRITTEN]))
+    with pytest.raises(StudyError, match="map 'geometry': the table has no rows"):
+        GEOMETRY.read(without_rows(written(WRITTEN)))
 
 
 def test_the_map_says_what_its_table_holds(tmp_path: Path) -> None:

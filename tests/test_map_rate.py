@@ -3,23 +3,39 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import pytest
+from map_runs import NEVER, recorded_and_audited
+from map_tables import Row, without_rows, written
 
-from hapticbridge.study.closed_loop import Timing
-from hapticbridge.study.maps.rate import (
+from hapticbridge.coupling import Coupling
+from hapticbridge.device import SimulatedDevice
+from hapticbridge.errors import StudyError
+from hapticbridge.passivity import SampledLoop, WorstHand
+from hapticbridge.scene import Scene, load_scene
+from hapticbridge.study.closed_loop import PARTS, Timing
+from hapticbridge.study.maps.rate import RATE, read
+from hapticbridge.study.maps.rate_runs import (
     DAMPING,
+    DELAYS,
     DEVICE_DAMPING,
-    RATE,
+    KNOCK,
+    SEARCHED,
+    SEEDS,
+    TICKS,
     UNEVEN_PERIOD,
     evaluate,
     finite_hand,
+    make_heavy,
+    unevenness,
     wall_limit,
     worst_hand,
 )
-from hapticbridge.study.maps.stability_map import run_map
+from hapticbridge.study.maps.stability_map import Point, run_map
 
 
 @pytest.mark.parametrize("period", [1e-4, 1e-3, 5e-3])
@@ -35,6 +51,13 @@ def test_the_worst_hand_is_unstable_above_the_bound_and_stable_below(
     assert failed.environment == "strict"
     assert delay > 0 or failed.device_energy > 0
     assert worst_hand(0.98 * limit, period, delay).is_stable
+
+
+@pytest.mark.parametrize("delay", range(DELAYS))
+def test_a_wall_far_too_stiff_is_unstable_too(delay: int) -> None:
+    # there the worst hand swings once in hundreds of ticks
+    for stiffness in (3 * wall_limit(5e-3, delay), SEARCHED[1]):
+        assert not worst_hand(stiffness, 5e-3, delay).is_stable
 
 
 def test_without_delay_the_bound_is_that_of_the_paper_and_doubles_with_the_rate() -> None:
@@ -71,6 +94,22 @@ def test_half_of_all_ticks_lost_costs_a_free_device_two_thirds_of_its_stiffness(
     assert finite_hand("ordinary hand", 0.97 * full, lost).is_stable
 
 
+def test_uneven_ticks_are_told_by_three_periods_and_an_ordinary_hand_bears_more() -> None:
+    told = unevenness([1e-3, 1e-3, 2e-3])
+    assert told == pytest.approx({"mean": 4e-3 / 3, "longest": 2e-3, "balanced": 6e-3 / 4})
+    point: Point = {"what": "drops", "hand": "no hand", "period": 1e-3, "delay": 0, "share": 0.5}
+    found = evaluate(point)
+    # geometric gaps: E[T] = T/(1 − p), E[T²]/E[T] = T (1 + p)/(1 − p)
+    assert found["mean"] == pytest.approx(2e-3, rel=0.05)
+    assert found["balanced"] == pytest.approx(3e-3, rel=0.05)
+    held = evaluate(point | {"hand": "ordinary hand"})
+    assert float(held["limit"]) > 3 * float(
+        found["limit"]
+    )  # an ordinary hand takes its share of the energy
+    longest = max(Timing(drops=0.5, seed=s).intervals(TICKS).max() for s in range(SEEDS))
+    assert found["longest"] == pytest.approx(1e-3 * longest / PARTS)
+
+
 @pytest.mark.parametrize("hand", ["no hand", "ordinary hand"])
 @pytest.mark.parametrize("timing", [Timing(jitter=0.9, seed=2), Timing(drops=0.3, seed=2)])
 def test_below_the_bound_at_the_longest_interval_nothing_fails(hand: str, timing: Timing) -> None:
@@ -78,9 +117,154 @@ def test_below_the_bound_at_the_longest_interval_nothing_fails(hand: str, timing
     assert finite_hand(hand, 0.98 * 2 * DEVICE_DAMPING / longest, timing).is_stable
 
 
+def wall() -> Scene:
+    scene = load_scene("virtual_wall")
+    make_heavy(scene.model)
+    mujoco.mj_setConst(scene.model, scene.data)
+    return scene
+
+
+def test_the_audit_names_the_device_where_the_wall_is_too_stiff(tmp_path: Path) -> None:
+    period = 1e-3
+    for share, name in ((1.05, "beyond"), (0.95, "safe")):
+        coupling = Coupling(share * wall_limit(period, 0), DAMPING, 0.0, 0.0)
+        loop = SampledLoop(coupling, period)
+        frequency = loop.worst_frequency()
+        hand = WorstHand(DEVICE_DAMPING, frequency, period, complex(loop.response(frequency)))
+        device = SimulatedDevice(
+            damping=DEVICE_DAMPING, hand=hand, force_limit=NEVER, torque_limit=NEVER
+        )
+        report = recorded_and_audited(
+            wall(), device, coupling, "implicit", period, 200, tmp_path, knock=KNOCK, name=name
+        )
+        assert report.resimulation == "bit for bit"
+        assert report.environment == "strict"  # the wall itself gives nothing
+        if name == "beyond":
+            assert (report.verdict, report.port, report.certified) == ("active", "device", False)
+            assert report.tick is not None and 0 < report.tick < 100
+        else:
+            assert (report.verdict, report.port, report.certified) == ("passive", "", True)
+
+
+def even(period: float, delay: int, limit: float) -> Row:
+    point: Point = {"what": "delay", "hand": "worst hand", "period": period, "delay": delay}
+    return point | {"share": 0.0}, {"limit": limit} | unevenness([period])
+
+
+def uneven(what: str, hand: str, share: float, limit: float) -> Row:
+    point: Point = {"what": what, "hand": hand, "period": UNEVEN_PERIOD, "delay": 0}
+    told = {"mean": 1e-3, "balanced": (1 + share) * 1e-3, "longest": 4e-3}
+    return point | {"share": share}, {"limit": limit} | told
+
+
+FULL = [
+    even(1e-3, 0, 1.1 * wall_limit(1e-3, 0)),
+    even(2e-3, 0, 1.1 * wall_limit(1e-3, 0)),  # as if the limit did not depend on T
+    even(1e-3, 5, 0.98 * wall_limit(1e-3, 5)),
+    even(2e-3, 5, 0.49 * wall_limit(1e-3, 5)),
+    *(
+        uneven(what, "no hand", share, 4000 - 2000 * share)
+        for what in ("jitter", "drops")
+        for share in (0.0, 0.5)
+    ),
+    *(
+        uneven(what, "ordinary hand", share, 12_000 - 6000 * share)
+        for what in ("jitter", "drops")
+        for share in (0.0, 0.5)
+    ),
+]
+
+
+def test_what_is_read_is_what_the_table_says() -> None:
+    found = read(written(FULL))
+    none, five = (found.boundary["by_delay"][delay] for delay in ("0", "5"))
+    assert none["worst_ratio_error"] == pytest.approx(1.2, rel=1e-4)
+    assert none["slope"] == pytest.approx(0, abs=1e-9)
+    assert five["worst_ratio_error"] == pytest.approx(0.02, rel=1e-2)
+    assert five["slope"] == pytest.approx(-1, abs=1e-9)
+    for mine in found.boundary["uneven"].values():
+        free = mine["no hand"]
+        assert free["share"] == [0.0, 0.5]
+        assert free["measured"] == [4000, 3000]
+        assert free["at_mean"] == pytest.approx([4000, 4000])
+        assert free["at_balanced"] == pytest.approx([4000, 4000 / 1.5])
+        assert free["at_longest"] == pytest.approx([1000, 1000])
+    said = found.paragraph
+    assert "within 1.2e+02 % of the bound" in said
+    assert "T = 1 to 2 ms" in said
+    assert "to the power 0.000" in said or "to the power -0.000" in said
+    assert said.count("at 0.5 a free device keeps 75 % of its stiffness (3000 N/m)") == 2
+    assert said.count("2b ΣT/ΣT² = 2667 by the balance of energy, 4000 at the mean") == 2
+    assert said.count("and 1000 at the longest") == 2
+    assert said.count("an ordinary hand is stable up to 9000 N/m") == 2
+    assert "Delay of 1, 2, 3, 4 samples: no point could be computed" in said
+
+
+def test_what_failed_is_left_out_and_named() -> None:
+    rows = [
+        (point, "SceneError: no")
+        if point["what"] == "jitter" or point["hand"] == "no hand"
+        else (point, got)
+        for point, got in FULL
+    ]
+    found = read(written([row for row in rows if row[0]["delay"] != 5]))
+    assert set(found.boundary["by_delay"]) == {"0"}
+    assert found.boundary["uneven"]["jitter"] == {}
+    assert set(found.boundary["uneven"]["drops"]) == {"ordinary hand"}
+    said = found.paragraph
+    assert "Delay of 1, 2, 3, 4, 5 samples: no point could be computed" in said
+    assert "share of T: no hand: no point could be computed; ordinary hand: no point" in said
+    assert "lost: no hand: no point could be computed; an ordinary hand is stable up to" in said
+    only = read(written([row for row in FULL if row[0]["what"] == "jitter"]))
+    assert only.boundary["by_delay"] == {}
+    assert only.paragraph.startswith("Even ticks: no point could be computed")
+
+
+def test_a_search_without_an_end_is_no_comparison() -> None:
+    ends = [even(1e-3, 0, 0.0), even(2e-3, 0, float("inf"))]
+    found = read(written([*ends, uneven("drops", "no hand", 0, 0.0)]))
+    assert found.boundary["by_delay"]["0"]["slope"] is None
+    some = read(written([*ends, even(1e-3, 0, 700.0), even(4e-3, 0, 175.0)]))
+    assert some.boundary["by_delay"]["0"]["slope"] == pytest.approx(-1)
+    assert "a free device bears (0 N/m)" in found.paragraph
+
+
+def test_a_table_without_a_computed_row_is_refused() -> None:
+    with pytest.raises(StudyError, match="map 'rate': the table has no rows"):
+        read(without_rows(written(FULL)))
+    with pytest.raises(StudyError, match="no point could be computed; first: SceneError: no"):
+        read(written([(point, "SceneError: no") for point, _ in FULL]))
+
+
+def evaluate_but_not_jitter(point: Point) -> dict[str, float]:
+    if point["what"] == "jitter":
+        raise StudyError("no jitter today")
+    return {"limit": 1000.0} | unevenness([float(point["period"])])
+
+
+def test_points_that_fail_say_why_and_do_not_stop_the_map(tmp_path: Path) -> None:
+    broken = replace(RATE, evaluate=evaluate_but_not_jitter)
+    with ThreadPoolExecutor(1) as executor:
+        files = run_map(broken, tmp_path, points=20, executor=executor)
+    assert files.failed == 4
+    assert "share of T: no hand: no point could be computed" in files.finding.paragraph
+    assert files.table.read_text(encoding="utf-8").count("StudyError: no jitter today") == 4
+    assert files.picture.stat().st_size > 10_000
+
+
+def few(count: int) -> list[Point]:
+    """Returns the shortest and the longest delay, and free devices that lose ticks."""
+    return [
+        point
+        for point in RATE.points(count)
+        if (point["hand"] == "worst hand" and point["delay"] in {0, 5})
+        or (point["hand"] == "no hand" and point["what"] == "drops")
+    ]
+
+
 def test_the_map_is_drawn_and_says_what_was_found(tmp_path: Path) -> None:
     with ThreadPoolExecutor(2) as executor:
-        files = run_map(RATE, tmp_path, points=20, executor=executor)
+        files = run_map(replace(RATE, points=few), tmp_path, points=20, executor=executor)
     assert files.failed == 0
     assert files.picture.stat().st_size > 10_000
     for mine in files.finding.boundary["by_delay"].values():

@@ -2,29 +2,39 @@
 
 from __future__ import annotations
 
+import warnings
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from map_runs import NEVER, recorded_and_audited
+from map_tables import Row, without_rows, written
 
+from hapticbridge.coupling import Coupling
+from hapticbridge.device import Motion, TrajectoryDevice
 from hapticbridge.errors import StudyError
 from hapticbridge.mechanics import ImpactBody
+from hapticbridge.scene import Scene
 from hapticbridge.study.maps.falling_rod import (
     APPROACH,
     INERTIA,
     LENGTH,
     MASS,
+    ROD,
+    SETTINGS,
     TIP,
     drop,
     restitution_of,
 )
 from hapticbridge.study.maps.restitution import RESTITUTION, RESTITUTION_LAWS, evaluate, points
+from hapticbridge.study.maps.rigs import scene_of
 from hapticbridge.study.maps.stability_map import Point, run_map
+from hapticbridge.study.maps.verdicts import MISSING
 from hapticbridge.study.sweep import sweep
-from hapticbridge.study.table import Outcome, table_of
 
 GAINING: Point = {
     "setting": "bouncy, implicitfast",
@@ -109,33 +119,134 @@ def test_an_unknown_setting_is_refused_with_the_choices() -> None:
         drop("rubber", 1.0, 0.5, 0.0)
 
 
+def falling_rod(setting: str, angle: float) -> Scene:
+    """Loads the rod of the map just above the floor, sliding and falling, with a grip."""
+    chosen = SETTINGS[setting]
+    height = float(LENGTH / 2 * np.sin(angle) + TIP + APPROACH * chosen.timestep / 2)
+    solref, impedance = (" ".join(map(repr, pair)) for pair in (chosen.solref, chosen.impedance))
+    contact = f'<geom solref="{solref}" solimp="{impedance} 0.001" friction="0.75 0 0"/>'
+    start = f'qpos="0 {height!r} {-angle!r}" qvel="0.8 {-APPROACH!r} 0"'
+    text = ROD.replace("<worldbody>", f"<default>{contact}</default><worldbody>")
+    text = text.replace("</body>", '<site name="grip"/></body>')
+    return scene_of(
+        text.replace("</mujoco>", f'<keyframe><key name="home" {start}/></keyframe></mujoco>')
+    )
+
+
+@pytest.mark.parametrize(
+    ("setting", "angle", "verdict"),
+    [
+        ("hard spring", 1.2, "active"),
+        ("hard spring", 1.3, "passive"),
+        ("bouncy, implicitfast", 1.1, "active"),
+        ("bouncy, implicitfast", 1.2, "passive"),
+        ("scenes", 1.2, "passive"),
+    ],
+)
+def test_the_audit_of_a_bridge_names_the_step_at_which_the_contact_gains(
+    setting: str, angle: float, verdict: str, tmp_path: Path
+) -> None:
+    still = Motion([0.0, 1.0], np.zeros((2, 3)))
+    device = TrajectoryDevice(still, force_limit=NEVER, torque_limit=NEVER, speed_limit=NEVER)
+    weak = Coupling(1e-3, 0.0, 1e-3, 0.0)  # a hand that hardly holds: next to no slack
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=".*the contact of geom 'tip'")
+        report = recorded_and_audited(
+            falling_rod(setting, angle),
+            device,
+            weak,
+            SETTINGS[setting].integrator.replace("discrete", "implicit"),
+            SETTINGS[setting].timestep,
+            100,
+            tmp_path,
+        )
+    mapped = drop(setting, angle, 0.75, 0.8)
+    assert report.resimulation == "bit for bit"
+    assert report.verdict == verdict
+    assert (mapped.energy_change > 0) == (verdict == "active")
+    if verdict == "active":
+        # steps are counted from 1, ticks from 0
+        assert (report.tick, report.port) == (mapped.first_gain - 1, "environment")
+    else:
+        assert mapped.first_gain == -1
+
+
+def dropped(setting: str, angle: float, **got: float) -> Row:
+    """Returns a row in which MuJoCo is a little nearer to Newton than to the others."""
+    point: Point = {"setting": setting, "friction": 0.75, "slide": 0.8, "angle": angle}
+    usual: dict[str, float] = {
+        "inelastic": -0.3,
+        "newton": -0.19,
+        "poisson": -0.2,
+        "stronge": -0.25,
+        "energy_change": -0.1,
+        "restitution": 0.5,
+        "own_restitution": 0.6,
+        "first_gain": -1,
+    }
+    return point, usual | got
+
+
 def test_a_law_is_named_only_with_a_lead_and_the_share_that_gained_is_counted() -> None:
-    given: list[Point] = []
-    done = []
-    for setting, newton, first_gain in (("scenes", -0.19, -1), ("hard spring", -0.11, 4)):
-        for row in range(4):
-            given.append({"setting": setting, "friction": 0.75, "slide": 0.8, "angle": 0.1 + row})
-            values = {"inelastic": -0.3, "newton": newton, "poisson": -0.2, "stronge": -0.25}
-            done.append(
-                Outcome(
-                    values
-                    | {
-                        "energy_change": -0.1,
-                        "restitution": 0.5,
-                        "own_restitution": 0.6 + 0.01 * row,
-                        "first_gain": first_gain if row == 0 else -1,
-                    }
-                )
-            )
-    finding = RESTITUTION.read(table_of(given, done))
+    rows = [dropped("scenes", 0.1 + i, own_restitution=0.6 + 0.01 * i) for i in range(4)]
+    rows += [dropped("hard spring", 0.1 + i, newton=-0.11) for i in range(3)]
+    rows += [dropped("hard spring", 3.1, newton=-0.11, energy_change=-0.02, first_gain=4)]
+    rows += [dropped("soft", 0.1, energy_change=-0.31), dropped("soft", 0.2, energy_change=0.04)]
+    finding = RESTITUTION.read(written(rows))
     found = finding.boundary["settings"]
     assert found["scenes"]["nearest_law"] is None  # 0.09 against 0.10 is no lead
+    assert found["scenes"]["restitution"] == 0.5
+    assert found["scenes"]["largest_energy_change"] == -0.1
+    assert found["scenes"]["largest_by_newton"] == -0.19
+    assert found["scenes"]["rms_distance_to_law"] == pytest.approx(
+        {"inelastic": 0.2, "newton": 0.09, "poisson": 0.1, "stronge": 0.15}
+    )
     assert found["hard spring"]["nearest_law"] == "newton"
     assert found["hard spring"]["share_that_gained"] == 0.25
     assert found["scenes"]["share_that_gained"] == 0.0
-    assert "nearest by more than 20 % is none in 1, Newton in 1" in finding.paragraph
-    assert "largest e of a slanted rod is 0.63" in finding.paragraph
+    # √((0.01² + 0.34²)/2): the root of the mean of squares, not the mean of distances
+    soft = found["soft"]
+    assert soft["rms_distance_to_law"]["inelastic"] == pytest.approx(0.24052, rel=1e-4)
+    assert soft["at_the_largest"] == {"angle": 0.2, "friction": 0.75, "slide": 0.8}
+    assert "nearest by more than 20 % is none in 2, Newton in 1" in finding.paragraph
+    assert "largest e of a slanted rod is 0.63, with 'scenes'" in finding.paragraph
     assert "by -0.11 J at most, with 'hard spring'" in finding.paragraph
+    assert "Kinetic energy is created with 'soft' up to +0.04 J." in finding.paragraph
+    assert "are 90 to 1.5e+02 mJ away (RMS), e = 0 2e+02 mJ" in finding.paragraph
+
+
+def as_if(point: Point) -> dict[str, float]:
+    """Returns a drop without a gain, but fails with two contact settings."""
+    if point["setting"] in ("scenes", "soft"):
+        raise StudyError("not today")
+    got = dropped("bouncy", 1.0)[1]
+    assert not isinstance(got, str)
+    return {name: float(value) for name, value in got.items()}
+
+
+def test_settings_that_fail_say_why_and_the_others_are_drawn(tmp_path: Path) -> None:
+    broken = replace(RESTITUTION, evaluate=as_if)
+    with ThreadPoolExecutor(1) as executor:
+        files = run_map(broken, tmp_path, points=210, executor=executor)
+    assert files.failed == 2 * 2 * 15
+    assert files.table.read_text(encoding="utf-8").count("StudyError: not today") == files.failed
+    said = files.finding.paragraph
+    assert said.startswith(f"With 'scenes', 'soft' {MISSING}. Of the 5 settings")
+    assert said.endswith("No setting created kinetic energy.")
+    assert "nan" not in said
+    texts = [[text.get_text() for text in axes.texts] for axes in files.finding.figure.axes[:2]]
+    assert texts == [[MISSING], []]
+    (legend,) = files.finding.figure.legends
+    names = [text.get_text() for text in legend.get_texts()]
+    assert names == ["any law, e = 0", "Newton", "Poisson", "Stronge", "MuJoCo"]
+
+
+def test_a_table_without_a_computed_row_is_refused() -> None:
+    point, got = dropped("soft", 1.0)
+    with pytest.raises(StudyError, match="map 'restitution': no point could be computed; first: E"):
+        RESTITUTION.read(written([(point, "E")]))
+    with pytest.raises(StudyError, match="map 'restitution': the table has no rows"):
+        RESTITUTION.read(without_rows(written([(point, got)])))
 
 
 def test_the_map_says_what_its_table_holds(tmp_path: Path) -> None:

@@ -2,17 +2,33 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from map_runs import NEVER, recorded_and_audited
+from map_tables import Row, without_rows, written
 
-from hapticbridge.study.maps.rotation import ROTATION, evaluate, points
-from hapticbridge.study.maps.spinning_tool import coupling_of, speed_of_cut, spin, sudden
+from hapticbridge.device import Motion, TrajectoryDevice
+from hapticbridge.errors import StudyError
+from hapticbridge.study.maps.rotation import ROTATION
+from hapticbridge.study.maps.rotation_picture import HIGHEST
+from hapticbridge.study.maps.rotation_runs import evaluate, points
+from hapticbridge.study.maps.spinning_tool import (
+    coupling_of,
+    speed_of_cut,
+    spin,
+    spinning_scene,
+    sudden,
+    turning,
+)
 from hapticbridge.study.maps.stability_map import Point, run_map
 from hapticbridge.study.maps.tumbling import (
     INERTIA,
+    MIDDLE,
     OBLIQUE,
     PERIOD,
     TICKS,
@@ -20,7 +36,7 @@ from hapticbridge.study.maps.tumbling import (
     free_creation,
     gyroscopic_speed,
 )
-from hapticbridge.study.table import Outcome, table_of
+from hapticbridge.study.maps.verdicts import MISSING
 
 SOFT = 2.0
 
@@ -108,6 +124,31 @@ def test_explicit_creates_energy_at_the_cut_and_implicit_does_not() -> None:
     assert explicit.first_active >= 0
 
 
+@pytest.mark.parametrize(
+    ("method", "share", "port"),
+    [("explicit", 1.02, "environment"), ("explicit", 0.98, ""), ("implicit", 1.02, "")],
+)
+def test_the_audit_of_a_bridge_names_the_tick_at_which_the_angle_passes_pi(
+    method: str, share: float, port: str, tmp_path: Path
+) -> None:
+    speed = share * cut_speed(SOFT)
+    path = Motion(
+        PERIOD * np.arange(TICKS + 1), np.zeros((TICKS + 1, 3)), turning(speed, axis=MIDDLE)
+    )
+    device = TrajectoryDevice(path, force_limit=NEVER, torque_limit=NEVER, speed_limit=NEVER)
+    report = recorded_and_audited(
+        spinning_scene(), device, coupling_of(SOFT), method, PERIOD, 200, tmp_path
+    )
+    assert report.resimulation == "bit for bit"
+    assert (report.verdict, report.port) == ("active" if port else "passive", port)
+    mapped = sudden(method, SOFT, speed)
+    assert (mapped.crossed >= 0) == (share > 1)
+    # the trajectory's first sample is where it starts, the map's is a tick later
+    assert report.tick == (mapped.first_active + 1 if port else None)
+    if port:
+        assert mapped.first_active == mapped.crossed
+
+
 def test_the_map_says_what_its_table_holds(tmp_path: Path) -> None:
     with ThreadPoolExecutor(1) as executor:
         files = run_map(ROTATION, tmp_path, points=120, executor=executor)
@@ -121,14 +162,28 @@ def test_the_map_says_what_its_table_holds(tmp_path: Path) -> None:
     assert files.picture.stat().st_size > 10_000
 
 
+GOOD: dict[str, float | int | bool | str] = {
+    "ticks": TICKS,
+    "environment": "strict",
+    "created": 0.0,
+    "crossed": -1,
+    "torque_jump": 0.1,
+}
+
+
+def row(
+    what: str,
+    method: str,
+    stiffness: float,
+    speed: float,
+    got: Mapping[str, float | int | bool | str],
+) -> Row:
+    """Returns a row of the map's table."""
+    point: Point = {"what": what, "method": method, "rotational_stiffness": stiffness}
+    return point | {"speed": speed, "angle": 0.0}, got
+
+
 def test_boundary_and_paragraph_follow_from_a_made_up_table() -> None:
-    good: dict[str, float | int | bool | str] = {
-        "ticks": TICKS,
-        "environment": "strict",
-        "created": 0.0,
-        "crossed": -1,
-        "torque_jump": 0.1,
-    }
     runs: list[tuple[str, str, float, float, dict[str, float | str]]] = [
         ("cell", "implicit", SOFT, 0.0, {}),
         ("cell", "implicit", SOFT, 20.0, {}),
@@ -144,9 +199,7 @@ def test_boundary_and_paragraph_follow_from_a_made_up_table() -> None:
         ("cut", "implicit", SOFT, 80.0, {"crossed": 5, "torque_jump": 12.0, "created": 0.5}),
         ("cut", "implicit", SOFT, 50.0, {"torque_jump": 99.0, "created": 9.0}),
     ]
-    names = ("what", "method", "rotational_stiffness", "speed", "angle")
-    given: list[Point] = [dict(zip(names, (*run[:4], 0.0), strict=True)) for run in runs]
-    finding = ROTATION.read(table_of(given, [Outcome(good | run[4]) for run in runs]))
+    finding = ROTATION.read(written([row(*run[:4], GOOD | run[4]) for run in runs]))
     found = finding.boundary
     assert found["fastest_passive"]["implicit"] == 40.0
     assert found["fastest_passive"]["explicit"] is None
@@ -155,13 +208,85 @@ def test_boundary_and_paragraph_follow_from_a_made_up_table() -> None:
     assert found["translation_only"]["grows_up_to"] == 40.0
     assert found["cut"]["torque_jump"] == 12.0
     assert found["cut"]["created"] == 0.5
+    jumps = found["cut"]["largest_torque_jump"]
+    assert jumps == dict.fromkeys(jumps) | {"implicit": 99.0}
+    told = found["translation_only"]
+    assert told["speed"] == [20.0, 40.0, 60.0]
+    assert told["predicted"] == pytest.approx([free_creation(v) for v in (20.0, 40.0, 60.0)])
+    # ½T²|ω × Iω|²/I is 0.5 % of the tool's energy at 20 rad/s, too much of it at 60 rad/s
+    assert told["compared_up_to"] < 60.0
+    assert told["largest_deviation"] == pytest.approx(0.1)
+    assert found["cut"]["speed_measured"] is None
     said = finding.paragraph
     assert "'implicit' is passive, strictly or within its slack, at every angle up to 40" in said
     assert "strict in 75 % of its runs below 64.4 rad/s" in said
     assert "its angle first passes π at 100 rad/s" in said
     assert "and more the faster up to 40 rad/s" in said
     assert "'weld': no point could be computed" in said
+    assert "torque of 'implicit' flips by 12 N m within a tick, and it creates 0.5 J" in said
+    assert "A sudden turn" not in said
+    assert "gains of a 'weld'" not in said
 
 
 def test_the_grid_has_about_as_many_points_as_asked() -> None:
     assert 1200 < len(points(ROTATION.default_points)) < 1800
+
+
+def test_a_jump_beyond_the_axes_is_marked_and_its_size_told() -> None:
+    jumps = {20.0: 0.5, 100.0: 7e4, 150.0: 9e4}
+    rows = [row("cut", "weld", SOFT, v, GOOD | {"torque_jump": j}) for v, j in jumps.items()]
+    finding = ROTATION.read(written(rows))
+    assert "its torque jumps by up to 9e+04 N m" in finding.paragraph
+    assert finding.boundary["cut"]["largest_torque_jump"]["weld"] == 9e4
+    axes = next(a for a in finding.figure.axes if "sudden" in a.get_xlabel())
+    (marks,) = [line for line in axes.lines if line.get_marker() == "^"]
+    assert list(np.asarray(marks.get_xdata())) == [100.0, 150.0]
+    assert np.all(np.asarray(marks.get_ydata()) < HIGHEST)
+    (line,) = [line for line in axes.lines if "weld" in str(line.get_label())]
+    assert "to 9e+04" in str(line.get_label())
+    np.testing.assert_array_equal(line.get_ydata(), [0.5, np.nan, np.nan])
+
+
+def as_if(point: Point) -> dict[str, float | int | bool | str]:
+    """Returns a run in which nothing went wrong, but fails for every cell of two methods."""
+    if point["what"] == "cell" and point["method"] in ("implicit", "weld"):
+        raise StudyError("not today")
+    return {"limit": 73.7} if point["what"] == "limit" else dict(GOOD)
+
+
+def test_points_that_fail_say_why_and_do_not_stop_the_map(tmp_path: Path) -> None:
+    with ThreadPoolExecutor(1) as executor:
+        files = run_map(replace(ROTATION, evaluate=as_if), tmp_path, points=40, executor=executor)
+    cells = [at for at in points(40) if at["what"] == "cell"]
+    assert files.failed == len(cells) / 2
+    said = files.table.read_text(encoding="utf-8")
+    assert said.count("StudyError: not today") == files.failed
+    texts = {axes.get_title(): len(axes.texts) for axes in files.finding.figure.axes[:4]}
+    assert texts == {"implicit": 1, "implicitfast": 0, "explicit": 0, "weld": 1}
+    for method, count in texts.items():
+        assert (f"'{method}': {MISSING}" in files.finding.paragraph) == bool(count)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("method", "implicit"), ("what", "line"), ("what", "cut"), ("what", "limit")],
+)
+def test_a_group_that_fails_is_named(name: str, value: str) -> None:
+    rows: list[Row] = []
+    for point in points(40):
+        found = {"limit": 73.7} if point["what"] == "limit" else GOOD
+        rows.append((point, "StudyError: not today" if point[name] == value else found))
+    said = ROTATION.read(written(rows)).paragraph
+    assert "nan" not in said
+    assert (f"'implicit': {MISSING}" in said) == (value == "implicit")
+    assert (f"In translation alone {MISSING}" in said) == (value in ("line", "implicit"))
+    assert (f"Of sudden turns {MISSING}" in said) == (value == "cut")
+    assert ("passes the cut at π at 73.7 rad/s" in said) == (value in ("line", "cut"))
+
+
+def test_a_table_without_a_computed_row_is_refused() -> None:
+    rows: list[Row] = [(row("cell", "implicit", SOFT, 1.0, {})[0], "SceneError: no")]
+    with pytest.raises(StudyError, match="map 'rotation': no point could be computed; first: Sc"):
+        ROTATION.read(written(rows))
+    with pytest.raises(StudyError, match="map 'rotation': the table has no rows"):
+        ROTATION.read(without_rows(written(rows)))

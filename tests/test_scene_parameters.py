@@ -113,6 +113,26 @@ def test_a_number_of_the_scene_is_offset_plus_factor_times_value(
     assert model.body("tool").mass[0] == pytest.approx(0.3 - 10.0 * value, rel=1e-9)
 
 
+SLIDE = '{ kind = "joint", name = "slide", field = "stiffness", index = 0'
+
+
+@pytest.mark.parametrize(
+    ("values", "stiffness"),
+    [({}, 20.0), ({"gap": 0.1}, 90.0), ({"less": 0.01}, 40.0), ({"gap": 0.1, "less": 0.01}, 110.0)],
+)
+def test_a_number_that_several_parameters_set_is_the_sum_of_what_they_say(
+    tmp_path: Path, values: dict[str, float], stiffness: float
+) -> None:
+    path = scene_with(
+        tmp_path,
+        table(SLIDE + ", factor = 1000.0 }", default="0.03")
+        + table(SLIDE + ", offset = 20, factor = -1000.0 }", name="less", default="0.03"),
+    )
+    scene = load_scene(path, "grip", **values)
+    assert scene.model.joint("slide").stiffness[0] == pytest.approx(stiffness, rel=1e-12)
+    assert scene.parameters == {"gap": 0.03, "less": 0.03} | values
+
+
 @each_parameter
 def test_a_shipped_default_gives_the_scene_of_the_file(name: str, parameter: Parameter) -> None:
     plain, asked = load_scene(name), load_scene(name, "grip", **{parameter.name: parameter.default})
@@ -122,8 +142,11 @@ def test_a_shipped_default_gives_the_scene_of_the_file(name: str, parameter: Par
         "geom_size",
         "geom_friction",
         "body_pos",
+        "body_mass",
         "body_inertia",
         "mesh_vert",
+        "dof_frictionloss",
+        "jnt_stiffness",
     ):
         assert getattr(asked.model, field) == pytest.approx(
             getattr(plain.model, field), rel=1e-9, abs=1e-12
@@ -201,13 +224,12 @@ def test_what_is_no_number_is_refused() -> None:
         assert "must be a number" in refusal("peg_in_hole", clearance=value)  # type: ignore[arg-type]
 
 
-def test_an_unknown_name_is_told_what_exists() -> None:
+def test_an_unknown_name_is_told_what_exists(tmp_path: Path) -> None:
     message = refusal("peg_in_hole", clearence=1e-4)
     assert "no parameter 'clearence'" in message
     assert "clearance (5e-05 to 0.001 m, default 0.0002)" in message
-    assert refusal("point_mass", mass=1.0) == (
-        "scene 'point_mass' has no parameters, so 'mass' cannot be set"
-    )
+    path = scene_with(tmp_path, "")
+    assert refusal(path, mass=1.0) == "scene 'bench' has no parameters, so 'mass' cannot be set"
 
 
 @pytest.mark.parametrize(
@@ -232,8 +254,9 @@ def test_an_unknown_name_is_told_what_exists() -> None:
         (table(WALLS.replace("index = 0", "index = 3")), "not a number of the scene"),
         (table(WALLS.replace("index = 0, ", "")), "not a number of the scene"),
         (table(WALLS.replace("0.03", "0.031")), "to 0.051 by default"),
-        (table(f"{WALLS}, {WALLS}"), "both set pos[0] of geom 'wall_0'"),
-        (table() + table(name="other"), "'gap' and 'other' both set pos[0] of geom 'wall_0'"),
+        (table(f"{WALLS}, {WALLS}"), "sets pos[0] of geom 'wall_0' twice"),
+        (table() + table(name="other"), "'gap' and 'other' together set pos[0] of geom 'wall_0'"),
+        (table() + table(name="other"), "to 0.1 by default, where the scene's file has 0.05"),
     ],
 )
 def test_a_file_of_parameters_that_does_not_fit_is_refused_in_a_sentence(
@@ -273,7 +296,7 @@ def test_values_used_are_recorded_and_the_run_is_simulated_again_with_them(
     assert main(["run", "peg_in_hole", *words, "--record", str(file)]) == 0
     recording = hb.read_recording(file)
     used = json.loads(recording.meta["scene_parameters"])
-    assert used == {"clearance": 0.1e-3, "friction": 0.3}
+    assert used == {"clearance": 0.1e-3, "friction": 0.3, "mass": 0.1}
     report = hb.audit(file)
     assert (report.verdict, report.resimulation) == ("passive", "bit for bit")
     # the walls of the recorded model stand where the clearance puts them, and the peg felt them

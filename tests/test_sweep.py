@@ -6,6 +6,7 @@ import concurrent.futures
 import csv
 import functools
 import math
+import os
 import sys
 from collections.abc import Callable
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
@@ -19,10 +20,12 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from sweep_runs import POINTS, Inline, computed, serial
 
+from hapticbridge.errors import StudyError
 from hapticbridge.study.points import grid, plain, point_key
 from hapticbridge.study.results import ResultFolder
 from hapticbridge.study.sweep import sweep
 from hapticbridge.study.table import Outcome
+from hapticbridge.study.workers import cores
 
 
 def test_the_table_holds_what_a_plain_loop_gives() -> None:
@@ -39,6 +42,30 @@ def test_the_table_holds_what_a_plain_loop_gives() -> None:
         assert table["needed"][row] == expected["needed"]
         assert table["verdict"][row] == expected["verdict"]
         np.testing.assert_equal(table["limit"][row], expected["limit"])
+
+
+def test_own_processes_get_one_blas_thread_each_unless_the_user_says_otherwise(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.delenv("OPENBLAS_NUM_THREADS", raising=False)
+    alone = sweep(functions.blas_threads, grid(n=[0]))
+    assert alone["asked"][0] == "1"
+    assert "OPENBLAS_NUM_THREADS" not in os.environ
+    monkeypatch.setenv("OPENBLAS_NUM_THREADS", "2")
+    told = sweep(functions.blas_threads, grid(n=[0]))
+    assert told["asked"][0] == "2"
+    assert os.environ["OPENBLAS_NUM_THREADS"] == "2"
+    if alone["threads"][0] and cores() > 1:
+        assert alone["threads"][0] < told["threads"][0]
+
+
+def test_a_result_that_no_point_gave_is_missing_or_empty() -> None:
+    table = serial()
+    assert np.isnan(table.numbers("mass")).all()
+    assert list(table.texts("verdict")) == list(table["verdict"])
+    assert list(table.texts("colour")) == [""] * len(table)
+    with pytest.raises(StudyError, match="no column 'colour'"):
+        table["colour"]
 
 
 def test_every_executor_gives_the_same_bits(tmp_path: Path) -> None:

@@ -12,7 +12,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticbridge.audit.device_port import (
+    burnt_by_damping,
+    kept_behind_a_law,
+    passed_shares,
+    ramp_share,
+)
 from hapticbridge.kernel.state import RunParameters
+from hapticbridge.tick import TickFlag
 
 Array = NDArray[np.float64]
 
@@ -54,6 +61,17 @@ def turns(values: Array, start: Array) -> Array:
     return turn_between(np.concatenate([start[None], values[:-1]]), values)
 
 
+def product_conjugate(values: Array, start: Array) -> Array:
+    """Returns q_k ⊗ q_{k−1}⁻¹ over rows (n, 4), with q_{−1} = start."""
+    return quaternion_product(values, conjugate(np.concatenate([start[None], values[:-1]])))
+
+
+def rotate(q: Array, v: Array) -> Array:
+    """Returns R(q) v over rows, q (n, 4) and v (n, 3)."""
+    pure = np.concatenate([np.zeros((len(v), 1)), v], axis=1)
+    return quaternion_product(quaternion_product(q, pure), conjugate(q))[:, 1:]
+
+
 @dataclass(frozen=True, slots=True)
 class Balance:
     """What the recorded poses and wrenches say by themselves.
@@ -71,8 +89,8 @@ class Balance:
         device_throughput: The same with absolute values.
         environment_energy: S_k − S_start − works, with ``coupling_work`` from here, (n,) in J.
         slack: Σ ½‖δx‖²_{K+B/T} + ½‖δφ‖²_{K_r+B_r/T}, (n,) in J.
-        kicked: What the device was given beyond what its damping burns and the scene gave up, (n,)
-            in J; zero where a coupling law stands between, or the damping is unknown.
+        kicked: What the device was given beyond what its damping burns and scene and coupling
+            give up, (n,) in J; zero for an unknown damping, or several laws a tick.
     """
 
     wrench_on_tool: Array
@@ -119,12 +137,26 @@ class Balance:
             handle_turn - tool_turn
         )
 
+        is_midpoint = (ticks["flags"] & int(TickFlag.MIDPOINT)) != 0
+        if np.any(is_midpoint):
+            # the turn that takes the tool from the tick before to this one carries what was then
+            carried = product_conjugate(ticks["tool_quaternion"], tool_start[3:])
+            before = turn_between(tool_start[3:], handle_start[3:])
+            spring = 0.5 * (twist + rotate(carried, np.vstack([before[None], twist[:-1]])))
+            midway = 0.5 * (handle_turn + rotate(carried, handle_turn)) - tool_turn
+            rate = coupling.rotational_damping / period + 0.5 * coupling.rotational_stiffness
+            midpoint = coupling.rotational_stiffness * spring + rate * midway
+            torque = np.where(is_midpoint[:, None], midpoint, torque)
+
         recorded = ticks["wrench_on_tool"]
         law = np.concatenate([force, torque], axis=1)
         if not parameters.has_law or parameters.laws > 1:
             law = recorded
-        work = np.sum(recorded[:, :3] * tool_step, axis=1)
-        work += np.sum(recorded[:, 3:] * tool_turn, axis=1)
+        works = (
+            np.sum(recorded[:, :3] * tool_step, axis=1),
+            np.sum(recorded[:, 3:] * tool_turn, axis=1),
+        )
+        work = works[0] + works[1]
         # over several laws a tick the work is a sum that their mean does not tell
         coupling_work = ticks["coupling_work"] if parameters.laws > 1 else np.cumsum(work)
 
@@ -140,6 +172,17 @@ class Balance:
 
         position, orientation = _handle(ticks, parameters)
         stored = ticks["kinetic"] + ticks["potential"] - start_energy
+        created = stored - coupling_work - ticks["actuator_work"] - ticks["external_work"]
+        kept = coupling_work  # without a law, all that the scene took up
+        if parameters.has_law:
+            kept = kept_behind_a_law(
+                parameters,
+                stretch=(stretch, twist),
+                stretched=(handle_step - tool_step, handle_turn - tool_turn),
+                work=works,
+                passed=passed_shares(ticks, parameters),
+                since_start=since_start(ticks, resumed),
+            )
         linear, angular = _slack_gains(parameters)
         slack = 0.5 * linear * np.sum(tool_step**2, axis=1)
         slack += 0.5 * angular * np.sum(tool_turn**2, axis=1)
@@ -154,18 +197,9 @@ class Balance:
             throughput=np.cumsum(np.abs(work)),
             device_energy=np.cumsum(device_work),
             device_throughput=np.cumsum(np.abs(device_work)),
-            environment_energy=stored
-            - coupling_work
-            - ticks["actuator_work"]
-            - ticks["external_work"],
+            environment_energy=created,
             slack=np.cumsum(slack),
-            kicked=_kicked(
-                ticks,
-                parameters,
-                np.cumsum(device_work),
-                stored - ticks["actuator_work"] - ticks["external_work"],
-                resumed,
-            ),
+            kicked=_kicked(ticks, parameters, np.cumsum(device_work), created, kept, resumed),
         )
 
 
@@ -187,26 +221,22 @@ def _kicked(
     ticks: NDArray[np.void],
     parameters: RunParameters,
     given: Array,
-    gained: Array,
+    created: Array,
+    kept: Array,
     resumed: Array,
 ) -> Array:
-    """Returns Σ w·δp − Σ b‖δp‖²/t + (S − S_start − works), the last in the device's scale.
-
-    t is the time between two samples, T at least: a damper that moves by δp within t burns no less
-    than at constant speed, and a missed deadline makes t longer. A jump before the first tick or in
-    a pause burns nothing: it took an unknown time.
-    """
-    if parameters.has_law or parameters.device_damping is None:
+    """Returns Σ w·δp − Σ b‖δp‖²/t + Σ E_k + what was kept, the last two in the device's scale."""
+    if parameters.device_damping is None or (parameters.has_law and parameters.laws > 1):
         return np.zeros(len(ticks))
     start = np.array(parameters.device_start)
-    moved = steps(ticks["device_position"], start[:3])
-    turned = turns(ticks["device_quaternion"], start[3:])
-    burnt = parameters.device_damping * np.sum(moved**2, axis=1)
-    burnt += (parameters.device_rotational_damping or 0.0) * np.sum(turned**2, axis=1)
-    burnt = np.where(since_start(ticks, resumed) > 0, burnt, 0.0)
-    interval = np.maximum(np.diff(ticks["read_ns"], prepend=0) * 1e-9, parameters.period)
-    ratio = parameters.force_scale / parameters.scale
-    return np.asarray(given - np.cumsum(burnt / interval) + ratio * gained)
+    burnt = burnt_by_damping(
+        parameters,
+        steps(ticks["device_position"], start[:3]),
+        turns(ticks["device_quaternion"], start[3:]),
+        np.diff(ticks["read_ns"], prepend=0) * 1e-9,
+        since_start(ticks, resumed) > 0,
+    )
+    return np.asarray(given - burnt + parameters.force_scale / parameters.scale * (created + kept))
 
 
 def _handle(ticks: NDArray[np.void], parameters: RunParameters) -> tuple[Array, Array]:
@@ -239,5 +269,5 @@ def _guarded(ticks: NDArray[np.void], parameters: RunParameters, resumed: Array)
     for vector, limit in ((force, parameters.force_limit), (torque, parameters.torque_limit)):
         norm = np.linalg.norm(vector, axis=1, keepdims=True)
         limited.append(vector * np.where(norm > limit, limit / np.maximum(norm, 1e-300), 1.0))
-    ramp = np.minimum((since_start(ticks, resumed) + 1.0) / (parameters.ramp_ticks + 1.0), 1.0)
+    ramp = ramp_share(parameters, since_start(ticks, resumed))
     return np.concatenate(limited, axis=1) * ramp[:, None]

@@ -37,7 +37,7 @@ class AuditReport:
             unknown or its motion is prescribed.
         reason: The verdict in a sentence.
         tick: First tick at fault, or None.
-        port: The port or field at fault.
+        port: The port at fault, ``environment`` or ``device``, or the field.
         joules: Energy at fault: created beyond what is allowed, or the mismatch.
         slack_share: Largest share of the slack that was used, 0 if strict.
         resimulation: ``bit for bit``, ``within 1e-9 (other processor)``, ``disagrees`` or ``not
@@ -92,7 +92,9 @@ def audit(path: str | Path, *, strict: bool = False) -> AuditReport:
 
     Structure (checksums, schema, contiguous ticks, finite numbers, digest), the wrench against the
     coupling law, energies recomputed from poses and wrenches, the device condition, and, where the
-    versions match, a re-simulation that must agree bit for bit.
+    versions match, a re-simulation that must agree bit for bit. Unless the device condition proves
+    the device's port, it is judged by what happened: the verdict is ``active`` from the tick on at
+    which the device was given more than its damping burns and scene and coupling give up.
 
     Args:
         path: The recording.
@@ -112,6 +114,11 @@ def audit(path: str | Path, *, strict: bool = False) -> AuditReport:
     try:
         parameters = parameters_of(recording.meta)
         info, method = _device_and_method(recording, parameters)
+        parameters = replace(
+            parameters,
+            device_damping=info.damping,
+            device_rotational_damping=info.rotational_damping,
+        )
         facts |= _device_facts(info, parameters, method)
     except RecordingError as error:
         return _invalid(facts, Fault(str(error)))
@@ -235,7 +242,9 @@ def _judged(facts: dict[str, Any], balance: Balance, *, strict: bool) -> AuditRe
     unstrict = created > rounding
     active = created > balance.slack + rounding
     share = float(np.max(np.where(unstrict, created / (balance.slack + rounding), 0.0)))
-    kicked = balance.kicked > rounding
+    # a device that meets its condition needs no watch behind a coupling law: that is the proof
+    is_watched = facts["certified"] is not True
+    kicked = is_watched & (balance.kicked > rounding)
     if kicked.any() and not (active & (np.arange(len(active)) <= np.argmax(kicked))).any():
         tick = int(np.argmax(kicked))
         excess = float(balance.kicked[tick])
@@ -244,7 +253,7 @@ def _judged(facts: dict[str, Any], balance: Balance, *, strict: bool) -> AuditRe
             verdict="active",
             environment="within slack" if unstrict.any() else "strict",
             reason=f"from tick {tick} the device is given {excess:.3g} J more than its damping "
-            "burns and the scene gives up",
+            "burns and scene and coupling give up",
             tick=tick,
             port="device",
             joules=excess,

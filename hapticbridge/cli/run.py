@@ -55,10 +55,12 @@ class Run:
     """Replace the recording if the file exists."""
     method: str = IMPLICIT.name
     """How the tool is rendered: 'implicit' (the coupling inside MuJoCo's implicit step),
+    'compensated' (the same, with the damping that the step adds taken off the coupling's),
+    'lossless' (half inside the step, half carried over: second order away from contact),
     'implicitfast' or 'implicitfast:compensated' (the same actuators under that integrator, with K T
     more damping), 'explicit', 'explicit:implicitfast' or 'explicit:rk4' (applied as a force and
     held, under Euler or the integrator named), 'weld' (MuJoCo's weld constraint), 'direct' (a tool
-    without mass, no coupling). All but the first exist to be compared."""
+    without mass, no coupling). All but the first three exist to be compared."""
     contact_stiffness: float | None = None
     """Stiffness per contact in N/m of method 'direct'; by default that of the coupling."""
     i_know: bool = False
@@ -147,8 +149,10 @@ class Run:
         """Returns the default coupling with what the user asked for put in its place."""
         asked = {field.name: getattr(self, field.name) for field in fields(Coupling)}
         given = {name: value for name, value in asked.items() if value is not None}
-        laws = method_named(self.method).laws(self.substeps)
-        return replace(default_coupling(info, period_of(self.rate), *scales, laws), **given)
+        method = method_named(self.method)
+        laws = method.laws(self.substeps)
+        default = default_coupling(info, period_of(self.rate), *scales, laws, method)
+        return replace(default, **given)
 
 
 def _announce(bridge: Bridge, scales: tuple[float, float]) -> None:
@@ -162,11 +166,22 @@ def _announce(bridge: Bridge, scales: tuple[float, float]) -> None:
     )
     if bridge.method != IMPLICIT:
         err.print(f"method {bridge.method.name}: {escape(bridge.method.about)}")
-        err.print(f"[yellow]warning:[/yellow] {escape(bridge.method.hazard)}")
+        if bridge.method.hazard:
+            err.print(f"[yellow]warning:[/yellow] {escape(bridge.method.hazard)}")
+    felt = bridge.rendered
+    if not (
+        math.isclose(felt.damping, coupling.damping)
+        and math.isclose(felt.rotational_damping, coupling.rotational_damping)
+    ):
+        err.print(
+            f"[yellow]warning:[/yellow] what is felt is B = {felt.damping:g} N s/m, "
+            f"B_r = {felt.rotational_damping:g} N m s/rad: method {bridge.method.name} cannot show "
+            "less damping at this stiffness and rate; lower the stiffness or raise the rate"
+        )
     if not bridge.method.has_law:
         return  # told when the scene is prepared and the weld measured: ``_announce_measured``
     conditions = device_conditions(
-        bridge.device.info, coupling, bridge.period, *scales, bridge.laws
+        bridge.device.info, bridge.used, bridge.period, *scales, bridge.laws
     )
     for condition in conditions:
         if not condition.holds:

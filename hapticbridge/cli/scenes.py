@@ -29,22 +29,24 @@ class Scenes:
         """Prints the table; returns the exit code."""
         if self.scene is not None:
             return _show(self.scene)
-        table = Table(
-            "scene", "moving bodies", "degrees of freedom", "about", box=None, pad_edge=False
-        )
+        table = Table("scene", "about", "parameters", box=None, pad_edge=False)
         for name in scene_names():
-            model = load_scene(name).model
-            moving = int((model.body_dofnum > 0).sum())
-            table.add_row(name, str(moving), str(model.nv), _about(model))
+            settable = ", ".join(p.name for p in scene_parameters(scene_path(name)))
+            table.add_row(name, _about(load_scene(name).model), settable)
         out.print(table)
+        out.print("next: hapticbridge scenes NAME (its parameters), hapticbridge run NAME")
         return 0
 
 
 def _show(scene: str) -> int:
     """Prints what one scene is and what can be set in it."""
     path = scene_path(scene)
-    sentence, parameters = _about(load_scene(path).model), scene_parameters(path)
+    model, parameters = load_scene(path).model, scene_parameters(path)
+    sentence, moving = _about(model), int((model.body_dofnum > 0).sum())
     out.print(f"[bold]{plain(path.stem)}[/bold]" + (f": {plain(sentence)}" if sentence else ""))
+    bodies = "body" if moving == 1 else "bodies"
+    freedom = "degree" if model.nv == 1 else "degrees"
+    out.print(f"{moving} moving {bodies}, {model.nv} {freedom} of freedom; {plain(str(path))}")
     if not parameters:
         out.print("no parameters")
         return 0
@@ -59,6 +61,8 @@ def _show(scene: str) -> int:
             plain(parameter.about),
         )
     out.print(table)
+    first, asked = parameters[0], plain(scene)
+    out.print(f"next: hapticbridge run {asked} --set {first.name}={first.minimum:g}")
     return 0
 
 

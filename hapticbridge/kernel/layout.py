@@ -57,10 +57,27 @@ _POINTERS = (
     "tool_map",
     "tool_qpos",
     "geom_is_tool",
+    "qfrc_written",
+    "qfrc_passive",
+    "gainprm",
+    "biasprm",
+    "geom_in_tree",
+    "joint_in_tree",
+    "dof_in_tree",
+    "last_written",
+    "carried_force",
+    "velocity",
+    "half_step",
+    "bias_at_u",
+    "bias_at_v",
+    "generalised",
+    "kept",
+    "wrench_buffer",
 )
 
 _COUNTS = (
     "nv",
+    "njnt",
     "nbody",
     "ngeom",
     "nmocap",
@@ -79,6 +96,10 @@ _COUNTS = (
     "handle_mocap_id",
     "handle_site_id",
     "grip_site_id",
+    "grip_body_id",
+    "has_law",
+    "has_passive",
+    "is_never_free",
     "weld_id",
     "tool_map_size",
     "watches_device",
@@ -116,6 +137,10 @@ _RUNNING_COUNTS = (
     "ramp_start",
     "flags",
     "mocap_has_moved",
+    "active_contacts",
+    "is_midpoint",
+    "is_held",
+    "hold",
     "equality_rows",
     "first_unstrict",
     "first_active",
@@ -130,6 +155,7 @@ _RUNNING = (
     "actuator_work",
     "external_work",
     "environment_energy",
+    "lossless_debt",
     "device_energy",
     "device_burnt",
     "throughput",
@@ -151,7 +177,7 @@ STATE_DTYPE = np.dtype(
     ]
     + [(f"{name}_position", "<f8", 3) for name in _POSES]
     + [(f"{name}_quaternion", "<f8", 4) for name in _POSES]
-    + [("handle_step", "<f8", 3), ("handle_turn", "<f8", 3)]
+    + [("handle_step", "<f8", 3), ("handle_turn", "<f8", 3), ("twist", "<f8", 3)]
     + [(name, "<f8", 6) for name in ("wrench_on_tool", "motion", "wrench_on_device")]
     + [(name, "<i8") for name in _RUNNING_COUNTS]
     + [(name, "<f8") for name in _RUNNING]

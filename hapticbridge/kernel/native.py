@@ -48,6 +48,18 @@ mj_make_m: Any = types.ExternalFunction("mj_makeM", _ON_DATA)
 mj_energy_pos: Any = types.ExternalFunction("mj_energyPos", _ON_DATA)
 mj_energy_vel: Any = types.ExternalFunction("mj_energyVel", _ON_DATA)
 mj_make_constraint: Any = types.ExternalFunction("mj_makeConstraint", _ON_DATA)
+mj_com_vel: Any = types.ExternalFunction("mj_comVel", _ON_DATA)
+mj_factor_m: Any = types.ExternalFunction("mj_factorM", _ON_DATA)
+mj_passive: Any = types.ExternalFunction("mj_passive", _ON_DATA)
+mj_rne: Any = types.ExternalFunction(
+    "mj_rne", types.void(_ADDRESS, _ADDRESS, types.int32, _ADDRESS)
+)
+mj_mul_m: Any = types.ExternalFunction(
+    "mj_mulM", types.void(_ADDRESS, _ADDRESS, _ADDRESS, _ADDRESS)
+)
+mj_solve_m: Any = types.ExternalFunction(
+    "mj_solveM", types.void(_ADDRESS, _ADDRESS, _ADDRESS, _ADDRESS, types.int32)
+)
 mj_apply_ft: Any = types.ExternalFunction(
     "mj_applyFT",
     types.void(_ADDRESS, _ADDRESS, _ADDRESS, _ADDRESS, _ADDRESS, types.int32, _ADDRESS),

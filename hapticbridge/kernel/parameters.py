@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from hapticbridge.arguments import Arguments
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import HapticBridgeError
-from hapticbridge.kernel.scheme import COUPLED, DIRECT, HELD, WELD
+from hapticbridge.kernel.scheme import COUPLED, DIRECT, HELD, LOSSLESS, WELD
 
 SLACK_SHARE = 0.5
 """Share of ½‖δx_i‖²_{K + nB/T} that counts as slack where n > 1 laws are computed in a tick; no
@@ -50,7 +50,7 @@ class RunParameters:
         device_origin: Device pose (x, y, z, qw, qx, qy, qz) that maps to ``handle_origin``.
         handle_origin: Handle pose of the same form, in the scene.
         device_start: Device pose of the same form before the first tick.
-        scheme: How the wrench reaches the tool, one of ``kernel.scheme``'s four.
+        scheme: How the wrench reaches the tool, one of ``kernel.scheme``'s five.
         felt: The coupling that the tool is really held by, where it is not ``coupling`` (a weld);
             the device condition is judged by it.
         contact_stiffness: K_c in N/m per contact of a tool without mass, > 0 for it, else 0.
@@ -88,8 +88,8 @@ class RunParameters:
             value = getattr(self, name)
             if not math.isfinite(value) or value <= 0:
                 raise HapticBridgeError(f"{name} is {value!r}; it must be finite and > 0")
-        if self.scheme not in (COUPLED, HELD, WELD, DIRECT):
-            raise HapticBridgeError(f"scheme is {self.scheme!r}; it must be 0 to 3")
+        if self.scheme not in (COUPLED, HELD, WELD, DIRECT, LOSSLESS):
+            raise HapticBridgeError(f"scheme is {self.scheme!r}; it must be 0 to 4")
         stiffness = self.contact_stiffness
         if (
             not math.isfinite(stiffness)
@@ -104,6 +104,11 @@ class RunParameters:
             raise HapticBridgeError(
                 f"substeps is {self.substeps!r}; a tool without mass has no motion to divide, so "
                 "it must be 1"
+            )
+        if self.scheme == LOSSLESS and self.substeps != 1:
+            raise HapticBridgeError(
+                f"substeps is {self.substeps!r}; a lossless coupling carries half of a tick's "
+                "wrench over to the next, so it must be 1"
             )
         if self.ramp_ticks < 0:
             raise HapticBridgeError(f"ramp_ticks is {self.ramp_ticks}; it must be >= 0")
@@ -131,7 +136,7 @@ class RunParameters:
     @property
     def has_law(self) -> bool:
         """Whether the coupling law gives the wrench."""
-        return self.scheme in (COUPLED, HELD)
+        return self.scheme in (COUPLED, HELD, LOSSLESS)
 
     def slack_gains(self) -> tuple[float, float]:
         """Returns gain g in N/m and its rotational counterpart in N m/rad: slack = Σ ½ g ‖δx_k‖².

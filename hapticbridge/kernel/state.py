@@ -10,10 +10,12 @@ from hapticbridge.kernel import native
 from hapticbridge.kernel.direct import balance_contacts, tool_map
 from hapticbridge.kernel.handle import handle_pose
 from hapticbridge.kernel.layout import STATE_DTYPE
+from hapticbridge.kernel.lossless import start_twist
 from hapticbridge.kernel.meter import refresh_energies
 from hapticbridge.kernel.parameters import RunParameters as RunParameters  # noqa: PLC0414
 from hapticbridge.kernel.parameters import rotation_numbers as rotation_numbers  # noqa: PLC0414
-from hapticbridge.kernel.scheme import DIRECT, WELD
+from hapticbridge.kernel.scheme import DIRECT, LOSSLESS, WELD
+from hapticbridge.kernel.tree import has_passive_forces, tree_of_tool
 from hapticbridge.tick import TICK_DTYPE
 
 HANDLE = "handle"
@@ -82,8 +84,11 @@ class Binding:
         state["device_rotational_damping"] = parameters.device_rotational_damping or 0.0
         state["watches_device"] = not parameters.has_law and parameters.device_damping is not None
         state["weld_id"] = model.equality(WELD_NAME).id if parameters.scheme == WELD else -1
+        state["has_law"] = parameters.has_law
         if parameters.scheme == DIRECT:
             self._bind_massless(model)
+        if parameters.scheme == LOSSLESS:
+            self._bind_lossless(model)
         state["axes"] = parameters.axes
         quaternion = np.zeros(4)
         mujoco.mju_mat2Quat(quaternion, np.asarray(parameters.axes, dtype=np.float64))
@@ -108,6 +113,34 @@ class Binding:
         self._owned |= owned
         self.state["tool_map_size"] = numbers.size
 
+    def _bind_lossless(self, model: mujoco.MjModel) -> None:
+        state, nv = self.state, max(model.nv, 1)
+        body = int(model.site_bodyid[int(state["grip_site_id"][0])])
+        tree = tree_of_tool(model, body)
+        owned: dict[str, NDArray[np.generic]] = {
+            "geom_in_tree": np.ascontiguousarray(tree.geoms, dtype=np.int32),
+            "joint_in_tree": np.ascontiguousarray(tree.joints, dtype=np.int32),
+            "dof_in_tree": np.ascontiguousarray(tree.dofs, dtype=np.int32),
+            "wrench_buffer": np.zeros(6),
+        }
+        names = "last_written carried_force velocity half_step bias_at_u bias_at_v generalised kept"
+        owned |= {name: np.zeros(nv) for name in names.split()}
+        # what the user applies is kept apart from what is written for MuJoCo
+        users = np.zeros(nv)
+        users[: model.nv] = self._data.qfrc_applied
+        owned["qfrc_applied"] = users
+        owned["last_written"][:] = users
+        for name, array in owned.items():
+            state[name] = array.ctypes.data
+        self._owned |= owned
+        state["qfrc_written"] = self._data.qfrc_applied.ctypes.data
+        state["qfrc_passive"] = self._data.qfrc_passive.ctypes.data
+        state["gainprm"] = model.actuator_gainprm.ctypes.data
+        state["biasprm"] = model.actuator_biasprm.ctypes.data
+        state["njnt"], state["grip_body_id"] = model.njnt, body
+        state["is_never_free"] = tree.is_never_free
+        state["has_passive"] = has_passive_forces(model)
+
     def _start(self, model: mujoco.MjModel, data: mujoco.MjData, parameters: RunParameters) -> None:
         state = self.state
         mujoco.mj_kinematics(model, data)
@@ -131,6 +164,8 @@ class Binding:
         else:
             refresh_energies(state)
         state["start_energy"] = state["kinetic"] + state["potential"]
+        if parameters.scheme == LOSSLESS:
+            start_twist(state)
 
 
 def _bind_addresses(

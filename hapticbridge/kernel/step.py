@@ -21,13 +21,14 @@ from hapticbridge.kernel.handle import (
     store_vector,
     vector_of,
 )
+from hapticbridge.kernel.lossless import apply_carried
 from hapticbridge.kernel.meter import (
     add_coupling_work,
     judge_environment,
 )
 from hapticbridge.kernel.native import floats, ints, mj_fwd_position, mj_step
 from hapticbridge.kernel.ports import meter_ports, note_moved_mocap_bodies
-from hapticbridge.kernel.scheme import DIRECT, HELD
+from hapticbridge.kernel.scheme import DIRECT, HELD, LOSSLESS
 from hapticbridge.kernel.wrench import render, wrench_of_step
 from hapticbridge.pose import (
     add,
@@ -44,7 +45,7 @@ from hapticbridge.pose import (
 )
 
 # flags as plain integers: the compiler cannot read an enumeration
-CONTACT, TRIP = 64, 512
+CONTACT, TRIP, MIDPOINT = 64, 512, 1024
 
 OK, BAD_SAMPLE, BAD_RESULT = 0, 1, 2
 """What a kernel function returns: go on, the device's sample is not finite, the simulation's
@@ -78,6 +79,8 @@ def _show_handle(state: NDArray[np.void], substep: int) -> None:
         store_vector(ctrl[0:3], rotated(to_handle, (w[0], w[1], w[2])))
         store_vector(ctrl[3:6], rotated(to_handle, (w[3], w[4], w[5])))
         return
+    if s.scheme == LOSSLESS:
+        apply_carried(state)
     rate = 1.0 / s.period
     store_vector(ctrl[0:3], scaled(rate, rotated(to_handle, vector_of(s.handle_step))))
     store_vector(ctrl[3:6], scaled(rate, rotated(to_handle, vector_of(s.handle_turn))))
@@ -174,7 +177,7 @@ def _record(state: NDArray[np.void], row: NDArray[np.void]) -> None:
     """Copies what the tick computed into its record."""
     s, r = state[0], row[0]
     r.flags = s.flags
-    r.contacts = ints(s.ncon, 1)[0]
+    r.contacts = s.active_contacts
     # without islands MuJoCo counts its iterations as those of island 0
     islands = max(ints(s.nisland, 1)[0], 1)
     iterations = ints(s.solver_niter, min(islands, 20))
@@ -209,6 +212,7 @@ def after_step(state: NDArray[np.void], row: NDArray[np.void], substep: int) -> 
     is_last = substep + 1 == s.substeps
     if s.laws == 1 and not is_last:
         return OK
+    was_midpoint = s.is_midpoint != 0
     force, torque, moved, turned = wrench_of_step(state, substep, is_last)
     add_coupling_work(state, force, torque, moved, turned)
     if s.laws > 1:
@@ -227,7 +231,7 @@ def after_step(state: NDArray[np.void], row: NDArray[np.void], substep: int) -> 
     if not is_last:
         return OK
     judge_environment(state, moved, turned)
-    s.flags = 0
+    s.flags = MIDPOINT if was_midpoint else 0
     square = dot(force, force) + dot(torque, torque)
     # MuJoCo ignores a control beyond its limit, so a wrench that is to be applied must stay below
     if not math.isfinite(square + s.environment_energy) or (
@@ -238,7 +242,9 @@ def after_step(state: NDArray[np.void], row: NDArray[np.void], substep: int) -> 
             s.wrench_on_device[i] = 0.0
         return BAD_RESULT
     render(state, force, torque)
-    if ints(s.ncon, 1)[0] > 0:
+    if s.scheme != LOSSLESS:  # there a contact may be near without a force
+        s.active_contacts = ints(s.ncon, 1)[0]
+    if s.active_contacts > 0:
         s.flags |= CONTACT
     s.peak_force = max(s.peak_force, norm(force))
     s.peak_torque = max(s.peak_torque, norm(torque))

@@ -14,9 +14,10 @@ from hapticbridge.kernel.handle import (
     store_vector,
     vector_of,
 )
+from hapticbridge.kernel.lossless import finish_lossless, implicit_half, is_near
 from hapticbridge.kernel.meter import refresh_energies, refresh_grip
 from hapticbridge.kernel.native import floats
-from hapticbridge.kernel.scheme import DIRECT, HELD, WELD
+from hapticbridge.kernel.scheme import DIRECT, LOSSLESS, WELD
 from hapticbridge.kernel.weld import weld_wrench
 from hapticbridge.pose import (
     Quaternion,
@@ -77,8 +78,13 @@ def wrench_of_step(
     Brings the tool's pose and, at the end of the tick, the energies up to date on the way.
     """
     s = state[0]
-    applied = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
-    if s.scheme == WELD:
+    applied = half = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    near = False
+    if s.scheme == LOSSLESS:  # while everything is still as the step had it
+        near = is_near(state)
+        if s.is_midpoint:
+            half = implicit_half(state)
+    elif s.scheme == WELD:
         applied = weld_wrench(state)  # in the Jacobians of the step's start, as the step had them
     elif s.scheme == DIRECT:
         applied = balance_contacts(state)
@@ -92,11 +98,16 @@ def wrench_of_step(
     orientation = canonical(quaternion_of(floats(s.site_xquat + 32 * grip, 4)))
     moved = subtract(position, vector_of(s.tool_position))
     turned = rotation_between(quaternion_of(s.tool_quaternion), orientation)
-    if s.scheme <= HELD:
+    if s.has_law:
         handle = (vector_of(s.handle_position), quaternion_of(s.handle_quaternion))
         if not is_last:
             handle = _handle_in_scene(state)
         applied = _law(state, handle, (position, orientation), moved, turned)
+        if s.scheme == LOSSLESS:
+            torque = finish_lossless(
+                state, applied[0], applied[1], half, near, orientation, moved, turned
+            )
+            applied = applied[0], torque
     store_vector(s.tool_position, position)
     store_quaternion(s.tool_quaternion, orientation)
     return applied[0], applied[1], moved, turned

@@ -65,6 +65,7 @@ class Scene:
 
     _spec: mujoco.MjSpec | None = None
     _is_claimed: bool = False
+    _reach: float = 0.0
 
     def claim(self) -> None:
         """Reserves the scene for one bridge: two would move the same tool.
@@ -118,6 +119,17 @@ class Scene:
         if substeps < 1:
             raise SceneError(f"substeps is {substeps}; it must be 1 or more")
         self.model.opt.timestep = period / substeps
+
+    def set_reach(self, distance: float) -> None:
+        """Lets MuJoCo find contacts, without a force, from a distance in m before they touch.
+
+        It is added to the gaps that the scene's file gives.
+        """
+        if distance == self._reach:
+            return
+        self.model.geom_gap += distance - self._reach
+        self.model.pair_gap += distance - self._reach
+        self._reach = distance
 
     def set_coupling(self, coupling: Coupling) -> None:
         """Sets the gains of the coupling's actuators; needs no compilation."""
@@ -215,7 +227,12 @@ def read_scene(path_or_name: str | Path, **parameters: float) -> SceneSource:
 
 
 def compile_scene(
-    source: SceneSource, grip: str = "grip", *, warns: bool = True, stacklevel: int = 2
+    source: SceneSource,
+    grip: str = "grip",
+    *,
+    warns: bool = True,
+    checks_start: bool = True,
+    stacklevel: int = 2,
 ) -> Scene:
     """Puts handle and coupling into a scene that was read, and compiles it.
 
@@ -224,6 +241,8 @@ def compile_scene(
             it is.
         grip: Name of the site on the tool.
         warns: Whether to say what will run otherwise than the file says.
+        checks_start: Whether to refuse a start that no hand should feel: inside something, or not
+            finite.
         stacklevel: Whose line the warnings name.
 
     Raises:
@@ -244,7 +263,8 @@ def compile_scene(
         scene.reset()
     except (ValueError, OSError, MemoryError, mujoco.FatalError) as error:
         raise SceneError(f"cannot compile scene '{path}': {_sentence(error)}") from None
-    check_start(model, scene.data, grip)
+    if checks_start:
+        check_start(model, scene.data, grip)
     if warns:
         for concern in concerns:
             warnings.warn(f"scene '{path}': {concern}", UserWarning, stacklevel=stacklevel)

@@ -18,7 +18,9 @@ number is, and which numbers of the MJCF follow from it:
 in the units of the MJCF. ``name`` may hold ``*``, ``?`` and ``[]`` and then means every element
 that fits; ``index`` is left out where the field is a single number. The default must give what the
 MJCF says, so that the file alone, opened in any viewer, is the scene that runs by default; what is
-not set stays as the file says, to the bit. No two parameters may set the same number.
+not set stays as the file says, to the bit. Where several parameters set the same number, it is the
+sum of what each says: a torque at which a nut breaks away, less the one with which it runs, is what
+its clamp holds.
 """
 
 from __future__ import annotations

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
@@ -50,19 +51,16 @@ def apply_parameters(
     known = {parameter.name: parameter for parameter in scene_parameters(scene)}
     for name, value in values.items():
         _check_value(scene.stem, name, value, known)
-    owners: dict[tuple[str, str, str, int | None], str] = {}
+    used = {name: float(values.get(name, p.default)) for name, p in known.items()}
+    places: dict[tuple[str, str, str, int | None], _Place] = {}
     for parameter in known.values():
         for setting in parameter.sets:
             for element in _elements(spec, setting, parameter.name):
-                place = setting.kind, str(element.name), setting.field, setting.index
-                if place in owners:
-                    raise SceneError(
-                        f"parameters '{owners[place]}' and '{parameter.name}' both set "
-                        f"{_words(setting, element)}; one number follows from one parameter, once"
-                    )
-                owners[place] = parameter.name
-                _set(element, setting, parameter, values.get(parameter.name))
-    return {name: float(values.get(name, parameter.default)) for name, parameter in known.items()}
+                key = setting.kind, str(element.name), setting.field, setting.index
+                places.setdefault(key, _Place(element, setting)).add(parameter, setting)
+    for place in places.values():
+        place.set(used, values)
+    return used
 
 
 def settings_from(words: Iterable[str]) -> dict[str, float]:
@@ -114,30 +112,45 @@ def _elements(spec: mujoco.MjSpec, setting: Setting, parameter: str) -> list[Any
     return found
 
 
-def _set(element: Any, setting: Setting, parameter: Parameter, value: float | None) -> None:
-    """Checks that the default is what the file says, then sets the value if there is one."""
-    where = f"parameter '{parameter.name}' sets {_words(setting, element)}"
-    try:
-        field = np.array(getattr(element, setting.field), dtype=np.float64)
-        now = float(field[() if setting.index is None else setting.index])
-    except (AttributeError, TypeError, ValueError, IndexError):
-        raise SceneError(f"{where}, which is not a number of the scene") from None
-    default = setting.offset + setting.factor * parameter.default
-    if not math.isclose(now, default, rel_tol=_AGREEMENT, abs_tol=_ROUNDING):
-        raise SceneError(
-            f"{where} to {default:g} by default, where the scene's file has {now:g}; make them "
-            "equal"
-        )
-    if value is None:
-        return
-    result = setting.offset + setting.factor * float(value)
-    if setting.index is None:
-        setattr(element, setting.field, result)
-    else:
-        field[setting.index] = result
-        setattr(element, setting.field, field)
+@dataclass(slots=True)
+class _Place:
+    """One number of the MJCF and what it follows from: the sum of offset + factor · value."""
 
+    element: Any
+    setting: Setting
+    terms: dict[str, Setting] = field(default_factory=dict)
+    default: float = 0.0
 
-def _words(setting: Setting, element: Any) -> str:
-    index = "" if setting.index is None else f"[{setting.index}]"
-    return f"{setting.field}{index} of {setting.kind} '{element.name}'"
+    def add(self, parameter: Parameter, setting: Setting) -> None:
+        """Adds what a parameter contributes."""
+        if parameter.name in self.terms:
+            raise SceneError(f"parameter '{parameter.name}' sets {self._words} twice; set it once")
+        self.terms[parameter.name] = setting
+        self.default += setting.offset + setting.factor * parameter.default
+
+    def set(self, used: Mapping[str, float], asked: Mapping[str, float]) -> None:
+        """Checks that the defaults give what the file says, then sets it if one was asked for."""
+        names, index = " and ".join(map(repr, self.terms)), self.setting.index
+        is_one = len(self.terms) == 1
+        subject = f"parameter {names} sets" if is_one else f"parameters {names} together set"
+        where = f"{subject} {self._words}"
+        try:
+            values = np.array(getattr(self.element, self.setting.field), dtype=np.float64)
+            now = float(values[() if index is None else index])
+        except (AttributeError, TypeError, ValueError, IndexError):
+            raise SceneError(f"{where}, which is not a number of the scene") from None
+        if not math.isclose(now, self.default, rel_tol=_AGREEMENT, abs_tol=_ROUNDING):
+            raise SceneError(
+                f"{where} to {self.default:g} by default, where the scene's file has {now:g}; make "
+                "them equal"
+            )
+        if not asked.keys() & self.terms.keys():
+            return
+        result = sum(term.offset + term.factor * used[name] for name, term in self.terms.items())
+        values[() if index is None else index] = result
+        setattr(self.element, self.setting.field, result if index is None else values)
+
+    @property
+    def _words(self) -> str:
+        index = "" if self.setting.index is None else f"[{self.setting.index}]"
+        return f"{self.setting.field}{index} of {self.setting.kind} '{self.element.name}'"

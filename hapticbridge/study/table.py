@@ -70,6 +70,12 @@ class Table:
             return np.full(len(self), np.nan)
         return np.asarray(self.columns[name], dtype=np.float64)
 
+    def texts(self, name: str) -> NDArray[np.object_]:
+        """Returns a column of text; empty texts where no point returned such a result."""
+        if name not in self.columns:
+            return np.full(len(self), "", dtype=object)
+        return np.asarray(self.columns[name], dtype=object)
+
     def __len__(self) -> int:
         return len(self.columns["error"])
 

@@ -12,7 +12,7 @@ import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import (
     BrokenExecutor,
     Executor,
@@ -28,6 +28,11 @@ from hapticbridge.signals import holding_interrupts
 
 _IN_FLIGHT = 64
 """Tasks in flight where the number of workers is not known: more workers than that would idle."""
+
+_ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+"""Set for the sweep's own processes unless the user did: there is one a core already. With more,
+the idle threads of OpenBLAS spin for 0.1 s after every matrix exponential, which is one a
+closed-loop run; the map ``contact`` took twice as long."""
 
 _PATIENCE = 3.0
 """Seconds for a dask scheduler to answer; a local one takes 0.05 s. Shorter refuses a far one."""
@@ -108,7 +113,8 @@ class ProcessWorkers(Workers):
 
     def submit(self, task: Callable[..., Any], *arguments: object) -> Future[Any]:
         """See ``Workers.submit``; a pool starts its processes one by one, as tasks come."""
-        with holding_interrupts():
+        # libraries read the environment as they load
+        with holding_interrupts(), _environment(_ONE_THREAD):
             return super().submit(task, *arguments)
 
     def restart(self) -> None:
@@ -230,6 +236,18 @@ async def _identity(distributed: Any, scheduler: str) -> None:
         answer = await asyncio.wait_for(asked.identity(), _PATIENCE)
     if answer["type"] != "Scheduler":
         raise ValueError(f"a {answer['type']} answers there")
+
+
+@contextlib.contextmanager
+def _environment(variables: Mapping[str, str]) -> Iterator[None]:
+    """Sets environment variables that are not set yet, for the processes that start meanwhile."""
+    missing = {name: value for name, value in variables.items() if name not in os.environ}
+    os.environ.update(missing)
+    try:
+        yield
+    finally:
+        for name in missing:
+            os.environ.pop(name, None)
 
 
 def _start_process() -> None:

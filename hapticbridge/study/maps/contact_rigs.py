@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Hand, Motion, SimulatedDevice
-from hapticbridge.device.motion_csv import read_motion
+from hapticbridge.guard import UNLIMITED
 from hapticbridge.rendering import METHODS
-from hapticbridge.scene import scene_path
 from hapticbridge.study.closed_loop import ClosedLoop
+from hapticbridge.study.maps.contact_hands import random_push, recorded, tapping
 from hapticbridge.study.maps.contact_treatments import PERIOD, Treatment
 from hapticbridge.study.maps.rigs import loop_in, set_tool_mass
 
@@ -36,18 +34,15 @@ PEG_ROTATION = (1e-3, 5e-4)
 PEG_START = 0.005
 """Height of the peg's centre at the start in m: 25 mm of the 60 mm peg stand in the hole."""
 
-RECORDED = (3.5, 6.0)
-"""Part of the recorded hand in s: into the hole and to the bottom, pressing to the sides."""
-
 DEPTH_EVERY = 20
 """Ticks in contact between two looks at the depth: the peak of a push lasts longer, and every look
 costs as much as five ticks."""
 
 WALL_RUNS = tuple(itertools.product((0.01, 0.05, 0.2), (0, 1)))
-"""Tool mass in kg and hand."""
+"""Tool mass in kg and hand, the most often active first."""
 
 PEG_RUNS = tuple(itertools.product((0.03, 0.1), (0.0, 0.42), (1, 2)))
-"""Tool mass in kg, friction and hand (0 is the recorded one, others are seeds)."""
+"""Tool mass in kg, friction and hand (0 is the recorded one, others are seeds), likewise."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,43 +85,64 @@ def summary(runs: Sequence[ContactRun]) -> dict[str, float | int]:
     }
 
 
+def until_active(runs: Iterable[ContactRun]) -> list[ContactRun]:
+    """Returns runs to the first that is active: no later one can make their verdict worse.
+
+    Given runs that are made as they are asked for, no later one is made.
+    """
+    made = []
+    for run in runs:
+        made.append(run)
+        if run.environment == "active":
+            break
+    return made
+
+
 def wall_runs(
     treatment: Treatment, stiffness: float, cases: Iterable[tuple[float, int]] = WALL_RUNS
-) -> list[ContactRun]:
-    """Runs masses (kg) against a wall with hands (0 slow and deep, 1 fast) at K in N/m."""
+) -> Iterator[ContactRun]:
+    """Runs masses (kg) against a wall with hands (0 slow and deep, 1 fast) at K in N/m.
+
+    Every run is made when it is asked for.
+    """
     loop = loop_in("virtual_wall", "contact")
-    treatment.apply(loop.scene.model, 0.0)
     coupling = Coupling(stiffness, WALL_DAMPING, 1.0, 1e-3)  # the rail lets nothing turn
-    found = []
     for mass, hand in cases:
+        treatment.apply(loop.scene.model, 0.0)
         _set_mass(loop, "tool", mass)
-        device = _device(coupling, _tapping((3.0, 6.0)[hand]), Hand(stiffness=2000.0, damping=25.0))
+        device = _device(coupling, tapping((3.0, 6.0)[hand]), Hand(stiffness=2000.0, damping=25.0))
         records, run = _run(loop, device, coupling, treatment, 1000)
         # the face is 10 mm from where the tool's surface starts
         depth = max(0.0, float(records["tool_position"][:, 0].max()) - 0.01)
-        found.append(replace(run, depth=depth))
-    return found
+        yield replace(run, depth=depth)
 
 
 def peg_runs(
     treatment: Treatment,
     stiffness: float,
     cases: Iterable[tuple[float, float, int]] = PEG_RUNS,
-) -> list[ContactRun]:
-    """Runs pegs by mass (kg), friction and hand in the hole at K in N/m."""
-    loop = loop_in("peg_in_hole", "contact", _start_in_hole)
-    per_k, rotational_damping = PEG_ROTATION
-    coupling = Coupling(stiffness, PEG_DAMPING, per_k * stiffness, rotational_damping)
-    found = []
+) -> Iterator[ContactRun]:
+    """Runs pegs by mass (kg), friction and hand in the hole at K in N/m, as ``wall_runs`` does."""
+    loop = loop_in("peg_in_hole", "contact", start_in_hole)
     for mass, friction, hand in cases:
         treatment.apply(loop.scene.model, friction)
         _set_mass(loop, "peg", mass)
-        path, holder = _recorded() if hand == 0 else _random_push(hand)
-        device = _device(coupling, path, holder)
-        ticks = int(path.duration / PERIOD)
-        records, run = _run(loop, device, coupling, treatment, ticks)
-        found.append(replace(run, depth=_depth(loop, records)))
-    return found
+        device, coupling = peg_device(stiffness, hand)
+        records, run = _run(loop, device, coupling, treatment, ticks_of(device))
+        yield replace(run, depth=_depth(loop, records))
+
+
+def peg_device(stiffness: float, hand: int) -> tuple[SimulatedDevice, Coupling]:
+    """Returns a hand (0 is the recorded one, others are seeds) and the coupling by K in N/m."""
+    per_k, rotational_damping = PEG_ROTATION
+    coupling = Coupling(stiffness, PEG_DAMPING, per_k * stiffness, rotational_damping)
+    path, holder = recorded() if hand == 0 else random_push(hand)
+    return _device(coupling, path, holder), coupling
+
+
+def ticks_of(device: SimulatedDevice) -> int:
+    """Returns how many ticks a hand's path takes."""
+    return int((device.info.duration or 0.0) / PERIOD)
 
 
 def _run(
@@ -164,6 +180,8 @@ def _device(coupling: Coupling, path: Motion, hand: Hand) -> SimulatedDevice:
         * (coupling.rotational_stiffness * half + coupling.rotational_damping),
         hand=hand,
         path=path,
+        force_limit=UNLIMITED.force,
+        torque_limit=UNLIMITED.torque,
     )
 
 
@@ -172,52 +190,9 @@ def _set_mass(loop: ClosedLoop, body: str, mass: float) -> None:
     mujoco.mj_setConst(loop.scene.model, loop.scene.data)
 
 
-def _start_in_hole(model: mujoco.MjModel) -> None:
+def start_in_hole(model: mujoco.MjModel) -> None:
+    """Lets runs of ``peg_in_hole`` start with the peg in the hole."""
     model.key_qpos[0, 2] = PEG_START
-
-
-@cache
-def _tapping(frequency: float) -> Motion:
-    """A hand that taps at a frequency in Hz and wants to go 6 mm behind the wall's face."""
-    time = np.linspace(0.0, 1.0, 301)
-    path = np.zeros((time.size, 3))
-    path[:, 0] = 0.008 * (1 - np.cos(2 * np.pi * frequency * time))
-    return Motion(time, path)
-
-
-@cache
-def _recorded() -> tuple[Motion, Hand]:
-    """The scene's recorded hand while it is in the hole, with the grip of a firm hand."""
-    table = read_motion(scene_path("peg_in_hole").with_suffix(".csv")).table
-    rows = (table[:, 0] >= RECORDED[0]) & (table[:, 0] <= RECORDED[1])
-    path = Motion(table[rows, 0], table[rows, 1:4], table[rows, 4:]).relative()
-    return path, Hand(
-        stiffness=2000.0, damping=25.0, rotational_stiffness=5.0, rotational_damping=0.05
-    )
-
-
-@cache
-def _random_push(seed: int) -> tuple[Motion, Hand]:
-    """A random firm hand that wants to go up to 8 mm and 0.15 rad out of place, at 0.5 to 3 Hz."""
-    random = np.random.default_rng(seed)
-    time = np.linspace(0.0, 2.0, 81)
-
-    def smooth(size: float) -> NDArray[np.float64]:
-        frequency, phase = random.uniform(0.5, 3.0, 5), random.uniform(0, 2 * np.pi, 5)
-        angle = 2 * np.pi * frequency[:, None] * time + phase[:, None]
-        waves = random.normal(size=5) @ (np.sin(angle) - np.sin(phase)[:, None])
-        return np.asarray(size * waves / np.abs(waves).max())
-
-    position = np.column_stack([smooth(8e-3) for _ in range(3)])
-    turn = Rotation.from_rotvec(np.column_stack([smooth(0.15), smooth(0.15), smooth(0.1)]))
-    hand = Hand(
-        mass=random.uniform(0.2, 0.8),
-        stiffness=random.uniform(800, 3000),
-        damping=random.uniform(5, 30),
-        rotational_stiffness=random.uniform(1, 5),
-        rotational_damping=random.uniform(0.01, 0.05),
-    )
-    return Motion(time, position, turn.as_quat(canonical=True)[:, [3, 0, 1, 2]]), hand
 
 
 def _depth(loop: ClosedLoop, records: NDArray[np.void]) -> float:

@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 
 from hapticbridge.study.maps.contact_rigs import peg_runs, summary
 from hapticbridge.study.maps.contact_treatments import TREATMENTS
-from hapticbridge.study.maps.verdicts import COLOURS, VERDICTS
+from hapticbridge.study.maps.verdicts import COLOURS, VERDICTS, say_missing
 from hapticbridge.study.table import Table
 
 SEARCH_MASSES = (0.03, 0.1, 0.3)
@@ -65,13 +65,15 @@ its factor and format. The steady depth is computed, the others are measured."""
 
 def draw_search(axes: Axes, found: Sequence[Mapping[str, Any]]) -> None:
     """Draws a bar a treatment, runs by verdict, with what they came to in columns beside it."""
+    if not found:
+        say_missing(axes)
+        return
     places = np.arange(len(found))[::-1]
     left = np.zeros(len(found))
     for verdict, colour in zip(VERDICTS[:3], COLOURS[:3], strict=True):
         width = np.array([one[verdict.replace(" ", "_")] for one in found])
         axes.barh(places, width, left=left, color=colour, height=0.8)
         left = left + width
-    most = max(left.max(), 1.0)
     beside = axes.get_yaxis_transform()
     for heading, share, name, factor, form in COLUMNS:
         edge = 1 + share
@@ -80,6 +82,6 @@ def draw_search(axes: Axes, found: Sequence[Mapping[str, Any]]) -> None:
             text = format(factor * one[name], form)
             axes.text(edge, place, text, transform=beside, size=8, ha="right", va="center")
     axes.set_yticks(places, [one["treatment"] for one in found], size=8)
-    axes.set_xlim(0, most)
+    axes.set_xlim(0, max(left.max(), 1.0))
     axes.set_ylim(-0.6, len(found) - 0.4)
     axes.set_xlabel("runs by verdict")

@@ -6,21 +6,19 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.colors import ListedColormap
-from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import SimulatedDevice
 from hapticbridge.passivity import quantization_limit
-from hapticbridge.picture import new_figure
+from hapticbridge.study.maps.device_picture import draw
 from hapticbridge.study.maps.device_runs import (
-    DAMPED,
-    DEVICE_MASS,
+    DAMPERS,
     LARGE,
     PERIOD,
     QUANTUM,
+    RANGE,
+    REGIONS,
     RESOLUTION,
     STIFFNESS,
     friction_to_rest,
@@ -28,17 +26,12 @@ from hapticbridge.study.maps.device_runs import (
     settle,
     shaken,
 )
-from hapticbridge.study.maps.stability_map import Finding, Point, StabilityMap
+from hapticbridge.study.maps.stability_map import Finding, Point, StabilityMap, computed
+from hapticbridge.study.maps.verdicts import MISSING
 from hapticbridge.study.table import Table
 
-RANGE = (0.1, 2.0)
-"""Of β and of σ, even in their logarithms."""
-
-DAMPERS = (0.0, 1.5)
-"""Range of B in N s/m for the friction that a coupling's damper needs."""
-
-REGIONS = ("passive", "locally stable", "bounded limit cycle", "unstable")
-COLOURS = ("#a8d5ba", "#8fb8de", "#f4e3a1", "#c0504d")
+SMALLEST = 1e-4
+"""Deviation in per cent below which rounding alone is left, and nothing smaller is quoted."""
 
 
 def points(count: int) -> Sequence[Point]:
@@ -80,70 +73,79 @@ def evaluate(point: Point) -> Mapping[str, float | str | bool]:
 
 
 def read(table: Table) -> Finding:
-    """Draws the regions over β and σ, the cycles' size, and the friction that a damper needs."""
+    """Compares regions over β and σ, and the friction that a damper needs, with theory.
+
+    Where no point of one of the two was computed it is left out, and the paragraph says so.
+
+    Raises:
+        StudyError: No point was computed at all.
+    """
+    table = computed(table, "device")
     cells = table.select(table["what"] == "cell")
     dampers = table.select(table["what"] == "friction")
-    figure = new_figure(10, 5.4)
-    left, right = figure.subplots(1, 2, width_ratios=(1.35, 1))
-    agreed = _draw_regions(left, cells)
+    boundary: dict[str, Any] = {
+        "period": PERIOD,
+        "stiffness": STIFFNESS,
+        "resolution": RESOLUTION,
+        "regions": _regions(cells) if len(cells) else {},
+        "friction": _friction(dampers) if len(dampers) else {},
+    }
+    said = [_of_regions(boundary["regions"]), _of_friction(boundary["friction"])]
+    return Finding(draw(cells, boundary["friction"]), " ".join(said), boundary)
+
+
+def _regions(cells: Table) -> dict[str, Any]:
+    cycle = cells.numbers("cycle")[cells["region"] == "bounded limit cycle"]
+    return {
+        "points": {name: int((cells["region"] == name).sum()) for name in REGIONS},
+        "agreement": float(np.mean(cells["region"] == predicted_regions(cells))),
+        "measured_edges": _edges(cells),
+        "predicted_edges": {"beta": 0.5, "sigma": 0.5},
+        "largest_cycle_steps": float(cycle.max()) if cycle.size else None,
+        "median_cycle_steps": float(np.median(cycle)) if cycle.size else None,
+    }
+
+
+def _friction(dampers: Table) -> dict[str, Any]:
+    """Returns σ needed at each B, measured twice and by theory, σ = ½ + B/(K T)."""
     predicted = 0.5 + dampers["damping"] / (PERIOD * STIFFNESS)
-    right.plot(dampers["damping"], predicted, color="black", label="f_c = KΔ/2 + BΔ/T")
-    for name, marker, label in (
-        ("needed_shaken", "o", "measured: hand shakes it across a step"),
-        ("needed_at_rest", "s", "measured: pressed device rests"),
-    ):
-        right.plot(
-            dampers["damping"], dampers[name], marker, color="black", mfc="white", label=label
-        )
-    right.set_xlabel("coupling damping B (N s/m)")
-    right.set_ylabel("friction needed, f_c/(K Δ)")
-    right.set_ylim(0, 1.15 * float(predicted.max()))
-    right.set_title(f"friction against the damper, b = {DAMPED:g} N s/m", fontsize="medium")
-    right.legend(fontsize="small")
-    figure.suptitle(
-        f"Encoder steps of Δ = {1e6 * RESOLUTION:g} µm against friction f_c: device of "
-        f"{1e3 * DEVICE_MASS:g} g pressed on a wall, K = {STIFFNESS:g} N/m, {1 / PERIOD:g} Hz",
-        fontsize="medium",
+    shaken_needs = dampers.numbers("needed_shaken")
+    return {
+        "damping": dampers["damping"].tolist(),
+        "predicted": predicted.tolist(),
+        "shaken": shaken_needs.tolist(),
+        "pressed": dampers.numbers("needed_at_rest").tolist(),
+        "worst_ratio_error": float(np.abs(shaken_needs / predicted - 1).max()),
+    }
+
+
+def _of_regions(found: Mapping[str, Any]) -> str:
+    if not found:
+        return f"Regions over β and σ: {MISSING}."
+    counts = ", ".join(f"{name} {count}" for name, count in found["points"].items())
+    edges, largest = found["measured_edges"], found["largest_cycle_steps"]
+    size = (
+        "no bounded limit cycle was seen"
+        if largest is None
+        else f"in encoder steps, peak to peak, the largest bounded limit cycle is {largest:.0f}, "
+        f"the median one {found['median_cycle_steps']:.0f}"
     )
-    figure.legend(
-        handles=[
-            *(Patch(facecolor=c, label=r) for r, c in zip(REGIONS, COLOURS, strict=True)),
-            left.plot([], [], color="black", label="β = ½, σ = ½ (Diolaiti)")[0],
-        ],
-        loc="outside lower center",
-        ncols=5,
-        frameon=False,
+    return (
+        f"What the runs did agrees with Diolaiti's regions at {100 * found['agreement']:.0f} % of "
+        f"the points: {counts}. Divergence ends at β = {_said(edges['beta'])}, and the pressed "
+        f"device comes to rest from σ = {_said(edges['sigma'])} on (theory: both ½); {size}."
     )
-    edges = _edges(cells)
-    cycle = cells["cycle"][cells["region"] == "bounded limit cycle"]
-    largest = f"{cycle.max():.0f}, median {np.median(cycle):.0f}" if cycle.size else "none"
-    error = float(np.abs(dampers["needed_shaken"] / predicted - 1).max())
-    return Finding(
-        figure,
-        f"What the runs did agrees with Diolaiti's regions at {100 * agreed:.0f} % of the points: "
-        + ", ".join(f"{name} {int((cells['region'] == name).sum())}" for name in REGIONS)
-        + f". Divergence ends at β = {_said(edges['beta'])}, and the pressed device comes to rest "
-        f"from σ = {_said(edges['sigma'])} on (theory: both ½). Largest bounded limit cycle "
-        f"in encoder steps, peak to peak: {largest}. With a damper, a hand that shakes the device "
-        f"across one encoder step "
-        f"needs f_c = K Δ/2 + B Δ/T within {100 * error:.2g} %, while one that only presses lets "
-        f"it rest from {dampers['needed_at_rest'].min():.3g} to "
-        f"{dampers['needed_at_rest'].max():.3g} K Δ on, depending on B.",
-        {
-            "period": PERIOD,
-            "stiffness": STIFFNESS,
-            "resolution": RESOLUTION,
-            "agreement": agreed,
-            "measured_edges": edges,
-            "predicted_edges": {"beta": 0.5, "sigma": 0.5},
-            "largest_cycle_steps": float(cycle.max(initial=0.0)),
-            "friction": {
-                "damping": dampers["damping"].tolist(),
-                "predicted": predicted.tolist(),
-                "shaken": dampers["needed_shaken"].tolist(),
-                "pressed": dampers["needed_at_rest"].tolist(),
-            },
-        },
+
+
+def _of_friction(found: Mapping[str, Any]) -> str:
+    if not found:
+        return f"Friction against the damper: {MISSING}."
+    error = max(100 * found["worst_ratio_error"], SMALLEST)
+    return (
+        "With a damper, a hand that shakes the device across one encoder step needs f_c = K Δ/2 + "
+        f"B Δ/T within {error:.2g} %, while one that only presses lets it rest "
+        f"from {min(found['pressed']):.3g} to {max(found['pressed']):.3g} "
+        "K Δ on, at the values of B that were tried."
     )
 
 
@@ -152,7 +154,10 @@ def _said(edge: Mapping[str, float] | None) -> str:
 
 
 def _edges(cells: Table) -> dict[str, Any]:
-    """Returns between which β divergence ends, and between which σ motion from a press ends."""
+    """Returns between which β divergence ends, and between which σ motion from a press ends.
+
+    None where no run was bad, or the largest value had a bad one.
+    """
     return {
         "beta": _edge(cells["beta"], cells["large"] == "diverges"),
         "sigma": _edge(cells["sigma"], cells["small"] != "rest"),
@@ -165,38 +170,6 @@ def _edge(values: NDArray[np.float64], is_bad: NDArray[np.bool_]) -> dict[str, f
         return None
     last = float(values[is_bad].max())
     return {"last": last, "first": float(values[values > last].min())}
-
-
-def _draw_regions(axes: Axes, cells: Table) -> float:
-    """Colours the regions and returns the share that theory names alike."""
-    number = np.array([REGIONS.index(name) for name in cells["region"]])
-    beta, sigma = np.unique(cells["beta"]), np.unique(cells["sigma"])
-    grid = np.full((sigma.size, beta.size), np.nan)
-    grid[np.searchsorted(sigma, cells["sigma"]), np.searchsorted(beta, cells["beta"])] = number
-    axes.pcolormesh(
-        beta, sigma, grid, cmap=ListedColormap(COLOURS), vmin=-0.5, vmax=3.5, shading="nearest"
-    )
-    axes.set_xscale("log")
-    axes.set_yscale("log")
-    axes.axvline(0.5, color="black", lw=1.8)
-    axes.axhline(0.5, color="black", lw=1.8)
-    axes.set_xlim(*RANGE)
-    axes.set_ylim(*RANGE)
-    for place, name in {
-        (1.0, 1.0): REGIONS[0],
-        (0.22, 1.0): REGIONS[1],
-        (1.0, 0.22): REGIONS[2],
-        (0.22, 0.22): REGIONS[3],
-    }.items():
-        axes.text(*place, f"theory:\n{name}", ha="center", va="center", fontsize="small")
-    ticks = (0.1, 0.2, 0.5, 1.0, 2.0)
-    axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
-    axes.set_yticks(ticks, [f"{tick:g}" for tick in ticks])
-    axes.minorticks_off()
-    axes.set_xlabel("β = b/(K T)")
-    axes.set_ylabel("σ = f_c/(K Δ)")
-    axes.set_title("what a pressed, and a knocked, device did (colours)", fontsize="medium")
-    return float(np.mean(cells["region"] == predicted_regions(cells)))
 
 
 def predicted_regions(cells: Table) -> NDArray[np.object_]:

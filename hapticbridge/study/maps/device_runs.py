@@ -13,6 +13,14 @@ from hapticbridge.study.closed_loop import LoopOutcome
 from hapticbridge.study.maps.bisection import largest_stable
 from hapticbridge.study.maps.rigs import loop_in, set_tool_mass
 
+RANGE = (0.1, 2.0)
+"""Of β and of σ, even in their logarithms."""
+
+DAMPERS = (0.0, 1.5)
+"""Range of B in N s/m for the friction that a coupling's damper needs."""
+
+REGIONS = ("passive", "locally stable", "bounded limit cycle", "unstable")
+
 PERIOD = 1e-3
 STIFFNESS = 2000.0
 """K in N/m. Only β = b/(K T) and σ = f_c/(K Δ) count, and the mass a little."""
@@ -97,25 +105,7 @@ def settle(
         down) or ``diverges``; the range of the
         reported position in the last sixth in steps of the encoder; and the run.
     """
-    time = [0.0, 0.02, 100.0]
-    target = np.zeros((3, 3))
-    target[1:, 0] = PRESSED * QUANTUM / PULL
-    hand = Hand(
-        mass=0.0,
-        damping=0.0,
-        stiffness=PULL,
-        rotational_inertia=0.0,
-        rotational_damping=0.0,
-        rotational_stiffness=0.0,
-    )
-    device = SimulatedDevice(
-        mass=DEVICE_MASS,
-        damping=beta * STIFFNESS * PERIOD,
-        friction=sigma * QUANTUM,
-        resolution=RESOLUTION,
-        hand=hand,
-        path=Motion(time, target),
-    )
+    device = pressed_device(beta, sigma)
     start = np.array([knock * RESOLUTION, 0.0, 0.0, 0.0, 0.0, 0.0])
     ticks = TICKS if knock else TICKS // 2
     run = _wall(device, damping, ticks, start)
@@ -133,10 +123,41 @@ def settle(
     return "cycle", last, run
 
 
+def pressed_device(beta: float, sigma: float, limit: float = 10.0) -> SimulatedDevice:
+    """Returns a device with friction and encoder steps whose hand presses it on the wall.
+
+    Args:
+        beta: b/(K T), without unit, >= 0.
+        sigma: f_c/(K Δ), without unit, >= 0.
+        limit: Of its data sheet, in N and N m.
+    """
+    time = [0.0, 0.02, 100.0]
+    target = np.zeros((3, 3))
+    target[1:, 0] = PRESSED * QUANTUM / PULL
+    hand = Hand(
+        mass=0.0,
+        damping=0.0,
+        stiffness=PULL,
+        rotational_inertia=0.0,
+        rotational_damping=0.0,
+        rotational_stiffness=0.0,
+    )
+    return SimulatedDevice(
+        mass=DEVICE_MASS,
+        damping=beta * STIFFNESS * PERIOD,
+        friction=sigma * QUANTUM,
+        resolution=RESOLUTION,
+        hand=hand,
+        path=Motion(time, target),
+        force_limit=limit,
+        torque_limit=limit,
+    )
+
+
 def _wall(
     device: SimulatedDevice, damping: float, ticks: int, knock: NDArray[np.float64]
 ) -> LoopOutcome:
-    return loop_in("virtual_wall", "heavy for device", _make_heavy).run(
+    return loop_in("virtual_wall", "heavy for device", make_heavy).run(
         device,
         Coupling(STIFFNESS, damping, 0.0, 0.0),
         METHODS["implicit"],
@@ -147,7 +168,8 @@ def _wall(
     )
 
 
-def _make_heavy(model: mujoco.MjModel) -> None:
+def make_heavy(model: mujoco.MjModel) -> None:
+    """Makes the tool a wall: so heavy that no hand moves it."""
     set_tool_mass(model, "tool", WALL_MASS)
 
 

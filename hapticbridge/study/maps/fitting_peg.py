@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import SimulatedDevice
+from hapticbridge.guard import UNLIMITED
 from hapticbridge.passivity import WorstHand
 from hapticbridge.rendering import METHODS
 from hapticbridge.study.closed_loop import LoopOutcome
@@ -44,23 +45,16 @@ def contact_stiffness_limit(length: NDArray[np.float64] | float) -> NDArray[np.f
     return np.asarray(4 * DEVICE_DAMPING / (PERIOD * np.asarray(length) ** 2))
 
 
-def run(name: str, length: float, stiffness: float) -> LoopOutcome:
-    """Runs a peg that fills its hole, handle midway, behind the rotational damper alone.
+def device_and_coupling(name: str, stiffness: float) -> tuple[SimulatedDevice, Coupling]:
+    """Returns the rotational damper behind which a peg is run, and its coupling.
 
     At Nyquist, where a spring is worst, that damper is device and worst hand in one. The damper of
     the translation is four times what two contacts could need: translation is not what fails.
 
     Args:
         name: ``direct`` or ``implicit``.
-        length: L in m: of the peg, and so between contacts on opposite walls.
         stiffness: K_c in N/m per wall, or K_r in N m/rad.
-
-    Returns:
-        The outcome, with its records.
     """
-    loop = loop_in("planar_peg", "geometry")
-    set_length(loop.scene.model, length)
-    mujoco.mj_setConst(loop.scene.model, loop.scene.data)
     if name == "direct":
         # box against box makes two contacts on a wall, one at each end of the 20 mm of its width
         coupling = Coupling(stiffness / 2, 0.0, 0.0, 0.0)
@@ -74,7 +68,27 @@ def run(name: str, length: float, stiffness: float) -> LoopOutcome:
         rotational_damping=DEVICE_DAMPING,
         hand=WorstHand(damping, nyquist, PERIOD),
         rotational_hand=WorstHand(DEVICE_DAMPING, nyquist, PERIOD),
+        force_limit=UNLIMITED.force,
+        torque_limit=UNLIMITED.torque,
     )
+    return device, coupling
+
+
+def run(name: str, length: float, stiffness: float) -> LoopOutcome:
+    """Runs a peg that fills its hole, handle midway, behind the rotational damper alone.
+
+    Args:
+        name: ``direct`` or ``implicit``.
+        length: L in m: of the peg, and so between contacts on opposite walls.
+        stiffness: K_c in N/m per wall, or K_r in N m/rad.
+
+    Returns:
+        The outcome, with its records.
+    """
+    loop = loop_in("planar_peg", "geometry")
+    set_length(loop.scene.model, length)
+    mujoco.mj_setConst(loop.scene.model, loop.scene.data)
+    device, coupling = device_and_coupling(name, stiffness)
     return loop.run(
         device,
         coupling,

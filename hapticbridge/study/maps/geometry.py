@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from numpy.typing import NDArray
+from matplotlib.figure import Figure
 
 from hapticbridge.passivity import maximum_stiffness
 from hapticbridge.picture import new_figure
@@ -22,8 +23,14 @@ from hapticbridge.study.maps.fitting_peg import (
     length_limit,
     run,
 )
-from hapticbridge.study.maps.stability_map import Finding, Point, StabilityMap
-from hapticbridge.study.maps.verdicts import draw_verdicts, verdict_legend, verdict_numbers
+from hapticbridge.study.maps.palette import THEORY_COLOUR
+from hapticbridge.study.maps.stability_map import Finding, Point, StabilityMap, computed
+from hapticbridge.study.maps.verdicts import (
+    MISSING,
+    draw_verdicts,
+    verdict_legend,
+    verdict_numbers,
+)
 from hapticbridge.study.table import Table
 
 LENGTH = (5e-3, 0.5)
@@ -39,6 +46,9 @@ LIMITS_AMONG = 60
 """One limit is searched for every so many cells; a search takes about a dozen runs."""
 
 METHODS_SHOWN = ("direct", "implicit")
+
+BOUND = float(maximum_stiffness(DEVICE_DAMPING, PERIOD, ROTATIONAL_DAMPING))
+"""The largest K_r in N m/rad by (6): 2 (b_θ − B_r)/T."""
 
 
 def points(count: int) -> Sequence[Point]:
@@ -98,22 +108,87 @@ def evaluate(point: Point) -> Mapping[str, float | int | str | bool]:
 
 
 def read(table: Table) -> Finding:
-    """Draws contact or coupling stiffness over the length, with the limits on top."""
+    """Draws contact or coupling stiffness over the length, with the limits on top.
+
+    Raises:
+        StudyError: No point was computed at all.
+    """
+    table = computed(table, "geometry")
     limits = table.select(table["what"] == "limit")
     direct = limits.select(limits["method"] == "direct")
     behind = limits.select(limits["method"] == "implicit")
-    bound = float(maximum_stiffness(DEVICE_DAMPING, PERIOD, ROTATIONAL_DAMPING))
-    predicted = length_limit(direct["stiffness"])
-    lengths_found, stiffness_found = direct.numbers("limit"), behind.numbers("limit")
+    boundary = {
+        "period": PERIOD,
+        "device_rotational_damping": DEVICE_DAMPING,
+        "direct": _of_direct(direct),
+        "implicit": _of_implicit(behind),
+    }
+    return Finding(_draw(table, direct, behind), _paragraph(boundary), boundary)
+
+
+def _of_direct(limits: Table) -> dict[str, Any]:
+    """Compares the longest pegs that were found, each at its K_c, with the printed limit."""
+    predicted, measured = length_limit(limits["stiffness"]), limits.numbers("limit")
+    return {
+        "contact_stiffness": limits["stiffness"].tolist(),
+        "measured_length": measured.tolist(),
+        "predicted_length": predicted.tolist(),
+        "largest_deviation": agreement(measured, predicted),
+    }
+
+
+def _of_implicit(limits: Table) -> dict[str, Any]:
+    """Compares the largest K_r that were found, each at its length, with (6) and each other."""
+    measured = limits.numbers("limit")
+    # 0 and infinity: nothing or everything that was searched is stable, which is no limit
+    known = measured[np.isfinite(measured) & (measured > 0)]
+    return {
+        "coupling_rotational_damping": ROTATIONAL_DAMPING,
+        "length": limits["length"].tolist(),
+        "measured_rotational_stiffness": measured.tolist(),
+        "predicted_6": BOUND,
+        "largest_deviation": agreement(measured, BOUND),
+        "smallest": float(known.min()) if known.size else None,
+        "largest": float(known.max()) if known.size else None,
+        "largest_over_smallest": float(known.max() / known.min()) if known.size else None,
+    }
+
+
+def _paragraph(boundary: Mapping[str, Any]) -> str:
+    direct, behind = boundary["direct"], boundary["implicit"]
+    contact, length = direct["contact_stiffness"], direct["measured_length"]
+    if contact:
+        soft, stiff = int(np.argmin(contact)), int(np.argmax(contact))
+        said = (
+            f"Rendered directly, a peg is stable up to {1e3 * length[soft]:.3g} mm with contacts "
+            f"of {contact[soft]:.3g} N/m and up to {1e3 * length[stiff]:.3g} mm with "
+            f"{contact[stiff]:.3g} N/m: {per_cent(direct['largest_deviation'])} of "
+            "L = 2 √(b_θ/(T K_c)). "
+        )
+    else:
+        said = f"Rendered directly, {MISSING}. "
+    if behind["largest"] is None:
+        nothing = "no limit was found" if behind["length"] else MISSING
+        return f"{said}Behind the coupling, {nothing}."
+    return said + (
+        f"Behind the coupling the largest K_r lies between {behind['smallest']:.4g} and "
+        f"{behind['largest']:.4g} N m/rad over all lengths, "
+        f"{per_cent(behind['largest_deviation'])} of the {BOUND:.3g} N m/rad of eq. (6), which "
+        "does not know L."
+    )
+
+
+def _draw(table: Table, direct: Table, behind: Table) -> Figure:
     figure = new_figure(8, 4.6)
     left, right = figure.subplots(1, 2, sharex=True)
     _draw_cells(left, table, "direct")
     _draw_cells(right, table, "implicit")
     lengths = np.geomspace(*LENGTH, 100)
+    measured = {"marker": "o", "ls": "", "color": "black", "ms": 4, "mfc": "white"}
     left.plot(1e3 * lengths, contact_stiffness_limit(lengths), color="black", lw=1.8)
-    left.plot(1e3 * lengths_found, direct["stiffness"], "o", color="black", ms=4, mfc="white")
-    right.axhline(bound, color="#1a5fb4", lw=1.8, ls="--")
-    right.plot(1e3 * behind["length"], stiffness_found, "o", color="black", ms=4, mfc="white")
+    left.plot(1e3 * direct.numbers("limit"), direct["stiffness"], **measured)
+    right.axhline(BOUND, color=THEORY_COLOUR, lw=1.8, ls="--")
+    right.plot(1e3 * behind["length"], behind.numbers("limit"), **measured)
     left.set_title("direct: no coupling", fontsize="medium")
     right.set_title("implicit: behind the coupling", fontsize="medium")
     left.set_ylabel("contact stiffness K_c (N/m)")
@@ -133,68 +208,16 @@ def read(table: Table) -> Finding:
         figure,
         [
             ("L = 2 √(b_θ/(T K_c))", "black", "-"),
-            ("(6): K_r = 2 (b_θ − B_r)/T", "#1a5fb4", "--"),
+            ("(6): K_r = 2 (b_θ − B_r)/T", THEORY_COLOUR, "--"),
             ("measured limit", "black", "o"),
         ],
     )
-    return Finding(
-        figure,
-        _paragraph(direct, predicted, behind.numbers("limit"), bound),
-        {
-            "period": PERIOD,
-            "device_rotational_damping": DEVICE_DAMPING,
-            "direct": {
-                "contact_stiffness": direct["stiffness"].tolist(),
-                "measured_length": direct.numbers("limit").tolist(),
-                "predicted_length": predicted.tolist(),
-                "largest_deviation": agreement(direct.numbers("limit"), predicted),
-            },
-            "implicit": {
-                "coupling_rotational_damping": ROTATIONAL_DAMPING,
-                "length": behind["length"].tolist(),
-                "measured_rotational_stiffness": behind.numbers("limit").tolist(),
-                "predicted_6": bound,
-                "largest_deviation": agreement(behind.numbers("limit"), bound),
-                "largest_over_smallest": (
-                    float(stiffness_found.max() / stiffness_found.min()) if len(behind) else None
-                ),
-            },
-        },
-    )
-
-
-def _paragraph(
-    direct: Table,
-    predicted: NDArray[np.float64],
-    stiffness: NDArray[np.float64],
-    bound: float,
-) -> str:
-    said = []
-    if len(direct):
-        length, contact = 1e3 * direct.numbers("limit"), direct["stiffness"]
-        soft, stiff = int(contact.argmin()), int(contact.argmax())
-        said.append(
-            f"Rendered directly, a peg is stable up to {length[soft]:.3g} mm with contacts of "
-            f"{contact[soft]:.3g} N/m and up to {length[stiff]:.3g} mm with {contact[stiff]:.3g} "
-            f"N/m: {per_cent(agreement(direct['limit'], predicted))} of L = 2 √(b_θ/(T K_c))."
-        )
-    else:
-        said.append("Rendered directly, no point could be computed.")
-    if stiffness.size:
-        said.append(
-            f"Behind the coupling the largest K_r lies between {stiffness.min():.4g} and "
-            f"{stiffness.max():.4g} N m/rad over all lengths, "
-            f"{per_cent(agreement(stiffness, bound))} of the {bound:.3g} N m/rad of eq. (6), which "
-            "does not know L."
-        )
-    else:
-        said.append("Behind the coupling, no point could be computed.")
-    return " ".join(said)
+    return figure
 
 
 def _draw_cells(axes: Axes, table: Table, name: str) -> None:
     cells = table.select((table["what"] == "cell") & (table["method"] == name))
-    verdict = verdict_numbers(cells["stable"], cells["environment"])
+    verdict = verdict_numbers(cells.numbers("stable") == 1, cells.texts("environment"))
     length = 1e3 * cells["length"]
     draw_verdicts(axes, length, cells["stiffness"], verdict, log_x=True, log_y=True)
 

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
 
 from hapticbridge.mechanics import ImpactBody, resolve_impact
 from hapticbridge.mechanics.impact import Law
-from hapticbridge.picture import new_figure
 from hapticbridge.study.maps.falling_rod import (
     APPROACH,
     INERTIA,
@@ -21,27 +18,17 @@ from hapticbridge.study.maps.falling_rod import (
     drop,
     restitution_of,
 )
-from hapticbridge.study.maps.stability_map import Finding, Point, StabilityMap
-from hapticbridge.study.maps.verdicts import MISSING, say_missing
+from hapticbridge.study.maps.restitution_picture import COLOURS, SLIDE, Summary, draw
+from hapticbridge.study.maps.stability_map import Finding, Point, StabilityMap, computed
+from hapticbridge.study.maps.verdicts import MISSING
 from hapticbridge.study.table import Table
 
 RESTITUTION_LAWS: tuple[Law, ...] = ("newton", "poisson", "stronge")
 
-SLIDE = 0.8
-"""Speed in m/s along the floor, forwards, backwards or none."""
-
 FRICTIONS = (0.0, 0.25, 0.5, 0.75, 1.0)
-SHOWN = 0.75
-"""The friction coefficient whose curves are drawn, that of the example in which Newton gains."""
-
-DRAWN = ("scenes", "bouncy, implicitfast")
-
 LEAD = 0.2
 """Share by which a law must be nearer to MuJoCo than the second to be named the nearest, without
 unit; with less, laws that a soft contact cannot tell apart would be named by chance."""
-
-COLOURS = {"inelastic": "#7f7f7f", "newton": "#c0504d", "poisson": "#1a5fb4", "stronge": "#2e8b57"}
-"""Of the laws; ``inelastic`` is any of them with e = 0."""
 
 
 def points(count: int) -> Sequence[Point]:
@@ -87,29 +74,15 @@ def _by_law(law: Law, angle: float, friction: float, slide: float, restitution: 
 
 
 def read(table: Table) -> Finding:
-    """Draws the energy over the angle, and how far each law is from MuJoCo."""
+    """Draws the energy over the angle, and how far each law is from MuJoCo.
+
+    Raises:
+        StudyError: No point was computed at all.
+    """
+    table = computed(table, "restitution")
     groups = {name: table.select(table["setting"] == name) for name in SETTINGS}
     by_setting = {name: _summary(mine) for name, mine in groups.items() if len(mine)}
-    figure = new_figure(8, 7.2)
-    panels = figure.subplots(2, 2, gridspec_kw={"height_ratios": [1, 1.1]})
-    for axes, name in zip(panels[0], DRAWN, strict=True):
-        _draw_curves(axes, table, name)
-    panels[0, 0].set_ylabel("change of kinetic energy (J)")
-    _draw_bars(panels[1, 0], by_setting)
-    _draw_gains(panels[1, 1], by_setting)
-    figure.suptitle(
-        f"A rod of {MASS:g} kg and {LENGTH:g} m falls at {APPROACH:g} m/s on MuJoCo's floor;\n"
-        f"above: it slides at {SLIDE:g} m/s, friction {SHOWN:g}",
-        fontsize="medium",
-    )
-    handles, labels = panels[0, 0].get_legend_handles_labels()
-    figure.legend(
-        handles, labels, loc="outside lower center", ncols=5, fontsize="small", frameon=False
-    )
-    return Finding(figure, _paragraph(by_setting), {"settings": by_setting})
-
-
-Summary = dict[str, Any]
+    return Finding(draw(table, by_setting), _paragraph(by_setting), {"settings": by_setting})
 
 
 def _summary(mine: Table) -> Summary:
@@ -135,56 +108,9 @@ def _nearest(distances: Mapping[str, float]) -> str | None:
     return first if distances[first] < (1 - LEAD) * distances[second] else None
 
 
-def _draw_curves(axes: Axes, table: Table, name: str) -> None:
-    rows = (table["setting"] == name) & (table["friction"] == SHOWN) & (table["slide"] == SLIDE)
-    mine = table.select(rows)
-    if not len(mine):
-        say_missing(axes)
-        return
-    angle = np.degrees(mine["angle"])
-    styles = {"inelastic": ":", "newton": "-", "poisson": "--", "stronge": "-."}
-    for law, colour in COLOURS.items():
-        label = "any law, e = 0" if law == "inelastic" else law.capitalize()
-        axes.plot(angle, mine[law], color=colour, ls=styles[law], lw=1.6, label=label)
-    axes.plot(angle, mine["energy_change"], "o", color="black", ms=3.5, mfc="white", label="MuJoCo")
-    axes.axhline(0.0, color="black", lw=0.6)
-    axes.set_xlabel("angle of the rod above the floor (°)")
-    axes.set_title(f"{name}: e = {mine['restitution'][0]:.2g}", fontsize="medium")
-
-
-def _draw_bars(axes: Axes, by_setting: Mapping[str, Summary]) -> None:
-    place = np.arange(len(by_setting))
-    for shift, (law, colour) in enumerate(COLOURS.items()):
-        distances = [row["rms_distance_to_law"][law] for row in by_setting.values()]
-        axes.barh(place + 0.2 * (shift - 1.5), distances, 0.2, color=colour)
-    axes.set_yticks(place, [name.replace(", ", ",\n", 1) for name in by_setting], fontsize="small")
-    axes.invert_yaxis()
-    axes.set_xlabel("distance from MuJoCo, RMS (J)")
-
-
-def _draw_gains(axes: Axes, by_setting: Mapping[str, Summary]) -> None:
-    place = np.arange(len(by_setting))
-    axes.barh(
-        place - 0.18,
-        [row["largest_energy_change"] for row in by_setting.values()],
-        0.36,
-        fc="black",
-    )
-    axes.barh(
-        place + 0.18,
-        [row["largest_by_newton"] for row in by_setting.values()],
-        0.36,
-        color=COLOURS["newton"],
-    )
-    axes.set_yticks(place, [name.replace(", ", ",\n", 1) for name in by_setting], fontsize="small")
-    axes.invert_yaxis()
-    axes.axvline(0.0, color="black", lw=0.6)
-    axes.set_xlabel("largest change of energy (J)\nblack: MuJoCo, red: Newton")
-
-
 def _paragraph(by_setting: Mapping[str, Summary]) -> str:
-    if not by_setting:
-        return f"{MISSING.capitalize()}."
+    missing = [f"'{name}'" for name in SETTINGS if name not in by_setting]
+    said = f"With {', '.join(missing)} {MISSING}. " if missing else ""
     nearest = [row["nearest_law"] for row in by_setting.values()]
     counts = {law: nearest.count(law) for law in dict.fromkeys(nearest)}
     names = {None: "none", "inelastic": "the inelastic one"}
@@ -197,7 +123,8 @@ def _paragraph(by_setting: Mapping[str, Summary]) -> str:
         for name, row in by_setting.items()
         if row["largest_energy_change"] > 0
     ]
-    said = _of_the_scenes(by_setting["scenes"]) if "scenes" in by_setting else ""
+    if "scenes" in by_setting:
+        said += _of_the_scenes(by_setting["scenes"])
     own = max(by_setting, key=lambda name: by_setting[name]["largest_own_restitution"])
     by_newton = max(by_setting, key=lambda name: by_setting[name]["largest_by_newton"])
     said += (

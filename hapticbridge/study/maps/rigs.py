@@ -63,11 +63,15 @@ def loop_in(
 def set_tool_mass(model: mujoco.MjModel, body: str, mass: float) -> None:
     """Gives a body another mass and scales its inertia alike.
 
+    The inertia per kg is rounded to single precision, so that a mass set before leaves no trace:
+    what a point gives must not depend, even in its last bit, on the points before it.
+
     Args:
         model: Changed in place; ``mj_setConst`` must follow.
         body: The tool's name.
         mass: In kg.
     """
     body_id = model.body(body).id
-    model.body_inertia[body_id] *= mass / model.body_mass[body_id]
+    per_kg = model.body_inertia[body_id] / model.body_mass[body_id]
+    model.body_inertia[body_id] = mass * per_kg.astype(np.float32).astype(np.float64)
     model.body_mass[body_id] = mass

@@ -102,19 +102,14 @@ def spin(
     Raises:
         HapticBridgeError: A value is out of range, or the method cannot render a free tool.
     """
-    scene = loop_in(_load).scene
+    scene = loop_in(spinning_scene).scene
     chosen = METHODS[method]
     felt = prepare(scene, coupling, PERIOD, 1, chosen)
-    direction = axis / np.linalg.norm(axis)
-    time = PERIOD * np.arange(TICKS + 1)
-    turns = Rotation.from_rotvec(np.outer(speed * time, direction)) * Rotation.from_rotvec(
-        [angle, 0.0, 0.0]
-    )
-    quaternions = turns.as_quat(canonical=True)[:, [3, 0, 1, 2]]
+    quaternions = turning(speed, angle=angle, axis=axis)
     samples = np.zeros(TICKS, SAMPLE_DTYPE)
     samples["quaternion"] = quaternions[1:]
     if spins_at_start:
-        _set_spin(scene, speed * direction)
+        _set_spin(scene, speed * axis / np.linalg.norm(axis))
     first = np.zeros(1, SAMPLE_DTYPE)
     first["quaternion"] = quaternions[0]
     parameters = run_parameters(scene, coupling, chosen, first, period=PERIOD, felt=felt)
@@ -124,6 +119,24 @@ def spin(
     records = np.zeros(TICKS, TICK_DTYPE)
     done = _run(binding, samples, records)
     return _read(binding, records[:done])
+
+
+def turning(
+    speed: float, *, angle: float = 0.0, axis: NDArray[np.float64] = OBLIQUE
+) -> NDArray[np.float64]:
+    """Returns the handle's unit quaternions (w, x, y, z) at the ticks, shape (``TICKS`` + 1, 4).
+
+    Args:
+        speed: In rad/s.
+        angle: By which it is turned about x at the start, in rad.
+        axis: Of the turning, in the world frame, shape (3,), of any length > 0.
+    """
+    time = PERIOD * np.arange(TICKS + 1)
+    about = axis / np.linalg.norm(axis)
+    turns = Rotation.from_rotvec(np.outer(speed * time, about)) * Rotation.from_rotvec(
+        [angle, 0.0, 0.0]
+    )
+    return np.asarray(turns.as_quat(canonical=True)[:, [3, 0, 1, 2]])
 
 
 def coupling_of(stiffness: float) -> Coupling:
@@ -143,7 +156,8 @@ def speed_of_cut(method: str, stiffness: float) -> float:
     ).middle
 
 
-def _load() -> Scene:
+def spinning_scene() -> Scene:
+    """Loads the tool, floating free of gravity."""
     return scene_of(_TOOL)
 
 

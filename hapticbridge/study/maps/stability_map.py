@@ -80,6 +80,23 @@ class MapFiles:
     failed: int
 
 
+def computed(table: Table, name: str) -> Table:
+    """Returns the rows of a map's table at which something was computed.
+
+    Args:
+        table: All rows; where a point failed, ``error`` says why.
+        name: The map's.
+
+    Raises:
+        StudyError: There is no such row.
+    """
+    if not len(table):
+        raise StudyError(f"map '{name}': the table has no rows, so there is nothing to read")
+    if table.failed.all():
+        raise StudyError(f"map '{name}': no point could be computed; first: {table['error'][0]}")
+    return table.select(~table.failed)
+
+
 def run_map(
     stability_map: StabilityMap,
     folder: Path,
@@ -126,9 +143,7 @@ def run_map(
     )
     table.write(files[form])  # first: it is what cost the time
     failed = int(table.failed.sum())
-    if failed == len(table):
-        raise StudyError(f"map '{name}': no point could be computed; first: {table['error'][0]}")
-    finding = stability_map.read(table.select(~table.failed))
+    finding = stability_map.read(computed(table, name))
     write_picture(finding.figure, files["png"])
     said = {
         "map": name,

@@ -1,0 +1,116 @@
+"""What a device was given that nothing paid for, from recorded poses and wrenches.
+
+Over a run the device may keep what its damping burns, what the scene gives up and what the
+coupling's spring gives up; a hand can take no more out. What exceeds that comes from the wrench
+being held between the samples, and is the fault of the port ``device``.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticbridge.kernel.state import RunParameters
+
+Array = NDArray[np.float64]
+
+
+def burnt_by_damping(
+    parameters: RunParameters,
+    moved: Array,
+    turned: Array,
+    interval: Array,
+    is_running: NDArray[np.bool_],
+) -> Array:
+    """Returns Σ b‖δp‖²/t, the least that the device's damping burns, (n,) in J.
+
+    t is the time between two samples, T at least: a damper that moves by δp within t burns no less
+    than at constant speed, and a missed deadline makes t longer. Dry friction is not counted: an
+    encoder's steps do not tell how far the device slid.
+
+    Args:
+        parameters: The run's; the damping is known.
+        moved: δp of each tick, (n, 3) in m.
+        turned: Its rotation vectors, (n, 3) in rad.
+        interval: t as recorded, (n,) in s.
+        is_running: Where the tick's duration is known: a jump before the first tick or in a pause
+            took an unknown time, and burns nothing here.
+    """
+    burnt = (parameters.device_damping or 0.0) * np.sum(moved**2, axis=1)
+    burnt += (parameters.device_rotational_damping or 0.0) * np.sum(turned**2, axis=1)
+    time = np.maximum(interval, parameters.period)
+    return np.asarray(np.cumsum(np.where(is_running, burnt / time, 0.0)))
+
+
+def ramp_share(parameters: RunParameters, since_start: Array) -> Array:
+    """Returns the share of the wrench that the guard lets through while it rises, (n,)."""
+    return np.asarray(np.minimum((since_start + 1.0) / (parameters.ramp_ticks + 1.0), 1.0))
+
+
+def passed_shares(ticks: NDArray[np.void], parameters: RunParameters) -> tuple[Array, Array]:
+    """Returns the share of force and of torque that the guard let through, (n,) each."""
+    scales = (parameters.force_scale, parameters.force_scale / parameters.scale)
+    shares = []
+    for part, scale in zip((slice(0, 3), slice(3, 6)), scales, strict=True):
+        full = scale * np.linalg.norm(ticks["wrench_on_tool"][:, part], axis=1)
+        sent = np.linalg.norm(ticks["wrench_on_device"][:, part], axis=1)
+        shares.append(np.divide(sent, full, out=np.ones_like(full), where=full > 0))
+    return shares[0], shares[1]
+
+
+def kept_behind_a_law(
+    parameters: RunParameters,
+    *,
+    stretch: tuple[Array, Array],
+    stretched: tuple[Array, Array],
+    work: tuple[Array, Array],
+    passed: tuple[Array, Array],
+    since_start: Array,
+) -> Array:
+    """Returns what coupling and tool took up of what the handle gave, (n,) in J of the scene.
+
+        Σ c_k w_k + r_k V(e_k) − Σ max(0, r_k − r_{k−1}) (V(e_k) + ½‖δe_k‖²_{B/T})
+
+    V is the energy of a spring whose force stops growing at the limit, ½ K e² below it. With b >=
+    K T/2 + B and no limit in play, what the device is given less what it burns and plus this is
+    never above zero, whatever hand and tool do: the identity behind (6), in which V(e) at the end
+    stands on the left. The last sum is what a force that is switched on finds stretched already,
+    in a ramp or after a jump of the device before its first tick.
+
+    Args:
+        parameters: The run's, of a method with a coupling law and one law a tick.
+        stretch: e in m and as rotation vectors, (n, 3) each.
+        stretched: Their changes in each tick.
+        work: Of force and of torque on the tool in each tick, (n,) each in J.
+        passed: c, the share of force and of torque that the guard let through, (n,) each.
+        since_start: Ticks since the force began to rise, (n,).
+
+    References:
+        Brown & Colgate 1997, eq. (6); here summed over time instead of frequency by frequency.
+    """
+    coupling = parameters.coupling
+    limits = (
+        parameters.force_limit / parameters.force_scale,
+        parameters.torque_limit * parameters.scale / parameters.force_scale,
+    )
+    stiffness = (coupling.stiffness, coupling.rotational_stiffness)
+    damping = (coupling.damping, coupling.rotational_damping)
+    share = ramp_share(parameters, since_start)
+    rise = np.where(since_start == 0, share, np.diff(share, prepend=0.0))
+    kept = np.zeros(len(share))
+    for k, b, limit, e, de, w, c in zip(
+        stiffness, damping, limits, stretch, stretched, work, passed, strict=True
+    ):
+        spring = _spring_energy(k, np.linalg.norm(e, axis=1), limit)
+        found = spring + 0.5 * b / parameters.period * np.sum(de**2, axis=1)
+        taken = np.where(since_start > 0, c * w, 0.0)
+        kept += np.cumsum(taken) + share * spring - np.cumsum(rise * found)
+    return kept
+
+
+def _spring_energy(stiffness: float, length: Array, limit: float) -> Array:
+    """Returns ∫ min(K e, limit) de, in J."""
+    if stiffness == 0:
+        return np.zeros_like(length)
+    elastic = np.minimum(length, limit / stiffness)
+    return np.asarray(0.5 * stiffness * elastic**2 + limit * (length - elastic))

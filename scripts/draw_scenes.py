@@ -1,0 +1,106 @@
+"""Draws scenes with the renderer that ``MUJOCO_GL`` names; ``render_scenes`` finds and sets one.
+
+Each scene is drawn as its file says: free camera (``statistic``, ``visual/global``), lights and
+materials, at the second of its hand path that its custom number ``picture`` names, or at the start.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from pathlib import Path
+
+import mujoco
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from hapticbridge import Bridge, HapticBridgeError, SimulatedClock, load_scene
+from hapticbridge.scene import Scene, scene_names, scene_path
+
+ROOT = Path(__file__).resolve().parents[1]
+
+WIDTH, HEIGHT = 640, 400
+"""Of a scene's picture, in pixels."""
+
+COLUMNS, GALLERY_WIDTH, GAP, LABEL = 4, 800, 6, 22
+"""Of the picture of all scenes: pictures in a row; width, space between and height of a name, in
+pixels."""
+
+
+def advance(scene: Scene) -> None:
+    """Moves a scene along its hand path to the moment that its picture shows."""
+    number = mujoco.mj_name2id(scene.model, mujoco.mjtObj.mjOBJ_NUMERIC, "picture")
+    path = scene.path.with_suffix(".csv")
+    if number < 0 or not path.is_file():
+        return
+    moment = float(scene.model.numeric_data[scene.model.numeric_adr[number]])
+    with Bridge(scene, f"trajectory:{path}", clock=SimulatedClock()) as bridge:
+        bridge.run(duration=moment)
+
+
+def picture(name: str) -> Image.Image:
+    """Returns the picture of a scene.
+
+    Raises:
+        HapticBridgeError: There is no such scene, or it cannot be loaded or run.
+    """
+    scene = load_scene(name)
+    advance(scene)
+    model, data = scene.model, scene.data
+    mujoco.mj_forward(model, data)
+    camera, shown = mujoco.MjvCamera(), mujoco.MjvOption()
+    mujoco.mjv_defaultFreeCamera(model, camera)
+    shown.sitegroup[:] = 0  # grip and handle are points for the computer, not parts of the tool
+    model.vis.global_.offwidth, model.vis.global_.offheight = WIDTH, HEIGHT
+    with mujoco.Renderer(model, HEIGHT, WIDTH) as renderer:
+        renderer.update_scene(data, camera, shown)
+        return Image.fromarray(np.asarray(renderer.render(), dtype=np.uint8))
+
+
+def gallery(pictures: dict[str, Image.Image]) -> Image.Image:
+    """Returns all pictures in a grid, each above its name, in 256 colours."""
+    width = (GALLERY_WIDTH - GAP * (COLUMNS - 1)) // COLUMNS
+    height = round(width * HEIGHT / WIDTH)
+    rows = -(-len(pictures) // COLUMNS)
+    page = Image.new("RGB", (GALLERY_WIDTH, rows * (height + LABEL)), "white")
+    font, pen = ImageFont.load_default(14), ImageDraw.Draw(page)
+    for index, (name, image) in enumerate(pictures.items()):
+        left, top = index % COLUMNS * (width + GAP), index // COLUMNS * (height + LABEL)
+        page.paste(image.resize((width, height), Image.Resampling.LANCZOS), (left, top))
+        pen.text((left + width // 2, top + height + 2), name, "black", font, anchor="ma")
+    return page.quantize(256, kmeans=10, dither=Image.Dither.FLOYDSTEINBERG)
+
+
+def main() -> int:
+    """Draws and writes; returns the exit code, 2 for a scene or a folder that does not exist."""
+    parser = argparse.ArgumentParser(prog="render_scenes", description="Draw scenes off-screen.")
+    parser.add_argument("scenes", nargs="*", metavar="NAME", help="scenes; none named: all")
+    parser.add_argument("--out", type=Path, help="folder for NAME.png (default: beside each scene)")
+    parser.add_argument(
+        "--gallery",
+        type=Path,
+        help="one picture of them all (default where no scene is named and no --out is given: "
+        "scripts/figures/scenes.png)",
+    )
+    asked = parser.parse_args()
+    pictures = {}
+    try:
+        for name in asked.scenes or scene_names():
+            pictures[name] = picture(name)
+            folder = asked.out or scene_path(name).parent
+            pictures[name].save(folder / f"{Path(name).stem}.png", optimize=True)
+        target = asked.gallery
+        if target is None and not asked.scenes and not asked.out:
+            target = ROOT / "scripts" / "figures" / "scenes.png"
+        if target is not None:
+            gallery(pictures).save(target, optimize=True)
+    except (HapticBridgeError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    print(f"drawn with {os.environ['MUJOCO_GL']}: {', '.join(pictures)}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

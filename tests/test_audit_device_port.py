@@ -1,0 +1,171 @@
+"""Claims of the audit about what a device was given that nothing paid for."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from audit_cases import ScriptedDevice, recorded
+from random_hands import random_motion
+
+from hapticbridge.audit.balance import Balance
+from hapticbridge.audit.device_port import kept_behind_a_law
+from hapticbridge.coupling import Coupling
+from hapticbridge.device import SimulatedDevice
+from hapticbridge.guard import Limits
+from hapticbridge.kernel.parameters import RunParameters
+from hapticbridge.provenance import STARTS, meta_start, parameters_of
+from hapticbridge.recording import read_recording
+
+T = 1e-3
+HOME = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
+RUN = RunParameters(
+    grip="grip",
+    period=T,
+    substeps=1,
+    coupling=Coupling(2000.0, 0.5, 2.0, 5e-4),
+    force_limit=1e9,
+    torque_limit=1e9,
+    ramp_ticks=0,
+    device_origin=HOME,
+    handle_origin=HOME,
+    device_start=HOME,
+    device_damping=1.5,
+    device_rotational_damping=1.5e-3,
+)
+
+
+def test_the_balance_is_the_identity_behind_the_bound() -> None:
+    """Any motion of handle and tool; the first tick is a jump of both, out of rest."""
+    generator = np.random.default_rng(5)
+    count, k, b = 40, RUN.coupling.stiffness, RUN.coupling.damping
+    h, x = generator.normal(0, 1e-3, (2, count, 3))
+    d, moved = (np.diff(v, axis=0, prepend=np.zeros((1, 3))) for v in (h, x))
+    e, de = h - x, d - moved
+    force = k * e + b / T * de
+    still = np.zeros((count, 3))
+    kept = kept_behind_a_law(
+        RUN,
+        stretch=(e, still),
+        stretched=(de, still),
+        work=(np.sum(force * moved, axis=1), np.zeros(count)),
+        passed=(np.ones(count), np.ones(count)),
+        since_start=np.arange(count, dtype=np.float64),
+    )
+
+    def norm(v: np.ndarray, weight: float) -> np.ndarray:
+        return np.asarray(weight * np.sum(v**2, axis=-1))
+
+    own = 1.5  # N s/m, burnt over every tick but the jump
+    last = count - 1
+    given = -np.sum(force[:-1] * d[1:]) - np.sum(norm(d[1:], own / T))
+    middle = slice(1, last)
+    squares = (
+        norm(moved[middle], (k + b / T) / 2)
+        + norm(de[: last - 1] + d[middle], b / T / 2)
+        + norm(d[middle], (own - b) / T - k / 2)
+    ).sum()
+    squares += norm(de[last - 1] + d[last], b / T / 2)
+    squares += norm(d[last], own / T - k / 2 - b / T / 2)
+    squares += norm(moved[last], k / 2) - b / T * np.sum(de[last] * moved[last])
+    assert given + kept[last] == pytest.approx(-squares, rel=1e-12)
+
+
+def kept(
+    run: RunParameters, stretch: list[float], passed: float = 1.0, work: float = 0.0
+) -> list[float]:
+    """Returns what was kept after each tick from the start, of a spring along x."""
+    count = len(stretch)
+    e = np.zeros((count, 3))
+    e[:, 0] = stretch
+    none = np.zeros((count, 3))
+    energy = kept_behind_a_law(
+        run,
+        stretch=(e, none),
+        stretched=(none, none),
+        work=(np.full(count, work), np.zeros(count)),
+        passed=(np.full(count, passed), np.ones(count)),
+        since_start=np.arange(count, dtype=np.float64),
+    )
+    return [float(value) for value in energy]
+
+
+def test_a_spring_that_is_limited_stores_force_times_length_beyond_the_limit() -> None:
+    # K = 2000 N/m: 1 N at 0.5 mm, 0.5 N at 0.25 mm
+    for run, spring in (
+        (replace(RUN, force_limit=1.0), 0.25e-3 + 1.5e-3),
+        (replace(RUN, force_limit=1.0, force_scale=2.0), 0.0625e-3 + 0.5 * 1.75e-3),
+        (RUN, 4e-3),
+    ):
+        assert kept(run, [0.0, 2e-3]) == pytest.approx([0.0, spring])
+
+
+def test_a_force_that_rises_finds_the_spring_stretched() -> None:
+    run = replace(RUN, ramp_ticks=1)  # half of the force in the first tick
+    assert kept(run, [1e-3, 1e-3]) == pytest.approx([0.0, 0.0], abs=1e-15)
+    assert kept(run, [1e-3, 2e-3]) == pytest.approx([0.0, 0.5 * (4e-3 - 1e-3)])
+
+
+def test_work_counts_as_far_as_its_force_reached_the_device() -> None:
+    assert kept(RUN, [0.0, 0.0, 0.0], passed=0.25, work=8.0) == [0.0, 2.0, 4.0]
+
+
+def test_half_the_force_is_half_the_energy(tmp_path: Path) -> None:
+    lost = []
+    for force_scale in (1.0, 0.5):
+        path = tmp_path / f"{force_scale}.mcap"
+        device = ScriptedDevice(lambda k: (1e-5 * k, 0, 1e-5 * k, 1, 0, 0, 0))
+        coupling = Coupling(1000.0, 0.5, 1.0, 5e-4)
+        recorded(path, "point_mass", device, coupling, duration=0.2, force_scale=force_scale)
+        lost.append(kicked(path, 0.0, 0.0))
+    assert np.abs(lost[0]).max() > 1e-6
+    np.testing.assert_allclose(lost[1], 0.5 * lost[0], rtol=1e-9, atol=1e-15)
+
+
+def kicked(path: Path, damping: float | None = None, rotational: float = 1.0) -> np.ndarray:
+    """Returns what the device of a recording was given beyond what is paid for, in J."""
+    recording = read_recording(path)
+    parameters = replace(
+        parameters_of(recording.meta), device_damping=damping, device_rotational_damping=rotational
+    )
+    starts = {name: meta_start(recording.meta, name) for name in STARTS}
+    resumed = [e["tick"] for e in recording.events if e["event"] == "resume"]
+    return Balance.of(
+        recording.ticks,
+        parameters,
+        np.array(starts["handle_start"]),
+        np.array(starts["tool_start"]),
+        starts["start_kinetic"][0] + starts["start_potential"][0],
+        np.array(resumed, dtype=np.float64),
+    ).kicked
+
+
+@pytest.mark.parametrize(
+    ("seed", "limit", "options"),
+    [
+        (1, 10.0, {}),
+        (2, 0.3, {}),  # the force is limited most of the time
+        (3, 10.0, {"scale": 2.0}),
+        (4, 10.0, {"force_scale": 0.5}),
+    ],
+)
+def test_a_device_that_bears_the_coupling_is_never_kicked(
+    seed: int, limit: float, options: dict[str, Any], tmp_path: Path
+) -> None:
+    path = tmp_path / "run.mcap"
+    device = SimulatedDevice(damping=10.0, path=random_motion(seed, 1.0))
+    limits = Limits(force=limit, torque=0.5, ramp=0.1)
+    coupling = Coupling(2000.0, 0.5, 2.0, 5e-4)
+    recorded(path, "peg_in_hole", device, coupling, duration=1.0, limits=limits, **options)
+    lost = kicked(path, 10.0)
+    assert lost.max() <= 1e-12
+    assert lost.min() < -1e-4  # and it is not zero by nature
+
+
+def test_where_damping_is_unknown_nobody_can_tell(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    recorded(path, "point_mass", "simulated", duration=0.1)
+    assert not kicked(path).any()
