@@ -56,7 +56,7 @@ SCENE = """
   </worldbody>
   {top}
   <keyframe>
-    <key name="home" qpos="0.1 0.2 0.3 0.9 0.1 0.3 -0.2" qvel="0.1 -0.2 0.3 1 2 -3"/>
+    <key name="home" qpos="0.1 0.2 0.3 0.9 0.1 0.3 -0.2" qvel="0.1 -0.2 0.3 3 1 2"/>
   </keyframe>
 </mujoco>
 """

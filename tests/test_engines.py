@@ -36,6 +36,7 @@ from hapticbridge.study.engines import (
     Shape,
     Task,
     Velocity,
+    composed,
     engine_names,
 )
 
@@ -240,6 +241,29 @@ def test_the_wrench_is_the_couplings(engine: Engine) -> None:
     torque += COUPLING.rotational_damping / 1e-3 * turned
     assert wrench.force == pytest.approx(force, rel=1e-5, abs=1e-3)
     assert wrench.torque == pytest.approx(torque, rel=1e-5, abs=1e-3)
+
+
+def test_a_pull_off_the_centre_turns_the_tool(engine: Engine) -> None:
+    mass, moment = 0.2, 2e-3
+    frame, grip = Pose((0.01, 0.0, 0.0)), Pose((0.0, 0.05, 0.02))
+    start = Pose((0.1, 0.2, 0.3), quaternion_exp((-0.4, 0.2, 0.9)))
+    body = Body(mass, (moment,) * 3, frame)
+    task = Task("pull", body, coupling=COUPLING, grip=grip, start=start)
+    away = tuple(np.add(composed(start, grip).position, (1e-3, 0.0, 2e-3)))
+    handle = away, composed(start, grip).quaternion
+    with opened(engine, task, 1e-4) as simulation:
+        simulation.step(*handle)
+        wrench = simulation.wrench()
+        if engine.name not in SPRINGS:  # what is held acts in the next step
+            simulation.step(*handle)
+        velocity, pose = simulation.velocity(), simulation.pose()
+    lever = composed(pose, grip).position - np.array(composed(pose, frame).position)
+    torque = wrench.torque + np.cross(lever, wrench.force)
+    # an engine's own spring takes part of its force back within the step
+    share = 0.1 if engine.name in SPRINGS else 1e-3
+    speed, spin = np.array(wrench.force) / mass * 1e-4, torque / moment * 1e-4
+    assert np.linalg.norm(velocity.linear - speed) < share * np.linalg.norm(speed)
+    assert np.linalg.norm(velocity.angular - spin) < share * np.linalg.norm(spin)
 
 
 def test_an_engine_names_a_source_for_every_setting(engine: Engine) -> None:
