@@ -27,6 +27,9 @@ from hapticbridge.study.engines.task import (
     inverted,
 )
 
+Frame = tuple[Vector, Quaternion]
+"""Position in m and orientation, as the compiler takes them."""
+
 _NOTHING: Vector = (0.0, 0.0, 0.0)
 _AT_ORIGIN = (_NOTHING, (1.0, 0.0, 0.0, 0.0))
 
@@ -68,8 +71,8 @@ class HeldSimulation(ABC):
         self._principal_in_body = task.body.inertia_frame
         self._body_in_principal = inverted(task.body.inertia_frame)
         self._centre = task.body.inertia_frame.position
-        self._handle: tuple[Vector, Quaternion] = _AT_ORIGIN
-        self._tool: tuple[Vector, Quaternion] = _AT_ORIGIN
+        self._handle: Frame = _AT_ORIGIN
+        self._tool: Frame = _AT_ORIGIN
         self._wrench = self._at_centre = (_NOTHING, _NOTHING)
 
     def _begin(self, task: Task) -> None:
@@ -90,14 +93,18 @@ class HeldSimulation(ABC):
 
     def step(self, handle_position: Vector, handle_quaternion: Quaternion) -> None:
         """Goes one step under the wrench of the last, and computes the next."""
-        self.advance(*self._at_centre)
+        self._couple((handle_position, handle_quaternion))
         self._measure((handle_position, handle_quaternion))
+
+    def _couple(self, _handle: Frame) -> None:
+        """Does the step; a child whose engine has a spring of its own aims it at the handle."""
+        self.advance(*self._at_centre)
 
     def wrench(self) -> Wrench:
         """Returns the wrench on the tool about the grip."""
         return Wrench(*self._wrench)
 
-    def _measure(self, handle: tuple[Vector, Quaternion]) -> None:
+    def _measure(self, handle: Frame) -> None:
         if self._gains is None:
             return
         pose = self.pose()
@@ -137,19 +144,16 @@ class HeldSimulation(ABC):
         """Gives back what the engine holds."""
 
 
-_Frame = tuple[Vector, Quaternion]
-
-
 @compiled
 def _law(
     gains: tuple[float, float, float, float],
-    body: _Frame,
-    grip: _Frame,
+    body: Frame,
+    grip: Frame,
     centre: Vector,
-    handle_before: _Frame,
-    handle: _Frame,
-    tool_before: _Frame,
-) -> tuple[_Frame, tuple[Vector, Vector], tuple[Vector, Vector]]:
+    handle_before: Frame,
+    handle: Frame,
+    tool_before: Frame,
+) -> tuple[Frame, tuple[Vector, Vector], tuple[Vector, Vector]]:
     """Returns the grip's pose, the wrench about it, and the same wrench at the centre of mass."""
     stiffness, damping, rotational_stiffness, rotational_damping = gains
     position = add(body[0], rotated(body[1], grip[0]))

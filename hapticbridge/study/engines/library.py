@@ -14,7 +14,9 @@ _PACKAGE = "hapticbridge.study.engines"
 _MODULES = {
     "mujoco": "mujoco_engine",
     "ode": "ode_engine",
+    "ode_spring": "ode_spring",
     "physx": "sapien_engine",
+    "physx_spring": "sapien_engine",
     "pybullet": "pybullet_engine",
     "pybullet_dantzig": "pybullet_engine",
     "drake_point": "drake_engine",

@@ -114,6 +114,16 @@ _SIGNATURES: dict[str, tuple[Any, ...]] = {
     "dGeomSetOffsetQuaternion": (None, *_QUATERNION),
     "dJointGroupCreate": (_ID, _INT),
     "dJointGroupDestroy": (None, _ID),
+    "dJointAttach": (None, _ID, _ID, _ID),
+    "dJointCreateBall": (_ID, _ID, _ID),
+    "dJointSetBallAnchor": (None, *_THREE),
+    "dJointSetBallAnchor2": (None, *_THREE),
+    "dJointSetBallParam": (None, _ID, _INT, _REAL),
+    "dJointCreateAMotor": (_ID, _ID, _ID),
+    "dJointSetAMotorNumAxes": (None, _ID, _INT),
+    "dJointSetAMotorAxis": (None, _ID, _INT, _INT, _REAL, _REAL, _REAL),
+    "dJointSetAMotorAngle": (None, _ID, _INT, _REAL),
+    "dJointSetAMotorParam": (None, _ID, _INT, _REAL),
 }
 """Type of the result, and of the arguments."""
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import pybullet
 
+from hapticbridge.errors import StudyError
 from hapticbridge.pose import Quaternion, Vector
 from hapticbridge.study.engines.base import Contacts, Engine, Setting
 from hapticbridge.study.engines.held import HeldSimulation
@@ -46,7 +47,6 @@ _TYPES = {
     "box": pybullet.GEOM_BOX,
     "sphere": pybullet.GEOM_SPHERE,
     "capsule": pybullet.GEOM_CAPSULE,
-    "mesh": pybullet.GEOM_MESH,
 }
 
 
@@ -76,6 +76,11 @@ class PybulletSimulation(HeldSimulation):
 
     def __init__(self, task: Task, timestep: float, parameters: Mapping[str, float]) -> None:
         super().__init__(task, timestep)
+        kinds = [shape.kind for shape in task.body.shapes]
+        if "mesh" in kinds and len(kinds) > 1:
+            raise StudyError(
+                f"task '{task.name}' has a tool of a mesh and more, which is not given to PyBullet"
+            )
         self._client = client = pybullet.connect(pybullet.DIRECT)
         pybullet.setGravity(*task.gravity, physicsClientId=client)
         pybullet.setPhysicsEngineParameter(
@@ -95,10 +100,10 @@ class PybulletSimulation(HeldSimulation):
             physicsClientId=client,
         )
         self._set_dynamics(self._body, task, localInertiaDiagonal=task.body.inertia)
-        if task.fixed:
+        for shape in task.fixed:
             fixed = pybullet.createMultiBody(
                 baseMass=0,
-                baseCollisionShapeIndex=self._collision([(s, s.pose) for s in task.fixed]),
+                baseCollisionShapeIndex=self._collision([(shape, shape.pose)]),
                 physicsClientId=client,
             )
             self._set_dynamics(fixed, task)
@@ -131,21 +136,30 @@ class PybulletSimulation(HeldSimulation):
         )
 
     def _collision(self, placed: Sequence[tuple[Shape, Pose]]) -> int:
-        """Makes one compound shape, and returns its number; −1 of nothing."""
+        """Makes one shape of several, and returns its number; −1 of nothing."""
         if not placed:
             return -1
         shapes = [shape for shape, _ in placed]
-        empty = (0.0, 0.0, 0.0)
-        meshes = [[] if shape.vertices is None else shape.vertices.tolist() for shape in shapes]
-        made: int = pybullet.createCollisionShapeArray(
+        positions = [pose.position for _, pose in placed]
+        orientations = [_xyzw(pose.quaternion) for _, pose in placed]
+        made: int
+        if shapes[0].vertices is not None:
+            made = pybullet.createCollisionShape(
+                pybullet.GEOM_MESH,
+                vertices=shapes[0].vertices.tolist(),
+                collisionFramePosition=positions[0],
+                collisionFrameOrientation=orientations[0],
+                physicsClientId=self._client,
+            )
+            return made
+        made = pybullet.createCollisionShapeArray(
             shapeTypes=[_TYPES[shape.kind] for shape in shapes],
-            halfExtents=[shape.size if shape.kind == "box" else empty for shape in shapes],
-            radii=[0.0 if shape.kind in ("box", "mesh") else shape.size[0] for shape in shapes],
-            lengths=[2 * shape.size[1] if shape.kind == "capsule" else 0.0 for shape in shapes],
-            collisionFramePositions=[pose.position for _, pose in placed],
-            collisionFrameOrientations=[_xyzw(pose.quaternion) for _, pose in placed],
+            halfExtents=[shape.size if shape.kind == "box" else (0, 0, 0) for shape in shapes],
+            radii=[0 if shape.kind == "box" else shape.size[0] for shape in shapes],
+            lengths=[2 * shape.size[1] if shape.kind == "capsule" else 0 for shape in shapes],
+            collisionFramePositions=positions,
+            collisionFrameOrientations=orientations,
             physicsClientId=self._client,
-            **({"vertices": meshes} if any(meshes) else {}),
         )
         return made
 

@@ -1,4 +1,4 @@
-"""PhysX 5 on the processor, through SAPIEN. It computes in single precision."""
+"""PhysX 5 on the processor, through SAPIEN, in single precision: held force, or its own spring."""
 
 from __future__ import annotations
 
@@ -11,14 +11,23 @@ from typing import Any
 import numpy as np
 
 with warnings.catch_warnings():
-    warnings.simplefilter("ignore")  # that no graphics card was found, which nothing here draws on
+    # that no graphics card was found, which nothing here draws on
+    warnings.simplefilter("ignore")
     import sapien
     from sapien import physx
 
-from hapticbridge.pose import Quaternion, Vector, product
+
+from hapticbridge.pose import (
+    Quaternion,
+    Vector,
+    product,
+    rotation_between,
+    scaled,
+    subtract,
+)
 from hapticbridge.study.engines.base import Contacts, Engine, Setting
-from hapticbridge.study.engines.held import HeldSimulation
-from hapticbridge.study.engines.task import Pose, Shape, Task, Velocity
+from hapticbridge.study.engines.held import Frame, HeldSimulation
+from hapticbridge.study.engines.task import Pose, Shape, Task, Velocity, composed
 
 POSITION_ITERATIONS = 20
 """Of the solver: at PhysX's own 4 a settled tool is wrong by 0.1 µm more; 50 change nothing."""
@@ -29,6 +38,11 @@ CONTACT_OFFSET = 1e-3
 _GUIDE = "PhysX 5 User's Guide"
 _DYNAMICS = f"{_GUIDE}: Rigid Body Dynamics"
 _COLLISION = f"{_GUIDE}: Advanced Collision Detection"
+SLERP = 4.0
+"""A slerp drive is a quarter as stiff as it is told, without unit: it acts on half the angle
+(measured under a torque: 4.00)."""
+
+_NOTHING: Vector = (0.0, 0.0, 0.0)
 _X_TO_Z: Quaternion = (math.sqrt(0.5), 0.0, -math.sqrt(0.5), 0.0)
 """A capsule lies along x in PhysX."""
 
@@ -109,7 +123,7 @@ class SapienSimulation(HeldSimulation):
 
     def principal_pose(self) -> Pose:
         """Returns the pose of the principal axes of inertia at the centre of mass."""
-        pose = self._body.pose
+        pose = self._body.entity_pose
         (x, y, z), (w, i, j, k) = pose.p.tolist(), pose.q.tolist()
         return Pose((x, y, z), (w, i, j, k))
 
@@ -126,6 +140,59 @@ class SapienSimulation(HeldSimulation):
     def close(self) -> None:
         """Lets go of the scene; PhysX takes it back with its last reference."""
         self._body = self._system = self._scene = None
+
+
+class SapienSpringEngine(SapienEngine):
+    """PhysX 5 with an implicit coupling: the drives of a D6 joint."""
+
+    name = "physx_spring"
+    settings: Mapping[str, Setting] = {
+        **SapienEngine.settings,
+        "coupling": Setting(
+            "implicit spring: D6 joint, linear and slerp drives", f"{_GUIDE}: Joints, D6 Joint"
+        ),
+    }
+
+    def open(self, task: Task, timestep: float) -> SapienSimulation:
+        """Sets a task up; see ``Engine.open``."""
+        return SapienSpringSimulation(task, timestep)
+
+
+class SapienSpringSimulation(SapienSimulation):
+    """A task in PhysX whose coupling is a drive from the world to the grip.
+
+    Its target is h_k, its target velocity the handle's over the step. The solver's iterations are
+    parts of the step here, so that it is less damped than the implicit scheme of one step.
+    """
+
+    def __init__(self, task: Task, timestep: float) -> None:
+        super().__init__(task, timestep)
+        coupling = task.coupling
+        if coupling is None:
+            return
+        self._drive = drive = physx.PhysxDriveComponent(self._body)
+        grip = composed(self._body_in_principal, task.grip)
+        drive.set_pose_in_child(sapien.Pose(*grip))
+        for set_gains in (
+            drive.set_drive_property_x,
+            drive.set_drive_property_y,
+            drive.set_drive_property_z,
+        ):
+            set_gains(coupling.stiffness, coupling.damping)
+        drive.set_drive_property_slerp(
+            SLERP * coupling.rotational_stiffness, SLERP * coupling.rotational_damping
+        )
+        self._body.entity.add_component(drive)
+
+    def _couple(self, handle: Frame) -> None:
+        """Aims the drive at the handle, and steps."""
+        if self._gains is not None:
+            rate = 1.0 / self._timestep
+            moved = scaled(rate, subtract(handle[0], self._handle[0]))
+            turned = scaled(rate, rotation_between(self._handle[1], handle[1]))
+            self._drive.set_drive_target(sapien.Pose(*handle))
+            self._drive.set_drive_velocity_target(moved, turned)
+        self.advance(_NOTHING, _NOTHING)
 
 
 def _collision(shape: Shape, pose: Pose, material: Any) -> Any:
@@ -145,4 +212,4 @@ def _collision(shape: Shape, pose: Pose, material: Any) -> Any:
 
 def engines() -> tuple[Engine, ...]:
     """Returns the engines of this module."""
-    return (SapienEngine(),)
+    return (SapienEngine(), SapienSpringEngine())
