@@ -28,8 +28,8 @@ TOLERANCE = 1e-9
 def recommended(points: Sequence[Measurement]) -> Measurement | None:
     """Returns the point to use, None where there is none.
 
-    Of the points at ``RATE`` or above, with an error below ``JND`` here and at every smaller step, a
-    passive environment, a solver that runs to its tolerance, at most ``SHARE`` of a core and no
+    Of the points at ``RATE`` or above, with an error below ``JND`` here and at every smaller step,
+    a passive environment, a solver that runs to its tolerance, at most ``SHARE`` of a core and no
     hazard on a real device (``Method.hazard``): the cheapest; where the costs of several lie within
     its spread, the most accurate of these; and where errors are the same within ``ALIKE``, one with
     the usual contacts.
@@ -78,7 +78,7 @@ def steady_error(each: Measurement, points: Sequence[Measurement]) -> float:
     alike = [
         other.score.felt
         for other in points
-        if other.setting.period <= setting.period
+        if (other is each or other.setting.period < setting.period)
         and replace(other.setting, period=setting.period) == setting
     ]
     return max(alike, default=each.score.felt)
