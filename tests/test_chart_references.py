@@ -204,6 +204,10 @@ def test_sliding_block_in_closed_form_is_what_a_solver_with_an_event_finds() -> 
     ).y
     place, force = sliding_block.exact_sliding(coupling, times)
     np.testing.assert_allclose(place, found[0], atol=2e-8)
+    handle = np.array([place_and_speed(time) for time in times])
+    law = coupling.stiffness * (handle[:, 0] - found[0])
+    law += coupling.damping * (handle[:, 1] - found[1])
+    np.testing.assert_allclose(force, law, atol=5e-5)
     before = times < sliding_block.breakaway(coupling)
     assert force[before].max() < limit < force[~before][:3].max()
 
