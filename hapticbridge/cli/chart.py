@@ -44,7 +44,8 @@ class ChartCommand:
 
     The scene is point_mass, peg_in_hole, rod_impact, sliding_block or spinning_body, which have
     references of their own, or any scene with a hand path beside it, which is compared with finer
-    steps. Writes SCENE.png, .svg, .csv, .json and .html into the folder. Example:
+    steps. 'work' in place of a scene charts what a tick costs as a scene grows. Writes SCENE.png,
+    .svg, .csv, .json and .html into the folder. Example:
 
         hapticbridge chart peg_in_hole --out charts
     """
@@ -105,7 +106,7 @@ class ChartCommand:
         """Returns the engines that are asked for and installed; says which are not."""
         if self.engines == (ALL,):
             found = available_engines()
-            for reason in found.missing.values():
+            for reason in dict.fromkeys(found.missing.values()):
                 err.print(plain(reason))
             return list(found.available)
         for name in self.engines:
@@ -135,6 +136,8 @@ def _print(files: ChartFiles) -> None:
     for panel in files.said["panels"]:
         out.print(f"[bold]{plain(panel['title'])}[/], against {plain(panel['reference'])}")
         out.print(f"  {plain(panel['recommendation'])}")
+    for note in files.said["notes"]:
+        out.print(f"  {plain(note)}")
     for name, reason in files.said["skipped"].items():
         out.print(f"  not simulated: {plain(name)} ({plain(reason)})")
     err.print("wrote " + ", ".join(plain(str(path)) for path in files.paths.values()))
