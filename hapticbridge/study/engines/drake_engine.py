@@ -42,7 +42,7 @@ RESOLUTION = 0.1
 """Edge of the tessellation of round shapes as a share of their radius, without unit."""
 
 _PLANT = "Drake, MultibodyPlant"
-_POINT = "Drake, Modeling of Dry Friction and Compliant Point Contact"
+_PROPERTIES = "Drake, geometry::DefaultProximityProperties"
 _USER_GUIDE = "Drake, Hydroelastic Contact User Guide"
 _SHARED = {
     "coupling": Setting("held force, applied_generalized_force", f"{_PLANT}: input ports"),
@@ -190,16 +190,18 @@ def _transform(pose: Pose) -> Any:
 
 def engines() -> tuple[Engine, ...]:
     """Returns the engines of this module."""
-    stiffness = Setting(f"{POINT_STIFFNESS:g} N/m", f"{_POINT}: Point Contact Parameters")
+    stiffness = Setting(f"{POINT_STIFFNESS:g} N/m", f"{_PROPERTIES}: point_stiffness")
     point = {
         "point_contact_stiffness": stiffness,
-        "relaxation_time": Setting("0", f"{_POINT}: SAP"),
+        "relaxation_time": Setting("0", f"{_PROPERTIES}: relaxation_time"),
     }
     hydroelastic = {
         "compliance": Setting("tool compliant, fixed shapes rigid", _USER_GUIDE),
-        "hydroelastic_modulus": Setting(f"{MODULUS:g} Pa", f"{_USER_GUIDE}: Setting the modulus"),
-        "resolution_hint": Setting(f"{RESOLUTION:g} of the radius", _USER_GUIDE),
-        "relaxation_time": Setting("1 timestep", f"{_POINT}: SAP"),
+        "hydroelastic_modulus": Setting(f"{MODULUS:g} Pa", f"{_PROPERTIES}: hydroelastic_modulus"),
+        "resolution_hint": Setting(
+            f"{RESOLUTION:g} of the radius", f"{_PROPERTIES}: resolution_hint"
+        ),
+        "relaxation_time": Setting("1 timestep", f"{_PROPERTIES}: relaxation_time"),
     }
     return (
         DrakeEngine("drake_point", "point", point),
