@@ -72,6 +72,8 @@ def _draw_panel(axes: Axes, chart: Chart, panel: Panel, colours: dict[str, str])
     points, orders = chart.of(panel), chart.orders(panel)
     for name, colour in colours.items():
         mine = [each for each in points if who(each.setting) == name]
+        if not mine:
+            continue
         order = orders.get(name, float("nan"))
         told = f"{name} (order {round(order, 1) + 0.0:.1f})" if np.isfinite(order) else name
         axes.plot([], [], "-", color=colour, lw=2, label=told)
