@@ -114,11 +114,6 @@ def audit(path: str | Path, *, strict: bool = False) -> AuditReport:
     try:
         parameters = parameters_of(recording.meta)
         info, method = _device_and_method(recording, parameters)
-        parameters = replace(
-            parameters,
-            device_damping=info.damping,
-            device_rotational_damping=info.rotational_damping,
-        )
         facts |= _device_facts(info, parameters, method)
     except RecordingError as error:
         return _invalid(facts, Fault(str(error)))
