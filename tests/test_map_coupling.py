@@ -245,7 +245,7 @@ def test_groups_that_fail_say_why_and_the_others_are_drawn(tmp_path: Path) -> No
     drawn = {axes.get_title(): [text.get_text() for text in axes.texts] for axes in panels(files)}
     assert [title for title, texts in drawn.items() if texts == [MISSING]] == [
         "explicit",
-        "weld: free tool and tapping only",
+        "weld: free, and tapping",
     ]
 
 

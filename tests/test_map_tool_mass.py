@@ -18,7 +18,7 @@ from hapticbridge.errors import StudyError
 from hapticbridge.passivity import SampledLoop, environment_minimum_damping, minimum_mass
 from hapticbridge.passivity.virtual_mass import Integrator
 from hapticbridge.scene import Scene, load_scene
-from hapticbridge.study.maps.free_tool import NAMES, felt, least_mass, worst_angle
+from hapticbridge.study.maps.free_tool import felt, least_mass, worst_angle
 from hapticbridge.study.maps.rigs import set_tool_mass
 from hapticbridge.study.maps.stability_map import Point, run_map
 from hapticbridge.study.maps.tool_mass import TOOL_MASS, read
@@ -28,6 +28,7 @@ from hapticbridge.study.maps.tool_mass_runs import (
     KNOCK,
     PATH,
     PERIOD,
+    THEORIES,
     coupling_of,
     evaluate,
     hand_worst_for,
@@ -334,7 +335,7 @@ def test_the_map_is_drawn_and_says_what_was_found(tmp_path: Path) -> None:
     assert files.failed == 0
     assert files.picture.stat().st_size > 10_000
     methods = files.finding.boundary["methods"]
-    assert set(methods) == set(NAMES)
+    assert set(methods) == set(THEORIES)
     assert methods["implicit"]["unstable_held_still"] == 0
     assert methods["explicit"]["unstable_held_still"] > 0
     assert "'implicit': held still, a tool is stable at all" in files.finding.paragraph
