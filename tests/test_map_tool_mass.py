@@ -133,6 +133,23 @@ def test_implicit_fails_at_no_mass() -> None:
         assert outcome["environment"] == "strict"
 
 
+@pytest.mark.parametrize("method", ["compensated", "lossless"])
+def test_without_the_lag_no_mass_fails_up_to_twice_b_over_t(method: str) -> None:
+    limit = 2 * DEVICE_DAMPING / PERIOD
+    assert held_still(method, 0.98 * limit, 1e-3).is_stable
+    for mass in (2e-3, 5.0):
+        assert worst_hand(method, 0.98 * limit, mass).is_stable
+    assert not worst_hand(method, 1.02 * limit, 5.0).is_stable
+    # the twin that keeps its lag bears a quarter less
+    assert not worst_hand("implicit", 0.98 * limit, 5.0).is_stable
+
+
+def test_a_light_tool_is_no_help_to_the_lossless_coupling() -> None:
+    limit = 2 * DEVICE_DAMPING / PERIOD
+    assert not worst_hand("lossless", 1.02 * limit, 2e-3).is_stable
+    assert worst_hand("compensated", 1.02 * limit, 2e-3).is_stable
+
+
 def test_a_heavy_tool_on_a_soft_coupling_decays() -> None:
     # it swings twice a second: a fifth of 2 s holds less than a swing, and would show growth
     assert held_still("explicit", 2000.0, 10.0).is_stable
