@@ -7,8 +7,6 @@ from functools import cache
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
 from hapticbridge.picture import new_figure
@@ -26,13 +24,7 @@ from hapticbridge.study.maps.tool_mass_runs import (
     law_damping,
     of_method,
 )
-from hapticbridge.study.maps.verdicts import (
-    COLOURS,
-    VERDICTS,
-    draw_verdicts,
-    say_missing,
-    verdict_numbers,
-)
+from hapticbridge.study.maps.verdicts import draw_verdicts, verdict_legend, verdict_numbers
 from hapticbridge.study.table import Table
 
 Array = NDArray[np.float64]
@@ -57,13 +49,8 @@ def draw(table: Table) -> Figure:
     panels = figure.subplots(2, 3, sharex=True, sharey=True).ravel()
     for axes, name in zip(panels, THEORIES, strict=True):
         cells = of_method(table, "cell", name)
-        if len(cells):
-            verdict = verdict_numbers(is_stable(cells), cells["environment"])
-            draw_verdicts(axes, cells["mass"], cells["stiffness"], verdict, log_x=True, log_y=True)
-        else:
-            axes.set_xscale("log")
-            axes.set_yscale("log")
-            say_missing(axes)
+        verdict = verdict_numbers(is_stable(cells), cells.texts("environment"))
+        draw_verdicts(axes, cells["mass"], cells["stiffness"], verdict, log_x=True, log_y=True)
         _draw_theory(axes, name)
         for what, marker in _MARKERS.items():
             rows = of_method(table, what, name)
@@ -84,21 +71,9 @@ def draw(table: Table) -> Figure:
         "the law of 'compensated' uses B′ = B − K T, of 'lossless' B − K T/2 (0 at least)",
         fontsize="medium",
     )
-    figure.legend(
-        handles=_handles(), loc="outside lower center", ncols=3, fontsize="small", frameon=False
-    )
+    measured = [(f"measured, {what}", "black", marker) for what, marker in _MARKERS.items()]
+    verdict_legend(figure, [*_LINES, *measured], columns=3)
     return figure
-
-
-def _handles() -> list[Patch | Line2D]:
-    return [
-        *(Patch(facecolor=c, label=v) for v, c in zip(VERDICTS, COLOURS, strict=True)),
-        *(Line2D([], [], color=colour, ls=style, label=label) for label, colour, style in _LINES),
-        *(
-            Line2D([], [], ls="", marker=m, color="black", mfc="white", label=f"measured, {what}")
-            for what, m in _MARKERS.items()
-        ),
-    ]
 
 
 @cache
