@@ -21,6 +21,12 @@ from hapticbridge.kernel.lossless import REACH
 from hapticbridge.kernel.parameters import RunParameters, checked_substeps
 from hapticbridge.kernel.scheme import COUPLED, DIRECT, HELD, LOSSLESS, WELD
 from hapticbridge.kernel.state import WELD_NAME
+from hapticbridge.passivity.compensation import (
+    IMPLICIT_LAG,
+    MIDPOINT_LAG,
+    felt_damping,
+    law_damping,
+)
 from hapticbridge.scene import Scene
 from hapticbridge.scene.contact_check import warn_of_contacts
 from hapticbridge.scene.methods import check_massless_tool, check_metered
@@ -110,28 +116,29 @@ class Method:
             coupling: What should be felt.
             timestep: h in s, MuJoCo's.
 
+        Raises:
+            CouplingError: The time step is not finite and > 0.
+
         References:
-            Of ``lag``: the damping K h of implicit Euler, K h/2 of a backward spring under the
-            midpoint rule.
+            ``passivity.compensation``.
         """
-        if self.lag == 0.0:
-            return coupling
-        return replace(
-            coupling,
-            damping=max(coupling.damping - self.lag * timestep * coupling.stiffness, 0.0),
-            rotational_damping=max(
-                coupling.rotational_damping - self.lag * timestep * coupling.rotational_stiffness,
-                0.0,
-            ),
-        )
+        return self._with_damping(coupling, timestep, law_damping)
 
     def rendered(self, used: Coupling, timestep: float) -> Coupling:
         """Returns what a tool feels where ``used`` is the law: B = B' + lag K h."""
+        return self._with_damping(used, timestep, felt_damping)
+
+    def _with_damping(
+        self, coupling: Coupling, timestep: float, damping: Callable[..., float]
+    ) -> Coupling:
+        if self.lag == 0.0:
+            return coupling
+        k, b = coupling.stiffness, coupling.damping
+        kr, br = coupling.rotational_stiffness, coupling.rotational_damping
         return replace(
-            used,
-            damping=used.damping + self.lag * timestep * used.stiffness,
-            rotational_damping=used.rotational_damping
-            + self.lag * timestep * used.rotational_stiffness,
+            coupling,
+            damping=damping(k, b, timestep, self.lag),
+            rotational_damping=damping(kr, br, timestep, self.lag),
         )
 
 
@@ -157,7 +164,7 @@ COMPENSATED = replace(
     IMPLICIT,
     name="compensated",
     about="implicit, with the damping K T that its integration adds taken off the coupling's",
-    lag=1.0,
+    lag=IMPLICIT_LAG,
 )
 
 LOSSLESS_COUPLING = Method(
@@ -167,7 +174,7 @@ LOSSLESS_COUPLING = Method(
     hazard="",
     scheme=LOSSLESS,
     integrator="discrete",
-    lag=0.5,
+    lag=MIDPOINT_LAG,
 )
 
 METHODS = {

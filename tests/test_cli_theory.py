@@ -121,7 +121,7 @@ def test_bound_as_json_is_valid_and_null_where_none_suffices(
     assert facts["largest_stiffness"] == (1000 if device else None)
     assert facts["frequency_hz"] == pytest.approx(500)
     assert [way["needed"] is None for way in facts["alternatives"]] == [
-        *(False, False, False, True, False, True, False)
+        *(False, False, False, True, False, True, False, False, False)
     ]
 
 

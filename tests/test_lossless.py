@@ -12,6 +12,7 @@ from rendering_runs import FREE_MASS
 from scipy.spatial.transform import Rotation
 
 import hapticbridge as hb
+from hapticbridge.certificate import default_coupling
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import SimulatedDevice
 from hapticbridge.errors import HapticBridgeError
@@ -121,11 +122,12 @@ def distance(rows: np.ndarray, reference: np.ndarray) -> tuple[float, float]:
 # --- accuracy -------------------------------------------------------------------------------------
 
 
-def response_from_rest(t: Array, stiffness: float, damping: float) -> Array:
-    """x(t) of 1 kg behind K and B when the handle starts as 20 mm sin(2π 2 Hz t); closed form."""
+def response_from_rest(t: Array, stiffness: float, damping: float, mass: float = 1.0) -> Array:
+    """x(t) of a mass behind K and B when the handle starts as 20 mm sin(2π 2 Hz t); closed form."""
     w, size = 2 * np.pi * 2.0, 0.02
-    steady = size * (stiffness + 1j * w * damping) / (stiffness - w * w + 1j * w * damping)
-    roots = np.roots([1.0, damping, stiffness])
+    law = stiffness + 1j * w * damping
+    steady = size * law / (law - mass * w * w)
+    roots = np.roots([mass, damping, stiffness])
     start = np.array([-steady.imag, -(1j * w * steady).imag])
     own = np.linalg.solve(np.array([[1, 1], roots]), start)
     moved = (steady * np.exp(1j * w * t)).imag
@@ -151,6 +153,20 @@ def test_one_mass_is_followed_to_second_order_without_creating_energy(tmp_path: 
     for method, order in (("implicit", 1), ("compensated", 1), ("lossless", 2)):
         found = np.polyfit(np.log(periods), np.log([errors[method, p] for p in periods]), 1)[0]
         assert found == pytest.approx(order, abs=0.16 if order == 1 else 0.02)
+
+
+def test_default_couplings_are_rendered_ten_times_better_than_by_implicit(tmp_path: Path) -> None:
+    scene = scene_of(FREE_MASS.format(mass=0.1), tmp_path)
+    t: Array = T * np.arange(1, 2001, dtype=np.float64)
+    path = np.zeros((t.size, 3))
+    path[:, 0] = 0.02 * np.sin(2 * np.pi * 2.0 * t)
+    errors = {}
+    for method in ("implicit", "lossless"):
+        asked = default_coupling(SimulatedDevice().info, T, method=METHODS[method])
+        rows, _ = led(scene, method, asked, path, T)
+        felt = response_from_rest(t, asked.stiffness, asked.damping, 0.1)
+        errors[method] = float(np.sqrt(np.mean((rows["tool_position"][:, 0] - felt) ** 2)))
+    assert 10 * errors["lossless"] < errors["implicit"]
 
 
 @pytest.mark.parametrize("name", ["spun", "arm", "arm in gravity with a spring"])

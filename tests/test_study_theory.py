@@ -21,7 +21,7 @@ T = 1e-3
 @given(st.floats(1, 1e5), st.floats(1e-3, 50))
 @settings(max_examples=30, deadline=None)
 def test_alternatives_follow_their_closed_forms(stiffness: float, damping: float) -> None:
-    asked, half, low_pass, tustin, wall, anywhere, line = alternatives(
+    asked, half, low_pass, tustin, wall, anywhere, line, compensated, lossless = alternatives(
         Coupling(stiffness, damping, 0, 0), T, 2 * T
     )
     a = stiffness * T / 2
@@ -31,6 +31,8 @@ def test_alternatives_follow_their_closed_forms(stiffness: float, damping: float
     assert tustin.needed == np.inf
     assert anywhere.needed == np.inf
     assert line.needed == pytest.approx(2 * a, rel=1e-12)
+    assert compensated.needed == pytest.approx(max(damping - a, a), rel=1e-12)
+    assert lossless.needed == pytest.approx(max(damping, a), rel=1e-12)
     if a < 2 * damping:
         assert wall.needed == pytest.approx(a + a**2 / (2 * damping) + damping, rel=1e-9)
     else:

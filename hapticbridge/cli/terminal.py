@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 
 from rich.console import Console
@@ -27,6 +28,19 @@ def plain(text: str) -> str:
 def print_error(error: Exception) -> None:
     """Prints what went wrong on stderr, in one line."""
     err.print(f"[red]error:[/red] {plain(' '.join(str(error).splitlines()))}")
+
+
+def print_json(facts: object) -> None:
+    """Prints facts as JSON on stdout, with null in place of numbers that JSON does not have."""
+    out.print_json(json.dumps(_without_inf(facts), allow_nan=False))
+
+
+def _without_inf(fact: object) -> object:
+    if isinstance(fact, dict):
+        return {key: _without_inf(value) for key, value in fact.items()}
+    if isinstance(fact, list | tuple):
+        return [_without_inf(value) for value in fact]
+    return None if isinstance(fact, float) and not math.isfinite(fact) else fact
 
 
 def quantity(value: float, unit: str) -> str:

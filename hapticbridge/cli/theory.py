@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +11,7 @@ import tyro
 from matplotlib.figure import Figure
 from rich.table import Table
 
-from hapticbridge.cli.terminal import err, out, plain
+from hapticbridge.cli.terminal import err, out, plain, print_json
 from hapticbridge.clock import period_of
 from hapticbridge.coupling import Coupling
 from hapticbridge.passivity import ZWidth, maximum_stiffness, z_width
@@ -27,19 +26,6 @@ DEFAULT_RATE = 1000.0
 def _next_command(stiffness: float, damping: float, rate: float) -> str:
     command = f"hapticbridge run SCENE --stiffness {stiffness:.6g} --damping {damping:.6g}"
     return command if rate == DEFAULT_RATE else f"{command} --rate {rate:.6g}"
-
-
-def _print_json(facts: dict[str, object]) -> None:
-    out.print_json(json.dumps(_without_inf(facts), allow_nan=False))
-
-
-def _without_inf(fact: object) -> object:
-    """Returns a fact with null in place of numbers that JSON does not have."""
-    if isinstance(fact, dict):
-        return {key: _without_inf(value) for key, value in fact.items()}
-    if isinstance(fact, list):
-        return [_without_inf(value) for value in fact]
-    return None if isinstance(fact, float) and not math.isfinite(fact) else fact
 
 
 def _write(figure: Figure, path: Path) -> None:
@@ -95,7 +81,7 @@ class Zwidth:
         command = _next_command(corner.stiffness, corner.damping, self.rate)
         told = None if z.filter_time else command
         if self.as_json:
-            _print_json(_z_width_facts(z, told))
+            print_json(_z_width_facts(z, told))
         else:
             _print_z_width(z, told)
         if self.plot is not None:
@@ -189,7 +175,7 @@ class Bound:
         ways = alternatives(coupling, period, filter_time)
         holds = b is None or b >= ways[0].needed
         if self.as_json:
-            _print_json(self._facts(ways, period))
+            print_json(self._facts(ways, period))
         else:
             self._print(ways, period)
         if self.plot is not None:

@@ -139,6 +139,7 @@ _RUNNING_COUNTS = (
     "mocap_has_moved",
     "active_contacts",
     "is_midpoint",
+    "is_held",
     "hold",
     "equality_rows",
     "first_unstrict",

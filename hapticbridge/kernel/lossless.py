@@ -157,25 +157,29 @@ def start_twist(state: NDArray[np.void]) -> None:
 def is_near(state: NDArray[np.void]) -> bool:
     """Tells whether the step saw the tool touch something, be near to it, or at a joint's limit.
 
+    Notes in ``is_held`` whether a constraint force acted on its tree.
+
     Contacts within ``REACH`` are there without a force, because the geoms' gap says so.
     """
     s = state[0]
-    found = bool(s.is_never_free)
+    found = held = bool(s.is_never_free)
     s.active_contacts = 0
     contacts = pointer_at(s.contact)
     for c in range(ints(s.ncon, 1)[0]):
         contact = contacts + s.contact_size * c
-        s.active_contacts += ints(contact + s.contact_row, 1)[0] >= 0
+        is_active = ints(contact + s.contact_row, 1)[0] >= 0
+        s.active_contacts += is_active
         for geom in ints(contact + s.contact_geoms, 2):
             # a flex is no geom
-            found = found or geom < 0 or bool(ints(s.geom_in_tree, s.ngeom)[geom])
+            if geom < 0 or ints(s.geom_in_tree, s.ngeom)[geom] != 0:
+                found, held = True, held or is_active
     count = ints(s.nefc, 1)[0]
     kinds, ids = ints(pointer_at(s.efc_type), count), ints(pointer_at(s.efc_id), count)
     for row in range(count):
-        if kinds[row] == LIMIT_TENDON:
-            found = True
-        if kinds[row] == LIMIT_JOINT:
-            found = found or bool(ints(s.joint_in_tree, s.njnt)[ids[row]])
+        is_joint = kinds[row] == LIMIT_JOINT and ints(s.joint_in_tree, s.njnt)[ids[row]] != 0
+        if is_joint or kinds[row] == LIMIT_TENDON:
+            found = held = True
+    s.is_held = held
     return found
 
 
@@ -271,6 +275,15 @@ def _settle(state: NDArray[np.void], work: float) -> None:
     v, u, half = floats(s.velocity, s.nv), floats(s.qvel, s.nv), floats(s.half_step, s.nv)
     for i in range(s.nv):
         v[i] = u[i] + half[i]
+    _balance(state, work)
+    _keep_carried(state)
+
+
+@compiled
+def _balance(state: NDArray[np.void], work: float) -> None:
+    """Takes the kinetic energy at v and gives back what was created."""
+    s = state[0]
+    v = floats(s.velocity, s.nv)
     momentum, in_tree = floats(s.kept, s.nv), ints(s.dof_in_tree, s.nv)
     mj_mul_m(s.model, s.data, s.kept, s.velocity)
     mine = others = 0.0
@@ -280,7 +293,6 @@ def _settle(state: NDArray[np.void], work: float) -> None:
         others += energy * (1 - in_tree[i])
     s.kinetic = mine + others
     _give_back(state, work, mine)
-    _keep_carried(state)
 
 
 @compiled
@@ -376,12 +388,20 @@ def finish_lossless(
     was_midpoint = s.is_midpoint != 0
     if was_midpoint:
         torque = midpoint_torque(state, tool, turned)
+    work = dot(force, moved) + dot(torque, turned)
+    if was_midpoint:
         mj_factor_m(s.model, s.data)
         # the torque is carried in the tool's frame, so that it turns with the tool
         q = s.tool_quaternion
         applied = rotated(tool, rotated(conjugate((q[0], q[1], q[2], q[3])), half[1]))
         _carry(state, subtract(force, half[0]), subtract(torque, applied))
-        _settle(state, dot(force, moved) + dot(torque, turned))
+        _settle(state, work)
+    elif not s.is_held:
+        # free, but not yet or no longer lossless: that balances to first order only
+        v, u = floats(s.velocity, s.nv), floats(s.qvel, s.nv)
+        for i in range(s.nv):
+            v[i] = u[i]
+        _balance(state, work)
     s.hold = HOLD_TICKS if near else max(s.hold - 1, 0)
     if was_midpoint and near:
         _leave(state)

@@ -3,6 +3,9 @@
 from hapticbridge.passivity.bounds import maximum_stiffness as maximum_stiffness
 from hapticbridge.passivity.bounds import minimum_damping as minimum_damping
 from hapticbridge.passivity.bounds import stiffest_coupling as stiffest_coupling
+from hapticbridge.passivity.compensation import felt_damping as felt_damping
+from hapticbridge.passivity.compensation import law_damping as law_damping
+from hapticbridge.passivity.compensation import needed_for_felt as needed_for_felt
 from hapticbridge.passivity.delay import coupled_stability_limit as coupled_stability_limit
 from hapticbridge.passivity.free_device import free_device_damping as free_device_damping
 from hapticbridge.passivity.free_device import free_device_stiffness as free_device_stiffness

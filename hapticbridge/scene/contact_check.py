@@ -93,32 +93,64 @@ def contact_settings(model: mujoco.MjModel, grip: str) -> Iterator[tuple[int, in
         model: The compiled scene.
         grip: Name of the site on the tool.
     """
+    yield from settings_among(model, tool_geoms(model, grip))
+
+
+def tool_geoms(model: mujoco.MjModel, grip: str) -> NDArray[np.bool_]:
+    """Tells of every geom whether it is of the tool: whether it moves with the grip."""
+    root = model.body_rootid[model.site(grip).bodyid[0]]
+    return np.asarray(model.body_rootid[model.geom_bodyid] == root, dtype=bool)
+
+
+def settings_among(
+    model: mujoco.MjModel, among: NDArray[np.bool_] | None = None
+) -> Iterator[tuple[int, int, ContactSetting]]:
+    """Yields geoms that may collide with their contact's setting; ``among`` as in the pairs."""
+    mixed = cache(_mixed)  # geoms of one class say the same
+    says = [_say(model, g) for g in range(model.ngeom)]
+    for first, second, pair in meeting_pairs(model, among):
+        if pair < 0:
+            setting = mixed(says[first], says[second])
+        else:
+            setting = ContactSetting(
+                _floats(model.pair_solref[pair]),
+                _floats(model.pair_solimp[pair]),
+                int(model.pair_dim[pair]),
+                float(model.pair_friction[pair, 0]),
+            )
+        yield first, second, _overridden(model, setting)
+
+
+def meeting_pairs(
+    model: mujoco.MjModel, among: NDArray[np.bool_] | None = None
+) -> Iterator[tuple[int, int, int]]:
+    """Yields geoms that may collide, by masks, exclusions, parents and explicit pairs.
+
+    Args:
+        model: The compiled scene.
+        among: Per geom, whether a pair with it counts; None counts all.
+
+    Yields:
+        Two geoms, and the explicit pair that they are, or -1.
+    """
     disable = mujoco.mjtDisableBit
     if model.opt.disableflags & (disable.mjDSBL_CONTACT | disable.mjDSBL_CONSTRAINT):
         return
-    is_tool = model.body_rootid[model.geom_bodyid] == model.body_rootid[model.site(grip).bodyid[0]]
+    counts = np.ones(model.ngeom, dtype=bool) if among is None else among
     paired = set()
     for p in range(model.npair):
         first, second = int(model.pair_geom1[p]), int(model.pair_geom2[p])
         paired.add(frozenset((first, second)))
-        if is_tool[first] or is_tool[second]:
-            setting = ContactSetting(
-                _floats(model.pair_solref[p]),
-                _floats(model.pair_solimp[p]),
-                int(model.pair_dim[p]),
-                float(model.pair_friction[p, 0]),
-            )
-            yield first, second, _overridden(model, setting)
-    mixed = cache(_mixed)  # geoms of one class say the same
-    says = [_say(model, g) for g in range(model.ngeom)]
+        if counts[first] or counts[second]:
+            yield first, second, p
     excluded = _excluded(model)
-    for first in np.flatnonzero(is_tool).tolist():
+    for first in np.flatnonzero(counts).tolist():
         for second in np.flatnonzero(_partners(model, first)).tolist():
             bodies = frozenset(model.geom_bodyid[[first, second]].tolist())
-            is_seen = is_tool[second] and second < first
+            is_seen = counts[second] and second < first
             if is_seen or bodies in excluded or frozenset((first, second)) in paired:
                 continue
-            yield first, second, _overridden(model, mixed(says[first], says[second]))
+            yield first, second, -1
 
 
 def _partners(model: mujoco.MjModel, geom: int) -> NDArray[np.bool_]:

@@ -153,7 +153,7 @@ def contact_numbers(
             f"solref {list(solref)}, solimp {list(solimp)} and time step {timestep!r} s: a contact "
             "needs two numbers, at least one, and a time step > 0, all finite"
         )
-    impedance, last = _impedances(solimp)
+    impedance, last = impedance_at(solimp, SHALLOW), impedance_at(solimp, math.inf)
     first, second = float(solref[0]), float(solref[1])
     if first > 0 and second > 0:
         resolved, ratio = first * second / timestep, second
@@ -170,15 +170,20 @@ def contact_numbers(
     return ContactNumbers(resolved, 2 * last * resolved * ratio, stiffness, impedance)
 
 
-def _impedances(solimp: Sequence[float]) -> tuple[float, float]:
-    """Returns the impedance at ``SHALLOW``, and d_w, as MuJoCo computes them."""
+def impedance_at(solimp: Sequence[float], depth: float) -> float:
+    """Returns the impedance d at a depth, as MuJoCo computes it, without unit.
+
+    Args:
+        solimp: MuJoCo's d₀, d_w, width in m, midpoint, power; the last may be left out.
+        depth: In m, >= 0; infinity for d_w.
+    """
     given = (*map(float, solimp), *MUJOCO_SOLIMP[len(solimp) :])
     # between mjMINIMP and mjMAXIMP
     start, last, middle = (min(max(given[i], 1e-4), 0.9999) for i in (0, 1, 3))
     width, power = given[2], max(given[4], 1.0)
-    share = min(SHALLOW / width, 1.0) if width > 0 else 1.0
+    share = min(depth / width, 1.0) if width > 0 else 1.0
     if share <= middle:
         rise = share**power / middle ** (power - 1)
     else:
         rise = 1 - (1 - share) ** power / (1 - middle) ** (power - 1)
-    return start + rise * (last - start), last
+    return float(start + rise * (last - start))

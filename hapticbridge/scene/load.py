@@ -227,7 +227,12 @@ def read_scene(path_or_name: str | Path, **parameters: float) -> SceneSource:
 
 
 def compile_scene(
-    source: SceneSource, grip: str = "grip", *, warns: bool = True, stacklevel: int = 2
+    source: SceneSource,
+    grip: str = "grip",
+    *,
+    warns: bool = True,
+    checks_start: bool = True,
+    stacklevel: int = 2,
 ) -> Scene:
     """Puts handle and coupling into a scene that was read, and compiles it.
 
@@ -236,6 +241,8 @@ def compile_scene(
             it is.
         grip: Name of the site on the tool.
         warns: Whether to say what will run otherwise than the file says.
+        checks_start: Whether to refuse a start that no hand should feel: inside something, or not
+            finite.
         stacklevel: Whose line the warnings name.
 
     Raises:
@@ -256,7 +263,8 @@ def compile_scene(
         scene.reset()
     except (ValueError, OSError, MemoryError, mujoco.FatalError) as error:
         raise SceneError(f"cannot compile scene '{path}': {_sentence(error)}") from None
-    check_start(model, scene.data, grip)
+    if checks_start:
+        check_start(model, scene.data, grip)
     if warns:
         for concern in concerns:
             warnings.warn(f"scene '{path}': {concern}", UserWarning, stacklevel=stacklevel)

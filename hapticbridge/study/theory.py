@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from textwrap import wrap
 
 import numpy as np
@@ -16,6 +16,12 @@ from hapticbridge.passivity import (
     minimum_damping,
     transmission_line_spectrum,
     worst_frequency,
+)
+from hapticbridge.passivity.compensation import (
+    IMPLICIT_LAG,
+    MIDPOINT_LAG,
+    felt_damping,
+    law_damping,
 )
 from hapticbridge.passivity.spectrum import Discretization
 from hapticbridge.picture import new_figure
@@ -33,8 +39,8 @@ of the region, the damping needed); more shows more of what lies far outside and
 TITLE_WIDTH = 95
 """Characters of a title's line that fit into 8 inches; more would be cut off."""
 
-_COLOURS = ("#1a5fb4", "#b3261e", "#2e7d32", "#8e44ad", "#c77700", "#5f6368")
-_STYLES = ("-", "--", "-.", ":", (0, (5, 1)), (0, (1, 1)))
+_COLOURS = ("#1a5fb4", "#b3261e", "#2e7d32", "#8e44ad", "#c77700", "#5f6368", "#0b7285", "#d6336c")
+_STYLES = ("-", "--", "-.", ":", (0, (5, 1)), (0, (1, 1)), "-.", (0, (4, 4)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,7 +67,8 @@ def alternatives(coupling: Coupling, period: float, filter_time: float) -> tuple
     In this order: as asked (backward difference); half the period; a first-order low-pass behind
     the damper; Tustin's damper; one sample of delay against a wall, and for any environment; a
     lossless transmission line of the same static stiffness, of impedance Z = K T and one sample
-    each way, ended by the device.
+    each way, ended by the device; the coupling as felt under the methods ``compensated`` and
+    ``lossless``, whose laws have less damping than is felt.
 
     Args:
         coupling: K and B; the translation counts.
@@ -81,20 +88,25 @@ def alternatives(coupling: Coupling, period: float, filter_time: float) -> tuple
         scheme: Discretization = "backward",
         delay: int = 0,
         low_pass: float = 0.0,
+        law: Coupling = coupling,
     ) -> Alternative:
         needed = minimum_damping(
-            coupling, step, discretization=scheme, delay=delay, filter_time=low_pass
+            law, step, discretization=scheme, delay=delay, filter_time=low_pass
         )
         frequency = _frequencies(step)
         spectrum = damping_spectrum(
-            coupling, step, frequency, discretization=scheme, delay=delay, filter_time=low_pass
+            law, step, frequency, discretization=scheme, delay=delay, filter_time=low_pass
         )
-        if delay == 0 and coupling.damping == 0:  # a plain spring asks for K T/2 at all of them
+        if delay == 0 and law.damping == 0:  # a plain spring asks for K T/2 at all of them
             return Alternative(name, needed, None, (frequency, spectrum))
-        worst = worst_frequency(
-            coupling, step, discretization=scheme, delay=delay, filter_time=low_pass
-        )
+        worst = worst_frequency(law, step, discretization=scheme, delay=delay, filter_time=low_pass)
         return Alternative(name, needed, float(worst), (frequency, spectrum))
+
+    def rendered(name: str, lag: float) -> Alternative:
+        k = coupling.stiffness
+        damping = law_damping(k, coupling.damping, period, lag)
+        felt = felt_damping(k, damping, period, lag)
+        return way(f"method {name}, B = {felt:.4g} felt", law=replace(coupling, damping=damping))
 
     asked = way("as asked (backward difference)")
     frequency = _frequencies(period)
@@ -114,6 +126,8 @@ def alternatives(coupling: Coupling, period: float, filter_time: float) -> tuple
             None,
             (frequency, line),
         ),
+        rendered("compensated", IMPLICIT_LAG),
+        rendered("lossless", MIDPOINT_LAG),
     )
 
 

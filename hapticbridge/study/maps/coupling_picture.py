@@ -100,7 +100,7 @@ def _draw_theory(axes: Axes, name: str, *, has_wall: bool) -> None:
     axes.contour(
         np.linspace(*DAMPING, CONTOUR),
         np.geomspace(*STIFFNESS, CONTOUR),
-        np.minimum(_needed(name), 10 * b),
+        np.minimum(_needed(_first_alike(name)), 10 * b),
         levels=[b],
         colors=THEORY_COLOUR,
         linestyles="--",
@@ -108,12 +108,15 @@ def _draw_theory(axes: Axes, name: str, *, has_wall: bool) -> None:
     )
 
 
+def _first_alike(name: str) -> str:
+    """Returns the first method with the same free tool's bound, which is so computed once."""
+    mine = THEORIES[name], METHODS[name].lag
+    return next(each for each in THEORIES if (THEORIES[each], METHODS[each].lag) == mine)
+
+
 @cache
 def _needed(name: str) -> NDArray[np.float64]:
-    """Returns the device damping in N s/m that a free tool needs, rows of K by columns of B.
-
-    Kept, because a folder is often drawn more than once.
-    """
+    """Returns the device damping in N s/m that a free tool needs, rows of K by columns of B."""
     stiffness, damping = np.geomspace(*STIFFNESS, CONTOUR), np.linspace(*DAMPING, CONTOUR)
     used = used_damping(name, stiffness[:, None], damping, PERIOD)
     return np.array(

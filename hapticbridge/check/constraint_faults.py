@@ -1,0 +1,148 @@
+"""Faults of constraints that are no contacts: soft stops, soft joints between bodies, creep."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import mujoco
+import numpy as np
+
+from hapticbridge.check.case import Case
+from hapticbridge.check.contact_stiffness import constraint_stiffness, depth_under
+from hapticbridge.check.faults import Fault, length, number
+from hapticbridge.check.inertia import joint_inertia
+from hapticbridge.scene.contact_concerns import SOFT_STEPS
+from hapticbridge.scene.contact_rule import REFERENCE_STEPS, ROUNDING, contact_numbers, impedance_at
+
+CREEP_LOAD = 0.5
+"""Share of the dry friction at which its creep is judged, no unit: it grows with the load."""
+
+FASTEST_CREEP, FASTEST_TURN = 1e-4, 1e-3
+"""Creep in m/s and rad/s from which a friction does not hold: 1 mm in 10 s, 0.1 m off the axis. The
+shipped scenes' creep by at most a fifth of it; MuJoCo's default by about 5 mm/s at 5 N/kg."""
+
+
+def constraint_faults(case: Case) -> Iterator[Fault]:
+    """Yields limits, equality constraints and dry friction that are as soft as MuJoCo's default.
+
+    Args:
+        case: The scene under check.
+    """
+    case.scene.reset()
+    yield from _limits(case)
+    yield from _equalities(case)
+    yield from _frictions(case)
+
+
+def creep_speed(
+    force: float, solref: Sequence[float], solimp: Sequence[float], inertia: float
+) -> float:
+    """Returns how fast dry friction slides under a force that it should hold, in m/s.
+
+        v = F (1 − d) d_w timeconst/(2 d m)
+
+    Args:
+        force: F in N, below the friction (of a hinge in N m, and the result is in rad/s).
+        solref: (timeconst in s, dampratio), or (−stiffness in 1/s², −damping in 1/s).
+        solimp: Its impedance d at depth zero, and d_w from the width on.
+        inertia: m in kg that the joint moves (of a hinge in kg m²).
+    """
+    impedance, last = impedance_at(solimp, 0.0), impedance_at(solimp, np.inf)
+    damping = 2.0 / solref[0] if solref[0] > 0 else -float(solref[1])
+    return force * (1.0 - impedance) * last / (impedance * inertia * damping)
+
+
+def _is_soft(case: Case, solref: Sequence[float], solimp: Sequence[float]) -> bool:
+    numbers = contact_numbers(solref, solimp, float(case.model.opt.timestep))
+    return numbers.resolved > SOFT_STEPS * (1 + ROUNDING)
+
+
+def _limits(case: Case) -> Iterator[Fault]:
+    model = case.model
+    for joint in np.flatnonzero(model.jnt_limited).tolist():
+        solref, solimp = model.jnt_solref[joint], model.jnt_solimp[joint]
+        if not _is_soft(case, solref, solimp):
+            continue
+        place, dof = case.places.joint(joint), int(model.jnt_dofadr[joint])
+        inertia = joint_inertia(model, case.scene.data, dof)
+        is_slide = model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE
+        yield Fault(
+            "soft limit",
+            place,
+            f"the limit of {place.element} {_depth_words(case, solref, solimp, inertia, is_slide)}",
+            f'solreflimit="{_reference(case)}" solimplimit="0.9 0.95 0.001"',
+        )
+    for tendon in np.flatnonzero(model.tendon_limited).tolist():
+        solref, solimp = model.tendon_solref_lim[tendon], model.tendon_solimp_lim[tendon]
+        if _is_soft(case, solref, solimp):
+            place, inertia = case.places.tendon(tendon), 1.0 / model.tendon_invweight0[tendon]
+            yield Fault(
+                "soft limit",
+                place,
+                f"the limit of {place.element} {_depth_words(case, solref, solimp, inertia, True)}",
+                f'solreflimit="{_reference(case)}" solimplimit="0.9 0.95 0.001"',
+            )
+
+
+def _equalities(case: Case) -> Iterator[Fault]:
+    model = case.model
+    for equality in np.flatnonzero(model.eq_active0).tolist():
+        solref, solimp = model.eq_solref[equality], model.eq_solimp[equality]
+        if _is_soft(case, solref, solimp):
+            place = case.places.equality(equality)
+            softer = contact_numbers(solref, solimp, float(model.opt.timestep)).softness
+            yield Fault(
+                "soft equality",
+                place,
+                f"{place.element} has solref {_numbers(solref)}: it gives {number(softer)} times "
+                f'as far as with "{_reference(case)}", and what it joins lags behind',
+                f'solref="{_reference(case)}" solimp="0.9 0.95 0.001"',
+            )
+
+
+def _frictions(case: Case) -> Iterator[Fault]:
+    model = case.model
+    told = set()
+    for dof in np.flatnonzero(model.dof_frictionloss > 0).tolist():
+        joint, solref = int(model.dof_jntid[dof]), model.dof_solref[dof]
+        solimp, loss = model.dof_solimp[dof], float(model.dof_frictionloss[dof])
+        inertia = joint_inertia(model, case.scene.data, dof)
+        speed = creep_speed(CREEP_LOAD * loss, solref, solimp, inertia)
+        is_slide = model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE
+        if joint in told or speed <= (FASTEST_CREEP if is_slide else FASTEST_TURN):
+            continue
+        told.add(joint)
+        moved = f"{length(speed)}/s" if is_slide else f"{number(speed)} rad/s"
+        place, unit = case.places.joint(joint), "N" if is_slide else "N m"
+        yield Fault(
+            "creeping friction",
+            place,
+            f"the dry friction of {place.element}, {loss:g} {unit}, creeps by {moved} under half "
+            f"of it (solref {_numbers(solref)}, impedance {solimp[0]:g}), where it should hold",
+            f'solreffriction="{_reference(case)}" solimpfriction="0.999 0.999 0.001"',
+        )
+
+
+def _depth_words(
+    case: Case, solref: Sequence[float], solimp: Sequence[float], inertia: float, is_slide: bool
+) -> str:
+    step = float(case.model.opt.timestep)
+    push = case.info.force_limit if is_slide else case.info.torque_limit
+    depth = depth_under(push, solref, solimp, inertia, step)
+    stiffness = constraint_stiffness(solref, solimp, inertia, step, depth)
+    if is_slide:
+        amount, deep = f"{number(stiffness)} N/m", f"{push:g} N push {length(depth)} through it"
+    else:
+        amount, deep = (
+            f"{number(stiffness)} N m/rad",
+            f"{push:g} N m turn {number(depth)} rad through it",
+        )
+    return f"amounts to {amount} (solref {_numbers(solref)}): {deep}"
+
+
+def _reference(case: Case) -> str:
+    return f"{REFERENCE_STEPS * float(case.model.opt.timestep):g} 1"
+
+
+def _numbers(values: Sequence[float]) -> str:
+    return f'"{" ".join(f"{value:g}" for value in values)}"'

@@ -1,0 +1,187 @@
+"""Faults of contacts' settings: too soft, too stiff, too slippery."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import mujoco
+import numpy as np
+
+from hapticbridge.check.case import Case
+from hapticbridge.check.clearance import clearances
+from hapticbridge.check.contact_stiffness import constraint_stiffness, depth_under
+from hapticbridge.check.faults import Fault, length, number, others
+from hapticbridge.check.inertia import body_inertia
+from hapticbridge.check.places import Place
+from hapticbridge.scene.contact_check import ContactSetting, settings_among, tool_geoms
+from hapticbridge.scene.contact_concerns import SOFT_STEPS, contact_concerns
+from hapticbridge.scene.contact_rule import REFERENCE_STEPS, ROUNDING, contact_numbers
+
+LEAST_PUSH = 1.0
+"""Force in N that a contact is tested with at least: a light touch. A motion that touches nothing
+stretches the coupling by nothing, and says nothing about what the contact must bear."""
+
+MUJOCO_SOLREF = (0.02, 1.0)
+"""What a geom has that says nothing."""
+
+_TYPICAL_INERTIA = 0.1  # kg; only of pairs of which neither side moves by itself
+
+
+def contact_faults(case: Case) -> Iterator[Fault]:
+    """Yields what is wrong with the settings of contacts that the hand can feel.
+
+    Looked at are the contacts that the tool can have, and those that any two things had.
+
+    Args:
+        case: The scene under check.
+    """
+    model, option = case.model, case.model.opt
+    meetings = case.observation.meetings if case.observation else {}
+    is_tool = tool_geoms(model, case.scene.grip)
+    where: dict[ContactSetting, list[tuple[int, int]]] = {}
+    for first, second, setting in settings_among(model):
+        pair = min(first, second), max(first, second)
+        if is_tool[first] or is_tool[second] or pair in meetings:
+            where.setdefault(setting, []).append(pair)
+    push, cone_told = push_of(case), False
+    case.scene.reset()
+    rooms = _rooms(case, [pair for pairs in where.values() for pair in pairs])
+    for setting, pairs in where.items():
+        place, also = _place(case, pairs[0], is_soft=False)
+        names = pair_names(case, pairs)
+        if fault := _soft(case, setting, pairs, push, rooms):
+            yield fault
+        for concern in contact_concerns(
+            setting.solref,
+            setting.solimp,
+            float(option.timestep),
+            cone="elliptic" if option.cone == mujoco.mjtCone.mjCONE_ELLIPTIC else "pyramidal",
+            condim=setting.condim,
+            friction=setting.friction,
+            only_active=True,
+        ):
+            clause, _, change = concern.partition("; write ")
+            is_cone = "pyramidal" in clause
+            if is_cone and cone_told:  # one word changes it for all
+                continue
+            cone_told |= is_cone
+            yield Fault(
+                "pyramidal cone" if is_cone else "not passive",
+                case.places.option("cone") if is_cone else place,
+                f"the contact of {names} (solref {_numbers(setting.solref)}) {clause}",
+                change if is_cone else change + also,
+            )
+
+
+def push_of(case: Case) -> float:
+    """Returns the force in N that contacts are tested with.
+
+    It is the coupling's largest in the motion, within ``LEAST_PUSH`` and what the device can give.
+    """
+    largest = float(case.observation.force.max()) if case.observation else 0.0
+    return min(max(largest, LEAST_PUSH), max(case.info.force_limit, LEAST_PUSH))
+
+
+def _rooms(case: Case, pairs: list[tuple[int, int]]) -> dict[tuple[int, int], float]:
+    if case.observation is None:
+        return {}
+    is_tool = tool_geoms(case.model, case.scene.grip)
+    mine = [pair for pair in pairs if is_tool[pair[0]] != is_tool[pair[1]]]
+    return clearances(case.model, mine, is_tool, case.observation.postures)
+
+
+def _soft(
+    case: Case,
+    setting: ContactSetting,
+    pairs: list[tuple[int, int]],
+    push: float,
+    rooms: dict[tuple[int, int], float],
+) -> Fault | None:
+    """Says how deep a push sinks in, where the setting is soft or a clearance is less deep."""
+    step = float(case.model.opt.timestep)
+    depths = {
+        pair: depth_under(push, setting.solref, setting.solimp, inertia_of(case, pair), step)
+        for pair in pairs
+    }
+    numbers = contact_numbers(setting.solref, setting.solimp, step)
+    if numbers.resolved <= REFERENCE_STEPS * (1 + ROUNDING):
+        return None  # as stiff as any that was seen to be passive with light tools
+    tight = [pair for pair in pairs if depths[pair] > rooms.get(pair, np.inf)]
+    if not tight and numbers.resolved <= SOFT_STEPS * (1 + ROUNDING):
+        return None
+    pair = max(tight or pairs, key=lambda each: depths[each])
+    stiffness = constraint_stiffness(
+        setting.solref, setting.solimp, inertia_of(case, pair), step, depths[pair]
+    )
+    is_default = np.allclose(setting.solref, MUJOCO_SOLREF)
+    default = "MuJoCo's default " if is_default else ""
+    sentence = (
+        f"the contact of {pair_names(case, [pair])}{others(len(pairs) - 1)} amounts to "
+        f"{number(stiffness)} N/m ({default}solref "
+        f"{_numbers(setting.solref)}): {number(push)} N sink in by {length(depths[pair])}"
+    )
+    if pair in rooms:
+        sentence += f", into a clearance of {length(rooms[pair])}"
+    change = f'solref="{REFERENCE_STEPS * step:g} 1" solimp="0.9 0.95 0.001"'
+    kind = "default contact" if is_default else "soft contact"
+    place, also = _place(case, pair, is_soft=True)
+    return Fault(kind, place, sentence, change + also)
+
+
+def inertia_of(case: Case, pair: tuple[int, int]) -> float:
+    """Returns the inertia in kg that the contact of two geoms has, the least that was seen.
+
+    Where they did not meet it is that of their centres at the start: 1/m = Σ 1/m_i, plus the
+    coupling's share h B + h² K at the tool.
+    """
+    model = case.model
+    seen = case.observation.meetings.get(pair) if case.observation else None
+    if seen is not None and np.isfinite(seen.inertia):
+        return seen.inertia
+    is_tool = tool_geoms(model, case.scene.grip)
+    step, inverse = float(model.opt.timestep), 0.0
+    share = step * case.coupling.damping + step**2 * case.coupling.stiffness
+    for geom in pair:
+        inertia = body_inertia(model, case.scene.data, int(model.geom_bodyid[geom]))
+        inverse += 1.0 / (inertia + (share if is_tool[geom] else 0.0))
+    return 1.0 / inverse if inverse > 0 else _TYPICAL_INERTIA
+
+
+def _place(case: Case, pair: tuple[int, int], *, is_soft: bool) -> tuple[Place, str]:
+    """Returns where to change a contact's setting, and what else must say the same.
+
+    That is an explicit pair, else the geom whose own solref is the softer (or the stiffer); the
+    tool's, where both say the same, and then the other must change too: MuJoCo takes the mean.
+    """
+    model = case.model
+    for p in range(model.npair):
+        if {int(model.pair_geom1[p]), int(model.pair_geom2[p])} == set(pair):
+            return case.places.pair(p), ""
+    is_tool = tool_geoms(model, case.scene.grip)
+    if model.geom_priority[pair[0]] != model.geom_priority[pair[1]]:
+        return case.places.geom(max(pair, key=lambda geom: model.geom_priority[geom])), ""
+    softness = [_softness(model.geom_solref[geom]) for geom in pair]
+    if softness[0] == softness[1]:
+        mine, other = pair if is_tool[pair[0]] else pair[::-1]
+        also = case.places.geom(other)
+        return case.places.geom(mine), f" there and at {also.file}:{also.line}, {also.element}"
+    extreme = max(softness) if is_soft else min(softness)
+    return case.places.geom(pair[softness.index(extreme)]), ""
+
+
+def _softness(solref: np.ndarray) -> float:
+    """Returns timeconst · dampratio in s, for either format."""
+    first, second = (float(value) for value in solref)
+    if first > 0 and second > 0:
+        return first * second
+    return 1.0 / np.sqrt(-first) if first < 0 else np.inf
+
+
+def pair_names(case: Case, pairs: list[tuple[int, int]]) -> str:
+    """Returns the names of the first of some pairs of geoms, and how many more there are."""
+    first, second = (case.places.geom(geom).element for geom in pairs[0])
+    return f"{first} with {second}{others(len(pairs) - 1)}"
+
+
+def _numbers(values: tuple[float, ...]) -> str:
+    return f'"{" ".join(f"{value:g}" for value in values)}"'

@@ -1,0 +1,126 @@
+"""How much of a difference between two versions of a scene a hand could feel."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticbridge.errors import SceneError
+
+WEBER = 0.07
+"""Just noticeable difference of a force as a share of it, without unit: 7 % from 2.5 to 10 N in the
+fingers (Pang, Tan & Durlach 1991). For torque 12.7 % was measured (Jandura & Srinivasan 1994); the
+same 7 % here is the stricter. Larger lets more be taken out of a scene."""
+
+FORCE_FLOOR = 0.03
+"""Force in N below which nothing is felt: 29 to 44 mN over fingers (King, Donlin & Hannaford 2010),
+21 mN with a pen (Lee & Hannaford 2003). It keeps a share of almost nothing from counting."""
+
+LEVER = 0.05
+"""Arm in m at which a hand feels a torque as a force: half a hand's breadth. The threshold of
+torque is never below the threshold of force on this arm."""
+
+
+@dataclass(frozen=True, slots=True)
+class FeltError:
+    """Difference between what two versions of a scene did under one motion of the handle.
+
+    Attributes:
+        force_rms: Of the difference of forces, in N, over all ticks and axes: √(mean ‖Δf‖²).
+        force_peak: Largest ‖Δf‖ in N.
+        torque_rms: In N m, likewise.
+        torque_peak: In N m.
+        force_threshold: One just noticeable difference of force, in N.
+        torque_threshold: In N m.
+        position_peak: Largest distance between the two tools, in m.
+        angle_peak: Largest angle between them, in rad.
+    """
+
+    force_rms: float
+    force_peak: float
+    torque_rms: float
+    torque_peak: float
+    force_threshold: float
+    torque_threshold: float
+    position_peak: float
+    angle_peak: float
+
+    @property
+    def force(self) -> float:
+        """RMS of the force's difference in just noticeable differences."""
+        return self.force_rms / self.force_threshold
+
+    @property
+    def torque(self) -> float:
+        """RMS of the torque's difference in just noticeable differences."""
+        return self.torque_rms / self.torque_threshold
+
+    @property
+    def felt(self) -> float:
+        """The larger of force and torque: 1 is just noticeable."""
+        return max(self.force, self.torque)
+
+    @property
+    def peak(self) -> float:
+        """Largest momentary difference, in the same thresholds; reported, never judged by."""
+        return max(self.force_peak / self.force_threshold, self.torque_peak / self.torque_threshold)
+
+
+def felt_error(original: NDArray[np.void], variant: NDArray[np.void]) -> FeltError:
+    """Compares two rehearsals of one motion.
+
+        felt = RMS ‖Δf‖ / max(0.07 RMS ‖f‖, 0.03 N),   torque likewise, where its threshold is
+
+    never below 0.05 m times that of force. RMS runs over the whole motion, so that an event that
+    comes a tick later does not count as its full height; in turn a short event is weighed against
+    everything else in the motion. Compare motions that do one thing.
+
+    Args:
+        original: Records, ``TICK_DTYPE``; its forces set the thresholds.
+        variant: Records of the same motion: as many, or every n-th of them at an n-th of the rate.
+
+    Raises:
+        SceneError: There are no records, or they are not of the same motion.
+
+    References:
+        Pang, Tan & Durlach, Perception & Psychophysics 49, 1991. King, Donlin & Hannaford, IEEE
+        Haptics Symposium 2010. Lee & Hannaford, Haptic Interfaces Symposium 2003. Jandura &
+        Srinivasan, ASME Dynamic Systems and Control 55, 1994.
+    """
+    if original.size == 0 or variant.size == 0:
+        raise SceneError("there is nothing to compare: a motion needs at least one tick")
+    every = max(1, round(original.size / variant.size))
+    rows = original[::every]
+    if rows.size != variant.size:
+        raise SceneError(
+            f"{original.size} and {variant.size} ticks are not of the same motion; one number must "
+            "be a multiple of the other"
+        )
+    whole = original["wrench_on_tool"]
+    force_threshold = max(WEBER * _rms(whole[:, :3]), FORCE_FLOOR)
+    torque_threshold = max(WEBER * _rms(whole[:, 3:]), LEVER * force_threshold)
+    difference = variant["wrench_on_tool"] - rows["wrench_on_tool"]
+    apart = variant["tool_position"] - rows["tool_position"]
+    cosine = np.abs(np.sum(variant["tool_quaternion"] * rows["tool_quaternion"], axis=1))
+    sine = np.linalg.norm(_vector_part(variant["tool_quaternion"], rows["tool_quaternion"]), axis=1)
+    return FeltError(
+        force_rms=_rms(difference[:, :3]),
+        force_peak=float(np.linalg.norm(difference[:, :3], axis=1).max()),
+        torque_rms=_rms(difference[:, 3:]),
+        torque_peak=float(np.linalg.norm(difference[:, 3:], axis=1).max()),
+        force_threshold=force_threshold,
+        torque_threshold=torque_threshold,
+        position_peak=float(np.linalg.norm(apart, axis=1).max()),
+        angle_peak=float((2.0 * np.arctan2(sine, cosine)).max()),
+    )
+
+
+def _rms(vectors: NDArray[np.float64]) -> float:
+    return float(np.sqrt(np.mean(np.sum(vectors**2, axis=1))))
+
+
+def _vector_part(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Vector part of a b⁻¹: its length is the sine of half the angle, exact where that is tiny."""
+    return b[:, :1] * a[:, 1:] - a[:, :1] * b[:, 1:] - np.cross(a[:, 1:], b[:, 1:])

@@ -1,0 +1,197 @@
+"""Faults of sizes and shapes: units, holes that are closed, a grip in the air, a small device."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull, QhullError
+
+from hapticbridge.check.case import Case
+from hapticbridge.check.faults import Fault, length, number, weight
+from hapticbridge.check.inventory import VISUAL, geom_uses
+from hapticbridge.check.places import Place
+
+LARGEST_TOOL, HEAVIEST_TOOL = 3.0, 50.0
+"""Length in m and mass in kg beyond which no hand holds a tool: its units are taken for others."""
+
+DEEPEST_DENT = 0.02
+"""Depth of a mesh's dent below its convex hull over its largest extent, no unit: rounding of
+vertices and of facets stays far below."""
+
+FARTHEST_GRIP = 1.0
+"""Distance from the grip to the tool's centre of mass over the tool's largest extent, no unit: a
+grip on the tool itself is at most at 1."""
+
+_AT_ONCE = 1000  # triangles compared with all facets of a hull: some 100 MB at 10 000 facets
+
+_SMALLEST_EXTENT = 1e-3  # m; nearer than this the grip is on any tool
+
+
+def geometry_faults(case: Case) -> Iterator[Fault]:
+    """Yields what is wrong with sizes and shapes.
+
+    Args:
+        case: The scene under check.
+    """
+    yield from _units(case)
+    yield from _dented_meshes(case)
+    yield from _far_grip(case)
+    yield from _workspace(case)
+
+
+def _units(case: Case) -> Iterator[Fault]:
+    model = case.model
+    mine = _tool_bodies(case)
+    mass, extent = float(model.body_mass[mine].sum()), float(_tool_extent(case).max())
+    found = []
+    if extent > LARGEST_TOOL:
+        found.append(f"is {length(extent)} long")
+    if mass > HEAVIEST_TOOL:
+        found.append(f"weighs {weight(mass)}")
+    if not found:
+        return
+    meshes = [
+        int(model.geom_dataid[geom])
+        for geom in range(model.ngeom)
+        if mine[model.geom_bodyid[geom]] and model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_MESH
+    ]
+    body = int(model.body_rootid[model.site(case.scene.grip).bodyid[0]])
+    place = case.places.mesh(meshes[0]) if meshes else case.places.body(body)
+    change = 'scale="0.001 0.001 0.001"' if meshes else "its sizes and positions in m, kg"
+    yield Fault(
+        "units",
+        place,
+        f"the tool {' and '.join(found)}: are these millimetres or grams? MuJoCo counts in m and "
+        "kg",
+        change,
+    )
+
+
+def _dented_meshes(case: Case) -> Iterator[Fault]:
+    """Finds meshes that collide and are not convex: MuJoCo collides their hulls."""
+    model, uses = case.model, geom_uses(case.model)
+    told = set()
+    for geom in range(model.ngeom):
+        mesh = int(model.geom_dataid[geom])
+        is_mesh = model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_MESH
+        if not is_mesh or uses[geom] == VISUAL or mesh in told:
+            continue
+        told.add(mesh)
+        vertices, faces = mesh_of(model, mesh)
+        dent, filled = dent_of(vertices, faces)
+        if dent <= DEEPEST_DENT * float(np.ptp(vertices, axis=0).max()):
+            continue
+        place = case.places.geom(geom)
+        mesh_place = case.places.mesh(mesh)
+        more = f" and {number(1e6 * filled)} cm³ of air are filled" if filled > 0 else ""
+        yield Fault(
+            "mesh not convex",
+            place,
+            f"{place.element} collides with {mesh_place.element} ({mesh_place.file}:"
+            f"{mesh_place.line}), which is not convex: MuJoCo takes its hull, so that a dent or "
+            f"hole {length(dent)} deep is closed{more}",
+            'contype="0" conaffinity="0", and convex pieces or primitives that collide instead',
+        )
+
+
+def mesh_of(model: mujoco.MjModel, mesh: int) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Returns vertices, shape (n, 3), in m, and triangles, shape (m, 3), of a compiled mesh."""
+    first, count = int(model.mesh_vertadr[mesh]), int(model.mesh_vertnum[mesh])
+    start, faces = int(model.mesh_faceadr[mesh]), int(model.mesh_facenum[mesh])
+    return (
+        np.asarray(model.mesh_vert[first : first + count], dtype=np.float64),
+        np.asarray(model.mesh_face[start : start + faces], dtype=np.int64),
+    )
+
+
+def dent_of(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> tuple[float, float]:
+    """Returns how deep a mesh's surface dips below its convex hull, and what the hull adds.
+
+    Args:
+        vertices: Shape (n, 3), in m.
+        faces: Shape (m, 3).
+
+    Returns:
+        The depth in m of the centre of a triangle that is deepest inside, and in m³ the volume of
+        the hull less that of the mesh; 0 for a surface that is not closed, which has none.
+    """
+    try:
+        hull = ConvexHull(vertices)
+    except (QhullError, ValueError):  # flat: MuJoCo gives it no volume either
+        return 0.0, 0.0
+    triangles = vertices[faces]
+    dent = 0.0
+    for centres in np.array_split(triangles.mean(axis=1), len(faces) // _AT_ONCE + 1):
+        inside = -(centres @ hull.equations[:, :3].T + hull.equations[:, 3])
+        dent = max(dent, float(inside.min(axis=1).max(initial=0.0)))
+    edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    is_closed = np.all(np.unique(edges, axis=0, return_counts=True)[1] == 2)
+    a, b, c = triangles[:, 0], triangles[:, 1], triangles[:, 2]
+    volume = abs(float(np.einsum("ij,ij->i", a, np.cross(b, c)).sum())) / 6.0
+    return dent, float(hull.volume) - volume if is_closed else 0.0
+
+
+def _far_grip(case: Case) -> Iterator[Fault]:
+    model, scene = case.model, case.scene
+    scene.reset()
+    site = model.site(scene.grip).id
+    mine, body = _tool_bodies(case), int(model.site_bodyid[site])
+    mass = model.body_mass[mine]
+    centre = mass @ scene.data.xipos[mine] / mass.sum()
+    grip = scene.data.site_xpos[site]
+    distance = float(np.linalg.norm(grip - centre))
+    extent = max(float(np.linalg.norm(_tool_extent(case))), _SMALLEST_EXTENT)
+    if distance <= FARTHEST_GRIP * extent:
+        return
+    rotation = scene.data.xmat[body].reshape(3, 3)
+    local = " ".join(f"{v:.4g}" for v in rotation.T @ (centre - scene.data.xpos[body]))
+    place = case.places.site(site)
+    yield Fault(
+        "far grip",
+        place,
+        f"{place.element}, the grip, is {length(distance)} from the tool's centre of mass, "
+        f"and the tool is {length(extent)} large: every push turns it about a point in the "
+        "air",
+        f'pos="{local}" (the centre of mass)',
+    )
+
+
+def _workspace(case: Case) -> Iterator[Fault]:
+    """Compares what the device must move with the cube that it reaches."""
+    extent = float(np.ptp(case.motion.table[:, 1:4], axis=0).max()) / case.scale
+    if extent <= case.workspace:
+        return
+    scale = case.scale * extent / case.workspace
+    yield Fault(
+        "workspace",
+        Place(case.motion_name, 0, "the motion"),
+        f"{case.motion_name} moves the handle by {length(extent * case.scale)}, which is "
+        f"{length(extent)} of the device at scale {case.scale:g}; it reaches "
+        f"{length(case.workspace)}",
+        f"a smaller scene, or run it with --scale {np.ceil(100 * scale) / 100:g}",
+    )
+
+
+def _tool_bodies(case: Case) -> NDArray[np.bool_]:
+    model = case.model
+    tree = model.body_treeid[model.site(case.scene.grip).bodyid[0]]
+    return np.asarray(model.body_treeid == tree, dtype=bool)
+
+
+def _tool_extent(case: Case) -> NDArray[np.float64]:
+    """Returns the edges in m of the upright box around the tool's geoms at the start."""
+    model, scene = case.model, case.scene
+    scene.reset()
+    mine = _tool_bodies(case)
+    corners = []
+    for geom in range(model.ngeom):
+        if mine[model.geom_bodyid[geom]] and model.geom_type[geom] != mujoco.mjtGeom.mjGEOM_PLANE:
+            centre, half = model.geom_aabb[geom, :3], model.geom_aabb[geom, 3:]
+            rotation = scene.data.geom_xmat[geom].reshape(3, 3)
+            middle = scene.data.geom_xpos[geom] + rotation @ centre
+            reach = np.abs(rotation) @ half
+            corners += [middle - reach, middle + reach]
+    return np.ptp(corners, axis=0) if corners else np.zeros(3)

@@ -1,0 +1,221 @@
+"""What a scene models: counted in the user's own model, without what the bridge adds to it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticbridge.check.observation import ROW_KINDS, Observation
+from hapticbridge.check.places import Place, Places
+from hapticbridge.check.reach import reached_trees
+from hapticbridge.kernel.state import COUPLING_ACTUATORS, HANDLE
+from hapticbridge.scene.contact_check import meeting_pairs
+
+VISUAL = "only visual"
+TOOL = "of the tool"
+MEETS_TOOL = "that meet the tool"
+MEETS_OTHER = "that meet something else"
+MOVING = "moving that meet nothing"
+FIXED = "fixed that meet nothing"
+USES = (TOOL, MEETS_TOOL, MEETS_OTHER, MOVING, FIXED, VISUAL)
+"""What a geom is there for, in the order in which it is printed."""
+
+
+@dataclass(frozen=True, slots=True)
+class Idle:
+    """Something that cannot influence the grip.
+
+    Attributes:
+        place: Where it is written.
+        reason: Why it cannot.
+    """
+
+    place: Place
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class Inventory:
+    """What a scene models.
+
+    Attributes:
+        bodies: All but the world.
+        moving_bodies: Those that a joint moves, their own or one further up.
+        degrees_of_freedom: Of the whole scene.
+        tool_degrees_of_freedom: Of what moves with the grip.
+        tool_mass: Of what moves with the grip, in kg.
+        geoms: By use, one of ``USES``; with a motion it counts what met, without what can.
+        triangles: Of the convex hulls of all meshes that collide.
+        possible_pairs: Pairs of geoms that may collide.
+        met_pairs: Those that did in the motion; None without one.
+        rows: By kind, largest and median number of constraint rows in a step; None without motion.
+        stiffness: Least and largest stiffness in N/m that a contact of the tool amounted to under a
+            force that can be felt; None without such a contact.
+        deepest: How deep the tool was in something at most, in m; 0 without a contact.
+        actuators: The scene's own.
+        equalities: Equality constraints.
+        tendons: Tendons.
+        idle: What cannot influence the grip.
+    """
+
+    bodies: int
+    moving_bodies: int
+    degrees_of_freedom: int
+    tool_degrees_of_freedom: int
+    tool_mass: float
+    geoms: dict[str, int]
+    triangles: int
+    possible_pairs: int
+    met_pairs: int | None
+    rows: dict[str, tuple[int, float]] | None
+    stiffness: tuple[float, float] | None
+    deepest: float
+    actuators: int
+    equalities: int
+    tendons: int
+    idle: tuple[Idle, ...]
+
+
+def take_inventory(
+    model: mujoco.MjModel, grip: str, places: Places, observation: Observation | None = None
+) -> Inventory:
+    """Counts what a scene models.
+
+    Args:
+        model: The compiled scene, with or without the bridge's handle: it is not counted.
+        grip: Name of the site on the tool.
+        places: Where things are written.
+        observation: What a motion showed; None counts as met what can meet.
+    """
+    own = np.array([model.body(i).name != HANDLE for i in range(model.nbody)])
+    own[0] = False
+    tool = int(model.body_treeid[model.site(grip).bodyid[0]])
+    is_tool = (model.body_treeid == tool) if tool >= 0 else np.zeros(model.nbody, dtype=bool)
+    possible = {(min(a, b), max(a, b)) for a, b, _ in meeting_pairs(model)}
+    met = possible if observation is None else set(observation.meetings)
+    uses = _uses(model, is_tool, possible, met)
+    of_tool = is_tool[model.geom_bodyid]
+    felt = [
+        meeting
+        for pair, meeting in (observation.meetings if observation else {}).items()
+        if of_tool[list(pair)].any()
+    ]
+    carried = [meeting for meeting in felt if np.isfinite(meeting.softest)]
+    names = [model.actuator(i).name for i in range(model.nactuator)]
+    return Inventory(
+        bodies=int(own.sum()),
+        moving_bodies=int((own & (model.body_treeid >= 0)).sum()),
+        degrees_of_freedom=int(model.nv),
+        tool_degrees_of_freedom=int(model.body_dofnum[is_tool].sum()),
+        tool_mass=float(model.body_mass[is_tool].sum()),
+        geoms={use: uses.count(use) for use in USES},
+        triangles=_hull_triangles(model, uses),
+        possible_pairs=len(possible),
+        met_pairs=None if observation is None else len(met),
+        rows=None if observation is None else _rows(observation),
+        stiffness=(
+            min(meeting.softest for meeting in carried),
+            max(meeting.stiffest for meeting in carried),
+        )
+        if carried
+        else None,
+        deepest=max((meeting.deepest for meeting in felt), default=0.0),
+        actuators=sum(name not in COUPLING_ACTUATORS for name in names),
+        equalities=int(model.neq),
+        tendons=int(model.ntendon),
+        idle=_idle(model, tool, places, uses, met, "" if observation is None else " in the motion"),
+    )
+
+
+def geom_uses(model: mujoco.MjModel) -> list[str]:
+    """Returns what every geom is there for, as far as masks and pairs tell: for no tool."""
+    possible = {(min(a, b), max(a, b)) for a, b, _ in meeting_pairs(model)}
+    return _uses(model, np.zeros(model.nbody, dtype=bool), possible, possible)
+
+
+def _uses(
+    model: mujoco.MjModel,
+    is_tool: NDArray[np.bool_],
+    possible: set[tuple[int, int]],
+    met: set[tuple[int, int]],
+) -> list[str]:
+    """Tells of every geom what it is there for."""
+    of_tool = is_tool[model.geom_bodyid]
+    meets_tool, meets = np.zeros((2, model.ngeom), dtype=bool)
+    for first, second in met:
+        meets[[first, second]] = True
+        meets_tool[second] |= of_tool[first]
+        meets_tool[first] |= of_tool[second]
+    paired = {geom for pair in possible for geom in pair}
+    masks = (model.geom_contype | model.geom_conaffinity) != 0
+    moves = model.body_treeid[model.geom_bodyid] >= 0
+    uses = []
+    for geom in range(model.ngeom):
+        if not masks[geom] and geom not in paired:
+            uses.append(VISUAL)
+        elif of_tool[geom]:
+            uses.append(TOOL)
+        elif meets_tool[geom]:
+            uses.append(MEETS_TOOL)
+        elif meets[geom]:
+            uses.append(MEETS_OTHER)
+        else:
+            uses.append(MOVING if moves[geom] else FIXED)
+    return uses
+
+
+def _rows(observation: Observation) -> dict[str, tuple[int, float]]:
+    return {
+        kind: (int(observation.rows[kind].max()), float(np.median(observation.rows[kind])))
+        for kind in ROW_KINDS
+    }
+
+
+def _hull_triangles(model: mujoco.MjModel, uses: list[str]) -> int:
+    """Counts the triangles of the convex hulls: what MuJoCo collides is the hull, not the mesh."""
+    meshes = {
+        int(model.geom_dataid[geom])
+        for geom in range(model.ngeom)
+        if uses[geom] != VISUAL and model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_MESH
+    }
+    graphs = [int(model.mesh_graphadr[mesh]) for mesh in meshes]
+    # a graph begins with its numbers of vertices and of faces
+    return sum(int(model.mesh_graph[adr + 1]) for adr in graphs if adr >= 0)
+
+
+def _idle(
+    model: mujoco.MjModel,
+    tool: int,
+    places: Places,
+    uses: list[str],
+    met: set[tuple[int, int]],
+    when: str,
+) -> tuple[Idle, ...]:
+    """Lists what no chain of contacts, equality constraints and tendons joins to the tool.
+
+    A fixed body hands nothing on: two things on one table do not feel each other through it.
+    """
+    tree = model.body_treeid
+    reached = reached_trees(model, tool, met)
+    idle = [
+        Idle(places.body(body), f"never meets the tool, directly or not{when}")
+        for body in range(1, model.nbody)
+        if tree[body] >= 0 and int(tree[body]) not in reached
+    ]
+    touched = {
+        geom
+        for pair in met
+        for geom in pair
+        if any(int(tree[model.geom_bodyid[other]]) in reached for other in pair)
+    }
+    for geom, use in enumerate(uses):
+        group = int(tree[model.geom_bodyid[geom]])
+        if use == VISUAL:
+            idle.append(Idle(places.geom(geom), VISUAL))
+        elif geom not in touched and (group < 0 or group in reached):
+            still = "fixed and never met" if group < 0 else "never meets anything"
+            idle.append(Idle(places.geom(geom), f"{still}{when}"))
+    return tuple(idle)

@@ -1,0 +1,131 @@
+"""Writes the leanest version of a scene as MJCF, reads it back and judges it again."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path, PurePath
+
+import mujoco
+
+from hapticbridge.check.draft import Draft
+from hapticbridge.check.lean import Lean
+from hapticbridge.check.observation import quiet
+from hapticbridge.check.trial import Trial
+from hapticbridge.errors import SceneError
+from hapticbridge.scene import SceneSource, read_scene
+
+ENDING = ".xml"
+
+
+def check_target(source: SceneSource, path: Path, *, overwrite: bool = False) -> None:
+    """Checks that a leaner scene can be written, before anything is computed for it.
+
+    Raises:
+        SceneError: The file's name does not end in .xml, it is a file of the scene itself, or it
+            exists and ``overwrite`` is not set.
+    """
+    if path.suffix.lower() != ENDING:
+        raise SceneError(f"cannot write the scene to '{path}': its name must end in {ENDING}")
+    if path.resolve() in {file.resolve() for file in _files(source)}:
+        raise SceneError(f"'{path}' is a file of the scene itself; choose another name")
+    if path.exists() and not overwrite:
+        raise SceneError(f"'{path}' exists; choose another file or add --overwrite")
+
+
+def write_lean(lean: Lean, path: Path, *, overwrite: bool = False) -> Trial:
+    """Writes the leanest version that was found.
+
+    Included files become part of it, paths of assets count from its own folder, and its comment
+    says what was changed. MuJoCo writes numbers with 6 digits, so what is in the file is not to the
+    bit what was judged: it is read back, and judged again.
+
+    Args:
+        lean: What was found.
+        path: The file.
+        overwrite: Whether to replace a file that exists.
+
+    Returns:
+        The written scene against the original.
+
+    Raises:
+        SceneError: Nothing may go, the file must not or cannot be written, or cannot be read back.
+    """
+    judge, source = lean.judge, lean.draft.source
+    check_target(source, path, overwrite=overwrite)
+    if not lean.together:
+        raise SceneError("nothing may go, so there is no leaner scene to write")
+    spec = source.spec.copy()
+    _point_to_assets(spec, source, path.absolute().parent)
+    setting = lean.draft.setting
+    spec.option.timestep = setting.period / setting.substeps
+    spec.comment = _comment(lean, str(spec.comment or ""))
+    try:
+        path.write_text(spec.to_xml(), encoding="utf-8")
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or " ".join(str(error).split())
+        raise SceneError(f"cannot write the scene to '{path}': {reason}") from None
+    written = Draft(read_scene(path), lean.draft.grip, setting)
+    with quiet():
+        return judge.judge("written", "the scene as it was read back from its file", written)
+
+
+def _files(source: SceneSource) -> list[Path]:
+    """Returns where the files of a scene are; the first is the main one."""
+    main = source.path.absolute()
+    root = main
+    for _ in PurePath(source.sources[0].name).parts:
+        root = root.parent
+    return [root / file.name for file in source.sources]
+
+
+def _point_to_assets(spec: mujoco.MjSpec, source: SceneSource, folder: Path) -> None:
+    """Makes the paths of meshes, textures and height fields count from a folder."""
+    files = _files(source)
+
+    def moved(name: str, directory: str) -> str:
+        if not name:
+            return name
+        name = name.replace("\\", "/")
+        name = PurePath(name).name if spec.strippath else name
+        home = source.path.absolute().parent
+        likely = [home / directory / name, home / name]
+        likely += [file for file in files if file.as_posix().endswith(f"/{name}")]
+        found = next((each for each in likely if each.is_file()), None)
+        return name if found is None else Path(os.path.relpath(found, folder)).as_posix()
+
+    for elements, directory in (
+        (spec.meshes, spec.meshdir),
+        (spec.hfields, spec.meshdir),
+        (spec.skins, spec.meshdir),
+        (spec.textures, spec.texturedir),
+    ):
+        for element in elements:
+            element.file = moved(str(element.file), str(directory))
+    for texture in spec.textures:
+        sides = [moved(str(side), str(spec.texturedir)) for side in texture.cubefiles]
+        for k, side in enumerate(sides):
+            texture.cubefiles[k] = side
+    spec.modelfiledir = str(folder)
+    spec.meshdir = spec.texturedir = ""
+    spec.strippath = False
+
+
+def _comment(lean: Lean, before: str) -> str:
+    """Says what was changed; XML allows no two dashes in a row within a comment."""
+    source, setting, result = lean.draft.source, lean.draft.setting, lean.result
+    felt = 0.0 if result.felt is None else result.felt.felt
+    judge, cost = lean.judge, 100.0 * (result.cost or 1.0)
+    lines = [
+        "",
+        f"  Made leaner from {source.path.name} by 'hapticbridge check': in a motion of "
+        f"{judge.motion.duration:g} s it costs {cost:.0f} % of that scene,",
+        f"  and differs by {felt:.2g} just noticeable differences (allowed: {judge.budget:g}).",
+        *(f"  Taken: {trial.name} ({trial.sentence})." for trial in lean.together),
+    ]
+    if setting != lean.judge.original.setting:
+        lines.append(
+            f"  To be run at {1 / setting.period:g} Hz with {setting.substeps} substep(s) a tick; "
+            f"the device then needs {result.needed_damping:.3g} N s/m of damping."
+        )
+    text = "\n".join([*lines, "  "]).replace("--", "- -")
+    return f"{before.rstrip()}\n{text}" if before.strip() else text

@@ -1,0 +1,168 @@
+"""Faults of masses: none, made up by MuJoCo, too unequal, or too heavy to be carried."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from hapticbridge.check.case import Case
+from hapticbridge.check.faults import Fault, length, number, others, weight
+from hapticbridge.check.inertia import body_inertia
+
+WATER = 1000.0
+"""Density in kg/m³ that MuJoCo gives a geom that says neither mass nor density."""
+
+LARGEST_RATIO = 1000.0
+"""Ratio of two masses in contact, or of a load to what carries it, no unit: a contact has the
+stiffness of the lighter one, and the heavier then sinks in a thousand times as deep."""
+
+LARGEST_SAG = 1e-3
+"""How far the tool's weight may stretch the coupling at rest, in m."""
+
+
+def mass_faults(case: Case) -> Iterator[Fault]:
+    """Yields bodies without inertia, with one that nobody chose, and masses that do not fit.
+
+    Args:
+        case: The scene under check.
+    """
+    for body, refusal in case.refused.items():
+        place = case.places.body(body)
+        what = "a mass and inertia > 0" if "mass and" in refusal else "inertias with A + B >= C"
+        yield Fault(
+            "missing inertia",
+            place,
+            f"{place.element} moves, and MuJoCo refuses its inertia: it needs {what}",
+            'mass="…" in one of its geoms, or <inertial pos="0 0 0" mass="…" diaginertia="…"/>',
+        )
+    yield from _of_water(case)
+    yield from _contact_ratios(case)
+    yield from _load_ratios(case)
+    yield from _sag(case)
+
+
+def _of_water(case: Case) -> Iterator[Fault]:
+    """Finds moving bodies of which a geom has the density of water because it says nothing."""
+    model, geoms = case.model, list(case.source.spec.geoms)
+    if len(geoms) != model.ngeom:  # the compiler threw some away, so ids do not tell which is which
+        return
+    silent: dict[int, list[int]] = {}
+    for geom, written in enumerate(geoms):
+        body = int(model.geom_bodyid[geom])
+        is_free_to_move = model.body_treeid[body] >= 0 and body not in case.refused
+        if is_free_to_move and _says_nothing(case, geom, written):
+            silent.setdefault(body, []).append(geom)
+    for body, those in silent.items():
+        visual = [
+            geom for geom in those if not model.geom_contype[geom] | model.geom_conaffinity[geom]
+        ]
+        first = (visual or those)[0]
+        place, name = case.places.geom(first), case.places.body(body).element
+        mass = float(model.body_mass[body])
+        made = "is made of water" if len(those) == 1 else "are made of water"
+        yield Fault(
+            "visual geom with mass" if visual else "density of water",
+            place,
+            f"{place.element}{others(len(those) - 1)} has neither mass nor density and so "
+            f"{made} ({WATER:g} kg/m³); {name} weighs {weight(mass)} with it",
+            'mass="0"' if visual else f'mass="{number(mass)}", or what it really weighs',
+        )
+
+
+def _says_nothing(case: Case, geom: int, written: Any) -> bool:
+    compiler = case.source.spec.compiler
+    low, high = compiler.inertiagrouprange
+    return bool(
+        np.isnan(written.mass)
+        and written.density == WATER
+        and low <= written.group <= high
+        and not written.parent.explicitinertial
+        and "density" not in case.places.attributes_at(case.places.geom(geom))
+    )
+
+
+def _contact_ratios(case: Case) -> Iterator[Fault]:
+    """Compares what met: the inertia that a push on a body meets, armature included."""
+    model, told = case.model, set()
+    case.scene.reset()
+    for pair in case.observation.meetings if case.observation else ():
+        bodies = [int(model.geom_bodyid[geom]) for geom in pair]
+        inverse = [1.0 / body_inertia(model, case.scene.data, body) for body in bodies]
+        key = frozenset(bodies)
+        if min(inverse) <= 0 or max(inverse) <= LARGEST_RATIO * min(inverse) or key in told:
+            continue
+        told.add(key)
+        light, heavy = (case.places.body(bodies[inverse.index(f(inverse))]) for f in (max, min))
+        least = 1.0 / (LARGEST_RATIO * min(inverse))
+        yield Fault(
+            "mass ratio",
+            light,
+            f"{light.element} ({weight(1 / max(inverse))}) meets {heavy.element} "
+            f"({weight(1 / min(inverse))}), 1 to {number(max(inverse) / min(inverse))}: the "
+            "contact is as stiff as the lighter one allows, and the heavier sinks in",
+            f'mass="{number(least)}" or more, or armature="{number(least)}" on its joint',
+        )
+
+
+def _load_ratios(case: Case) -> Iterator[Fault]:
+    """Compares a moving body with what hangs on it by further joints."""
+    model = case.model
+    for body in range(1, model.nbody):
+        parent = int(model.body_weldid[model.body_parentid[body]])
+        if not model.body_dofnum[body] or model.body_treeid[parent] < 0:
+            continue
+        own = float(model.body_mass[model.body_weldid == parent].sum())
+        dofs = model.dof_bodyid == parent
+        if np.any(model.dof_armature[dofs] > 0):
+            continue
+        load = float(model.body_subtreemass[body])
+        if load > LARGEST_RATIO * own:
+            place, name = case.places.body(parent), case.places.body(body).element
+            yield Fault(
+                "mass ratio",
+                place,
+                f"{place.element} ({weight(own)}) carries {name} ({weight(load)}), "
+                f"1 to {number(load / own)}: its motion is computed from small differences",
+                f'mass="{load / LARGEST_RATIO:.3g}" or more in it',
+            )
+
+
+def _sag(case: Case) -> Iterator[Fault]:
+    """Computes how far the tool hangs below the handle: (JᵀKJ + K_joints) δq = its weight."""
+    model, scene = case.model, case.scene
+    scene.reset()
+    data, site = scene.data, model.site(scene.grip).id
+    body = int(model.site_bodyid[site])
+    tree = int(model.body_treeid[body])
+    dofs = np.flatnonzero(model.dof_treeid == tree)
+    jacobian = np.zeros((6, model.nv))
+    mujoco.mj_jacSite(model, data, jacobian[:3], jacobian[3:], site)
+    coupling = case.coupling
+    gains = np.repeat([coupling.stiffness, coupling.rotational_stiffness], 3)
+    data.qvel[:] = 0.0
+    bias = np.zeros(model.nv)
+    mujoco.mj_rne(model, data, 0, bias)
+    springs = np.zeros(model.nv)
+    for joint in range(model.njnt):
+        if model.jnt_type[joint] in (mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE):
+            springs[model.jnt_dofadr[joint]] = float(np.ravel(model.jnt_stiffness[joint])[0])
+    mine = jacobian[:, dofs]
+    stiffness = mine.T @ (gains[:, None] * mine) + np.diag(springs[dofs])
+    pulls = (data.qfrc_gravcomp - bias)[dofs]
+    moved = np.linalg.lstsq(stiffness, pulls, rcond=1e-9)[0]
+    sag = float(np.linalg.norm(mine[:3] @ moved))
+    if sag <= LARGEST_SAG:
+        return
+    root = int(model.body_rootid[body])
+    mass = float(model.body_mass[model.body_treeid == tree].sum())
+    pull = sag * coupling.stiffness
+    yield Fault(
+        "heavy tool",
+        case.places.body(root),
+        f"the tool weighs {weight(mass)}; what of it the hand carries, {number(pull)} N, stretches "
+        f"the coupling of {coupling.stiffness:.4g} N/m by {length(sag)} at rest",
+        'gravcomp="1" in the body and those below it, or less mass',
+    )

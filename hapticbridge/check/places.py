@@ -1,0 +1,189 @@
+"""Where in the files of a scene an element is written."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import mujoco
+
+from hapticbridge.scene import SceneSource
+from hapticbridge.scene.source import Element, read_elements
+
+_JOINTS = ("joint", "freejoint")
+_EQUALITIES = ("connect", "weld", "joint", "tendon", "flex", "flexvert", "flexstrain")
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """One element of a scene's files.
+
+    Attributes:
+        file: Name of the file, relative to the scene's folder.
+        line: Counted from 1; 0 where the element could not be found in the files.
+        element: What it is and is called: ``geom 'peg'``, ``<option>``.
+    """
+
+    file: str
+    line: int
+    element: str
+
+    def __str__(self) -> str:
+        where = f"{self.file}:{self.line}" if self.line else self.file
+        return f"{where}, {self.element}"
+
+
+class Places:
+    """Finds the line on which an element of a compiled scene stands.
+
+    MuJoCo knows the line of what stands in the main file, and none of what was included. There an
+    element is found by its name, one without a name by its place among those of its kind without
+    one, where their number says that none was added or left out on the way.
+    """
+
+    def __init__(self, source: SceneSource, model: mujoco.MjModel) -> None:
+        """Reads the files.
+
+        Args:
+            source: The scene as it was read.
+            model: What was compiled from it, with or without the bridge's handle.
+        """
+        self._spec, self._model = source.spec, model
+        self._files = [
+            (file.name, list(read_elements(file.data)))
+            for file in source.sources
+            if file.name.lower().endswith(".xml")
+        ]
+        self._main = self._files[0][0] if self._files else source.path.name
+
+    def geom(self, geom_id: int) -> Place:
+        """Returns the place of a geom."""
+        owner = self._owner(int(self._model.geom_bodyid[geom_id]))
+        return self._find(("geom",), self._spec.geoms, geom_id, self._model.geom, owner)
+
+    def body(self, body_id: int) -> Place:
+        """Returns the place of a body."""
+        return self._find(("body",), self._spec.bodies, body_id, self._model.body)
+
+    def joint(self, joint_id: int) -> Place:
+        """Returns the place of a joint."""
+        owner = self._owner(int(self._model.jnt_bodyid[joint_id]))
+        return self._find(_JOINTS, self._spec.joints, joint_id, self._model.joint, owner)
+
+    def site(self, site_id: int) -> Place:
+        """Returns the place of a site."""
+        return self._find(("site",), self._spec.sites, site_id, self._model.site)
+
+    def equality(self, equality_id: int) -> Place:
+        """Returns the place of an equality constraint."""
+        return self._find(
+            _EQUALITIES, self._spec.equalities, equality_id, self._model.equality, kind="equality"
+        )
+
+    def tendon(self, tendon_id: int) -> Place:
+        """Returns the place of a tendon."""
+        kinds = ("spatial", "fixed")
+        return self._find(kinds, self._spec.tendons, tendon_id, self._model.tendon, kind="tendon")
+
+    def pair(self, pair_id: int) -> Place:
+        """Returns the place of an explicit pair of geoms."""
+        return self._find(("pair",), self._spec.pairs, pair_id, self._model.pair)
+
+    def mesh(self, mesh_id: int) -> Place:
+        """Returns the place of a mesh; one without a name is called as its file is."""
+        return self._find(("mesh",), self._spec.meshes, mesh_id, self._model.mesh)
+
+    def named(self, tag: str, name: str) -> Place:
+        """Returns the place of an element by its name, as an error of MuJoCo tells it."""
+        found = self._first((tag,), lambda element: element.attributes.get("name") == name)
+        return found or Place(self._main, 0, f"{tag} '{name}'")
+
+    def option(self, attribute: str) -> Place:
+        """Returns where <option> sets an attribute, or else where it would be set."""
+        return (
+            self._first(("option", "flag"), lambda element: attribute in element.attributes)
+            or self._first(("option",), lambda _: True)
+            or self._first(("mujoco",), lambda _: True)
+            or Place(self._main, 0, "<option>")
+        )
+
+    def with_attribute(self, attribute: str) -> Place | None:
+        """Returns the first element that has an attribute, of whatever tag."""
+        for file, elements in self._files:
+            for element in elements:
+                if attribute in element.attributes:
+                    return Place(file, element.line, _describe(element))
+        return None
+
+    def attributes_at(self, place: Place) -> dict[str, str]:
+        """Returns what is written at a place itself, without the defaults that reach it."""
+        for name, elements in self._files:
+            for element in elements:
+                if (name, element.line) == (place.file, place.line) and (
+                    _describe(element) == place.element or place.element.startswith(element.tag)
+                ):
+                    return element.attributes
+        return {}
+
+    def _owner(self, body_id: int) -> str:
+        if body_id == 0:
+            return " of the world"
+        name = self._model.body(body_id).name
+        return f" of body '{name}'" if name else f" of body {body_id}"
+
+    def _find(
+        self,
+        tags: tuple[str, ...],
+        written: Any,
+        index: int,
+        compiled: Callable[[int], Any],
+        owner: str = "",
+        kind: str = "",
+    ) -> Place:
+        """Finds an element by its name, its line, or its place among those without a name."""
+        kind, name = kind or tags[0], str(compiled(index).name)
+        label = f"{kind} '{name}'" if name else f"{kind} {index}{owner}"
+        if name and (found := self._first(tags, lambda e: e.attributes.get("name") == name)):
+            return Place(found.file, found.line, label)
+        elements = list(written)
+        if index >= len(elements) or str(elements[index].name) != name:
+            return Place(self._main, 0, label)
+        line = _line(elements[index])
+        if line:
+            return Place(self._main, line, label)
+        nameless = [k for k, e in enumerate(elements) if not e.name and not _line(e)]
+        included = [
+            (file, element.line)
+            for file, those in self._files[1:]
+            for element in _outside_defaults(those)
+            if element.tag in tags and "name" not in element.attributes
+        ]
+        if index in nameless and len(nameless) == len(included):
+            return Place(*included[nameless.index(index)], label)
+        return Place(self._main, 0, label)
+
+    def _first(self, tags: tuple[str, ...], fits: Callable[[Element], bool]) -> Place | None:
+        for file, elements in self._files:
+            for element in elements:
+                if element.tag in tags and fits(element):
+                    return Place(file, element.line, _describe(element))
+        return None
+
+
+def _describe(element: Element) -> str:
+    name = element.attributes.get("name")
+    return f"{element.tag} '{name}'" if name else f"<{element.tag}>"
+
+
+def _line(element: Any) -> int:
+    words = str(element.info).split()
+    return int(words[-1]) if words and words[-1].isdigit() else 0
+
+
+def _outside_defaults(elements: list[Element]) -> list[Element]:
+    """Leaves out what stands before the first body or world of a file: classes have geoms too."""
+    for k, element in enumerate(elements):
+        if element.tag in ("worldbody", "body"):
+            return elements[k:]
+    return []

@@ -1,0 +1,68 @@
+"""Faults that only the motion shows."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from hapticbridge.check.case import Case
+from hapticbridge.check.faults import Fault, number
+from hapticbridge.check.observation import Observation
+from hapticbridge.scene.contact_concerns import suggested_solref
+
+ITERATIONS = 100
+"""MuJoCo's own limit on the solver's iterations; Newton's takes 1 to 8 in the shipped scenes."""
+
+
+def run_faults(case: Case) -> Iterator[Fault]:
+    """Yields what went wrong while the scene was led through its motion.
+
+    Args:
+        case: The scene under check.
+    """
+    seen, option = case.observation, case.places.option
+    if seen is None:
+        yield Fault(
+            "motion not finished",
+            option("timestep"),
+            f"under {case.motion_name}: {case.motion_fault}",
+            "what stands above, if anything; else a softer contact or a heavier tool",
+        )
+        return
+    if seen.full_ticks:
+        limit = int(case.model.opt.iterations)
+        yield Fault(
+            "solver iterations",
+            option("iterations"),
+            f"the solver stopped at its limit of {limit} iterations in {seen.full_ticks} of "
+            f"{case.samples.size} ticks: contact forces are not what they should be",
+            f'iterations="{max(ITERATIONS, 2 * limit)}"',
+        )
+    for words, count in seen.warnings.items():
+        yield Fault(
+            "MuJoCo warning",
+            option("timestep"),
+            f"MuJoCo warned {count} times in the motion: {words}",
+            "see what it says",
+        )
+    if seen.environment != "strict":
+        yield _energy_created(case, seen)
+
+
+def _energy_created(case: Case, seen: Observation) -> Fault:
+    """Names the contact that carried most: which one created the energy, no meter tells."""
+    used = f"{number(100 * seen.slack_share)} % of the coupling's slack, which covers it"
+    if seen.environment == "active":
+        used = "more than the coupling's slack covers"
+    sentence = f"contacts or joints created energy in the motion: {used}"
+    if not seen.meetings:
+        place = case.places.option("integrator")
+        return Fault("energy created", place, sentence, "slower springs and actuators")
+    pair = max(seen.meetings, key=lambda each: seen.meetings[each].force)
+    one, other = (case.places.geom(geom) for geom in pair)
+    return Fault(
+        "energy created",
+        one,
+        f"{sentence}; the largest force was between {one.element} and {other.element}",
+        f"{suggested_solref(float(case.model.opt.timestep))} there and at {other.file}:"
+        f"{other.line}, {other.element} (four times softer, and slow to come back), or more mass",
+    )

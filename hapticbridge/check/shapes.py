@@ -1,0 +1,158 @@
+"""Simpler shapes: fewer corners of a mesh, a primitive in its place, nothing that is only seen."""
+
+from __future__ import annotations
+
+from pathlib import PurePath
+
+import mujoco
+import numpy as np
+
+from hapticbridge.check.draft import Draft, model_of
+from hapticbridge.check.frames import IDENTITY, matrix_of, quaternion_of
+from hapticbridge.check.primitive import Primitive, best_primitive
+from hapticbridge.check.simplifications import PICTURE, Simplification, collides, paired_geoms
+
+HULL_CORNERS = (64, 32, 16, 8)
+"""Corners that a convex hull keeps at most, as tried."""
+
+
+def shape_simplifications() -> list[Simplification]:
+    """Returns what may be left out of shapes; masses and inertias stay as they were compiled."""
+    return [
+        Simplification(
+            "nothing only seen",
+            "geoms that do not collide are left out; their mass stays",
+            _drop_visual_geoms,
+            loses=PICTURE,
+        ),
+        *(_hull(count) for count in HULL_CORNERS),
+        Simplification(
+            "primitives",
+            "each mesh that collides becomes the primitive that fits it best",
+            _fit_primitives,
+        ),
+    ]
+
+
+def _drop_visual_geoms(draft: Draft) -> bool:
+    spec = draft.spec
+    left = spec.copy()
+    left.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO
+    left.discard_visual()  # knows what sensors, tendons and the like refer to
+    kept = {geom.name for geom in left.geoms}
+    dropped = [geom for geom in spec.geoms if geom.name not in kept]
+    _keep_inertia(spec, {geom.parent.name for geom in dropped})
+    for geom in dropped:
+        spec.delete(geom)
+    return bool(dropped)
+
+
+def _hull(count: int) -> Simplification:
+    def limit(draft: Draft) -> bool:
+        spec = draft.spec
+        corners = _hull_corners(spec)
+        meshes = [mesh for mesh in spec.meshes if corners.get(_name(mesh), 0) > count]
+        changed = {_name(mesh) for mesh in meshes}
+        _keep_inertia(spec, {geom.parent.name for geom in spec.geoms if geom.meshname in changed})
+        for mesh in meshes:
+            mesh.maxhullvert = count
+        return bool(meshes)
+
+    return Simplification(
+        f"hulls of {count}", f"meshes that collide keep {count} corners of their hull", limit
+    )
+
+
+def _hull_corners(spec: mujoco.MjSpec) -> dict[str, int]:
+    """Returns how many corners the hulls of the colliding meshes have."""
+    meshes = {geom.meshname for geom in _mesh_geoms(spec)}
+    if not meshes:
+        return {}
+    model = model_of(spec)
+    adr = {name: int(model.mesh_graphadr[model.mesh(name).id]) for name in meshes}
+    # a graph begins with its number of corners
+    return {name: int(model.mesh_graph[start]) for name, start in adr.items() if start >= 0}
+
+
+def _mesh_geoms(spec: mujoco.MjSpec) -> list[mujoco.MjsGeom]:
+    paired = paired_geoms(spec)
+    return [
+        geom
+        for geom in spec.geoms
+        if geom.type == mujoco.mjtGeom.mjGEOM_MESH and (collides(geom) or geom.name in paired)
+    ]
+
+
+def _name(mesh: mujoco.MjsMesh) -> str:
+    """A mesh without a name is called as its file is."""
+    return str(mesh.name or PurePath(str(mesh.file).replace("\\", "/")).stem)
+
+
+def _fit_primitives(draft: Draft) -> bool:
+    spec = draft.spec
+    names = [geom.name for geom in _mesh_geoms(spec)]
+    if not names:
+        return False
+    _keep_inertia(spec, {spec.geom(name).parent.name for name in names})
+    model = model_of(spec)
+    fits = {name: _fit(model, name) for name in names}
+    for name in names:
+        geom = spec.geom(name)
+        geom.type, geom.size = fits[name].kind, fits[name].size
+        _forget_mesh(spec, geom)
+        geom.pos, geom.quat = np.zeros(3), IDENTITY
+        geom.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
+    for mesh in [mesh for mesh in spec.meshes if not _is_used(spec, mesh)]:
+        spec.delete(mesh)
+    # where a geom is written in a frame, its pose counts from there
+    frames = model_of(spec)
+    for name in names:
+        geom, at = spec.geom(name), frames.geom(name).id
+        turn = matrix_of(frames.geom_quat[at])
+        geom.pos = turn.T @ (fits[name].position - frames.geom_pos[at])
+        geom.quat = quaternion_of(turn.T @ fits[name].axes)
+    return True
+
+
+def _forget_mesh(spec: mujoco.MjSpec, geom: mujoco.MjsGeom) -> None:
+    """Takes the mesh off a geom and its classes, from which a written file would get it back."""
+    geom.meshname = ""
+    for default in (geom.classname, spec.default):
+        if default is not None:
+            default.geom.meshname = ""
+
+
+def _is_used(spec: mujoco.MjSpec, mesh: mujoco.MjsMesh) -> bool:
+    return any(geom.meshname == _name(mesh) for geom in spec.geoms)
+
+
+def _fit(model: mujoco.MjModel, name: str) -> Primitive:
+    """Fits a mesh geom in its body's frame, along the mesh's own axes and its axes of inertia."""
+    geom = model.geom(name).id
+    mesh = int(model.geom_dataid[geom])
+    start, count = int(model.mesh_vertadr[mesh]), int(model.mesh_vertnum[mesh])
+    inertia = matrix_of(model.geom_quat[geom])
+    points = np.asarray(model.mesh_vert[start : start + count], np.float64) @ inertia.T
+    own = inertia @ matrix_of(model.mesh_quat[mesh]).T
+    return best_primitive(points + model.geom_pos[geom], (own, inertia))
+
+
+def _keep_inertia(spec: mujoco.MjSpec, bodies: set[str]) -> None:
+    """Writes down the inertia that some bodies have from their geoms, as compiled.
+
+    MuJoCo's own ``adopt_inertial`` refuses a scene whose geoms overrule what is written.
+    """
+    compiler, model = spec.compiler, model_of(spec)
+    is_forced = compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
+    if is_forced or compiler.settotalmass > 0:  # one is overruled or scaled together with all
+        bodies = {body.name for body in spec.bodies}
+        compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO
+    unwritten = mujoco.MjSpec().worldbody.add_body()
+    for body in spec.bodies:
+        at = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, body.name)
+        if body.name not in bodies or at <= 0 or not model.body_mass[at]:
+            continue
+        body.explicitinertial, body.mass = True, model.body_mass[at]
+        body.ipos, body.iquat = model.body_ipos[at], model.body_iquat[at]
+        body.inertia, body.fullinertia = model.body_inertia[at], unwritten.fullinertia
+        body.ialt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT

@@ -1,0 +1,152 @@
+"""Judges a version of a scene against the scene as it was read: may it take its place?"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from hapticbridge.certificate import needed_damping
+from hapticbridge.check.draft import Draft
+from hapticbridge.check.felt import FeltError, felt_error
+from hapticbridge.check.rehearsal import Rehearsal
+from hapticbridge.check.side_by_side import CostMeter
+from hapticbridge.device import Motion
+
+LEAST_SAVING = 0.05
+"""Share of the cost that a simplification must save, without unit. The same scene measured against
+itself differs by 1 % at most on a machine at work (where it differs by more, three times that
+counts), and less than a twentieth is no reason to touch a scene. A larger share keeps more in."""
+
+CLEARLY_MORE = 1.2
+"""Cost over that of what it must beat, without unit, at which one run is enough to see it."""
+
+_ROUNDING = 1e-9  # relative, of a sum of products
+
+_ENVIRONMENTS = ("strict", "within slack", "active")
+
+MAY_GO, IS_FELT, SAVES_NOTHING = "may go", "is felt", "saves nothing"
+CREATES, WARNS, NOT_BORNE, FAILS = "creates energy", "MuJoCo warns", "device too weak", "fails"
+
+
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """A version of a scene against the scene as it was read.
+
+    Attributes:
+        name: Of the simplification.
+        sentence: What it does, or why it failed.
+        verdict: ``MAY_GO`` or why not: one of the constants of this module.
+        loses: What else goes, see ``Simplification``.
+        cost: Processor time over that of the original, without unit, from a single run where it is
+            refused for another reason; None where it failed.
+        felt: What a hand would feel; None where it failed.
+        environment: ``strict``, ``within slack`` or ``active``.
+        warnings: How often MuJoCo warned.
+        needed_damping: b in N s/m that a device needs at this version's rate.
+    """
+
+    name: str
+    sentence: str
+    verdict: str
+    loses: str = ""
+    cost: float | None = None
+    felt: FeltError | None = None
+    environment: str = ""
+    warnings: int = 0
+    needed_damping: float = 0.0
+
+
+class Judge:
+    """Compares versions of one scene in one motion.
+
+    Attributes:
+        original: The scene as it was read.
+        motion: Of the handle.
+        budget: Felt error in just noticeable differences that is allowed.
+        device_damping: b of the device in N s/m.
+        rehearsal: What the original did.
+        seconds: Processor time of the original in s per second of motion.
+        least_saving: Share of the cost that counts as less, without unit.
+    """
+
+    def __init__(
+        self,
+        original: Draft,
+        motion: Motion,
+        budget: float,
+        device_damping: float,
+        cost: CostMeter,
+    ) -> None:
+        """Rehearses the original, and measures it against itself.
+
+        Raises:
+            SceneError: It does not compile, or a result is not finite.
+        """
+        self.original, self.motion = original, motion
+        self.budget, self.device_damping = budget, device_damping
+        self._cost = cost
+        self.rehearsal = original.rehearsed(motion)
+        first, second = cost(original, original.copy(), motion)
+        self.seconds = 0.5 * (first + second)
+        self.least_saving = max(LEAST_SAVING, 3.0 * abs(second / first - 1.0))
+
+    def judge(
+        self,
+        name: str,
+        sentence: str,
+        draft: Draft,
+        base: Draft | None = None,
+        share: float = 1.0,
+        loses: str = "",
+    ) -> Trial:
+        """Returns whether a version may take the original's place.
+
+        Args:
+            name: Of what was changed.
+            sentence: What was changed.
+            draft: The version.
+            base: What it must be cheaper than; None takes the original.
+            share: Cost of ``base`` over that of the original, without unit.
+            loses: What else goes.
+
+        Raises:
+            SceneError: The version does not compile, or a result is not finite.
+        """
+        done = draft.rehearsed(self.motion)
+        felt = felt_error(self.rehearsal.records, done.records)
+        needed = needed_damping(
+            draft.setting.coupling, draft.setting.period, draft.setting.substeps
+        )
+        verdict = self._refusal(done, felt, needed)
+        cost = done.seconds / (self.seconds * self.motion.duration)
+        if not verdict and cost > CLEARLY_MORE * share:
+            verdict = SAVES_NOTHING
+        if not verdict:  # what is refused anyway need not be measured well
+            before, after = self._cost(base or self.original, draft, self.motion)
+            verdict = MAY_GO if after <= (1.0 - self.least_saving) * before else SAVES_NOTHING
+            cost = share * after / before
+        return Trial(
+            name=name,
+            sentence=sentence,
+            verdict=verdict,
+            loses=loses,
+            cost=cost,
+            felt=felt,
+            environment=done.environment,
+            warnings=done.warnings,
+            needed_damping=needed,
+        )
+
+    def _refusal(self, done: Rehearsal, felt: FeltError, needed: float) -> str:
+        """Returns why a version cannot be, whatever it saves; empty if it can."""
+        ranks = [_ENVIRONMENTS.index(each.environment) for each in (done, self.rehearsal)]
+        asked = self.original.setting
+        bearable = max(
+            self.device_damping, needed_damping(asked.coupling, asked.period, asked.substeps)
+        )
+        if done.warnings > self.rehearsal.warnings:
+            return WARNS
+        if ranks[0] > ranks[1]:
+            return CREATES
+        if needed > bearable * (1.0 + _ROUNDING):
+            return NOT_BORNE
+        return IS_FELT if felt.felt > self.budget else ""

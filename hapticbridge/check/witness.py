@@ -1,0 +1,157 @@
+"""What happened in a scene under a motion: which geoms met, how near they came, what moved."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticbridge.check.draft import Draft
+from hapticbridge.check.frames import pose_in, rotation_vector
+from hapticbridge.check.rehearsal import rehearsal_parameters
+from hapticbridge.device import Motion
+from hapticbridge.errors import SceneError
+from hapticbridge.kernel.state import Binding
+from hapticbridge.kernel.step import simulate
+from hapticbridge.scene.contact_check import meeting_pairs
+from hapticbridge.tick import TICK_DTYPE
+
+CLEARANCE = 2e-3
+"""Distance in m that geoms must keep throughout to count as never meeting. A wider one takes less
+out of a scene, and holds for motions that differ more."""
+
+LOOK_EVERY = 5e-3
+"""Time in s from one look at distances to the next; contacts are looked at in every tick. In it a
+tool that misses ``CLEARANCE`` would have to move at 0.4 m/s or more."""
+
+_UNMEASURED = (mujoco.mjtGeom.mjGEOM_HFIELD, mujoco.mjtGeom.mjGEOM_SDF)
+"""Geoms whose distance MuJoCo does not compute: they count as near everything."""
+
+Pair = frozenset[str]
+
+
+@dataclass(slots=True)
+class Witness:
+    """What was seen, by name.
+
+    Attributes:
+        possible: Pairs of geoms that may collide by MuJoCo's filters.
+        near: Those that met or came nearer than ``CLEARANCE``.
+        travel: By joint, its way from the start: values in m and rad, shape (looks, 1); for a ball
+            rotation vectors (looks, 3); for a free joint displacements in m and rotation vectors in
+            the world frame (looks, 6).
+        start: By joint, its values at the start of the motion.
+        pose: By body, position in m and quaternion in its parent's frame at the start, shape (7,).
+        solver_iterations: Most that a step took.
+    """
+
+    possible: set[Pair] = field(default_factory=set)
+    near: set[Pair] = field(default_factory=set)
+    travel: dict[str, NDArray[np.float64]] = field(default_factory=dict)
+    start: dict[str, NDArray[np.float64]] = field(default_factory=dict)
+    pose: dict[str, NDArray[np.float64]] = field(default_factory=dict)
+    solver_iterations: int = 0
+
+    @property
+    def near_geoms(self) -> set[str]:
+        """Geoms that met anything, or came near it."""
+        return {name for pair in self.near for name in pair}
+
+
+def witness(draft: Draft, motion: Motion) -> Witness:
+    """Leads a scene through a motion tick by tick, and watches.
+
+    Args:
+        draft: Its bodies, joints and geoms have names.
+        motion: Of the handle.
+
+    Raises:
+        SceneError: The scene does not compile, or a result is not finite.
+    """
+    scene, setting = draft.compiled(), draft.setting
+    model, data = scene.model, scene.data
+    parameters = rehearsal_parameters(scene, setting.coupling, setting.period, setting.substeps)
+    binding = Binding(model, data, parameters)
+    samples = draft.samples(motion)
+    row = np.zeros(1, TICK_DTYPE)
+    seen = Witness(start=_joint_values(model, data), pose=_poses(model, data))
+    pairs = np.array([pair[:2] for pair in meeting_pairs(model)], np.intp).reshape(-1, 2)
+    names = [model.geom(g).name for g in range(model.ngeom)]
+    seen.possible = {frozenset((names[a], names[b])) for a, b in pairs}
+    looks: dict[str, list[NDArray[np.float64]]] = {name: [] for name in seen.start}
+    every = max(1, round(LOOK_EVERY / setting.period))
+    for k in range(samples.size):
+        if not simulate(binding.state, samples[k : k + 1], binding.row, row):
+            raise SceneError(f"scene '{scene.name}' is not finite after tick {k} of the motion")
+        seen.solver_iterations = max(seen.solver_iterations, int(row["solver_iterations"][0]))
+        if data.ncon:
+            touching = [pair for pair in data.contact.geom.tolist() if min(pair) >= 0]
+            seen.near |= {frozenset((names[a], names[b])) for a, b in touching}
+        if k % every == 0:
+            pairs = _look_at_pairs(model, data, pairs, names, seen.near)
+            for name, values in _joint_values(model, data).items():
+                looks[name].append(_way(seen.start[name], values))
+    seen.travel = {name: np.array(ways) for name, ways in looks.items()}
+    return seen
+
+
+def _look_at_pairs(
+    model: mujoco.MjModel,
+    data: mujoco.MjData,
+    pairs: NDArray[np.intp],
+    names: list[str],
+    near: set[Pair],
+) -> NDArray[np.intp]:
+    """Adds pairs that are near to each other now; returns those that never were so far."""
+    if not pairs.size:
+        return pairs
+    first, second = pairs[:, 0], pairs[:, 1]
+    radius = model.geom_rbound
+    gap = np.linalg.norm(data.geom_xpos[first] - data.geom_xpos[second], axis=1)
+    gap -= radius[first] + radius[second]
+    # planes and height fields have no bounding sphere
+    is_close = (gap < CLEARANCE) | (radius[first] == 0.0) | (radius[second] == 0.0)
+    is_far = np.ones(len(pairs), dtype=bool)
+    for i in np.flatnonzero(is_close).tolist():
+        a, b = int(first[i]), int(second[i])
+        pair = frozenset((names[a], names[b]))
+        if pair in near or _distance(model, data, a, b) < CLEARANCE:
+            near.add(pair)
+            is_far[i] = False
+    return pairs[is_far]
+
+
+def _distance(model: mujoco.MjModel, data: mujoco.MjData, a: int, b: int) -> float:
+    if any(model.geom_type[geom] in _UNMEASURED for geom in (a, b)):
+        return 0.0
+    return float(mujoco.mj_geomDistance(model, data, a, b, 2.0 * CLEARANCE, None))
+
+
+def _joint_values(model: mujoco.MjModel, data: mujoco.MjData) -> dict[str, NDArray[np.float64]]:
+    return {
+        model.joint(j).name: np.array(data.qpos[model.joint(j).qposadr[0] :][: _width(model, j)])
+        for j in range(model.njnt)
+    }
+
+
+def _poses(model: mujoco.MjModel, data: mujoco.MjData) -> dict[str, NDArray[np.float64]]:
+    world = [np.concatenate([data.xpos[b], data.xquat[b]]) for b in range(model.nbody)]
+    return {
+        model.body(b).name: pose_in(world[model.body_parentid[b]], world[b])
+        for b in range(1, model.nbody)
+    }
+
+
+def _width(model: mujoco.MjModel, joint: int) -> int:
+    return {mujoco.mjtJoint.mjJNT_FREE: 7, mujoco.mjtJoint.mjJNT_BALL: 4}.get(
+        mujoco.mjtJoint(model.jnt_type[joint]), 1
+    )
+
+
+def _way(start: NDArray[np.float64], now: NDArray[np.float64]) -> NDArray[np.float64]:
+    if start.size == 1:
+        return now - start
+    vector = rotation_vector(start[-4:], now[-4:])
+    return vector if start.size == 4 else np.concatenate([now[:3] - start[:3], vector])

@@ -1,0 +1,260 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+from check_scenes import GOOD_CONTACT, GOOD_OPTION, bench, case_of, written
+from outside_scenes import mjcf
+
+from hapticbridge.check.inventory import (
+    FIXED,
+    MEETS_OTHER,
+    MEETS_TOOL,
+    MOVING,
+    TOOL,
+    VISUAL,
+    Inventory,
+    take_inventory,
+)
+from hapticbridge.check.places import Places
+from hapticbridge.scene import read_scene, scene_names, scene_path
+from hapticbridge.scene.contact_check import meeting_pairs
+
+
+def inventory_of(scene: Path) -> Inventory:
+    case = case_of(scene)
+    return take_inventory(case.model, case.scene.grip, case.places, case.observation)
+
+
+@pytest.mark.parametrize("name", scene_names())
+def test_counts_are_those_of_the_model_without_the_bridge(name: str) -> None:
+    path = scene_path(name)
+    plain, counted = mujoco.MjModel.from_xml_path(str(path)), inventory_of(path)
+    assert counted.bodies == plain.nbody - 1
+    assert counted.degrees_of_freedom == plain.nv
+    assert sum(counted.geoms.values()) == plain.ngeom
+    assert counted.actuators == plain.nactuator
+    assert counted.equalities == plain.neq
+    assert counted.tendons == plain.ntendon
+    assert counted.geoms[VISUAL] == sum(
+        not (type_ or affinity)
+        for type_, affinity in zip(plain.geom_contype, plain.geom_conaffinity, strict=True)
+    )
+
+
+def heap(seed: int) -> str:
+    """Geoms of random masks in one place, on bodies in and below each other, some excluded."""
+    random = np.random.default_rng(seed)
+    bodies = []
+    for k in range(4):
+        joint = '<joint type="slide"/>' if random.random() < 0.7 else ""
+        geoms = "".join(
+            f'<geom size="0.1" mass="1" contype="{random.integers(4)}" '
+            f'conaffinity="{random.integers(4)}"/>'
+            for _ in range(2)
+        )
+        bodies.append(f'<body name="b{k}">{joint}{geoms}{{}}</body>')
+    nested = bodies[0].format(bodies[1].format(""))
+    return f"""<mujoco>
+      <default><geom condim="1"/></default>
+      <worldbody>
+        <geom name="w0" size="0.1"/><geom name="w1" size="0.1"/>
+        {nested}{bodies[2].format(bodies[3].format(""))}
+        <body name="p"><joint type="slide"/>
+          <geom name="p" size="0.1" mass="1" contype="0" conaffinity="0"/></body>
+      </worldbody>
+      <contact><exclude body1="b0" body2="b2"/><pair geom1="p" geom2="w0"/></contact>
+    </mujoco>"""
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_pairs_that_can_meet_are_those_that_mujoco_lets_meet(seed: int) -> None:
+    model = mujoco.MjModel.from_xml_string(heap(seed))
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    found = {tuple(sorted(pair)) for pair in data.contact.geom.tolist()}
+    pairs = [tuple(sorted(pair[:2])) for pair in meeting_pairs(model)]
+    assert len(pairs) == len(set(pairs))
+    assert set(pairs) == found
+    assert found
+
+
+def test_disabled_contacts_cannot_meet() -> None:
+    model = mujoco.MjModel.from_xml_string(heap(0))
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
+    assert list(meeting_pairs(model)) == []
+
+
+HAND = "t,x,y,z\n0,0,0,0\n0.1,0,0,-0.002\n0.5,0,0,-0.002\n"
+ROWS = mjcf(
+    GOOD_OPTION,
+    GOOD_CONTACT,
+    body='<body name="tool" pos="0 0 0.0101"><freejoint/><geom size="0.01" mass="0.1"/>'
+    '<site name="grip"/></body>',
+    world="""<geom name="floor" type="plane" size="1 1 1"/>
+    <body name="held" pos="1 0 1"><joint type="hinge" frictionloss="1"/><geom size="0.01" mass="1"/>
+      <body pos="0.1 0 0"><joint name="bent" type="hinge" limited="true" range="10 20"
+        stiffness="10"/>
+        <geom size="0.01" mass="1"/></body></body>
+    <body name="pinned" pos="2 0 1"><freejoint/><geom size="0.01" mass="1"/></body>""",
+).replace("</mujoco>", '<equality><connect body1="pinned" anchor="0 0 0"/></equality></mujoco>')
+
+
+def test_constraint_rows_are_counted_by_kind(tmp_path: Path) -> None:
+    rows = inventory_of(written(tmp_path, ROWS, HAND)).rows
+    assert rows is not None
+    assert rows["contact"] == (3, 3.0)  # one contact of three dimensions, elliptic
+    assert rows["friction loss"] == (1, 1.0)
+    assert rows["limit"] == (1, 1.0)  # zero is below its range
+    assert rows["equality"] == (3, 3.0)
+
+
+def test_rows_of_a_cone_of_four_edges_are_four(tmp_path: Path) -> None:
+    text = ROWS.replace("elliptic", "pyramidal")
+    rows = inventory_of(written(tmp_path, text, HAND)).rows
+    assert rows is not None
+    assert rows["contact"] == (4, 4.0)
+
+
+@pytest.mark.parametrize("cone", ["elliptic", "pyramidal"])
+@pytest.mark.parametrize("condim", [1, 3, 4])
+def test_stiffness_that_was_seen_is_force_over_depth_at_rest(
+    tmp_path: Path, cone: str, condim: int
+) -> None:
+    text = ROWS.replace("elliptic", cone).replace("<geom solref", f'<geom condim="{condim}" solref')
+    case = case_of(written(tmp_path, text, HAND))
+    assert case.observation is not None
+    (meeting,) = case.observation.meetings.values()
+    data, force = case.scene.data, np.zeros(6)
+    mujoco.mj_contactForce(case.model, data, 0, force)
+    assert force[0] == pytest.approx(4.5, rel=0.1)  # 1.9 mm of the coupling
+    # impedance grows by 0.1 % over this depth
+    assert meeting.softest <= 1.001 * force[0] / -data.contact[0].dist
+    assert meeting.stiffest == pytest.approx(force[0] / -data.contact[0].dist, rel=2e-3)
+    inventory = take_inventory(case.model, "grip", case.places, case.observation)
+    assert inventory.stiffness == (meeting.softest, meeting.stiffest)
+    assert inventory.deepest == meeting.deepest
+
+
+def test_geoms_are_sorted_by_what_they_met(tmp_path: Path) -> None:
+    counted = inventory_of(bench(tmp_path / "scene"))
+    # shaft; floor and button; block; slider; stop; cap
+    assert counted.geoms == {
+        TOOL: 1, MEETS_TOOL: 2, MEETS_OTHER: 1, MOVING: 1, FIXED: 1, VISUAL: 1,
+    }  # fmt: skip
+    assert counted.met_pairs == 3
+    # of five things four move: all meet all but themselves, the cap nothing
+    assert counted.possible_pairs == 4 * 2 + 6
+    assert counted.triangles == 8
+    assert counted.moving_bodies == counted.bodies == 4
+    assert counted.tool_degrees_of_freedom == 6
+    assert counted.tool_mass == pytest.approx(0.5)
+
+
+def test_what_cannot_influence_the_grip_is_named(tmp_path: Path) -> None:
+    scene = bench(tmp_path / "scene")
+    idle = {each.place.element: each for each in inventory_of(scene).idle}
+    assert set(idle) == {
+        "body 'slider'", "body 'block'", "geom 'cap'", "geom 'stop'",
+    }  # fmt: skip
+    assert "never meets the tool" in idle["body 'block'"].reason
+    assert idle["geom 'cap'"].reason == VISUAL
+    assert idle["geom 'stop'"].reason == "fixed and never met in the motion"
+    assert idle["body 'block'"].place.file == "parts.xml"
+
+
+@pytest.mark.parametrize(
+    ("joints", "reached"),
+    [
+        ("", set()),
+        ('<equality><connect body1="a" body2="b" anchor="0 0 0"/></equality>', set()),
+        ('<equality><weld body1="tool" body2="a"/></equality>', {"a"}),
+        (
+            '<equality><weld body1="tool" body2="a"/><joint joint1="ja" joint2="jb"/></equality>',
+            {"a", "b"},
+        ),
+        ('<equality><connect site1="grip" site2="sa"/></equality>', {"a"}),
+        ('<tendon><spatial><site site="grip"/><site site="sa"/></spatial></tendon>', {"a"}),
+        (
+            '<tendon><spatial><site site="grip"/><site site="sa"/></spatial>'
+            '<fixed><joint joint="ja" coef="1"/><joint joint="jb" coef="1"/></fixed></tendon>',
+            {"a", "b"},
+        ),
+    ],
+)
+def test_influence_goes_through_equalities_and_tendons(
+    tmp_path: Path, joints: str, reached: set[str]
+) -> None:
+    others = "".join(
+        f'<body name="{name}" pos="{x} 0 0"><joint name="j{name}" type="slide"/>'
+        f'<geom name="{name}" size="0.01" mass="0.1" contype="0" conaffinity="0"/>'
+        f'<site name="s{name}"/></body>'
+        for name, x in (("a", 0.5), ("b", 1.0))
+    )
+    text = mjcf(GOOD_OPTION, world=others).replace("</mujoco>", f"{joints}</mujoco>")
+    idle = inventory_of(written(tmp_path, text)).idle
+    named = {each.place.element for each in idle if each.place.element.startswith("body")}
+    assert named == {f"body '{name}'" for name in ("a", "b") if name not in reached}
+
+
+def test_in_a_scene_with_flexes_nothing_that_moves_is_called_idle(tmp_path: Path) -> None:
+    cloth = (
+        '<flexcomp name="cloth" type="grid" count="3 3 1" spacing=".02 .02 .02" pos="0 0 -.02" '
+        'radius=".002" mass="0.1" dim="2"><contact selfcollide="none"/>'
+        '<edge equality="true"/></flexcomp>'
+    )
+    case = case_of(written(tmp_path, mjcf(GOOD_OPTION, world=cloth)))
+    counted = take_inventory(case.model, "grip", case.places, case.observation)
+    assert not [each for each in counted.idle if each.place.element.startswith("body")]
+
+
+def test_without_a_motion_what_can_meet_counts_as_met(tmp_path: Path) -> None:
+    case = case_of(bench(tmp_path / "scene"))
+    counted = take_inventory(case.model, "grip", case.places)
+    assert counted.rows is None
+    assert counted.met_pairs is None
+    assert [each.place.element for each in counted.idle] == ["geom 'cap'"]
+
+
+def test_every_geom_is_found_on_its_line(tmp_path: Path) -> None:
+    scene = bench(tmp_path / "scene")
+    case = case_of(scene)
+    lines = {"floor": 13, "stop": 14, "shaft": 17, "cap": 18, "button": 6, "": 11, "block": 15}
+    for geom in range(case.model.ngeom):
+        place = case.places.geom(geom)
+        name = case.model.geom(geom).name
+        assert place.line == lines[name]
+        text = (scene.parent / place.file).read_text().splitlines()[place.line - 1]
+        assert "<geom" in text
+        assert name in text
+
+
+def test_geoms_without_a_name_in_an_included_file_are_told_apart(tmp_path: Path) -> None:
+    (tmp_path / "parts.xml").write_text(
+        """<mujoco>
+          <default><geom condim="3"/></default>
+          <worldbody>
+            <geom size="0.01" pos="1 0 0"/>
+            <geom name="named" size="0.01"/>
+            <geom size="0.01" pos="2 0 0"/>
+          </worldbody>
+        </mujoco>""",
+        encoding="utf-8",
+    )
+    case = case_of(written(tmp_path, mjcf('<include file="parts.xml"/>', GOOD_OPTION)))
+    model = case.model
+    found = {float(model.geom_pos[g, 0]): case.places.geom(g) for g in range(3)}
+    assert [(found[x].file, found[x].line) for x in (1.0, 2.0)] == [
+        ("parts.xml", 4),
+        ("parts.xml", 6),
+    ]
+
+
+def test_places_of_a_repeated_element_are_the_line_that_repeats_it() -> None:
+    source = read_scene("round_peg")
+    places = Places(source, case_of(scene_path("round_peg")).model)
+    text = source.path.read_text(encoding="utf-8").splitlines()
+    assert '<geom name="sector"' in text[places.geom(5).line - 1]
+    assert places.geom(5).element.startswith("geom 'sector_")

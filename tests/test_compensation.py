@@ -1,0 +1,77 @@
+"""What a device needs to show a coupling as it feels, against spectrum, worst hand and motion."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hapticbridge.coupling import Coupling
+from hapticbridge.errors import CouplingError
+from hapticbridge.mechanics import drive_mass
+from hapticbridge.passivity import felt_damping, law_damping, needed_for_felt
+
+T = 1e-3
+LAGS = {"implicit": 1.0, "midpoint": 0.5}
+
+
+def tool_spectrum(
+    theta: np.ndarray, stiffness: float, damping: float, mass: float, scheme: str
+) -> np.ndarray:
+    """(T/2) Re[(1 − w) H]/(1 − cos θ) of a free tool behind the law K, B'; an own derivation."""
+    w = np.exp(-1j * theta)
+    law = stiffness + damping * (1 - w) / T
+    moved = T**2 / mass / (1 - w) ** 2  # of a unit force, implicit Euler
+    if scheme == "midpoint":
+        moved = moved * (1 + w) / 2
+    felt = law / (1 + law * moved)
+    return np.asarray(T / 2 * ((1 - w) * felt).real / (1 - np.cos(theta)))
+
+
+@given(
+    k=st.floats(10.0, 1e4),
+    b=st.floats(0.0, 20.0),
+    mass=st.floats(1e-3, 10.0),
+    scheme=st.sampled_from(sorted(LAGS)),
+)
+def test_no_free_tool_needs_more_than_a_wall(k: float, b: float, mass: float, scheme: str) -> None:
+    damping = law_damping(k, b, T, LAGS[scheme])
+    theta = np.linspace(1e-3, np.pi, 4001)
+    needed = needed_for_felt(k, b, T, LAGS[scheme])
+    spectrum = tool_spectrum(theta, k, damping, mass, scheme)
+    assert spectrum.max() <= needed * (1 + 1e-9)
+    if scheme == "midpoint":  # at Nyquist a tool of any mass stands still
+        assert spectrum[-1] == pytest.approx(needed, rel=1e-6)
+    wall = tool_spectrum(theta, k, damping, 1e12, scheme)
+    assert wall[-1] == pytest.approx(needed, rel=1e-6)
+
+
+def test_formulas_of_the_theory_where_nothing_is_clipped() -> None:
+    assert needed_for_felt(1000.0, 5.0, T, 1.0) == pytest.approx(5.0 - 0.5)  # B − KT/2
+    assert needed_for_felt(1000.0, 5.0, T, 0.5) == pytest.approx(5.0)  # B
+    assert needed_for_felt(2400.0, 0.5, T, 0.5) == pytest.approx(1.2)  # clipped: KT/2
+    assert felt_damping(2400.0, 0.0, T, 0.5) == pytest.approx(1.2)
+    assert law_damping(1000.0, 5.0, T, 0.5) == pytest.approx(4.5)
+
+
+@pytest.mark.parametrize("scheme", ["compensated", "midpoint"])
+def test_a_mass_decays_as_fast_as_the_felt_damping_says(scheme: str) -> None:
+    # ln of the amplitude falls by B/(2m) a second, whatever the period, if B is what is felt
+    lag = LAGS["implicit"] if scheme == "compensated" else LAGS["midpoint"]
+    rates = []
+    for period in (1e-3, 5e-4):
+        damping = law_damping(1000.0, 5.0, period, lag)
+        coupling = Coupling(1000.0, felt_damping(1000.0, damping, period, lag), 0, 0)
+        assert coupling.damping == pytest.approx(5.0)
+        handle = np.zeros(round(1.0 / period) + 1)
+        motion = drive_mass(coupling, 1.0, handle, period, scheme, position=0.01)  # type: ignore[arg-type] # one of the schemes
+        energy = 500.0 * motion.position**2 + 0.5 * motion.velocity**2
+        rates.append(np.log(energy[0] / energy[-1]) / (1.0 * 2))
+    assert rates == pytest.approx([2.5, 2.5], rel=0.03)
+
+
+@pytest.mark.parametrize("period", [0.0, -1e-3, float("nan"), float("inf")])
+def test_a_period_out_of_range_is_refused(period: float) -> None:
+    with pytest.raises(CouplingError, match="period"):
+        needed_for_felt(1000.0, 5.0, period, 0.5)
