@@ -233,7 +233,8 @@ def parameters_of(meta: Mapping[str, str]) -> RunParameters:
     """
     try:
         method = method_named(meta.get("method", ""))
-        burning, rotational = DeviceInfo.from_json(meta.get("device", "")).burning_damping
+        device = None if method.has_law else DeviceInfo.from_json(meta.get("device", ""))
+        burning, rotational = (None, None) if device is None else device.burning_damping
         return RunParameters(
             grip=meta.get("grip", ""),
             period=meta_float(meta, "period_s"),

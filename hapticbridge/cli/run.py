@@ -65,7 +65,7 @@ class Run:
     contact_stiffness: float | None = None
     """Stiffness per contact in N/m of method 'direct'; by default that of the coupling."""
     i_know: bool = False
-    """Accept a method other than 'implicit' on a real device."""
+    """Accept a method that may kick on a real device; the first three need no such word."""
     rate: float = 1000.0
     """Ticks per second."""
     substeps: int = 1
