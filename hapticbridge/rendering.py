@@ -50,9 +50,9 @@ class Method:
         integrator: MuJoCo's, by the name that MJCF gives it.
         discretization: How the coupling's damper is discretised, as the bounds call it; ``none``
             where no coupling law gives the wrench.
-        compensated: Whether the actuators get the extra K T of damping that makes the implicit
-            integration of velocity alone one of position too.
-        lag: Share of K h, h the time step, that the method's integration adds to the damping, and
+        compensated: Whether the actuators get the extra K h of damping, h the time step, that makes
+            the implicit integration of velocity alone one of position too.
+        lag: Share of K h that the method's integration adds to the damping, and
             which it therefore takes off the damping asked for; no unit.
     """
 
@@ -95,13 +95,13 @@ class Method:
         """Whether anything elastic lies between handle and tool."""
         return self.scheme != DIRECT
 
-    def gains(self, coupling: Coupling, period: float) -> tuple[Gains, Gains]:
+    def gains(self, coupling: Coupling, timestep: float) -> tuple[Gains, Gains]:
         """Returns the gains of the coupling's actuators, for forces and for torques."""
         if self.scheme == HELD:
             return (1.0, 0.0, 0.0), (1.0, 0.0, 0.0)
         if self.scheme not in (COUPLED, LOSSLESS):
             return (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
-        more = period if self.compensated else 0.0
+        more = timestep if self.compensated else 0.0
         k, b = coupling.stiffness, coupling.damping
         kr, br = coupling.rotational_stiffness, coupling.rotational_damping
         return (b, k, b + k * more), (br, kr, br + kr * more)
@@ -347,7 +347,8 @@ def prepare(
     scene.set_reach(REACH if method.scheme == LOSSLESS else 0.0)
     if warns and method.scheme in (COUPLED, LOSSLESS):
         warn_of_contacts(scene.model, scene.grip, scene.path)
-    scene.set_gains(*method.gains(method.used(coupling, period / substeps), period))
+    step = period / substeps
+    scene.set_gains(*method.gains(method.used(coupling, step), step))
     felt = measured_weld(scene.model, scene.grip) if method.scheme == WELD else None
     scene.reset()
     return felt

@@ -118,7 +118,8 @@ def _model(recording: Recording, parameters: RunParameters) -> mujoco.MjModel:
         if mujoco.mj_name2id(model, kind, name) < 0:
             raise RecordingError(f"the attached model has no '{name}'")
     method = method_named(recording.meta.get("method", ""))
-    forces, torques = method.gains(parameters.coupling, parameters.period)
+    step = parameters.period / parameters.substeps
+    forces, torques = method.gains(parameters.coupling, step)
     for axis, name in enumerate(COUPLING_ACTUATORS):
         actuator_id = model.actuator(name).id
         factor, stiffness, damping = forces if axis < 3 else torques
