@@ -141,7 +141,10 @@ def _search(judge: Judge, simpler: list[Simplification], progress: Progress | No
         if found is not None and found[1].verdict == MAY_GO:
             best, share = found[0], found[1].cost or share
             together.append(found[1])
-    result = judge.judge("lean", "all that was taken", best)
+    result = judge.judge("lean", "all that was taken", best, is_last_word=True)
+    if together and result.verdict != MAY_GO:  # what was saved step by step was the machine's noise
+        best, together = judge.original, []
+        result = judge.judge("lean", "all that was taken", best)
     if not together:
         result = replace(result, cost=1.0)  # not measured against itself
     if progress is not None:

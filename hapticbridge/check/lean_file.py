@@ -21,13 +21,15 @@ def check_target(source: SceneSource, path: Path, *, overwrite: bool = False) ->
     """Checks that a leaner scene can be written, before anything is computed for it.
 
     Raises:
-        SceneError: The file's name does not end in .xml, it is a file of the scene itself, or it
-            exists and ``overwrite`` is not set.
+        SceneError: The file's name does not end in .xml, its folder does not exist, it is a file of
+            the scene itself, or it exists and ``overwrite`` is not set.
     """
     if path.suffix.lower() != ENDING:
         raise SceneError(f"cannot write the scene to '{path}': its name must end in {ENDING}")
     if path.resolve() in {file.resolve() for file in _files(source)}:
         raise SceneError(f"'{path}' is a file of the scene itself; choose another name")
+    if not path.absolute().parent.is_dir():
+        raise SceneError(f"cannot write the scene to '{path}': its folder does not exist")
     if path.exists() and not overwrite:
         raise SceneError(f"'{path}' exists; choose another file or add --overwrite")
 
@@ -66,7 +68,9 @@ def write_lean(lean: Lean, path: Path, *, overwrite: bool = False) -> Trial:
         raise SceneError(f"cannot write the scene to '{path}': {reason}") from None
     written = Draft(read_scene(path), lean.draft.grip, setting)
     with quiet():
-        return judge.judge("written", "the scene as it was read back from its file", written)
+        return judge.judge(
+            "written", "the scene as it was read back from its file", written, is_last_word=True
+        )
 
 
 def _files(source: SceneSource) -> list[Path]:
