@@ -90,7 +90,7 @@ PLANTS = (
     Plant("solver", 'solver="Newton"', 'solver="CG"'),
     Plant("solver iterations", 'iterations="100"', 'iterations="1"'),
     Plant("pyramidal cone", 'cone="elliptic"', 'cone="pyramidal"'),
-    Plant("diagexact", ' diagexact="enable"', ' energy="enable"', at="<option"),
+    Plant("diagexact", ' diagexact="enable"', ' energy="enable"', at="<flag"),
     Plant("keyframe", "<!-- keys -->", f'<keyframe><key name="start" qpos="{START}"/></keyframe>'),
     Plant("heavy tool", 'pos="0 0 0.03" gravcomp="1"', 'pos="0 0 0.03"'),
     Plant("far grip", '<site name="grip"/>', '<site name="grip" pos="0 0 0.2"/>'),

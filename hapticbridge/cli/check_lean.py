@@ -5,13 +5,11 @@ from __future__ import annotations
 import shlex
 from pathlib import Path
 
-from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
-
 from hapticbridge.check.case import Case
 from hapticbridge.check.draft import Setting
 from hapticbridge.check.lean import Lean, find_lean
 from hapticbridge.check.trial import MAY_GO, Trial
-from hapticbridge.cli.terminal import err, out, plain, quantity
+from hapticbridge.cli.terminal import err, out, plain, progress, quantity
 
 _HEADINGS = ("alone", "cost", "JND", "force, RMS", "peak", "torque, RMS", "tool off by")
 """Of the table; JND: felt error in just noticeable differences."""
@@ -23,13 +21,7 @@ def look_for_lean(case: Case, budget: float) -> Lean:
     Raises:
         SceneError: The scene cannot be run as it is, or the budget is out of range.
     """
-    columns = TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn()
-    with Progress(*columns, console=err, transient=True) as bar:
-        task = bar.add_task("leaner", total=None)
-
-        def show(done: int, total: int, name: str) -> None:
-            bar.update(task, completed=done, total=total, description=f"leaner: {plain(name)}")
-
+    with progress("leaner") as show:
         damping = case.info.damping or 0.0
         return find_lean(
             case.source,
