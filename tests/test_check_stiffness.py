@@ -14,10 +14,9 @@ from check_scenes import (
     GOOD_OPTION,
     case_of,
     cup_obj,
-    hand_rows,
     written,
 )
-from outside_scenes import mjcf
+from outside_scenes import hand_rows, mjcf
 
 from hapticbridge.check.constraint_faults import creep_speed
 from hapticbridge.check.contact_faults import inertia_of

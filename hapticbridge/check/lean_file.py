@@ -10,6 +10,7 @@ import mujoco
 from hapticbridge.check.draft import Draft
 from hapticbridge.check.lean import Lean
 from hapticbridge.check.observation import quiet
+from hapticbridge.check.simplifications import OTHER_MOTIONS
 from hapticbridge.check.trial import Trial
 from hapticbridge.errors import SceneError
 from hapticbridge.scene import SceneSource, read_scene
@@ -126,6 +127,8 @@ def _comment(lean: Lean, before: str) -> str:
         f"  and differs by {felt:.2g} just noticeable differences (allowed: {judge.budget:g}).",
         *(f"  Taken: {trial.name} ({trial.sentence})." for trial in lean.together),
     ]
+    if any(trial.loses == OTHER_MOTIONS for trial in lean.together):
+        lines.append("  Another motion may miss what this one did not need.")
     if setting != lean.judge.original.setting:
         lines.append(
             f"  To be run at {1 / setting.period:g} Hz with {setting.substeps} substep(s) a tick; "

@@ -8,6 +8,7 @@ from pathlib import Path
 from hapticbridge.check.case import Case
 from hapticbridge.check.draft import Setting
 from hapticbridge.check.lean import Lean, find_lean
+from hapticbridge.check.simplifications import OTHER_MOTIONS
 from hapticbridge.check.trial import MAY_GO, Trial
 from hapticbridge.cli.terminal import err, out, plain, progress, quantity
 
@@ -57,6 +58,11 @@ def print_lean(lean: Lean) -> None:
     if not lean.together:
         out.print("  [green]nothing may go: the scene is lean[/]")
         return
+    if any(trial.loses == OTHER_MOTIONS for trial in lean.together):
+        out.print(
+            "  [yellow]another motion may miss what this one did not need[/]: judge it by one that "
+            "does all that the hand will do"
+        )
     setting = lean.draft.setting
     if setting != judge.original.setting:
         out.print(
