@@ -13,7 +13,7 @@ from hapticbridge.check import lean
 from hapticbridge.check.draft import Draft, Setting, name_everything
 from hapticbridge.check.faults import Fault, number
 from hapticbridge.check.places import Place
-from hapticbridge.check.simplifications import Simplification
+from hapticbridge.check.simplifications import OTHER_MOTIONS, Simplification
 from hapticbridge.check.trial import MAY_GO
 from hapticbridge.cli.check_words import MOST_NAMED, print_faults
 from hapticbridge.cli.main import USAGE_ERROR, main
@@ -148,6 +148,27 @@ def test_saving_that_is_gone_when_measured_again_is_noise(
     assert bool(found.together) == is_taken
     assert found.result.cost == pytest.approx(again)
     assert found.draft.spec.option.tolerance == (1e-6 if is_taken else 1e-8)
+
+
+def test_what_another_motion_may_miss_is_taken_last(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def edit(draft: Draft) -> bool:
+        draft.spec.option.tolerance *= 2.0
+        return True
+
+    risky = Simplification("risky", "saves most", edit, loses=OTHER_MOTIONS)
+    plain = [Simplification(name, "loses nothing", edit) for name in ("some", "more")]
+    monkeypatch.setattr(lean, "_simplifications", lambda *_: [risky, *plain])
+    costs = iter([1.0, 0.3, 0.8, 0.6])  # against itself, then each alone
+    found = lean.find_lean(
+        read_scene(written(tmp_path, mjcf(GOOD_OPTION, GOOD_CONTACT, body=BALL))),
+        "grip",
+        Motion([0.0, 0.1], [(0, 0, 0)] * 2),
+        Setting(Coupling(2400.0, 0.5, 2.4, 5e-4)),
+        cost=lambda *_: (1.0, next(costs, 0.5)),
+    )
+    assert [trial.name for trial in found.together] == ["more", "some", "risky"]
 
 
 @pytest.mark.parametrize("option", ["--write", "--table", "--plot"])

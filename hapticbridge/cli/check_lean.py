@@ -15,6 +15,8 @@ from hapticbridge.cli.terminal import err, out, plain, progress, quantity
 _HEADINGS = ("alone", "cost", "JND", "force, RMS", "peak", "torque, RMS", "tool off by")
 """Of the table; JND: felt error in just noticeable differences."""
 
+_ROUNDING = 1e-9  # N and N m; what is below is how the computer adds
+
 
 def look_for_lean(case: Case, budget: float) -> Lean:
     """Tries what could go, with progress on stderr.
@@ -105,8 +107,13 @@ def _numbers(trial: Trial) -> list[str]:
         trial.name,
         f"{100 * trial.cost:.0f} %",
         f"{felt.felt:.3f}",
-        quantity(felt.force_rms, "N"),
-        quantity(felt.force_peak, "N"),
-        quantity(felt.torque_rms, "N m"),
+        *(
+            quantity(0.0 if value < _ROUNDING else value, unit)
+            for value, unit in (
+                (felt.force_rms, "N"),
+                (felt.force_peak, "N"),
+                (felt.torque_rms, "N m"),
+            )
+        ),
         f"{1e6 * felt.position_peak:.0f} µm",
     ]
