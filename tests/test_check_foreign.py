@@ -6,15 +6,17 @@ from pathlib import Path
 
 import mujoco
 import pytest
-from check_scenes import GOOD_CONTACT, GOOD_OPTION, faults_of, kinds, written
+from check_scenes import GOOD_CONTACT, GOOD_OPTION, case_of, faults_of, kinds, written
 from outside_scenes import FREE_TOOL, mjcf
 
 from hapticbridge.check import lean
 from hapticbridge.check.draft import Draft, Setting, name_everything
 from hapticbridge.check.faults import Fault, number
+from hapticbridge.check.inventory import take_inventory
 from hapticbridge.check.places import Place
 from hapticbridge.check.simplifications import OTHER_MOTIONS, Simplification
 from hapticbridge.check.trial import MAY_GO
+from hapticbridge.check.witness import witness
 from hapticbridge.cli.check_words import MOST_NAMED, print_faults
 from hapticbridge.cli.main import USAGE_ERROR, main
 from hapticbridge.coupling import Coupling
@@ -83,6 +85,19 @@ def test_one_line_mends_the_default_contact_of_many_geoms(tmp_path: Path) -> Non
     line = fault.change.split("at once: ")[1].removesuffix(" in <default>")
     mended = mjcf(GOOD_OPTION, f"<default>{line}</default>", body=BALL, world=BRICKS)
     assert "default contact" not in kinds(faults_of(written(tmp_path, mended, STILL)))
+
+
+def test_floor_under_a_flex_is_not_called_idle(tmp_path: Path) -> None:
+    cloth = """<geom name="floor" type="plane" size="1 1 1"/><flexcomp name="cloth" type="grid"
+      count="3 3 1" spacing="0.02 0.02 0.02" pos="0 0 0.002" mass="0.1" radius="0.003" dim="2">
+      <edge equality="true"/></flexcomp>"""
+    scene = written(tmp_path, mjcf(GOOD_OPTION, body=BALL, world=cloth), STILL)
+    case = case_of(scene)
+    inventory = take_inventory(case.model, "grip", case.places, case.observation)
+    assert inventory.flexes == 1
+    assert not inventory.idle
+    draft = Draft(case.source, "grip", Setting(case.coupling))
+    assert "floor" in witness(draft, case.motion).near_geoms
 
 
 @pytest.mark.parametrize(("mass", "is_told"), [(0.05, True), (20.0, False)])

@@ -62,12 +62,12 @@ def print_inventory(inventory: Inventory) -> None:
             f"{least} to {most} kN/m at the tool, which sank in by {length(inventory.deepest)}"
         )
     is_met = inventory.rows is None or inventory.geoms[MEETS_TOOL] > 0
-    if inventory.possible_pairs and not is_met:
+    if inventory.possible_pairs and not inventory.flexes and not is_met:
         lines["contact"] = (
             "the tool touches nothing in this motion, so what contact costs is unknown;\n"
             f"{'':23}lead it to where it does: --motion hand.csv (t,x,y,z in s and m)"
         )
-    for kind in ("actuators", "equalities", "tendons"):
+    for kind in ("actuators", "equalities", "tendons", "flexes"):
         if count := getattr(inventory, kind):
             lines[kind] = str(count)
     for name, words in lines.items():
