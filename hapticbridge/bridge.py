@@ -58,7 +58,7 @@ class Bridge:
             is sent, and the device needs another damping: ``certificate.needed_damping``.
         method: How the tool is rendered; see ``rendering.METHODS``.
         contact_stiffness: K_c in N/m of method ``direct``; None takes the coupling's stiffness.
-        i_know: Accept a method other than ``implicit`` on a real device.
+        i_know: Accept a method that may kick (``Method.hazard``) on a real device.
         recording: File to write (``.mcap``), or None; an existing file is replaced.
         clock: ``RealClock()`` by default; ``SimulatedClock()`` runs as fast as it goes.
         scale: Handle motion per device motion.

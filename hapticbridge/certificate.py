@@ -39,21 +39,23 @@ class Condition:
     Attributes:
         axis: ``translation`` or ``rotation``.
         needed: The right-hand side in N s/m (rotation: N m s/rad).
-        available: The device's damping b.
+        available: The device's damping b; None where unknown.
     """
 
     axis: str
     needed: float
-    available: float
+    available: float | None
 
     @property
-    def holds(self) -> bool:
-        """Whether the device has enough damping."""
-        return self.available >= self.needed
+    def holds(self) -> bool | None:
+        """Whether the device has enough damping; None where that is unknown."""
+        return None if self.available is None else self.available >= self.needed
 
     def sentence(self) -> str:
         """Says it, with what to change if it does not hold."""
         unit = "N s/m" if self.axis == "translation" else "N m s/rad"
+        if self.available is None:
+            return f"{self.axis}: device damping unknown, {self.needed:g} {unit} needed"
         relation = ">=" if self.holds else "<"
         text = f"{self.axis}: device damping {self.available:g} {relation} {self.needed:g} {unit}"
         return text if self.holds else f"{text}; lower stiffness or damping, or raise the rate"
@@ -127,7 +129,7 @@ def device_conditions(
     force_scale: float,
     laws: int = 1,
 ) -> tuple[Condition, ...]:
-    """Returns the condition per kind of axis that the device has, if its damping is known.
+    """Returns the condition per kind of axis that the device has, if b of translation is known.
 
     A handle that moves ``scale`` times as far and a force that returns ``force_scale`` times as
     large make the coupling scale · force_scale times as stiff for the device; angles are not
@@ -148,7 +150,7 @@ def device_conditions(
     if info.damping is not None:
         needed = scale * force_scale * needed_damping(coupling, period, laws)
         conditions.append(Condition("translation", needed, info.damping))
-        if info.rotational_damping is not None and info.degrees_of_freedom > 3:
+        if info.degrees_of_freedom > 3:
             needed = force_scale / scale * needed_damping(coupling, period, laws, "rotation")
             conditions.append(Condition("rotation", needed, info.rotational_damping))
     return tuple(conditions)
@@ -208,8 +210,9 @@ def is_run_certified(conditions: tuple[Condition, ...], method: Method) -> bool 
 
 
 def is_certified(conditions: tuple[Condition, ...]) -> bool | None:
-    """Returns whether all conditions hold; None where the device's damping is unknown."""
-    return all(condition.holds for condition in conditions) if conditions else None
+    """Returns whether all conditions hold; None where a damping is unknown that decides it."""
+    held = {condition.holds for condition in conditions}
+    return False if False in held else None if None in held or not held else True
 
 
 def default_coupling(

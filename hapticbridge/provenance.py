@@ -234,6 +234,7 @@ def parameters_of(meta: Mapping[str, str]) -> RunParameters:
     try:
         method = method_named(meta.get("method", ""))
         device = None if method.has_law else DeviceInfo.from_json(meta.get("device", ""))
+        burning, rotational = (None, None) if device is None else device.burning_damping
         return RunParameters(
             grip=meta.get("grip", ""),
             period=meta_float(meta, "period_s"),
@@ -251,8 +252,8 @@ def parameters_of(meta: Mapping[str, str]) -> RunParameters:
             scheme=method.scheme,
             felt=_felt(meta, method),
             contact_stiffness=meta_float(meta, "contact_stiffness"),
-            device_damping=None if device is None else device.damping,
-            device_rotational_damping=None if device is None else device.rotational_damping,
+            device_damping=burning,
+            device_rotational_damping=rotational,
         )
     except RecordingError:
         raise

@@ -37,7 +37,9 @@ class Summary:
         coupling: The coupling asked for.
         felt: The coupling that the tool was truly held by, where it is not the one asked for (a
             weld: the stiffest axis, as measured at the start).
-        fault: Tick and port (``environment`` or ``device``) of the first fault, or None.
+        fault: Tick and port (``environment`` or ``device``) of the first fault, or None. Behind a
+            coupling law the device's port is not metered while it runs: a certified device needs
+            no watch, and of another the audit of its recording tells.
         conditions: What the device must satisfy, as sentences.
         is_certified: Whether b >= scale · force_scale · (KT/2 + B) holds for the device in
             translation and rotation; None where its damping is unknown, or where no coupling law
@@ -69,7 +71,7 @@ class Summary:
 
     @property
     def verdict(self) -> str:
-        """``passive`` (strict or within slack, and no kick of the device) or ``active``."""
+        """``passive`` (strict or within slack, and no kick that is metered) or ``active``."""
         return "active" if self.fault is not None else "passive"
 
     @classmethod

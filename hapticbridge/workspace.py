@@ -108,6 +108,7 @@ def run_parameters(
         HapticBridgeError: A value is out of range.
     """
     start = tuple(float(v) for v in (*first["position"][0], *first["quaternion"][0]))
+    burning, rotational = (None, None) if info is None else info.burning_damping
     return RunParameters(
         grip=scene.grip,
         period=period,
@@ -125,6 +126,6 @@ def run_parameters(
         scheme=method.scheme,
         felt=felt,
         contact_stiffness=contact_stiffness_of(method, coupling, contact_stiffness),
-        device_damping=None if info is None else info.damping,
-        device_rotational_damping=None if info is None else info.rotational_damping,
+        device_damping=burning,
+        device_rotational_damping=rotational,
     )

@@ -16,7 +16,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from hapticbridge import Bridge, HapticBridgeError, SimulatedClock, load_scene
-from hapticbridge.scene import Scene, scene_names, scene_path
+from hapticbridge.scene import Scene, custom_numbers, scene_names, scene_path
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -30,13 +30,11 @@ pixels."""
 
 def advance(scene: Scene) -> None:
     """Moves a scene along its hand path to the moment that its picture shows."""
-    number = mujoco.mj_name2id(scene.model, mujoco.mjtObj.mjOBJ_NUMERIC, "picture")
-    path = scene.path.with_suffix(".csv")
-    if number < 0 or not path.is_file():
+    path, moment = scene.path.with_suffix(".csv"), custom_numbers(scene.model, "picture")
+    if not moment or not path.is_file():
         return
-    moment = float(scene.model.numeric_data[scene.model.numeric_adr[number]])
     with Bridge(scene, f"trajectory:{path}", clock=SimulatedClock()) as bridge:
-        bridge.run(duration=moment)
+        bridge.run(duration=moment[0])
 
 
 def picture(name: str) -> Image.Image:

@@ -11,6 +11,7 @@ import pytest
 from audit_cases import ScriptedDevice, recorded
 from random_hands import random_motion
 
+from hapticbridge.audit import audit
 from hapticbridge.audit.balance import Balance
 from hapticbridge.audit.device_port import kept_behind_a_law
 from hapticbridge.coupling import Coupling
@@ -125,8 +126,8 @@ def test_half_the_force_is_half_the_energy(tmp_path: Path) -> None:
     np.testing.assert_allclose(lost[1], 0.5 * lost[0], rtol=1e-9, atol=1e-15)
 
 
-def kicked(path: Path, damping: float | None = None, rotational: float = 1.0) -> np.ndarray:
-    """Returns what the device of a recording was given beyond what is paid for, in J."""
+def balance(path: Path, damping: float | None = None, rotational: float = 1.0) -> Balance:
+    """Returns a recording's balance, as if its device had this damping."""
     recording = read_recording(path)
     parameters = replace(
         parameters_of(recording.meta), device_damping=damping, device_rotational_damping=rotational
@@ -140,7 +141,12 @@ def kicked(path: Path, damping: float | None = None, rotational: float = 1.0) ->
         np.array(starts["tool_start"]),
         starts["start_kinetic"][0] + starts["start_potential"][0],
         np.array(resumed, dtype=np.float64),
-    ).kicked
+    )
+
+
+def kicked(path: Path, damping: float | None = None, rotational: float = 1.0) -> np.ndarray:
+    """Returns what the device of a recording was given beyond what is paid for, in J."""
+    return balance(path, damping, rotational).kicked
 
 
 @pytest.mark.parametrize(
@@ -169,3 +175,72 @@ def test_where_damping_is_unknown_nobody_can_tell(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     recorded(path, "point_mass", "simulated", duration=0.1)
     assert not kicked(path).any()
+
+
+@pytest.mark.parametrize("limit", [0.3, 1e3])
+def test_what_the_scene_creates_within_its_slack_is_not_the_devices_fault(
+    limit: float, tmp_path: Path
+) -> None:
+    # a force that is limited or still rises lets through only a share of the slack
+    path, period = tmp_path / "run.mcap", 5e-4
+    coupling = Coupling(3971.0, 1.97, 0.2, 1.5e-3)
+    device = ScriptedDevice(
+        lambda k: (2e-4 * np.sin(25 * period * k), 0, 0, 1, 0, 0, 0), strength=limit
+    )
+    limits = Limits(force=limit, torque=0.05 * limit, ramp=0.3)
+    options: dict[str, Any] = {"method": "implicitfast", "rate": 1 / period, "limits": limits}
+    recorded(path, "point_mass", device, coupling, duration=0.5, **options)
+    found = balance(path, coupling.stiffness * period / 2 + coupling.damping)
+    created = found.environment_energy
+    assert created.max() > 1e-9
+    assert np.all(created <= found.slack + 1e-12)
+    assert found.kicked.max() <= 1e-12
+
+
+class Turning(ScriptedDevice):
+    """A device that a strong hand turns to and fro, with its data sheet changed.
+
+    On ``virtual_wall`` it turns against a tool that cannot turn.
+    """
+
+    def __init__(self, **changed: Any) -> None:
+        super().__init__(lambda k: (0, 0, 0, *self._turned(5e-3 * np.sin(0.05 * k))))
+        self.info = replace(self.info, **changed)
+
+    @staticmethod
+    def _turned(angle: float) -> tuple[float, ...]:
+        return float(np.cos(angle / 2)), float(np.sin(angle / 2)), 0.0, 0.0
+
+
+@pytest.mark.parametrize(
+    ("changed", "coupling", "certified", "port"),
+    [
+        # K_r T/2 alone is beyond what 2e-3 N m s/rad bear
+        ({}, Coupling(1000.0, 0.5, 80.0, 5e-4), False, "device"),
+        ({"rotational_damping": None}, Coupling(1000.0, 0.5, 80.0, 5e-4), None, ""),
+        ({"rotational_damping": None}, Coupling(9000.0, 0.5, 80.0, 5e-4), False, ""),
+        ({"is_prescribed": True}, Coupling(1000.0, 0.5, 80.0, 5e-4), None, ""),
+    ],
+)
+def test_a_device_is_blamed_only_where_all_its_damping_is_known_and_it_is_free_to_move(
+    changed: dict[str, Any],
+    coupling: Coupling,
+    certified: bool | None,
+    port: str,
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "run.mcap"
+    summary = recorded(path, "virtual_wall", Turning(**changed), coupling, duration=0.3)
+    report = audit(path)
+    assert (report.certified, report.port) == (certified, port)
+    assert summary.is_certified is certified
+
+
+def test_a_weld_kicks_no_device_whose_motion_is_prescribed(tmp_path: Path) -> None:
+    for is_prescribed, port in ((False, "device"), (True, "")):
+        path = tmp_path / f"{is_prescribed}.mcap"
+        device = Turning(is_prescribed=is_prescribed, damping=0.0, rotational_damping=0.0)
+        coupling = Coupling(1000.0, 0.5, 80.0, 5e-4)
+        summary = recorded(path, "point_mass", device, coupling, duration=0.3, method="weld")
+        assert (summary.fault or (0, ""))[1] == port
+        assert audit(path).port == port

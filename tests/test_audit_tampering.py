@@ -209,7 +209,7 @@ def test_sum_that_overflows_is_a_fault_and_no_agreement(tap: Recording, folder: 
 def test_device_that_no_force_moves_is_not_certified_whatever_damping_it_claims(
     tap: Recording, folder: Path
 ) -> None:
-    claimed = json.loads(tap.meta["device"]) | {"damping": 100.0}
+    claimed = json.loads(tap.meta["device"]) | {"damping": 100.0, "rotational_damping": 1.0}
     report = verdict_of(tap, folder, meta={"device": json.dumps(claimed)})
     assert (report.verdict, report.certified, report.conditions) == ("passive", None, ())
     free = claimed | {"is_prescribed": False}

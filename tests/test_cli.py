@@ -212,6 +212,7 @@ def test_coupling_above_the_device_bound_is_exit_code_1_with_a_warning(
     assert code == 1
     assert "warning" in err and "3 N s/m" in err
     assert "not certified" in out
+    assert "the device's port is not proven, nor metered while it runs: the audit judges it" in out
     code, out, _ = call("audit", path)
     assert code == 1
     assert "passive" in out and "2 < 3 N s/m" in out

@@ -16,8 +16,14 @@ from matplotlib.axes import Axes
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import SimulatedDevice
 from hapticbridge.errors import StudyError
-from hapticbridge.passivity import environment_minimum_damping, maximum_stiffness
+from hapticbridge.passivity import (
+    environment_minimum_damping,
+    maximum_stiffness,
+    minimum_damping,
+)
+from hapticbridge.rendering import METHODS
 from hapticbridge.study.maps import MapFiles, run_map
+from hapticbridge.study.maps.bound_of_method import limit_by_6, needed_by_6, used_damping
 from hapticbridge.study.maps.coupling import COUPLING
 from hapticbridge.study.maps.coupling_runs import (
     DEVICE_DAMPING,
@@ -43,6 +49,24 @@ def test_worst_hand_on_a_wall_finds_the_bound_within_a_percent(damping: float) -
     assert found["limit"] == pytest.approx(
         maximum_stiffness(DEVICE_DAMPING, PERIOD, damping), rel=0.01
     )
+
+
+@pytest.mark.parametrize("method", ["implicit", "compensated", "lossless", "explicit"])
+def test_the_bound_of_a_method_is_that_of_the_coupling_it_uses(method: str) -> None:
+    for k in (500.0, 1500.0, 6000.0):
+        used = METHODS[method].used(Coupling(k, 1.2, 1.0, 0.0), PERIOD)
+        assert used_damping(method, k, 1.2, PERIOD) == pytest.approx(used.damping)
+        assert needed_by_6(method, k, 1.2, PERIOD) == pytest.approx(minimum_damping(used, PERIOD))
+    limit = limit_by_6(method, DEVICE_DAMPING, PERIOD, 1.2)
+    assert needed_by_6(method, limit, 1.2, PERIOD) == pytest.approx(DEVICE_DAMPING)
+
+
+@pytest.mark.parametrize("method", ["compensated", "lossless"])
+def test_what_takes_its_lag_off_is_stable_on_a_wall_beyond_the_bound_of_implicit(
+    method: str,
+) -> None:
+    point: Point = {"what": "limit", "method": method, "stiffness": 0.0, "damping": 1.2}
+    assert evaluate(point)["limit"] == pytest.approx(2 * DEVICE_DAMPING / PERIOD, rel=0.01)
 
 
 def test_coupling_that_the_device_cannot_bear_is_unstable_though_the_scene_is_passive() -> None:
@@ -245,7 +269,7 @@ def test_groups_that_fail_say_why_and_the_others_are_drawn(tmp_path: Path) -> No
     drawn = {axes.get_title(): [text.get_text() for text in axes.texts] for axes in panels(files)}
     assert [title for title, texts in drawn.items() if texts == [MISSING]] == [
         "explicit",
-        "weld: free tool and tapping only",
+        "weld: free, and tapping",
     ]
 
 

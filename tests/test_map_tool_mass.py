@@ -18,7 +18,7 @@ from hapticbridge.errors import StudyError
 from hapticbridge.passivity import SampledLoop, environment_minimum_damping, minimum_mass
 from hapticbridge.passivity.virtual_mass import Integrator
 from hapticbridge.scene import Scene, load_scene
-from hapticbridge.study.maps.free_tool import NAMES, felt, least_mass, worst_angle
+from hapticbridge.study.maps.free_tool import felt, least_mass, worst_angle
 from hapticbridge.study.maps.rigs import set_tool_mass
 from hapticbridge.study.maps.stability_map import Point, run_map
 from hapticbridge.study.maps.tool_mass import TOOL_MASS, read
@@ -28,6 +28,7 @@ from hapticbridge.study.maps.tool_mass_runs import (
     KNOCK,
     PATH,
     PERIOD,
+    THEORIES,
     coupling_of,
     evaluate,
     hand_worst_for,
@@ -130,6 +131,23 @@ def test_implicit_fails_at_no_mass() -> None:
         assert outcome["stable_held_still"] is True
         assert outcome["stable_worst_hand"] is True
         assert outcome["environment"] == "strict"
+
+
+@pytest.mark.parametrize("method", ["compensated", "lossless"])
+def test_without_the_lag_no_mass_fails_up_to_twice_b_over_t(method: str) -> None:
+    limit = 2 * DEVICE_DAMPING / PERIOD
+    assert held_still(method, 0.98 * limit, 1e-3).is_stable
+    for mass in (2e-3, 5.0):
+        assert worst_hand(method, 0.98 * limit, mass).is_stable
+    assert not worst_hand(method, 1.02 * limit, 5.0).is_stable
+    # the twin that keeps its lag bears a quarter less
+    assert not worst_hand("implicit", 0.98 * limit, 5.0).is_stable
+
+
+def test_a_light_tool_is_no_help_to_the_lossless_coupling() -> None:
+    limit = 2 * DEVICE_DAMPING / PERIOD
+    assert not worst_hand("lossless", 1.02 * limit, 2e-3).is_stable
+    assert worst_hand("compensated", 1.02 * limit, 2e-3).is_stable
 
 
 def test_a_heavy_tool_on_a_soft_coupling_decays() -> None:
@@ -334,7 +352,7 @@ def test_the_map_is_drawn_and_says_what_was_found(tmp_path: Path) -> None:
     assert files.failed == 0
     assert files.picture.stat().st_size > 10_000
     methods = files.finding.boundary["methods"]
-    assert set(methods) == set(NAMES)
+    assert set(methods) == set(THEORIES)
     assert methods["implicit"]["unstable_held_still"] == 0
     assert methods["explicit"]["unstable_held_still"] > 0
     assert "'implicit': held still, a tool is stable at all" in files.finding.paragraph

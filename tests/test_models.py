@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 import xml.etree.ElementTree as ET
@@ -21,6 +22,7 @@ from model_runs import (
     scene_with_handle,
     spec_of,
 )
+from scipy.spatial import ConvexHull
 
 TOOL_SCENES = (
     "drawer",
@@ -123,13 +125,50 @@ def test_the_script_makes_the_hand_paths_that_are_here(tmp_path: Path) -> None:
         np.testing.assert_allclose(made, path_of(name), rtol=0, atol=1.1e-8)
 
 
-def test_the_script_refuses_a_folder_without_the_scenes(tmp_path: Path) -> None:
-    script = ROOT / "scripts" / "make_hand_paths.py"
+def meshes_of(folder: Path) -> dict[tuple[str, str], np.ndarray]:
+    """Returns the corners of every mesh of the scenes in a folder, shape (n, 3), in m."""
+    return {
+        (file.stem, mesh.attrib["name"]): np.array(mesh.attrib["vertex"].split(), float).reshape(
+            -1, 3
+        )
+        for file in sorted(folder.glob("*/*.xml"))
+        for mesh in ET.parse(file).getroot().iter("mesh")
+    }
+
+
+def test_the_script_makes_the_meshes_that_are_here(tmp_path: Path) -> None:
+    for name in SCENES:
+        text = (MODELS / name / f"{name}.xml").read_text(encoding="utf-8")
+        (tmp_path / name).mkdir()
+        blank = re.sub('vertex="[^"]*"', 'vertex=""', text)
+        (tmp_path / name / f"{name}.xml").write_text(blank, encoding="utf-8")
+    script = ROOT / "scripts" / "make_meshes.py"
+    subprocess.run([sys.executable, str(script), str(tmp_path)], check=True)
+    made, here = meshes_of(tmp_path), meshes_of(MODELS)
+    assert made.keys() == here.keys()
+    assert len(here) == 6
+    for key, corners in here.items():
+        # one unit of the last written digit: processors differ in the last bit of a sine
+        np.testing.assert_allclose(made[key], corners, rtol=0, atol=1.1e-8)
+
+
+def test_meshes_are_small_and_convex() -> None:
+    for corners in meshes_of(MODELS).values():
+        assert len(corners) < 60
+        # MuJoCo collides the hull: no corner may lie inside, or what is drawn would not be touched
+        faces = ConvexHull(corners).equations
+        assert ((corners @ faces[:, :3].T + faces[:, 3]).max(axis=1) > -1e-9).all()
+
+
+@pytest.mark.parametrize("name", ["make_hand_paths.py", "make_meshes.py"])
+def test_the_scripts_refuse_a_folder_without_the_scenes(name: str, tmp_path: Path) -> None:
+    script = ROOT / "scripts" / name
     done = subprocess.run(
         [sys.executable, str(script), str(tmp_path)], check=False, capture_output=True, text=True
     )
     assert done.returncode == 2
-    assert str(tmp_path / "virtual_wall") in done.stderr
+    first = {"make_hand_paths.py": "virtual_wall", "make_meshes.py": "round_peg"}
+    assert str(tmp_path / first[name]) in done.stderr
     assert "Traceback" not in done.stderr
 
 

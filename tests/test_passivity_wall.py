@@ -6,7 +6,7 @@ import time
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from hapticbridge.coupling import Coupling
@@ -83,7 +83,10 @@ def test_a_weak_low_pass_hides_no_maximum_near_the_first_cell() -> None:
     assert bound == pytest.approx(swept.max(), rel=1e-8)
 
 
-@given(st.integers(1, MOST_DELAY), st.floats(1e-3, 1e3))
+@given(st.integers(1, MOST_DELAY), st.floats(1e-3, 1e6))
+@example(36, 1.90625)  # the low-pass begins beside the end of the first cell
+@example(8, 0.01 / (1e-6 + (np.pi - 1e-6) / 144) * (1 + 1e-13))  # beside it by rounding
+@example(1, 1e4 * (1 - 1e-13))  # beside the lowest angle
 def test_no_two_angles_of_the_search_are_equal_but_for_rounding(delay: int, lag: float) -> None:
     grid = search_grid(delay, lag)
     assert grid[-1] == np.pi

@@ -93,21 +93,6 @@ def test_bridge_and_audit_call_the_scripted_path_passive(name: str, tmp_path: Pa
     assert ended == pytest.approx(run_of_own_path(name).joints[-1], abs=2e-4)
 
 
-@pytest.mark.parametrize("name", SCENES)
-def test_default_device_and_hand_do_the_same_within_its_limits(name: str) -> None:
-    torques: list[Array] = []
-    with hb.Bridge(name, "simulated", clock=hb.SimulatedClock()) as bridge:
-        summary = bridge.run(
-            duration=8.0,
-            on_tick=lambda _: torques.extend(bridge.latest_records(1)["wrench_on_tool"][:, 3:]),
-        )
-        turned = math.degrees(bridge.scene.data.joint("screw").qpos[0])
-    assert turned == pytest.approx(2 * STROKE[name], abs=2.0)
-    assert summary.verdict == "passive"
-    assert summary.peak_force < FORCE_LIMIT
-    assert np.linalg.norm(torques, axis=1).max() < TORQUE_LIMIT
-
-
 # --- the screw -----------------------------------------------------------------------------------
 
 

@@ -51,34 +51,6 @@ def test_task_in_the_bridge_is_passive_and_without_a_warning(name: str, tmp_path
     assert scene.data.qpos == pytest.approx(run_of_own_path(name).joints[-1], abs=2e-4)
 
 
-@pytest.mark.parametrize(
-    ("name", "soft", "firm"),
-    [
-        ("drawer", 0.183, 0.198),
-        ("hammer", 0.0004, 0.0072),
-        ("open_wrench", np.radians(58.8), np.radians(59.8)),
-        ("ratchet", np.radians(69), np.radians(88)),
-    ],
-)
-def test_simulated_hands_get_as_far_as_the_scene_s_page_says(
-    name: str, soft: float, firm: float
-) -> None:
-    page = (MODELS / name / "README.md").read_text(encoding="utf-8")
-    option = "simulated:hand_stiffness=1000,hand_damping=30"
-    assert (f"`--device {option}`" in page) == (name != "open_wrench")
-    for device, expected in (("simulated", soft), (option, firm)):
-        reached = 0.0
-
-        def look(_tick: int) -> None:
-            nonlocal reached
-            reached = max(reached, abs(float(bridge.scene.data.qpos[0])))
-
-        with Bridge(name, device, clock=SimulatedClock()) as bridge:
-            summary = bridge.run(duration=8.0, on_tick=look)
-        assert summary.verdict == "passive"
-        assert reached == pytest.approx(expected, rel=0.01, abs=0.1e-3)
-
-
 # --- drawer ---------------------------------------------------------------------------------------
 
 
@@ -87,8 +59,8 @@ def test_drawer_opens_to_its_stop_and_closes_again() -> None:
     opening = run.joints[:, 0]
     assert opening[3700:4500] == pytest.approx(0.2, abs=5e-6)
     assert run.touched["open_stop"][3900:4500].all()
-    # 2 mm beyond the stop at K
-    assert run.force[3900:4500, 0] == pytest.approx(K * 0.002, rel=0.15)
+    # 3.5 mm beyond the stop at K
+    assert run.force[3900:4500, 0] == pytest.approx(K * 0.0035, rel=0.1)
     assert opening[-1] == pytest.approx(-0.001, abs=5e-6)
     assert run.touched["closed_stop"][6500:7000].any()
 

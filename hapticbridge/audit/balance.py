@@ -90,7 +90,8 @@ class Balance:
         environment_energy: S_k − S_start − works, with ``coupling_work`` from here, (n,) in J.
         slack: Σ ½‖δx‖²_{K+B/T} + ½‖δφ‖²_{K_r+B_r/T}, (n,) in J.
         kicked: What the device was given beyond what its damping burns and scene and coupling
-            give up, (n,) in J; zero for an unknown damping, or several laws a tick.
+            give up, (n,) in J; zero for an unknown damping, or several laws a tick. Behind a
+            coupling law what the environment created is not in it: that is the other port's.
     """
 
     wrench_on_tool: Array
@@ -173,8 +174,11 @@ class Balance:
         position, orientation = _handle(ticks, parameters)
         stored = ticks["kinetic"] + ticks["potential"] - start_energy
         created = stored - coupling_work - ticks["actuator_work"] - ticks["external_work"]
-        kept = coupling_work  # without a law, all that the scene took up
+        kept, lost = coupling_work, created  # without a law, all that the scene took up
         if parameters.has_law:
+            # the slack pays for what the environment creates, but a ramp or a limit lets through
+            # only a share of the slack: counted here, it would blame a device that bears its law
+            lost = np.minimum(created, 0.0)
             kept = kept_behind_a_law(
                 parameters,
                 stretch=(stretch, twist),
@@ -199,7 +203,7 @@ class Balance:
             device_throughput=np.cumsum(np.abs(device_work)),
             environment_energy=created,
             slack=np.cumsum(slack),
-            kicked=_kicked(ticks, parameters, np.cumsum(device_work), created, kept, resumed),
+            kicked=_kicked(ticks, parameters, np.cumsum(device_work), lost + kept, resumed),
         )
 
 
@@ -221,11 +225,10 @@ def _kicked(
     ticks: NDArray[np.void],
     parameters: RunParameters,
     given: Array,
-    created: Array,
-    kept: Array,
+    taken: Array,
     resumed: Array,
 ) -> Array:
-    """Returns Σ w·δp − Σ b‖δp‖²/t + Σ E_k + what was kept, the last two in the device's scale."""
+    """Returns Σ w·δp − Σ b‖δp‖²/t + what scene and coupling took up, in the device's scale."""
     if parameters.device_damping is None or (parameters.has_law and parameters.laws > 1):
         return np.zeros(len(ticks))
     start = np.array(parameters.device_start)
@@ -236,7 +239,7 @@ def _kicked(
         np.diff(ticks["read_ns"], prepend=0) * 1e-9,
         since_start(ticks, resumed) > 0,
     )
-    return np.asarray(given - burnt + parameters.force_scale / parameters.scale * (created + kept))
+    return np.asarray(given - burnt + parameters.force_scale / parameters.scale * taken)
 
 
 def _handle(ticks: NDArray[np.void], parameters: RunParameters) -> tuple[Array, Array]:

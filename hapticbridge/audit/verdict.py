@@ -114,10 +114,9 @@ def audit(path: str | Path, *, strict: bool = False) -> AuditReport:
     try:
         parameters = parameters_of(recording.meta)
         info, method = _device_and_method(recording, parameters)
+        burning, rotational = info.burning_damping
         parameters = replace(
-            parameters,
-            device_damping=info.damping,
-            device_rotational_damping=info.rotational_damping,
+            parameters, device_damping=burning, device_rotational_damping=rotational
         )
         facts |= _device_facts(info, parameters, method)
     except RecordingError as error:

@@ -13,6 +13,7 @@ import mujoco
 import tyro
 from rich.markup import escape
 
+from hapticbridge.cli.chart import ChartCommand
 from hapticbridge.cli.check import Check
 from hapticbridge.cli.judge import Audit, Repair
 from hapticbridge.cli.run import Run
@@ -28,6 +29,7 @@ Command = (
     | Annotated[Scenes, tyro.conf.subcommand("scenes")]
     | Annotated[Check, tyro.conf.subcommand("check")]
     | Annotated[Stability, tyro.conf.subcommand("stability")]
+    | Annotated[ChartCommand, tyro.conf.subcommand("chart")]
     | Annotated[Repair, tyro.conf.subcommand("repair")]
     | Annotated[Zwidth, tyro.conf.subcommand("zwidth")]
     | Annotated[Bound, tyro.conf.subcommand("bound")]

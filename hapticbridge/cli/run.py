@@ -46,7 +46,8 @@ class Run:
     grip: str = "grip"
     """Site on the tool that the hand holds."""
     device: str = "simulated"
-    """'simulated', 'simulated:damping=5,friction=0.1', or 'trajectory:FILE' (CSV or recording)."""
+    """'simulated' (in the hand that the scene asks for), 'simulated:damping=5,hand_mass=1', or
+    'trajectory:FILE' (CSV or recording)."""
     duration: float | None = None
     """Seconds to run; by default until the device's motion ends, or until Ctrl-C."""
     record: Path | None = None
@@ -64,7 +65,7 @@ class Run:
     contact_stiffness: float | None = None
     """Stiffness per contact in N/m of method 'direct'; by default that of the coupling."""
     i_know: bool = False
-    """Accept a method other than 'implicit' on a real device."""
+    """Accept a method that may kick on a real device; the first three need no such word."""
     rate: float = 1000.0
     """Ticks per second."""
     substeps: int = 1
@@ -232,7 +233,7 @@ def _print_summary(summary: Summary, laws: int) -> None:
     if summary.is_certified is None and summary.conditions:
         for sentence in summary.conditions:
             out.print(escape(sentence))
-        out.print("nothing proves that this is enough under this method")
+        out.print("nothing proves that the device bears this")
     else:
         bound = "KT/2 + B" if laws == 1 else f"what {laws} substeps need"
         certified = {
@@ -241,5 +242,8 @@ def _print_summary(summary: Summary, laws: int) -> None:
             None: f"device unknown: b >= {bound} not checked",
         }
         out.print(certified[summary.is_certified])
+    if summary.is_certified is False and method_named(summary.method).has_law and laws == 1:
+        judge = "the audit judges" if summary.recording else "with --record FILE the audit judges"
+        out.print(f"the device's port is not proven, nor metered while it runs: {judge} it")
     if summary.recording is not None:
         out.print(f"next: hapticbridge audit {escape(shlex.quote(str(summary.recording)))}")

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import mujoco
 import tyro
 from rich.table import Table
 
 from hapticbridge.cli.terminal import out, plain
-from hapticbridge.scene import load_scene, scene_names, scene_parameters, scene_path
+from hapticbridge.device import DEFAULT_HAND, scene_hand
+from hapticbridge.scene import custom_text, load_scene, scene_names, scene_parameters, scene_path
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,7 +32,7 @@ class Scenes:
         table = Table("scene", "about", "parameters", box=None, pad_edge=False)
         for name in scene_names():
             settable = ", ".join(p.name for p in scene_parameters(scene_path(name)))
-            table.add_row(name, _about(load_scene(name).model), settable)
+            table.add_row(name, custom_text(load_scene(name).model, "about"), settable)
         out.print(table)
         out.print("next: hapticbridge scenes NAME (its parameters), hapticbridge run NAME")
         return 0
@@ -41,12 +41,18 @@ class Scenes:
 def _show(scene: str) -> int:
     """Prints what one scene is and what can be set in it."""
     path = scene_path(scene)
-    model, parameters = load_scene(path).model, scene_parameters(path)
-    sentence, moving = _about(model), int((model.body_dofnum > 0).sum())
+    loaded, parameters = load_scene(path), scene_parameters(path)
+    model, hand = loaded.model, scene_hand(loaded)
+    sentence, moving = custom_text(model, "about"), int((model.body_dofnum > 0).sum())
     out.print(f"[bold]{plain(path.stem)}[/bold]" + (f": {plain(sentence)}" if sentence else ""))
     bodies = "body" if moving == 1 else "bodies"
     freedom = "degree" if model.nv == 1 else "degrees"
     out.print(f"{moving} moving {bodies}, {model.nv} {freedom} of freedom; {plain(str(path))}")
+    if path.with_suffix(".csv").is_file() or hand != DEFAULT_HAND:
+        out.print(
+            f"simulated hand: {hand.stiffness:g} N/m and {hand.damping:g} N s/m, "
+            f"{hand.rotational_stiffness:g} N m/rad and {hand.rotational_damping:g} N m s/rad"
+        )
     if not parameters:
         out.print("no parameters")
         return 0
@@ -64,12 +70,3 @@ def _show(scene: str) -> int:
     first, asked = parameters[0], plain(scene)
     out.print(f"next: hapticbridge run {asked} --set {first.name}={first.minimum:g}")
     return 0
-
-
-def _about(model: mujoco.MjModel) -> str:
-    """Returns the sentence that a scene carries as custom text ``about``."""
-    text_id = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_TEXT, "about")
-    if text_id < 0:
-        return ""
-    start, size = model.text_adr[text_id], model.text_size[text_id]
-    return bytes(model.text_data[start : start + size - 1]).decode()

@@ -125,6 +125,19 @@ class DeviceInfo:
             number = checked_number(name, value, unit, is_positive=name in _POSITIVE)
             object.__setattr__(self, name, number)
 
+    @property
+    def burning_damping(self) -> tuple[float | None, float | None]:
+        """What the device burns energy with: b in N s/m and in N m s/rad; None, None where unknown.
+
+        Unknown on one kind of axis is unknown altogether: nobody can tell which of them took the
+        energy. A device without rotation needs none for it; one whose motion is prescribed keeps
+        nothing of what it is given.
+        """
+        is_complete = self.rotational_damping is not None or self.degrees_of_freedom == 3
+        if self.is_prescribed or not is_complete:
+            return None, None
+        return self.damping, self.rotational_damping
+
     def to_json(self) -> str:
         """Returns the sheet as one JSON object: a key per attribute, null where unknown."""
         return json.dumps(dataclasses.asdict(self), allow_nan=False)

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from hapticbridge.device.base import Device
 from hapticbridge.device.hand import Hand
 from hapticbridge.device.motion_csv import read_motion
+from hapticbridge.device.scene_hand import scene_hand
 from hapticbridge.device.simulated import SimulatedDevice
 from hapticbridge.device.trajectory import ReplayDevice, TrajectoryDevice
 from hapticbridge.errors import DeviceError, choices
@@ -54,7 +56,10 @@ def open_device(spec: str, **options: object) -> Device:
 
 
 def device_for(scene: Scene, spec: str) -> Device:
-    """Opens a device for a scene; the simulated one's hand follows ``NAME.csv`` beside the scene.
+    """Opens a device for a scene; the simulated one does what the scene is there for.
+
+    Its hand is the one that the scene asks for (``scene_hand``) and follows ``NAME.csv`` beside the
+    scene, if there is one. Every option in the specification goes before what the scene says.
 
     Args:
         scene: The scene that the device will move in.
@@ -62,11 +67,19 @@ def device_for(scene: Scene, spec: str) -> Device:
 
     Raises:
         DeviceError: See ``open_device``.
+        SceneError: The scene asks for a hand that cannot be.
     """
+    name, _, rest = spec.partition(":")
+    if name != "simulated":
+        return open_device(spec)
+    options: dict[str, object] = {}
+    if "hand" not in _parsed(rest):
+        hand = asdict(scene_hand(scene))
+        options |= {_HAND_PREFIX + field: value for field, value in hand.items()}
     path = scene.path.with_suffix(".csv")
-    if spec.partition(":")[0] == "simulated" and path.is_file():
-        return open_device(spec, path=path)
-    return open_device(spec)
+    if path.is_file():
+        options["path"] = path
+    return open_device(spec, **options)
 
 
 def _open_simulated(rest: str, options: Mapping[str, object]) -> Device:

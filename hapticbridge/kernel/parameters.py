@@ -54,9 +54,9 @@ class RunParameters:
         felt: The coupling that the tool is really held by, where it is not ``coupling`` (a weld);
             the device condition is judged by it.
         contact_stiffness: K_c in N/m per contact of a tool without mass, > 0 for it, else 0.
-        device_damping: b of the device in N s/m, None where unknown. Where no coupling law leaves
-            a slack, what the device was given is held against what this damping burns.
-        device_rotational_damping: In N m s/rad, None where unknown.
+        device_damping: b of the device in N s/m, None where unknown, in rotation too, or where the
+            motion is prescribed. What the device was given is held against what this burns.
+        device_rotational_damping: In N m s/rad, None likewise, or where nothing turns.
 
     Raises:
         HapticBridgeError: A value is out of range.

@@ -13,14 +13,11 @@ from hapticbridge.passivity.grid import (
     Axis,
     CouplingGrid,
     checked,
-    delayed_by,
-    one_of,
     plain,
     scalar,
-    spring_and_damper,
     together,
 )
-from hapticbridge.passivity.spectrum import DISCRETIZATIONS, Discretization
+from hapticbridge.passivity.spectrum import Discretization, SampledLaw
 from hapticbridge.passivity.wall import wall_supremum
 
 STIFFNESS_MARGIN = 0.8
@@ -101,12 +98,8 @@ def minimum_damping(
     References:
         Brown & Colgate 1997, eqs. (6), (7); Colgate & Schenkel 1997 (wall).
     """
-    period = scalar("period", period, "s", positive=True)
-    filter_time = scalar("filter time", filter_time, "s")
-    delay = delayed_by(delay)
-    stiffness, damping = spring_and_damper(coupling, axis)
-    one_of("discretization", discretization, DISCRETIZATIONS)
-    unbounded = discretization == "tustin" and filter_time == 0
+    law = SampledLaw.of(coupling, period, discretization, delay, filter_time, axis)
+    stiffness, damping, period, delay, filter_time, unbounded = law
     if delay:
         # without low-pass, Tustin is only asked where B = 0, and is the backward difference there
         scheme: Discretization = "backward" if unbounded else discretization

@@ -8,7 +8,7 @@ digits at low frequency.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -126,6 +126,49 @@ def needed_for_fixed_environment(
     return needed
 
 
+class SampledLaw(NamedTuple):
+    """What every bound of a coupling is asked about, checked.
+
+    Attributes:
+        stiffness: K in N/m, shaped like the coupling.
+        damping: B in N s/m, likewise.
+        period: T in s.
+        delay: d in samples.
+        filter_time: τ in s.
+        rings: Whether the damper is Tustin's without low-pass: its gain is infinite at Nyquist.
+    """
+
+    stiffness: NDArray[np.float64]
+    damping: NDArray[np.float64]
+    period: float
+    delay: int
+    filter_time: float
+    rings: bool
+
+    @classmethod
+    def of(
+        cls,
+        coupling: Coupling | CouplingGrid,
+        period: float,
+        discretization: Discretization,
+        delay: int,
+        filter_time: float,
+        axis: Axis,
+    ) -> SampledLaw:
+        """Checks what a bound was given.
+
+        Raises:
+            CouplingError: An argument is out of range, or the axis or discretization is unknown.
+        """
+        period = scalar("period", period, "s", positive=True)
+        filter_time = scalar("filter time", filter_time, "s")
+        delay = delayed_by(delay)
+        stiffness, damping = spring_and_damper(coupling, axis)
+        one_of("discretization", discretization, DISCRETIZATIONS)
+        rings = discretization == "tustin" and filter_time == 0
+        return cls(stiffness, damping, period, delay, filter_time, rings)
+
+
 def damping_spectrum(
     coupling: Coupling | CouplingGrid,
     period: float,
@@ -164,19 +207,17 @@ def damping_spectrum(
     References:
         Brown & Colgate 1997, eqs. (2), (4), (5); Colgate & Schenkel 1997.
     """
-    period = scalar("period", period, "s", positive=True)
-    filter_time = scalar("filter time", filter_time, "s")
-    delay = delayed_by(delay)
+    law = SampledLaw.of(coupling, period, discretization, delay, filter_time, axis)
+    period, delay, filter_time = law.period, law.delay, law.filter_time
     theta = angles(frequency, period)
     stiffness, damping = (
-        value.reshape(value.shape + (1,) * theta.ndim)
-        for value in spring_and_damper(coupling, axis)
+        value.reshape(value.shape + (1,) * theta.ndim) for value in (law.stiffness, law.damping)
     )
     transfer = coupling_transfer(stiffness, damping, period, theta, discretization, filter_time)
     if delay:
         return needed_for_fixed_environment(transfer * np.exp(-1j * delay * theta), period, theta)
     needed = needed_for_any_environment(transfer, period, theta)
-    if discretization == "tustin" and filter_time == 0:
+    if law.rings:
         # tan(π/2) is finite in floating point; the limit at Nyquist is not
         needed = np.where((theta == np.pi) & (damping > 0), np.inf, needed)
     return needed

@@ -98,11 +98,12 @@ def search_grid(delay: int, lag: float) -> _Array:
         lag: τ/T, without unit.
     """
     grid = np.linspace(LOWEST_ANGLE, np.pi, POINTS_PER_RIPPLE * (delay + 1) + 1)
-    corner = max(1e-2 / lag, LOWEST_ANGLE) if lag > 0 else np.inf
-    # a corner beyond the first cell needs no finer grid, and equal ends would differ by rounding
-    if corner < grid[1]:
+    # from a hundredth of the corner on, but no nearer to an end of the first cell than a factor of
+    # two: points crowded between them could differ by rounding alone
+    corner = max(1e-2 / lag, 2.0 * LOWEST_ANGLE) if lag > 0 else np.inf
+    if corner < 0.5 * grid[1]:
         low = np.geomspace(corner, grid[1], POINTS_PER_RIPPLE)
-        grid = np.concatenate([grid[:1], low[low > grid[0]][:-1], grid[1:]])
+        grid = np.concatenate([grid[:1], low[:-1], grid[1:]])
     return grid
 
 

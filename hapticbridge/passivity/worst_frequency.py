@@ -6,18 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.coupling import Coupling
-from hapticbridge.passivity.grid import (
-    Axis,
-    CouplingGrid,
-    delayed_by,
-    one_of,
-    plain,
-    scalar,
-    spring_and_damper,
-)
+from hapticbridge.passivity.grid import Axis, CouplingGrid, plain
 from hapticbridge.passivity.spectrum import (
-    DISCRETIZATIONS,
     Discretization,
+    SampledLaw,
     coupling_transfer,
     needed_for_fixed_environment,
 )
@@ -62,14 +54,10 @@ def worst_frequency(
     References:
         Brown & Colgate 1997, eqs. (6), (7); Colgate & Schenkel 1997 (wall).
     """
-    period = scalar("period", period, "s", positive=True)
-    tau = scalar("filter time", filter_time, "s")
-    samples = delayed_by(delay)
-    k, b = spring_and_damper(coupling, axis)
-    one_of("discretization", discretization, DISCRETIZATIONS)
+    law = SampledLaw.of(coupling, period, discretization, delay, filter_time, axis)
+    k, b, period, samples, tau, is_ringing = law
     if samples == 0:
         return plain(np.full(k.shape, np.pi / period))
-    is_ringing = discretization == "tustin" and tau == 0
     # a spring alone is the same under either rule, and the backward difference is finite at Nyquist
     scheme: Discretization = "backward" if is_ringing else discretization
     top, angle = wall_supremum(k, b, period, scheme, samples, tau)

@@ -1,5 +1,7 @@
 """MJCF scenes put behind a haptic device: loading, the handle and its coupling, checks."""
 
+from hapticbridge.scene.custom import custom_numbers as custom_numbers
+from hapticbridge.scene.custom import custom_text as custom_text
 from hapticbridge.scene.library import scene_names as scene_names
 from hapticbridge.scene.library import scene_path as scene_path
 from hapticbridge.scene.load import Scene as Scene

@@ -89,7 +89,10 @@ def settings_from(words: Iterable[str]) -> dict[str, float]:
 
 def _check_value(scene: str, name: str, value: float, known: Mapping[str, Parameter]) -> None:
     if not known:
-        raise SceneError(f"scene '{scene}' has no parameters, so '{name}' cannot be set")
+        raise SceneError(
+            f"scene '{scene}' has no parameters, so '{name}' cannot be set; they would stand in "
+            f"'{scene}.toml' beside it"
+        )
     exist = "; ".join(map(str, known.values()))
     if name not in known:
         raise SceneError(f"scene '{scene}' has no parameter '{name}'; it has: {exist}")

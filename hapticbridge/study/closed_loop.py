@@ -112,7 +112,8 @@ class LoopOutcome:
         created: The largest Σ E_k so far at any tick, in J: > 0 where (14) is violated.
         slack_share: Largest share of the slack that was used, without unit.
         first_active: Tick of the first violation of the slack, −1 for none.
-        fault: Tick and port of the first fault, ``environment`` or ``device``; None if passive.
+        fault: Tick and port of the first fault, ``environment`` or ``device``; None if passive. The
+            device is metered only where no coupling law gives the wrench; else see ``is_stable``.
         peak_force: Largest force on the tool in N.
         last_force: Largest signal in the last fifth, force and torque over ``LEVER``, in N.
         device_energy: Given to the device in J.

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from hapticbridge.passivity import maximum_stiffness
 from hapticbridge.study.maps.bisection import agreement, per_cent
+from hapticbridge.study.maps.bound_of_method import limit_by_6, needed_by_6
 from hapticbridge.study.maps.coupling_picture import draw
 from hapticbridge.study.maps.coupling_runs import (
     DEVICE_DAMPING,
@@ -32,8 +32,8 @@ def read(table: Table) -> Finding:
     """
     table = computed(table, "coupling")
     boundary = {
-        name: _cells_below(of_method(table, "cell", name))
-        | _limits(of_method(table, "limit", name))
+        name: _cells_below(name, of_method(table, "cell", name))
+        | _limits(name, of_method(table, "limit", name))
         for name in THEORIES
     }
     return Finding(
@@ -43,9 +43,10 @@ def read(table: Table) -> Finding:
     )
 
 
-def _cells_below(cells: Table) -> dict[str, Any]:
+def _cells_below(name: str, cells: Table) -> dict[str, Any]:
     """Counts what happened at a method's points below (6), where a device bears the coupling."""
-    below = cells["stiffness"] < 2 * (DEVICE_DAMPING - cells["damping"]) / PERIOD
+    needed = needed_by_6(name, cells["stiffness"], cells["damping"], PERIOD)
+    below = needed < DEVICE_DAMPING
     mine = cells.select(below)
     is_passive = verdicts_of(mine) <= VERDICTS.index("within slack")
     ports = mine.texts("fault_port")
@@ -59,11 +60,11 @@ def _cells_below(cells: Table) -> dict[str, Any]:
     }
 
 
-def _limits(limits: Table) -> dict[str, Any]:
+def _limits(name: str, limits: Table) -> dict[str, Any]:
     """Compares the limits that were found on a wall with (6); empty where none was searched."""
     if not len(limits):
         return {}
-    predicted = np.asarray(maximum_stiffness(DEVICE_DAMPING, PERIOD, limits["damping"]))
+    predicted = limit_by_6(name, DEVICE_DAMPING, PERIOD, limits["damping"])
     measured = limits.numbers("limit")
     return {
         "damping": limits["damping"].tolist(),
@@ -83,6 +84,10 @@ def _paragraph(boundary: Mapping[str, Mapping[str, Any]]) -> str:
     else:
         on_wall = f"On a wall, behind 'implicit', {MISSING}"
     said = [on_wall, *(_of_method(name, mine) for name, mine in boundary.items())]
+    said.append(
+        "B is the damping asked for; 'compensated' and 'lossless' use B − K T and B − K T/2, 0 "
+        "at least, and (6) holds for what is used"
+    )
     return ". ".join(said) + ". The table holds tick and port of every first fault."
 
 
@@ -113,7 +118,7 @@ COUPLING = StabilityMap(
     name="coupling",
     about="stiffness against damping of the coupling at one device, for every method: stable and "
     "passive, or not",
-    default_points=4500,
+    default_points=6000,
     points=points,
     evaluate=evaluate,
     read=read,

@@ -41,6 +41,8 @@ reaches the wall 10 mm away."""
 
 THEORIES: Mapping[str, str] = {
     "implicit": "implicit",
+    "compensated": "implicit",
+    "lossless": "lossless",
     "implicitfast": "implicitfast",
     "implicitfast:compensated": "implicit",
     "explicit": "explicit",
@@ -140,7 +142,8 @@ def _coupling(stiffness: float, damping: float) -> Coupling:
 
 def _worst_hand(name: str, coupling: Coupling, mass: float | None) -> LoopOutcome:
     """Runs the hand that is worst for a method on a wall (no mass) or with a free tool."""
-    k, b = coupling.stiffness, coupling.damping
+    used = METHODS[name].used(coupling, PERIOD)
+    k, b = used.stiffness, used.damping
     if mass is None:  # at Nyquist, where the damper alone is the worst hand
         hand, loop = WorstHand(DEVICE_DAMPING, np.pi / PERIOD, PERIOD), _wall()
     else:

@@ -1,8 +1,9 @@
 """A free tool behind the coupling, by rendering method: what theory says of its mass.
 
-The methods differ in the samples from force to position: none (implicit), one (explicit), one and a
-half (RK4, which holds the force exactly); the actuators of implicitfast have the spring at the old
-place and the damper at the new velocity.
+The methods differ in the samples from force to position: none (implicit), a half (lossless, the
+trapezoidal rule), one (explicit), one and a half (RK4, which holds the force exactly); the
+actuators of implicitfast have the spring at the old place and the damper at the new velocity. K and
+B are those of the law: of a method that takes some damping off (``Method.used``), what is left.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from hapticbridge.errors import StudyError, choices
 from hapticbridge.passivity.spectrum import needed_for_fixed_environment
 
-NAMES = ("implicit", "implicitfast", "explicit", "explicit:rk4")
+NAMES = ("implicit", "lossless", "implicitfast", "explicit", "explicit:rk4")
 """Methods that have a theory here."""
 
 ANGLES = np.union1d(np.linspace(0.01, np.pi, 2000), np.geomspace(0.01, np.pi, 1000))
@@ -25,6 +26,7 @@ def least_mass(method: str, stiffness: float, damping: float, period: float) -> 
     """Returns the mass that a free tool must exceed to be stable behind a handle held still.
 
         implicit        0
+        lossless        0
         implicitfast    (T/2)(K T/2 − B), at least 0
         explicit        (T/2)(K T/2 + B)
         explicit:rk4    (B T/2)(2B + K T)/(2B − K T);  inf for B <= K T/2
@@ -50,7 +52,7 @@ def least_mass(method: str, stiffness: float, damping: float, period: float) -> 
     """
     _check(method, stiffness, damping, period)
     kt, b = stiffness * period, damping
-    if method == "implicit":
+    if method in ("implicit", "lossless"):
         return 0.0
     if method == "implicitfast":
         return max(0.0, period / 2 * (kt / 2 - b))
@@ -65,7 +67,8 @@ def felt(
     """Returns what the device feels of a free tool, force per displacement of the handle.
 
         H = C / (1 + C P),    C = K + B D/T,    D = 1 − z⁻¹,    P = (T²/m) n / D²
-        n = 1 (implicit),  z⁻¹ (explicit),  z⁻¹(1 + z⁻¹)/2 (explicit:rk4, the exact hold)
+        n = 1 (implicit),  (1 + z⁻¹)/2 (lossless),  z⁻¹ (explicit),
+        z⁻¹(1 + z⁻¹)/2 (explicit:rk4, the exact hold)
         H = C (m D²/T² − K D) / (m D²/T² + K z⁻¹ + B D/T)          (implicitfast)
 
     Args:
@@ -90,7 +93,12 @@ def felt(
     if method == "implicitfast":
         rest = inertia + stiffness * back + damping / period * change
         return np.asarray(coupling * (inertia - stiffness * change) / rest)
-    late = {"implicit": 1 + 0 * back, "explicit": back, "explicit:rk4": back * (1 + back) / 2}
+    late = {
+        "implicit": 1 + 0 * back,
+        "lossless": (1 + back) / 2,
+        "explicit": back,
+        "explicit:rk4": back * (1 + back) / 2,
+    }
     return np.asarray(coupling / (1 + coupling * late[method] / inertia))
 
 

@@ -6,6 +6,8 @@ from collections.abc import Mapping
 
 METHOD_COLOURS: Mapping[str, str] = {
     "implicit": "#000000",
+    "compensated": "#9aa3d6",
+    "lossless": "#3a1fd1",
     "implicitfast": "#7b3294",
     "implicitfast:compensated": "#d684bd",
     "explicit": "#00868b",

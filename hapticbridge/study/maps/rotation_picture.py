@@ -30,22 +30,24 @@ STYLES = {0.0: "s:", SOFT: "o-", HARD: "^--"}
 LEAST = 1e-12
 """Energy in J that stands for none on a logarithmic axis."""
 
-HIGHEST = 3 * np.pi * SOFT
-"""Upper end of the axis of torque in N m: one and a half times the jump at the cut."""
+HIGHEST = 5 * np.pi * SOFT
+"""Upper end of the axis of torque in N m: the jump at the cut, and room for the names above it."""
 
 
 def draw(table: Table) -> Figure:
     """Draws verdicts over speed and angle, creation over speed, and the jump at the cut."""
     figure = new_figure(8, 8.4)
-    panels = figure.subplots(3, 2, gridspec_kw={"height_ratios": [1, 1, 1.4]})
-    for axes, method in zip(panels[:2].ravel(), METHODS_SHOWN, strict=True):
+    grid = figure.add_gridspec(3, 6, height_ratios=[1, 1, 1.4])
+    for place, method in enumerate(METHODS_SHOWN):
+        row, column = divmod(place, 3)
+        axes = figure.add_subplot(grid[row, 2 * column : 2 * column + 2])
         _draw_cells(axes, table, method)
-    for axes in panels[1]:
-        axes.set_xlabel("speed (rad/s)")
-    for axes in panels[:2, 0]:
-        axes.set_ylabel("angle at the start (rad)")
-    _draw_creation(panels[2, 0], table)
-    _draw_cut(panels[2, 1], table)
+        if row == 1:
+            axes.set_xlabel("speed (rad/s)")
+        if column == 0:
+            axes.set_ylabel("angle at the start (rad)")
+    _draw_creation(figure.add_subplot(grid[2, :3]), table)
+    _draw_cut(figure.add_subplot(grid[2, 3:]), table)
     figure.suptitle(
         f"A free tool of {1e3 * INERTIA[0]:.3g}, {1e3 * INERTIA[1]:.3g}, "
         f"{1e3 * INERTIA[2]:.3g} g m² behind a handle that spins for 1 s at "
@@ -99,15 +101,15 @@ def _draw_creation(axes: Axes, table: Table) -> None:
         )
     axes.set_xscale("log")
     axes.set_yscale("log")
-    axes.set_ylim(0.1 * LEAST, 1e4)  # room for the names below the curves
+    axes.set_ylim(1e-4 * LEAST, 1e4)  # room for the names below the curves
     axes.set_xlabel("speed (rad/s)")
     axes.set_ylabel("energy created (J)")
-    axes.legend(fontsize="x-small", loc="lower right")
+    axes.legend(fontsize="x-small", loc="lower right", ncols=2, handlelength=1.5)
 
 
 def _draw_cut(axes: Axes, table: Table) -> None:
     cuts = table.select(table["what"] == "cut")
-    widths = (5, 3, 1, 1)  # three of the four lie on each other
+    widths = (7, 5.5, 4, 2.5, 1, 1)  # all but the last lie on each other
     for method, width in zip(METHODS_SHOWN, widths, strict=True):
         mine = cuts.select(cuts["method"] == method)
         jump = mine.numbers("torque_jump")
@@ -131,4 +133,4 @@ def _draw_cut(axes: Axes, table: Table) -> None:
     axes.set_ylim(0, HIGHEST)
     axes.set_xlabel("speed of a sudden turn (rad/s)")
     axes.set_ylabel("largest jump of torque\nin a tick (N m)")
-    axes.legend(fontsize="x-small", loc="lower right")
+    axes.legend(fontsize="x-small", loc="upper right", bbox_to_anchor=(1.0, 0.95))

@@ -12,7 +12,7 @@ from hapticbridge.study.maps.stability_map import Point
 SOFT, HARD = 2.0, 20.0
 """K_r in N m/rad: that of the simulated device, and one ten times stiffer."""
 
-METHODS_SHOWN = ("implicit", "implicitfast", "explicit", "weld")
+METHODS_SHOWN = ("implicit", "compensated", "lossless", "implicitfast", "explicit", "weld")
 
 SPEED = (0.0, 200.0)
 ANGLE = (0.0, 3.1)
@@ -25,6 +25,8 @@ LINES = (
     ("implicit", 0.0),
     ("implicit", SOFT),
     ("implicit", HARD),
+    ("compensated", SOFT),
+    ("lossless", SOFT),
     ("implicitfast", SOFT),
     ("explicit", SOFT),
 )

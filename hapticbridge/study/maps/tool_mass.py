@@ -7,9 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from hapticbridge.passivity import maximum_stiffness
 from hapticbridge.study.maps.bisection import agreement, per_cent
-from hapticbridge.study.maps.free_tool import NAMES
+from hapticbridge.study.maps.bound_of_method import needed_by_6
 from hapticbridge.study.maps.stability_map import Finding, StabilityMap, computed
 from hapticbridge.study.maps.tool_mass_picture import draw
 from hapticbridge.study.maps.tool_mass_runs import (
@@ -17,6 +16,7 @@ from hapticbridge.study.maps.tool_mass_runs import (
     DEVICE_DAMPING,
     PERIOD,
     SEARCHES,
+    THEORIES,
     evaluate,
     is_stable,
     of_method,
@@ -37,9 +37,9 @@ def read(table: Table) -> Finding:
     """
     table = computed(table, "tool_mass")
     methods: dict[str, dict[str, Any]] = {}
-    for name in NAMES:
+    for name in THEORIES:
         cells = of_method(table, "cell", name)
-        methods[name] = _counts(cells) if len(cells) else {}
+        methods[name] = _counts(name, cells) if len(cells) else {}
         for what in SEARCHES:
             rows = of_method(table, what, name)
             if len(rows):
@@ -53,10 +53,10 @@ def read(table: Table) -> Finding:
     return Finding(draw(table), _paragraph(methods), boundary)
 
 
-def _counts(cells: Table) -> dict[str, Any]:
+def _counts(name: str, cells: Table) -> dict[str, Any]:
     """Returns how many tools of the grid were unstable, and what the stable ones created."""
     stable = is_stable(cells)
-    is_below = cells["stiffness"] < maximum_stiffness(DEVICE_DAMPING, PERIOD, DAMPING)
+    is_below = needed_by_6(name, cells["stiffness"], DAMPING, PERIOD) < DEVICE_DAMPING
     return {
         "points": len(cells),
         "unstable_held_still": int((cells.numbers("stable_held_still") != 1).sum()),
@@ -131,7 +131,7 @@ def _of_method(name: str, mine: Mapping[str, Any]) -> str:
 TOOL_MASS = StabilityMap(
     name="tool_mass",
     about="mass of the tool, 1 g to 10 kg, against stiffness of the coupling, by method",
-    default_points=640,
+    default_points=1000,
     points=points,
     evaluate=evaluate,
     read=read,

@@ -14,7 +14,8 @@ from hapticbridge.passivity import WorstHand
 from hapticbridge.rendering import METHODS
 from hapticbridge.study.closed_loop import LoopOutcome
 from hapticbridge.study.maps.bisection import WIDTH, largest_stable
-from hapticbridge.study.maps.free_tool import NAMES, felt, worst_angle
+from hapticbridge.study.maps.bound_of_method import used_damping
+from hapticbridge.study.maps.free_tool import felt, worst_angle
 from hapticbridge.study.maps.rigs import loop_in, set_tool_mass
 from hapticbridge.study.maps.stability_map import Point
 from hapticbridge.study.table import Table
@@ -55,6 +56,16 @@ def _swinging() -> Motion:
 
 PATH = _swinging()
 
+THEORIES: Mapping[str, str] = {
+    "implicit": "implicit",
+    "compensated": "implicit",
+    "lossless": "lossless",
+    "implicitfast": "implicitfast",
+    "explicit": "explicit",
+    "explicit:rk4": "explicit:rk4",
+}
+"""Methods shown, and the theory of a free tool of each."""
+
 LIMITS = 9
 """Values of K per method at which the limits in mass are searched."""
 
@@ -64,18 +75,18 @@ SEARCHES = ("held still", "worst hand")
 
 def points(count: int) -> Sequence[Point]:
     """Returns a grid of mass and stiffness per method, and searches for the limit in mass."""
-    side = max(2, round((count / len(NAMES)) ** 0.5))
+    side = max(2, round((count / len(THEORIES)) ** 0.5))
     stiffness = np.geomspace(*STIFFNESS, side)
     cells: list[Point] = [
         {"what": "cell", "method": name, "stiffness": float(k), "mass": float(m)}
-        for name in NAMES
+        for name in THEORIES
         for k in stiffness
         for m in np.geomspace(*MASS, side)
     ]
     # two to a column of the picture, and away from the grid's own values
     limits: list[Point] = [
         {"what": what, "method": name, "stiffness": float(k), "mass": 0.0}
-        for name in NAMES
+        for name in THEORIES
         for k in np.geomspace(1.1 * STIFFNESS[0], STIFFNESS[1] / 1.1, min(LIMITS, side))
         for what in SEARCHES
     ]
@@ -117,9 +128,15 @@ def worst_hand(name: str, stiffness: float, mass: float) -> LoopOutcome:
 
 def hand_worst_for(name: str, stiffness: float, mass: float) -> WorstHand:
     """Returns the hand that needs most damping for this method, mass and stiffness."""
-    angle, _ = worst_angle(name, stiffness, DAMPING, mass, PERIOD)
-    response = complex(felt(name, stiffness, DAMPING, mass, PERIOD, angle))
+    law = THEORIES[name], stiffness, law_damping(name, stiffness), mass, PERIOD
+    angle, _ = worst_angle(*law)
+    response = complex(felt(*law, angle))
     return WorstHand(DEVICE_DAMPING, angle / PERIOD, PERIOD, response)
+
+
+def law_damping(name: str, stiffness: float) -> float:
+    """Returns B' in N s/m, which a method's law uses where ``DAMPING`` is asked for."""
+    return float(used_damping(name, stiffness, DAMPING, PERIOD))
 
 
 def coupling_of(stiffness: float) -> Coupling:
@@ -161,7 +178,7 @@ def predicted_limit(name: str, stiffness: float, *, is_held: bool) -> Mapping[st
     """Returns where theory has the mass at which stability changes, within ``MASS``.
 
     Args:
-        name: One of ``NAMES``.
+        name: One of ``THEORIES``.
         stiffness: K in N/m, > 0.
         is_held: Whether the handle is held still, or held by the worst hand of the device.
 
@@ -170,11 +187,12 @@ def predicted_limit(name: str, stiffness: float, *, is_held: bool) -> Mapping[st
         the ends of the range.
 
     Raises:
-        StudyError: The method is none of these, or the stiffness is out of range.
+        StudyError: The stiffness is out of range.
     """
+    theory, damping = THEORIES[name], law_damping(name, stiffness)
 
     def is_stable(mass: float) -> bool:
-        needed = worst_angle(name, stiffness, DAMPING, mass, PERIOD)[1]
+        needed = worst_angle(theory, stiffness, damping, mass, PERIOD)[1]
         return np.isfinite(needed) if is_held else needed < DEVICE_DAMPING
 
     return _change(is_stable, WIDTH / 10)

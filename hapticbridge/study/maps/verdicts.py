@@ -85,28 +85,32 @@ def _edges(centres: NDArray[np.float64], *, is_log: bool) -> NDArray[np.float64]
     return np.asarray(np.exp(middle) if is_log else middle)
 
 
-def verdict_legend(figure: Figure, lines: Sequence[tuple[str, str, str]] = ()) -> None:
+def verdict_legend(
+    figure: Figure, lines: Sequence[tuple[str, str, str]] = (), columns: int = 4
+) -> None:
     """Names the colours, and the lines of theory, below a figure.
 
     Args:
         figure: Drawn already.
-        lines: Label, colour and line style each; the style ``o`` is a row of white circles.
+        lines: Label, colour and line style each; the styles ``o`` and ``s`` are white circles and
+            squares.
+        columns: Of the legend.
     """
     handles: list[object] = [
         Patch(facecolor=colour, label=name) for name, colour in zip(VERDICTS, COLOURS, strict=True)
     ]
     axes = figure.axes[0]
     for label, colour, style in lines:
-        is_circle = style == "o"
+        is_marker = style in ("o", "s")
         handles += axes.plot(
             [],
             [],
             color=colour,
             label=label,
-            ls="" if is_circle else style,
-            marker="o" if is_circle else "",
+            ls="" if is_marker else style,
+            marker=style if is_marker else "",
             mfc="white",
         )
     figure.legend(
-        handles=handles, loc="outside lower center", ncols=4, fontsize="small", frameon=False
+        handles=handles, loc="outside lower center", ncols=columns, fontsize="small", frameon=False
     )

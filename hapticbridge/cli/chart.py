@@ -1,0 +1,143 @@
+"""``hapticbridge chart``."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from hapticbridge.cli.terminal import err, out, plain
+from hapticbridge.study.chart import (
+    ChartFiles,
+    Extent,
+    chosen_methods,
+    chosen_periods,
+    measure_chart,
+    open_workload,
+    peer_settings,
+    prepared_files,
+    settings_for,
+    write_chart,
+)
+from hapticbridge.study.chart.work import measure_work
+from hapticbridge.study.chart.work_files import write_work
+from hapticbridge.study.engines.library import available_engines, open_engine
+
+ALL = "all"
+
+WORK = "work"
+QUICK_SIZE = 30
+"""Largest scene of a quick chart of work."""
+
+QUICK_REPEATS, REPEATS = 3, 7
+
+
+@dataclass(frozen=True, slots=True)
+class ChartCommand:
+    """Chart what every way to simulate a scene costs against how wrong it is.
+
+    The scene is point_mass, peg_in_hole, rod_impact, sliding_block or spinning_body, which have
+    references of their own, or any scene with a hand path beside it, which is compared with finer
+    steps. 'work' in place of a scene charts what a tick costs as a scene grows. Writes SCENE.png,
+    .svg, .csv, .json and .html into the folder. Example:
+
+        hapticbridge chart peg_in_hole --out charts
+    """
+
+    scene: tyro.conf.Positional[str]
+    """A workload's or scene's name, or an MJCF file."""
+    methods: tuple[str, ...] | None = None
+    """Rendering methods; by default all of them."""
+    steps: tuple[float, ...] | None = None
+    """Time steps in ms, all of which divide the longest; by default 4, 2, 1, 0.5, 0.25, 0.125."""
+    engines: tuple[str, ...] = ()
+    """Other engines on the same work (extra 'peers'), or 'all' that are installed."""
+    out: Path = Path("chart")
+    """Folder to write to."""
+    quick: bool = False
+    """Three time steps and three rounds of timing: half a minute."""
+    as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
+    """Print what the chart says as JSON."""
+
+    def execute(self) -> int:
+        """Measures the chart; returns the exit code."""
+        if self.scene == WORK:
+            return self._execute_work()
+        periods = chosen_periods(self.steps, is_quick=self.quick)
+        methods = chosen_methods(self.methods)
+        with err.status("preparing references …"):
+            workload = open_workload(self.scene, Extent(periods[0], periods[-1]))
+        paths = prepared_files(self.out, workload.name)
+        settings = settings_for(methods, periods, has_contact=workload.has_contact)
+        settings += peer_settings(self._peers(), periods)
+        with _progress(f"chart {workload.name}") as show:
+            chart = measure_chart(
+                workload,
+                settings,
+                repeats=QUICK_REPEATS if self.quick else REPEATS,
+                progress=show,
+            )
+        files = write_chart(chart, paths)
+        if self.as_json:
+            out.print_json(json.dumps(files.said))
+        else:
+            _print(files)
+        return 0
+
+    def _execute_work(self) -> int:
+        prepared_files(self.out, WORK)
+        with _progress(f"chart {WORK}") as show:
+            chart = measure_work(most=QUICK_SIZE if self.quick else None, progress=show)
+        paths, said = write_work(chart, self.out)
+        if self.as_json:
+            out.print_json(json.dumps(said))
+        else:
+            out.print(plain(said["paragraph"]))
+        err.print("wrote " + ", ".join(plain(str(path)) for path in paths.values()))
+        return 0
+
+    def _peers(self) -> list[str]:
+        """Returns the engines that are asked for and installed; says which are not."""
+        if self.engines == (ALL,):
+            found = available_engines()
+            for reason in dict.fromkeys(found.missing.values()):
+                err.print(plain(reason))
+            return list(found.available)
+        for name in self.engines:
+            open_engine(name)
+        return list(self.engines)
+
+
+@contextmanager
+def _progress(name: str) -> Iterator[Callable[[int, int], None]]:
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.completed}/{task.total}"),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=err, transient=True) as bar:
+        task = bar.add_task(name, total=None)
+
+        def show(done: int, total: int) -> None:
+            bar.update(task, completed=done, total=total)
+
+        yield show
+
+
+def _print(files: ChartFiles) -> None:
+    for panel in files.said["panels"]:
+        out.print(f"[bold]{plain(panel['title'])}[/], against {plain(panel['reference'])}")
+        out.print(f"  {plain(panel['recommendation'])}")
+    for note in files.said["notes"]:
+        out.print(f"  {plain(note)}")
+    for name, reason in files.said["skipped"].items():
+        out.print(f"  not simulated: {plain(name)} ({plain(reason)})")
+    err.print("wrote " + ", ".join(plain(str(path)) for path in files.paths.values()))

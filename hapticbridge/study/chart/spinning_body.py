@@ -1,0 +1,192 @@
+"""Workload ``spinning_body``: a free body that tumbles, held in its place and free to turn."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+from scipy.integrate import solve_ivp
+
+from hapticbridge.check.felt import FORCE_FLOOR, LEVER
+from hapticbridge.coupling import Coupling
+from hapticbridge.errors import StudyError
+from hapticbridge.kernel.scheme import DIRECT, WELD
+from hapticbridge.mechanics import integrate_rotation
+from hapticbridge.scene import Scene
+from hapticbridge.study.chart.engine_run import PeerWork, work_of
+from hapticbridge.study.chart.scene_run import SceneRun, Stage, Stages, Take
+from hapticbridge.study.chart.score import Score, diverged, score_of
+from hapticbridge.study.chart.setting import Setting
+from hapticbridge.study.chart.workload import Panel, References, Run
+from hapticbridge.study.engines.task import Velocity
+from hapticbridge.study.maps.rigs import scene_of
+from hapticbridge.tick import TICK_DTYPE
+
+MASS = 0.3
+"""In kg."""
+INERTIA = (1.5e-3, 3.63e-3, 4.53e-3)
+"""Principal moments in kg m², all different: near those of a hand tool with a long handle."""
+
+SPIN = (3.0, 20.0, 3.0)
+"""Angular velocity at the start in rad/s, near the middle axis, about which the body tumbles."""
+
+DURATION = 1.0
+"""In s: three turns and a flip."""
+
+COUPLING = Coupling(1000.0, 1.0, 0.0, 0.0)
+"""Holds the place, in N/m and N s/m, and lets the body turn."""
+
+FELT_STIFFNESS = 1.0
+"""K_r in N m/rad, that of the other workloads: what an error of angle would be felt through."""
+
+FINE_STEP = 2e-6
+"""T in s of the reference. The midpoint rule errs by some (ωT)²/12 of the angle: some 1e-9 rad."""
+
+PANEL = Panel(
+    "torque-free",
+    "a body that tumbles without torque",
+    f"mechanics' midpoint rule at {1e6 * FINE_STEP:g} µs, checked against SciPy's DOP853; the "
+    f"angle counts as the torque that {FELT_STIFFNESS:g} N m/rad would make of it",
+)
+
+_BODY = f"""
+<mujoco model="spinning_body">
+  <option gravity="0 0 0"/>
+  <worldbody>
+    <body name="tool">
+      <freejoint/>
+      <inertial pos="0 0 0" mass="{MASS!r}" diaginertia="{" ".join(map(repr, INERTIA))}"/>
+      <geom type="sphere" size="0.01" mass="0" contype="0" conaffinity="0"/>
+      <site name="grip"/>
+    </body>
+  </worldbody>
+</mujoco>"""
+
+
+def spinning_scene() -> Scene:
+    """Returns the body as a scene, at rest."""
+    return scene_of(_BODY)
+
+
+def set_spinning(scene: Scene) -> None:
+    """Gives the body its angular velocity; its axes are the world's at the start."""
+    scene.data.qvel[3:6] = SPIN
+    mujoco.mj_forward(scene.model, scene.data)
+
+
+def still(times: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Returns a handle that stands still."""
+    quaternions = np.zeros((times.size, 4))
+    quaternions[:, 0] = 1.0
+    return np.zeros((times.size, 3)), quaternions
+
+
+def exact_orientations(grid: float, count: int) -> NDArray[np.float64]:
+    """Returns orientations at grid, 2 grid, … in s by the midpoint rule, shape (count, 4), w >= 0.
+
+    Raises:
+        StudyError: ``grid`` is no multiple of ``FINE_STEP``.
+    """
+    every = round(grid / FINE_STEP)
+    if abs(every * FINE_STEP / grid - 1) > 1e-9:
+        raise StudyError(f"{grid:g} s is no multiple of the reference's {FINE_STEP:g} s")
+    motion = integrate_rotation(INERTIA, SPIN, FINE_STEP, every * count, "midpoint")
+    found = motion.orientation[every::every]
+    return np.where(found[:, :1] < 0, -found, found)
+
+
+def orientations_by_dop853(grid: float, count: int) -> NDArray[np.float64]:
+    """Returns the same by SciPy's explicit Runge–Kutta method of order 8: another route.
+
+    Euler's equations and q' = ½ q ⊗ ω, to a relative tolerance of 1e-12.
+    """
+    moments = np.array(INERTIA)
+
+    def rate(_time: float, state: NDArray[np.float64]) -> NDArray[np.float64]:
+        w, u, omega = state[0], state[1:4], state[4:]
+        turning = -np.cross(omega, moments * omega) / moments
+        return np.concatenate([[-0.5 * u @ omega], 0.5 * (w * omega + np.cross(u, omega)), turning])
+
+    times = grid * np.arange(1, count + 1)
+    start = np.array([1.0, 0.0, 0.0, 0.0, *SPIN])
+    found = (
+        solve_ivp(rate, (0.0, times[-1]), start, "DOP853", t_eval=times, rtol=1e-12, atol=1e-13)
+        .y[:4]
+        .T
+    )
+    return np.asarray(np.where(found[:, :1] < 0, -found, found))
+
+
+class SpinningBody:
+    """The workload.
+
+    Args:
+        coupling: K and B; without K_r and B_r, or there would be a torque.
+        grid: Longest period T in s.
+        finest: Shortest in s.
+
+    Raises:
+        StudyError: The coupling would turn the body.
+    """
+
+    name = "spinning_body"
+    about = "a body with three moments of inertia tumbles freely, held in its place by the coupling"
+    panels: Sequence[Panel] = (PANEL,)
+    has_contact = False
+    references: References | None = None
+
+    def __init__(self, coupling: Coupling, grid: float, finest: float) -> None:
+        if coupling.rotational_stiffness or coupling.rotational_damping:
+            raise StudyError("the spinning body must be free to turn: K_r and B_r must be 0")
+        self.coupling = coupling
+        self._grid = grid
+        self._finest = finest
+        count = round(DURATION / grid)
+        self._reference = np.zeros(count, TICK_DTYPE)
+        self._reference["tool_quaternion"] = exact_orientations(grid, count)
+        self._energy = 0.5 * float(np.sum(np.array(INERTIA) * np.square(SPIN)))
+        self._stages = Stages(
+            lambda: Stage(spinning_scene(), still, grid * count, coupling, starts=(set_spinning,))
+        )
+
+    def run(self, setting: Setting) -> Run:
+        """Prepares a point.
+
+        Raises:
+            StudyError: The method does without the tool's own dynamics.
+        """
+        if setting.method.scheme in (WELD, DIRECT):
+            raise StudyError(f"method '{setting.method.name}' lets no tool turn by itself")
+        return SceneRun(self._stages.for_method(setting), setting, self._judge)
+
+    def peer_work(self) -> PeerWork:
+        """Describes the body to other engines, with its spin."""
+        duration = self._grid * self._reference.size
+        work = work_of(spinning_scene(), still, duration, self._finest, self.coupling, self._judge)
+        spin = Velocity(angular=SPIN)
+        return replace(work, task=replace(work.task, start_velocity=spin))
+
+    def _judge(self, takes: Sequence[Take]) -> Mapping[str, Score]:
+        (take,) = takes
+        if take.has_diverged:
+            return {PANEL.key: diverged(take.created)}
+        records = take.at(self._grid)
+        score = score_of(
+            self._reference,
+            records,
+            created=take.created,
+            verdict=take.environment,
+            energy=float(np.max(np.abs(records["kinetic"] - self._energy))),
+        )
+        torque = FELT_STIFFNESS * angles(self._reference, records)
+        turned = float(np.sqrt(np.mean(torque**2))) / (LEVER * FORCE_FLOOR)
+        return {PANEL.key: replace(score, felt=max(score.felt, turned))}
+
+
+def angles(first: NDArray[np.void], second: NDArray[np.void]) -> NDArray[np.float64]:
+    """Returns the angles between the tools of two records in rad, shape (n,)."""
+    cosine = np.abs(np.sum(first["tool_quaternion"] * second["tool_quaternion"], axis=1))
+    return np.asarray(2 * np.arccos(np.minimum(cosine, 1.0)))

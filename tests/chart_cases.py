@@ -1,0 +1,55 @@
+"""Made-up points of a chart, and runs that cost what a test says."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from hapticbridge.rendering import METHODS
+from hapticbridge.study.chart.measurement import Measurement
+from hapticbridge.study.chart.score import Score, Verdict
+from hapticbridge.study.chart.setting import SHIPPED, Setting
+from hapticbridge.study.chart.timing import Cost
+
+
+def made_up(
+    cost: float,
+    felt: float,
+    *,
+    method: str = "implicit",
+    period: float = 1e-3,
+    verdict: Verdict = "strict",
+    spread: float = 0.0,
+    contact: str = SHIPPED,
+    substeps: int = 1,
+    iterations: int | None = None,
+) -> Measurement:
+    """Returns a point of panel ``panel`` that costs and errs as said."""
+    return Measurement(
+        "panel",
+        Setting(METHODS[method], period, substeps, contact, iterations),
+        Cost(cost, cost * (1 - spread), cost * (1 + spread), 1.0, 1.0, 1.0, 3),
+        Score(felt=felt, created=0.0, verdict=verdict),
+    )
+
+
+class FakeRun:
+    """A run that takes the times that it is given, one after the other."""
+
+    def __init__(self, *times: float, seconds: float = 1.0) -> None:
+        self.seconds = seconds
+        self._times = list(times)
+        self.calls = 0
+
+    @property
+    def chosen(self) -> Mapping[str, str | int]:
+        """Returns no choice."""
+        return {}
+
+    def go(self) -> float:
+        """Returns the next of its times."""
+        self.calls += 1
+        return self._times[(self.calls - 1) % len(self._times)]
+
+    def scores(self) -> Mapping[str, Score]:
+        """Judges nothing."""
+        return {}

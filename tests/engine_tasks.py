@@ -1,0 +1,89 @@
+"""Tasks whose outcome is known in closed form, for every engine alike."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from hapticbridge.coupling import Coupling
+from hapticbridge.device.motion import Motion
+from hapticbridge.errors import StudyError
+from hapticbridge.mechanics import exact_mass_response
+from hapticbridge.study.engines import Body, Engine, Shape, Simulation, Task, open_engine
+
+COUPLING = Coupling(
+    stiffness=1000.0, damping=5.0, rotational_stiffness=2.0, rotational_damping=2e-3
+)
+AMPLITUDE, FREQUENCY, SECONDS = 0.01, 2.0, 0.5
+MASS = 1.0
+GRAVITY = 9.81
+
+
+def engine_or_skip(name: str) -> Engine:
+    try:
+        return open_engine(name)
+    except StudyError as error:
+        pytest.skip(str(error))
+
+
+@contextmanager
+def opened(engine: Engine, task: Task, timestep: float) -> Iterator[Simulation]:
+    simulation = engine.open(task, timestep)
+    try:
+        yield simulation
+    finally:
+        simulation.close()
+
+
+def driven_mass(timestep: float, mass: float = MASS) -> tuple[Task, NDArray[np.float64]]:
+    """A mass at rest behind the coupling, whose handle begins to swing; and the handle's path."""
+    times = np.arange(round(SECONDS / timestep) + 1) * timestep
+    handle = AMPLITUDE * np.sin(2 * np.pi * FREQUENCY * times)
+    motion = Motion(times, np.column_stack([handle, 0 * handle, 0 * handle]))
+    return Task("driven_mass", Body(mass, (1e-3,) * 3), coupling=COUPLING, handle=motion), handle
+
+
+def exact_path(timestep: float) -> NDArray[np.float64]:
+    """Where the mass of ``driven_mass`` is: the swing, and what dies away of having begun it."""
+    times = np.arange(round(SECONDS / timestep) + 1) * timestep
+    omega = 2 * np.pi * FREQUENCY
+    swing = complex(exact_mass_response(COUPLING, MASS, FREQUENCY)) * np.exp(1j * omega * times)
+    roots = np.roots([MASS, COUPLING.damping, COUPLING.stiffness])
+    at_start = [swing[0].imag, (1j * omega * swing[0]).imag]
+    first, second = np.linalg.solve(np.vstack([np.ones(2), roots]), -np.array(at_start))
+    dying = first * np.exp(roots[0] * times) + second * np.exp(roots[1] * times)
+    return np.asarray(AMPLITUDE * (swing.imag + dying.real))
+
+
+def driven_path(engine: Engine, timestep: float, mass: float = MASS) -> NDArray[np.float64]:
+    task, _ = driven_mass(timestep, mass)
+    poses = task.handle_poses(timestep, round(SECONDS / timestep))
+    path = [0.0]
+    with opened(engine, task, timestep) as simulation:
+        for pose in poses[1:]:
+            simulation.step(*pose)
+            path.append(simulation.pose().position[0])
+    return np.array(path)
+
+
+def driven_error(engine: Engine, timestep: float, mass: float = MASS) -> float:
+    """RMS error of the driven mass's position as a share of the handle's amplitude."""
+    error = driven_path(engine, timestep, mass) - exact_path(timestep)
+    return float(np.sqrt(np.mean(error**2))) / AMPLITUDE
+
+
+FLOOR = Shape("box", (0.2, 0.2, 0.05), (0.0, 0.0, -0.05))
+EDGE = 0.02
+LYING = (np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0)
+CORNERS = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * EDGE
+RESTING = {
+    "box": (Shape("box", (0.03, 0.025, EDGE)), EDGE),
+    "sphere": (Shape("sphere", (EDGE,)), EDGE),
+    "capsule": (Shape("capsule", (EDGE, 0.03), quaternion=LYING), EDGE),
+    "mesh": (Shape("mesh", (), vertices=CORNERS), EDGE),
+}
+"""A shape, and the height of its centre where it lies on the floor."""

@@ -1,0 +1,284 @@
+"""The chart: its points, its timing, its front and what it recommends, its files."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from chart_cases import FakeRun, made_up
+
+from hapticbridge.cli import main
+from hapticbridge.errors import StudyError
+from hapticbridge.kernel.scheme import DIRECT, LOSSLESS
+from hapticbridge.rendering import METHODS
+from hapticbridge.study.chart import (
+    Chart,
+    Extent,
+    chosen_methods,
+    chosen_periods,
+    measure_chart,
+    open_workload,
+    prepared_files,
+    settings_for,
+    write_chart,
+)
+from hapticbridge.study.chart.chart import convergence_orders
+from hapticbridge.study.chart.front import pareto_front
+from hapticbridge.study.chart.recommendation import recommendation, recommended
+from hapticbridge.study.chart.setting import CONTACTS, Setting
+from hapticbridge.study.chart.timing import interleaved_costs, one_core
+
+
+def test_front_is_what_no_other_point_beats() -> None:
+    costs = [1.0, 2.0, 3.0, 2.0, 4.0, 1.0]
+    errors = [9.0, 4.0, 4.0, 5.0, 1.0, 8.0]
+    assert pareto_front(costs, errors) == [5, 1, 4]
+
+
+def test_front_of_random_points_beats_all_others_and_itself_never() -> None:
+    generator = np.random.default_rng(5)
+    points = generator.integers(0, 12, (200, 2)).astype(float)
+    front = pareto_front(points[:, 0].tolist(), points[:, 1].tolist())
+
+    def beats(a: int, b: int) -> bool:
+        return bool((points[a] <= points[b]).all() and (points[a] < points[b]).any())
+
+    assert not any(beats(a, b) for a in front for b in front)
+    same = {tuple(points[i]) for i in front}
+    for b in set(range(200)) - set(front):
+        assert tuple(points[b]) in same or any(beats(a, b) for a in front)
+
+
+def test_front_leaves_out_what_has_no_error_or_no_cost() -> None:
+    assert pareto_front([1.0, 2.0, np.nan], [np.inf, 3.0, 1.0]) == [1]
+    assert pareto_front([], []) == []
+
+
+def test_cheapest_sound_point_is_recommended_and_the_more_accurate_of_equal_costs() -> None:
+    cheap = made_up(0.010, 0.9, spread=0.1)
+    better = made_up(0.0105, 0.3, method="lossless")
+    dear = made_up(0.020, 0.1)
+    assert recommended([cheap, better, dear]) is better
+    assert recommended([cheap, dear]) is cheap
+
+
+def test_usual_contact_is_recommended_where_errors_are_alike() -> None:
+    odd = made_up(0.0100, 0.300, contact="2 steps", spread=0.1)
+    usual = made_up(0.0101, 0.301)
+    assert recommended([odd, usual]) is usual
+
+
+@pytest.mark.parametrize(
+    ("flawed", "said"),
+    [
+        (made_up(0.01, 1.5), "its error is 1.5 JND"),
+        (made_up(0.01, 0.5, verdict="active"), "its environment is active"),
+        (made_up(0.01, 0.5, verdict="lost contact"), "its environment is lost contact"),
+        (made_up(0.6, 0.5), "it takes 60 % of a core"),
+        (made_up(0.01, 0.5, method="explicit"), "it may kick on a real device"),
+    ],
+)
+def test_flawed_point_is_not_recommended_but_named_with_its_flaw(flawed: object, said: str) -> None:
+    assert recommended([flawed]) is None  # type: ignore[list-item]
+    text = recommendation([flawed], "a machine")  # type: ignore[list-item]
+    assert "no point does it all" in text
+    assert said in text
+    good = made_up(0.3, 0.9)
+    assert recommended([flawed, good]) is good  # type: ignore[list-item]
+
+
+def test_error_that_grows_at_a_smaller_step_is_called_luck() -> None:
+    lucky, finer = made_up(0.01, 0.2), made_up(0.02, 3.0, period=5e-4)
+    assert recommended([lucky, finer]) is None
+    assert "it is luck" in recommendation([lucky, finer], "a machine")
+    assert recommended([lucky, made_up(0.02, 0.4, period=5e-4)]) is lucky
+    # another method's error at a smaller step says nothing of this one
+    assert recommended([lucky, made_up(0.02, 3.0, period=5e-4, method="lossless")]) is lucky
+
+
+def test_solver_that_is_cut_short_is_not_recommended() -> None:
+    short = made_up(0.01, 0.2, iterations=1)
+    assert recommended([short]) is None
+    assert "its solver is cut short" in recommendation([short], "a machine")
+    assert recommended([short, made_up(0.02, 0.3)]) is not short
+
+
+def test_slower_than_a_kilohertz_is_never_recommended() -> None:
+    slow = made_up(0.001, 0.1, period=2e-3)
+    assert recommended([slow]) is None
+    assert "nothing was tried that runs at this rate" in recommendation([slow], "a machine")
+    assert recommended([slow, made_up(0.1, 0.5)]) is not slow
+
+
+def test_recommendation_says_machine_setting_and_numbers() -> None:
+    text = recommendation([made_up(0.012, 0.25, method="lossless")], "a machine")
+    assert text.startswith("For 1 kHz on this machine (a machine) and an error below one JND, use")
+    assert "lossless, 1 ms" in text
+    assert "0.25 JND at 12 µs a tick, 1.2 % of a core" in text
+
+
+def test_order_is_the_slope_over_the_three_smallest_steps() -> None:
+    periods = (4e-3, 1e-3, 5e-4, 2.5e-4)
+    points = [made_up(1.0, 1e6 * p**2, period=p) for p in periods[1:]]
+    points += [made_up(1.0, 7.0, period=periods[0]), made_up(1.0, 3.0, period=2.5e-4, substeps=2)]
+    assert convergence_orders(points)["implicit"] == pytest.approx(2.0)
+    assert np.isnan(convergence_orders(points[:2])["implicit"])
+
+
+def test_costs_are_medians_per_simulated_second_and_ratios_are_taken_within_a_round() -> None:
+    # every round is slower by a factor, as on a machine whose clock goes down
+    slow = FakeRun(2.0, 4.0, 20.0, seconds=2.0)
+    fast = FakeRun(1.0, 2.0, 10.0, seconds=2.0)
+    costs = interleaved_costs([slow, fast], 1, repeats=3)
+    assert (costs[0].low, costs[0].median, costs[0].high) == (1.0, 2.0, 10.0)
+    assert (costs[0].ratio_low, costs[0].ratio, costs[0].ratio_high) == (2.0, 2.0, 2.0)
+    assert costs[1].ratio == 1.0
+    assert costs[0].repeats == 3
+
+
+def test_no_further_round_begins_when_patience_is_over_but_three_are_done() -> None:
+    now = iter(range(1000))
+    run = FakeRun(1.0)
+    costs = interleaved_costs([run], 0, repeats=9, patience=0.5, clock=lambda: float(next(now)))
+    assert costs[0].repeats == run.calls == 3
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="the system pins no threads")
+def test_pinning_is_undone() -> None:
+    before = os.sched_getaffinity(0)
+    with one_core() as core:
+        assert os.sched_getaffinity(0) == {core}
+    assert os.sched_getaffinity(0) == before
+
+
+def test_selection_has_every_method_at_every_step_and_no_point_twice() -> None:
+    methods, periods = chosen_methods(None), chosen_periods(None)
+    settings = settings_for(methods, periods, has_contact=True)
+    assert len(set(settings)) == len(settings)
+    for method in METHODS.values():
+        assert {s.period for s in settings if s.method is method} == set(periods)
+    assert {s.contact for s in settings} == set(CONTACTS)
+    undivided = [s for s in settings if s.method.scheme in (LOSSLESS, DIRECT)]
+    assert {s.substeps for s in undivided} == {1}
+    without = settings_for(methods, periods, has_contact=False)
+    assert {(s.contact, s.iterations) for s in without} == {("as shipped", None)}
+
+
+@pytest.mark.parametrize(
+    ("steps", "said"),
+    [
+        ([1.0, 0.3], "step 0.3 ms does not divide 1 ms"),
+        ([0.001], "must be between 0.02 and 20"),
+        ([float("nan")], "must be between 0.02 and 20"),
+        ([], "steps is empty"),
+    ],
+)
+def test_bad_steps_are_refused_in_a_sentence(steps: list[float], said: str) -> None:
+    with pytest.raises(StudyError, match=said):
+        chosen_periods(steps)
+
+
+@pytest.fixture(scope="module")
+def chart() -> Chart:
+    """A small chart: one good method, and one that a step of 20 ms throws out of bounds."""
+    workload = open_workload("point_mass", Extent(0.02, 1e-3))
+    settings = [
+        Setting(METHODS[name], period)
+        for name in ("implicit", "explicit")
+        for period in (0.02, 2e-3, 1e-3)
+    ]
+    return measure_chart(workload, settings, repeats=1)
+
+
+def test_diverged_point_stays_on_the_chart(chart: Chart) -> None:
+    verdicts = {each.setting.label: each.score.verdict for each in chart.measurements}
+    assert verdicts["explicit, 20 ms"] in ("diverged", "active")
+    assert len(verdicts) == 6
+    assert "explicit, 20 ms" not in {
+        each.setting.label for each in chart.front(chart.workload.panels[0])
+    }
+
+
+def test_files_hold_every_setting_and_the_page_needs_nothing_else(
+    chart: Chart, tmp_path: Path
+) -> None:
+    files = write_chart(chart, prepared_files(tmp_path / "new", "point_mass"))
+    with files.paths["csv"].open(encoding="utf-8") as lines:
+        rows = list(csv.DictReader(lines))
+    assert len(rows) == 6
+    assert {row["method"] for row in rows} == {"implicit", "explicit"}
+    assert {float(row["period_s"]) for row in rows} == {0.02, 2e-3, 1e-3}
+    assert {row["solver_iterations"] for row in rows} == {"100"}
+    assert all(row["machine"] and float(row["cost_median"]) > 0 for row in rows)
+    said = json.loads(files.paths["json"].read_text(encoding="utf-8"))
+    assert said["panels"][0]["reference_is_truth"] is True
+    assert said["panels"][0]["recommendation"].startswith("For 1 kHz")
+    page = files.paths["html"].read_text(encoding="utf-8")
+    assert page.count('class="spot"') == 6
+    assert not re.search(r"(src|href)\s*=|https?://|@import|url\(", page)
+    assert len(page) < 100_000
+    assert files.paths["png"].stat().st_size > 10_000
+    assert files.paths["svg"].read_text(encoding="utf-8").lstrip().startswith("<?xml")
+
+
+def test_chart_without_a_point_is_refused() -> None:
+    workload = open_workload("spinning_body", Extent(4e-3, 4e-3))
+    with pytest.raises(StudyError, match="no point could be simulated; first: method 'weld'"):
+        measure_chart(workload, [Setting(METHODS["weld"], 4e-3)], repeats=1)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["nowhere"], "no scene"),
+        (["point_mass", "--steps", "1", "0.3"], "does not divide"),
+        (["point_mass", "--methods", "magic"], "no method is called 'magic'"),
+    ],
+)
+def test_bad_input_at_the_command_line_is_one_sentence(
+    arguments: list[str], said: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    assert main(["chart", *arguments, "--out", str(tmp_path / "out")]) == 2
+    error = capsys.readouterr().err
+    assert said in error
+    assert len(error.strip().splitlines()) == 1
+
+
+def test_folder_that_is_a_file_is_refused_before_anything_is_measured(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    taken = tmp_path / "file"
+    taken.write_text("", encoding="utf-8")
+    assert main(["chart", "point_mass", "--out", str(taken)]) == 2
+    assert "is a file; name a folder" in capsys.readouterr().err
+
+
+def test_command_draws_a_chart(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["chart", "point_mass", "--methods", "implicit", "lossless", "--steps", "4", "1"]
+    assert main([*arguments, "--quick", "--out", str(tmp_path)]) == 0
+    printed = capsys.readouterr()
+    assert "For 1 kHz on this machine" in printed.out
+    names = {path.name for path in tmp_path.iterdir()}
+    assert names == {f"point_mass.{ending}" for ending in ("png", "svg", "csv", "json", "html")}
+
+
+def test_table_says_what_contacts_and_solver_really_were() -> None:
+    workload = open_workload("rod_impact", Extent(4e-3, 1e-3))
+    settings = [
+        Setting(METHODS["implicit"], 1e-3, contact=contact, iterations=iterations)
+        for contact, iterations in (
+            ("as shipped", None),
+            ("damped", None),
+            ("soft", None),
+            ("pyramidal cone", 5),
+        )
+    ]
+    chosen = [each.chosen for each in measure_chart(workload, settings, repeats=1).measurements]
+    assert [each["solref"] for each in chosen] == ["0.002 1", "0.0005 8", "0.02 1", "0.002 1"]
+    assert [each["cone"] for each in chosen] == ["elliptic"] * 3 + ["pyramidal"]
+    assert [each["solver_iterations"] for each in chosen] == [100, 100, 100, 5]

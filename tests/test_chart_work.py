@@ -1,0 +1,126 @@
+"""Cost against work: the scenes that grow, their timing and the exponents."""
+
+from __future__ import annotations
+
+import csv
+import json
+from itertools import count
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial import ConvexHull
+
+from hapticbridge.check.growth import Spread
+from hapticbridge.cli import main
+from hapticbridge.errors import StudyError
+from hapticbridge.study.chart.tick_times import USUAL, VARIANTS
+from hapticbridge.study.chart.work import Work, WorkChart, growth_exponent, measure_work
+from hapticbridge.study.chart.work_files import paragraph, write_work
+from hapticbridge.study.chart.work_scenes import (
+    FAMILIES,
+    floating,
+    mesh_ball,
+    plate,
+    resting,
+    sphere,
+)
+
+
+def test_floating_bodies_are_as_many_as_asked_and_touch_nothing() -> None:
+    for number in (1, 7):
+        scene = floating(number)
+        assert scene.model.nv == 6 * number
+        assert scene.data.ncon == 0
+
+
+def test_plate_stands_on_as_many_contacts_as_it_has_feet() -> None:
+    families = tuple(family for family in FAMILIES if family.name == "contacts")
+    chart = measure_work(families, most=30, rounds=1)
+    assert [point.contacts for point in chart.points] == [1, 3, 10, 30]
+    assert {point.freedoms for point in chart.points} == {6}
+
+
+def test_mesh_has_as_many_triangles_as_asked() -> None:
+    for number in (12, 100, 1000):
+        assert len(ConvexHull(sphere(number // 2 + 2)).simplices) == number
+    scene = mesh_ball(100)
+    assert scene.model.nmeshvert == 52
+
+
+def test_boxes_at_rest_sleep_where_they_may_and_only_there() -> None:
+    families = tuple(family for family in FAMILIES if family.name == "resting")
+    chart = measure_work(families, most=3, rounds=1)
+    contacts = {(p.variant, p.size): p.contacts for p in chart.points}
+    for variant in VARIANTS:
+        awake = 0 if variant.sleeps else 12
+        assert contacts[variant.name, 3] == awake
+    scene = resting(2)
+    assert scene.model.opt.enableflags & 64 == 0
+
+
+@pytest.mark.parametrize("build", [floating, plate, mesh_ball, resting])
+def test_scene_of_nothing_or_of_too_much_is_refused(build: object) -> None:
+    for number in (-1, 10**9):
+        with pytest.raises(StudyError, match=r"a scene of .* is asked for"):
+            build(number)  # type: ignore[operator]
+
+
+def test_exponent_is_the_slope_at_the_larger_sizes() -> None:
+    sizes = np.array([1.0, 10.0, 30.0, 100.0])
+    # what every tick costs hides the growth at small sizes
+    assert growth_exponent(sizes, 1e-9 * sizes**2 + 1e-12) == pytest.approx(2.0, abs=0.01)
+    assert growth_exponent(sizes, np.array([50.0, 10.0, 30.0, 100.0])) == pytest.approx(1.0)
+    assert np.isnan(growth_exponent(sizes[:1], sizes[:1]))
+    assert np.isnan(growth_exponent(np.zeros(0), np.zeros(0)))
+
+
+def test_rate_is_what_half_a_period_leaves_at_the_99th_percentile() -> None:
+    ticks = count()
+    families = tuple(family for family in FAMILIES if family.name == "bodies")
+    # a clock that goes on by 1 µs a call: every tick takes one
+    chart = measure_work(families, most=1, rounds=1, clock=lambda: 1000 * next(ticks))
+    (point,) = chart.points
+    assert point.time.median == pytest.approx(1e-6)
+    assert point.rate == pytest.approx(0.5 / 1e-6)
+
+
+def made_up() -> WorkChart:
+    """Returns a chart in which the time of a tick is known."""
+
+    def point(family: str, variant: str, size: int, seconds: float) -> Work:
+        spread = Spread(100, seconds, seconds)
+        return Work(family, variant, size, 0, 0, 6, spread, seconds, seconds, 0.5 / seconds)
+
+    points = [point("bodies", USUAL.name, size, 1e-5 * size) for size in (1, 10, 100)]
+    for variant, factor in zip(VARIANTS, (1.0, 3.0, 1.0, 0.1), strict=True):
+        points += [point("resting", variant.name, size, factor * 1e-5 * size) for size in (10, 100)]
+    return WorkChart(tuple(points), "a machine")
+
+
+def test_paragraph_says_how_it_grows_and_what_holds_a_kilohertz() -> None:
+    text = paragraph(made_up())
+    assert "Free bodies: 10 µs a tick for 1, 1e+03 µs for 100 (growing as n^1.00)" in text
+    assert "up to 10 hold 1 kHz" in text
+    assert "without islands a tick with 100 boxes at rest takes 3.00 times as long" in text.lower()
+    assert (
+        "sleep, which a bridge refuses, would make mujoco's step 10 times as fast" in text.lower()
+    )
+
+
+def test_files_hold_every_point(tmp_path: Path) -> None:
+    paths, said = write_work(made_up(), tmp_path)
+    with paths["csv"].open(encoding="utf-8") as lines:
+        rows = list(csv.DictReader(lines))
+    assert len(rows) == 11
+    assert {row["variant"] for row in rows} == {variant.name for variant in VARIANTS}
+    assert json.loads(paths["json"].read_text(encoding="utf-8")) == said
+    assert said["exponents"]["bodies"][USUAL.name] == pytest.approx(1.0)
+    assert paths["png"].stat().st_size > 10_000
+
+
+def test_work_into_a_file_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    taken = tmp_path / "file"
+    taken.write_text("", encoding="utf-8")
+    assert main(["chart", "work", "--out", str(taken)]) == 2
+    assert "is a file; name a folder" in capsys.readouterr().err
