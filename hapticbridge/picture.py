@@ -21,18 +21,20 @@ makes files larger."""
 
 
 def check_ending(path: Path) -> None:
-    """Checks that a picture's name says what it is, before anything is computed for it.
+    """Checks that a picture can be written under its name, before anything is computed for it.
 
     Args:
         path: The file to be written.
 
     Raises:
-        HapticBridgeError: The name ends in none of ``ENDINGS``.
+        HapticBridgeError: The name ends in none of ``ENDINGS``, or its folder does not exist.
     """
     if path.suffix.lower() not in ENDINGS:
         raise HapticBridgeError(
             f"'{path}' does not end like a picture; endings: {', '.join(ENDINGS)}"
         )
+    if not path.absolute().parent.is_dir():
+        raise HapticBridgeError(f"cannot write '{path}': its folder does not exist")
 
 
 def new_figure(width: float, height: float) -> Figure:

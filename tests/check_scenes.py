@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from outside_scenes import hand_rows
 
 from hapticbridge.check.case import Case, open_case
 from hapticbridge.check.faults import Fault
@@ -90,7 +90,7 @@ PLANTS = (
     Plant("solver", 'solver="Newton"', 'solver="CG"'),
     Plant("solver iterations", 'iterations="100"', 'iterations="1"'),
     Plant("pyramidal cone", 'cone="elliptic"', 'cone="pyramidal"'),
-    Plant("diagexact", ' diagexact="enable"', ' energy="enable"', at="<option"),
+    Plant("diagexact", ' diagexact="enable"', ' energy="enable"', at="<flag"),
     Plant("keyframe", "<!-- keys -->", f'<keyframe><key name="start" qpos="{START}"/></keyframe>'),
     Plant("heavy tool", 'pos="0 0 0.03" gravcomp="1"', 'pos="0 0 0.03"'),
     Plant("far grip", '<site name="grip"/>', '<site name="grip" pos="0 0 0.2"/>'),
@@ -179,17 +179,6 @@ def _obj(vertices: np.ndarray, faces: list[tuple[int, int, int]]) -> str:
     lines = [f"v {x:.6g} {y:.6g} {z:.6g}" for x, y, z in vertices]
     lines += [f"f {a} {b} {c}" for a, b, c in faces]
     return "\n".join(lines) + "\n"
-
-
-def hand_rows(stops: Sequence[tuple[float, tuple[float, float, float]]]) -> str:
-    """A hand that moves from rest to rest, 100 rows/s."""
-    rows = [np.zeros(4)]
-    for seconds, offset in stops:
-        s = np.linspace(0.0, 1.0, round(seconds * 100) + 1)[1:, None]
-        start, time = rows[-1][1:], rows[-1][0]
-        path = start + s**3 * (10 - 15 * s + 6 * s**2) * (np.array(offset) - start)
-        rows.extend(np.hstack([time + s * seconds, path]))
-    return "t,x,y,z\n" + "".join(",".join(f"{v:.9f}" for v in row) + "\n" for row in rows)
 
 
 def bench(folder: Path, *plants: Plant) -> Path:

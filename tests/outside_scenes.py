@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 import zlib
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -98,16 +99,21 @@ def mjcf(*sections: str, body: str = FREE_TOOL, world: str = "") -> str:
 
 
 def hand_file(folder: Path, stops: list[tuple[float, tuple[float, float, float]]]) -> Path:
-    """Writes a hand that moves from rest to rest through (seconds, offset in m), 100 rows/s."""
+    """Writes a hand that moves from rest to rest through (seconds, offset in m)."""
+    file = folder / "hand.csv"
+    file.write_text(hand_rows(stops), encoding="utf-8")
+    return file
+
+
+def hand_rows(stops: Sequence[tuple[float, tuple[float, float, float]]]) -> str:
+    """A hand that moves from rest to rest through (seconds, offset in m), 100 rows/s."""
     rows = [np.zeros(4)]
     for seconds, offset in stops:
         s = np.linspace(0.0, 1.0, round(seconds * 100) + 1)[1:, None]
         start, time = rows[-1][1:], rows[-1][0]
         path = start + s**3 * (10 - 15 * s + 6 * s**2) * (np.array(offset) - start)
         rows.extend(np.hstack([time + s * seconds, path]))
-    file = folder / "hand.csv"
-    np.savetxt(file, rows, delimiter=",", header="t,x,y,z", comments="", fmt="%.9f")
-    return file
+    return "t,x,y,z\n" + "".join(",".join(f"{v:.9f}" for v in row) + "\n" for row in rows)
 
 
 def tetrahedron(side: float) -> tuple[np.ndarray, list[tuple[int, int, int]]]:

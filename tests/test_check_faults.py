@@ -13,13 +13,12 @@ from check_scenes import (
     bench,
     case_of,
     faults_of,
-    hand_rows,
     kinds,
     line_of,
     peg_with,
     written,
 )
-from outside_scenes import mjcf
+from outside_scenes import hand_rows, mjcf
 
 from hapticbridge.check.case import open_case
 from hapticbridge.check.contact_stiffness import depth_under

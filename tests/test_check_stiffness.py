@@ -2,17 +2,30 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
+
 import mujoco
 import numpy as np
 import pytest
-from check_scenes import CUP_DEPTH, CUP_ROOM, GOOD_OPTION, case_of, cup_obj
+from check_scenes import (
+    CUP_DEPTH,
+    CUP_ROOM,
+    GOOD_OPTION,
+    case_of,
+    cup_obj,
+    written,
+)
+from outside_scenes import hand_rows, mjcf
 
 from hapticbridge.check.constraint_faults import creep_speed
+from hapticbridge.check.contact_faults import inertia_of
 from hapticbridge.check.contact_stiffness import constraint_stiffness, depth_under
 from hapticbridge.check.faults import length, number, weight
 from hapticbridge.check.geometry_faults import dent_of, mesh_of
 from hapticbridge.check.inertia import body_inertia, joint_inertia
 from hapticbridge.scene import scene_path
+from hapticbridge.scene.contact_check import settings_among
 
 SINKS = [
     ("0.002 1", "0.9 0.95 0.001 0.5 2", 0.1),
@@ -46,6 +59,32 @@ def test_stiffness_and_depth_are_those_of_mujoco_at_rest(
     assert depth == pytest.approx(-data.qpos[0], rel=1e-3)
     stiffness = constraint_stiffness(ref, imp, mass, model.opt.timestep, depth)
     assert stiffness == pytest.approx(force / -data.qpos[0], rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("cone", "condim", "friction"),
+    [("elliptic", 3, 0.4), ("pyramidal", 1, 1), ("pyramidal", 3, 0.4), ("pyramidal", 6, 2)],
+)
+def test_contact_is_as_stiff_as_its_cone_makes_it(
+    tmp_path: Path, cone: str, condim: int, friction: float
+) -> None:
+    rubs = f'condim="{condim}" friction="{friction} 0.005 0.0001"'
+    rails = "".join(f'<joint type="slide" axis="{axis}"/>' for axis in ("1 0 0", "0 1 0", "0 0 1"))
+    tool = f"""<body name="tool" pos="0 0 0.0105">{rails}<geom size="0.01" mass="0.1" {rubs}/>
+      <site name="grip"/></body>"""
+    path = hand_rows([(0.3, (0.0, 0.0, -0.003)), (0.5, (0.0, 0.0, -0.003))])
+    option = GOOD_OPTION.replace("elliptic", cone)
+    world = f'<geom name="floor" type="plane" size="1 1 1" {rubs}/>'
+    case = case_of(written(tmp_path, mjcf(option, body=tool, world=world), path))
+    assert case.observation is not None
+    ((pair, seen),) = case.observation.meetings.items()
+    force = float(case.observation.force[-1])  # at rest since 0.5 s
+    depth = depth_under(force, (0.02, 1.0), (0.9, 0.95, 0.001, 0.5, 2.0), seen.inertia, 1e-3)
+    assert depth == pytest.approx(seen.deepest, rel=0.02)
+    # and from masses alone, as where nothing met
+    ((_, _, setting),) = settings_among(case.model)
+    guessed = inertia_of(replace(case, observation=None), pair, setting)
+    assert guessed == pytest.approx(seen.inertia, rel=1e-6)
 
 
 def test_nothing_that_pushes_back_lets_a_force_sink_for_ever() -> None:

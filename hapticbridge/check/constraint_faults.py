@@ -21,6 +21,10 @@ FASTEST_CREEP, FASTEST_TURN = 1e-4, 1e-3
 """Creep in m/s and rad/s from which a friction does not hold: 1 mm in 10 s, 0.1 m off the axis. The
 shipped scenes' creep by at most a fifth of it; MuJoCo's default by about 5 mm/s at 5 N/kg."""
 
+LEAST_GIVE, LEAST_TURN = 1e-4, 1e-3
+"""How far in m and rad a limit must give under all that the device can push to count as soft: 0.1
+mm, on the axis or 0.1 m off it. A heavy arm's is stiff even by MuJoCo's default."""
+
 
 def constraint_faults(case: Case) -> Iterator[Fault]:
     """Yields limits, equality constraints and dry friction that are as soft as MuJoCo's default.
@@ -59,27 +63,24 @@ def _is_soft(case: Case, solref: Sequence[float], solimp: Sequence[float]) -> bo
 
 def _limits(case: Case) -> Iterator[Fault]:
     model = case.model
+    found = []
     for joint in np.flatnonzero(model.jnt_limited).tolist():
-        solref, solimp = model.jnt_solref[joint], model.jnt_solimp[joint]
-        if not _is_soft(case, solref, solimp):
-            continue
-        place, dof = case.places.joint(joint), int(model.jnt_dofadr[joint])
-        inertia = joint_inertia(model, case.scene.data, dof)
-        is_slide = model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE
-        yield Fault(
-            "soft limit",
-            place,
-            f"the limit of {place.element} {_depth_words(case, solref, solimp, inertia, is_slide)}",
-            f'solreflimit="{_reference(case)}" solimplimit="0.9 0.95 0.001"',
-        )
+        inertia = joint_inertia(model, case.scene.data, int(model.jnt_dofadr[joint]))
+        is_slide = bool(model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE)
+        solver = model.jnt_solref[joint], model.jnt_solimp[joint]
+        found.append((case.places.joint(joint), *solver, inertia, is_slide))
     for tendon in np.flatnonzero(model.tendon_limited).tolist():
-        solref, solimp = model.tendon_solref_lim[tendon], model.tendon_solimp_lim[tendon]
-        if _is_soft(case, solref, solimp):
-            place, inertia = case.places.tendon(tendon), 1.0 / model.tendon_invweight0[tendon]
+        solver = model.tendon_solref_lim[tendon], model.tendon_solimp_lim[tendon]
+        inertia = 1.0 / float(model.tendon_invweight0[tendon])
+        found.append((case.places.tendon(tendon), *solver, inertia, True))
+    for place, solref, solimp, inertia, is_slide in found:
+        if _is_soft(case, solref, solimp) and (
+            words := _depth_words(case, solref, solimp, inertia, is_slide)
+        ):
             yield Fault(
                 "soft limit",
                 place,
-                f"the limit of {place.element} {_depth_words(case, solref, solimp, inertia, True)}",
+                f"the limit of {place.element} {words}",
                 f'solreflimit="{_reference(case)}" solimplimit="0.9 0.95 0.001"',
             )
 
@@ -129,6 +130,8 @@ def _depth_words(
     step = float(case.model.opt.timestep)
     push = case.info.force_limit if is_slide else case.info.torque_limit
     depth = depth_under(push, solref, solimp, inertia, step)
+    if depth < (LEAST_GIVE if is_slide else LEAST_TURN):
+        return ""
     stiffness = constraint_stiffness(solref, solimp, inertia, step, depth)
     if is_slide:
         amount, deep = f"{number(stiffness)} N/m", f"{push:g} N push {length(depth)} through it"

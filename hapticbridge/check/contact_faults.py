@@ -24,6 +24,7 @@ stretches the coupling by nothing, and says nothing about what the contact must 
 MUJOCO_SOLREF = (0.02, 1.0)
 """What a geom has that says nothing."""
 
+_LEAST_FRICTION = float(mujoco.mjMINMU)
 _TYPICAL_INERTIA = 0.1  # kg; only of pairs of which neither side moves by itself
 
 
@@ -100,7 +101,9 @@ def _soft(
     """Says how deep a push sinks in, where the setting is soft or a clearance is less deep."""
     step = float(case.model.opt.timestep)
     depths = {
-        pair: depth_under(push, setting.solref, setting.solimp, inertia_of(case, pair), step)
+        pair: depth_under(
+            push, setting.solref, setting.solimp, inertia_of(case, pair, setting), step
+        )
         for pair in pairs
     }
     numbers = contact_numbers(setting.solref, setting.solimp, step)
@@ -111,7 +114,11 @@ def _soft(
         return None
     pair = max(tight or pairs, key=lambda each: depths[each])
     stiffness = constraint_stiffness(
-        setting.solref, setting.solimp, inertia_of(case, pair), step, depths[pair]
+        setting.solref,
+        setting.solimp,
+        inertia_of(case, pair, setting),
+        step,
+        depths[pair],
     )
     is_default = np.allclose(setting.solref, MUJOCO_SOLREF)
     default = "MuJoCo's default " if is_default else ""
@@ -125,14 +132,16 @@ def _soft(
     change = f'solref="{REFERENCE_STEPS * step:g} 1" solimp="0.9 0.95 0.001"'
     kind = "default contact" if is_default else "soft contact"
     place, also = _place(case, pair, is_soft=True)
+    if is_default and len(pairs) > 1:
+        also += f"; for all geoms at once: <geom {change}/> in <default>"
     return Fault(kind, place, sentence, change + also)
 
 
-def inertia_of(case: Case, pair: tuple[int, int]) -> float:
+def inertia_of(case: Case, pair: tuple[int, int], setting: ContactSetting) -> float:
     """Returns the inertia in kg that the contact of two geoms has, the least that was seen.
 
     Where they did not meet it is that of their centres at the start: 1/m = Σ 1/m_i, plus the
-    coupling's share h B + h² K at the tool.
+    coupling's share h B + h² K at the tool, with a pyramidal cone times that of its edges.
     """
     model = case.model
     seen = case.observation.meetings.get(pair) if case.observation else None
@@ -144,7 +153,21 @@ def inertia_of(case: Case, pair: tuple[int, int]) -> float:
     for geom in pair:
         inertia = body_inertia(model, case.scene.data, int(model.geom_bodyid[geom]))
         inverse += 1.0 / (inertia + (share if is_tool[geom] else 0.0))
-    return 1.0 / inverse if inverse > 0 else _TYPICAL_INERTIA
+    return _edges(model, setting) / inverse if inverse > 0 else _TYPICAL_INERTIA
+
+
+def _edges(model: mujoco.MjModel, setting: ContactSetting) -> float:
+    """Returns how many times as stiff as an elliptic cone's a pyramidal cone's edges are together.
+
+        (dim − 1)/(μ² (1 + μ²))
+
+    for the friction μ and a contact that is as heavy sideways as it is along its normal: 198 times
+    at μ = 0.1, once at μ = 1 and dim = 3. Measured with MuJoCo at rest, to 9 digits.
+    """
+    friction = max(setting.friction, _LEAST_FRICTION)
+    if model.opt.cone != mujoco.mjtCone.mjCONE_PYRAMIDAL or setting.condim == 1:
+        return 1.0
+    return (setting.condim - 1) / (friction**2 * (1 + friction**2))
 
 
 def _place(case: Case, pair: tuple[int, int], *, is_soft: bool) -> tuple[Place, str]:

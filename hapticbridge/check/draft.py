@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, replace
 
 import mujoco
@@ -88,15 +89,21 @@ class Draft:
 def name_everything(spec: mujoco.MjSpec) -> None:
     """Names bodies, joints and geoms that have no name, so that an edit can find them again.
 
-    An id would not do: it changes as soon as something before it is deleted.
+    An id would not do: it changes as soon as something before it is deleted. A joint or geom is
+    called after its body, so that a reader of its name knows which one it is.
     """
     for kind, elements in (("body", spec.bodies), ("joint", spec.joints), ("geom", spec.geoms)):
         taken = {element.name for element in elements}
         for number, element in enumerate(elements):
             if not element.name:
-                name = f"{kind}_{number}"
-                while name in taken:
-                    name += "_"
+                stem = f"{kind}_{number}" if kind == "body" else f"{element.parent.name}_{kind}"
+                name = (
+                    stem
+                    if stem not in taken
+                    else next(
+                        f"{stem}_{k}" for k in itertools.count(2) if f"{stem}_{k}" not in taken
+                    )
+                )
                 element.name = name
                 taken.add(name)
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import numpy as np
+
 from hapticbridge.check.places import Place
 
 
@@ -27,7 +29,9 @@ class Fault:
 
 def number(value: float) -> str:
     """Returns a number with three digits and no exponent: ``2500``, ``0.0375``."""
-    return f"{float(f'{value:.3g}'):.15g}" if math.isfinite(value) else "infinite"
+    if not math.isfinite(value):
+        return "infinite"
+    return np.format_float_positional(float(f"{value:.3g}"), trim="-")
 
 
 def length(value: float) -> str:

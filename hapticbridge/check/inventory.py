@@ -58,6 +58,7 @@ class Inventory:
         actuators: The scene's own.
         equalities: Equality constraints.
         tendons: Tendons.
+        flexes: Flexes; with one, what meets it is not told by geoms.
         idle: What cannot influence the grip.
     """
 
@@ -76,6 +77,7 @@ class Inventory:
     actuators: int
     equalities: int
     tendons: int
+    flexes: int
     idle: tuple[Idle, ...]
 
 
@@ -126,6 +128,7 @@ def take_inventory(
         actuators=sum(name not in COUPLING_ACTUATORS for name in names),
         equalities=int(model.neq),
         tendons=int(model.ntendon),
+        flexes=int(model.nflex),
         idle=_idle(model, tool, places, uses, met, "" if observation is None else " in the motion"),
     )
 
@@ -215,7 +218,7 @@ def _idle(
         group = int(tree[model.geom_bodyid[geom]])
         if use == VISUAL:
             idle.append(Idle(places.geom(geom), VISUAL))
-        elif geom not in touched and (group < 0 or group in reached):
+        elif not model.nflex and geom not in touched and (group < 0 or group in reached):
             still = "fixed and never met" if group < 0 else "never meets anything"
             idle.append(Idle(places.geom(geom), f"{still}{when}"))
     return tuple(idle)

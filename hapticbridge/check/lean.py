@@ -1,8 +1,8 @@
 """Finds what a scene models beyond need: what could go without the hand noticing.
 
-Each simplification is tried alone, then those that may go are taken together, the one that saves
-most first. The judge is always the scene as it was read: what the hand would feel of all changes
-together must stay under the budget.
+Each simplification is tried alone, then those that may go are taken together: the one that saves
+most first, but what another motion might miss after all others. The judge is always the scene as it
+was read: what the hand would feel of all changes together must stay under the budget.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from hapticbridge.check.observation import quiet
 from hapticbridge.check.shapes import shape_simplifications
 from hapticbridge.check.side_by_side import CostMeter, processor_costs
 from hapticbridge.check.simplifications import (
+    OTHER_MOTIONS,
     Simplification,
     contact_simplifications,
     rate_simplifications,
@@ -132,7 +133,8 @@ def _search(judge: Judge, simpler: list[Simplification], progress: Progress | No
     # what saves little of the whole may save much of what is left
     order = [pair for pair in alone if pair[1].verdict in (MAY_GO, SAVES_NOTHING)]
     order = [pair for pair in order if (pair[1].cost or 0.0) < 1.0 + judge.least_saving]
-    order.sort(key=lambda pair: pair[1].cost or 0.0)
+    # what only this motion does not need goes last: it may turn out not to be worth it
+    order.sort(key=lambda pair: (pair[0].loses == OTHER_MOTIONS, pair[1].cost or 0.0))
     best, share, together = judge.original, 1.0, []
     for k, (each, _) in enumerate(order):
         if progress is not None:
@@ -141,7 +143,10 @@ def _search(judge: Judge, simpler: list[Simplification], progress: Progress | No
         if found is not None and found[1].verdict == MAY_GO:
             best, share = found[0], found[1].cost or share
             together.append(found[1])
-    result = judge.judge("lean", "all that was taken", best)
+    result = judge.judge("lean", "all that was taken", best, is_last_word=True)
+    if together and result.verdict != MAY_GO:  # what was saved step by step was the machine's noise
+        best, together = judge.original, []
+        result = judge.judge("lean", "all that was taken", best)
     if not together:
         result = replace(result, cost=1.0)  # not measured against itself
     if progress is not None:

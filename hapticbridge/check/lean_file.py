@@ -10,6 +10,7 @@ import mujoco
 from hapticbridge.check.draft import Draft
 from hapticbridge.check.lean import Lean
 from hapticbridge.check.observation import quiet
+from hapticbridge.check.simplifications import OTHER_MOTIONS
 from hapticbridge.check.trial import Trial
 from hapticbridge.errors import SceneError
 from hapticbridge.scene import SceneSource, read_scene
@@ -21,13 +22,15 @@ def check_target(source: SceneSource, path: Path, *, overwrite: bool = False) ->
     """Checks that a leaner scene can be written, before anything is computed for it.
 
     Raises:
-        SceneError: The file's name does not end in .xml, it is a file of the scene itself, or it
-            exists and ``overwrite`` is not set.
+        SceneError: The file's name does not end in .xml, its folder does not exist, it is a file of
+            the scene itself, or it exists and ``overwrite`` is not set.
     """
     if path.suffix.lower() != ENDING:
         raise SceneError(f"cannot write the scene to '{path}': its name must end in {ENDING}")
     if path.resolve() in {file.resolve() for file in _files(source)}:
         raise SceneError(f"'{path}' is a file of the scene itself; choose another name")
+    if not path.absolute().parent.is_dir():
+        raise SceneError(f"cannot write the scene to '{path}': its folder does not exist")
     if path.exists() and not overwrite:
         raise SceneError(f"'{path}' exists; choose another file or add --overwrite")
 
@@ -66,7 +69,9 @@ def write_lean(lean: Lean, path: Path, *, overwrite: bool = False) -> Trial:
         raise SceneError(f"cannot write the scene to '{path}': {reason}") from None
     written = Draft(read_scene(path), lean.draft.grip, setting)
     with quiet():
-        return judge.judge("written", "the scene as it was read back from its file", written)
+        return judge.judge(
+            "written", "the scene as it was read back from its file", written, is_last_word=True
+        )
 
 
 def _files(source: SceneSource) -> list[Path]:
@@ -122,6 +127,8 @@ def _comment(lean: Lean, before: str) -> str:
         f"  and differs by {felt:.2g} just noticeable differences (allowed: {judge.budget:g}).",
         *(f"  Taken: {trial.name} ({trial.sentence})." for trial in lean.together),
     ]
+    if any(trial.loses == OTHER_MOTIONS for trial in lean.together):
+        lines.append("  Another motion may miss what this one did not need.")
     if setting != lean.judge.original.setting:
         lines.append(
             f"  To be run at {1 / setting.period:g} Hz with {setting.substeps} substep(s) a tick; "

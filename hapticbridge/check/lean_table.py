@@ -96,10 +96,13 @@ def check_table(path: Path, scenes: Iterable[Path]) -> None:
         scenes: MJCF files that are there, or will be.
 
     Raises:
-        SceneError: Its name does not end in .csv, or it would be taken for a scene's hand motion.
+        SceneError: Its name does not end in .csv, its folder does not exist, or it would be taken
+            for a scene's hand motion.
     """
     if path.suffix.lower() != ENDING:
         raise SceneError(f"cannot write the table to '{path}': its name must end in {ENDING}")
+    if not path.absolute().parent.is_dir():
+        raise SceneError(f"cannot write the table to '{path}': its folder does not exist")
     for scene in scenes:
         if path.resolve() == scene.with_suffix(ENDING).resolve():
             raise SceneError(

@@ -62,13 +62,17 @@ def _of_water(case: Case) -> Iterator[Fault]:
         first = (visual or those)[0]
         place, name = case.places.geom(first), case.places.body(body).element
         mass = float(model.body_mass[body])
-        made = "is made of water" if len(those) == 1 else "are made of water"
+        made = "has neither mass nor density and so is made of water"
+        mend = f'mass="{number(mass)}", or what it really weighs'
+        if len(those) > 1:
+            made = "have neither mass nor density and so are made of water"
+            mend = f'mass="…" in each, what it really weighs; now {weight(mass)} together'
         yield Fault(
             "visual geom with mass" if visual else "density of water",
             place,
-            f"{place.element}{others(len(those) - 1)} has neither mass nor density and so "
-            f"{made} ({WATER:g} kg/m³); {name} weighs {weight(mass)} with it",
-            'mass="0"' if visual else f'mass="{number(mass)}", or what it really weighs',
+            f"{place.element}{others(len(those) - 1)} {made} ({WATER:g} kg/m³); {name} "
+            f"weighs {weight(mass)} with it",
+            'mass="0"' if visual else mend,
         )
 
 

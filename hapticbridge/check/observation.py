@@ -172,7 +172,8 @@ def _note_contacts(
 
     with the depth −r, the velocity v, MuJoCo's k and b of the row, its impedance d at that depth,
     and 1/A the inertia that the contact really has. So f/r = k d/(R (1 + h b + h² k d)) is the
-    stiffness that it amounts to. With a pyramidal cone 2 (dim − 1) rows share the normal force.
+    stiffness that it amounts to. With a pyramidal cone 2 (dim − 1) rows share the normal force, and
+    together they are as stiff as one with that many times the inertia.
     """
     contacts, rows = data.contact, data.efc_type
     addresses, dims, depths = contacts.efc_address.tolist(), contacts.dim, (-contacts.dist).tolist()
@@ -195,7 +196,7 @@ def _note_contacts(
             spring *= impedance
             regular = float(data.efc_R[adr]) * (1.0 + step * damper + step**2 * spring)
             stiffness = count * spring / regular
-            inertia = (1.0 - impedance) / (impedance * regular)
+            inertia = count * (1.0 - impedance) / (impedance * regular)
             meeting.inertia = min(meeting.inertia, inertia)
             meeting.softest = min(meeting.softest, stiffness)
             meeting.stiffest = max(meeting.stiffest, stiffness)

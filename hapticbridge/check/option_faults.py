@@ -31,7 +31,7 @@ def option_faults(case: Case) -> Iterator[Fault]:
             places.option("integrator"),
             f"the scene has integrator {name}, under which a coupling is not passive; it runs "
             "under 'discrete'",
-            'integrator="discrete"',
+            places.option_change("integrator", "discrete"),
         )
     if option.solver != mujoco.mjtSolver.mjSOL_NEWTON:
         name = str(mujoco.mjtSolver(option.solver).name).removeprefix("mjSOL_")
@@ -39,15 +39,17 @@ def option_faults(case: Case) -> Iterator[Fault]:
             "solver",
             places.option("solver"),
             f"the scene has solver {name}; it runs with Newton's",
-            'solver="Newton"',
+            places.option_change("solver", "Newton"),
         )
     if not option.enableflags & mujoco.mjtEnableBit.mjENBL_DIAGEXACT:
         yield Fault(
             "diagexact",
-            places.option("diagexact"),
+            places.flag(),
             "flag diagexact is not set; it runs with it, because contacts that share a body "
             "create energy without",
-            '<flag diagexact="enable"/> in <option>',
+            'diagexact="enable"'
+            if places.flag().element == "<flag>"
+            else '<flag diagexact="enable"/> in <option>',
         )
     step = float(option.timestep)
     if not case.is_rate_given and abs(step - case.period) > _SAME_STEP * case.period:
@@ -56,7 +58,8 @@ def option_faults(case: Case) -> Iterator[Fault]:
             places.option("timestep"),
             f"the scene has a time step of {1e3 * step:g} ms; it runs at {1e3 * case.period:g} ms, "
             f"one step per tick at {1 / case.period:g} Hz, and its contacts change with it",
-            f'timestep="{case.period:g}", or check with --rate {1 / step:g}',
+            f"{places.option_change('timestep', f'{case.period:g}')}, or check with --rate "
+            f"{1 / step:g}",
         )
     told = [*case.source.concerns, *check_model(case.model, case.scene.grip)]
     for concern in told:

@@ -108,6 +108,16 @@ class Places:
             or Place(self._main, 0, "<option>")
         )
 
+    def option_change(self, attribute: str, value: str) -> str:
+        """Returns what to write at ``option(attribute)``; a scene need not have an <option>."""
+        written = f'{attribute}="{value}"'
+        is_missing = self.option(attribute).element == "<mujoco>"
+        return f"<option {written}/> in <mujoco>" if is_missing else written
+
+    def flag(self) -> Place:
+        """Returns where flags are set: MuJoCo takes one <flag> per <option>."""
+        return self._first(("flag",), lambda _: True) or self.option("flag")
+
     def with_attribute(self, attribute: str) -> Place | None:
         """Returns the first element that has an attribute, of whatever tag."""
         for file, elements in self._files:

@@ -38,7 +38,7 @@ class Witness:
 
     Attributes:
         possible: Pairs of geoms that may collide by MuJoCo's filters.
-        near: Those that met or came nearer than ``CLEARANCE``.
+        near: Those that met or came nearer than ``CLEARANCE``; with a flex each geom by itself too.
         travel: By joint, its way from the start: values in m and rad, shape (looks, 1); for a ball
             rotation vectors (looks, 3); for a free joint displacements in m and rotation vectors in
             the world frame (looks, 6).
@@ -80,6 +80,8 @@ def witness(draft: Draft, motion: Motion) -> Witness:
     pairs = np.array([pair[:2] for pair in meeting_pairs(model)], np.intp).reshape(-1, 2)
     names = [model.geom(g).name for g in range(model.ngeom)]
     seen.possible = {frozenset((names[a], names[b])) for a, b in pairs}
+    if model.nflex:  # how near a flex is to a geom nobody measures: all count as near to one
+        seen.near |= {frozenset((name,)) for name in names}
     looks: dict[str, list[NDArray[np.float64]]] = {name: [] for name in seen.start}
     every = max(1, round(LOOK_EVERY / setting.period))
     for k in range(samples.size):

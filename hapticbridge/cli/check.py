@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 from matplotlib.figure import Figure
-from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from hapticbridge.certificate import default_coupling
 from hapticbridge.check.case import DEFAULT_PERIOD, LARGEST_WORKSPACE, Case, open_case
@@ -27,7 +24,7 @@ from hapticbridge.check.rules import find_faults
 from hapticbridge.check.trial import MAY_GO, SAVES_NOTHING, Trial
 from hapticbridge.cli.check_lean import look_for_lean, print_lean, print_written
 from hapticbridge.cli.check_words import print_case, print_cost, print_faults, print_inventory
-from hapticbridge.cli.terminal import err, plain, print_json
+from hapticbridge.cli.terminal import err, plain, print_json, progress
 from hapticbridge.clock import period_of
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import SimulatedDevice
@@ -97,7 +94,7 @@ class Check:
                 self.table, [path for path in (source.path, self.write) if path is not None]
             )
         period = None if self.rate is None else period_of(self.rate)
-        with _progress("leading it through its motion") as show:
+        with progress("leading it through its motion") as show:
             case = open_case(
                 source,
                 self.grip,
@@ -111,7 +108,7 @@ class Check:
         inventory = take_inventory(case.model, self.grip, case.places, case.observation)
         faults, cost = find_faults(case), None
         if case.observation is not None:
-            with _progress("timing it") as show, quiet():
+            with progress("timing it") as show, quiet():
                 cost = measure_cost(
                     case.scene, case.samples, case.coupling, case.period, progress=show
                 )
@@ -164,18 +161,6 @@ class Check:
         if self.damping is not None:
             coupling = replace(coupling, damping=self.damping)
         return coupling
-
-
-@contextmanager
-def _progress(words: str) -> Iterator[Callable[[int, int], None]]:
-    columns = TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn()
-    with Progress(*columns, console=err, transient=True) as bar:
-        task = bar.add_task(words, total=None)
-
-        def show(done: int, total: int) -> None:
-            bar.update(task, completed=done, total=total)
-
-        yield show
 
 
 def _picture(case: Case, cost: Cost | None, lean: Lean | None) -> Figure | None:

@@ -5,16 +5,17 @@ from __future__ import annotations
 import shlex
 from pathlib import Path
 
-from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
-
 from hapticbridge.check.case import Case
 from hapticbridge.check.draft import Setting
 from hapticbridge.check.lean import Lean, find_lean
+from hapticbridge.check.simplifications import OTHER_MOTIONS
 from hapticbridge.check.trial import MAY_GO, Trial
-from hapticbridge.cli.terminal import err, out, plain, quantity
+from hapticbridge.cli.terminal import err, out, plain, progress, quantity
 
 _HEADINGS = ("alone", "cost", "JND", "force, RMS", "peak", "torque, RMS", "tool off by")
 """Of the table; JND: felt error in just noticeable differences."""
+
+_ROUNDING = 1e-9  # N and N m; what is below is how the computer adds
 
 
 def look_for_lean(case: Case, budget: float) -> Lean:
@@ -23,13 +24,7 @@ def look_for_lean(case: Case, budget: float) -> Lean:
     Raises:
         SceneError: The scene cannot be run as it is, or the budget is out of range.
     """
-    columns = TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn()
-    with Progress(*columns, console=err, transient=True) as bar:
-        task = bar.add_task("leaner", total=None)
-
-        def show(done: int, total: int, name: str) -> None:
-            bar.update(task, completed=done, total=total, description=f"leaner: {plain(name)}")
-
+    with progress("leaner") as show:
         damping = case.info.damping or 0.0
         return find_lean(
             case.source,
@@ -65,6 +60,11 @@ def print_lean(lean: Lean) -> None:
     if not lean.together:
         out.print("  [green]nothing may go: the scene is lean[/]")
         return
+    if any(trial.loses == OTHER_MOTIONS for trial in lean.together):
+        out.print(
+            "  [yellow]another motion may miss what this one did not need[/]: judge it by one that "
+            "does all that the hand will do"
+        )
     setting = lean.draft.setting
     if setting != judge.original.setting:
         out.print(
@@ -107,8 +107,13 @@ def _numbers(trial: Trial) -> list[str]:
         trial.name,
         f"{100 * trial.cost:.0f} %",
         f"{felt.felt:.3f}",
-        quantity(felt.force_rms, "N"),
-        quantity(felt.force_peak, "N"),
-        quantity(felt.torque_rms, "N m"),
+        *(
+            quantity(0.0 if value < _ROUNDING else value, unit)
+            for value, unit in (
+                (felt.force_rms, "N"),
+                (felt.force_peak, "N"),
+                (felt.torque_rms, "N m"),
+            )
+        ),
         f"{1e6 * felt.position_peak:.0f} µm",
     ]

@@ -3,22 +3,25 @@
 from __future__ import annotations
 
 import math
+import re
 import textwrap
+from collections import Counter
 
 import numpy as np
 from rich.table import Table
 
 from hapticbridge.check.case import Case
 from hapticbridge.check.cost import TICK_SHARE, Cost
-from hapticbridge.check.faults import Fault
+from hapticbridge.check.faults import Fault, length
 from hapticbridge.check.growth import Growth, Spread
-from hapticbridge.check.inventory import Inventory
+from hapticbridge.check.inventory import MEETS_TOOL, Inventory
 from hapticbridge.cli.terminal import out, plain
 
 MOST_NAMED = 4
 """How many things of a kind are named before the rest is counted."""
 
 _SHOWN = 0.01  # s/s; a stage that takes less of the tick is left out
+_GLUE = "\x00"  # in place of a space at which a line is not to end
 _WIDTH = 96  # letters of a line of text below a fault
 
 
@@ -56,9 +59,15 @@ def print_inventory(inventory: Inventory) -> None:
     if inventory.stiffness is not None:
         least, most = (f"{1e-3 * stiffness:.3g}" for stiffness in inventory.stiffness)
         lines["contact stiffness"] = (
-            f"{least} to {most} kN/m at the tool, which sank in by {1e6 * inventory.deepest:.3g} µm"
+            f"{least} to {most} kN/m at the tool, which sank in by {length(inventory.deepest)}"
         )
-    for kind in ("actuators", "equalities", "tendons"):
+    is_met = inventory.rows is None or inventory.geoms[MEETS_TOOL] > 0
+    if inventory.possible_pairs and not inventory.flexes and not is_met:
+        lines["contact"] = (
+            "the tool touches nothing in this motion, so what contact costs is unknown;\n"
+            f"{'':23}lead it to where it does: --motion hand.csv (t,x,y,z in s and m)"
+        )
+    for kind in ("actuators", "equalities", "tendons", "flexes"):
         if count := getattr(inventory, kind):
             lines[kind] = str(count)
     for name, words in lines.items():
@@ -103,13 +112,22 @@ def print_faults(faults: tuple[Fault, ...]) -> None:
         out.print("\n[bold]What is wrong[/]\n  [green]nothing found[/]")
         return
     out.print(f"\n[bold]What is wrong[/]: [yellow]{len(faults)} found[/]")
+    seen: Counter[str] = Counter()
     for number, fault in enumerate(faults, 1):
+        seen[fault.kind] += 1
+        if seen[fault.kind] > MOST_NAMED:
+            continue
         out.print(
             f"  {number:>2} [yellow]{plain(fault.kind)}[/]  {plain(str(fault.place))}",
         )
-        for line in textwrap.wrap(fault.sentence, _WIDTH):
-            out.print(f"     {plain(line)}")
+        # what stands in quotes is to be copied: it stays on one line
+        whole = re.sub(r'"[^"]*"', lambda quoted: quoted[0].replace(" ", _GLUE), fault.sentence)
+        for line in textwrap.wrap(whole, _WIDTH):
+            out.print(f"     {plain(line.replace(_GLUE, ' '))}")
         out.print(f"     [green]write:[/] {plain(fault.change)}")
+    for kind, count in seen.items():
+        if count > MOST_NAMED:
+            out.print(f"  and {count - MOST_NAMED} more of '{plain(kind)}': --json lists all")
 
 
 def _medians(cost: Cost) -> tuple[float, float]:

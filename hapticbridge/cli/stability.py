@@ -66,7 +66,7 @@ class Stability:
             TextColumn("{task.completed}/{task.total}"),
             TimeRemainingColumn(),
         )
-        with Progress(*columns, console=err, transient=True) as bar:
+        with Progress(*columns, console=err, transient=True, disable=not err.is_terminal) as bar:
             task = bar.add_task(f"map {each.name}", total=None)
 
             def show(done: int, total: int) -> None:

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
 from rich.console import Console
 from rich.markup import escape
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 out = Console(highlight=False, soft_wrap=True)
 """Results, on stdout."""
@@ -28,6 +31,27 @@ def plain(text: str) -> str:
 def print_error(error: Exception) -> None:
     """Prints what went wrong on stderr, in one line."""
     err.print(f"[red]error:[/red] {plain(' '.join(str(error).splitlines()))}")
+
+
+@contextmanager
+def progress(words: str) -> Iterator[Callable[..., None]]:
+    """Shows a bar on stderr while something runs; yields what tells it how far it is.
+
+    That takes what is done, what there is to do, and, where it changes, what is being done. Where
+    nobody looks there is no bar: rich would leave an empty line of it in a file.
+
+    Args:
+        words: What runs.
+    """
+    columns = TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn()
+    with Progress(*columns, console=err, transient=True, disable=not err.is_terminal) as bar:
+        task = bar.add_task(words, total=None)
+
+        def show(done: int, total: int, name: str = "") -> None:
+            told = f"{words}: {plain(name)}" if name else words
+            bar.update(task, completed=done, total=total, description=told)
+
+        yield show
 
 
 def print_json(facts: object) -> None:

@@ -69,34 +69,54 @@ def check_options(spec: mujoco.MjSpec) -> list[str]:
 
 
 _MASSES = ("mass", "density", "diaginertia", "fullinertia")
+_FREE_TEXT = ("text", "numeric")  # <custom>: nobody computes with it
 
 
 def check_numbers(sources: Iterable[SourceFile]) -> None:
-    """Refuses masses and inertias that are not finite where they are written.
+    """Refuses nan wherever it is written, and masses and inertias that are not finite.
 
-    MuJoCo takes ``mass="nan"`` for a mass that was not given, and computes one.
+    MuJoCo takes ``mass="nan"`` for a mass that was not given, and computes one; elsewhere it warns,
+    and what a nan reaches stands still or ends the run.
 
     Raises:
         SceneError: Names the file, the line, the element and the value.
     """
-    for source in sources:
-        if not source.name.lower().endswith(".xml"):
-            continue
-        for element in read_elements(source.data):
-            for attribute in _MASSES:
-                value = element.attributes.get(attribute, "")
-                if not all(_is_finite(word) for word in value.split()):
-                    raise SceneError(
-                        f"{source.name}, line {element.line}: {attribute} of <{element.tag}> is "
-                        f"'{value}'; masses and inertias must be finite"
-                    )
+    files = [
+        (source.name, list(read_elements(source.data)))
+        for source in sources
+        if source.name.lower().endswith(".xml")
+    ]
+    names = {
+        element.attributes.get(key)
+        for _, elements in files
+        for element in elements
+        for key in ("name", "class")
+    }
+    for file, elements in files:
+        for element in elements:
+            for attribute, value in element.attributes.items():
+                numbers = [_number(word) for word in value.split()]
+                if attribute in _MASSES and not all(map(math.isfinite, numbers)):
+                    must = "masses and inertias must be finite"
+                elif (
+                    any(map(math.isnan, numbers))
+                    and value not in names
+                    and element.tag not in _FREE_TEXT
+                ):
+                    must = "write a number"
+                else:
+                    continue
+                raise SceneError(
+                    f"{file}, line {element.line}: {attribute} of <{element.tag}> is '{value}'; "
+                    f"{must}"
+                )
 
 
-def _is_finite(word: str) -> bool:
+def _number(word: str) -> float:
     try:
-        return math.isfinite(float(word))
+        return float(word)
     except ValueError:
-        return True  # MuJoCo says better what is wrong with it
+        return 0.0  # no number, and MuJoCo says better what is wrong with it
 
 
 def check_model(model: mujoco.MjModel, grip: str) -> list[str]:
