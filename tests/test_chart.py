@@ -67,6 +67,34 @@ def test_cheapest_sound_point_is_recommended_and_the_more_accurate_of_equal_cost
     assert recommended([cheap, dear]) is cheap
 
 
+def test_points_whose_spreads_meet_cost_alike_whichever_is_disturbed() -> None:
+    calm, disturbed = made_up(0.0100, 0.9), made_up(0.0110, 0.3, method="lossless", spread=0.1)
+    assert recommended([calm, disturbed]) is disturbed
+    apart = made_up(0.0110, 0.3, method="lossless", spread=0.05)
+    assert recommended([calm, apart]) is calm
+
+
+def test_better_point_that_is_not_taken_is_named_with_the_reason() -> None:
+    best = made_up(0.010, 0.6)
+    kicks = made_up(0.009, 0.2, method="explicit")
+    text = recommendation([best, kicks], "a machine")
+    assert "use implicit, 1 ms" in text
+    assert "explicit, 1 ms would cost no more and err less (0.2 JND), but it may kick" in text
+    for no_better in (
+        made_up(0.020, 0.2, method="explicit"),
+        made_up(0.009, 0.595, method="explicit"),
+        made_up(0.009, 0.7, method="explicit"),
+        made_up(0.009, 0.2, method="explicit", period=4e-3),
+    ):
+        assert "explicit" not in recommendation([best, no_better], "a machine")
+
+
+def test_recommendation_says_where_its_error_is_not_counted_from_the_truth() -> None:
+    point = made_up(0.01, 0.2)
+    assert "not from the truth" in recommendation([point], "a machine", is_truth=False)
+    assert "not from the truth" not in recommendation([point], "a machine", is_truth=True)
+
+
 def test_usual_contact_is_recommended_where_errors_are_alike() -> None:
     odd = made_up(0.0100, 0.300, contact="2 steps", spread=0.1)
     usual = made_up(0.0101, 0.301)

@@ -124,3 +124,14 @@ def test_work_into_a_file_is_refused(tmp_path: Path, capsys: pytest.CaptureFixtu
     taken.write_text("", encoding="utf-8")
     assert main(["chart", "work", "--out", str(taken)]) == 2
     assert "is a file; name a folder" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "option", [["--methods", "implicit"], ["--steps", "1"], ["--engines", "all"]]
+)
+def test_work_refuses_what_it_would_not_heed(
+    option: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["chart", "work", *option, "--out", str(tmp_path)]) == 2
+    assert "it takes neither --methods nor" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())

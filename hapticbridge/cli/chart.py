@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import tyro
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from hapticbridge.cli.terminal import err, out, plain
+from hapticbridge.cli.terminal import err, out, plain, print_json, progress
+from hapticbridge.errors import StudyError
 from hapticbridge.study.chart import (
     ChartFiles,
     Extent,
@@ -28,6 +25,7 @@ from hapticbridge.study.chart import (
 from hapticbridge.study.chart.work import measure_work
 from hapticbridge.study.chart.work_files import write_work
 from hapticbridge.study.engines.library import available_engines, open_engine
+from hapticbridge.study.engines.prints import caught_prints
 
 ALL = "all"
 
@@ -68,6 +66,11 @@ class ChartCommand:
     def execute(self) -> int:
         """Measures the chart; returns the exit code."""
         if self.scene == WORK:
+            if self.methods is not None or self.steps is not None or self.engines:
+                raise StudyError(
+                    f"'{WORK}' has scenes and settings of its own; it takes neither --methods nor "
+                    "--steps nor --engines"
+                )
             return self._execute_work()
         periods = chosen_periods(self.steps, is_quick=self.quick)
         methods = chosen_methods(self.methods)
@@ -75,8 +78,8 @@ class ChartCommand:
             workload = open_workload(self.scene, Extent(periods[0], periods[-1]))
         paths = prepared_files(self.out, workload.name)
         settings = settings_for(methods, periods, has_contact=workload.has_contact)
-        settings += peer_settings(self._peers(), periods)
-        with _progress(f"chart {workload.name}") as show:
+        with caught_prints(_tell), progress(f"chart {workload.name}") as show:
+            settings += peer_settings(self._peers(), periods)
             chart = measure_chart(
                 workload,
                 settings,
@@ -85,18 +88,18 @@ class ChartCommand:
             )
         files = write_chart(chart, paths)
         if self.as_json:
-            out.print_json(json.dumps(files.said))
+            print_json(files.said)
         else:
             _print(files)
         return 0
 
     def _execute_work(self) -> int:
         prepared_files(self.out, WORK)
-        with _progress(f"chart {WORK}") as show:
+        with progress(f"chart {WORK}") as show:
             chart = measure_work(most=QUICK_SIZE if self.quick else None, progress=show)
         paths, said = write_work(chart, self.out)
         if self.as_json:
-            out.print_json(json.dumps(said))
+            print_json(said)
         else:
             out.print(plain(said["paragraph"]))
         err.print("wrote " + ", ".join(plain(str(path)) for path in paths.values()))
@@ -114,22 +117,8 @@ class ChartCommand:
         return list(self.engines)
 
 
-@contextmanager
-def _progress(name: str) -> Iterator[Callable[[int, int], None]]:
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TextColumn("{task.completed}/{task.total}"),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=err, transient=True) as bar:
-        task = bar.add_task(name, total=None)
-
-        def show(done: int, total: int) -> None:
-            bar.update(task, completed=done, total=total)
-
-        yield show
+def _tell(line: str) -> None:
+    err.print(f"[dim]{plain(line)}[/]")
 
 
 def _print(files: ChartFiles) -> None:

@@ -108,6 +108,9 @@ def _draw_panel(axes: Axes, chart: Chart, panel: Panel, colours: dict[str, str])
     title = f"{panel.title}\n{kind} {panel.reference}"
     axes.set_title(_wrapped(title), fontsize="small", parse_math=False)
     axes.grid(visible=True, which="major", alpha=0.3)
+    if not all(each.is_usual for each in points):
+        told = "small: substeps, contacts, solver"
+        axes.plot([], [], "o", color="grey", ms=3.5, label=told)
     for verdict in dict.fromkeys(each.score.verdict for each in points):
         mark, is_filled, told = MARKS[verdict]
         axes.plot(

@@ -112,7 +112,9 @@ def summary_of(chart: Chart) -> dict[str, Any]:
             "title": panel.title,
             "reference": panel.reference,
             "reference_is_truth": panel.is_truth,
-            "recommendation": recommendation(chart.of(panel), chart.machine),
+            "recommendation": recommendation(
+                chart.of(panel), chart.machine, is_truth=panel.is_truth
+            ),
             "front": [each.setting.label for each in chart.front(panel)],
             "convergence_orders": chart.orders(panel),
         }

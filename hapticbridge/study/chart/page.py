@@ -152,7 +152,7 @@ def panel_page(chart: Chart, panel: Panel) -> PanelPage:
         across=across.ticks(),
         upwards=upwards.ticks(),
         jnd=upwards.at(JND),
-        recommendation=recommendation(points, chart.machine),
+        recommendation=recommendation(points, chart.machine, is_truth=panel.is_truth),
         front=[
             {
                 "setting": each.setting.label,

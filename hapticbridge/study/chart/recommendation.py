@@ -30,31 +30,35 @@ def recommended(points: Sequence[Measurement]) -> Measurement | None:
 
     Of the points at ``RATE`` or above, with an error below ``JND`` here and at every smaller step,
     a passive environment, a solver that runs to its tolerance, at most ``SHARE`` of a core and no
-    hazard on a real device (``Method.hazard``): the cheapest; where the costs of several lie within
-    its spread, the most accurate of these; and where errors are the same within ``ALIKE``, one with
-    the usual contacts.
+    hazard on a real device (``Method.hazard``): the cheapest; of those whose spread of cost meets
+    its own, the most accurate; and where errors are the same within ``ALIKE``, one with the
+    usual contacts.
     """
     fit = [each for each in points if _is_fast(each) and not _objections(each, points)]
     if not fit:
         return None
     cheapest = min(fit, key=lambda each: each.cost.median)
-    alike = [each for each in fit if each.cost.median <= cheapest.cost.high]
+    alike = [each for each in fit if each.cost.low <= cheapest.cost.high]
     least = min(each.score.felt for each in alike)
     best = [each for each in alike if each.score.felt <= (1 + ALIKE) * least]
     return min(best, key=lambda each: (not each.is_usual, each.score.felt, each.cost.median))
 
 
-def recommendation(points: Sequence[Measurement], machine: str) -> str:
-    """Says what to use, or which point is nearest and what is wrong with it.
+def recommendation(points: Sequence[Measurement], machine: str, *, is_truth: bool = True) -> str:
+    """Says what to use and why nothing better, or which point is nearest and what is wrong with it.
 
     Args:
         points: Of one panel.
         machine: In words.
+        is_truth: Whether errors are counted from the truth (``Panel.is_truth``); if not, it says
+            that they are only the distance from each method's own limit.
     """
     best = recommended(points)
     goal = f"For {RATE / 1000:g} kHz on this machine ({machine}) and an error below one JND"
+    if not is_truth:
+        goal += " (counted from the method's own limit at small steps, not from the truth)"
     if best is not None:
-        return f"{goal}, use {best.setting.label}: {_numbers(best)}."
+        return f"{goal}, use {best.setting.label}: {_numbers(best)}.{_passed_over(best, points)}"
     fast = [each for each in points if _is_fast(each) and np.isfinite(each.score.felt)]
     if not fast:
         return f"{goal}, nothing was tried that runs at this rate."
@@ -103,6 +107,25 @@ def _objections(each: Measurement, points: Sequence[Measurement]) -> list[str]:
     if each.setting.method.hazard:
         found.append("it may kick on a real device")
     return found
+
+
+def _passed_over(best: Measurement, points: Sequence[Measurement]) -> str:
+    """Says why the most accurate of the points that cost no more and err less was not taken."""
+    better = [
+        each
+        for each in points
+        if _is_fast(each)
+        and each.cost.median <= best.cost.median
+        and (1 + ALIKE) * each.score.felt < best.score.felt
+        and _objections(each, points)
+    ]
+    if not better:
+        return ""
+    other = min(better, key=lambda each: each.score.felt)
+    return (
+        f" {other.setting.label} would cost no more and err less ({other.score.felt:.2g} JND), but "
+        f"{' and '.join(_objections(other, points))}."
+    )
 
 
 def _numbers(each: Measurement) -> str:

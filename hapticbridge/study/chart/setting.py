@@ -75,7 +75,8 @@ class Setting:
         if self.contact != SHIPPED:
             parts.append(f"contact: {self.contact}")
         if self.iterations is not None:
-            parts.append(f"{self.iterations} solver iterations")
+            plural = "" if self.iterations == 1 else "s"
+            parts.append(f"{self.iterations} solver iteration{plural}")
         return ", ".join(parts)
 
 

@@ -1,0 +1,48 @@
+"""What engines print: it is caught below Python, told once, and stdout is itself again."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+from pathlib import Path
+
+import pytest
+
+from hapticbridge.study.engines.prints import caught_prints
+
+
+def test_prints_of_c_are_told_once_and_kept_from_stdout(
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    told: list[str] = []
+    with caught_prints(told.append):
+        ctypes.CDLL(None).puts(b"switched solver")
+        ctypes.CDLL(None).puts(b"switched solver")
+        os.write(1, b"\xff raw\n\n")
+    ctypes.CDLL(None).puts(b"after")
+    ctypes.CDLL(None).fflush(None)
+    assert sorted(told) == ["switched solver", "\ufffd raw"]
+    assert capfd.readouterr().out == "after\n"
+
+
+def test_what_was_printed_before_stays_on_stdout(capfd: pytest.CaptureFixture[str]) -> None:
+    told: list[str] = []
+    ctypes.CDLL(None).puts(b"before")
+    with caught_prints(told.append):
+        pass
+    assert capfd.readouterr().out == "before\n"
+    assert told == []
+
+
+def test_stdout_is_itself_again_after_an_error_and_what_was_printed_is_told(
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    told: list[str] = []
+    descriptors = len(list(Path("/dev/fd").iterdir()))
+    with pytest.raises(ZeroDivisionError), caught_prints(told.append):
+        os.write(1, b"last words\n")
+        raise ZeroDivisionError
+    os.write(1, b"after\n")
+    assert told == ["last words"]
+    assert capfd.readouterr().out == "after\n"
+    assert len(list(Path("/dev/fd").iterdir())) == descriptors
