@@ -286,6 +286,25 @@ def test_folder_that_is_a_file_is_refused_before_anything_is_measured(
     assert "is a file; name a folder" in capsys.readouterr().err
 
 
+def test_hand_path_beside_a_scene_is_never_overwritten(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scene, hand_path = tmp_path / "mine.xml", tmp_path / "mine.csv"
+    scene.write_text(
+        '<mujoco><worldbody><body><freejoint/><geom size=".02" mass=".1"/>'
+        '<site name="grip"/></body></worldbody></mujoco>',
+        encoding="utf-8",
+    )
+    hand_path.write_text("t,x,y,z\n0,0,0,0\n0.2,0,0,0.01\n", encoding="utf-8")
+    before = hand_path.read_bytes()
+    arguments = ["chart", str(scene), "--methods", "implicit", "--steps", "4", "--quick", "--out"]
+    assert main([*arguments, str(tmp_path)]) == 2
+    assert "would be overwritten; name another folder" in capsys.readouterr().err
+    assert hand_path.read_bytes() == before
+    assert main([*arguments, str(tmp_path / "charts")]) == 0
+    assert (tmp_path / "charts" / "mine.csv").exists()
+
+
 def test_command_draws_a_chart(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arguments = ["chart", "point_mass", "--methods", "implicit", "lossless", "--steps", "4", "1"]
     assert main([*arguments, "--quick", "--out", str(tmp_path)]) == 0

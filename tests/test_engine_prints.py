@@ -10,11 +10,17 @@ import pytest
 
 from hapticbridge.study.engines.prints import caught_prints
 
+BUFFER = ctypes.create_string_buffer(4096)
+"""C's stdout keeps it as long as the process lives."""
+
 
 def test_prints_of_c_are_told_once_and_kept_from_stdout(
     capfd: pytest.CaptureFixture[str],
 ) -> None:
     told: list[str] = []
+    libc = ctypes.CDLL(None)
+    # as where stdout is a pipe: C writes when its memory is full (_IOFBF), or when it is told to
+    libc.setvbuf(ctypes.c_void_p.in_dll(libc, "stdout"), BUFFER, 0, len(BUFFER))
     with caught_prints(told.append):
         ctypes.CDLL(None).puts(b"switched solver")
         ctypes.CDLL(None).puts(b"switched solver")

@@ -39,8 +39,13 @@ def prepared_files(folder: Path, name: str) -> dict[str, Path]:
     """Makes the folder and proves that every file can be written, before anything is computed.
 
     Raises:
-        StudyError: It cannot.
+        StudyError: It cannot, or a scene of this name lies there, whose hand path is ``NAME.csv``.
     """
+    if (folder / f"{name}.xml").exists():
+        raise StudyError(
+            f"'{folder}' holds the scene {name}.xml, and its hand path {name}.csv would be "
+            "overwritten; name another folder"
+        )
     paths = {ending: folder / f"{name}.{ending}" for ending in ENDINGS}
     try:
         folder.mkdir(parents=True, exist_ok=True)
