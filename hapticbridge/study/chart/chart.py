@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 
-import mujoco
 import numpy as np
 
+from hapticbridge.check.observation import quiet
 from hapticbridge.errors import HapticBridgeError, StudyError
 from hapticbridge.study.chart.engine_run import EngineRun, PeerWork
 from hapticbridge.study.chart.front import pareto_front
@@ -126,7 +125,8 @@ def measure_chart(
     runs: list[tuple[Setting, Run, dict[str, Score]]] = []
     skipped: dict[str, str] = {}
     peer_work = cache(workload.peer_work)
-    with _silent_mujoco(), one_core() as core:
+    # the chart tells of every run that diverges; MuJoCo need not
+    with quiet(), one_core() as core:
         for index, setting in enumerate(settings):
             tell(index)
             try:
@@ -189,14 +189,3 @@ def _notes(workload: Workload) -> Iterator[str]:
             f"{listed}. Limits that agree are those of one model; a limit far away is another "
             "model's, however well its method converges."
         )
-
-
-@contextmanager
-def _silent_mujoco() -> Iterator[None]:
-    """Keeps MuJoCo from telling of every run that diverges: the chart does."""
-    before = mujoco.get_mju_user_warning()
-    mujoco.set_mju_user_warning(lambda _message: None)
-    try:
-        yield
-    finally:
-        mujoco.set_mju_user_warning(before)
