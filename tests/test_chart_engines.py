@@ -120,3 +120,26 @@ def test_engines_are_not_divided_into_substeps() -> None:
     setting = Setting(METHODS["explicit"], FINE, substeps=2)
     with pytest.raises(StudyError, match="not divided into substeps"):
         EngineRun(open_engine("mujoco"), work, setting)
+
+
+class Broken(Altered):
+    """An engine whose library raises what this project does not know."""
+
+    name = "broken"
+
+    def open(self, task: Task, timestep: float) -> Simulation:
+        """Fails at 1 ms, as a solver that finds no step."""
+        if timestep == FINE:
+            raise RuntimeError("no convergence")
+        return super().open(task, timestep)
+
+
+def test_engine_that_fails_at_one_step_is_named_and_ends_no_chart(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(chart_module, "open_engine", lambda _name: Broken(1.0))
+    settings = peer_settings(["broken"], [GRID, FINE])
+    chart = measure_chart(workload("point_mass"), settings, repeats=1)
+    said = "engine 'broken' failed at 1 ms: RuntimeError: no convergence"
+    assert chart.skipped == {"broken": said}
+    assert [each.setting.period for each in chart.measurements] == [GRID]

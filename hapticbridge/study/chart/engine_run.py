@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Motion
-from hapticbridge.errors import StudyError
+from hapticbridge.errors import HapticBridgeError, StudyError
 from hapticbridge.rendering import METHODS
 from hapticbridge.scene import Scene
 from hapticbridge.study.chart.scene_run import Judge, Path, Take
@@ -109,12 +109,25 @@ class EngineRun:
             simulation.close()
 
     def scores(self) -> Mapping[str, Score]:
-        """Runs it once more with every tick written down, and judges it."""
-        simulation = self._engine.open(self._work.task, self._setting.period)
+        """Runs it once more with every tick written down, and judges it.
+
+        Raises:
+            HapticBridgeError: The engine refuses the task, or fails.
+        """
         try:
-            take = self._take(simulation)
-        finally:
-            simulation.close()
+            simulation = self._engine.open(self._work.task, self._setting.period)
+            try:
+                take = self._take(simulation)
+            finally:
+                simulation.close()
+        except HapticBridgeError:
+            raise
+        except Exception as error:
+            # a foreign library raises what it likes; one engine's failure must not end the chart
+            raise StudyError(
+                f"engine '{self._engine.name}' failed at {1e3 * self._setting.period:g} ms: "
+                f"{type(error).__name__}: {error}"
+            ) from error
         # a run that diverged is timed as far as it came
         self._ticks = max(1, take.records.size)
         self.seconds = self._ticks * self._setting.period
