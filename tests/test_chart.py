@@ -87,6 +87,8 @@ def test_better_point_that_is_not_taken_is_named_with_the_reason() -> None:
         made_up(0.009, 0.2, method="explicit", period=4e-3),
     ):
         assert "explicit" not in recommendation([best, no_better], "a machine")
+    other_law = made_up(0.001, 0.0, method="direct")
+    assert "direct" not in recommendation([best, other_law], "a machine")
 
 
 def test_recommendation_says_where_its_error_is_not_counted_from_the_truth() -> None:

@@ -110,11 +110,16 @@ def _objections(each: Measurement, points: Sequence[Measurement]) -> list[str]:
 
 
 def _passed_over(best: Measurement, points: Sequence[Measurement]) -> str:
-    """Says why the most accurate of the points that cost no more and err less was not taken."""
+    """Says why the most accurate of the points that cost no more and err less was not taken.
+
+    As on the front, a weld and a tool that is where the handle is are left out: they render another
+    coupling, and a small distance from their own limit would be no merit.
+    """
     better = [
         each
         for each in points
         if _is_fast(each)
+        and each.setting.method.has_law
         and each.cost.median <= best.cost.median
         and (1 + ALIKE) * each.score.felt < best.score.felt
         and _objections(each, points)
