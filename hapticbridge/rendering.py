@@ -17,7 +17,7 @@ import mujoco
 from hapticbridge.arguments import Arguments
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import DeviceError, SceneError, choices
-from hapticbridge.kernel.lossless import REACH
+from hapticbridge.kernel.nearness import REACH
 from hapticbridge.kernel.parameters import RunParameters, checked_substeps
 from hapticbridge.kernel.scheme import COUPLED, DIRECT, HELD, LOSSLESS, WELD
 from hapticbridge.kernel.state import WELD_NAME

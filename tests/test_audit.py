@@ -1,4 +1,4 @@
-"""TODO"""
+"""The audit: verdicts on honest runs, its own balance, the certificate, and what it may import."""
 
 from __future__ import annotations
 

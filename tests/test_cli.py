@@ -1,4 +1,4 @@
-"""TODO"""
+"""The commands as a user calls them: what they print, their exit codes, what they leave behind."""
 
 from __future__ import annotations
 

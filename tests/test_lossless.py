@@ -225,15 +225,16 @@ def test_damping_used_is_what_the_integration_leaves_and_never_negative() -> Non
     assert METHODS["implicit"].used(asked, T) is asked
 
 
-@pytest.mark.parametrize("mass", [0.01, 0.1, 1e9])
-@pytest.mark.parametrize("method", ["compensated", "lossless"])
+@pytest.mark.parametrize(
+    ("method", "mass"),
+    # an implicit tool yields at Nyquist: there only the wall has this hand as its worst
+    [("lossless", 0.01), ("lossless", 0.1), ("lossless", 1e9), ("compensated", 1e9)],
+)
 @pytest.mark.parametrize("share", [0.97, 1.03])
 def test_worst_hand_needs_half_kt_and_the_damping_used(
     method: str, mass: float, share: float, tmp_path: Path
 ) -> None:
     # at Nyquist a tool of any mass stands still under the midpoint rule; 1e9 kg is a wall
-    if method == "compensated" and mass < 1e9:
-        pytest.skip("an implicit tool yields at Nyquist, so its hand is better than the worst")
     asked = Coupling(1000.0, 2.0, 1.0, 0.002)
     used = METHODS[method].used(asked, T)
     needed = share * (0.5 * used.stiffness * T + used.damping)

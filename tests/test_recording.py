@@ -1,4 +1,4 @@
-"""TODO"""
+"""Recordings: what survives the file, what MCAP's own library reads, repair and refusals."""
 
 from __future__ import annotations
 

@@ -10,8 +10,8 @@ from hapticbridge.kernel import native
 from hapticbridge.kernel.direct import balance_contacts, tool_map
 from hapticbridge.kernel.handle import handle_pose
 from hapticbridge.kernel.layout import STATE_DTYPE
-from hapticbridge.kernel.lossless import start_twist
 from hapticbridge.kernel.meter import refresh_energies
+from hapticbridge.kernel.midpoint import start_twist
 from hapticbridge.kernel.parameters import RunParameters as RunParameters  # noqa: PLC0414
 from hapticbridge.kernel.parameters import rotation_numbers as rotation_numbers  # noqa: PLC0414
 from hapticbridge.kernel.scheme import DIRECT, LOSSLESS, WELD

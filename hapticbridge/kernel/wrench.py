@@ -14,9 +14,11 @@ from hapticbridge.kernel.handle import (
     store_vector,
     vector_of,
 )
-from hapticbridge.kernel.lossless import finish_lossless, implicit_half, is_near
+from hapticbridge.kernel.lossless import finish_lossless
 from hapticbridge.kernel.meter import refresh_energies, refresh_grip
+from hapticbridge.kernel.midpoint import implicit_half
 from hapticbridge.kernel.native import floats
+from hapticbridge.kernel.nearness import is_near
 from hapticbridge.kernel.scheme import DIRECT, LOSSLESS, WELD
 from hapticbridge.kernel.weld import weld_wrench
 from hapticbridge.pose import (
