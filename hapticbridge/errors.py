@@ -43,7 +43,7 @@ class DeviceLost(DeviceError):  # noqa: N818 - as SafetyTrip: what happened, not
 
 
 class IdentificationError(DeviceError):
-    """A run does not tell what a device is: too little motion, a hand that moves, a motor at its end."""
+    """A run does not tell what a device is: too little motion, a hand on it, a motor at its end."""
 
 
 class RecordingError(HapticBridgeError):

@@ -162,7 +162,13 @@ def move_axis(
             before = place
             deflection = abs(float(place[index]))
             reach = max(deflection, reach * decay)
-            rate = -1.0 / SHRINKING if reach > 0.6 * travel else 1.0 / GROWTH if reach < 0.4 * travel else 0.0
+            rate = (
+                -1.0 / SHRINKING
+                if reach > 0.6 * travel
+                else 1.0 / GROWTH
+                if reach < 0.4 * travel
+                else 0.0
+            )
             amplitude = min(amplitude * np.exp(rate * period), most)
             weight -= springs * place * (period / _WEIGHT_TIME)
             oldest = past[k % len(past)]
@@ -170,7 +176,10 @@ def move_axis(
             oldest[:] = place
             wrench[:] = np.where(present, weight - springs * place - dampers * speed, 0.0)
             wrench[index] += amplitude * tones[k]
-            for part, limit in ((slice(0, 3), allowance.force[0]), (slice(3, 6), allowance.force[1])):
+            for part, limit in (
+                (slice(0, 3), allowance.force[0]),
+                (slice(3, 6), allowance.force[1]),
+            ):
                 size = float(np.linalg.norm(wrench[part]))
                 if size > limit:
                     wrench[part] *= limit / size
@@ -187,7 +196,10 @@ def move_axis(
 def _pose(sample: NDArray[np.void]) -> Array:
     """Returns position and rotation vector of a sample, shape (6,)."""
     w, x, y, z = sample["quaternion"][0]
-    if not np.isfinite(sample["position"]).all() or not 0.5 < np.hypot(np.hypot(w, x), np.hypot(y, z)) < 2.0:
+    if (
+        not np.isfinite(sample["position"]).all()
+        or not 0.5 < np.hypot(np.hypot(w, x), np.hypot(y, z)) < 2.0
+    ):
         raise IdentificationError("the device's pose is not finite or not a rotation")
     return np.concatenate([sample["position"][0], Rotation.from_quat([x, y, z, w]).as_rotvec()])
 

@@ -125,8 +125,8 @@ def fit_axis(position: Array, force: Array, period: float, resolution: float = 0
             best = fitted
     if best is None:
         raise IdentificationError(
-            f"the axis moved {1e3 * float(np.nanmax(position) - np.nanmin(position)):.3g} mm and never long enough in one "
-            "direction to tell mass from damping; allow more travel or more force"
+            "it never moved long enough in one direction to tell mass from damping; allow more "
+            "travel, more force or more time"
         )
     return best
 
