@@ -7,43 +7,26 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from hapticbridge.clock import Clock
 from hapticbridge.device import AXES, Device
-from hapticbridge.errors import IdentificationError
+from hapticbridge.errors import DeviceError, IdentificationError
+from hapticbridge.identify.excitation import (
+    FAR,
+    FAST,
+    OK,
+    SPAN,
+    START_SHARE,
+    STATE_DTYPE,
+    TURNED_FAR,
+    TURNED_FAST,
+    next_wrench,
+    signal,
+)
+from hapticbridge.jit import direct
 from hapticbridge.tick import SAMPLE_DTYPE, TickFlag
 
 Array = NDArray[np.float64]
-
-LOWEST, HIGHEST, TONES = 0.7, 12.0, 9
-"""In Hz, and how many between them, evenly in their logarithm. Low ones show damping and friction,
-high ones mass; above 12 Hz an axis of 1 kg moves less than an encoder sees, below 0.7 Hz a run of
-12 s holds too few swings."""
-
-_TILT = -0.3  # amplitude over frequency: all tones then move a damped axis by similar amounts
-
-START_SHARE = 0.03
-"""Share of the force limit with which the signal starts. It grows until the axis moves."""
-
-GROWTH, SHRINKING = 0.7, 0.5
-"""Time in s in which the signal grows e-fold while the axis moves less than asked, and shrinks
-while it moves more. Faster overshoots the travel, slower wastes the run."""
-
-_MEMORY = 0.7  # s for which the largest deflection is remembered: half of the slowest swing
-
-CENTRING = (40.0, 0.1)
-"""Stiffness in N/m and N m/rad of the spring that keeps every axis near its start. It is part of
-the known force, so it does not disturb the fit. Stiffer leaves less travel to the signal."""
-
-CALMING = (1.0, 1e-3)
-"""Damping in N s/m and N m s/rad, of the motion over the last ``_SPAN``, without which a heavy
-device of little damping would swing for ever. More would hide the damping that is looked for."""
-
-_SPAN = 0.01  # s: an encoder's steps of 0.1 mm then make 0.01 N of noise
-
-_WEIGHT_TIME = 2.0
-"""Time in s in which the centring spring's integral takes over a weight."""
 
 RUNAWAY = 2.5
 """Multiple of the allowed travel at which a run is given up: the device is not doing what the force
@@ -51,6 +34,8 @@ says, so no force is better than more of it."""
 
 SPEED_MARGIN = 1.5
 """Multiple of the device's own top speed that counts as a fault."""
+
+_TOLD_PER_SECOND = 10
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,34 +61,17 @@ class AxisRun:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Allowance:
-    """What a run may do, per kind of axis: translation (m, N), then rotation (rad, N m).
+    """What a run may do, per kind of axis: translation (m, N, m/s), rotation (rad, N m, rad/s).
 
     Attributes:
         travel: From the start, to each side.
         force: Largest force or torque.
-        speed: Top speed in m/s and rad/s, beyond which a sample is a fault.
+        speed: The device's own top speed.
     """
 
     travel: tuple[float, float]
     force: tuple[float, float]
     speed: tuple[float, float]
-
-
-def signal(axis_index: int, ticks: int, period: float) -> Array:
-    """Returns tones of random phase between −1 and 1, another one for each axis, the same always.
-
-    Args:
-        axis_index: 0 to 5.
-        ticks: n.
-        period: T in s.
-    """
-    generator = np.random.default_rng(axis_index)
-    frequencies = np.geomspace(LOWEST, HIGHEST, TONES)
-    phases = generator.uniform(0.0, 2.0 * np.pi, TONES)
-    time = period * np.arange(ticks)
-    tones = np.sin(2.0 * np.pi * frequencies[:, None] * time + phases[:, None])
-    summed = (frequencies**_TILT) @ tones
-    return np.asarray(summed / np.abs(summed).max())
 
 
 def move_axis(
@@ -135,89 +103,57 @@ def move_axis(
         DeviceError: The device failed.
     """
     ticks, index = round(duration / period), AXES.index(axis)
-    is_turn = index >= 3
-    kind = 1 if is_turn else 0
     tones = signal(index, ticks, period)
-    travel, most = allowance.travel[kind], allowance.force[kind]
-    springs, dampers = np.repeat(CENTRING, 3), np.repeat(CALMING, 3)
-    past = np.zeros((max(round(_SPAN / period), 1), 6))
-    present = np.array([name in device.info.axes for name in AXES])
-    sample, wrench, weight = np.zeros(1, SAMPLE_DTYPE), np.zeros(6), np.zeros(6)
+    state, sample, wrench = np.zeros(1, STATE_DTYPE), np.zeros(1, SAMPLE_DTYPE), np.zeros(6)
+    past = np.zeros((max(round(SPAN / period), 1), 6))
+    s = state[0]
+    s["axis"], s["period"] = index, period
+    s["present"] = [float(name in device.info.axes) for name in AXES]
+    s["force"], s["travel"] = allowance.force, allowance.travel
+    s["farthest"] = RUNAWAY * np.asarray(allowance.travel)
+    s["fastest"] = SPEED_MARGIN * np.asarray(allowance.speed)
+    s["amplitude"] = START_SHARE * allowance.force[index >= 3]
+    compute = direct(next_wrench, state, sample, past, 0.0, 1, wrench)
     position, force, wakes = np.empty(ticks), np.empty(ticks), np.empty(ticks)
-    amplitude, reach, stale = START_SHARE * most, 0.0, 0
-    device.read(sample)
-    start, before = _pose(sample), np.zeros(6)
-    turn = Rotation.from_rotvec(start[3:]).inv()
-    decay = np.exp(-period / _MEMORY)
+    told_every, stale, place = max(round(1.0 / (_TOLD_PER_SECOND * period)), 1), 0, s["place"]
     try:
         for k in range(ticks):
-            _, wake, skipped = clock.wait()
-            news = device.read(sample)
-            place = _pose(sample)
-            place[:3] -= start[:3]
-            place[3:] = (Rotation.from_rotvec(place[3:]) * turn).as_rotvec()
-            _refuse_runaway(place, before, period * (1 + skipped), allowance)
-            is_new = not news & TickFlag.STALE_SAMPLE and not skipped
-            stale += not is_new
-            before = place
-            deflection = abs(float(place[index]))
-            reach = max(deflection, reach * decay)
-            rate = (
-                -1.0 / SHRINKING
-                if reach > 0.6 * travel
-                else 1.0 / GROWTH
-                if reach < 0.4 * travel
-                else 0.0
-            )
-            amplitude = min(amplitude * np.exp(rate * period), most)
-            weight -= springs * place * (period / _WEIGHT_TIME)
-            oldest = past[k % len(past)]
-            speed = (place - oldest) / (len(past) * period)
-            oldest[:] = place
-            wrench[:] = np.where(present, weight - springs * place - dampers * speed, 0.0)
-            wrench[index] += amplitude * tones[k]
-            for part, limit in (
-                (slice(0, 3), allowance.force[0]),
-                (slice(3, 6), allowance.force[1]),
-            ):
-                size = float(np.linalg.norm(wrench[part]))
-                if size > limit:
-                    wrench[part] *= limit / size
+            _, wakes[k], skipped = clock.wait()
+            is_new = not device.read(sample) & TickFlag.STALE_SAMPLE and not skipped
+            code = compute(state, sample, past, tones[k], 1 + skipped, wrench)
+            if code != OK:
+                raise IdentificationError(_told(code, s))
             device.write(wrench)
             position[k] = place[index] if is_new else np.nan
-            force[k], wakes[k] = wrench[index], wake
-            if progress is not None and k % max(round(0.1 / period), 1) == 0:
+            force[k] = wrench[index]
+            stale += not is_new
+            if progress is not None and k % told_every == 0:
                 progress(k / ticks)
     finally:
-        device.write(np.zeros(6))
+        _silence(device)
     return AxisRun(axis, period, position, force, 1e-9 * np.diff(wakes), stale / ticks)
 
 
-def _pose(sample: NDArray[np.void]) -> Array:
-    """Returns position and rotation vector of a sample, shape (6,)."""
-    w, x, y, z = sample["quaternion"][0]
-    if (
-        not np.isfinite(sample["position"]).all()
-        or not 0.5 < np.hypot(np.hypot(w, x), np.hypot(y, z)) < 2.0
-    ):
-        raise IdentificationError("the device's pose is not finite or not a rotation")
-    return np.concatenate([sample["position"][0], Rotation.from_quat([x, y, z, w]).as_rotvec()])
+def _silence(device: Device) -> None:
+    """Commands zero force; a device that is gone has said so already."""
+    try:
+        device.write(np.zeros(6))
+    except DeviceError:
+        return
 
 
-def _refuse_runaway(place: Array, before: Array, time: float, allowance: Allowance) -> None:
-    for kind, (part, unit, factor) in enumerate(
-        ((slice(0, 3), "mm", 1e3), (slice(3, 6), "rad", 1.0))
-    ):
-        distance = float(np.linalg.norm(place[part]))
-        most = RUNAWAY * allowance.travel[kind]
-        if distance > most:
-            raise IdentificationError(
-                f"the device moved {factor * distance:.3g} {unit} from where it started, the limit "
-                f"is {factor * most:.3g} {unit}; let go of it, support its weight, or allow more "
-                "travel"
-            )
-        speed = float(np.linalg.norm(place[part] - before[part])) / time
-        if speed > SPEED_MARGIN * allowance.speed[kind]:
-            raise IdentificationError(
-                f"the device's pose jumped at {factor * speed:.3g} {unit}/s, faster than it can be"
-            )
+def _told(code: int, s: np.void) -> str:
+    """Says why a run was given up."""
+    turns = code in (TURNED_FAR, TURNED_FAST)
+    part, unit, factor = (slice(3, 6), "rad", 1.0) if turns else (slice(0, 3), "mm", 1e3)
+    if code in (FAR, TURNED_FAR):
+        distance = factor * float(np.linalg.norm(s["place"][part]))
+        return (
+            f"the device moved {distance:.3g} {unit} from where it started, the limit is "
+            f"{factor * s['farthest'][int(turns)]:.3g} {unit}; let go of it, support its weight, "
+            "or allow more travel"
+        )
+    if code in (FAST, TURNED_FAST):
+        step = factor * float(np.linalg.norm(s["place"][part] - s["before"][part]))
+        return f"the device's pose jumped by {step:.3g} {unit} in a tick, faster than it can move"
+    return "the device's pose is not finite or not a rotation"

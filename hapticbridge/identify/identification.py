@@ -79,7 +79,8 @@ class Identification:
             turns: Whether of rotation.
             most: Whether the largest is the safe one (delay); else the smallest.
         """
-        found = [getattr(fit, name) for axis, fit in self.fits.items() if (len(axis) == 2) == turns]
+        fits = [fit for axis, fit in self.fits.items() if (len(axis) == 2) == turns]
+        found: list[Estimate] = [getattr(fit, name) for fit in fits]
         if not found:
             return None
         return max(found, key=lambda e: e.most) if most else min(found, key=lambda e: e.least)
