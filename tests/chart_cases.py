@@ -22,6 +22,7 @@ def made_up(
     contact: str = SHIPPED,
     substeps: int = 1,
     iterations: int | None = None,
+    limit_apart: float = 0.0,
 ) -> Measurement:
     """Returns a point of panel ``panel`` that costs and errs as said."""
     return Measurement(
@@ -29,6 +30,7 @@ def made_up(
         Setting(METHODS[method], period, substeps, contact, iterations),
         Cost(cost, cost * (1 - spread), cost * (1 + spread), 1.0, 1.0, 1.0, 3),
         Score(felt=felt, created=0.0, verdict=verdict),
+        limit_apart=limit_apart,
     )
 
 

@@ -64,6 +64,12 @@ def test_rk4_turns_a_free_body_with_fourth_order_and_euler_with_first() -> None:
     # the energy of a step is one order better than the motion; five is what rk4 leaves of four
     rk4 = [score(spinning(), "explicit:rk4", period).energy for period in periods]
     assert 3.8 < order(rk4, periods) < 5.2
+    # the motion itself, above what the reference errs by
+    periods = (8e-3, 4e-3, 2e-3)
+    workload = open_workload("spinning_body", Extent(periods[0], periods[-1]))
+    found = [score(workload, "explicit:rk4", period) for period in periods]
+    assert order([each.angle_peak for each in found], periods) == pytest.approx(4, abs=0.3)
+    assert order([each.felt for each in found], periods) == pytest.approx(4, abs=0.3)
     euler = [score(spinning(), "explicit", period).angle_peak for period in FINE]
     assert order(euler) == pytest.approx(1, abs=0.05)
     lossless = [score(spinning(), "lossless", period).angle_peak for period in FINE]
@@ -145,7 +151,18 @@ def test_methods_agree_on_where_the_moving_peg_goes_in_the_limit() -> None:
     assert isinstance(references, OwnReferences)
     apart = references.disagreement()
     assert apart["explicit"] < 0.3
+    assert apart["implicit"] < 0.3
     assert apart["weld"] > 3  # another stiffness than was asked for: converged, and not to the same
+
+
+def test_central_limit_is_one_of_the_coupling_that_was_asked_for() -> None:
+    workload = PegInHole(PEG_COUPLING, GRID, 4e-3, refinement=2)
+    for name in ("weld", "direct", "implicit"):
+        workload.run(Setting(METHODS[name], GRID)).scores()
+    assert workload.references is not None
+    apart = workload.references.disagreement()
+    assert apart["implicit"] == 0.0
+    assert min(apart["weld"], apart["direct"]) > 3
 
 
 @pytest.mark.parametrize("method", ["implicit", "compensated", "implicitfast", "explicit"])
