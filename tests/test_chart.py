@@ -6,13 +6,11 @@ import csv
 import json
 import os
 import re
-from dataclasses import replace
-from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
 import pytest
-from chart_cases import FakeRun, made_up
+from chart_cases import FakeRun
 
 from hapticbridge.cli import main
 from hapticbridge.errors import StudyError
@@ -29,12 +27,7 @@ from hapticbridge.study.chart import (
     settings_for,
     write_chart,
 )
-from hapticbridge.study.chart.convergence import convergence_orders
-from hapticbridge.study.chart.drawing import draw_chart
 from hapticbridge.study.chart.front import pareto_front
-from hapticbridge.study.chart.measurement import Measurement
-from hapticbridge.study.chart.page import chart_page
-from hapticbridge.study.chart.recommendation import recommendation, recommended
 from hapticbridge.study.chart.setting import CONTACTS, SHIPPED, Setting
 from hapticbridge.study.chart.timing import interleaved_costs, one_core
 
@@ -62,162 +55,6 @@ def test_front_of_random_points_beats_all_others_and_itself_never() -> None:
 def test_front_leaves_out_what_has_no_error_or_no_cost() -> None:
     assert pareto_front([1.0, 2.0, np.nan], [np.inf, 3.0, 1.0]) == [1]
     assert pareto_front([], []) == []
-
-
-def test_cheapest_sound_point_is_recommended_and_the_more_accurate_of_equal_costs() -> None:
-    cheap = made_up(0.010, 0.9, spread=0.1)
-    better = made_up(0.0105, 0.3, method="lossless")
-    dear = made_up(0.020, 0.1)
-    assert recommended([cheap, better, dear]) is better
-    assert recommended([cheap, dear]) is cheap
-
-
-def test_points_whose_spreads_meet_cost_alike_whichever_is_disturbed() -> None:
-    calm, disturbed = made_up(0.0100, 0.9), made_up(0.0110, 0.3, method="lossless", spread=0.1)
-    assert recommended([calm, disturbed]) is disturbed
-    apart = made_up(0.0110, 0.3, method="lossless", spread=0.05)
-    assert recommended([calm, apart]) is calm
-
-
-def test_better_point_that_is_not_taken_is_named_with_the_reason() -> None:
-    best = made_up(0.010, 0.6)
-    kicks = made_up(0.009, 0.2, method="explicit")
-    text = recommendation([best, kicks], "a machine")
-    assert "use implicit, 1 ms" in text
-    assert "explicit, 1 ms would cost no more and err less (0.2 JND), but it may kick" in text
-    for no_better in (
-        made_up(0.020, 0.2, method="explicit"),
-        made_up(0.009, 0.595, method="explicit"),
-        made_up(0.009, 0.7, method="explicit"),
-        made_up(0.009, 0.2, method="explicit", period=4e-3),
-    ):
-        assert "explicit" not in recommendation([best, no_better], "a machine")
-    other_law = made_up(0.001, 0.0, method="direct")
-    assert "direct" not in recommendation([best, other_law], "a machine")
-
-
-def test_recommendation_says_where_its_error_is_not_counted_from_the_truth() -> None:
-    point = made_up(0.01, 0.2)
-    assert "not from the truth" in recommendation([point], "a machine", is_truth=False)
-    assert "not from the truth" not in recommendation([point], "a machine", is_truth=True)
-
-
-def test_usual_contact_is_recommended_where_errors_are_alike() -> None:
-    odd = made_up(0.0100, 0.300, contact="2 steps", spread=0.1)
-    usual = made_up(0.0101, 0.301)
-    assert recommended([odd, usual]) is usual
-
-
-@pytest.mark.parametrize(
-    ("flawed", "said"),
-    [
-        (made_up(0.01, 1.5), "its error is 1.5 JND"),
-        (made_up(0.01, 0.5, verdict="active"), "its environment is active"),
-        (made_up(0.01, 0.5, verdict="lost contact"), "its environment is lost contact"),
-        (made_up(0.6, 0.5), "it takes 60 % of a core"),
-        (made_up(0.01, 0.5, method="explicit"), "it may kick on a real device"),
-    ],
-)
-def test_flawed_point_is_not_recommended_but_named_with_its_flaw(flawed: object, said: str) -> None:
-    assert recommended([flawed]) is None  # type: ignore[list-item]
-    text = recommendation([flawed], "a machine")  # type: ignore[list-item]
-    assert "no point does it all" in text
-    assert said in text
-    good = made_up(0.3, 0.9)
-    assert recommended([flawed, good]) is good  # type: ignore[list-item]
-
-
-def test_error_that_grows_at_a_smaller_step_is_called_luck() -> None:
-    lucky, finer = made_up(0.01, 0.2), made_up(0.02, 3.0, period=5e-4)
-    assert recommended([lucky, finer]) is None
-    assert "it is luck" in recommendation([lucky, finer], "a machine")
-    assert recommended([lucky, made_up(0.02, 0.4, period=5e-4)]) is lucky
-    # another method's error at a smaller step says nothing of this one
-    assert recommended([lucky, made_up(0.02, 3.0, period=5e-4, method="lossless")]) is lucky
-
-
-def test_solver_that_is_cut_short_is_not_recommended() -> None:
-    short = made_up(0.01, 0.2, iterations=1)
-    assert recommended([short]) is None
-    assert "its solver is cut short" in recommendation([short], "a machine")
-    assert recommended([short, made_up(0.02, 0.3)]) is not short
-
-
-def test_slower_than_a_kilohertz_is_never_recommended() -> None:
-    slow = made_up(0.001, 0.1, period=2e-3)
-    assert recommended([slow]) is None
-    assert "nothing was tried that runs at this rate" in recommendation([slow], "a machine")
-    assert recommended([slow, made_up(0.1, 0.5)]) is not slow
-
-
-def test_recommendation_says_machine_setting_and_numbers() -> None:
-    text = recommendation([made_up(0.012, 0.25, method="lossless")], "a machine")
-    assert text.startswith("For 1 kHz on this machine (a machine) and an error below one JND, use")
-    assert "lossless, 1 ms" in text
-    assert "0.25 JND at 12 µs a tick, 1.2 % of a core" in text
-
-
-def test_order_is_the_slope_at_the_three_smallest_steps() -> None:
-    periods = (4e-3, 1e-3, 5e-4, 2.5e-4)
-    points = [made_up(1.0, 1e6 * p**2, period=p) for p in periods[1:]]
-    points += [made_up(1.0, 7.0, period=periods[0]), made_up(1.0, 3.0, period=2.5e-4, substeps=2)]
-    order = convergence_orders(points)["implicit"]
-    assert order.power == pytest.approx(2.0)
-    assert (order.finest, order.coarsest) == (2.5e-4, 1e-3)
-    assert order.words == "order 2.0"
-    assert not convergence_orders(points[:2])
-
-
-def test_order_that_the_next_step_contradicts_is_not_told() -> None:
-    def words(*errors: float) -> str:
-        steps = (2.5e-4, 1e-3, 4e-3)
-        points = [made_up(1.0, e, period=p) for e, p in zip(errors, steps, strict=True)]
-        return convergence_orders(points)["implicit"].words
-
-    assert words(0.65, 1.8, 3.4) == "order ?"  # 'implicit' on the point mass at quick steps
-    assert words(0.1, 0.4, 1.6) == "order 1.0"
-    assert words(0.1, 0.4, 1.4) == "order 1.0"  # 0.1 of a power off
-    assert words(0.1, 0.4, 1.3) == "order ?"
-    assert words(0.08, 0.08, 0.084) == "level"
-    assert words(0.08, 0.08, 0.3) == "order ?"
-
-
-def test_no_order_is_taken_from_errors_that_a_reference_may_have_itself() -> None:
-    points = [made_up(1.0, 1e8 * p**4, period=p) for p in (4e-3, 2e-3, 1e-3)]
-    assert convergence_orders(points)["implicit"].power == pytest.approx(4.0)
-    unresolved = [made_up(1.0, 2e-6, period=p) for p in (5e-4, 2.5e-4)]
-    assert convergence_orders([*points, *unresolved])["implicit"].power == pytest.approx(4.0)
-    assert not convergence_orders([*points[:2], *unresolved])
-
-
-def test_setting_that_no_other_step_bears_out_is_recommended_last_and_said_to_be_luck() -> None:
-    once = made_up(0.010, 0.1, contact="damped")
-    twice = [
-        made_up(0.012, 0.8, method="lossless"),
-        made_up(0.02, 0.4, method="lossless", period=5e-4),
-    ]
-    assert recommended([once, *twice]) is twice[0]
-    finer = made_up(0.02, 0.2, contact="damped", period=5e-4)
-    assert recommended([once, finer, *twice]) is once
-    assert "may be luck" not in recommendation([once, finer, *twice], "a machine")
-    # nothing else was tried: it is said
-    assert recommended([once]) is once
-    assert "No other time step bears this out, so it may be luck" in recommendation([once], "m")
-    # and what another step contradicts is not borne out by it
-    coarser = made_up(0.005, 4.0, contact="damped", period=2e-3)
-    assert recommended([once, coarser, *twice]) is twice[0]
-
-
-def test_point_nearer_to_its_own_limit_than_that_is_to_others_is_not_comparable() -> None:
-    apart = made_up(0.010, 0.02, method="lossless", limit_apart=0.34)
-    shared = made_up(0.012, 0.3, limit_apart=0.004)
-    assert not apart.is_comparable
-    assert shared.is_comparable
-    assert recommended([apart, shared]) is shared
-    text = recommendation([apart], "a machine")
-    assert "its own limit lies 0.34 JND from what most methods converge to" in text
-    far = made_up(0.010, 0.5, method="lossless", limit_apart=0.34)
-    assert far.is_comparable
 
 
 def test_costs_are_medians_per_simulated_second_and_ratios_are_taken_within_a_round() -> None:
@@ -281,14 +118,8 @@ def test_bad_steps_are_refused_in_a_sentence(steps: list[float], said: str) -> N
 
 @pytest.fixture(scope="module")
 def chart() -> Chart:
-    """A small chart: one good method, and one that a step of 20 ms throws out of bounds."""
-    workload = open_workload("point_mass", Extent(0.02, 1e-3))
-    settings = [
-        Setting(METHODS[name], period)
-        for name in ("implicit", "explicit")
-        for period in (0.02, 2e-3, 1e-3)
-    ]
-    return measure_chart(workload, settings, repeats=1)
+    """A chart on which one point has diverged."""
+    return small_chart()
 
 
 def test_diverged_point_stays_on_the_chart(chart: Chart) -> None:
@@ -316,93 +147,6 @@ def test_files_hold_every_setting_and_the_page_needs_nothing_else(
     assert said["panels"][0]["recommendation"].startswith("For 1 kHz")
     assert files.paths["png"].stat().st_size > 10_000
     assert files.paths["svg"].read_text(encoding="utf-8").lstrip().startswith("<?xml")
-
-
-class Page(HTMLParser):
-    """Reads a page: which elements it has, and whether each is closed in its turn."""
-
-    VOID = ("meta", "br", "link", "img", "input")
-
-    def __init__(self, text: str) -> None:
-        super().__init__()
-        self.found: list[tuple[str, dict[str, str | None]]] = []
-        self._open: list[str] = []
-        self.feed(text)
-        self.close()
-        assert not self._open, f"never closed: {self._open}"
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        """Notes an element."""
-        self.found.append((tag, dict(attrs)))
-        if tag not in self.VOID:
-            self._open.append(tag)
-
-    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        """Notes an element without content."""
-        self.found.append((tag, dict(attrs)))
-
-    def handle_endtag(self, tag: str) -> None:
-        """Checks that the innermost open element is the one that ends."""
-        assert self._open.pop() == tag
-
-
-def check_page(text: str, *, spots: int) -> Page:
-    """Checks that a page is well formed, asks for nothing, and tells of every point."""
-    page = Page(text)
-    assert text.startswith("<!doctype html>")
-    assert not re.search(r"https?://|@import|url\(|fetch\(|XMLHttp|WebSocket", text)
-    asking = {"src", "href", "srcset", "data", "action", "poster", "xlink:href"}
-    assert not [tag for tag, named in page.found if asking & set(named) or tag == "link"]
-    told = [named["data-told"] for _, named in page.found if named.get("class") == "spot"]
-    assert len(told) == spots
-    assert all((each and "JND" in each) or "diverged" in str(each) for each in told)
-    names = {named.get("data-name") for _, named in page.found} - {None}
-    assert {named["data-of"] for _, named in page.found if named.get("class") == "spot"} == names
-    assert not [named for _, named in page.found if "nan" in " ".join(map(str, named.values()))]
-    assert len(text) < 100_000
-    return page
-
-
-def test_page_is_well_formed_and_asks_for_no_other_file(chart: Chart) -> None:
-    check_page(chart_page(chart), spots=6)
-
-
-def test_page_without_a_front_or_with_points_that_are_not_comparable_is_well_formed(
-    chart: Chart,
-) -> None:
-    created = [
-        replace(each, score=replace(each.score, verdict="active")) for each in chart.measurements
-    ]
-    page = chart_page(replace(chart, measurements=tuple(created)))
-    check_page(page, spots=6)
-    assert "Nothing is on the front" in page
-    apart = [replace(each, limit_apart=1e9) for each in chart.measurements]
-    pale = check_page(chart_page(replace(chart, measurements=tuple(apart))), spots=6)
-    marked = [named for _, named in pale.found if named.get("class") == "spot"]
-    finite = sum(np.isfinite(each.score.felt) for each in chart.measurements)
-    assert sum(named.get("opacity") == ".2" for named in marked) == finite
-    assert draw_chart(replace(chart, measurements=tuple(apart))).axes
-
-
-def test_picture_says_what_its_words_and_pale_points_mean(chart: Chart) -> None:
-    def words(*points: Measurement) -> str:
-        labelled = tuple(replace(each, panel=chart.workload.panels[0].key) for each in points)
-        figure = draw_chart(replace(chart, measurements=labelled))
-        legend = figure.axes[0].get_legend()
-        assert legend is not None
-        return " ".join(text.get_text() for text in legend.get_texts())
-
-    steps = (2.5e-4, 5e-4, 1e-3)
-    plain = words(*(made_up(1.0, p, period=p) for p in steps))
-    assert "implicit (order 1.0)" in plain
-    for told in ("not settled", "gain nothing", "not comparable", "lower edge"):
-        assert told not in plain
-    assert "smaller steps gain nothing" in words(*(made_up(1.0, 0.1, period=p) for p in steps))
-    assert "not settled" in words(*(made_up(1.0, p**p, period=p) for p in (0.1, 0.4, 1.6)))
-    apart = words(made_up(1.0, 0.1, limit_apart=0.34))
-    assert "implicit (limit 0.34 off)" in apart
-    assert "not comparable" in apart
-    assert "at the lower edge: 0.0001 JND or less" in words(made_up(1.0, 1e-6))
 
 
 def test_chart_without_a_point_is_refused() -> None:

@@ -7,11 +7,13 @@ from functools import lru_cache
 import mujoco
 import numpy as np
 import pytest
+from chart_cases import made_up
 
 from hapticbridge.rendering import METHODS
 from hapticbridge.scene import Scene, load_scene
 from hapticbridge.study.chart import driven_mass, rod_impact, spinning_body
 from hapticbridge.study.chart.catalogue import Extent, open_workload
+from hapticbridge.study.chart.convergence import convergence_orders
 from hapticbridge.study.chart.own_reference import OwnReferences
 from hapticbridge.study.chart.peg import COUPLING as PEG_COUPLING
 from hapticbridge.study.chart.peg import PegInHole
@@ -46,6 +48,39 @@ def score(workload: Workload, method: str, period: float) -> Score:
 def order(errors: list[float], periods: tuple[float, ...] = FINE) -> float:
     """Returns the power of the period that the errors go with."""
     return float(np.polyfit(np.log(periods), np.log(errors), 1)[0])
+
+
+def test_order_is_the_slope_at_the_three_smallest_steps() -> None:
+    periods = (4e-3, 1e-3, 5e-4, 2.5e-4)
+    points = [made_up(1.0, 1e6 * p**2, period=p) for p in periods[1:]]
+    points += [made_up(1.0, 7.0, period=periods[0]), made_up(1.0, 3.0, period=2.5e-4, substeps=2)]
+    order = convergence_orders(points)["implicit"]
+    assert order.power == pytest.approx(2.0)
+    assert (order.finest, order.coarsest) == (2.5e-4, 1e-3)
+    assert order.words == "order 2.0"
+    assert not convergence_orders(points[:2])
+
+
+def test_order_that_the_next_step_contradicts_is_not_told() -> None:
+    def words(*errors: float) -> str:
+        steps = (2.5e-4, 1e-3, 4e-3)
+        points = [made_up(1.0, e, period=p) for e, p in zip(errors, steps, strict=True)]
+        return convergence_orders(points)["implicit"].words
+
+    assert words(0.65, 1.8, 3.4) == "order ?"  # 'implicit' on the point mass at quick steps
+    assert words(0.1, 0.4, 1.6) == "order 1.0"
+    assert words(0.1, 0.4, 1.4) == "order 1.0"  # 0.1 of a power off
+    assert words(0.1, 0.4, 1.3) == "order ?"
+    assert words(0.08, 0.08, 0.084) == "level"
+    assert words(0.08, 0.08, 0.3) == "order ?"
+
+
+def test_no_order_is_taken_from_errors_that_a_reference_may_have_itself() -> None:
+    points = [made_up(1.0, 1e8 * p**4, period=p) for p in (4e-3, 2e-3, 1e-3)]
+    assert convergence_orders(points)["implicit"].power == pytest.approx(4.0)
+    unresolved = [made_up(1.0, 2e-6, period=p) for p in (5e-4, 2.5e-4)]
+    assert convergence_orders([*points, *unresolved])["implicit"].power == pytest.approx(4.0)
+    assert not convergence_orders([*points[:2], *unresolved])
 
 
 @pytest.mark.parametrize(
