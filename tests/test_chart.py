@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from chart_cases import FakeRun
+from chart_cases import FakeRun, small_chart
 
 from hapticbridge.cli import main
 from hapticbridge.errors import StudyError

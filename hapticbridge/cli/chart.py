@@ -130,7 +130,7 @@ def _print(files: ChartFiles) -> None:
         out.print("  on the front, by cost:" if panel["front"] else "  nothing is on the front")
         for point in panel["front"]:
             out.print(
-                f"    {point['cost']:.2g} s per s, {point['error']:.2g} JND: "
+                f"    {point['cost']:.2g} s per s, {point['error']:.3g} JND: "
                 f"{plain(point['setting'])}"
             )
     for note in files.said["notes"]:
