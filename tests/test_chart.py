@@ -6,6 +6,7 @@ import csv
 import json
 import os
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -129,6 +130,16 @@ def test_diverged_point_stays_on_the_chart(chart: Chart) -> None:
     assert "explicit, 20 ms" not in {
         each.setting.label for each in chart.front(chart.workload.panels[0])
     }
+
+
+def test_point_that_cannot_be_compared_is_not_on_the_front(chart: Chart) -> None:
+    (panel,) = chart.workload.panels
+    best = chart.front(panel)[-1]
+    apart = [
+        replace(each, limit_apart=1e9) if each is best else each for each in chart.measurements
+    ]
+    front = replace(chart, measurements=tuple(apart)).front(panel)
+    assert best.setting not in [each.setting for each in front]
 
 
 def test_files_hold_every_setting_and_the_page_needs_nothing_else(

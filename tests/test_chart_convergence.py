@@ -11,7 +11,7 @@ from chart_cases import made_up
 
 from hapticbridge.rendering import METHODS
 from hapticbridge.scene import Scene, load_scene
-from hapticbridge.study.chart import driven_mass, rod_impact, spinning_body
+from hapticbridge.study.chart import driven_mass, measure_chart, rod_impact, spinning_body
 from hapticbridge.study.chart.catalogue import Extent, open_workload
 from hapticbridge.study.chart.convergence import convergence_orders
 from hapticbridge.study.chart.own_reference import OwnReferences
@@ -188,6 +188,20 @@ def test_methods_agree_on_where_the_moving_peg_goes_in_the_limit() -> None:
     assert apart["explicit"] < 0.3
     assert apart["implicit"] < 0.3
     assert apart["weld"] > 3  # another stiffness than was asked for: converged, and not to the same
+
+
+def test_measured_points_carry_how_far_the_limit_of_their_method_lies() -> None:
+    workload = PegInHole(PEG_COUPLING, GRID, GRID, refinement=2)
+    settings = [Setting(METHODS[name], GRID) for name in ("implicit", "weld")]
+    found = measure_chart(workload, settings, repeats=1)
+    apart = {
+        (each.panel, each.setting.method.name): each.limit_apart for each in found.measurements
+    }
+    assert apart["moving", "implicit"] == 0.0
+    assert apart["moving", "weld"] > 3
+    # the settled peg is compared with one truth
+    assert apart["settled", "weld"] == apart["settled", "implicit"] == 0.0
+    assert "implicit, in JND: weld" in found.notes[0]
 
 
 def test_central_limit_is_one_of_the_coupling_that_was_asked_for() -> None:
