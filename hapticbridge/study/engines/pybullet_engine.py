@@ -32,9 +32,9 @@ ITERATIONS = 200
 flat in its hole."""
 
 RESIDUAL = 1e-7
-"""Change of velocity in m/s at which the iterations end before: Bullet's own, and the least that the
-guide names. A settled peg is wrong by 0.2 to 0.6 µm, worst where it lies on the bottom; at 1e-10 by
-0.07 to 0.3 µm, at 1.4 times the cost."""
+"""Change of velocity in m/s at which the iterations end before: Bullet's own, and the least that
+the guide names. A settled peg is wrong by 0.2 to 0.6 µm, worst where it lies on the bottom; at
+1e-10 by 0.07 to 0.3 µm, at 1.4 times the cost."""
 
 CFM = 1e-8
 """Constraint force mixing of the direct solver: at 0 redundant contacts make its matrix singular

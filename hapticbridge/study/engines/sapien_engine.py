@@ -41,12 +41,12 @@ CONTACT_OFFSET = 1e-3
 """Distance in m at which contacts are made: some steps' motion, small against the parts."""
 
 LENGTH, SPEED = 1e-4, 1.0
-"""``PxTolerancesScale``: a length in m and a speed in m/s, of the whole process. The manifold of two
-shapes keeps its normal until they have moved by a share of their size or of this length. At the
-default of 1 m a peg that leans on its hole's edge by 19 mrad still has the normal from when it stood
-upright, and rests 31 µm away; at 1 mm by 0.7, at 0.1 mm, half the peg's clearance, by 0.5 µm, as it
-does where its manifolds are made in place. The steps take as long. The manual advises the size of
-the objects; 10 mm changes nothing here. The speed enters only bouncing and sleep, which are off."""
+"""``PxTolerancesScale``: a length in m and a speed in m/s, of the whole process. The manifold of
+two shapes keeps its normal until they have moved by a share of their size or of this length. At the
+default of 1 m a peg that leans on its hole's edge by 19 mrad still has the normal from when it
+stood upright, and rests 31 µm away; at 1 mm 0.7 µm; at 0.1 mm, half the peg's clearance, 0.5 µm, as
+where its manifolds are made in place. The steps take as long. The manual advises the size of the
+objects; 10 mm changes nothing here. The speed enters only bouncing and sleep, which are off."""
 
 _GUIDE = "PhysX 5 User's Guide"
 _DYNAMICS = f"{_GUIDE}: Rigid Body Dynamics"
@@ -152,9 +152,16 @@ class SapienSimulation(HeldSimulation):
         return Velocity(tuple(linear.tolist()), tuple(angular.tolist()))
 
     def contacts(self) -> Contacts:
-        """Returns the contacts of the last step, as they were at its start."""
-        found = self._system.get_contacts()
-        return Contacts.of(-point.separation for contact in found for point in contact.points)
+        """Returns the contacts of the last step, as they were at its start.
+
+        PhysX stops what would touch within the step, and leaves gaps of less than a nanometre: what
+        pushes touches, too.
+        """
+        points = [point for contact in self._system.get_contacts() for point in contact.points]
+        return Contacts.of(
+            max(-point.separation, 0.0) if np.any(point.impulse) else -point.separation
+            for point in points
+        )
 
     def close(self) -> None:
         """Lets go of the scene; PhysX takes it back with its last reference."""
