@@ -23,8 +23,8 @@ from hapticbridge.study.engines.task import Pose, Task, Velocity, composed
 from hapticbridge.tick import TICK_DTYPE
 
 HELD = METHODS["explicit"]
-"""How every engine gets the coupling: a force that is computed after a step and held in the next.
-Only MuJoCo can solve it together with the contacts."""
+"""How engines get the coupling: a force that is computed after a step and held in the next. Those
+whose name ends with ``SPRING`` solve it together with the contacts, as a spring of their own."""
 
 FARTHEST = 10.0
 """Distance in m of the tool at which a run has diverged beyond doubt."""
@@ -96,12 +96,18 @@ class EngineRun:
 
     @property
     def chosen(self) -> Mapping[str, str | int]:
-        """What the engine was set to, and which page of its documentation advises it."""
+        """What the engine was set to, and which page of its documentation advises it.
+
+        Method and integrator of the bridge are none of another engine's.
+        """
         told = "; ".join(
             f"{name}: {setting.value} ({setting.source})"
             for name, setting in self.engine.settings.items()
         )
+        coupling = self.engine.settings.get("coupling")
         return {
+            "method": "held force" if coupling is None else coupling.value,
+            "integrator": "",
             "solref": "",
             "solimp": "",
             "cone": "",

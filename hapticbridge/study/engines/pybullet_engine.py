@@ -50,6 +50,7 @@ _SHARED = {
     "collisionMargin": Setting("0 for meshes", _DYNAMICS),
     "activationState": Setting("disable sleeping", _DYNAMICS),
     "deterministicOverlappingPairs": Setting("1", _PARAMETERS),
+    "numSubSteps": Setting("0 (default)", _PARAMETERS),
 }
 
 _TYPES = {
