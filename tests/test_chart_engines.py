@@ -29,6 +29,7 @@ from hapticbridge.study.chart.drawing import CEILING, draw_chart, drawn_cost
 from hapticbridge.study.chart.engine_run import EngineRun, PeerWork
 from hapticbridge.study.chart.files import summary_of, table_of
 from hapticbridge.study.chart.page import chart_page
+from hapticbridge.study.chart.score import Score
 from hapticbridge.study.chart.setting import Setting
 from hapticbridge.study.chart.timing import interleaved_costs
 from hapticbridge.study.chart.workload import Workload
@@ -92,6 +93,27 @@ def test_peg_that_leans_and_rod_that_taps_touch_and_rest_in_every_engine(name: s
     assert settled.position_peak < (20e-6 if name.startswith("drake") else 5e-6)
     rod = EngineRun(engine, workload("rod_impact").peer_work(), Setting(METHODS["explicit"], FINE))
     assert rod.scores()["impact"].verdict == "not metered"
+
+
+NAN = float("nan")
+
+
+class Rounds:
+    """A run that takes these times."""
+
+    seconds = 1.0
+    chosen: Mapping[str, str | int] = {}
+
+    def __init__(self, *spent: float) -> None:
+        self._spent = iter(spent)
+
+    def go(self) -> float:
+        """Takes the next."""
+        return next(self._spent)
+
+    def scores(self) -> Mapping[str, Score]:
+        """Is not judged."""
+        return {}
 
 
 def test_engine_that_throws_the_tool_away_has_diverged_and_is_timed_as_far_as_it_came() -> None:
@@ -263,19 +285,19 @@ def test_engine_that_refuses_a_task_is_left_out_with_its_sentence(
     assert {each.setting.engine for each in chart.measurements} == {"hapticbridge"}
 
 
-def test_engine_that_fails_while_it_is_timed_loses_that_round_alone() -> None:
-    engine, setting = StandIn(), Setting(METHODS["explicit"], FINE)
-    run = EngineRun(engine, workload("point_mass").peer_work(), setting)
+def test_engine_that_fails_while_it_is_timed_loses_those_rounds_alone() -> None:
+    setting = Setting(METHODS["explicit"], FINE)
+    run = EngineRun(StandIn(), workload("point_mass").peer_work(), setting)
     run.scores()
     assert run.go() > 0
     run.engine = StandIn(fails_at=10)
     assert np.isnan(run.go())
-    sound = EngineRun(
-        engine, workload("point_mass").peer_work(), Setting(METHODS["explicit"], FINE)
-    )
-    costs = interleaved_costs([run, sound], 1, repeats=2)
-    assert np.isnan([costs[0].median, costs[0].low, costs[0].ratio_high]).all()
-    assert costs[1].ratio == 1
+    never, sound, sometimes = Rounds(NAN, NAN, NAN), Rounds(2, 4, 2), Rounds(NAN, 8, 5)
+    lost, kept, some = interleaved_costs([never, sound, sometimes], 1, repeats=3)
+    assert np.isnan([lost.median, lost.low, lost.high, lost.ratio]).all()
+    assert (kept.median, kept.ratio) == (2, 1)
+    assert (some.median, some.low, some.high) == (6.5, 5, 8)
+    assert (some.ratio, some.ratio_low, some.ratio_high) == (2.25, 2, 2.5)
 
 
 def test_point_that_diverged_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
