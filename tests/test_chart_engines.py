@@ -255,6 +255,7 @@ def test_engine_that_fails_on_the_way_is_a_mark_with_its_reason(
     page = chart_page(chart)
     assert said in page
     assert "the engine failed" in page
+    assert "M0,6 L6,-5 L-6,-5 Z" in page  # its mark: a wedge
     assert (broken.cost.median, CEILING) in marks_of(chart)
     legend = draw_chart(chart).axes[0].get_legend()
     assert legend is not None
