@@ -11,11 +11,11 @@ passive and applied forces. In the step after it
 
     qfrc_applied = J_kᵀ r_k + c(q_k, u_k) − c(q_k, v_k)
 
-puts the bias at v where MuJoCo takes it at u. In contact half of a wrench that is a step late would
-create energy, so the tool changes over to the implicit form before it touches, and back after it
-has been free for a while; both ways keep S. B' stays the same, so that one device condition holds
-on both sides: with more in contact, a device that bears only the less would be thrown off for ever
-(``passivity.compensation``).
+puts the bias at v where MuJoCo takes it at u. What the user applies enters as the mean of now and
+before. In contact half of a wrench that is a step late would create energy, so the tool changes
+over to the implicit form before it touches, and back after it has been free for a while; both ways
+keep S. B' stays the same, so that one device condition holds on both sides: with more in contact, a
+device that bears only the less would be thrown off for ever (``passivity.compensation``).
 
 The trees that the tool does not belong to are MuJoCo's alone: for them v = u.
 """
