@@ -79,5 +79,28 @@ def needed_for_felt(stiffness: float, felt: float, period: float, lag: float) ->
     return 0.5 * stiffness * _period(period) + law_damping(stiffness, felt, period, lag)
 
 
+def largest_felt_damping(
+    device_damping: float, stiffness: float, period: float, lag: float
+) -> float:
+    """Returns the largest B in N s/m that a device of damping b can show beside K.
+
+        B = b + (λ − ½) K T    for K T/2 <= b, else 0: no damping is low enough
+
+    Args:
+        device_damping: b in N s/m, finite and > 0.
+        stiffness: K in N/m, finite and >= 0.
+        period: T in s, finite and > 0: of the device and of the integration.
+        lag: λ, finite and >= 0.
+
+    Raises:
+        CouplingError: An argument is out of range.
+    """
+    available = scalar("device damping", device_damping, "N s/m", positive=True)
+    per_tick = scalar("stiffness", stiffness, "N/m") * _period(period)
+    if per_tick > 2 * available:
+        return 0.0
+    return available + (scalar("lag", lag, "") - 0.5) * per_tick
+
+
 def _period(period: float) -> float:
     return scalar("period", period, "s", positive=True)
