@@ -105,12 +105,13 @@ def alternatives(felt: Coupling, period: float, filter_time: float) -> tuple[Alt
         name = f"method {method.name}: B = {shown:.4g} felt, B' = {used.damping:.4g}"
         return way(name, law=used)
 
+    methods = [by(method) for method in dict.fromkeys((default_method(), COMPENSATED, IMPLICIT))]
     frequency = _frequencies(period)
     line = transmission_line_spectrum(felt.stiffness * period, period, frequency)
     # the phase of (1 − z⁻¹)z/C passes through π on its way to Nyquist, whatever K and B
     anywhere = Alternative("B' = B, one tick late, any environment", float("inf"), None, None)
     return (
-        *(by(method) for method in dict.fromkeys((default_method(), COMPENSATED, IMPLICIT))),
+        *methods,
         way("B' = B at half the period", step=period / 2),
         way(f"B' = B, low-pass of {1e3 * filter_time:g} ms on the damper", low_pass=filter_time),
         way("B' = B, Tustin's damper", scheme="tustin"),
