@@ -19,8 +19,8 @@ and needs less. A wall is the tool of infinite mass.
 
 **And for the compensated one.** Its tool is G = (T²/m)/(1 − w)². At θ = π it yields by T²/(4m), so
 that H = 1/(1/(K + 2B'/T) + T²/(4m)) and the right-hand side is (T/2) H, below K T/2 + B'; at no θ
-does a free tool ask for more than a wall, for which it is K T/2 + B' again. In contact the lossless coupling is the implicit form with the same B', so its
-condition does not change there.
+does a free tool ask for more than a wall, for which it is K T/2 + B' again. In contact the lossless
+coupling is the implicit form with the same B', so its condition does not change there.
 """
 
 from __future__ import annotations
