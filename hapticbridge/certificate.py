@@ -157,7 +157,7 @@ def device_conditions(
         needed = scale * force_scale * needed_damping(coupling, period, laws)
         remedy = _remedy(method, coupling.damping)
         conditions.append(Condition("translation", needed, info.damping, remedy))
-        if info.degrees_of_freedom > 3:
+        if info.turns:
             needed = force_scale / scale * needed_damping(coupling, period, laws, "rotation")
             remedy = _remedy(method, coupling.rotational_damping)
             conditions.append(Condition("rotation", needed, info.rotational_damping, remedy))
@@ -168,7 +168,7 @@ def _remedy(method: Method | None, used: float) -> str:
     """Returns what lowers the damping needed.
 
     A method that takes its own damping off what is felt spends on B' what a softer spring or a
-    shorter period saves, as long as there is some B' left: then only B counts.
+    shorter period saves, or more, as long as there is some B': until then only B counts.
     """
     if method is None or method.lag == 0.0:
         return "lower stiffness or damping, or raise the rate"
@@ -210,7 +210,7 @@ def condition_sentences(
     sentences = [condition.sentence() for condition in run_conditions(info, parameters, method)]
     if method.has_coupling or info.is_prescribed:
         return tuple(sentences)
-    if info.rotational_damping is None or info.degrees_of_freedom <= 3:
+    if info.rotational_damping is None or not info.turns:
         return ("geometry decides: no coupling bounds what contacts do to the device",)
     damping = info.rotational_damping * parameters.scale / parameters.force_scale
     length = 2.0 * math.sqrt(damping / (parameters.period * parameters.contact_stiffness))

@@ -67,7 +67,7 @@ FACTS = {
 }
 """Metadata that a page shows, with their units; the gains are those of the law, B' and not B."""
 
-DEVICE_FACTS = {"name": "", "degrees_of_freedom": ""} | DATA_SHEET_UNITS
+DEVICE_FACTS = {"name": "", "axes": ""} | DATA_SHEET_UNITS
 """What a page shows of the device's data sheet, with units."""
 
 
