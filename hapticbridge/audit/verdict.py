@@ -17,6 +17,7 @@ from hapticbridge.audit.structure import TOLERANCE, Fault, structure_fault
 from hapticbridge.certificate import condition_sentences, is_run_certified, run_conditions
 from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import HapticBridgeError, RecordingError
+from hapticbridge.felt import coupling_sentences
 from hapticbridge.guard import Limits, limits_for
 from hapticbridge.jsonable import jsonable
 from hapticbridge.kernel.state import RunParameters
@@ -46,6 +47,7 @@ class AuditReport:
         ticks: Number of records.
         duration: Their number times the period, in s.
         conditions: The device condition per kind of axis, as sentences.
+        rendered: What was felt away from contact, and what was used, as sentences.
         unchecked: What records alone do not tell and only the re-simulation confirms, or nothing;
             without a re-simulation such a recording is not called passive but invalid.
         energies: Energies at the end, in J.
@@ -66,6 +68,7 @@ class AuditReport:
     ticks: int = 0
     duration: float = 0.0
     conditions: tuple[str, ...] = ()
+    rendered: tuple[str, ...] = ()
     unchecked: str = ""
     energies: dict[str, float] = field(default_factory=dict)
     events: dict[str, int] = field(default_factory=dict)
@@ -188,6 +191,9 @@ def _device_facts(info: DeviceInfo, parameters: RunParameters, method: Method) -
         return {
             "certified": is_run_certified(run_conditions(info, parameters, method), method),
             "conditions": condition_sentences(info, parameters, method),
+            "rendered": coupling_sentences(
+                parameters.coupling, method, parameters.period, parameters.substeps
+            ),
         }
     except HapticBridgeError as error:  # numbers beyond what the theory computes with
         raise RecordingError(f"the metadata are out of range: {error}") from None
