@@ -156,6 +156,7 @@ def contact_layout() -> dict[str, int]:
         "geoms": "geom",
         "dim": "dim",
         "row": "efc_address",
+        "margin": "includemargin",
     }
     offsets = {name: int(getattr(contact, field).offset) for name, field in fields.items()}
     return {"size": ctypes.sizeof(contact), **offsets}

@@ -118,6 +118,7 @@ class Binding:
         body = int(model.site_bodyid[int(state["grip_site_id"][0])])
         tree = tree_of_tool(model, body)
         owned: dict[str, NDArray[np.generic]] = {
+            "body_rootid": np.ascontiguousarray(model.body_rootid, dtype=np.int32),
             "geom_in_tree": np.ascontiguousarray(tree.geoms, dtype=np.int32),
             "joint_in_tree": np.ascontiguousarray(tree.joints, dtype=np.int32),
             "dof_in_tree": np.ascontiguousarray(tree.dofs, dtype=np.int32),
@@ -134,6 +135,8 @@ class Binding:
             state[name] = array.ctypes.data
         self._owned |= owned
         state["qfrc_written"] = self._data.qfrc_applied.ctypes.data
+        state["cvel"] = self._data.cvel.ctypes.data
+        state["subtree_com"] = self._data.subtree_com.ctypes.data
         state["qfrc_passive"] = self._data.qfrc_passive.ctypes.data
         state["gainprm"] = model.actuator_gainprm.ctypes.data
         state["biasprm"] = model.actuator_biasprm.ctypes.data
