@@ -20,9 +20,9 @@ CLOSE = 2e-5
 """Distance in m, at the next step's start, below which something is near. The next step has a
 contact's force if that distance is below zero; 20 µm is for what a straight line misses of a turn
 (½ ω² r T² at 20 rad/s and 0.1 m). More makes the tool implicit sooner and longer: calling all
-within ``REACH`` near errs by 30 µm instead of 24 µm in tapping on a wall at 4 Hz. It also burns more
-before a contact that creates energy: a peg led into its hole then uses 0.9 % of the slack, not
-1.4 % (the implicit form alone 0.6 %)."""
+within ``REACH`` near errs by 30 µm instead of 24 µm in tapping on a wall at 4 Hz. It also burns
+more energy before a contact that creates some: a peg led into its hole then uses 0.9 % of the
+slack, not 1.4 % (the implicit form alone 0.6 %)."""
 
 
 @compiled
