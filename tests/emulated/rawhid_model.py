@@ -127,7 +127,7 @@ class RawHid(HidDevice):
 
     def _push_with(self, now: float) -> None:
         if self._handle is not None:
-            self._handle.force[:] = self.wrench
+            self._handle.force[:] = 0.0 if self.status & (8 | 16) else self.wrench
             self._handle.advance(now)
 
     # -- frames ----------------------------------------------------------------------------------
