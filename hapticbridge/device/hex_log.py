@@ -1,4 +1,4 @@
-"""A log of every byte between host and device, on demand: kept in memory, written at the end."""
+"""What went over the wire, in hexadecimal, for whoever looks for a fault."""
 
 from __future__ import annotations
 
@@ -9,55 +9,64 @@ from pathlib import Path
 
 from hapticbridge.errors import DeviceError
 
-ENVIRONMENT = "HAPTICBRIDGE_LOG_USB"
-"""Environment variable that names the file, for devices opened without the option ``log``."""
+VARIABLE = "HAPTICBRIDGE_LOG_USB"
+"""Environment variable that names the file of the log where the device's option ``log`` does not."""
 
-LONGEST = 1_000_000
-"""Lines that are kept, the newest: about eight minutes of 1 kHz both ways, some 150 MB."""
+MOST_LINES = 200_000
+"""Transfers that are kept. At 1 kHz both ways that is the last 100 s, in some 40 MB."""
 
 
 class HexLog:
-    """Lines of time, direction and bytes; nothing is formatted or written before ``save``.
+    """Transfers with their time, kept in memory and written when it is closed.
+
+    The loop must not wait for a disk, so nothing is written while it runs. A line is
+    ``SECONDS < HEX`` (from the device) or ``SECONDS > HEX`` (to it), seconds of a monotonic clock
+    from the log's beginning.
 
     Args:
-        path: The file, replaced by ``save``.
+        path: File to write; None takes ``HAPTICBRIDGE_LOG_USB``, and keeps nothing without it.
     """
 
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._lines: deque[tuple[int, str, bytes]] = deque(maxlen=LONGEST)
+    def __init__(self, path: str | Path | None = None) -> None:
+        named = path or os.environ.get(VARIABLE, "")
+        self._path = Path(named) if named else None
+        self._lines: deque[tuple[int, str, bytes]] = deque(maxlen=MOST_LINES)
+        self._count = 0
+        self._origin = time.monotonic_ns()
 
-    @classmethod
-    def asked_for(cls, path: str | None) -> HexLog | None:
-        """Returns a log into a file, or into the environment's; None where neither names one.
-
-        Raises:
-            DeviceError: The file cannot be written.
-        """
-        name = path or os.environ.get(ENVIRONMENT, "")
-        if not name:
-            return None
-        try:
-            Path(name).write_text("", encoding="ascii")
-        except (OSError, ValueError) as error:
-            reason = getattr(error, "strerror", None) or error
-            raise DeviceError(f"log = '{name}': cannot be written ({reason})") from None
-        return cls(Path(name))
+    @property
+    def is_on(self) -> bool:
+        """Whether it keeps anything."""
+        return self._path is not None
 
     def add(self, direction: str, data: bytes) -> None:
-        """Notes bytes with the present time; ``direction`` is a word, as 'out' or 'in'."""
-        self._lines.append((time.monotonic_ns(), direction, data))
+        """Keeps one transfer.
 
-    def save(self) -> None:
-        """Writes ``seconds direction hex`` per line, seconds of the monotonic clock; best effort.
-
-        Called while a device is released, where a full disk must not hide what went wrong before.
+        Args:
+            direction: ``<`` from the device, ``>`` to it.
+            data: What went over.
         """
-        text = "".join(
-            f"{ns // 10**9}.{ns % 10**9:09d} {direction} {data.hex(' ')}\n"
-            for ns, direction, data in self._lines
-        )
-        try:
-            self._path.write_text(text, encoding="ascii")
-        except OSError:
+        if self._path is not None:
+            self._lines.append((time.monotonic_ns(), direction, data))
+            self._count += 1
+
+    def close(self) -> None:
+        """Writes the file, appending; a second call writes nothing more.
+
+        Raises:
+            DeviceError: It cannot be written.
+        """
+        if self._path is None:
             return
+        path, self._path = self._path, None
+        dropped = self._count - len(self._lines)
+        try:
+            with path.open("a", encoding="ascii") as file:
+                if dropped:
+                    file.write(f"# {dropped} transfers before these were not kept\n")
+                for when, direction, data in self._lines:
+                    file.write(f"{1e-9 * (when - self._origin):.6f} {direction} {data.hex(' ')}\n")
+        except OSError as error:
+            raise DeviceError(f"the log '{path}' cannot be written: {error.strerror}") from None
+        finally:
+            self._lines.clear()

@@ -1,64 +1,92 @@
-"""What a family of real devices is, and one of them that is plugged in."""
+"""What kinds of hardware the project drives, and what of it is plugged in: two plain records."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
-Transport = Literal["usb", "hid"]
+from hapticbridge.device.base import Device
+
+Tell = Callable[[str], None]
+"""Takes a sentence for the user while a device is opened or started: a prompt, how far it is."""
+
+RULES_COMMAND = "hapticbridge devices --udev-rules"
+"""What prints the udev rules; sentences about a missing permission name it."""
+
+
+def tell_nobody(_sentence: str) -> None:
+    """Says nothing: where a script opens a device, nobody may be reading."""
 
 
 @dataclass(frozen=True, slots=True)
 class UsbId:
-    """By what a model is known on the bus.
+    """A vendor's and product's number on the USB bus, and what is sold under it.
 
     Attributes:
-        vendor: idVendor, 0 to 0xFFFF.
-        product: idProduct, 0 to 0xFFFF.
-        model: What people call it.
+        vendor: 16 bits.
+        product: 16 bits.
+        model: The maker's name for it.
     """
 
     vendor: int
     product: int
     model: str
 
+    def __str__(self) -> str:
+        return f"{self.vendor:04x}:{self.product:04x}"
 
-@dataclass(frozen=True, slots=True)
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Family:
-    """Devices that one codec drives.
+    """Devices that one codec drives: an entry in the list of what is supported.
 
     Attributes:
-        name: What ``open_device`` calls it.
+        name: What ``open_device`` knows it by.
         about: What it is, in a few words.
-        ids: The models.
-        transport: ``usb`` (libusb) or ``hid`` (hidapi).
-        axes: Which of ``AXES`` it has.
-        force: What it renders, in words with units.
-        rate: How often it speaks, in words with units.
+        ids: Every product of the family.
+        transport: ``hid`` (hidapi) or ``usb`` (pyusb).
+        axes: Which axes it has, in words, because it may differ from unit to unit.
+        force: What force it can show, in words.
+        rate: How often it reports, in words.
+        options: Names that ``open`` understands.
+        open: Finds the device and opens it; takes the options and whom to tell.
+        usage: Usage page and usage of the HID collection that speaks the protocol, where a product
+            has several; None where any will do.
     """
 
     name: str
     about: str
     ids: tuple[UsbId, ...]
-    transport: Transport
-    axes: tuple[str, ...]
+    transport: Literal["hid", "usb"]
+    axes: str
     force: str
     rate: str
+    options: tuple[str, ...]
+    open: Callable[[Mapping[str, object], Tell], Device]
+    usage: tuple[int, int] | None = None
+
+    def model(self, vendor: int, product: int) -> str | None:
+        """Returns the model that has these numbers, or None if it is none of the family."""
+        for usb_id in self.ids:
+            if (usb_id.vendor, usb_id.product) == (vendor, product):
+                return usb_id.model
+        return None
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Plugged:
     """A device that is plugged in.
 
     Attributes:
-        family: Name of its family.
-        name: Its model.
-        serial: Its serial number, empty where it has none or may not be read.
-        path: Where it is: what the transport opens, and what tells two of them apart.
-        vendor: idVendor.
-        product: idProduct.
-        transport: As in ``Family``.
-        problem: Why it cannot be opened, in one sentence; None where nothing is known to hinder.
+        family: The family's name.
+        name: What the device calls itself, else the model's name.
+        serial: Its serial number, empty where it has none or does not tell.
+        path: Where it is opened: a device node.
+        vendor: Its numbers.
+        product: Likewise.
+        transport: ``hid`` or ``usb``.
+        problem: Why it cannot be opened, and what to do, in one sentence; None where it can.
     """
 
     family: str
@@ -67,5 +95,17 @@ class Plugged:
     path: str
     vendor: int
     product: int
-    transport: Transport
-    problem: str | None = None
+    transport: str
+    problem: str | None
+
+    def __str__(self) -> str:
+        serial = f", serial {self.serial}" if self.serial else ""
+        return f"{self.name} ({self.vendor:04x}:{self.product:04x}{serial})"
+
+
+def permission_problem(path: str) -> str:
+    """Says that a node may not be opened, and how to get that permission."""
+    return (
+        f"no permission to open {path}; '{RULES_COMMAND}' prints the rule that grants it to "
+        "whoever sits at the machine"
+    )
