@@ -38,7 +38,7 @@ PLATE, LINKS = 0.01443, 2 * 0.01125
 """c and d + e in m: from the grip's point to the plate's joint, and the two links of the shin."""
 
 SIDEWAYS, HIP_OUT, HIP_SIDEWAYS = -0.025, 0.0400, -0.02309
-"""f, r and s in m: the plate's joint and the hip's axis beside the leg's plane, the hip outwards."""
+"""f, r and s in m: the plate's joint beside the leg's plane, the hip's axis outwards and beside."""
 
 LEG_ANGLES = np.radians([105.0, -15.0, -135.0])
 """φ in rad: a third of a turn apart, 15° off the maker's frame."""
@@ -67,8 +67,7 @@ CLOSED = 1e-14
 encoder's step."""
 
 FLATTEST = 0.03
-"""Smallest |det| of the legs' directions, and smallest share of the thigh's length that is lever, no
-unit. In the middle of the workspace they are 0.8 and 0.98, at its rim 0.07 and 0.05; at 0 a leg is
+"""Smallest |det| of the legs' directions, and smallest lever as a share of the thigh, no unit. In the middle of the workspace they are 0.8 and 0.98, at its rim 0.07 and 0.05; at 0 a leg is
 stretched or folded, and two positions answer to the same angles."""
 
 _COS, _SIN = np.cos(LEG_ANGLES), np.sin(LEG_ANGLES)

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 from hapticbridge.device.base import Device
+from hapticbridge.errors import DeviceError, choices
 
 Tell = Callable[[str], None]
 """Takes a sentence for the user while a device is opened or started: a prompt, how far it is."""
@@ -109,3 +110,37 @@ def permission_problem(path: str) -> str:
         f"no permission to open {path}; '{RULES_COMMAND}' prints the rule that grants it to "
         "whoever sits at the machine"
     )
+
+
+def chosen(family: Family, plugged: Sequence[Plugged], serial: object = None) -> Plugged:
+    """Returns the device to open.
+
+    Args:
+        family: What was looked for.
+        plugged: What of it is plugged in.
+        serial: The serial number, or path, that the user asked for; None: there must be just one.
+
+    Raises:
+        DeviceError: None is plugged in, or not that one, or several and none was asked for, or it
+            may not be opened; says what to do.
+    """
+    several = {(usb_id.vendor, usb_id.product): str(usb_id) for usb_id in family.ids}
+    looked = f"looked for {', '.join(several.values())}"
+    if not plugged:
+        raise DeviceError(
+            f"no {family.name} is plugged in ({looked}); 'hapticbridge devices' lists what is, and "
+            "what permission is missing"
+        )
+    names = choices(device.serial or device.path for device in plugged)
+    if serial is None:
+        if len(plugged) > 1:
+            raise DeviceError(f"{len(plugged)} of {family.name} are plugged in; add serial={names}")
+        device = plugged[0]
+    else:
+        wanted = [d for d in plugged if str(serial) in (d.serial, d.path)]
+        if not wanted:
+            raise DeviceError(f"no {family.name} has serial '{serial}'; plugged in: {names}")
+        device = wanted[0]
+    if device.problem is not None:
+        raise DeviceError(f"{device}: {device.problem}")
+    return device
