@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from hapticbridge.device.plugged import Family, Plugged, permission_problem
+from hapticbridge.device import usb_search
+from hapticbridge.device.falcon import FAMILY as FALCON
+from hapticbridge.device.plugged import Family, Plugged
 from hapticbridge.device.rawhid import FAMILY as RAWHID
 from hapticbridge.device.spacemouse import FAMILY as SPACEMOUSE
 from hapticbridge.device.transport_hid import find, hid_api
-from hapticbridge.device.usb_bus import on_the_bus
 
-FAMILIES: tuple[Family, ...] = (RAWHID, SPACEMOUSE)
+FAMILIES: tuple[Family, ...] = (FALCON, SPACEMOUSE, RAWHID)
 """In the order in which they are listed."""
 
 RULES_FILE = "/etc/udev/rules.d/70-hapticbridge.rules"
@@ -32,20 +33,7 @@ def plugged_of(family: Family) -> list[Plugged]:
     """Lists a family's devices that are plugged in, with what keeps each from being opened."""
     if family.transport == "hid":
         return find(family)
-    return [
-        Plugged(
-            family=family.name,
-            name=device.name or model,
-            serial=device.serial,
-            path=str(device.node),
-            vendor=device.vendor,
-            product=device.product,
-            transport="usb",
-            problem=None if device.is_permitted else permission_problem(str(device.node)),
-        )
-        for device in on_the_bus()
-        if (model := family.model(device.vendor, device.product)) is not None
-    ]
+    return usb_search.find(family)
 
 
 def blind_spots() -> list[str]:

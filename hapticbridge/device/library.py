@@ -12,8 +12,8 @@ from hapticbridge.device.base import Device
 from hapticbridge.device.families import FAMILIES, family_named
 from hapticbridge.device.hand import Hand
 from hapticbridge.device.motion_csv import read_motion
-from hapticbridge.device.scene_hand import scene_hand
 from hapticbridge.device.plugged import Tell, tell_nobody
+from hapticbridge.device.scene_hand import scene_hand
 from hapticbridge.device.simulated import SimulatedDevice
 from hapticbridge.device.specification import parsed, refuse_unknown
 from hapticbridge.device.trajectory import ReplayDevice, TrajectoryDevice
@@ -94,7 +94,7 @@ def device_for(scene: Scene, spec: str, tell: Tell = tell_nobody) -> Device:
     path = scene.path.with_suffix(".csv")
     if path.is_file():
         options["path"] = path
-    return open_device(spec, **options)
+    return open_device(spec, tell=tell, **options)
 
 
 def _open_simulated(rest: str, options: Mapping[str, object]) -> Device:
