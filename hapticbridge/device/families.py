@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from hapticbridge.device import usb_search
+from hapticbridge.device import hid_search, usb_search
 from hapticbridge.device.falcon import FAMILY as FALCON
 from hapticbridge.device.plugged import Family, Plugged
 from hapticbridge.device.rawhid import FAMILY as RAWHID
 from hapticbridge.device.spacemouse import FAMILY as SPACEMOUSE
-from hapticbridge.device.transport_hid import find, hid_api
 
 FAMILIES: tuple[Family, ...] = (FALCON, SPACEMOUSE, RAWHID)
 """In the order in which they are listed."""
@@ -32,13 +31,13 @@ def plugged_devices() -> list[Plugged]:
 def plugged_of(family: Family) -> list[Plugged]:
     """Lists a family's devices that are plugged in, with what keeps each from being opened."""
     if family.transport == "hid":
-        return find(family)
+        return hid_search.find(family)
     return usb_search.find(family)
 
 
 def blind_spots() -> list[str]:
     """Says what keeps devices from being seen at all, one sentence each; empty where nothing."""
-    if hid_api() is None:
+    if hid_search.hid_api() is None:
         return ["hidapi cannot be loaded, so HID devices are not seen: 'pip install hidapi'"]
     return []
 
