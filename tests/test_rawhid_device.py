@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 from emulated.hid_seam import DrivingClock, HidSeam
-from emulated.rawhid_model import NAN, Claims, RawHid
+from emulated.rawhid_model import NAN, Claims, RawHid, crc
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -85,8 +85,6 @@ def test_one_that_does_not_speak_the_protocol_or_another_version_is_refused() ->
 
     class Newer(RawHid):
         def push(self, report: bytes) -> None:
-            from emulated.rawhid_model import crc
-
             body = report[:1] + b"\x02" + report[2:62]
             super().push(body + crc(body).to_bytes(2, "little"))
 
@@ -101,7 +99,7 @@ def test_another_teensy_interface_and_another_serial_are_not_taken_for_it() -> N
     with pytest.raises(DeviceError, match="no device 'rawhid' is plugged in"):
         opened(Serial())
     first, second = RawHid(serial="A"), RawHid(serial="B")
-    with pytest.raises(DeviceError, match="2 devices 'rawhid' .* one of 'A', 'B'"):
+    with pytest.raises(DeviceError, match=r"2 devices 'rawhid' .* one of 'A', 'B'"):
         open_rawhid({}, tell_nobody, HidSeam(first, second))
     with pytest.raises(DeviceError, match="no device 'rawhid' has serial 'C'; plugged in: 'A', "):
         open_rawhid({"serial": "C"}, tell_nobody, HidSeam(first, second))
@@ -265,7 +263,8 @@ def test_closing_switches_the_motors_off() -> None:
     device, model, _ = still()
     device.write(PUSH)
     device.close()
-    assert (model.is_enabled, model.wrench.any()) == (False, False)
+    assert not model.is_enabled
+    assert not model.wrench.any()
 
 
 def test_the_echo_counts_force_frames_on_the_way() -> None:
@@ -324,9 +323,7 @@ def test_the_model_moves_as_its_mechanics_do_under_the_force_it_is_sent() -> Non
     expected = (seconds - decay * (1.0 - math.exp(-seconds / decay))) / damping
     # the state that is read was latched up to a period ago, and a force acts from the next 125 µs
     assert sample["position"][0] == pytest.approx(expected, rel=0.15)
-    assert device.velocity[0] == pytest.approx(
-        (1 - math.exp(-seconds / decay)) / damping, rel=0.1
-    )
+    assert device.velocity[0] == pytest.approx((1 - math.exp(-seconds / decay)) / damping, rel=0.1)
 
 
 def test_the_clock_of_the_tests_moves_the_device() -> None:
