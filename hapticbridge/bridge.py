@@ -20,7 +20,7 @@ from hapticbridge.certificate import condition_sentences, default_coupling
 from hapticbridge.clock import Clock, RealClock, period_of
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Device, device_for
-from hapticbridge.errors import HapticBridgeError, SafetyTrip, SceneError
+from hapticbridge.errors import DeviceError, HapticBridgeError, SafetyTrip, SceneError
 from hapticbridge.guard import Limits, limits_for, refuse_stretched_start, trip_reason
 from hapticbridge.inputs import Write, apply_writes, input_writes
 from hapticbridge.jit import direct
@@ -125,7 +125,7 @@ class Bridge:
         with ExitStack() as resources:
             resources.callback(self.device.close)
             self._prepare(resources)
-            resources.callback(self.device.write, _NO_FORCE)
+            resources.callback(self._silence)
             self._resources = resources.pop_all()
         self._is_open = True
         return self
@@ -161,11 +161,11 @@ class Bridge:
             What the run was; of all ticks so far, if ``run`` is called again.
 
         Raises:
-            SafetyTrip: The guard stopped the run; zero force was commanded first.
-            DeviceError: The device failed; likewise.
+            SafetyTrip: The guard stopped the run, or the device failed; zero force was commanded
+                first, where it still could be.
             HapticBridgeError: The bridge is not open, or the duration is out of range.
         """
-        last, code, read = self._last_tick(duration), OK, 0
+        last, code, read, failure = self._last_tick(duration), OK, 0, ""
         self._resume()
         state, row = self._binding.state, self._binding.row
         model, data, substeps = self.scene.model, self.scene.data, range(self._substeps)
@@ -184,7 +184,7 @@ class Bridge:
                         on_tick(self._tick)
                     if inputs:
                         self._apply_inputs()
-                    read_device(sample)
+                    news = read_device(sample)
                     read_before, read = read, now()
                     elapsed = 1e-9 * (read - read_before)
                     for substep in substeps:
@@ -197,23 +197,33 @@ class Bridge:
                         break
                     write_device(wrench)
                     write = now()
-                    flags = stream.lost | (self._overrun(skipped) if skipped else 0)
+                    flags = news | stream.lost | (self._overrun(skipped) if skipped else 0)
                     while not hand_over(row, records, cursors, deadline, wake, read, write, flags):
                         if not stream.makes_room(may_wait=not self._stopped_by):
                             break
                     else:
                         stream.lost = 0
                     self._tick += 1
+            except DeviceError as error:
+                failure = f"tick {self._tick}: {error}"
             finally:
-                write_device(_NO_FORCE)
-        if code != OK:
-            self._trip(trip_reason(code, self._tick))
+                unsent = self._silence()
+        if code != OK or failure or unsent:
+            self._trip(failure or (unsent if code == OK else trip_reason(code, self._tick)))
         self._stopped_by = self._stopped_by or "duration"
         return self.summary()
 
     def stop(self) -> None:
         """Ends the run after the present tick; may be called from ``on_tick`` or a thread."""
         self._stopped_by = "caller"
+
+    def _silence(self) -> str:
+        """Commands zero force; returns why that failed, or nothing."""
+        try:
+            self.device.write(_NO_FORCE)
+        except DeviceError as error:
+            return f"zero force could not be sent: {error}"
+        return ""
 
     def _stop_on_signal(self) -> None:
         self._stopped_by = "signal"

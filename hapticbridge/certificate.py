@@ -150,7 +150,7 @@ def device_conditions(
     if info.damping is not None:
         needed = scale * force_scale * needed_damping(coupling, period, laws)
         conditions.append(Condition("translation", needed, info.damping))
-        if info.degrees_of_freedom > 3:
+        if info.turns:
             needed = force_scale / scale * needed_damping(coupling, period, laws, "rotation")
             conditions.append(Condition("rotation", needed, info.rotational_damping))
     return tuple(conditions)
@@ -190,7 +190,7 @@ def condition_sentences(
     sentences = [condition.sentence() for condition in run_conditions(info, parameters, method)]
     if method.has_coupling or info.is_prescribed:
         return tuple(sentences)
-    if info.rotational_damping is None or info.degrees_of_freedom <= 3:
+    if info.rotational_damping is None or not info.turns:
         return ("geometry decides: no coupling bounds what contacts do to the device",)
     damping = info.rotational_damping * parameters.scale / parameters.force_scale
     length = 2.0 * math.sqrt(damping / (parameters.period * parameters.contact_stiffness))

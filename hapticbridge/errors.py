@@ -38,6 +38,10 @@ class DeviceError(HapticBridgeError):
     """A device cannot be opened, read or written, or its input file is bad."""
 
 
+class DeviceLost(DeviceError):  # noqa: N818 - as SafetyTrip: what happened, not a mistake
+    """A device is gone in mid-run: unplugged, or silent for longer than it may be."""
+
+
 class RecordingError(HapticBridgeError):
     """A recording cannot be read or written."""
 

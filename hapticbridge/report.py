@@ -65,7 +65,7 @@ FACTS = {
 }
 """Metadata that a page shows, with their units."""
 
-DEVICE_FACTS = {"name": "", "degrees_of_freedom": ""} | DATA_SHEET_UNITS
+DEVICE_FACTS = {"name": "", "axes": ""} | DATA_SHEET_UNITS
 """What a page shows of the device's data sheet, with units."""
 
 

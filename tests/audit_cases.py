@@ -13,7 +13,7 @@ from hapticbridge.audit import AuditReport, audit
 from hapticbridge.bridge import Bridge
 from hapticbridge.clock import SimulatedClock
 from hapticbridge.coupling import Coupling
-from hapticbridge.device import Device, DeviceInfo
+from hapticbridge.device import AXES, Device, DeviceInfo
 from hapticbridge.guard import Limits
 from hapticbridge.provenance import MODEL_ATTACHMENT
 from hapticbridge.recording import Attachment, Recording, RecordingWriter
@@ -114,7 +114,7 @@ class ScriptedDevice:
     ) -> None:
         self.info = DeviceInfo(
             name="scripted",
-            degrees_of_freedom=6,
+            axes=AXES,
             mass=0.1,
             damping=damping,
             rotational_inertia=1e-4,
@@ -125,6 +125,7 @@ class ScriptedDevice:
             torque_limit=0.05 * strength,
             speed_limit=5.0,
             rate=None,
+            delay=0.0,
             is_prescribed=False,
             is_real=False,
             duration=None,
@@ -142,10 +143,11 @@ class ScriptedDevice:
         self._report(sample, 0)
         return sample
 
-    def read(self, sample: NDArray[np.void]) -> None:
+    def read(self, sample: NDArray[np.void]) -> int:
         tick = self._tick
         self._tick += 1
         self._report(sample, tick)
+        return 0
 
     def write(self, wrench: NDArray[np.float64]) -> None:
         self.writes.append(wrench.copy())

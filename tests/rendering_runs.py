@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from hapticbridge.coupling import Coupling
-from hapticbridge.device import DeviceInfo
+from hapticbridge.device import AXES, DeviceInfo
 from hapticbridge.guard import Limits
 from hapticbridge.kernel.state import Binding, RunParameters
 from hapticbridge.kernel.step import simulate
@@ -116,7 +116,7 @@ class Rotor:
     ) -> None:
         self.info = DeviceInfo(
             name="rotor",
-            degrees_of_freedom=6,
+            axes=AXES,
             mass=0.1,
             damping=50.0,
             rotational_inertia=inertia,
@@ -127,6 +127,7 @@ class Rotor:
             torque_limit=10.0,
             speed_limit=5.0,
             rate=None,
+            delay=0.0,
             is_prescribed=False,
             is_real=is_real,
             duration=None,
@@ -142,7 +143,7 @@ class Rotor:
         sample["quaternion"][0, 0] = 1.0
         return sample
 
-    def read(self, sample: NDArray[np.void]) -> None:
+    def read(self, sample: NDArray[np.void]) -> int:
         damping, inertia = self.info.rotational_damping or 0.0, self.info.rotational_inertia or 1.0
         rate = damping / inertia
         steady = self._torque / damping
@@ -152,6 +153,7 @@ class Rotor:
         sample["position"] = 0.0
         half = 0.5 * self._angle
         sample["quaternion"][0] = np.cos(half), 0.0, np.sin(half), 0.0
+        return 0
 
     def write(self, wrench: NDArray[np.float64]) -> None:
         self.writes.append(wrench.copy())

@@ -14,10 +14,11 @@ import numpy as np
 import pytest
 from audit_cases import ScriptedDevice, SlowClock, recorded
 from bridge_runs import REST, fast, still, sway
+from numpy.typing import NDArray
 
 from hapticbridge.audit import audit
 from hapticbridge.bridge import Bridge
-from hapticbridge.errors import DeviceError, HapticBridgeError, SafetyTrip
+from hapticbridge.errors import DeviceError, DeviceLost, HapticBridgeError, SafetyTrip
 from hapticbridge.recording import Recorder, Ring, read_recording
 from hapticbridge.recording import stream as stream_module
 from hapticbridge.tick import TickFlag
@@ -71,13 +72,15 @@ def test_device_that_fails_to_read_gets_zero_force_and_the_recording_is_whole(
 ) -> None:
     path = tmp_path / "run.mcap"
     device = ScriptedDevice(failing("unplugged", 60))
-    with pytest.raises(DeviceError, match="unplugged"):
+    with pytest.raises(SafetyTrip, match="tick 60: unplugged") as caught:
         recorded(path, "point_mass", device)
     assert (device.writes[-1] == 0).all()
     assert device.is_closed
     recording = read_recording(path)
     assert not recording.is_cut
-    assert recording.events[-1]["reason"] == "DeviceError: unplugged"
+    assert caught.value.records["tick"].tolist() == list(range(60))
+    assert [event["event"] for event in recording.events] == ["start", "trip", "stop"]
+    assert recording.events[1]["reason"] == "tick 60: unplugged"
     assert (audit(path).verdict, len(recording.ticks)) == ("passive", 60)
 
 
@@ -89,7 +92,7 @@ def test_device_that_fails_to_write_is_closed_and_the_recording_is_whole(tmp_pat
             raise DeviceError("unplugged")
 
     device = ScriptedDevice(sway, on_write=fail)
-    with pytest.raises(DeviceError, match="unplugged"):
+    with pytest.raises(SafetyTrip, match="tick 60: unplugged"):
         recorded(path, "point_mass", device)
     assert len(device.writes) > 61  # zero force was tried after the failure
     assert (device.writes[-1] == 0).all()
@@ -198,6 +201,39 @@ def test_no_shared_memory_is_left_whatever_happens(tmp_path: Path) -> None:
             recorded(tmp_path / "no" / "run.mcap", "point_mass", device, duration=0.01)
         assert device.is_closed
         assert not segments()
+
+
+def test_a_run_whose_last_zero_force_cannot_be_sent_trips(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+
+    def fail(count: int) -> None:
+        if count == 51:
+            raise DeviceLost("unplugged")
+
+    with pytest.raises(SafetyTrip, match="zero force could not be sent: unplugged"):
+        recorded(path, "point_mass", ScriptedDevice(sway, on_write=fail), duration=0.05)
+    assert len(read_recording(path).ticks) == 50
+
+
+def test_what_the_device_repeats_is_flagged_and_must_be_the_same(tmp_path: Path) -> None:
+    class Slow(ScriptedDevice):
+        is_honest = True
+
+        def read(self, sample: NDArray[np.void]) -> int:
+            repeats, self._tick = self._tick % 3, self._tick + 1
+            self._report(sample, self._tick - (repeats if self.is_honest else 0))
+            return int(TickFlag.STALE_SAMPLE) if repeats else 0
+
+    path = tmp_path / "run.mcap"
+    recorded(path, "point_mass", Slow(sway), duration=0.03)
+    is_stale = (read_recording(path).ticks["flags"] & TickFlag.STALE_SAMPLE) != 0
+    assert is_stale.tolist() == [bool(k % 3) for k in range(30)]
+    assert audit(path).verdict == "passive"
+    Slow.is_honest = False
+    recorded(path, "point_mass", Slow(sway), duration=0.03)
+    report = audit(path)
+    assert report.verdict == "invalid"
+    assert "tick 1 says that the device had nothing new" in report.reason
 
 
 def test_recording_is_closed_although_the_device_cannot_be(tmp_path: Path) -> None:

@@ -12,7 +12,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from hapticbridge.device import Device, DeviceInfo, Hand, ReplayDevice, SimulatedDevice, open_device
+from hapticbridge.device import (
+    AXES,
+    Device,
+    DeviceInfo,
+    Hand,
+    ReplayDevice,
+    SimulatedDevice,
+    open_device,
+)
 from hapticbridge.errors import DeviceError
 from hapticbridge.tick import SAMPLE_DTYPE, TICK_DTYPE
 
@@ -123,7 +131,9 @@ at_least_zero = st.floats(0.0, 1e300)
     st.builds(
         DeviceInfo,
         name=st.text(min_size=1),
-        degrees_of_freedom=st.sampled_from([3, 6]),
+        axes=st.sets(st.sampled_from(AXES), min_size=1).map(
+            lambda axes: tuple(axis for axis in AXES if axis in axes)
+        ),
         mass=unknown_or_positive,
         damping=st.none() | at_least_zero,
         rotational_inertia=unknown_or_positive,
@@ -134,6 +144,7 @@ at_least_zero = st.floats(0.0, 1e300)
         torque_limit=at_least_zero,
         speed_limit=at_least_zero,
         rate=unknown_or_positive,
+        delay=st.none() | at_least_zero,
         is_prescribed=st.booleans(),
         is_real=st.booleans(),
         duration=st.none() | at_least_zero,
@@ -148,8 +159,12 @@ def test_any_data_sheet_survives_json(info: DeviceInfo) -> None:
     [
         ({"name": ""}, "device name = ''"),
         ({"name": 3}, "device name = 3"),
-        ({"degrees_of_freedom": 5}, "degrees_of_freedom = 5: must be 3"),
-        ({"degrees_of_freedom": True}, "degrees_of_freedom = True"),
+        ({"axes": ()}, "axes = (): must be one or more of 'rx', 'ry', 'rz', 'x', 'y', 'z'"),
+        ({"axes": "xyz"}, "axes = 'xyz': must be one or more of"),
+        ({"axes": ("y", "x")}, "axes = ('y', 'x'): must be of x, y, z, rx, ry, rz, each once, in"),
+        ({"axes": ("x", "x")}, "axes = ('x', 'x')"),
+        ({"axes": ("x", "w")}, "axes = ('x', 'w')"),
+        ({"delay": -1e-3}, "delay = -0.001: must be a finite number >= 0 s"),
         ({"mass": 0.0}, "mass = 0.0: must be a finite number > 0 kg"),
         ({"damping": -0.1}, "damping = -0.1: must be a finite number >= 0 N s/m"),
         ({"damping": "2"}, "damping = '2'"),
@@ -175,8 +190,8 @@ def test_a_bad_data_sheet_is_refused(change: dict[str, object], words: str) -> N
         ("{", "is not JSON"),
         ("[" * 100_000, "is not JSON"),
         ("[1]", "is not a JSON object but [1]"),
-        ("{}", "lacks 'damping', 'degrees_of_freedom'"),
-        ('{"colour": "red"}', "holds 'colour', which it does not know; it knows 'damping'"),
+        ("{}", "lacks 'axes', 'damping'"),
+        ('{"colour": "red"}', "holds 'colour', which it does not know; it knows 'axes'"),
     ],
 )
 def test_text_that_is_no_data_sheet_is_refused(text: str, words: str) -> None:

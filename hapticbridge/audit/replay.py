@@ -39,7 +39,8 @@ recordings."""
 
 NOT_RUN = "not re-simulated"
 
-_TIMING = int(TickFlag.OVERRUN | TickFlag.DROPPED_BEFORE)
+_OUTSIDE = int(TickFlag.OVERRUN | TickFlag.DROPPED_BEFORE | TickFlag.STALE_SAMPLE)
+"""Flags that the clock, the recorder and the device set, not the simulation."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -212,7 +213,7 @@ def _compared(recording: Recording, again: NDArray[np.void]) -> Replay:
             continue
         recorded, simulated = ticks[name], again[name]
         if name == "flags":
-            recorded, simulated = recorded & ~_TIMING, simulated & ~_TIMING
+            recorded, simulated = recorded & ~_OUTSIDE, simulated & ~_OUTSIDE
         unequal = (recorded != simulated).reshape(len(again), -1).any(axis=1)
         if not unequal.any():
             continue

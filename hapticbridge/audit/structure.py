@@ -135,4 +135,11 @@ def _flag_fault(
             tick = int(np.argmax(wrong))
             name = (flag.name or "").lower()
             return Fault(f"flag '{name}' of tick {tick} contradicts the record", tick, "flags")
+    is_stale = (ticks["flags"][1:] & int(TickFlag.STALE_SAMPLE)) != 0
+    for field in ("device_position", "device_quaternion"):
+        moved = is_stale & (ticks[field][1:] != ticks[field][:-1]).any(axis=1)
+        if moved.any():
+            tick = 1 + int(np.argmax(moved))
+            text = f"tick {tick} says that the device had nothing new, and its {field} differs"
+            return Fault(text, tick, "flags")
     return None

@@ -1,5 +1,6 @@
 """Haptic devices: real, simulated and replayed, behind one protocol."""
 
+from hapticbridge.device.base import AXES as AXES
 from hapticbridge.device.base import DATA_SHEET_UNITS as DATA_SHEET_UNITS
 from hapticbridge.device.base import Device as Device
 from hapticbridge.device.base import DeviceInfo as DeviceInfo

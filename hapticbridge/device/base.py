@@ -57,9 +57,13 @@ DATA_SHEET_UNITS = {
     "torque_limit": "N m",
     "speed_limit": "m/s",
     "rate": "Hz",
+    "delay": "s",
     "duration": "s",
 }
 """SI units of the numbers in a device's data sheet."""
+
+AXES = ("x", "y", "z", "rx", "ry", "rz")
+"""Axes that a device may move along (x, y, z) and turn about (rx, ry, rz), in its own frame."""
 
 _NEVER_UNKNOWN = ("force_limit", "torque_limit", "speed_limit")
 _POSITIVE = ("mass", "rotational_inertia", "rate")
@@ -71,7 +75,8 @@ class DeviceInfo:
 
     Attributes:
         name: What it is called, not empty.
-        degrees_of_freedom: 3 (translation) or 6 (translation, then rotation).
+        axes: Which of ``AXES`` it moves along and turns about, in that order, at least one. What
+            is not there stays where it is, and no wrench acts on it.
         mass: Inertia felt at the handle in kg, > 0; None where unknown.
         damping: Physical damping b at the handle in N s/m, >= 0; None where unknown or where
             the motion is prescribed. The bound b >= KT/2 + B is judged against it.
@@ -83,6 +88,8 @@ class DeviceInfo:
         torque_limit: Largest torque in N m, by norm, >= 0.
         speed_limit: Fastest motion in m/s that the device can make, >= 0.
         rate: The device's own rate in Hz, > 0; None where it follows the bridge.
+        delay: How old a sample is when the loop reads it, plus the time until a written wrench
+            acts, in s, >= 0; None where unknown.
         is_prescribed: Whether its motion does not react to force.
         is_real: Whether it moves a motor in somebody's hand.
         duration: Time in s after which its motion ends by itself, >= 0; None where it does not.
@@ -92,7 +99,7 @@ class DeviceInfo:
     """
 
     name: str
-    degrees_of_freedom: int
+    axes: tuple[str, ...]
     mass: float | None
     damping: float | None
     rotational_inertia: float | None
@@ -103,6 +110,7 @@ class DeviceInfo:
     torque_limit: float
     speed_limit: float
     rate: float | None
+    delay: float | None
     is_prescribed: bool
     is_real: bool
     duration: float | None
@@ -110,11 +118,14 @@ class DeviceInfo:
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not self.name:
             raise DeviceError(f"device name = {self.name!r}: must be a text that is not empty")
-        if isinstance(self.degrees_of_freedom, bool) or self.degrees_of_freedom not in (3, 6):
+        if not isinstance(self.axes, tuple | list) or not self.axes:
+            raise DeviceError(f"axes = {self.axes!r}: must be one or more of {choices(AXES)}")
+        if tuple(self.axes) != tuple(axis for axis in AXES if axis in self.axes):
             raise DeviceError(
-                f"degrees_of_freedom = {self.degrees_of_freedom!r}: must be 3 (translation) "
-                "or 6 (translation and rotation)"
+                f"axes = {tuple(self.axes)!r}: must be of {', '.join(AXES)}, each once, in this "
+                "order"
             )
+        object.__setattr__(self, "axes", tuple(self.axes))
         for name in ("is_prescribed", "is_real"):
             if not isinstance(getattr(self, name), bool):
                 raise DeviceError(f"{name} = {getattr(self, name)!r}: must be true or false")
@@ -126,6 +137,21 @@ class DeviceInfo:
             object.__setattr__(self, name, number)
 
     @property
+    def degrees_of_freedom(self) -> int:
+        """How many axes it has."""
+        return len(self.axes)
+
+    @property
+    def moves(self) -> bool:
+        """Whether it moves along any axis."""
+        return any(axis in self.axes for axis in AXES[:3])
+
+    @property
+    def turns(self) -> bool:
+        """Whether it turns about any axis."""
+        return any(axis in self.axes for axis in AXES[3:])
+
+    @property
     def burning_damping(self) -> tuple[float | None, float | None]:
         """What the device burns energy with: b in N s/m and in N m s/rad; None, None where unknown.
 
@@ -133,7 +159,7 @@ class DeviceInfo:
         energy. A device without rotation needs none for it; one whose motion is prescribed keeps
         nothing of what it is given.
         """
-        is_complete = self.rotational_damping is not None or self.degrees_of_freedom == 3
+        is_complete = self.rotational_damping is not None or not self.turns
         if self.is_prescribed or not is_complete:
             return None, None
         return self.damping, self.rotational_damping
@@ -193,11 +219,18 @@ class Device(Protocol):
             DeviceError: The device cannot run at this period.
         """
 
-    def read(self, sample: NDArray[np.void]) -> None:
+    def read(self, sample: NDArray[np.void]) -> int:
         """Fills in the newest sample.
 
         Args:
             sample: Shape (1,), ``SAMPLE_DTYPE``, filled in place.
+
+        Returns:
+            0 where the sample is new, ``TickFlag.STALE_SAMPLE`` where the device had nothing new
+            since the last read and the sample repeats it.
+
+        Raises:
+            DeviceLost: It is gone, or has been silent too long.
         """
 
     def write(self, wrench: NDArray[np.float64]) -> None:
@@ -205,6 +238,10 @@ class Device(Protocol):
 
         Args:
             wrench: Shape (6,): force in N, torque in N m, on the device, in the device's frame.
+                What it has no axis for it leaves out.
+
+        Raises:
+            DeviceLost: It is gone.
         """
 
     def close(self) -> None:

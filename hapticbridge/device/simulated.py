@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from hapticbridge.device.base import DeviceInfo, checked_number, checked_period
+from hapticbridge.device.base import AXES, DeviceInfo, checked_number, checked_period
 from hapticbridge.device.hand import DEFAULT_HAND, NO_HAND, Hand
 from hapticbridge.device.handheld import (
     FREE,
@@ -121,7 +121,7 @@ class SimulatedDevice:
         friction = checked_number("friction", friction, "N")
         self.info = DeviceInfo(
             name="simulated",
-            degrees_of_freedom=6,
+            axes=AXES,
             mass=mass,
             damping=damping,
             rotational_inertia=rotational_inertia,
@@ -132,6 +132,7 @@ class SimulatedDevice:
             torque_limit=torque_limit,
             speed_limit=speed_limit,
             rate=None,
+            delay=0.0,
             is_prescribed=False,
             is_real=False,
             duration=duration,
@@ -206,7 +207,7 @@ class SimulatedDevice:
         self._is_started = True
         return sample
 
-    def read(self, sample: NDArray[np.void]) -> None:
+    def read(self, sample: NDArray[np.void]) -> int:
         """Moves on by one period (the first call does not) and reports the pose, no buttons.
 
         Args:
@@ -218,6 +219,7 @@ class SimulatedDevice:
         if not self._is_started:
             raise DeviceError("the simulated device is read before it was started")
         self._next_sample(self._states, self._motion, sample)
+        return 0
 
     def write(self, wrench: NDArray[np.float64]) -> None:
         """Holds a wrench on the handle until the next write, ``delay`` samples later.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.device.base import DeviceInfo, checked_period
+from hapticbridge.device.base import AXES, DeviceInfo, checked_period
 from hapticbridge.device.motion import NORM_TOLERANCE, Motion, pose_at
 from hapticbridge.errors import DeviceError
 from hapticbridge.jit import compiled, direct
@@ -43,7 +43,7 @@ def _prescribed(
     """Returns the data sheet of a device that no force moves."""
     return DeviceInfo(
         name="trajectory",
-        degrees_of_freedom=6,
+        axes=AXES,
         mass=None,
         damping=None,
         rotational_inertia=None,
@@ -54,6 +54,7 @@ def _prescribed(
         torque_limit=torque_limit,
         speed_limit=speed_limit,
         rate=rate,
+        delay=0.0,
         is_prescribed=True,
         is_real=False,
         duration=duration,
@@ -115,7 +116,7 @@ class TrajectoryDevice:
         self._is_started = True
         return sample
 
-    def read(self, sample: NDArray[np.void]) -> None:
+    def read(self, sample: NDArray[np.void]) -> int:
         """Reports the pose of this tick, no buttons.
 
         Args:
@@ -127,6 +128,7 @@ class TrajectoryDevice:
         if not self._is_started:
             raise DeviceError("the trajectory is read before it was started")
         self._advance(self._states, self._table, sample)
+        return 0
 
     def write(self, wrench: NDArray[np.float64]) -> None:
         """Ignores the wrench: the motion is prescribed."""
@@ -217,7 +219,7 @@ class ReplayDevice:
         self._tick = 0
         return np.asarray(self._samples[:1].copy())
 
-    def read(self, sample: NDArray[np.void]) -> None:
+    def read(self, sample: NDArray[np.void]) -> int:
         """Reports the recorded sample of this tick.
 
         Args:
@@ -232,6 +234,7 @@ class ReplayDevice:
         sample[0] = self._samples[tick]
         if tick + 1 < len(self._samples):
             self._tick = tick + 1
+        return 0
 
     def write(self, wrench: NDArray[np.float64]) -> None:
         """Ignores the wrench: the motion is prescribed."""
