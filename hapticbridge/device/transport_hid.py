@@ -234,7 +234,8 @@ class HidLink:
         if self._lost or not self._is_open:
             raise DeviceLost(self._lost or f"{self._name} is closed")
         if self._writer is None:
-            self._send(report)
+            if not self._is_sent(report):
+                raise DeviceLost(f"{self._name} did not take a report")
             return
         if not self._is_idle.is_set() and time.monotonic() - self._busy_since > LONGEST_WRITE:
             self._lost = f"{self._name} takes no reports any more"
@@ -250,9 +251,8 @@ class HidLink:
         if self._writer is not None:
             self._wake.set()
             self._writer.join(LONGEST_WRITE)
-            if self._writer.is_alive():
-                return  # it is still inside hidapi's write: closing now would free what it uses
-        self._handle.close()
+        if self._writer is None or not self._writer.is_alive():
+            self._handle.close()  # else it is inside hidapi's write, which uses what this frees
         self._log.close()
 
     def _read(self, timeout_ms: int) -> bytes:
@@ -261,25 +261,19 @@ class HidLink:
         try:
             report = bytes(self._handle.read(LONGEST_REPORT, timeout_ms))
         except (OSError, ValueError):
-            self._lost = self._gone()
+            self._lost = f"{self._name} is gone: unplugged, or switched off"
             raise DeviceLost(self._lost) from None
         if report and self._log.is_on:
             self._log.add("<", report)
         return report
 
-    def _send(self, report: bytes) -> None:
-        try:
-            count = self._handle.write(report)
-        except (OSError, ValueError):
-            count = -1
-        if count < 0:
-            self._lost = self._gone()
-            raise DeviceLost(self._lost)
+    def _is_sent(self, report: bytes) -> bool:
         if self._log.is_on:
             self._log.add(">", report)
-
-    def _gone(self) -> str:
-        return f"{self._name} is gone: unplugged, or switched off"
+        try:
+            return self._handle.write(report) >= 0
+        except (OSError, ValueError):
+            return False
 
     def _send_newest(self) -> None:
         """Runs in the writer's thread until the link is closed or the device lost."""
@@ -289,10 +283,9 @@ class HidLink:
             while self._outgoing:
                 self._busy_since = time.monotonic()
                 self._is_idle.clear()
-                try:
-                    self._send(self._outgoing.popleft())
-                except DeviceLost:
-                    return  # the loop learns it from its next read or write
+                if not self._is_sent(self._outgoing.popleft()):
+                    self._lost = f"{self._name} is gone: it took no report"
+                    return
                 self._is_idle.set()
             if not self._is_open:
                 return
