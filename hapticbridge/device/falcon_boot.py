@@ -208,7 +208,7 @@ def _greet(link: Link, name: str) -> None:
 
 
 def _echo(link: Link, data: bytes, length: int | None = None) -> bytes:
-    """Sends bytes; returns what comes back within ``ANSWER_TIME``, as many unless told otherwise."""
+    """Sends bytes; returns what comes back within ``ANSWER_TIME``, as many by default."""
     wanted = len(data) if length is None else length
     link.write(array.array("B", data), _WRITE_MS)
     end = link.now() + ANSWER_TIME
