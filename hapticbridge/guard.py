@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticbridge.clock import Clock, SimulatedClock
 from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import DeviceError
 from hapticbridge.kernel.step import BAD_SAMPLE
@@ -87,6 +88,19 @@ def refuse_stretched_start(state: NDArray[np.void], limits: Limits) -> None:
             f"the device's absolute pose puts the handle {1e3 * distance:.3g} mm from the grip, "
             f"{force:.3g} N at the start; the limit is {limits.force:g} N: start nearer to "
             f"{np.round(s['tool_position'], 4).tolist()} m or use relative poses"
+        )
+
+
+def refuse_simulated_time(info: DeviceInfo, clock: Clock) -> None:
+    """Refuses a clock that runs as fast as it goes for a device that lives in real time.
+
+    Raises:
+        DeviceError: Says so.
+    """
+    if info.is_real and isinstance(clock, SimulatedClock):
+        raise DeviceError(
+            f"the device '{info.name}' is real and cannot keep up with simulated time; leave out "
+            "--fast (from code: pass no SimulatedClock)"
         )
 
 

@@ -261,8 +261,8 @@ class FalconDevice:
                 is_told = True
                 tell(f"{self._name}: pull the grip all the way out and push it back in, slowly")
         raise DeviceError(
-            f"{self._name}: was not homed within {HOMING_TIME:g} s; open it again and move the grip "
-            "all the way out and in"
+            f"{self._name}: was not homed within {HOMING_TIME:g} s; open it again and move the "
+            "grip all the way out and in"
         )
 
     def _silent(self) -> DeviceLost:

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from hapticbridge.device.plugged import Family, Plugged, permission_problem
+from hapticbridge.device.falcon import FAMILY as FALCON
+from hapticbridge.device.plugged import Family, Plugged
 from hapticbridge.device.rawhid import FAMILY as RAWHID
 from hapticbridge.device.spacemouse import FAMILY as SPACEMOUSE
-from hapticbridge.device.transport_hid import find, hid_api
-from hapticbridge.device.usb_bus import on_the_bus
+from hapticbridge.device.transport_hid import find as find_hid
+from hapticbridge.device.transport_hid import hid_api
+from hapticbridge.device.usb_search import find as find_usb
+from hapticbridge.device.usb_search import libusb
 
-FAMILIES: tuple[Family, ...] = (RAWHID, SPACEMOUSE)
+FAMILIES: tuple[Family, ...] = (FALCON, RAWHID, SPACEMOUSE)
 """In the order in which they are listed."""
 
 RULES_FILE = "/etc/udev/rules.d/70-hapticbridge.rules"
@@ -30,29 +33,19 @@ def plugged_devices() -> list[Plugged]:
 
 def plugged_of(family: Family) -> list[Plugged]:
     """Lists a family's devices that are plugged in, with what keeps each from being opened."""
-    if family.transport == "hid":
-        return find(family)
-    return [
-        Plugged(
-            family=family.name,
-            name=device.name or model,
-            serial=device.serial,
-            path=str(device.node),
-            vendor=device.vendor,
-            product=device.product,
-            transport="usb",
-            problem=None if device.is_permitted else permission_problem(str(device.node)),
-        )
-        for device in on_the_bus()
-        if (model := family.model(device.vendor, device.product)) is not None
-    ]
+    return find_hid(family) if family.transport == "hid" else find_usb(family)
 
 
 def blind_spots() -> list[str]:
     """Says what keeps devices from being seen at all, one sentence each; empty where nothing."""
+    spots = []
     if hid_api() is None:
-        return ["hidapi cannot be loaded, so HID devices are not seen: 'pip install hidapi'"]
-    return []
+        spots.append("hidapi cannot be loaded, so HID devices are not seen: 'pip install hidapi'")
+    if libusb() is None:
+        spots.append(
+            "libusb cannot be loaded, so USB devices cannot be opened: 'pip install libusb-package'"
+        )
+    return spots
 
 
 def udev_rules(families: Sequence[Family] = FAMILIES) -> str:

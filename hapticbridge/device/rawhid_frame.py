@@ -165,9 +165,7 @@ def force_frame(
         is_enabled: Whether the motors may act at all.
     """
     flags = ENABLE if is_enabled else 0
-    return _sealed(
-        _FORCE.pack(MAGIC, VERSION, Kind.FORCE, flags, sequence, watchdog_ms, *wrench)
-    )
+    return _sealed(_FORCE.pack(MAGIC, VERSION, Kind.FORCE, flags, sequence, watchdog_ms, *wrench))
 
 
 def ask_frame(sequence: int, page: int) -> bytes:

@@ -11,9 +11,10 @@ from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
+
 from emulated.handle import Handle
 from emulated.usb_device import BULK, Endpoint, Setup, StallError, UsbDevice
-from numpy.typing import NDArray
 
 BAUD = {0x4138: 9600.0, 0x0015: 142857.0, 0x0002: 1.5e6}
 BITS = 10  # a byte on the line, with start and stop bit
@@ -117,16 +118,9 @@ class FalconModel(UsbDevice):
                 self._inbox.clear()
                 self._text.clear()
         elif setup.request == 1:
-            if value & 0x0100:
-                if value & 1 and not self._dtr:  # the rising line restarts the processor
-                    self.program, self._is_loading, self.uploaded = None, False, b""
-                self._dtr = bool(value & 1)
+            self._set_line(value)
         elif setup.request == 3:
-            self._baud = BAUD.get(value, 300.0)
-            if self._baud > 1e6 and self._is_loading:
-                self._is_loading = False
-                if self.valid is None or self.uploaded == self.valid:
-                    self.program = self.uploaded
+            self._set_baud(value)
         elif setup.request == 6:
             self._event = value & 0xFF if value & 0x0100 and self._heeds_events else None
         elif setup.request == 9:
@@ -134,6 +128,19 @@ class FalconModel(UsbDevice):
         elif setup.request not in (2, 4):
             raise StallError
         return b""
+
+    def _set_line(self, value: int) -> None:
+        if value & 0x0100:
+            if value & 1 and not self._dtr:  # the rising line restarts the processor
+                self.program, self._is_loading, self.uploaded = None, False, b""
+            self._dtr = bool(value & 1)
+
+    def _set_baud(self, value: int) -> None:
+        self._baud = BAUD.get(value, 300.0)
+        if self._baud > 1e6 and self._is_loading:
+            self._is_loading = False
+            if self.valid is None or self.uploaded == self.valid:
+                self.program = self.uploaded
 
     def accept(self, endpoint: int, data: bytes, now: float) -> None:
         if endpoint != 0x02:

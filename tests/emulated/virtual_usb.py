@@ -1,11 +1,10 @@
-"""Virtual time for an emulated USB device: a link and a loop's clock that move it, and no thread."""
+"""Virtual time for an emulated USB device: a link and a loop's clock that move it."""
 
 from __future__ import annotations
 
 import array
 
 from emulated.usb_device import Setup, StallError, UsbDevice
-
 from hapticbridge.errors import DeviceLost
 
 LAST = 5e-6  # s that a call into the library takes: time never stands still for a driver that polls
