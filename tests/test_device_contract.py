@@ -5,6 +5,7 @@ import json
 import math
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -243,7 +244,7 @@ def test_options_reach_the_device_and_the_specification_goes_before_the_code(
         ("trajectory:a.csv", {"damping": 2}, "unknown option 'damping' of the trajectory device"),
     ],
 )
-def test_bad_specifications_are_refused(spec: str, options: dict[str, object], words: str) -> None:
+def test_bad_specifications_are_refused(spec: str, options: dict[str, Any], words: str) -> None:
     with pytest.raises(DeviceError) as error:
         open_device(spec, **options)
     assert words in str(error.value)

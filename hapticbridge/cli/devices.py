@@ -6,7 +6,6 @@ from dataclasses import asdict, dataclass
 from typing import Annotated, Any
 
 import tyro
-from rich.table import Table
 
 from hapticbridge.cli.terminal import out, plain, print_json
 from hapticbridge.device.families import (
@@ -42,15 +41,13 @@ class Devices:
         if self.as_json:
             print_json(_facts(plugged, unseen))
             return 0
-        table = Table("device", "about", "axes", "force", "rate", box=None, pad_edge=False)
-        for family in FAMILIES:
-            words = family.name, family.about, family.axes, family.force, family.rate
-            table.add_row(*map(plain, words))
         out.print("[bold]supported[/bold]")
-        out.print(table)
+        for family in FAMILIES:
+            out.print(f"{family.name}: {plain(family.about)}")
+            out.print(f"  axes {family.axes}; force {family.force}; rate {family.rate}")
         out.print("[bold]plugged in[/bold]")
         for device in plugged:
-            out.print(f"{device.family}  {plain(str(device))} at {plain(device.path)}")
+            out.print(f"{device.family}: {plain(str(device))} at {plain(device.path)}")
             if device.problem:
                 out.print(f"  [yellow]not usable:[/yellow] {plain(device.problem)}")
         if not plugged:

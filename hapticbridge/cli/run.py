@@ -16,7 +16,7 @@ from rich.table import Table
 
 from hapticbridge.bridge import Bridge
 from hapticbridge.certificate import default_coupling, device_conditions
-from hapticbridge.cli.terminal import err, out, quantity
+from hapticbridge.cli.terminal import err, out, quantity, tell
 from hapticbridge.clock import RealClock, SimulatedClock, period_of
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo, device_for
@@ -46,8 +46,9 @@ class Run:
     grip: str = "grip"
     """Site on the tool that the hand holds."""
     device: str = "simulated"
-    """'simulated' (in the hand that the scene asks for), 'simulated:damping=5,hand_mass=1', or
-    'trajectory:FILE' (CSV or recording)."""
+    """'simulated' (in the hand that the scene asks for), 'simulated:damping=5,hand_mass=1',
+    'trajectory:FILE' (CSV or recording), or one that is plugged in (see 'hapticbridge devices'),
+    with options: 'rawhid:serial=12345,damping=0.4'."""
     duration: float | None = None
     """Seconds to run; by default until the device's motion ends, or until Ctrl-C."""
     record: Path | None = None
@@ -104,7 +105,7 @@ class Run:
         if self.record is not None and self.record.exists() and not self.overwrite:
             raise RecordingError(f"'{self.record}' exists; choose another file or add --overwrite")
         scene = load_scene(self.scene, self.grip, **settings_from(self.settings))
-        device = device_for(scene, self.device)
+        device = device_for(scene, self.device, tell)
         scales = self.scale, self.scale if self.force_scale is None else self.force_scale
         bridge = Bridge(
             scene,

@@ -10,7 +10,7 @@ from pathlib import Path
 from hapticbridge.errors import DeviceError
 
 VARIABLE = "HAPTICBRIDGE_LOG_USB"
-"""Environment variable that names the file of the log where the device's option ``log`` does not."""
+"""Environment variable that names the log's file where the device's option ``log`` does not."""
 
 MOST_LINES = 200_000
 """Transfers that are kept. At 1 kHz both ways that is the last 100 s, in some 40 MB."""

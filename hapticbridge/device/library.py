@@ -94,7 +94,7 @@ def device_for(scene: Scene, spec: str, tell: Tell = tell_nobody) -> Device:
     path = scene.path.with_suffix(".csv")
     if path.is_file():
         options["path"] = path
-    return open_device(spec, **options)
+    return open_device(spec, tell=tell, **options)
 
 
 def _open_simulated(rest: str, options: Mapping[str, object]) -> Device:

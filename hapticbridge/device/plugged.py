@@ -124,22 +124,28 @@ def chosen(family: Family, plugged: Sequence[Plugged], serial: object = None) ->
         DeviceError: None is plugged in, or not that one, or several and none was asked for, or it
             may not be opened; says what to do.
     """
-    several = {(usb_id.vendor, usb_id.product): str(usb_id) for usb_id in family.ids}
-    looked = f"looked for {', '.join(several.values())}"
     if not plugged:
+        vendors = ", ".join(sorted({f"{usb_id.vendor:04x}" for usb_id in family.ids}))
+        is_one = len(family.ids) == 1
+        looked = str(family.ids[0]) if is_one else f"{len(family.ids)} products of {vendors}"
         raise DeviceError(
-            f"no {family.name} is plugged in ({looked}); 'hapticbridge devices' lists what is, and "
-            "what permission is missing"
+            f"no device '{family.name}' is plugged in (looked for {looked}); 'hapticbridge "
+            "devices' lists what is, and what permission is missing"
         )
     names = choices(device.serial or device.path for device in plugged)
     if serial is None:
         if len(plugged) > 1:
-            raise DeviceError(f"{len(plugged)} of {family.name} are plugged in; add serial={names}")
+            raise DeviceError(
+                f"{len(plugged)} devices '{family.name}' are plugged in; choose one with "
+                f"serial=, one of {names}"
+            )
         device = plugged[0]
     else:
         wanted = [d for d in plugged if str(serial) in (d.serial, d.path)]
         if not wanted:
-            raise DeviceError(f"no {family.name} has serial '{serial}'; plugged in: {names}")
+            raise DeviceError(
+                f"no device '{family.name}' has serial '{serial}'; plugged in: {names}"
+            )
         device = wanted[0]
     if device.problem is not None:
         raise DeviceError(f"{device}: {device.problem}")

@@ -215,7 +215,8 @@ class RawHidDevice:
     def velocity(self) -> NDArray[np.float64]:
         """Velocity in m/s and angular velocity in rad/s as last reported, shape (6,); 0 before."""
         numbers = (0.0,) * 12 if self._state is None else self._state.numbers
-        return np.array(numbers[6:]) * self._mask
+        moving: NDArray[np.float64] = np.array(numbers[6:]) * self._mask
+        return moving
 
     @property
     def on_the_way(self) -> int:

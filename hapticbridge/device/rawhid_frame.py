@@ -233,7 +233,8 @@ def decoded(frame: bytes) -> State | Numbers | str | None:
     kind, page = frame[2], frame[3]
     if kind == Kind.STATE:
         values = _STATE.unpack_from(frame)
-        return State(values[3], *values[4:7], numbers=values[7:19], echo=values[19])
+        status, sequence, buttons, time_us = values[3:7]
+        return State(status, sequence, buttons, time_us, values[7:19], values[19])
     if kind == Kind.SHEET and page == NUMBERS_PAGE:
         return Numbers(*_NUMBERS.unpack_from(frame)[5:])
     if kind == Kind.SHEET and page == NAME_PAGE:

@@ -169,7 +169,8 @@ class SpaceMouseDevice:
     def _to_origin(self) -> None:
         self._position, self._rate = np.zeros(3), np.zeros(6)
         self._quaternion: Quaternion = (1.0, 0.0, 0.0, 0.0)
-        self._buttons, self._silence, self._has_begun = 0, 0.0, False
+        self._buttons, self._silence = 0, 0.0
+        self._has_begun: bool = False
 
     def _take(self, report: bytes) -> None:
         news = decoded(report)

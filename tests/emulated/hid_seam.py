@@ -1,4 +1,4 @@
-"""hidapi in this process: what ``HidLink`` takes for the module, with emulated devices behind it."""
+"""hidapi in this process: what ``HidLink`` takes for it, with emulated devices behind it."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from typing import Any
 
 from emulated.hid_device import HidDevice
-
 from hapticbridge.device.transport_hid import HidHandle
 
 

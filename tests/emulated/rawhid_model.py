@@ -10,11 +10,11 @@ import struct
 from dataclasses import dataclass
 
 import numpy as np
-from emulated.handle import Handle
-from emulated.hid_device import HidDevice
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from emulated.handle import Handle
+from emulated.hid_device import HidDevice
 from hapticbridge.device import SimulatedDevice
 
 NAN = math.nan
