@@ -224,7 +224,8 @@ class FalconDevice:
             return
         self._is_open = self._is_started = False
         try:
-            ask(self._link, self._stream, 0, SILENCE)
+            for _ in range(2):  # the first reply may be to a question of the loop's
+                ask(self._link, self._stream, 0, SILENCE)
         except DeviceLost:
             pass  # whoever pulled the plug also took the force away
         finally:
