@@ -14,6 +14,7 @@ from emulated.hid_seam import HidSeam
 from emulated.rawhid_model import RawHid
 from emulated.spacemouse_model import SpaceMouse
 from emulated.ticking import Ticking
+from falcon_cases import Bench
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -69,6 +70,13 @@ def ticking(model: Callable[[], HidDevice], opener: Callable[..., Device]) -> De
     return Ticking(build)
 
 
+def falcon(_: Path) -> Device:
+    bench = Bench()
+    device = bench.opened()
+    bench.link.pace = PERIOD
+    return device
+
+
 DEVICES: dict[str, Callable[[Path], Device]] = {
     "simulated": lambda _: open_device("simulated"),
     "free": lambda _: open_device("simulated:hand=none,damping=0"),
@@ -84,6 +92,7 @@ DEVICES: dict[str, Callable[[Path], Device]] = {
     "new spacemouse": lambda _: ticking(
         lambda: SpaceMouse(pushed, has_long_reports=True), open_spacemouse
     ),
+    "falcon": falcon,
 }
 
 
@@ -121,6 +130,8 @@ def test_a_read_overwrites_the_whole_sample(device: Device) -> None:
 
 
 def test_starting_again_repeats_the_run_to_the_bit(device: Device) -> None:
+    if device.info.is_real:
+        return  # time goes on for what stands in somebody's hand
     first = run(device, 2)
     run(device, 3)
     assert run(device, 2).tobytes() == first.tobytes()

@@ -133,7 +133,8 @@ class FalconDevice:
         self._last = np.zeros(1, SAMPLE_DTYPE)
         self._packet = array.array("B", bytes(SIZE))
         self._bytes = np.frombuffer(self._packet, np.uint8)
-        self._answered = self._believed = self._read = 0.0
+        self._believed = self._read = 0.0
+        self._asked = self._asked_before = self._sampled_after = 0.0
 
     def start(self, period: float) -> NDArray[np.void]:
         """Asks for the pose, without force, and compiles what the loop will call.
@@ -162,7 +163,8 @@ class FalconDevice:
                 f"{self._name}: encoders at {reply['encoders'][0].tolist()} are no position of the "
                 "grip; switch its power off and on, so that it is homed again"
             )
-        self._answered = self._believed = self._read = self._link.now()
+        self._believed = self._read = self._link.now()
+        self._asked = self._asked_before = self._sampled_after = self._read
         self._is_started = True
         return sample.copy()
 
@@ -193,7 +195,8 @@ class FalconDevice:
         self._read = now
         flag = int(TickFlag.STALE_SAMPLE)
         if found:
-            elapsed, self._answered = now - self._answered, now
+            # a reply may be to the last question or the one before: no older than that is its pose
+            elapsed, self._sampled_after = now - self._sampled_after, self._asked_before
             if self._believe(self._motion, self._stream.reply, self._last, elapsed) == BELIEVED:
                 self._believed = now
                 flag = 0
@@ -212,6 +215,7 @@ class FalconDevice:
             DeviceLost: It is gone.
         """
         self._command(self._motion, wrench, self._bytes)
+        self._asked_before, self._asked = self._asked, self._link.now()
         self._link.write(self._packet)
 
     def close(self) -> None:
@@ -220,7 +224,8 @@ class FalconDevice:
             return
         self._is_open = self._is_started = False
         try:
-            ask(self._link, self._stream, 0, SILENCE)
+            for _ in range(2):  # the first reply may be to a question of the loop's
+                ask(self._link, self._stream, 0, SILENCE)
         except DeviceLost:
             pass  # whoever pulled the plug also took the force away
         finally:
@@ -261,8 +266,8 @@ class FalconDevice:
                 is_told = True
                 tell(f"{self._name}: pull the grip all the way out and push it back in, slowly")
         raise DeviceError(
-            f"{self._name}: was not homed within {HOMING_TIME:g} s; open it again and move the grip "
-            "all the way out and in"
+            f"{self._name}: was not homed within {HOMING_TIME:g} s; open it again and move the "
+            "grip all the way out and in"
         )
 
     def _silent(self) -> DeviceLost:

@@ -35,8 +35,8 @@ GREETINGS = 100
 """How often the loader is greeted, as libnifalcon does, before it is given up: 10 s in all."""
 
 ANSWER_TIME = 0.1
-"""In s: how long one answer is waited for. The slowest, a piece of the program at 140000 baud, is on
-the line for 9 ms and in the bridge for up to 16."""
+"""In s: how long one answer is waited for. The slowest, a piece of the program at 140000 baud, is
+on the line for 9 ms, there and back, and in the bridge for up to 16."""
 
 PROBES = 20
 """Packets that a Falcon is asked with before it counts as not speaking: the first ones after a
@@ -208,7 +208,7 @@ def _greet(link: Link, name: str) -> None:
 
 
 def _echo(link: Link, data: bytes, length: int | None = None) -> bytes:
-    """Sends bytes and returns what comes back within ``ANSWER_TIME``, of the length that was sent."""
+    """Sends bytes; returns what comes back within ``ANSWER_TIME``, as many by default."""
     wanted = len(data) if length is None else length
     link.write(array.array("B", data), _WRITE_MS)
     end = link.now() + ANSWER_TIME

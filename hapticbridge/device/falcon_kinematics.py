@@ -67,8 +67,9 @@ CLOSED = 1e-14
 encoder's step."""
 
 FLATTEST = 0.03
-"""Smallest |det| of the legs' directions, and smallest lever as a share of the thigh, no unit. In the middle of the workspace they are 0.8 and 0.98, at its rim 0.07 and 0.05; at 0 a leg is
-stretched or folded, and two positions answer to the same angles."""
+"""Smallest |det| of the legs' directions, and smallest lever as a share of the thigh, no unit. In
+the middle of the workspace they are 0.8 and 0.98, at its rim 0.07 and 0.05; at 0 a leg is stretched
+or folded, and two positions answer to the same angles."""
 
 _COS, _SIN = np.cos(LEG_ANGLES), np.sin(LEG_ANGLES)
 
@@ -177,7 +178,7 @@ def _solve(
     answer[0] = (right[0] * x0 + right[1] * y0 + right[2] * z0) / determinant
     answer[1] = (right[0] * x1 + right[1] * y1 + right[2] * z1) / determinant
     answer[2] = (right[0] * x2 + right[1] * y2 + right[2] * z2) / determinant
-    return determinant
+    return float(determinant)
 
 
 @compiled

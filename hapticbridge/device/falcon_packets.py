@@ -84,7 +84,7 @@ def _is_reply(data: NDArray[np.uint8], at: int) -> bool:
     for i in range(at + 1, at + 13):
         if not _ZERO <= data[i] < _ZERO + 16:
             return False
-    return _ZERO <= data[at + 13] < _ZERO + 128
+    return bool(_ZERO <= data[at + 13] < _ZERO + 128)
 
 
 @compiled
@@ -119,9 +119,9 @@ def newest_reply(
         for i in range(3):
             number = 0
             for j in range(4):
-                number |= (np.int64(data[last + 1 + 4 * i + j]) - _ZERO) << (4 * j)
+                number |= (int(data[last + 1 + 4 * i + j]) - _ZERO) << (4 * j)
             reply.encoders[i] = number - 65536 if number & 0x8000 else number
-        flags = np.int64(data[last + 13]) - _ZERO
+        flags = int(data[last + 13]) - _ZERO
         reply.buttons, reply.homed = flags & 15, (flags >> 4) & 7
     return at, found, dropped
 

@@ -12,7 +12,7 @@ TIME = 0.1
 """In s: how long each of the two measurements takes."""
 
 UNDER_WAY = 2
-"""Questions kept under way while the rate is measured: the next one is there when a reply leaves."""
+"""Questions kept under way while the rate is measured: one is there when a reply leaves."""
 
 PACE = 1.07e-3
 """In s: from question to question while the delay is measured. A little more than the bridge's

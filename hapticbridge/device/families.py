@@ -37,9 +37,14 @@ def plugged_of(family: Family) -> list[Plugged]:
 
 def blind_spots() -> list[str]:
     """Says what keeps devices from being seen at all, one sentence each; empty where nothing."""
+    spots = []
     if hid_search.hid_api() is None:
-        return ["hidapi cannot be loaded, so HID devices are not seen: 'pip install hidapi'"]
-    return []
+        spots.append("hidapi cannot be loaded, so HID devices are not seen: 'pip install hidapi'")
+    if usb_search.libusb() is None:
+        spots.append(
+            "libusb cannot be loaded, so USB devices cannot be opened: 'pip install libusb-package'"
+        )
+    return spots
 
 
 def udev_rules(families: Sequence[Family] = FAMILIES) -> str:

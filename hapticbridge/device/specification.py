@@ -6,10 +6,10 @@ from collections.abc import Iterable
 
 from hapticbridge.errors import DeviceError, choices
 
-FILES = ("path", "firmware", "log")
-"""Options that name a file. One comes last: all after it is the file's name, commas too."""
+FILES = ("path",)
+"""Options that take all that comes after them: the file's name, commas too."""
 
-TEXTS = ("hand", "serial")
+TEXTS = ("hand", "serial", "firmware", "log")
 """Options that are text up to the next comma; a serial number may have leading zeros."""
 
 WHOLE = ("delay",)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import array
+import atexit
 import errno
 import sys
 import threading
@@ -67,6 +68,7 @@ class UsbLink:
         sys.setswitchinterval(min(SWITCH_INTERVAL, self._switch_interval))
         self._reader = threading.Thread(target=self._read_always, name="usb", daemon=True)
         self._reader.start()
+        atexit.register(self.close)  # a thread inside libusb must not outlive the interpreter
 
     @classmethod
     def open(
@@ -156,7 +158,7 @@ class UsbLink:
             DeviceLost: The device is gone; packets that came before are returned first.
         """
         packets = self._packets
-        if not packets:
+        if not packets or not self._is_open:
             self._require()
         self._arrived.clear()
         return [packets.popleft() for _ in range(len(packets))]
@@ -171,6 +173,7 @@ class UsbLink:
         if not self._is_open:
             return
         self._is_open = False
+        atexit.unregister(self.close)
         self._reader.join(2e-3 * READ_MS)
         if not self._reader.is_alive():  # else it is still inside libusb with what this would free
             usb.util.dispose_resources(self._device)

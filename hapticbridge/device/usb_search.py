@@ -35,32 +35,36 @@ def libusb() -> Any:
 def find(family: Family, backend: Any = None) -> list[Plugged]:
     """Lists the family's devices that are plugged in, with what keeps each from being opened.
 
+    On Linux the kernel tells, without a device's being opened, which a running loop would feel;
+    elsewhere libusb is asked.
+
     Args:
         family: What to look for.
-        backend: A pyusb backend; None takes libusb, and then asks the kernel for what may not be
-            opened.
+        backend: A pyusb backend to ask; None takes kernel or libusb.
 
     Returns:
         One entry per device, in the order of their places on the bus.
     """
-    source = libusb() if backend is None else backend
-    if source is None:
-        problem = "libusb cannot be loaded; reinstall the package 'libusb-package'"
-        return [
-            Plugged(
-                family=family.name,
-                name=device.name or model,
-                serial=device.serial,
-                path=str(device.node),
-                vendor=device.vendor,
-                product=device.product,
-                transport="usb",
-                problem=problem,
-            )
-            for device in on_the_bus()
-            if (model := family.model(device.vendor, device.product)) is not None
-        ]
-    return [_described(family, device) for device in devices_of(family, source)]
+    listed = [] if backend is not None else _told_by_kernel(family)
+    source = libusb() if backend is None and not listed else backend
+    return listed if source is None else [_described(family, d) for d in devices_of(family, source)]
+
+
+def _told_by_kernel(family: Family) -> list[Plugged]:
+    return [
+        Plugged(
+            family=family.name,
+            name=device.name or model,
+            serial=device.serial,
+            path=str(device.node),
+            vendor=device.vendor,
+            product=device.product,
+            transport="usb",
+            problem=None if device.is_permitted else permission_problem(str(device.node)),
+        )
+        for device in on_the_bus()
+        if (model := family.model(device.vendor, device.product)) is not None
+    ]
 
 
 def devices_of(family: Family, backend: Any) -> list[Any]:
@@ -88,9 +92,6 @@ def _described(family: Family, device: Any) -> Plugged:
     except (usb.core.USBError, ValueError, NotImplementedError) as error:
         is_refused = getattr(error, "errno", None) == errno.EACCES
         problem = permission_problem(node) if is_refused else None
-        for entry in on_the_bus():  # the kernel tells everybody what it read at plugging in
-            if str(entry.node) == node:
-                texts = [entry.name, entry.serial]
     finally:
         usb.util.dispose_resources(device)
     return Plugged(

@@ -11,9 +11,10 @@ from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
+
 from emulated.handle import Handle
 from emulated.usb_device import BULK, Endpoint, Setup, StallError, UsbDevice
-from numpy.typing import NDArray
 
 BAUD = {0x4138: 9600.0, 0x0015: 142857.0, 0x0002: 1.5e6}
 BITS = 10  # a byte on the line, with start and stop bit
@@ -51,6 +52,7 @@ class Faults:
     """What goes wrong, for tests."""
 
     is_mute: bool = False  # takes packets, answers none
+    is_deaf: bool = False  # the loader hears nothing
     noise: bytes = b""  # before every answer
     bad_echo_at: int = -1  # byte of the program that is echoed wrongly
     is_cut_short: bool = False  # leaves out a byte of every second answer
@@ -65,6 +67,7 @@ class FalconModel(UsbDevice):
         program: The program it runs, None: only its loader runs.
         is_homed: Whether its encoders have passed their zeros.
         heeds_events: Whether its bridge passes an answer on at the event character.
+        valid: The only program that would run; None: any.
     """
 
     vendor, product, release = 0x0403, 0xCB48, 0x0400
@@ -117,16 +120,9 @@ class FalconModel(UsbDevice):
                 self._inbox.clear()
                 self._text.clear()
         elif setup.request == 1:
-            if value & 0x0100:
-                if value & 1 and not self._dtr:  # the rising line restarts the processor
-                    self.program, self._is_loading, self.uploaded = None, False, b""
-                self._dtr = bool(value & 1)
+            self._set_line(value)
         elif setup.request == 3:
-            self._baud = BAUD.get(value, 300.0)
-            if self._baud > 1e6 and self._is_loading:
-                self._is_loading = False
-                if self.valid is None or self.uploaded == self.valid:
-                    self.program = self.uploaded
+            self._set_baud(value)
         elif setup.request == 6:
             self._event = value & 0xFF if value & 0x0100 and self._heeds_events else None
         elif setup.request == 9:
@@ -134,6 +130,19 @@ class FalconModel(UsbDevice):
         elif setup.request not in (2, 4):
             raise StallError
         return b""
+
+    def _set_line(self, value: int) -> None:
+        if value & 0x0100:
+            if value & 1 and not self._dtr:  # the rising line restarts the processor
+                self.program, self._is_loading, self.uploaded = None, False, b""
+            self._dtr = bool(value & 1)
+
+    def _set_baud(self, value: int) -> None:
+        self._baud = BAUD.get(value, 300.0)
+        if self._baud > 1e6 and self._is_loading:
+            self._is_loading = False
+            if self.valid is None or self.uploaded == self.valid:
+                self.program = self.uploaded
 
     def accept(self, endpoint: int, data: bytes, now: float) -> None:
         if endpoint != 0x02:
@@ -200,6 +209,8 @@ class FalconModel(UsbDevice):
             wrong = len(self.uploaded) == self.faults.bad_echo_at
             self.uploaded += bytes([byte])
             self._answer(bytes([byte ^ 0x40 if wrong else byte]), when)
+            return
+        if self.faults.is_deaf:
             return
         self._text.append(byte)
         del self._text[:-3]

@@ -1,11 +1,10 @@
-"""Virtual time for an emulated USB device: a link and a loop's clock that move it, and no thread."""
+"""Virtual time for an emulated USB device: a link and a loop's clock that move it."""
 
 from __future__ import annotations
 
 import array
 
 from emulated.usb_device import Setup, StallError, UsbDevice
-
 from hapticbridge.errors import DeviceLost
 
 LAST = 5e-6  # s that a call into the library takes: time never stands still for a driver that polls
@@ -49,10 +48,16 @@ class VirtualTime:
 
 
 class VirtualLink:
-    """What a driver sees of it: the methods of ``UsbLink``."""
+    """What a driver sees of it: the methods of ``UsbLink``.
+
+    Args:
+        time: The device and its time.
+        write_to: Endpoint that writes go to.
+    """
 
     def __init__(self, time: VirtualTime, write_to: int = 0x02) -> None:
         self.time = time
+        self.pace = 0.0  # s by which a take moves time, where no clock does
         self.is_closed = False
         self._write_to = write_to
 
@@ -77,6 +82,8 @@ class VirtualLink:
         return True
 
     def take(self) -> list[bytes]:
+        if self.pace:
+            self.time.until(self.time.now + self.pace)
         if not self.time.packets:
             self._require()
         packets, self.time.packets[:] = self.time.packets[:], []
