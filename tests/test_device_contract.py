@@ -237,7 +237,7 @@ def test_options_reach_the_device_and_the_specification_goes_before_the_code(
 @pytest.mark.parametrize(
     ("spec", "options", "words"),
     [
-        ("falcn", {}, "unknown device 'falcn'; there are 'simulated', 'trajectory'"),
+        ("falcn", {}, "unknown device 'falcn'; there are 'falcon', 'rawhid', 'simulated',"),
         ("", {}, "unknown device ''"),
         ("simulated:dampng=5", {}, "unknown option 'dampng' of the simulated device; there are 'd"),
         ("simulated", {"colour": 1}, "unknown option 'colour'"),

@@ -324,9 +324,7 @@ def test_the_model_moves_as_its_mechanics_do_under_the_force_it_is_sent() -> Non
     expected = (seconds - decay * (1.0 - math.exp(-seconds / decay))) / damping
     # the state that is read was latched up to a period ago, and a force acts from the next 125 µs
     assert sample["position"][0] == pytest.approx(expected, rel=0.15)
-    assert device.velocity[0] == pytest.approx(
-        (1 - math.exp(-seconds / decay)) / damping, rel=0.1
-    )
+    assert device.velocity[0] == pytest.approx((1 - math.exp(-seconds / decay)) / damping, rel=0.1)
 
 
 def test_the_clock_of_the_tests_moves_the_device() -> None:

@@ -154,9 +154,7 @@ def test_a_pose_that_is_not_finite_trips_with_zero_force_first(tmp_path: Path) -
 def test_a_paddle_of_one_axis_runs_a_scene_and_its_other_axes_stay(tmp_path: Path) -> None:
     device, model, seam = opened(paddle())
     recording = tmp_path / "run.mcap"
-    with hb.Bridge(
-        "peg_in_hole", device, clock=DrivingClock(seam), recording=recording
-    ) as bridge:
+    with hb.Bridge("peg_in_hole", device, clock=DrivingClock(seam), recording=recording) as bridge:
         summary = bridge.run(0.5)
     ticks = hb.read_recording(recording).ticks
     assert np.ptp(ticks["device_position"][:, 0]) > 1e-4
