@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence, Set
+from dataclasses import dataclass, field
 from functools import cache
 
 import numpy as np
@@ -17,6 +17,7 @@ from hapticbridge.study.chart.score import Score
 from hapticbridge.study.chart.setting import OWN, SHIPPED, Setting
 from hapticbridge.study.chart.timing import REPEATS, interleaved_costs, machine, one_core
 from hapticbridge.study.chart.workload import Panel, Run, Workload
+from hapticbridge.study.engines.base import Engine
 from hapticbridge.study.engines.library import open_engine
 
 ORDER_POINTS = 3
@@ -37,6 +38,7 @@ class Chart:
         machine: Where it was measured, in words.
         baseline: The setting that ratios are to.
         notes: What else is to be known, a sentence each.
+        engines: The other engines on it, by name, with their settings.
     """
 
     workload: Workload
@@ -45,6 +47,7 @@ class Chart:
     machine: str
     baseline: str
     notes: tuple[str, ...] = ()
+    engines: Mapping[str, Engine] = field(default_factory=dict)
 
     def of(self, panel: Panel) -> list[Measurement]:
         """Returns the points of a panel."""
@@ -105,7 +108,7 @@ def measure_chart(
     """Judges and times every setting.
 
     A setting that the workload cannot be rendered by is left out and named in ``skipped``; one that
-    diverges stays in.
+    diverges, or whose engine fails on the way, stays in.
 
     Args:
         workload: What to simulate.
@@ -139,7 +142,10 @@ def measure_chart(
                 f"workload '{workload.name}': no point could be simulated; first: "
                 f"{next(iter(skipped.values()), 'no setting')}"
             )
-        baseline = _baseline([setting for setting, _, _ in runs])
+        baseline = _baseline(
+            [setting for setting, _, _ in runs],
+            {i for i, (_, _, scores) in enumerate(runs) if _has_failed(scores)},
+        )
         costs = interleaved_costs(
             [run for _, run, _ in runs],
             baseline,
@@ -156,7 +162,8 @@ def measure_chart(
         if panel.is_truth or setting.engine == OWN
     )
     label = runs[baseline][0].label
-    return Chart(workload, measurements, skipped, where, label, tuple(_notes(workload)))
+    engines = {each.engine.name: each.engine for _, each, _ in runs if isinstance(each, EngineRun)}
+    return Chart(workload, measurements, skipped, where, label, tuple(_notes(workload)), engines)
 
 
 def _opened(workload: Workload, setting: Setting, peer_work: Callable[[], PeerWork]) -> Run:
@@ -165,13 +172,18 @@ def _opened(workload: Workload, setting: Setting, peer_work: Callable[[], PeerWo
     return EngineRun(open_engine(setting.engine), peer_work(), setting)
 
 
-def _baseline(settings: Sequence[Setting]) -> int:
+def _has_failed(scores: Mapping[str, Score]) -> bool:
+    return any(score.verdict == "failed" for score in scores.values())
+
+
+def _baseline(settings: Sequence[Setting], failed: Set[int]) -> int:
     """Returns the index of ``implicit`` at the period nearest to 1 ms, or what comes nearest."""
 
-    def distance(index: int) -> tuple[bool, bool, float]:
+    def distance(index: int) -> tuple[bool, bool, bool, float]:
         setting = settings[index]
         is_plain = setting.substeps == 1 and setting.contact == SHIPPED
         return (
+            index in failed,  # it may not have been timed
             setting.engine != OWN or setting.method.name != "implicit",
             not (is_plain and setting.iterations is None),
             abs(np.log(setting.period / 1e-3)),

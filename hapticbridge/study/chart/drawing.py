@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -24,12 +25,16 @@ FLOOR = 1e-4
 CEILING = 1e3
 """Error in JND above which they are drawn at the upper edge, with those that diverged."""
 
+UNTIMED = 1.0
+"""Cost in s per s at which points are drawn where none was timed."""
+
 MARKS: dict[Verdict, tuple[str, bool, str]] = {
     "strict": ("o", True, "passive"),
     "within slack": ("o", False, "passive within the slack"),
     "active": ("^", True, "created energy"),
     "lost contact": ("P", True, "lost contact"),
     "diverged": ("X", True, "diverged (at the upper edge)"),
+    "failed": ("v", True, "the engine failed (at the upper edge)"),
     "not metered": ("s", True, "another engine: energy not metered"),
 }
 """Mark, whether it is filled, and what it means."""
@@ -51,6 +56,17 @@ def drawn_error(each: Measurement) -> float:
     """Returns where a point is drawn, in JND: held within the picture's edges."""
     felt = each.score.felt
     return float(np.clip(felt, FLOOR, CEILING)) if np.isfinite(felt) else CEILING
+
+
+def drawn_cost(each: Measurement, points: Sequence[Measurement]) -> float:
+    """Returns where a point is drawn, in s per s: with the dearest where it was not timed.
+
+    An engine that fails in its first step has no cost, and is on the chart all the same.
+    """
+    if math.isfinite(each.cost.median):
+        return each.cost.median
+    costs = (other.cost.median for other in points)
+    return max((cost for cost in costs if math.isfinite(cost)), default=UNTIMED)
 
 
 def draw_chart(chart: Chart) -> Figure:
@@ -79,7 +95,7 @@ def _draw_panel(axes: Axes, chart: Chart, panel: Panel, colours: dict[str, str])
         axes.plot([], [], "-", color=colour, lw=2, label=told)
         line = [each for each in mine if each.is_usual]
         axes.plot(
-            [each.cost.median for each in line],
+            [drawn_cost(each, points) for each in line],
             [drawn_error(each) for each in line],
             "-",
             color=colour,
@@ -87,7 +103,7 @@ def _draw_panel(axes: Axes, chart: Chart, panel: Panel, colours: dict[str, str])
             alpha=0.6,
         )
         for each in mine:
-            _draw_point(axes, each, colour)
+            _draw_point(axes, each, drawn_cost(each, points), colour)
     _draw_front(axes, chart.front(panel))
     best = recommended(points)
     if best is not None:
@@ -119,13 +135,13 @@ def _draw_panel(axes: Axes, chart: Chart, panel: Panel, colours: dict[str, str])
     axes.legend(fontsize="x-small", loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
 
 
-def _draw_point(axes: Axes, each: Measurement, colour: str) -> None:
+def _draw_point(axes: Axes, each: Measurement, place: float, colour: str) -> None:
     mark, is_filled, _ = MARKS[each.score.verdict]
     cost = each.cost
     axes.errorbar(
-        cost.median,
+        place,
         drawn_error(each),
-        xerr=[[cost.median - cost.low], [cost.high - cost.median]],
+        xerr=np.nan_to_num([[cost.median - cost.low], [cost.high - cost.median]]),
         fmt=mark,
         color=colour,
         mfc=colour if is_filled else "white",

@@ -140,7 +140,7 @@ class DrivenMass:
     def _judge(self, takes: Sequence[Take]) -> Mapping[str, Score]:
         (take,) = takes
         if take.has_diverged:
-            return {PANEL.key: diverged(take.created)}
+            return {PANEL.key: diverged(take.created, take.ended)}
         records = take.at(self._grid)
         return {
             PANEL.key: score_of(

@@ -136,6 +136,13 @@ def summary_of(chart: Chart) -> dict[str, Any]:
         "baseline": chart.baseline,
         "notes": list(chart.notes),
         "skipped": chart.skipped,
+        "engines": {
+            name: {
+                "version": engine.version,
+                "settings": {key: each._asdict() for key, each in engine.settings.items()},
+            }
+            for name, engine in chart.engines.items()
+        },
         "panels": panels,
         "points": points,
     }

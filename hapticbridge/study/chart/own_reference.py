@@ -76,7 +76,7 @@ class OwnReferences:
             return Score(felt=NAN)  # not on the chart
         reference = self.of(take.setting.method)
         if take.has_diverged:
-            return diverged(take.created)
+            return diverged(take.created, take.ended)
         if reference is None:
             return Score(felt=NAN, created=take.created, verdict=take.environment)
         records = take.at(self._grid)[: self._count]

@@ -13,6 +13,7 @@ from hapticbridge.study.chart.drawing import (
     FLOOR,
     MARKS,
     colours_of,
+    drawn_cost,
     drawn_error,
 )
 from hapticbridge.study.chart.measurement import Measurement
@@ -32,6 +33,7 @@ SHAPES: dict[Verdict, str] = {
     "active": "triangle",
     "lost contact": "plus",
     "diverged": "cross",
+    "failed": "wedge",
     "not metered": "square",
 }
 """The drawn marks, as in the picture."""
@@ -111,11 +113,12 @@ class PanelPage:
 def panel_page(chart: Chart, panel: Panel) -> PanelPage:
     """Lays a panel out."""
     points, colours = chart.of(panel), colours_of(chart)
-    across = Scale.around([each.cost.median for each in points], LEFT, WIDTH - RIGHT)
+    costs = {id(each): drawn_cost(each, points) for each in points}
+    across = Scale.around(list(costs.values()), LEFT, WIDTH - RIGHT)
     upwards = Scale.around([JND, *map(drawn_error, points)], HEIGHT - BOTTOM, TOP)
 
     def place(each: Measurement) -> tuple[float, float]:
-        return across.at(each.cost.median), upwards.at(drawn_error(each))
+        return across.at(costs[id(each)]), upwards.at(drawn_error(each))
 
     def polyline(chosen: list[Measurement]) -> str:
         return " ".join(f"{x},{y}" for x, y in map(place, chosen))
@@ -177,11 +180,16 @@ def described(each: Measurement) -> str:
     score, cost = each.score, each.cost
     said = [
         each.setting.label,
-        f"error {score.felt:.3g} JND" if math.isfinite(score.felt) else "diverged",
-        f"cost {cost.median:.3g} s per s ({cost.low:.3g} to {cost.high:.3g}), "
-        f"{1e6 * cost.median * each.setting.period:.3g} µs a tick",
-        f"{cost.ratio:.3g} times the baseline ({cost.ratio_low:.3g} to {cost.ratio_high:.3g})",
+        f"error {score.felt:.3g} JND" if math.isfinite(score.felt) else score.reason or "no error",
     ]
+    if math.isfinite(cost.median):
+        said += [
+            f"cost {cost.median:.3g} s per s ({cost.low:.3g} to {cost.high:.3g}), "
+            f"{1e6 * cost.median * each.setting.period:.3g} µs a tick",
+            f"{cost.ratio:.3g} times the baseline ({cost.ratio_low:.3g} to {cost.ratio_high:.3g})",
+        ]
+    else:
+        said.append("not timed: it failed in its first step, and is drawn with the dearest point")
     numbers = (
         ("force", score.force_rms, 1.0, "N RMS"),
         ("force, peak", score.force_peak, 1.0, "N"),

@@ -93,7 +93,7 @@ class PegInHole:
     def settled(self, take: Take) -> Score:
         """Compares where the peg rests at the end of each hold with the rigid optimum."""
         if take.has_diverged:
-            return diverged(take.created)
+            return diverged(take.created, take.ended)
         ends = [round(end_of_hold(index) / take.setting.period) - 1 for index in JUDGED]
         records = take.records[np.minimum(ends, take.records.size - 1)]
         force, exact = (

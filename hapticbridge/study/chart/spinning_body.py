@@ -167,12 +167,12 @@ class SpinningBody:
         duration = self._grid * self._reference.size
         work = work_of(spinning_scene(), still, duration, self._finest, self.coupling, self._judge)
         spin = Velocity(angular=SPIN)
-        return replace(work, task=replace(work.task, start_velocity=spin))
+        return replace(work, tasks=(replace(work.tasks[0], start_velocity=spin),))
 
     def _judge(self, takes: Sequence[Take]) -> Mapping[str, Score]:
         (take,) = takes
         if take.has_diverged:
-            return {PANEL.key: diverged(take.created)}
+            return {PANEL.key: diverged(take.created, take.ended)}
         records = take.at(self._grid)
         score = score_of(
             self._reference,

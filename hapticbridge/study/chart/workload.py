@@ -33,8 +33,9 @@ class Panel:
 class Run(Protocol):
     """A workload at one setting, which can be run again and again."""
 
-    seconds: float
-    """Simulated time in s."""
+    @property
+    def seconds(self) -> float:
+        """Simulated time in s."""
 
     @property
     def chosen(self) -> Mapping[str, str | int]:
