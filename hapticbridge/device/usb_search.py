@@ -51,10 +51,10 @@ def find(family: Family, backend: Any = None) -> list[Plugged]:
 
 
 def _told_by_kernel(family: Family) -> list[Plugged]:
-    def problem(node: OnTheBus) -> str | None:
+    def problem(device: OnTheBus) -> str | None:
         if libusb() is None:
             return "libusb cannot be loaded; reinstall the package 'libusb-package'"
-        return None if node.is_permitted else permission_problem(str(node.node))
+        return None if device.is_permitted else permission_problem(str(device.node))
 
     return [
         Plugged(
