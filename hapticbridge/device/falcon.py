@@ -22,18 +22,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.device.base import DeviceInfo, checked_number, checked_period
-from hapticbridge.device.falcon_boot import Link, ask, read_firmware
+from hapticbridge.device.falcon_boot import READ_FROM, WRITE_TO, Link, ask, read_firmware
 from hapticbridge.device.falcon_motion import (
     BELIEVED,
+    FORCE_LIMIT,
     MOTION_DTYPE,
     PLACE,
     SPEED_LIMIT,
+    UNFELT_TORQUE_LIMIT,
     believe,
     command,
     resolution,
 )
 from hapticbridge.device.falcon_packets import SIZE, ReplyStream, Request
-from hapticbridge.device.falcon_start import SILENCE, bring_up, home, silent
+from hapticbridge.device.falcon_start import LONGEST_PERIOD, SILENCE, bring_up, home, silent
 from hapticbridge.device.falcon_timing import measured_timing
 from hapticbridge.device.hex_log import HexLog
 from hapticbridge.device.plugged import Family, Tell, UsbId, chosen, tell_nobody
@@ -42,17 +44,6 @@ from hapticbridge.device.usb_search import find
 from hapticbridge.errors import DeviceError, DeviceLost
 from hapticbridge.jit import direct
 from hapticbridge.tick import SAMPLE_DTYPE, TickFlag
-
-FORCE_LIMIT = 8.0
-"""In N: what CHAI3D lets applications ask of a Falcon; the maker's figure is above 8.9 N."""
-
-LONGEST_PERIOD = 0.02
-"""In s. It is asked once a tick; slower, two lost replies would already count as silence."""
-
-READ_FROM, WRITE_TO = 0x81, 0x02
-"""Addresses of its bulk endpoints."""
-
-_NOTHING_RECORDED = 0.5  # N m, of torques that are recorded and have no motor: the usual limit
 
 
 class FalconDevice:
@@ -106,7 +97,7 @@ class FalconDevice:
                 friction=friction,
                 resolution=resolution(),
                 force_limit=FORCE_LIMIT,
-                torque_limit=_NOTHING_RECORDED,
+                torque_limit=UNFELT_TORQUE_LIMIT,
                 speed_limit=SPEED_LIMIT,
                 rate=rate,
                 delay=delay,
@@ -224,8 +215,7 @@ def open_falcon(options: Mapping[str, object], tell: Tell, backend: Any = None) 
     """Finds a Falcon and opens it.
 
     Args:
-        options: ``serial``, ``firmware`` (a file), ``mass``, ``damping``, ``friction`` (numbers or
-            their text), ``log`` (a file for the bytes).
+        options: Those of ``FAMILY``: names of files and numbers in SI units.
         tell: Told what the user should know or do.
         backend: A pyusb backend; None takes libusb.
 
@@ -238,14 +228,14 @@ def open_falcon(options: Mapping[str, object], tell: Tell, backend: Any = None) 
         for name, unit in _NUMBERS.items()
         if options.get(name) is not None
     }
-    firmware, log = (
-        None if options.get(name) is None else str(options[name]) for name in ("firmware", "log")
-    )
+    files = {name: str(options[name]) for name in ("firmware", "log") if options.get(name)}
+    firmware = files.get("firmware")
     if firmware is not None:
         read_firmware(firmware)  # a wrong name is said before anything moves
     plugged = chosen(FAMILY, find(FAMILY, backend), options.get("serial"))
+    log = HexLog(files.get("log"))
     link = UsbLink.open(
-        plugged, FAMILY, read_from=READ_FROM, write_to=WRITE_TO, backend=backend, log=HexLog(log)
+        plugged, FAMILY, read_from=READ_FROM, write_to=WRITE_TO, backend=backend, log=log
     )
     return FalconDevice(link, name=str(plugged), firmware=firmware, tell=tell, **numbers)
 
