@@ -9,7 +9,6 @@ import os
 import shlex
 import shutil
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Mapping, Sequence
@@ -124,14 +123,10 @@ def python_environment() -> dict[str, str]:
         "TMPDIR": "/dev/shm",
         "PYTHONPATH": f"{CHECKOUT}:{CHECKOUT / 'tests'}",
         "PYTHONDONTWRITEBYTECODE": "1",
+        "PYTHONHASHSEED": "0",
         # numba uses a cache only where it may write; the guest may write to this one
         "NUMBA_CACHE_DIR": "/run/compiled",
     }
-
-
-def python() -> str:
-    """Returns the interpreter's path, which is the same in the guest."""
-    return sys.executable
 
 
 def _compiled_code() -> Path:
