@@ -87,7 +87,7 @@ def _pytest(report: str, *arguments: str) -> list[str]:
     return [sys.executable, "-m", "pytest", *plain, *form, *arguments, *files]
 
 
-def _claims(report: Path, otherwise: str) -> list[Claim]:
+def claims_of(report: Path, otherwise: str) -> list[Claim]:
     """Reads a report; where there is none, the only claim is that the job ran."""
     if not report.is_file():
         return [Claim("the job ran", is_true=False, note=otherwise)]
@@ -121,7 +121,7 @@ def _under_umockdev(folder: Path) -> list[Claim]:
         )
     except subprocess.TimeoutExpired:
         return [Claim("the job ran", is_true=False, note=f"stopped after {LIMIT:g} s")]
-    return _claims(report, ended.stdout + ended.stderr)
+    return claims_of(report, ended.stdout + ended.stderr)
 
 
 def _in_the_guest(folder: Path, command: Sequence[str], *, is_virtual: bool) -> GuestRun:
@@ -135,13 +135,13 @@ def _in_the_guest(folder: Path, command: Sequence[str], *, is_virtual: bool) -> 
 
 def _checks_in_virtual_time(folder: Path) -> list[Claim]:
     run = _in_the_guest(folder, _pytest("/run/job/report.xml"), is_virtual=True)
-    return _claims(folder / "report.xml", run.output)
+    return claims_of(folder / "report.xml", run.output)
 
 
 def _round_trips(folder: Path) -> list[Claim]:
     command = _pytest("/run/job/report.xml", "-k", "come_back_through")
     run = _in_the_guest(folder, command, is_virtual=False)
-    return _claims(folder / "report.xml", run.output)
+    return claims_of(folder / "report.xml", run.output)
 
 
 def _recorded(folder: Path, device: str, seconds: float) -> tuple[GuestRun, Path]:
