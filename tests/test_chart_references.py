@@ -215,4 +215,4 @@ def test_sliding_block_in_closed_form_is_what_a_solver_with_an_event_finds() -> 
 def test_block_that_would_break_away_too_early_or_never_is_refused() -> None:
     for stiffness in (1e5, 10.0):
         with pytest.raises(StudyError, match="the block breaks away at"):
-            sliding_block.SlidingBlock(Coupling(stiffness, 1.0, 0.0, 0.0), GRID)
+            sliding_block.SlidingBlock(Coupling(stiffness, 1.0, 0.0, 0.0), GRID, GRID)

@@ -40,7 +40,7 @@ def open_workload(name: str, extent: Extent) -> Workload:
         "point_mass": lambda: driven_mass.DrivenMass(scene_motion.COUPLING, grid, finest),
         "peg_in_hole": lambda: peg.PegInHole(peg.COUPLING, grid, finest),
         "rod_impact": lambda: rod_impact.RodImpact(rod_impact.COUPLING, grid),
-        "sliding_block": lambda: sliding_block.SlidingBlock(sliding_block.COUPLING, grid),
+        "sliding_block": lambda: sliding_block.SlidingBlock(sliding_block.COUPLING, grid, finest),
         "spinning_body": lambda: spinning_body.SpinningBody(spinning_body.COUPLING, grid, finest),
     }
     if name in known:

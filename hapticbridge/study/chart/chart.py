@@ -2,28 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence, Set
+from dataclasses import dataclass, field
 from functools import cache
 
 import numpy as np
 
 from hapticbridge.check.observation import quiet
 from hapticbridge.errors import HapticBridgeError, StudyError
+from hapticbridge.study.chart.convergence import Order, convergence_orders
 from hapticbridge.study.chart.engine_run import EngineRun, PeerWork
 from hapticbridge.study.chart.front import pareto_front
 from hapticbridge.study.chart.measurement import Measurement
 from hapticbridge.study.chart.score import Score
-from hapticbridge.study.chart.setting import OWN, SHIPPED, Setting
+from hapticbridge.study.chart.setting import OWN, SHIPPED, Setting, who
 from hapticbridge.study.chart.timing import REPEATS, interleaved_costs, machine, one_core
 from hapticbridge.study.chart.workload import Panel, Run, Workload
+from hapticbridge.study.engines.base import Engine
 from hapticbridge.study.engines.library import open_engine
-
-ORDER_POINTS = 3
-"""How many of the smallest steps an order of convergence is fitted to."""
-
-RESOLVED = 1e-5
-"""Error in JND below which a reference's own error may count: no order is fitted to it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,6 +33,7 @@ class Chart:
         machine: Where it was measured, in words.
         baseline: The setting that ratios are to.
         notes: What else is to be known, a sentence each.
+        engines: The other engines on it, by name, with their settings.
     """
 
     workload: Workload
@@ -45,6 +42,7 @@ class Chart:
     machine: str
     baseline: str
     notes: tuple[str, ...] = ()
+    engines: Mapping[str, Engine] = field(default_factory=dict)
 
     def of(self, panel: Panel) -> list[Measurement]:
         """Returns the points of a panel."""
@@ -53,46 +51,22 @@ class Chart:
     def front(self, panel: Panel) -> list[Measurement]:
         """Returns the Pareto front, cheapest first.
 
-        Of the points that are sound and render the coupling that was asked for: a weld, or a tool
-        that is where the handle is, renders another one, however well it converges.
+        Of the points that are sound and comparable, and render the coupling that was asked for: a
+        weld, or a tool that is where the handle is, renders another one, however well it converges.
         """
-        points = [each for each in self.of(panel) if each.is_sound and each.setting.method.has_law]
+        points = [
+            each
+            for each in self.of(panel)
+            if each.is_sound and each.is_comparable and each.setting.method.has_law
+        ]
         chosen = pareto_front(
             [each.cost.median for each in points], [each.score.felt for each in points]
         )
         return [points[index] for index in chosen]
 
-    def orders(self, panel: Panel) -> dict[str, float]:
-        """Returns by method the power of the period that its error goes with."""
+    def orders(self, panel: Panel) -> dict[str, Order]:
+        """Returns by method how its error goes with the period."""
         return convergence_orders(self.of(panel))
-
-
-def convergence_orders(points: Sequence[Measurement]) -> dict[str, float]:
-    """Fits felt ~ T^p to the smallest steps of each method, all else as usual.
-
-    Returns:
-        p by method or engine; nan where there are fewer than three points, or an error is below
-        ``RESOLVED``.
-    """
-    series: dict[str, list[tuple[float, float]]] = {}
-    for each in points:
-        if each.is_usual:
-            value = (each.setting.period, each.score.felt)
-            series.setdefault(who(each.setting), []).append(value)
-    found = {}
-    for name, values in series.items():
-        period, felt = np.array(sorted(values)[:ORDER_POINTS]).T
-        is_clear = period.size == ORDER_POINTS and np.isfinite(felt).all()
-        is_clear = bool(is_clear and (felt > RESOLVED).all())
-        found[name] = (
-            float(np.polyfit(np.log(period), np.log(felt), 1)[0]) if is_clear else float("nan")
-        )
-    return found
-
-
-def who(setting: Setting) -> str:
-    """Returns the method's name, or the engine's where it is another."""
-    return setting.method.name if setting.engine == OWN else setting.engine
 
 
 def measure_chart(
@@ -105,7 +79,7 @@ def measure_chart(
     """Judges and times every setting.
 
     A setting that the workload cannot be rendered by is left out and named in ``skipped``; one that
-    diverges stays in.
+    diverges, or whose engine fails on the way, stays in.
 
     Args:
         workload: What to simulate.
@@ -139,7 +113,10 @@ def measure_chart(
                 f"workload '{workload.name}': no point could be simulated; first: "
                 f"{next(iter(skipped.values()), 'no setting')}"
             )
-        baseline = _baseline([setting for setting, _, _ in runs])
+        baseline = _baseline(
+            [setting for setting, _, _ in runs],
+            {i for i, (_, _, scores) in enumerate(runs) if _has_failed(scores)},
+        )
         costs = interleaved_costs(
             [run for _, run, _ in runs],
             baseline,
@@ -148,15 +125,24 @@ def measure_chart(
         )
         where = machine(core)
     tell(total)
+    apart = {} if workload.references is None else workload.references.disagreement()
     measurements = tuple(
-        Measurement(panel.key, setting, cost, scores[panel.key], run.chosen)
+        Measurement(
+            panel.key,
+            setting,
+            cost,
+            scores[panel.key],
+            run.chosen,
+            limit_apart=0.0 if panel.is_truth else apart.get(setting.method.name, 0.0),
+        )
         for panel in workload.panels
         for (setting, run, scores), cost in zip(runs, costs, strict=True)
         # what another engine converges to is no error of its own
         if panel.is_truth or setting.engine == OWN
     )
     label = runs[baseline][0].label
-    return Chart(workload, measurements, skipped, where, label, tuple(_notes(workload)))
+    engines = {each.engine.name: each.engine for _, each, _ in runs if isinstance(each, EngineRun)}
+    return Chart(workload, measurements, skipped, where, label, tuple(_notes(apart)), engines)
 
 
 def _opened(workload: Workload, setting: Setting, peer_work: Callable[[], PeerWork]) -> Run:
@@ -165,13 +151,18 @@ def _opened(workload: Workload, setting: Setting, peer_work: Callable[[], PeerWo
     return EngineRun(open_engine(setting.engine), peer_work(), setting)
 
 
-def _baseline(settings: Sequence[Setting]) -> int:
+def _has_failed(scores: Mapping[str, Score]) -> bool:
+    return any(score.verdict == "failed" for score in scores.values())
+
+
+def _baseline(settings: Sequence[Setting], failed: Set[int]) -> int:
     """Returns the index of ``implicit`` at the period nearest to 1 ms, or what comes nearest."""
 
-    def distance(index: int) -> tuple[bool, bool, float]:
+    def distance(index: int) -> tuple[bool, bool, bool, float]:
         setting = settings[index]
         is_plain = setting.substeps == 1 and setting.contact == SHIPPED
         return (
+            index in failed,  # it may not have been timed
             setting.engine != OWN or setting.method.name != "implicit",
             not (is_plain and setting.iterations is None),
             abs(np.log(setting.period / 1e-3)),
@@ -180,12 +171,13 @@ def _baseline(settings: Sequence[Setting]) -> int:
     return min(range(len(settings)), key=distance)
 
 
-def _notes(workload: Workload) -> Iterator[str]:
-    apart = {} if workload.references is None else workload.references.disagreement()
-    if apart:
-        listed = ", ".join(f"{name} {felt:.2g}" for name, felt in apart.items())
+def _notes(apart: Mapping[str, float]) -> Iterator[str]:
+    if len(apart) > 1:
+        central = min(apart, key=lambda name: apart[name])
+        listed = ", ".join(f"{name} {felt:.2g}" for name, felt in apart.items() if name != central)
         yield (
-            "How far the methods' own limits lie from that of the first method, in JND: "
-            f"{listed}. Limits that agree are those of one model; a limit far away is another "
-            "model's, however well its method converges."
+            "How far the methods' own limits lie from the one that most of them are near, that of "
+            f"{central}, in JND: {listed}. A point that is nearer to its own limit than that limit "
+            "is to the others cannot be compared with them: it is drawn pale, and is neither on "
+            "the front nor recommended."
         )

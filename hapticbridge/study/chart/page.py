@@ -4,20 +4,25 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import pairwise
 
 from jinja2 import Environment, PackageLoader, select_autoescape
 
-from hapticbridge.study.chart.chart import Chart, who
+from hapticbridge.study.chart.chart import Chart
+from hapticbridge.study.chart.convergence import Order
 from hapticbridge.study.chart.drawing import (
     CEILING,
     FLOOR,
     MARKS,
+    NARROW,
     colours_of,
+    drawn_cost,
     drawn_error,
 )
 from hapticbridge.study.chart.measurement import Measurement
 from hapticbridge.study.chart.recommendation import JND, recommendation, recommended
 from hapticbridge.study.chart.score import Verdict
+from hapticbridge.study.chart.setting import who
 from hapticbridge.study.chart.workload import Panel
 
 WIDTH, HEIGHT = 860, 420
@@ -32,6 +37,7 @@ SHAPES: dict[Verdict, str] = {
     "active": "triangle",
     "lost contact": "plus",
     "diverged": "cross",
+    "failed": "wedge",
     "not metered": "square",
 }
 """The drawn marks, as in the picture."""
@@ -47,6 +53,7 @@ class Spot:
     colour: str
     name: str
     is_usual: bool
+    is_comparable: bool
     told: str
 
 
@@ -80,9 +87,11 @@ class Scale:
         return round(self.start + share * (self.end - self.start), 1)
 
     def ticks(self) -> list[Tick]:
-        """Returns a tick for every power of ten within the axis."""
-        first, last = math.ceil(math.log10(self.low)), math.floor(math.log10(self.high))
-        return [Tick(self.at(10.0**n), f"{10.0**n:g}") for n in range(first, last + 1)]
+        """Returns a tick for every power of ten within the axis; on a short one 2 and 5 too."""
+        first, last = math.floor(math.log10(self.low)), math.ceil(math.log10(self.high))
+        steps = (1, 2, 5) if self.high < NARROW * self.low else (1,)
+        values = [step * 10.0**n for n in range(first, last + 1) for step in steps]
+        return [Tick(self.at(v), f"{v:g}") for v in values if self.low <= v <= self.high]
 
     @classmethod
     def around(cls, values: list[float], start: float, end: float) -> Scale:
@@ -105,17 +114,18 @@ class PanelPage:
     jnd: float
     recommendation: str
     front: list[dict[str, str]]
-    orders: dict[str, str]
+    orders: dict[str, Order]
 
 
 def panel_page(chart: Chart, panel: Panel) -> PanelPage:
     """Lays a panel out."""
     points, colours = chart.of(panel), colours_of(chart)
-    across = Scale.around([each.cost.median for each in points], LEFT, WIDTH - RIGHT)
+    costs = {id(each): drawn_cost(each, points) for each in points}
+    across = Scale.around(list(costs.values()), LEFT, WIDTH - RIGHT)
     upwards = Scale.around([JND, *map(drawn_error, points)], HEIGHT - BOTTOM, TOP)
 
     def place(each: Measurement) -> tuple[float, float]:
-        return across.at(each.cost.median), upwards.at(drawn_error(each))
+        return across.at(costs[id(each)]), upwards.at(drawn_error(each))
 
     def polyline(chosen: list[Measurement]) -> str:
         return " ".join(f"{x},{y}" for x, y in map(place, chosen))
@@ -127,6 +137,7 @@ def panel_page(chart: Chart, panel: Panel) -> PanelPage:
             colour=colours[who(each.setting)],
             name=who(each.setting),
             is_usual=each.is_usual,
+            is_comparable=each.is_comparable,
             told=described(each),
         )
         for each in points
@@ -136,12 +147,9 @@ def panel_page(chart: Chart, panel: Panel) -> PanelPage:
         for name, colour in colours.items()
     ]
     front = chart.front(panel)
-    stairs = []
-    for before, after in zip(front, [*front[1:], None], strict=True):
-        x, y = place(before)
-        stairs.append(f"{x},{y}")
-        if after is not None:
-            stairs.append(f"{place(after)[0]},{y}")
+    stairs = [f"{x},{y}" for x, y in map(place, front[:1])]
+    for before, after in pairwise(map(place, front)):
+        stairs += [f"{after[0]},{before[1]}", f"{after[0]},{after[1]}"]
     best = recommended(points)
     return PanelPage(
         panel=panel,
@@ -164,11 +172,7 @@ def panel_page(chart: Chart, panel: Panel) -> PanelPage:
             }
             for each in front
         ],
-        orders={
-            name: f"{round(order, 2) + 0.0:.2f}"
-            for name, order in chart.orders(panel).items()
-            if math.isfinite(order)
-        },
+        orders=chart.orders(panel),
     )
 
 
@@ -177,11 +181,16 @@ def described(each: Measurement) -> str:
     score, cost = each.score, each.cost
     said = [
         each.setting.label,
-        f"error {score.felt:.3g} JND" if math.isfinite(score.felt) else "diverged",
-        f"cost {cost.median:.3g} s per s ({cost.low:.3g} to {cost.high:.3g}), "
-        f"{1e6 * cost.median * each.setting.period:.3g} µs a tick",
-        f"{cost.ratio:.3g} times the baseline ({cost.ratio_low:.3g} to {cost.ratio_high:.3g})",
+        f"error {score.felt:.3g} JND" if math.isfinite(score.felt) else score.reason or "no error",
     ]
+    if math.isfinite(cost.median):
+        said += [
+            f"cost {cost.median:.3g} s per s ({cost.low:.3g} to {cost.high:.3g}), "
+            f"{1e6 * cost.median * each.setting.period:.3g} µs a tick",
+            f"{cost.ratio:.3g} times the baseline ({cost.ratio_low:.3g} to {cost.ratio_high:.3g})",
+        ]
+    else:
+        said.append("not timed: it failed in its first step, and is drawn with the dearest point")
     numbers = (
         ("force", score.force_rms, 1.0, "N RMS"),
         ("force, peak", score.force_peak, 1.0, "N"),
@@ -197,6 +206,8 @@ def described(each: Measurement) -> str:
         for name, value, factor, unit in numbers
         if math.isfinite(value)
     ]
+    if not each.is_comparable:
+        said.append(f"its own limit lies {each.limit_apart:.2g} JND from what most converge to")
     return "\n".join([*said, MARKS[score.verdict][2]])
 
 
@@ -217,4 +228,5 @@ def chart_page(chart: Chart) -> str:
         size=(WIDTH, HEIGHT),
         margins=(LEFT, RIGHT, TOP, BOTTOM),
         edges=(FLOOR, CEILING),
+        pale=not all(each.is_comparable for each in chart.measurements),
     )

@@ -2,29 +2,33 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 
 import mujoco
 import numpy as np
 
 from hapticbridge.check.felt import WEBER
 from hapticbridge.coupling import Coupling
-from hapticbridge.errors import StudyError
-from hapticbridge.kernel.scheme import DIRECT, WELD
 from hapticbridge.mechanics import Impact, ImpactBody, resolve_impact
+from hapticbridge.pose import quaternion_exp
 from hapticbridge.scene import Scene
 from hapticbridge.study.chart.engine_run import PeerWork
-from hapticbridge.study.chart.scene_run import SceneRun, Stage, Stages, Take
+from hapticbridge.study.chart.scene_run import Stage, Stages, Take
 from hapticbridge.study.chart.score import Score, Verdict, diverged
-from hapticbridge.study.chart.setting import Setting
 from hapticbridge.study.chart.spinning_body import still
-from hapticbridge.study.chart.workload import Panel, References, Run
+from hapticbridge.study.chart.staged import Staged
+from hapticbridge.study.chart.workload import Panel
+from hapticbridge.study.engines.task import Body, Pose, Shape, Task, Velocity
 from hapticbridge.study.maps.rigs import scene_of
 
 MASS, LENGTH = 0.1, 0.2
 """Of a uniform rod, in kg and m: a light tool."""
 INERTIA = MASS * LENGTH**2 / 12
 """About its centre of mass in kg m²."""
+THIN = 1e-6
+"""About its axis in kg m²: a rod 9 mm thick. Nothing turns it about that axis."""
 TIP = 1e-3
 """Radius in m of the sphere at the lower end, all that can touch."""
 
@@ -65,7 +69,7 @@ _ROD = f"""
       <joint type="slide" axis="1 0 0"/>
       <joint type="slide" axis="0 0 1"/>
       <joint type="hinge" axis="0 1 0"/>
-      <inertial pos="0 0 0" mass="{MASS!r}" diaginertia="{INERTIA!r} {INERTIA!r} 1e-6"/>
+      <inertial pos="0 0 0" mass="{MASS!r}" diaginertia="{THIN!r} {INERTIA!r} {INERTIA!r}"/>
       <geom name="tip" type="sphere" size="{TIP!r}" pos="{-LENGTH / 2!r} 0 0" mass="0"/>
       <site name="grip"/>
     </body>
@@ -90,6 +94,29 @@ def falls_at(angle: float) -> Callable[[Scene], None]:
     return put
 
 
+def free_fall(angle: float) -> Task:
+    """Returns the same fall of a rod that is free in space, for other engines.
+
+    The floor's surface is at z = 0. The tip's sphere is all that can touch, and it touches in the
+    plane of motion, so that no impulse turns the rod out of it.
+    """
+    tip = Shape("sphere", (TIP,), (-LENGTH / 2, 0.0, 0.0))
+    rod = Body(MASS, (THIN, INERTIA, INERTIA), shapes=(tip,), friction=FRICTION)
+    height = LENGTH / 2 * math.sin(angle) + TIP + HEIGHT
+    return Task(
+        "rod_impact",
+        rod,
+        (Shape("box", (1.0, 1.0, 0.1), (0.0, 0.0, -0.1)),),
+        start=Pose((0.0, 0.0, height), quaternion_exp((0.0, -angle, 0.0))),
+        start_velocity=Velocity((SLIDE, 0.0, -APPROACH)),
+    )
+
+
+def _in_the_plane(take: Take) -> Take:
+    """Returns a take with the velocities of the plane alone: along x, along z, about y."""
+    return replace(take, velocity=take.velocity[[0, 2, 4]])
+
+
 def rigid_impacts() -> Impact:
     """Returns the four impacts of a rigid rod that does not rebound, by mechanics."""
     angle = np.array(ANGLES)
@@ -98,7 +125,7 @@ def rigid_impacts() -> Impact:
     return resolve_impact(rod, [SLIDE, -APPROACH], FRICTION, 0.0)
 
 
-class RodImpact:
+class RodImpact(Staged):
     """The workload.
 
     Args:
@@ -109,38 +136,29 @@ class RodImpact:
     name = "rod_impact"
     about = "a rod taps the floor at four angles, with friction"
     panels: Sequence[Panel] = (PANEL,)
+    needs_tool = "lets no tool fall by itself"
     has_contact = True
-    references: References | None = None
 
     def __init__(self, coupling: Coupling, grid: float) -> None:
-        self.coupling = coupling
         self._rigid = rigid_impacts()
-        duration = grid * max(1, round(DURATION / grid))
+        self._duration = duration = grid * max(1, round(DURATION / grid))
         starts = [falls_at(angle) for angle in ANGLES]
-        self._stages = Stages(lambda: Stage(rod_scene(), still, duration, coupling, starts=starts))
-
-    def run(self, setting: Setting) -> Run:
-        """Prepares a point.
-
-        Raises:
-            StudyError: The method does without the tool's own dynamics.
-        """
-        if setting.method.scheme in (WELD, DIRECT):
-            raise StudyError(f"method '{setting.method.name}' lets no tool fall by itself")
-        return SceneRun(self._stages.for_method(setting), setting, self._judge)
+        super().__init__(
+            coupling, Stages(lambda: Stage(rod_scene(), still, duration, coupling, starts=starts))
+        )
 
     def peer_work(self) -> PeerWork:
-        """Refuses: other engines are given free tools alone.
-
-        Raises:
-            StudyError: Always.
-        """
-        raise StudyError("a rod that moves in a plane is not described to other engines")
+        """Describes the falls to other engines: of a free rod, which stays in its plane."""
+        return PeerWork(
+            tuple(free_fall(angle) for angle in ANGLES),
+            self._duration,
+            lambda takes: self._judge([_in_the_plane(take) for take in takes]),
+        )
 
     def _judge(self, takes: Sequence[Take]) -> Mapping[str, Score]:
         created = max(take.created for take in takes)
-        if any(take.has_diverged for take in takes):
-            return {PANEL.key: diverged(created)}
+        if ended := next((take.ended for take in takes if take.has_diverged), ""):
+            return {PANEL.key: diverged(created, ended)}
         velocities = np.array([take.velocity[:3] for take in takes])
         impulses = MASS * (velocities[:, :2] - (SLIDE, -APPROACH))
         error = np.linalg.norm(impulses - self._rigid.impulse, axis=1)
@@ -161,5 +179,5 @@ class RodImpact:
 
 
 def _worst(takes: Sequence[Take]) -> Verdict:
-    order: tuple[Verdict, ...] = ("strict", "within slack", "active")
+    order: tuple[Verdict, ...] = ("not metered", "strict", "within slack", "active")
     return max((take.environment for take in takes), key=order.index)

@@ -44,7 +44,8 @@ class Take:
     Attributes:
         setting: How.
         records: ``TICK_DTYPE``, one per tick that was completed.
-        has_diverged: Whether it ended early, or MuJoCo gave its state up.
+        ended: Why it diverged, in words: it ended early, or MuJoCo gave its state up; empty where
+            it did not.
         environment: ``strict``, ``within slack`` or ``active``.
         created: Largest Σ E_k in J.
         velocity: ``qvel`` at the end.
@@ -52,10 +53,15 @@ class Take:
 
     setting: Setting
     records: NDArray[np.void]
-    has_diverged: bool
+    ended: str
     environment: Verdict
     created: float
     velocity: NDArray[np.float64]
+
+    @property
+    def has_diverged(self) -> bool:
+        """Whether it ended early, or MuJoCo gave its state up."""
+        return bool(self.ended)
 
     def at(self, grid: float) -> NDArray[np.void]:
         """Returns the records at whole multiples of a time in s, the first excluded."""
@@ -162,11 +168,15 @@ class Stage:
 
     def _take(self, setting: Setting, binding: Binding, rows: NDArray[np.void], ticks: int) -> Take:
         warnings = self._scene.data.warning
-        is_bad = any(warnings[int(kind)].number > 0 for kind in _BAD)
+        ended = ""
+        if rows.size < ticks:
+            ended = f"a number was not finite after {setting.period * rows.size:.4g} s"
+        elif bad := [kind for kind in _BAD if warnings[int(kind)].number > 0]:
+            ended = f"MuJoCo gave its state up ({bad[0].name.removeprefix('mjWARN_')})"
         return Take(
             setting=setting,
             records=rows,
-            has_diverged=is_bad or rows.size < ticks,
+            ended=ended,
             environment=Ledger.of(binding.state).environment,
             created=float(rows["environment_energy"].max(initial=0.0)),
             velocity=self._scene.data.qvel.copy(),

@@ -10,9 +10,11 @@ from numpy.typing import NDArray
 
 from hapticbridge.check.felt import felt_error
 
-Verdict = Literal["strict", "within slack", "active", "lost contact", "diverged", "not metered"]
-"""Of the environment (``Ledger.environment``), or what else became of the run. ``not metered``:
-another engine, whose energy nobody counted."""
+Verdict = Literal[
+    "strict", "within slack", "active", "lost contact", "diverged", "failed", "not metered"
+]
+"""Of the environment (``Ledger.environment``), or what else became of the run. ``failed``: another
+engine raised an error on the way. ``not metered``: another engine, whose energy nobody counted."""
 
 PASSIVE = ("strict", "within slack")
 
@@ -34,6 +36,7 @@ class Score:
         energy: Error of the energy in J, where the reference knows it.
         created: Largest Σ E_k in J: > 0 where the simulation created energy.
         verdict: What became of it.
+        reason: Why it ended early, in words; empty where it did not.
     """
 
     felt: float
@@ -46,6 +49,7 @@ class Score:
     energy: float = NAN
     created: float = NAN
     verdict: Verdict = "not metered"
+    reason: str = ""
 
 
 def score_of(
@@ -85,6 +89,6 @@ def score_of(
     )
 
 
-def diverged(created: float = INF) -> Score:
+def diverged(created: float = INF, reason: str = "") -> Score:
     """Returns the score of a run that left all bounds."""
-    return Score(felt=INF, created=created, verdict="diverged")
+    return Score(felt=INF, created=created, verdict="diverged", reason=reason)

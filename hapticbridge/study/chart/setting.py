@@ -16,6 +16,9 @@ OWN = "hapticbridge"
 """The bridge itself, in its compiled loop around MuJoCo; other engines carry their own names, and
 MuJoCo as any other engine is called ``mujoco``."""
 
+SPRING = "_spring"
+"""How the name of an engine ends that solves the coupling as a spring of its own."""
+
 SHIPPED = "as shipped"
 """The contact setting that the scene's file names."""
 
@@ -50,7 +53,8 @@ class Setting:
         contact: One of ``CONTACTS``.
         iterations: The most that MuJoCo's solver may take; None as the scene says.
         engine: Who simulates; another than ``OWN`` is set as its documentation advises, and
-            holds the coupling's force as method ``explicit`` does.
+            holds the coupling's force as method ``explicit`` does, unless its name ends with
+            ``SPRING``.
     """
 
     method: Method
@@ -68,7 +72,8 @@ class Setting:
     @property
     def label(self) -> str:
         """The setting in words, what is usual left out."""
-        who = self.method.name if self.engine == OWN else f"{self.engine}, held force"
+        law = "own spring" if self.engine.endswith(SPRING) else "held force"
+        who = self.method.name if self.engine == OWN else f"{self.engine}, {law}"
         parts = [who, f"{1e3 * self.period:g} ms"]
         if self.substeps > 1:
             parts.append(f"{self.substeps} substeps")
@@ -78,6 +83,11 @@ class Setting:
             plural = "" if self.iterations == 1 else "s"
             parts.append(f"{self.iterations} solver iteration{plural}")
         return ", ".join(parts)
+
+
+def who(setting: Setting) -> str:
+    """Returns the method's name, or the engine's where it is another."""
+    return setting.method.name if setting.engine == OWN else setting.engine
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -9,14 +9,15 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 
 from hapticbridge.coupling import Coupling
+from hapticbridge.device import Motion
 from hapticbridge.errors import StudyError
-from hapticbridge.kernel.scheme import DIRECT, WELD
 from hapticbridge.scene import Scene
-from hapticbridge.study.chart.engine_run import PeerWork
-from hapticbridge.study.chart.scene_run import SceneRun, Stage, Stages, Take
+from hapticbridge.study.chart.engine_run import PeerWork, motion_along
+from hapticbridge.study.chart.scene_run import Stage, Stages, Take
 from hapticbridge.study.chart.score import Score, diverged, score_of
-from hapticbridge.study.chart.setting import Setting
-from hapticbridge.study.chart.workload import Panel, References, Run
+from hapticbridge.study.chart.staged import Staged
+from hapticbridge.study.chart.workload import Panel
+from hapticbridge.study.engines.task import Body, Pose, Shape, Task
 from hapticbridge.study.maps.rigs import scene_of
 from hapticbridge.tick import TICK_DTYPE
 
@@ -42,6 +43,9 @@ PANEL = Panel(
     "closed form with Coulomb's friction: stuck until K e + B e' = μ m g, then a driven "
     "oscillator with a constant force",
 )
+
+WIDTH, HEIGHT = 0.02, 0.01
+"""Half edges in m of the free box that other engines are given, along the floor and upwards."""
 
 TOUCHING = 0.25
 """Share of the ticks in which the block must touch the floor. Not all: MuJoCo's friction lifts what
@@ -79,6 +83,33 @@ def pulled(times: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.
     positions, quaternions = np.zeros((times.size, 3)), np.zeros((times.size, 4))
     positions[:, 0], quaternions[:, 0] = handle_place(times), 1.0
     return positions, quaternions
+
+
+def free_block(coupling: Coupling, path: Motion) -> Task:
+    """Returns the same block as a box that is free in space, for other engines.
+
+    It is held and pulled at its centre. Friction acts HEIGHT below it, a torque of μ m g HEIGHT
+    that the weight on a base of half a side WIDTH bears: the box slides as it does on rails, and
+    does not tip while μ HEIGHT < WIDTH.
+
+    Args:
+        coupling: K and B.
+        path: Of the handle, counted from its first pose.
+    """
+    box = Shape("box", (WIDTH, WIDTH, HEIGHT))
+    across = MASS * (WIDTH**2 + HEIGHT**2) / 3
+    body = Body(MASS, (across, across, MASS * 2 * WIDTH**2 / 3), shapes=(box,), friction=FRICTION)
+    centre = (0.0, 0.0, HEIGHT)
+    places = path.table[:, 1:4] + np.array(centre)
+    return Task(
+        "sliding_block",
+        body,
+        (Shape("box", (1.0, 1.0, 0.1), (0.0, 0.0, -0.1)),),
+        (0.0, 0.0, -GRAVITY),
+        coupling,
+        start=Pose(centre),
+        handle=Motion(path.table[:, 0], places, path.table[:, 4:]),
+    )
 
 
 def breakaway(coupling: Coupling) -> float:
@@ -122,12 +153,13 @@ def exact_sliding(
     return handle_place(times) - stretch, k * stretch + b * rate
 
 
-class SlidingBlock:
+class SlidingBlock(Staged):
     """The workload.
 
     Args:
         coupling: K and B.
         grid: Longest period T in s.
+        finest: Shortest in s.
 
     Raises:
         StudyError: The closed form does not hold for the coupling.
@@ -136,44 +168,32 @@ class SlidingBlock:
     name = "sliding_block"
     about = "a block on the floor is pulled at a constant speed: stick, breakaway, slide"
     panels: Sequence[Panel] = (PANEL,)
+    needs_tool = "pulls by no spring of known stiffness"
     has_contact = True
-    references: References | None = None
 
-    def __init__(self, coupling: Coupling, grid: float) -> None:
-        self.coupling = coupling
+    def __init__(self, coupling: Coupling, grid: float, finest: float) -> None:
         self._grid = grid
+        self._finest = finest
         count = round(DURATION / grid)
         place, force = exact_sliding(coupling, grid * np.arange(1.0, count + 1))
         self._reference = np.zeros(count, TICK_DTYPE)
         self._reference["tool_quaternion"][:, 0] = 1.0
         self._reference["wrench_on_tool"][:, 0] = force
         self._place = place
-        self._stages = Stages(lambda: Stage(block_scene(), pulled, grid * count, coupling))
-
-    def run(self, setting: Setting) -> Run:
-        """Prepares a point.
-
-        Raises:
-            StudyError: The method does without the tool's own dynamics.
-        """
-        if setting.method.scheme in (WELD, DIRECT):
-            raise StudyError(
-                f"method '{setting.method.name}' pulls by no spring of known stiffness"
-            )
-        return SceneRun(self._stages.for_method(setting), setting, self._judge)
+        super().__init__(
+            coupling, Stages(lambda: Stage(block_scene(), pulled, grid * count, coupling))
+        )
 
     def peer_work(self) -> PeerWork:
-        """Refuses: other engines are given free tools alone.
-
-        Raises:
-            StudyError: Always.
-        """
-        raise StudyError("a block on rails is not described to other engines")
+        """Describes the block to other engines: a free box, which the coupling keeps upright."""
+        duration = self._grid * self._place.size
+        task = free_block(self.coupling, motion_along(pulled, duration, self._finest))
+        return PeerWork((task,), duration, self._judge)
 
     def _judge(self, takes: Sequence[Take]) -> Mapping[str, Score]:
         (take,) = takes
         if take.has_diverged:
-            return {PANEL.key: diverged(take.created)}
+            return {PANEL.key: diverged(take.created, take.ended)}
         records = take.at(self._grid).copy()
         # the weight rests on a contact that gives way, and the handle holds a share of it: judged
         # is what happens along the floor

@@ -32,7 +32,7 @@ class Cost:
     """Processor time in s per simulated second.
 
     Attributes:
-        median: Over the rounds.
+        median: Over the rounds; nan where a run failed before it could be timed.
         low: Least.
         high: Largest.
         ratio: Median of the ratio to the baseline, each taken within one round; no unit.
@@ -108,14 +108,14 @@ def interleaved_costs(
     table = np.array(rounds)
     ratios = table / table[:, [baseline]]
     return [
-        Cost(
-            median=float(np.median(table[:, i])),
-            low=float(table[:, i].min()),
-            high=float(table[:, i].max()),
-            ratio=float(np.median(ratios[:, i])),
-            ratio_low=float(ratios[:, i].min()),
-            ratio_high=float(ratios[:, i].max()),
-            repeats=len(rounds),
-        )
+        Cost(*_spread(table[:, i]), *_spread(ratios[:, i]), repeats=len(rounds))
         for i in range(len(runs))
     ]
+
+
+def _spread(values: NDArray[np.float64]) -> tuple[float, float, float]:
+    """Returns median, least and largest of the rounds that were timed; nan where none was."""
+    known = values[np.isfinite(values)]
+    if not known.size:
+        return (float("nan"),) * 3
+    return float(np.median(known)), float(known.min()), float(known.max())

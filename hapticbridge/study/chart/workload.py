@@ -33,8 +33,9 @@ class Panel:
 class Run(Protocol):
     """A workload at one setting, which can be run again and again."""
 
-    seconds: float
-    """Simulated time in s."""
+    @property
+    def seconds(self) -> float:
+        """Simulated time in s."""
 
     @property
     def chosen(self) -> Mapping[str, str | int]:
@@ -51,7 +52,7 @@ class References(Protocol):
     """What each method converges to."""
 
     def disagreement(self) -> dict[str, float]:
-        """Returns how far each limit lies from the first method's in JND, by method."""
+        """Returns how far each limit lies from the one that most agree on in JND, by method."""
 
 
 class Workload(Protocol):

@@ -1,4 +1,24 @@
-"""Other physics engines on the same work, behind one small interface."""
+"""Other physics engines on the same work, behind one small interface.
+
+Each engine tells its own ``settings``: the value of every one, and the page of its manual that
+advises it. A chart writes them into its table, its JSON and its page, ``scripts/bench_engines``
+prints them. The manuals' addresses, and what the tuned numbers do to a settled peg, are in the
+engines' modules, beside the constants. Two settings depart from what a manual says, and say so:
+PhysX's tolerances are those of a clearance and not of an object, and Bullet's direct solver is
+marked experimental.
+
+| engine | contacts and solver | coupling |
+|---|---|---|
+| ``mujoco`` | soft, two timesteps; Newton; ``implicitfast`` | held force |
+| ``ode`` | direct solver, contact layer of 0.1 µm | held force |
+| ``ode_spring`` | the same | soft joints, solved with the contacts |
+| ``physx`` | TGS, 20 iterations, single precision | held force |
+| ``physx_spring`` | the same | drives of a joint, solved with the contacts |
+| ``pybullet`` | sequential impulses, at most 200 iterations | held force |
+| ``pybullet_dantzig`` | direct solver | held force |
+| ``drake_point`` | SAP, compliant points | held force |
+| ``drake_hydroelastic`` | SAP, compliant tool against rigid shapes | held force |
+"""
 
 from hapticbridge.study.engines.base import Contacts as Contacts
 from hapticbridge.study.engines.base import Engine as Engine

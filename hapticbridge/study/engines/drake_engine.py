@@ -1,4 +1,8 @@
-"""Drake's discrete MultibodyPlant with the SAP solver: point contact, and hydroelastic contact."""
+"""Drake's discrete MultibodyPlant with the SAP solver: point contact, and hydroelastic contact.
+
+References:
+    Drake, https://drake.mit.edu/doxygen_cxx
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,8 @@
-"""MuJoCo as a peer would use it: the coupling is a held force, as in every other engine here."""
+"""MuJoCo as a peer would use it: the coupling is a held force, as in every other engine here.
+
+References:
+    MuJoCo documentation, https://mujoco.readthedocs.io
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,8 @@
-"""ODE, the Open Dynamics Engine, through its C library."""
+"""ODE, the Open Dynamics Engine, through its C library.
+
+References:
+    ODE Manual, http://ode.org/wiki/index.php/Manual
+"""
 
 from __future__ import annotations
 
