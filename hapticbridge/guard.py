@@ -70,6 +70,22 @@ def limits_for(info: DeviceInfo, limits: Limits | None) -> Limits:
     return limits
 
 
+def refuse_simulated_time(info: DeviceInfo, clock: Clock) -> None:
+    """Refuses a clock that runs ahead of a device that lives in real time.
+
+    That is a device with motors, and one that follows a hand without ever ending by itself.
+
+    Raises:
+        DeviceError: It is so.
+    """
+    is_live = info.is_real or (info.is_prescribed and info.duration is None)
+    if is_live and isinstance(clock, SimulatedClock):
+        raise DeviceError(
+            f"the device '{info.name}' moves in real time, so the loop cannot run as fast as it "
+            "goes; leave out --fast (in code: the SimulatedClock)"
+        )
+
+
 def refuse_stretched_start(state: NDArray[np.void], limits: Limits) -> None:
     """Refuses a start at which the coupling would already pull with more than the force limit.
 
@@ -88,19 +104,6 @@ def refuse_stretched_start(state: NDArray[np.void], limits: Limits) -> None:
             f"the device's absolute pose puts the handle {1e3 * distance:.3g} mm from the grip, "
             f"{force:.3g} N at the start; the limit is {limits.force:g} N: start nearer to "
             f"{np.round(s['tool_position'], 4).tolist()} m or use relative poses"
-        )
-
-
-def refuse_simulated_time(info: DeviceInfo, clock: Clock) -> None:
-    """Refuses a clock that runs as fast as it goes for a device that lives in real time.
-
-    Raises:
-        DeviceError: Says so.
-    """
-    if info.is_real and isinstance(clock, SimulatedClock):
-        raise DeviceError(
-            f"the device '{info.name}' is real and cannot keep up with simulated time; leave out "
-            "--fast (from code: pass no SimulatedClock)"
         )
 
 

@@ -47,8 +47,7 @@ class Run:
     """Site on the tool that the hand holds."""
     device: str = "simulated"
     """'simulated' (in the hand that the scene asks for), 'simulated:damping=5,hand_mass=1',
-    'trajectory:FILE' (CSV or recording), or one that is plugged in (see 'hapticbridge devices'),
-    with options: 'rawhid:serial=12345,damping=0.4'."""
+    'trajectory:FILE' (CSV or recording), or one that 'hapticbridge devices' lists."""
     duration: float | None = None
     """Seconds to run; by default until the device's motion ends, or until Ctrl-C."""
     record: Path | None = None
@@ -143,7 +142,7 @@ class Run:
             values = asdict(summary) | {"verdict": summary.verdict}
             out.print_json(json.dumps(values | {"recording": str(self.record or "") or None}))
         else:
-            _print_summary(summary, bridge.laws)
+            _print_summary(summary, bridge)
         is_good = summary.verdict == "passive" and summary.is_certified is not False
         return 0 if is_good else 1
 
@@ -210,7 +209,8 @@ def _true_weld(felt: Coupling, asked: Coupling) -> str:
     )
 
 
-def _print_summary(summary: Summary, laws: int) -> None:
+def _print_summary(summary: Summary, bridge: Bridge) -> None:
+    laws, is_prescribed = bridge.laws, bridge.device.info.is_prescribed
     table = Table(show_header=False, box=None, pad_edge=False)
     table.add_row("ran", f"{summary.duration:.3f} s, {summary.ticks} ticks ({summary.stopped_by})")
     skipped = f" ({summary.skipped} deadlines skipped)" if summary.skipped else ""
@@ -242,7 +242,8 @@ def _print_summary(summary: Summary, laws: int) -> None:
             False: f"device not certified: b < {bound}",
             None: f"device unknown: b >= {bound} not checked",
         }
-        out.print(certified[summary.is_certified])
+        unfelt = "the device feels no force: there is nothing to certify"
+        out.print(unfelt if is_prescribed else certified[summary.is_certified])
     if summary.is_certified is False and method_named(summary.method).has_law and laws == 1:
         judge = "the audit judges" if summary.recording else "with --record FILE the audit judges"
         out.print(f"the device's port is not proven, nor metered while it runs: {judge} it")

@@ -12,10 +12,9 @@ from hapticbridge.device.falcon_kinematics import (
     ZERO_ANGLE,
     forward,
     inverse,
-    jacobian,
-    thigh_torques,
 )
-from hapticbridge.device.falcon_packets import encode
+from hapticbridge.device.falcon_packets import Request, encode
+from hapticbridge.device.falcon_statics import jacobian, thigh_torques
 from hapticbridge.jit import compiled
 
 MOTION_DTYPE = np.dtype([("position", "<f8", 3), ("angles", "<f8", 3), ("motors", "<i8", 3)])
@@ -36,11 +35,14 @@ MOTOR_LIMIT = 4096.0
 
 SPEED_LIMIT = 3.0
 """In m/s: faster motion is not believed. No figure was found; a hand that crosses the 0.1 m of the
-workspace in 33 ms is at its end. With one reply a millisecond it is a jump of 3 mm."""
+workspace in 33 ms is at its end."""
 
-SHORTEST = 2e-3
-"""In s: replies are bunched by the bridge's timer of 1 ms, so a jump is judged as over two ticks of
-it at least: 6 mm, about a hundred encoder steps."""
+MOST_COUNTS = 3000
+"""Counts either side of zero that a thigh can turn to: -74° to 144°. The workspace takes -66° to
+114°; a whole turn further the same place would follow."""
+
+FLAGS = int(Request.GREEN)
+"""The light while the loop runs."""
 
 BELIEVED, OUT_OF_REACH, JUMP = 0, 1, 2
 
@@ -58,7 +60,8 @@ def believe(
         motions: Shape (1,), ``MOTION_DTYPE``; moved on only where the reply is believed.
         replies: Shape (1,), ``REPLY_DTYPE``.
         samples: Shape (1,), ``SAMPLE_DTYPE``, filled in place likewise.
-        elapsed: Time since the reply before in s; inf believes any place within reach.
+        elapsed: Longest time in s that can lie between this pose and the one of the reply before;
+            inf believes any place within reach.
 
     Returns:
         ``BELIEVED``, ``OUT_OF_REACH`` or ``JUMP``.
@@ -66,12 +69,14 @@ def believe(
     motion, reply, sample = motions[0], replies[0], samples[0]
     angles, position = np.empty(3), motion.position.copy()
     for i in range(3):
+        if abs(reply.encoders[i]) > MOST_COUNTS:
+            return OUT_OF_REACH
         angles[i] = ZERO_ANGLE + reply.encoders[i] * RADIANS_PER_COUNT
     if not forward(angles, position):
         return OUT_OF_REACH
     moved = position - motion.position
     distance = math.sqrt(moved[0] ** 2 + moved[1] ** 2 + moved[2] ** 2)
-    if not distance <= SPEED_LIMIT * max(elapsed, SHORTEST):
+    if not distance <= SPEED_LIMIT * elapsed:
         return JUMP
     for i in range(3):
         motion.position[i], motion.angles[i] = position[i], angles[i]
@@ -112,10 +117,6 @@ def command(
     for i in range(3):
         motion.motors[i] = round(share * UNITS_PER_TORQUE * torques[i])
     encode(motion.motors, FLAGS, packet)
-
-
-FLAGS = 2
-"""``Request.GREEN`` as compiled code can take it: the light while the loop runs."""
 
 
 def resolution() -> float:

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from hapticbridge.device import hid_search, usb_search
 from hapticbridge.device.falcon import FAMILY as FALCON
 from hapticbridge.device.plugged import Family, Plugged
 from hapticbridge.device.rawhid import FAMILY as RAWHID
 from hapticbridge.device.spacemouse import FAMILY as SPACEMOUSE
-from hapticbridge.device.transport_hid import find as find_hid
-from hapticbridge.device.transport_hid import hid_api
-from hapticbridge.device.usb_search import find as find_usb
-from hapticbridge.device.usb_search import libusb
 
-FAMILIES: tuple[Family, ...] = (FALCON, RAWHID, SPACEMOUSE)
+FAMILIES: tuple[Family, ...] = (FALCON, SPACEMOUSE, RAWHID)
 """In the order in which they are listed."""
 
 RULES_FILE = "/etc/udev/rules.d/70-hapticbridge.rules"
@@ -33,15 +30,17 @@ def plugged_devices() -> list[Plugged]:
 
 def plugged_of(family: Family) -> list[Plugged]:
     """Lists a family's devices that are plugged in, with what keeps each from being opened."""
-    return find_hid(family) if family.transport == "hid" else find_usb(family)
+    if family.transport == "hid":
+        return hid_search.find(family)
+    return usb_search.find(family)
 
 
 def blind_spots() -> list[str]:
     """Says what keeps devices from being seen at all, one sentence each; empty where nothing."""
     spots = []
-    if hid_api() is None:
+    if hid_search.hid_api() is None:
         spots.append("hidapi cannot be loaded, so HID devices are not seen: 'pip install hidapi'")
-    if libusb() is None:
+    if usb_search.libusb() is None:
         spots.append(
             "libusb cannot be loaded, so USB devices cannot be opened: 'pip install libusb-package'"
         )

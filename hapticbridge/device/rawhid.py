@@ -3,37 +3,29 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
-from typing import Any, Protocol
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.device.base import AXES, DeviceInfo, checked_period
+from hapticbridge.device.base import AXES, checked_period
 from hapticbridge.device.hex_log import HexLog
-from hapticbridge.device.plugged import Family, Plugged, Tell, UsbId, chosen
+from hapticbridge.device.hid_search import HidApi, find
+from hapticbridge.device.plugged import Family, Tell, UsbId, chosen
 from hapticbridge.device.rawhid_frame import (
     LARGEST,
     LONGEST_WATCHDOG_MS,
-    NAME_PAGE,
-    NUMBERS_PAGE,
-    VERSION,
-    Numbers,
     State,
     Status,
-    ask_frame,
     decoded,
     force_frame,
-    version_of,
 )
-from hapticbridge.device.transport_hid import HidApi, HidLink, find
+from hapticbridge.device.rawhid_sheet import CHANGES, asked, data_sheet, reports
+from hapticbridge.device.transport_hid import HidLink, Link
 from hapticbridge.errors import DeviceError, DeviceLost
 from hapticbridge.pose import canonical, quaternion_exp
 from hapticbridge.tick import SAMPLE_DTYPE, TickFlag
-
-ASKS, ASK_WAIT_MS = 10, 100
-"""How often a page of the sheet is asked for before giving up, and how long each answer is waited
-for, in ms: a device that still boots has a second for each."""
 
 FIRST_STATE_MS = 1000
 """Longest wait in ms for the first state frame."""
@@ -46,42 +38,7 @@ SHORTEST_WATCHDOG, WATCHDOG_PERIODS = 0.02, 10
 """The watchdog asked for is ten periods of the loop, but not less than 20 ms: an ordinary kernel
 stalls a loop for some ms now and then, and a force that drops out each time would rattle."""
 
-POLLING = 1e-3
-"""In s: a full-speed device is asked once a millisecond, in each direction."""
-
-UNFELT_FORCE_LIMIT, UNFELT_TORQUE_LIMIT = 10.0, 0.5
-"""In N and N m, those of the simulated device: for a device that does not move, or does not turn.
-It feels no such wrench; only what is recorded is limited."""
-
 _NO_WRENCH = (0.0,) * 6
-_MUST_SAY = ("rate", "speed_limit")
-_CHANGES = (
-    "mass",
-    "damping",
-    "rotational_inertia",
-    "rotational_damping",
-    "friction",
-    "resolution",
-    "force_limit",
-    "torque_limit",
-    "speed_limit",
-)
-
-
-class Link(Protocol):
-    """What the device needs of a transport: ``HidLink``, or what stands for it."""
-
-    def take(self) -> list[bytes]:
-        """Returns the reports that have come, without waiting."""
-
-    def wait(self, timeout_ms: int) -> bytes:
-        """Returns the next report, or nothing after that time."""
-
-    def write(self, report: bytes) -> None:
-        """Sends a report, its number first."""
-
-    def close(self) -> None:
-        """Lets the device go."""
 
 
 class RawHidDevice:
@@ -112,12 +69,11 @@ class RawHidDevice:
         self._link, self._name = link, name
         self._sequence = 0
         self.lost = self.damaged = self.repeated = 0
-        numbers, title = self._page(NUMBERS_PAGE), self._page(NAME_PAGE)
-        self.info = _data_sheet(name, numbers, str(title), dict(changes or {}))
+        self.info = data_sheet(name, *asked(link, name), dict(changes or {}))
         self._mask = np.array([float(axis in self.info.axes) for axis in AXES])
         self._sample = np.zeros(1, SAMPLE_DTYPE)
         self._state: State | None = None
-        self._period = self._silence = 0.0
+        self._period, self._silent_ticks = 0.0, 0
         self._watchdog_ms = LONGEST_WATCHDOG_MS
         self._is_open = True
 
@@ -137,9 +93,9 @@ class RawHidDevice:
         watchdog = max(SHORTEST_WATCHDOG, WATCHDOG_PERIODS * period)
         self._watchdog_ms = min(math.ceil(1e3 * watchdog), LONGEST_WATCHDOG_MS)
         self.lost = self.damaged = self.repeated = 0
-        self._silence, self._state = 0.0, None
+        self._silent_ticks, self._state = 0, None
         self._link.take()
-        for report in self._reports(FIRST_STATE_MS):
+        for report in reports(self._link, FIRST_STATE_MS):
             if self._is_newest(report):
                 break
         if self._state is None:
@@ -172,13 +128,14 @@ class RawHidDevice:
         for report in self._link.take():
             is_new |= self._is_newest(report)
         if not is_new:
-            self._silence += self._period
-            if self._silence > LONGEST_SILENCE:
-                raise DeviceLost(f"{self._name} has sent nothing for {1e3 * self._silence:.0f} ms")
+            self._silent_ticks += 1
+            silence = self._silent_ticks * self._period
+            if silence > LONGEST_SILENCE:
+                raise DeviceLost(f"{self._name} has sent nothing for {1e3 * silence:.0f} ms")
             sample[0] = self._sample[0]
             return int(TickFlag.STALE_SAMPLE)
-        self._silence = 0.0
-        if self._state.status & Status.FAULT:
+        self._silent_ticks = 0
+        if self._state.status & (Status.FAULT | Status.NOT_READY):
             raise DeviceError(f"{self._name} reports a fault of its own and gives no force")
         self._fill()
         sample[0] = self._sample[0]
@@ -254,71 +211,12 @@ class RawHidDevice:
         sample["quaternion"] = canonical(quaternion_exp((x, y, z)))
         sample["buttons"] = self._state.buttons
 
-    def _page(self, page: int) -> Numbers | str:
-        """Asks for a page of the sheet until it comes."""
-        for _ in range(ASKS):
-            self._send(ask_frame(self._next(), page))
-            for report in self._reports(ASK_WAIT_MS):
-                answer = decoded(report)
-                if isinstance(answer, Numbers if page == NUMBERS_PAGE else str):
-                    return answer
-                if (version := version_of(report)) not in (None, VERSION):
-                    raise DeviceError(
-                        f"{self._name} speaks version {version} of the raw HID protocol; "
-                        f"this is version {VERSION}"
-                    )
-        raise DeviceError(
-            f"{self._name} does not answer as hapticbridge/device/rawhid.md says; "
-            "is its firmware on it?"
-        )
-
-    def _reports(self, timeout_ms: int) -> Iterator[bytes]:
-        """Yields reports as they come, for about that time: one a millisecond, or waiting."""
-        left = timeout_ms
-        while left > 0:
-            report = self._link.wait(min(left, 10))
-            left -= 1 if report else min(left, 10)
-            if report:
-                yield report
-
     def _next(self) -> int:
         self._sequence = (self._sequence + 1) & 0xFFFF
         return self._sequence
 
     def _send(self, frame: bytes) -> None:
         self._link.write(b"\0" + frame)  # reports without a number: hidapi wants a 0 in front
-
-
-def _data_sheet(
-    name: str, numbers: Numbers | str, title: str, changes: dict[str, Any]
-) -> DeviceInfo:
-    """Makes a data sheet of what the device says of itself and what the user knows better."""
-    assert isinstance(numbers, Numbers)
-    known: dict[str, Any] = numbers.known()
-    axes = numbers.axis_names
-    moves, turns = (any(axis in axes for axis in kind) for kind in (AXES[:3], AXES[3:]))
-    if not moves:
-        known["force_limit"] = UNFELT_FORCE_LIMIT
-    if not turns:
-        known["torque_limit"] = UNFELT_TORQUE_LIMIT
-    known |= changes
-    must = [*_MUST_SAY, *["force_limit"] * moves, *["torque_limit"] * turns]
-    if missing := [field for field in must if known[field] is None]:
-        raise DeviceError(f"{name} does not say its {missing[0]}, and nobody can guess it")
-    # what the device adds by itself, a state that is one of its periods old, and the bus both ways
-    delay = known.pop("delay")
-    try:
-        return DeviceInfo(
-            name=title or name,
-            axes=axes,
-            delay=None if delay is None else delay + 1.0 / known["rate"] + 2.0 * POLLING,
-            is_prescribed=False,
-            is_real=True,
-            duration=None,
-            **known,
-        )
-    except (DeviceError, ZeroDivisionError) as error:
-        raise DeviceError(f"{name} claims what cannot be: {error}") from None
 
 
 def open_rawhid(
@@ -333,12 +231,12 @@ def open_rawhid(
     Raises:
         DeviceError: There is none, or it cannot be opened or does not speak the protocol.
     """
-    plugged: Plugged = chosen(FAMILY, find(FAMILY, api), options.get("serial"))
+    plugged = chosen(FAMILY, find(FAMILY, api), options.get("serial"))
     log = options.get("log")
     link = HidLink.open(
         plugged, api, is_overlapped=api is None, log=HexLog(None if log is None else str(log))
     )
-    changes = {key: value for key, value in options.items() if key in _CHANGES}
+    changes = {key: value for key, value in options.items() if key in CHANGES}
     try:
         return RawHidDevice(link, str(plugged), changes)
     except BaseException:
@@ -354,7 +252,7 @@ FAMILY = Family(
     axes="1 to 6, as built",
     force="as built",
     rate="to 1 kHz, as built",
-    options=("serial", "log", *_CHANGES),
+    options=("serial", "log", *CHANGES),
     open=open_rawhid,
     usage=(0xFFAB, 0x0200),
 )

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from hapticbridge.device.base import AXES, DeviceInfo, checked_number, checked_period
 from hapticbridge.device.hex_log import HexLog
-from hapticbridge.device.plugged import Family, Tell, UsbId, chosen
-from hapticbridge.device.rawhid import Link
+from hapticbridge.device.hid_search import HidApi, find
+from hapticbridge.device.plugged import Family, Tell, chosen
+from hapticbridge.device.spacemouse_ids import IDS
 from hapticbridge.device.spacemouse_reports import (
     LED_OFF,
     LED_ON,
@@ -21,7 +22,7 @@ from hapticbridge.device.spacemouse_reports import (
     decoded,
     share,
 )
-from hapticbridge.device.transport_hid import HidApi, HidLink, find
+from hapticbridge.device.transport_hid import HidLink, Link
 from hapticbridge.errors import DeviceError
 from hapticbridge.pose import Quaternion, canonical, product, quaternion_exp
 from hapticbridge.tick import SAMPLE_DTYPE
@@ -103,7 +104,7 @@ class SpaceMouseDevice:
             duration=None,
         )
         self._period = 0.0
-        self._is_open = True
+        self._is_open, self._has_begun = True, False
         self._to_origin()
 
     def start(self, period: float) -> NDArray[np.void]:
@@ -170,7 +171,7 @@ class SpaceMouseDevice:
         self._position, self._rate = np.zeros(3), np.zeros(6)
         self._quaternion: Quaternion = (1.0, 0.0, 0.0, 0.0)
         self._buttons, self._silence = 0, 0.0
-        self._has_begun: bool = False
+        self._has_begun = False
 
     def _take(self, report: bytes) -> None:
         news = decoded(report)
@@ -226,41 +227,10 @@ def open_spacemouse(
 
 _NUMBERS = ("speed", "turn", "dead_band", "force_limit", "torque_limit")
 
-_LOGITECH = {
-    0xC603: "SpaceMouse Plus XT",
-    0xC605: "CadMan",
-    0xC606: "SpaceMouse Classic",
-    0xC621: "Spaceball 5000",
-    0xC623: "SpaceTraveler",
-    0xC625: "SpacePilot",
-    0xC626: "SpaceNavigator",
-    0xC627: "SpaceExplorer",
-    0xC628: "SpaceNavigator for Notebooks",
-    0xC629: "SpacePilot Pro",
-    0xC62B: "SpaceMouse Pro",
-}
-
-_3DCONNEXION = {
-    0xC62E: "SpaceMouse Wireless (cable)",
-    0xC62F: "SpaceMouse Wireless (receiver)",
-    0xC631: "SpaceMouse Pro Wireless (cable)",
-    0xC632: "SpaceMouse Pro Wireless (receiver)",
-    0xC633: "SpaceMouse Enterprise",
-    0xC635: "SpaceMouse Compact",
-    0xC636: "SpaceMouse Module",
-    0xC638: "SpaceMouse Pro Wireless (Bluetooth)",
-    0xC63A: "SpaceMouse Wireless (Bluetooth)",
-    0xC641: "SpaceMouse Module (USB)",
-    0xC652: "Universal Receiver",
-}
-
 FAMILY = Family(
     name="spacemouse",
     about="3Dconnexion SpaceMouse and its ancestors: input only, its rate moves the handle",
-    ids=(
-        *(UsbId(0x046D, product, model) for product, model in _LOGITECH.items()),
-        *(UsbId(0x256F, product, model) for product, model in _3DCONNEXION.items()),
-    ),
+    ids=IDS,
     transport="hid",
     axes="6, by rate",
     force="none; shown, not felt",
@@ -268,5 +238,3 @@ FAMILY = Family(
     options=("serial", "log", *_NUMBERS),
     open=open_spacemouse,
 )
-"""The maker's CadMouse (256f: c650, c651, c654 to c658, c664, c665, c668) are two-dimensional mice
-and are left out. Source: spacenavd of December 2025 and pyspacemouse of June 2026."""

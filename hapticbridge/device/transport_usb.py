@@ -158,7 +158,7 @@ class UsbLink:
             DeviceLost: The device is gone; packets that came before are returned first.
         """
         packets = self._packets
-        if not packets:
+        if not packets or not self._is_open:
             self._require()
         self._arrived.clear()
         return [packets.popleft() for _ in range(len(packets))]

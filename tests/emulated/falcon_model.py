@@ -52,6 +52,7 @@ class Faults:
     """What goes wrong, for tests."""
 
     is_mute: bool = False  # takes packets, answers none
+    is_deaf: bool = False  # the loader hears nothing
     noise: bytes = b""  # before every answer
     bad_echo_at: int = -1  # byte of the program that is echoed wrongly
     is_cut_short: bool = False  # leaves out a byte of every second answer
@@ -66,6 +67,7 @@ class FalconModel(UsbDevice):
         program: The program it runs, None: only its loader runs.
         is_homed: Whether its encoders have passed their zeros.
         heeds_events: Whether its bridge passes an answer on at the event character.
+        valid: The only program that would run; None: any.
     """
 
     vendor, product, release = 0x0403, 0xCB48, 0x0400
@@ -207,6 +209,8 @@ class FalconModel(UsbDevice):
             wrong = len(self.uploaded) == self.faults.bad_echo_at
             self.uploaded += bytes([byte])
             self._answer(bytes([byte ^ 0x40 if wrong else byte]), when)
+            return
+        if self.faults.is_deaf:
             return
         self._text.append(byte)
         del self._text[:-3]

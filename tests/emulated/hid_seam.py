@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from emulated.hid_device import HidDevice
-from hapticbridge.device.transport_hid import HidHandle
+from hapticbridge.device.hid_search import HidHandle
 
 
 class HidSeam:

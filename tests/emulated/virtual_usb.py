@@ -48,10 +48,16 @@ class VirtualTime:
 
 
 class VirtualLink:
-    """What a driver sees of it: the methods of ``UsbLink``."""
+    """What a driver sees of it: the methods of ``UsbLink``.
+
+    Args:
+        time: The device and its time.
+        write_to: Endpoint that writes go to.
+    """
 
     def __init__(self, time: VirtualTime, write_to: int = 0x02) -> None:
         self.time = time
+        self.pace = 0.0  # s by which a take moves time, where no clock does
         self.is_closed = False
         self._write_to = write_to
 
@@ -76,6 +82,8 @@ class VirtualLink:
         return True
 
     def take(self) -> list[bytes]:
+        if self.pace:
+            self.time.until(self.time.now + self.pace)
         if not self.time.packets:
             self._require()
         packets, self.time.packets[:] = self.time.packets[:], []
