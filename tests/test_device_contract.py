@@ -9,10 +9,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+from emulated.hid_device import HidDevice
+from emulated.hid_seam import HidSeam
+from emulated.rawhid_model import RawHid
+from emulated.spacemouse_model import SpaceMouse
+from emulated.ticking import Ticking
 from falcon_cases import Bench
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from rawhid_cases import paddle
 
 from hapticbridge.device import (
     AXES,
@@ -23,6 +29,9 @@ from hapticbridge.device import (
     SimulatedDevice,
     open_device,
 )
+from hapticbridge.device.plugged import tell_nobody
+from hapticbridge.device.rawhid import open_rawhid
+from hapticbridge.device.spacemouse import open_spacemouse
 from hapticbridge.errors import DeviceError
 from hapticbridge.tick import SAMPLE_DTYPE, TICK_DTYPE
 
@@ -47,6 +56,20 @@ def replayed(_: Path) -> Device:
     return ReplayDevice(ticks, PERIOD)
 
 
+def pushed(when: float) -> tuple[float, ...]:
+    return (0.5, -0.2, 0.3, 0.4, 0.1, 1.0) if when < 0.2 else (0.0,) * 6
+
+
+def ticking(model: Callable[[], HidDevice], opener: Callable[..., Device]) -> Device:
+    """Returns a real driver on an emulated device that lives in virtual time."""
+
+    def build() -> tuple[Device, HidSeam]:
+        seam = HidSeam(model())
+        return opener({}, tell_nobody, seam), seam
+
+    return Ticking(build)
+
+
 def falcon(_: Path) -> Device:
     bench = Bench()
     device = bench.opened()
@@ -63,6 +86,12 @@ DEVICES: dict[str, Callable[[Path], Device]] = {
     "guided": lambda path: open_device("simulated", path=written(path / "hand.csv")),
     "trajectory": lambda path: open_device(f"trajectory:{written(path / 'hand.csv')}"),
     "replay": replayed,
+    "rawhid": lambda _: ticking(lambda: RawHid(SimulatedDevice()), open_rawhid),
+    "paddle": lambda _: ticking(paddle, open_rawhid),
+    "spacemouse": lambda _: ticking(lambda: SpaceMouse(pushed), open_spacemouse),
+    "new spacemouse": lambda _: ticking(
+        lambda: SpaceMouse(pushed, has_long_reports=True), open_spacemouse
+    ),
     "falcon": falcon,
 }
 
@@ -237,7 +266,10 @@ def test_options_reach_the_device_and_the_specification_goes_before_the_code(
 @pytest.mark.parametrize(
     ("spec", "options", "words"),
     [
-        ("falcn", {}, "unknown device 'falcn'; there are 'falcon', 'rawhid', 'simulated',"),
+        ("falcn", {}, "unknown device 'falcn'; there are 'falcon', 'rawhid', 'simul"),
+        ("rawhid:colour=red", {}, "unknown option 'colour' of the rawhid device; there are 'd"),
+        ("spacemouse", {"colour": 1}, "unknown option 'colour' of the spacemouse device"),
+        ("spacemouse:speed=fast", {}, "speed = 'fast': must be a number"),
         ("", {}, "unknown device ''"),
         ("simulated:dampng=5", {}, "unknown option 'dampng' of the simulated device; there are 'd"),
         ("simulated", {"colour": 1}, "unknown option 'colour'"),

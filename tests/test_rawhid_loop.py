@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from emulated.hid_seam import DrivingClock
-from emulated.rawhid_model import RawHid
-from rawhid_cases import PERIOD, opened, paddle
+from emulated.rawhid_model import Claims, RawHid
+from rawhid_cases import opened, paddle
 
 import hapticbridge as hb
 from hapticbridge.device import SimulatedDevice
@@ -43,16 +43,20 @@ def test_the_peg_goes_in_behind_a_raw_hid_device_and_the_audit_finds_it_passive(
     report = hb.audit(recording)
     assert (report.verdict, report.certified, report.resimulation) == (
         "passive",
-        True,
+        None,
         "bit for bit",
     )
+    # b is enough for a wall, but nobody certifies a device whose force is late: 1 ms for its own
+    # period and 1 ms each way on the bus
+    assert all("behind a delay of 3 ticks" in condition for condition in report.conditions)
     ticks = hb.read_recording(recording).ticks
     assert (summary.ticks, len(ticks)) == (4000, 4000)
     assert (ticks["flags"] & int(TickFlag.CONTACT)).any()
     assert summary.peak_force > 0.05
     # every tick sent a frame, and so did the two of the trip home: zero, then motors off
     assert model.commands >= 4000
-    assert (model.is_enabled, model.wrench.any()) == (False, False)
+    assert not model.is_enabled
+    assert not model.wrench.any()
 
 
 def test_what_the_hand_felt_is_what_the_recording_says_was_sent(
@@ -103,8 +107,6 @@ def test_lost_and_damaged_frames_are_flagged_and_the_run_stays_passive(tmp_path:
 def test_a_slower_device_repeats_its_samples_and_every_repetition_is_flagged(
     tmp_path: Path,
 ) -> None:
-    from emulated.rawhid_model import Claims
-
     model = RawHid(SimulatedDevice(), Claims(rate=250.0))
     device, _, seam = opened(model)
     with hb.Bridge(
@@ -124,7 +126,7 @@ def test_unplugging_in_mid_run_trips_and_no_row_up_to_it_is_lost(tmp_path: Path)
 
     recording = tmp_path / "run.mcap"
     with (
-        pytest.raises(SafetyTrip, match="tick 150: .* is gone: unplugged"),
+        pytest.raises(SafetyTrip, match=r"tick 150: .* is gone: unplugged"),
         hb.Bridge("peg_in_hole", device, clock=DrivingClock(seam), recording=recording) as bridge,
     ):
         bridge.run(1.0, on_tick=pull)
@@ -143,7 +145,7 @@ def test_a_pose_that_is_not_finite_trips_with_zero_force_first(tmp_path: Path) -
             model.motion = (float("nan"),) * 12
 
     with (
-        pytest.raises(SafetyTrip, match="tick 12[01]: .* a number that is not finite") as trip,
+        pytest.raises(SafetyTrip, match=r"tick 12[01]: .* a number that is not finite") as trip,
         hb.Bridge("peg_in_hole", device, clock=DrivingClock(seam)) as bridge,
     ):
         bridge.run(1.0, on_tick=spoil)
@@ -162,13 +164,14 @@ def test_a_paddle_of_one_axis_runs_a_scene_and_its_other_axes_stay(tmp_path: Pat
     assert (ticks["device_quaternion"] == (1.0, 0.0, 0.0, 0.0)).all()
     steps = ticks["device_position"][:, 0] / model.claims.resolution
     np.testing.assert_allclose(steps, np.round(steps), atol=1e-3)
-    # b = 0.8 N s/m is known, and it does not turn: that is all the certificate needs
-    assert summary.is_certified is True
+    # b = 0.8 N s/m is enough, and it does not turn; how late it is it does not say
+    (condition,) = summary.conditions
+    assert "if it answers without delay, which is unknown" in condition
+    assert summary.is_certified is None
 
 
 def test_a_device_in_a_hand_refuses_a_clock_that_runs_ahead_of_it() -> None:
     device, _, _ = opened()
-    with pytest.raises(DeviceError, match="moves in real time, .* leave out --fast"):
+    with pytest.raises(DeviceError, match=r"moves in real time, .* leave out --fast"):
         hb.Bridge("peg_in_hole", device, clock=hb.SimulatedClock())
     assert device.info.is_real
-    assert PERIOD == 1e-3
