@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -288,6 +289,18 @@ def test_closing_switches_the_motors_off() -> None:
     device.close()
     assert not model.is_enabled
     assert not model.wrench.any()
+
+
+def test_the_log_that_the_user_asks_for_holds_every_frame(tmp_path: Path) -> None:
+    device, model, seam = opened(log=str(tmp_path / "wire.log"))
+    device.start(PERIOD)
+    device.write(PUSH)
+    read(device, seam)
+    device.close()
+    lines = (tmp_path / "wire.log").read_text().splitlines()
+    sent = [line.split(" > ")[1] for line in lines if " > " in line]
+    assert [line[:11] for line in sent] == ["00 48 01 3f"] * 2 + ["00 48 01 46"] * 2
+    assert len(lines) - len(sent) == model.frames + 2  # and both pages of the sheet
 
 
 def test_the_echo_counts_force_frames_on_the_way() -> None:
