@@ -10,12 +10,12 @@ import pytest
 PACKAGE = Path(__file__).parents[1] / "hapticbridge"
 
 ORDER = (
-    ("errors", "arguments", "jit", "tick", "pose", "clock", "signals", "picture"),
+    ("errors", "arguments", "jit", "tick", "pose", "clock", "signals", "picture", "jsonable"),
     ("coupling", "kernel", "mechanics", "passivity"),
     ("scene",),
     ("rendering",),
     ("ledger", "inputs", "device"),
-    ("guard", "recording", "certificate"),
+    ("guard", "recording", "certificate", "felt"),
     ("provenance", "summary", "workspace"),
     ("bridge", "audit"),
     ("report", "study", "check"),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -19,7 +18,9 @@ from hapticbridge.certificate import condition_sentences, is_run_certified, run_
 from hapticbridge.device import DeviceInfo
 from hapticbridge.device.lateness import delay_ticks
 from hapticbridge.errors import HapticBridgeError, RecordingError
+from hapticbridge.felt import coupling_sentences
 from hapticbridge.guard import Limits, limits_for
+from hapticbridge.jsonable import jsonable
 from hapticbridge.kernel.state import RunParameters
 from hapticbridge.provenance import STARTS, meta_start, parameters_of
 from hapticbridge.recording import Recording, read_recording
@@ -47,6 +48,7 @@ class AuditReport:
         ticks: Number of records.
         duration: Their number times the period, in s.
         conditions: The device condition per kind of axis, as sentences.
+        rendered: What was felt away from contact, and what was used, as sentences.
         unchecked: What records alone do not tell and only the re-simulation confirms, or nothing;
             without a re-simulation such a recording is not called passive but invalid.
         energies: Energies at the end, in J.
@@ -67,24 +69,20 @@ class AuditReport:
     ticks: int = 0
     duration: float = 0.0
     conditions: tuple[str, ...] = ()
+    rendered: tuple[str, ...] = ()
     unchecked: str = ""
     energies: dict[str, float] = field(default_factory=dict)
     events: dict[str, int] = field(default_factory=dict)
 
     def to_json(self) -> str:
         """Returns the report as one JSON object; a number that is not finite becomes null."""
-        values = asdict(self) | {"path": str(self.path), "joules": _finite(self.joules)}
-        values["energies"] = {name: _finite(value) for name, value in self.energies.items()}
-        return json.dumps(values, indent=2, allow_nan=False)
+        values = asdict(self) | {"path": str(self.path)}
+        return json.dumps(jsonable(values), indent=2, allow_nan=False)
 
     @property
     def exit_code(self) -> int:
         """0 if passive and certified or the device is unknown, else 1."""
         return 0 if self.verdict == "passive" and self.certified is not False else 1
-
-
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None
 
 
 @np.errstate(all="ignore")  # numbers of a damaged file overflow; what comes out is then a fault
@@ -195,6 +193,9 @@ def _device_facts(info: DeviceInfo, parameters: RunParameters, method: Method) -
         return {
             "certified": is_run_certified(run_conditions(info, parameters, method), method),
             "conditions": condition_sentences(info, parameters, method),
+            "rendered": coupling_sentences(
+                parameters.coupling, method, parameters.period, parameters.substeps
+            ),
         }
     except HapticBridgeError as error:  # numbers beyond what the theory computes with
         raise RecordingError(f"the metadata are out of range: {error}") from None
