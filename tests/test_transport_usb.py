@@ -18,7 +18,8 @@ from emulated.handle import Handle
 from emulated.pyusb_backend import PyusbBackend
 
 from hapticbridge.device import SimulatedDevice
-from hapticbridge.device.falcon import FAMILY, READ_FROM, WRITE_TO, FalconDevice, open_falcon
+from hapticbridge.device.falcon import FAMILY, FalconDevice, open_falcon
+from hapticbridge.device.falcon_boot import READ_FROM, WRITE_TO
 from hapticbridge.device.falcon_packets import SIZE, encode
 from hapticbridge.device.hex_log import HexLog
 from hapticbridge.device.plugged import tell_nobody
