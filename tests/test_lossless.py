@@ -216,7 +216,7 @@ def test_tool_changes_over_before_it_touches_and_back_after() -> None:
     assert step <= others
 
 
-def test_touch_and_go_errs_less_than_implicit() -> None:
+def test_touch_and_go_errs_by_less_than_a_third_of_implicit() -> None:
     scene = load_scene("virtual_wall")
     asked = Coupling(2400.0, 1.7, 1.0, 0.002)
     errors = {}
@@ -224,7 +224,7 @@ def test_touch_and_go_errs_less_than_implicit() -> None:
         fine, _ = led(scene, method, asked, tapping(T / 32, 4.0), T / 32)
         rows, _ = led(scene, method, asked, tapping(T, 4.0), T)
         errors[method] = distance(rows, fine)[0]
-    assert errors["lossless"] < 0.4 * errors["implicit"]
+    assert errors["lossless"] < errors["implicit"] / 3
 
 
 def test_joint_friction_and_constraints_keep_a_tool_implicit() -> None:

@@ -17,7 +17,11 @@ b > (T/2) Re[(1 − w) H]/(1 − cos θ) is hardest at θ = π: there 1 + w = 0,
 whatever it weighs, H = K + 2B'/T, and the right-hand side is K T/2 + B'. Below it the tool yields
 and needs less. A wall is the tool of infinite mass.
 
-<<<<<<< HEAD
+**And for the compensated one.** Its tool is G = (T²/m)/(1 − w)². At θ = π it yields by T²/(4m), so
+that H = 1/(1/(K + 2B'/T) + T²/(4m)) and the right-hand side is (T/2) H, below K T/2 + B'; at no θ
+does a free tool ask for more than a wall, for which it is K T/2 + B' again. In contact the lossless
+coupling is the implicit form with the same B', so its condition does not change there.
+
 **Damping that changes from tick to tick**, as where a tool goes over to another form in contact.
 With B'_k, handle motion d_k, tool motion δx_k, e_k = e_{k−1} + d_k − δx_k and δe_k = d_k − δx_k,
 
@@ -32,12 +36,6 @@ for every k, so if b >= K T/2 + max B', in whatever order they come. Change-over
 therefore create nothing and are not unstable by themselves: their cost is that the device must bear
 the larger B'. One that bears only the smaller is unstable in that form and comes to rest in the
 other: a limit cycle.
-=======
-**And for the compensated one.** Its tool is G = (T²/m)/(1 − w)². At θ = π it yields by T²/(4m), so
-that H = 1/(1/(K + 2B'/T) + T²/(4m)) and the right-hand side is (T/2) H, below K T/2 + B'; at no θ
-does a free tool ask for more than a wall, for which it is K T/2 + B' again. In contact the lossless
-coupling is the implicit form with the same B', so its condition does not change there.
->>>>>>> 206deb3f1361225812879e050bfc1a829d1fb90f
 """
 
 from __future__ import annotations
