@@ -148,8 +148,8 @@ def _round_trips(folder: Path) -> list[Claim]:
 def _recorded(folder: Path, device: str, seconds: float) -> tuple[GuestRun, Path]:
     """Runs ``hapticbridge run peg_in_hole`` on an emulated device in virtual time."""
     folder.mkdir(exist_ok=True)
-    program = str(CHECKS / "closed_loop.py")
-    command = [sys.executable, program, device, f"{seconds:g}", "/run/job/run.mcap"]
+    program = ["-m", "usb_tiers.closed_loop"]
+    command = [sys.executable, *program, device, f"{seconds:g}", "/run/job/run.mcap"]
     return _in_the_guest(folder, command, is_virtual=True), folder / "run.mcap"
 
 

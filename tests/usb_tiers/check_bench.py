@@ -11,10 +11,11 @@ import pytest
 import usb.backend.libusb1
 import usb.core
 import usb.util
-from conftest import IS_TIME_VIRTUAL, Plug
 from emulated.echo import VENDOR, EchoHid, EchoUsb
 from emulated.emulator_process import EmulatorProcess
-from waiting import wait_for
+
+from usb_tiers.conftest import IS_TIME_VIRTUAL, Plug
+from usb_tiers.waiting import wait_for
 
 Echo = tuple[EmulatorProcess, Any]
 
