@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from hapticbridge.cli import main
-from hapticbridge.device import SimulatedDevice, TrajectoryDevice
+from hapticbridge.device import SimulatedDevice
 
 FREE = "simulated:hand=none,resolution=1e-6"
 
@@ -59,8 +59,11 @@ def test_bad_input_gets_one_sentence(
 
 def test_a_device_is_closed_whatever_was_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     closed = []
-    monkeypatch.setattr(SimulatedDevice, "close", lambda self: closed.append(self))
-    monkeypatch.setattr(TrajectoryDevice, "close", lambda self: closed.append(self))
+
+    def close(self: SimulatedDevice) -> None:
+        closed.append(self)
+
+    monkeypatch.setattr(SimulatedDevice, "close", close)
     assert main(["zwidth", "--measure", FREE, "--axis", "q"]) == 2
     assert main(["zwidth", "--measure", FREE, "--damping", "nan"]) == 2
     assert len(closed) == 2
