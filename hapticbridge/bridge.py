@@ -24,7 +24,7 @@ from hapticbridge.errors import DeviceError, HapticBridgeError, SafetyTrip, Scen
 from hapticbridge.guard import Limits, limits_for, refuse_stretched_start, trip_reason
 from hapticbridge.inputs import Write, apply_writes, input_writes
 from hapticbridge.jit import direct
-from hapticbridge.kernel.parameters import checked_substeps
+from hapticbridge.kernel.parameters import checked_substeps, refuse_substeps
 from hapticbridge.kernel.publish import publish
 from hapticbridge.kernel.state import Binding
 from hapticbridge.kernel.step import OK, after_step, before_step
@@ -105,6 +105,7 @@ class Bridge:
         self.period = period_of(rate)
         self._substeps = checked_substeps(substeps)
         self.method = default_method(substeps) if method is None else method_named(method)
+        refuse_substeps(self.method.scheme, substeps)
         self._workspace = Workspace.of(scale, force_scale, axes, is_absolute=absolute)
         self.coupling = coupling or default_coupling(
             self.device.info,
