@@ -34,7 +34,8 @@ class Summary:
         slack_share: Largest share of the slack that was used.
         method: How the tool was rendered.
         about: What that means, in a sentence.
-        hazard: What it may do on a real device, in a sentence; empty for ``implicit``.
+        hazard: What it may do on a real device, in a sentence; empty where the device condition is
+            all that is to be said.
         coupling: The coupling asked for: what should be felt.
         used: That of the law, whose damping B' the device condition counts.
         rendered: What is felt away from contact, or everywhere if the tool was never let go, and

@@ -53,7 +53,7 @@ class RunParameters:
         grip: Name of the site on the tool.
         period: T in s.
         substeps: MuJoCo steps per tick, >= 1.
-        coupling: K and B.
+        coupling: K and B' of the law, which is not what is felt (``rendering.Method.used``).
         scale: Handle motion per device motion, without unit.
         force_scale: Force on the device per force on the tool, without unit. Power is equal on both
             sides where it equals ``scale``; torques return by force_scale / scale.
