@@ -127,8 +127,8 @@ class Scene:
         """
         if distance == self._reach:
             return
-        self.model.geom_gap += distance - self._reach
-        self.model.pair_gap += distance - self._reach
+        for gaps in (self.model.geom_gap, self.model.pair_gap, self.model.flex_gap):
+            gaps += distance - self._reach
         self._reach = distance
 
     def set_coupling(self, coupling: Coupling) -> None:
