@@ -21,9 +21,16 @@ from hapticbridge.clock import Clock, RealClock, period_of
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Device, device_for
 from hapticbridge.errors import DeviceError, HapticBridgeError, SafetyTrip, SceneError
-from hapticbridge.guard import Limits, limits_for, refuse_stretched_start, trip_reason
+from hapticbridge.guard import (
+    Limits,
+    limits_for,
+    refuse_simulated_time,
+    refuse_stretched_start,
+    trip_reason,
+)
 from hapticbridge.inputs import Write, apply_writes, input_writes
 from hapticbridge.jit import direct
+from hapticbridge.kernel.layout import STATE_DTYPE
 from hapticbridge.kernel.parameters import checked_substeps, refuse_substeps
 from hapticbridge.kernel.publish import publish
 from hapticbridge.kernel.state import Binding
@@ -41,7 +48,7 @@ from hapticbridge.rendering import (
 from hapticbridge.scene import Scene, load_scene
 from hapticbridge.signals import stopping_on_signals
 from hapticbridge.summary import Summary
-from hapticbridge.tick import SAMPLE_DTYPE, TickFlag
+from hapticbridge.tick import SAMPLE_DTYPE, TICK_DTYPE, TickFlag
 from hapticbridge.workspace import Workspace, run_parameters
 
 _NO_FORCE = np.zeros(6)
@@ -122,6 +129,7 @@ class Bridge:
         self._path = Path(recording) if recording is not None else None
         self._is_live = live
         self.clock = clock or RealClock()
+        refuse_simulated_time(self.device.info, self.clock)
         self._sample = np.zeros(1, SAMPLE_DTYPE)
         self._inputs: deque[list[Write]] = deque()
         self._tick = self._overruns = self._skipped = 0
@@ -322,9 +330,16 @@ class Bridge:
             raise HapticBridgeError("a bridge is entered once; make a new one for another run")
         self.scene.claim()
         resources.callback(self.scene.release)
-        scene, clock, info, method = self.scene, self.clock, self.device.info, self.method
+        scene, clock, method = self.scene, self.clock, self.method
         felt = prepare(scene, self.coupling, self.period, self._substeps, method)
+        self._stream = RecordStream(
+            self._path, self.period, live=self._is_live, is_lossless=clock.is_lossless
+        )
+        resources.callback(self._stream.close)
+        self._compile()
+        # last, because from here on the device is held, and its pose counts
         self._sample[:] = self.device.start(self.period)
+        info = self.device.info
         self.parameters = run_parameters(
             scene,
             self.coupling,
@@ -340,11 +355,6 @@ class Bridge:
         )
         self._binding = binding = Binding(scene.model, scene.data, self.parameters)
         refuse_stretched_start(binding.state, self._limits)
-        self._stream = RecordStream(
-            self._path, self.period, live=self._is_live, is_lossless=clock.is_lossless
-        )
-        resources.callback(self._stream.close)
-        self._compile()
         if self._stream.is_read:
             meta = describe_run(
                 scene, self.parameters, binding, method=method.name, device=info, clock=clock.name
@@ -354,7 +364,7 @@ class Bridge:
 
     def _compile(self) -> None:
         """Gets the machine code of the tick ready, so that the first one is not late."""
-        state, row, sample = self._binding.state, self._binding.row, self._sample
+        state, row, sample = np.zeros(1, STATE_DTYPE), np.zeros(1, TICK_DTYPE), self._sample
         rows, cursors = self._stream.rows, self._stream.cursors
         self._before_step = direct(before_step, state, sample, row, 0, 0.0)
         self._after_step = direct(after_step, state, row, 0)

@@ -6,12 +6,15 @@ import json
 import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
+from matplotlib.figure import Figure
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from hapticbridge.jsonable import jsonable
+from hapticbridge.picture import write_picture
 
 out = Console(highlight=False, soft_wrap=True)
 """Results, on stdout."""
@@ -28,6 +31,11 @@ def plain(text: str) -> str:
     What it holds is taken neither as the console's markup nor as control codes of the terminal.
     """
     return escape("".join(letter if letter.isprintable() else "�" for letter in text))
+
+
+def tell(sentence: str) -> None:
+    """Prints what the user should know or do while a device is opened, on stderr."""
+    err.print(plain(sentence))
 
 
 def print_error(error: Exception) -> None:
@@ -54,6 +62,13 @@ def progress(words: str) -> Iterator[Callable[..., None]]:
             bar.update(task, completed=done, total=total, description=told)
 
         yield show
+
+
+def write_figure(figure: Figure, path: Path) -> None:
+    """Writes a picture and says so on stderr."""
+    with err.status("drawing …"):
+        write_picture(figure, path)
+    err.print(f"wrote {plain(str(path))}")
 
 
 def print_json(facts: object) -> None:
