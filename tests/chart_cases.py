@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from hapticbridge.rendering import METHODS
+from hapticbridge.study.chart import Chart, Extent, measure_chart, open_workload
 from hapticbridge.study.chart.measurement import Measurement
 from hapticbridge.study.chart.score import Score, Verdict
 from hapticbridge.study.chart.setting import SHIPPED, Setting
@@ -22,6 +23,7 @@ def made_up(
     contact: str = SHIPPED,
     substeps: int = 1,
     iterations: int | None = None,
+    limit_apart: float = 0.0,
 ) -> Measurement:
     """Returns a point of panel ``panel`` that costs and errs as said."""
     return Measurement(
@@ -29,6 +31,7 @@ def made_up(
         Setting(METHODS[method], period, substeps, contact, iterations),
         Cost(cost, cost * (1 - spread), cost * (1 + spread), 1.0, 1.0, 1.0, 3),
         Score(felt=felt, created=0.0, verdict=verdict),
+        limit_apart=limit_apart,
     )
 
 
@@ -53,3 +56,14 @@ class FakeRun:
     def scores(self) -> Mapping[str, Score]:
         """Judges nothing."""
         return {}
+
+
+def small_chart() -> Chart:
+    """Returns a small chart: a good method, and one that a step of 20 ms throws out of bounds."""
+    workload = open_workload("point_mass", Extent(0.02, 1e-3))
+    settings = [
+        Setting(METHODS[name], period)
+        for name in ("implicit", "explicit")
+        for period in (0.02, 2e-3, 1e-3)
+    ]
+    return measure_chart(workload, settings, repeats=1)

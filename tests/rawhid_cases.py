@@ -12,9 +12,7 @@ from hapticbridge.device.rawhid import RawHidDevice, open_rawhid
 PERIOD = 1e-3
 
 
-def opened(
-    model: RawHid | None = None, **options: object
-) -> tuple[RawHidDevice, RawHid, HidSeam]:
+def opened(model: RawHid | None = None, **options: object) -> tuple[RawHidDevice, RawHid, HidSeam]:
     """Returns the driver, opened; the device; and what it is plugged into."""
     model = model or RawHid(SimulatedDevice())
     seam = HidSeam(model)

@@ -7,11 +7,13 @@ from functools import lru_cache
 import mujoco
 import numpy as np
 import pytest
+from chart_cases import made_up
 
 from hapticbridge.rendering import METHODS
 from hapticbridge.scene import Scene, load_scene
-from hapticbridge.study.chart import driven_mass, rod_impact, spinning_body
+from hapticbridge.study.chart import driven_mass, measure_chart, rod_impact, spinning_body
 from hapticbridge.study.chart.catalogue import Extent, open_workload
+from hapticbridge.study.chart.convergence import convergence_orders
 from hapticbridge.study.chart.own_reference import OwnReferences
 from hapticbridge.study.chart.peg import COUPLING as PEG_COUPLING
 from hapticbridge.study.chart.peg import PegInHole
@@ -48,6 +50,39 @@ def order(errors: list[float], periods: tuple[float, ...] = FINE) -> float:
     return float(np.polyfit(np.log(periods), np.log(errors), 1)[0])
 
 
+def test_order_is_the_slope_at_the_three_smallest_steps() -> None:
+    periods = (4e-3, 1e-3, 5e-4, 2.5e-4)
+    points = [made_up(1.0, 1e6 * p**2, period=p) for p in periods[1:]]
+    points += [made_up(1.0, 7.0, period=periods[0]), made_up(1.0, 3.0, period=2.5e-4, substeps=2)]
+    order = convergence_orders(points)["implicit"]
+    assert order.power == pytest.approx(2.0)
+    assert (order.finest, order.coarsest) == (2.5e-4, 1e-3)
+    assert order.words == "order 2.0"
+    assert not convergence_orders(points[:2])
+
+
+def test_order_that_the_next_step_contradicts_is_not_told() -> None:
+    def words(*errors: float) -> str:
+        steps = (2.5e-4, 1e-3, 4e-3)
+        points = [made_up(1.0, e, period=p) for e, p in zip(errors, steps, strict=True)]
+        return convergence_orders(points)["implicit"].words
+
+    assert words(0.65, 1.8, 3.4) == "order ?"  # 'implicit' on the point mass at quick steps
+    assert words(0.1, 0.4, 1.6) == "order 1.0"
+    assert words(0.1, 0.4, 1.4) == "order 1.0"  # 0.1 of a power off
+    assert words(0.1, 0.4, 1.3) == "order ?"
+    assert words(0.08, 0.08, 0.084) == "level"
+    assert words(0.08, 0.08, 0.3) == "order ?"
+
+
+def test_no_order_is_taken_from_errors_that_a_reference_may_have_itself() -> None:
+    points = [made_up(1.0, 1e8 * p**4, period=p) for p in (4e-3, 2e-3, 1e-3)]
+    assert convergence_orders(points)["implicit"].power == pytest.approx(4.0)
+    unresolved = [made_up(1.0, 2e-6, period=p) for p in (5e-4, 2.5e-4)]
+    assert convergence_orders([*points, *unresolved])["implicit"].power == pytest.approx(4.0)
+    assert not convergence_orders([*points[:2], *unresolved])
+
+
 @pytest.mark.parametrize(
     ("method", "expected"),
     [("implicit", 1), ("compensated", 1), ("explicit", 1), ("implicitfast", 1), ("lossless", 2)],
@@ -64,6 +99,12 @@ def test_rk4_turns_a_free_body_with_fourth_order_and_euler_with_first() -> None:
     # the energy of a step is one order better than the motion; five is what rk4 leaves of four
     rk4 = [score(spinning(), "explicit:rk4", period).energy for period in periods]
     assert 3.8 < order(rk4, periods) < 5.2
+    # the motion itself, above what the reference errs by
+    periods = (8e-3, 4e-3, 2e-3)
+    workload = open_workload("spinning_body", Extent(periods[0], periods[-1]))
+    found = [score(workload, "explicit:rk4", period) for period in periods]
+    assert order([each.angle_peak for each in found], periods) == pytest.approx(4, abs=0.3)
+    assert order([each.felt for each in found], periods) == pytest.approx(4, abs=0.3)
     euler = [score(spinning(), "explicit", period).angle_peak for period in FINE]
     assert order(euler) == pytest.approx(1, abs=0.05)
     lossless = [score(spinning(), "lossless", period).angle_peak for period in FINE]
@@ -145,7 +186,32 @@ def test_methods_agree_on_where_the_moving_peg_goes_in_the_limit() -> None:
     assert isinstance(references, OwnReferences)
     apart = references.disagreement()
     assert apart["explicit"] < 0.3
+    assert apart["implicit"] < 0.3
     assert apart["weld"] > 3  # another stiffness than was asked for: converged, and not to the same
+
+
+def test_measured_points_carry_how_far_the_limit_of_their_method_lies() -> None:
+    workload = PegInHole(PEG_COUPLING, GRID, GRID, refinement=2)
+    settings = [Setting(METHODS[name], GRID) for name in ("implicit", "weld")]
+    found = measure_chart(workload, settings, repeats=1)
+    apart = {
+        (each.panel, each.setting.method.name): each.limit_apart for each in found.measurements
+    }
+    assert apart["moving", "implicit"] == 0.0
+    assert apart["moving", "weld"] > 3
+    # the settled peg is compared with one truth
+    assert apart["settled", "weld"] == apart["settled", "implicit"] == 0.0
+    assert "implicit, in JND: weld" in found.notes[0]
+
+
+def test_central_limit_is_one_of_the_coupling_that_was_asked_for() -> None:
+    workload = PegInHole(PEG_COUPLING, GRID, 4e-3, refinement=2)
+    for name in ("weld", "direct", "implicit"):
+        workload.run(Setting(METHODS[name], GRID)).scores()
+    assert workload.references is not None
+    apart = workload.references.disagreement()
+    assert apart["implicit"] == 0.0
+    assert min(apart["weld"], apart["direct"]) > 3
 
 
 @pytest.mark.parametrize("method", ["implicit", "compensated", "implicitfast", "explicit"])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from dataclasses import astuple
 from itertools import count
 from pathlib import Path
 
@@ -14,9 +15,10 @@ from scipy.spatial import ConvexHull
 from hapticbridge.check.growth import Spread
 from hapticbridge.cli import main
 from hapticbridge.errors import StudyError
+from hapticbridge.study.chart.files import prepared_files
 from hapticbridge.study.chart.tick_times import USUAL, VARIANTS
-from hapticbridge.study.chart.work import Work, WorkChart, growth_exponent, measure_work
-from hapticbridge.study.chart.work_files import paragraph, write_work
+from hapticbridge.study.chart.work import Work, WorkChart, growth_of, measure_work
+from hapticbridge.study.chart.work_files import WORK_ENDINGS, paragraph, write_work
 from hapticbridge.study.chart.work_scenes import (
     FAMILIES,
     floating,
@@ -69,10 +71,21 @@ def test_scene_of_nothing_or_of_too_much_is_refused(build: object) -> None:
 def test_exponent_is_the_slope_at_the_larger_sizes() -> None:
     sizes = np.array([1.0, 10.0, 30.0, 100.0])
     # what every tick costs hides the growth at small sizes
-    assert growth_exponent(sizes, 1e-9 * sizes**2 + 1e-12) == pytest.approx(2.0, abs=0.01)
-    assert growth_exponent(sizes, np.array([50.0, 10.0, 30.0, 100.0])) == pytest.approx(1.0)
-    assert np.isnan(growth_exponent(sizes[:1], sizes[:1]))
-    assert np.isnan(growth_exponent(np.zeros(0), np.zeros(0)))
+    steep = growth_of(sizes, 1e-9 * sizes**2 + 1e-12)
+    assert steep is not None
+    assert steep.exponent == pytest.approx(2.0, abs=0.01)
+    even = growth_of(sizes, np.array([50.0, 10.0, 30.0, 100.0]))
+    assert even is not None
+    assert astuple(even) == pytest.approx((1.0, 1.0, 1.0, 10.0))
+    assert growth_of(sizes[:1], sizes[:1]) is None
+    assert growth_of(np.zeros(0), np.zeros(0)) is None
+
+
+def test_growth_that_is_no_power_shows_in_the_range_of_its_exponent() -> None:
+    bent = growth_of(np.array([10.0, 30.0, 90.0]), np.array([1.0, 3.0, 27.0]))
+    assert bent is not None
+    assert [bent.low, bent.high] == pytest.approx([1.0, 2.0])
+    assert bent.low < bent.exponent < bent.high
 
 
 def test_rate_is_what_half_a_period_leaves_at_the_99th_percentile() -> None:
@@ -100,22 +113,33 @@ def made_up() -> WorkChart:
 
 def test_paragraph_says_how_it_grows_and_what_holds_a_kilohertz() -> None:
     text = paragraph(made_up())
-    assert "Free bodies: 10 µs a tick for 1, 1e+03 µs for 100 (growing as n^1.00)" in text
-    assert "up to 10 hold 1 kHz" in text
-    assert "without islands a tick with 100 boxes at rest takes 3.00 times as long" in text.lower()
     assert (
-        "sleep, which a bridge refuses, would make mujoco's step 10 times as fast" in text.lower()
+        "Free bodies: 10 µs a tick for 1, 1e+03 µs for 100 "
+        "(growing as n^1.00 (1.00 to 1.00) from 10 on)" in text
+    )
+    assert "up to 10 hold 1 kHz" in text
+    assert (
+        "without islands a tick with 100 boxes at rest takes 3 (3 to 3) times as long"
+        in text.lower()
+    )
+    assert (
+        "sleep, which a bridge refuses, would make mujoco's step 10 (10 to 10) times as fast"
+        in text.lower()
     )
 
 
 def test_files_hold_every_point(tmp_path: Path) -> None:
-    paths, said = write_work(made_up(), tmp_path)
+    paths = prepared_files(tmp_path, "work", WORK_ENDINGS)
+    said = write_work(made_up(), paths)
+    assert {path.name for path in tmp_path.iterdir()} == {
+        f"work.{ending}" for ending in ("png", "svg", "csv", "json")
+    }
     with paths["csv"].open(encoding="utf-8") as lines:
         rows = list(csv.DictReader(lines))
     assert len(rows) == 11
     assert {row["variant"] for row in rows} == {variant.name for variant in VARIANTS}
     assert json.loads(paths["json"].read_text(encoding="utf-8")) == said
-    assert said["exponents"]["bodies"][USUAL.name] == pytest.approx(1.0)
+    assert said["growth"]["bodies"][USUAL.name]["exponent"] == pytest.approx(1.0)
     assert paths["png"].stat().st_size > 10_000
 
 

@@ -10,7 +10,7 @@ import pytest
 PACKAGE = Path(__file__).parents[1] / "hapticbridge"
 
 ORDER = (
-    ("errors", "arguments", "jit", "tick", "pose", "clock", "signals", "picture"),
+    ("errors", "arguments", "jit", "tick", "pose", "clock", "signals", "picture", "jsonable"),
     ("coupling", "kernel", "mechanics", "passivity"),
     ("scene",),
     ("rendering",),

@@ -132,6 +132,7 @@ def test_a_wrench_arrives_on_the_axes_that_there_are() -> None:
 
 def test_lost_frames_are_counted_and_the_newest_pose_is_used() -> None:
     device, model, seam = still()
+    read(device, seam)
     model.lose = set(range(model.frames + 3, model.frames + 6))
     flags = [read(device, seam)[0] for _ in range(10)]
     assert flags.count(STALE) == 3
@@ -150,6 +151,7 @@ def test_a_sequence_that_wraps_loses_nothing() -> None:
 
 def test_a_frame_with_a_wrong_crc_is_dropped_counted_and_missed() -> None:
     device, model, seam = still()
+    read(device, seam)
     model.motion = (0.5,) * 12
     model.damage = {model.frames + 1}
     flag, sample = read(device, seam)
@@ -179,6 +181,20 @@ def test_the_newest_of_several_frames_is_taken() -> None:
     model.motion = (0.2,) * 12
     assert read(device, seam)[1]["position"][0] == np.float32(0.2)
     assert device.lost == 0
+
+
+def test_after_a_pause_the_pose_is_a_fresh_one_though_the_queue_is_full_of_old_ones() -> None:
+    device, model, seam = still()
+    for pause in (0.5, 2.0):  # as long as compiling takes, and a stall in mid-run
+        model.motion = (0.1,) * 12
+        seam.advance(seam.now + pause)
+        model.motion = (0.2,) * 12
+        sample = np.zeros(1, SAMPLE_DTYPE)
+        before = seam.now
+        assert device.read(sample) == 0
+        assert sample[0]["position"][0] == np.float32(0.2)
+        assert seam.now - before <= 2.1e-3
+    assert device.lost == pytest.approx(2000 - 63, abs=2)  # of the stall; the first is no loss
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 1e31])

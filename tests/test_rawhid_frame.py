@@ -33,9 +33,7 @@ NAN = math.nan
 single = st.floats(-(2.0**99), 2.0**99, width=32)
 any_single = st.floats(width=32)
 u8, u16 = st.integers(0, 255), st.integers(0, 65535)
-states = st.builds(
-    State, u8, u16, u16, st.integers(0, 2**32 - 1), st.tuples(*[single] * 12), u16
-)
+states = st.builds(State, u8, u16, u16, st.integers(0, 2**32 - 1), st.tuples(*[single] * 12), u16)
 
 WRITTEN = {
     "Force 7": force_frame(7, (1.0, -0.5, 0.0, 0.0, 0.0, 0.01), 20),

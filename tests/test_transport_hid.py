@@ -17,7 +17,7 @@ from hapticbridge.device.hex_log import VARIABLE, HexLog
 from hapticbridge.device.hid_search import HidApi, find
 from hapticbridge.device.plugged import Family, Plugged, UsbId
 from hapticbridge.device.rawhid import open_rawhid
-from hapticbridge.device.transport_hid import MOST_REPORTS, HidLink
+from hapticbridge.device.transport_hid import QUEUE, HidLink
 from hapticbridge.errors import DeviceError, DeviceLost
 
 ECHO = Family(
@@ -65,7 +65,7 @@ class Flood(EchoHid):
 
 def test_a_device_that_floods_does_not_hold_the_loop() -> None:
     link, _, _ = linked(Flood())
-    assert len(link.take()) == MOST_REPORTS
+    assert len(link.take()) == QUEUE + 1
 
 
 def test_a_device_that_is_gone_is_lost_for_reads_waits_and_writes() -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -19,6 +18,7 @@ from hapticbridge.certificate import condition_sentences, is_run_certified, run_
 from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.guard import Limits, limits_for
+from hapticbridge.jsonable import jsonable
 from hapticbridge.kernel.state import RunParameters
 from hapticbridge.provenance import STARTS, meta_start, parameters_of
 from hapticbridge.recording import Recording, read_recording
@@ -72,18 +72,13 @@ class AuditReport:
 
     def to_json(self) -> str:
         """Returns the report as one JSON object; a number that is not finite becomes null."""
-        values = asdict(self) | {"path": str(self.path), "joules": _finite(self.joules)}
-        values["energies"] = {name: _finite(value) for name, value in self.energies.items()}
-        return json.dumps(values, indent=2, allow_nan=False)
+        values = asdict(self) | {"path": str(self.path)}
+        return json.dumps(jsonable(values), indent=2, allow_nan=False)
 
     @property
     def exit_code(self) -> int:
         """0 if passive and certified or the device is unknown, else 1."""
         return 0 if self.verdict == "passive" and self.certified is not False else 1
-
-
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None
 
 
 @np.errstate(all="ignore")  # numbers of a damaged file overflow; what comes out is then a fault

@@ -103,8 +103,6 @@ def felt_error(original: NDArray[np.void], variant: NDArray[np.void]) -> FeltErr
     torque_threshold = max(WEBER * _rms(whole[:, 3:]), LEVER * force_threshold)
     difference = variant["wrench_on_tool"] - rows["wrench_on_tool"]
     apart = variant["tool_position"] - rows["tool_position"]
-    cosine = np.abs(np.sum(variant["tool_quaternion"] * rows["tool_quaternion"], axis=1))
-    sine = np.linalg.norm(_vector_part(variant["tool_quaternion"], rows["tool_quaternion"]), axis=1)
     return FeltError(
         force_rms=_rms(difference[:, :3]),
         force_peak=float(np.linalg.norm(difference[:, :3], axis=1).max()),
@@ -113,8 +111,18 @@ def felt_error(original: NDArray[np.void], variant: NDArray[np.void]) -> FeltErr
         force_threshold=force_threshold,
         torque_threshold=torque_threshold,
         position_peak=float(np.linalg.norm(apart, axis=1).max()),
-        angle_peak=float((2.0 * np.arctan2(sine, cosine)).max()),
+        angle_peak=float(tool_angles(rows, variant).max()),
     )
+
+
+def tool_angles(first: NDArray[np.void], second: NDArray[np.void]) -> NDArray[np.float64]:
+    """Returns the angles between the tools of two records in rad, shape (n,), within 0 to π.
+
+    From sine and cosine of half the angle: its arccosine alone would round below 3e-8 rad.
+    """
+    a, b = first["tool_quaternion"], second["tool_quaternion"]
+    sine = np.linalg.norm(_vector_part(a, b), axis=1)
+    return np.asarray(2.0 * np.arctan2(sine, np.abs(np.sum(a * b, axis=1))))
 
 
 def _rms(vectors: NDArray[np.float64]) -> float:

@@ -23,7 +23,7 @@ from hapticbridge.study.chart import (
     write_chart,
 )
 from hapticbridge.study.chart.work import measure_work
-from hapticbridge.study.chart.work_files import write_work
+from hapticbridge.study.chart.work_files import WORK_ENDINGS, write_work
 from hapticbridge.study.engines.library import available_engines, open_engine
 from hapticbridge.study.engines.prints import caught_prints
 
@@ -43,7 +43,7 @@ class ChartCommand:
     The scene is point_mass, peg_in_hole, rod_impact, sliding_block or spinning_body, which have
     references of their own, or any scene with a hand path beside it, which is compared with finer
     steps. 'work' in place of a scene charts what a tick costs as a scene grows. Writes SCENE.png,
-    .svg, .csv, .json and .html into the folder. Example:
+    .svg, .csv, .json and, but for 'work', .html into the folder. Example:
 
         hapticbridge chart peg_in_hole --out charts
     """
@@ -94,10 +94,10 @@ class ChartCommand:
         return 0
 
     def _execute_work(self) -> int:
-        prepared_files(self.out, WORK)
+        paths = prepared_files(self.out, WORK, WORK_ENDINGS)
         with progress(f"chart {WORK}") as show:
             chart = measure_work(most=QUICK_SIZE if self.quick else None, progress=show)
-        paths, said = write_work(chart, self.out)
+        said = write_work(chart, paths)
         if self.as_json:
             print_json(said)
         else:
@@ -112,6 +112,8 @@ class ChartCommand:
             for reason in dict.fromkeys(found.missing.values()):
                 err.print(plain(reason))
             return list(found.available)
+        if ALL in self.engines:
+            raise StudyError(f"--engines {ALL} names every engine; give it alone")
         for name in self.engines:
             open_engine(name)
         return list(self.engines)
@@ -125,6 +127,12 @@ def _print(files: ChartFiles) -> None:
     for panel in files.said["panels"]:
         out.print(f"[bold]{plain(panel['title'])}[/], against {plain(panel['reference'])}")
         out.print(f"  {plain(panel['recommendation'])}")
+        out.print("  on the front, by cost:" if panel["front"] else "  nothing is on the front")
+        for point in panel["front"]:
+            out.print(
+                f"    {point['cost']:.2g} s per s, {point['error']:.3g} JND: "
+                f"{plain(point['setting'])}"
+            )
     for note in files.said["notes"]:
         out.print(f"  {plain(note)}")
     for name, reason in files.said["skipped"].items():

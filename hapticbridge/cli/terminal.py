@@ -11,6 +11,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
+from hapticbridge.jsonable import jsonable
+
 out = Console(highlight=False, soft_wrap=True)
 """Results, on stdout."""
 
@@ -61,15 +63,7 @@ def progress(words: str) -> Iterator[Callable[..., None]]:
 
 def print_json(facts: object) -> None:
     """Prints facts as JSON on stdout, with null in place of numbers that JSON does not have."""
-    out.print_json(json.dumps(_without_inf(facts), allow_nan=False))
-
-
-def _without_inf(fact: object) -> object:
-    if isinstance(fact, dict):
-        return {key: _without_inf(value) for key, value in fact.items()}
-    if isinstance(fact, list | tuple):
-        return [_without_inf(value) for value in fact]
-    return None if isinstance(fact, float) and not math.isfinite(fact) else fact
+    out.print_json(json.dumps(jsonable(facts), allow_nan=False))
 
 
 def quantity(value: float, unit: str) -> str:

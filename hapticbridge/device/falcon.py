@@ -22,14 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.device.base import DeviceInfo, checked_number, checked_period
-from hapticbridge.device.falcon_boot import (
-    Link,
-    ask,
-    enter_run_mode,
-    read_firmware,
-    speaks,
-    upload,
-)
+from hapticbridge.device.falcon_boot import Link, ask, read_firmware
 from hapticbridge.device.falcon_motion import (
     BELIEVED,
     MOTION_DTYPE,
@@ -40,6 +33,7 @@ from hapticbridge.device.falcon_motion import (
     resolution,
 )
 from hapticbridge.device.falcon_packets import SIZE, ReplyStream, Request
+from hapticbridge.device.falcon_start import SILENCE, bring_up, home, silent
 from hapticbridge.device.falcon_timing import measured_timing
 from hapticbridge.device.hex_log import HexLog
 from hapticbridge.device.plugged import Family, Tell, UsbId, chosen, tell_nobody
@@ -52,14 +46,8 @@ from hapticbridge.tick import SAMPLE_DTYPE, TickFlag
 FORCE_LIMIT = 8.0
 """In N: what CHAI3D lets applications ask of a Falcon; the maker's figure is above 8.9 N."""
 
-SILENCE = 0.05
-"""In s: a Falcon that gave no sample that can be believed for so long is lost. Fifty replies."""
-
 LONGEST_PERIOD = 0.02
 """In s. It is asked once a tick; slower, two lost replies would already count as silence."""
-
-HOMING_TIME = 60.0
-"""In s: how long the user has to move the grip through its range."""
 
 READ_FROM, WRITE_TO = 0x81, 0x02
 """Addresses of its bulk endpoints."""
@@ -105,8 +93,8 @@ class FalconDevice:
         self._stream = ReplyStream()
         self._is_open, self._is_started = True, False
         try:
-            self._bring_up(firmware, tell)
-            self._home(tell)
+            bring_up(link, self._stream, name, firmware, tell)
+            home(link, self._stream, name, tell)
             rate, delay = measured_timing(link, self._stream, name)
             self.info = DeviceInfo(
                 name="falcon",
@@ -157,7 +145,7 @@ class FalconDevice:
         motion[0] = np.zeros((), MOTION_DTYPE)
         motion["position"] = PLACE
         if not ask(self._link, self._stream, Request.GREEN, SILENCE):
-            raise self._silent()
+            raise silent(self._name)
         if self._believe(motion, reply, sample, np.inf) != BELIEVED:
             raise DeviceError(
                 f"{self._name}: encoders at {reply['encoders'][0].tolist()} are no position of the "
@@ -201,7 +189,7 @@ class FalconDevice:
                 self._believed = now
                 flag = 0
         if now - self._believed > SILENCE:
-            raise self._silent()
+            raise silent(self._name)
         sample[:] = self._last
         return flag
 
@@ -230,48 +218,6 @@ class FalconDevice:
             pass  # whoever pulled the plug also took the force away
         finally:
             self._link.close()
-
-    def _bring_up(self, firmware: str | None, tell: Tell) -> None:
-        image = None if firmware is None else read_firmware(firmware)
-        enter_run_mode(self._link)
-        if speaks(self._link, self._stream):
-            return
-        if image is None:
-            raise DeviceError(
-                f"{self._name}: has no firmware (it forgets it without power); name the file with "
-                "the maker's program: falcon:firmware=FILE"
-            )
-        upload(self._link, image, self._name, tell)
-        enter_run_mode(self._link)
-        self._stream.clear()
-        if not speaks(self._link, self._stream):
-            raise DeviceError(
-                f"{self._name}: took '{firmware}', and does not answer; it is no firmware for it"
-            )
-
-    def _home(self, tell: Tell) -> None:
-        """Waits until every encoder has passed its zero; asks the user to see to it."""
-        end, is_told = self._link.now() + HOMING_TIME, False
-        heard = self._link.now()
-        while self._link.now() < end:
-            if ask(self._link, self._stream, Request.HOMING | Request.RED, SILENCE):
-                heard = self._link.now()
-                if self._stream.reply["homed"][0] == 7:
-                    if is_told:
-                        tell(f"{self._name}: homed")
-                    return
-            elif self._link.now() - heard > 2 * SILENCE:
-                raise self._silent()
-            if not is_told:
-                is_told = True
-                tell(f"{self._name}: pull the grip all the way out and push it back in, slowly")
-        raise DeviceError(
-            f"{self._name}: was not homed within {HOMING_TIME:g} s; open it again and move the "
-            "grip all the way out and in"
-        )
-
-    def _silent(self) -> DeviceLost:
-        return DeviceLost(f"{self._name}: gave no usable reply for {1e3 * SILENCE:g} ms")
 
 
 def open_falcon(options: Mapping[str, object], tell: Tell, backend: Any = None) -> FalconDevice:

@@ -12,10 +12,9 @@ from hapticbridge.device.falcon_kinematics import (
     ZERO_ANGLE,
     forward,
     inverse,
-    jacobian,
-    thigh_torques,
 )
-from hapticbridge.device.falcon_packets import encode
+from hapticbridge.device.falcon_packets import Request, encode
+from hapticbridge.device.falcon_statics import jacobian, thigh_torques
 from hapticbridge.jit import compiled
 
 MOTION_DTYPE = np.dtype([("position", "<f8", 3), ("angles", "<f8", 3), ("motors", "<i8", 3)])
@@ -41,6 +40,9 @@ workspace in 33 ms is at its end."""
 MOST_COUNTS = 3000
 """Counts either side of zero that a thigh can turn to: -74° to 144°. The workspace takes -66° to
 114°; a whole turn further the same place would follow."""
+
+FLAGS = int(Request.GREEN)
+"""The light while the loop runs."""
 
 BELIEVED, OUT_OF_REACH, JUMP = 0, 1, 2
 
@@ -115,10 +117,6 @@ def command(
     for i in range(3):
         motion.motors[i] = round(share * UNITS_PER_TORQUE * torques[i])
     encode(motion.motors, FLAGS, packet)
-
-
-FLAGS = 2
-"""``Request.GREEN`` as compiled code can take it: the light while the loop runs."""
 
 
 def resolution() -> float:

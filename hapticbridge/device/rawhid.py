@@ -56,7 +56,8 @@ class RawHidDevice:
         changes: Numbers of the data sheet that go before what the device says of itself.
 
     Attributes:
-        lost: State frames that never came, by their sequence.
+        info: Its data sheet.
+        lost: State frames that never came, by their sequence, since the first read.
         damaged: Reports that were no valid frame.
         repeated: State frames that came twice.
 
@@ -75,7 +76,7 @@ class RawHidDevice:
         self._state: State | None = None
         self._period, self._silent_ticks = 0.0, 0
         self._watchdog_ms = LONGEST_WATCHDOG_MS
-        self._is_open = True
+        self._is_open, self._has_begun = True, False
 
     def start(self, period: float) -> NDArray[np.void]:
         """Waits for a state frame that is newer than this call.
@@ -93,7 +94,7 @@ class RawHidDevice:
         watchdog = max(SHORTEST_WATCHDOG, WATCHDOG_PERIODS * period)
         self._watchdog_ms = min(math.ceil(1e3 * watchdog), LONGEST_WATCHDOG_MS)
         self.lost = self.damaged = self.repeated = 0
-        self._silent_ticks, self._state = 0, None
+        self._silent_ticks, self._state, self._has_begun = 0, None, False
         self._link.take()
         for report in reports(self._link, FIRST_STATE_MS):
             if self._is_newest(report):
@@ -127,6 +128,8 @@ class RawHidDevice:
         is_new = False
         for report in self._link.take():
             is_new |= self._is_newest(report)
+        if not self._has_begun:  # between the start and the loop nobody took what was sent
+            self._has_begun, self.lost = True, 0
         if not is_new:
             self._silent_ticks += 1
             silence = self._silent_ticks * self._period

@@ -15,9 +15,13 @@ from hapticbridge.errors import DeviceError, DeviceLost
 LONGEST_REPORT = 256
 """In bytes. Full-speed reports have at most 64; a longer one would be cut, and its check fail."""
 
-MOST_REPORTS = 64
-"""Reports taken at once: what Linux keeps per open device (HIDRAW_BUFFER_SIZE). Without a limit
-a device that sends faster than they are read would hold the loop."""
+QUEUE = 63
+"""Reports that Linux keeps per open device (HIDRAW_BUFFER_SIZE, a ring with one free place). Of
+those that come when it is full it drops the new ones, so a full queue is an old one. It is also the
+most that is taken at once: a device that sends faster than it is read must not hold the loop."""
+
+FRESH_MS = 2
+"""In ms: how long a report is waited for after a full queue. At 1 kHz one comes within 1 ms."""
 
 LONGEST_WRITE = 0.05
 """In s. A full-speed device is asked every millisecond, so a report that is not taken in 50 of them
@@ -106,11 +110,16 @@ class HidLink:
     def take(self) -> list[bytes]:
         """Returns the reports that have come since the last call, oldest first, without waiting.
 
+        Only after a pause so long that the kernel's queue is full, and all in it old, a new one is
+        waited for, up to ``FRESH_MS``.
+
         Raises:
             DeviceLost: The device is gone.
         """
         reports: list[bytes] = []
-        while len(reports) < MOST_REPORTS and (report := self._read(0)):
+        while len(reports) < QUEUE and (report := self._read(0)):
+            reports.append(report)
+        if len(reports) == QUEUE and (report := self._read(FRESH_MS)):
             reports.append(report)
         return reports
 

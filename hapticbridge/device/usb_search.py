@@ -85,13 +85,15 @@ def node_of(device: Any) -> str:
 def _described(family: Family, device: Any) -> Plugged:
     node, problem, texts = node_of(device), None, ["", ""]
     try:
+        device.get_active_configuration()  # opens it; reading texts would hide why it cannot
         texts = [
             usb.util.get_string(device, index) or "" if index else ""
             for index in (device.iProduct, device.iSerialNumber)
         ]
-    except (usb.core.USBError, ValueError, NotImplementedError) as error:
-        is_refused = getattr(error, "errno", None) == errno.EACCES
-        problem = permission_problem(node) if is_refused else None
+    except usb.core.USBError as error:
+        problem = permission_problem(node) if error.errno == errno.EACCES else None
+    except (ValueError, NotImplementedError):
+        pass  # it has no texts, or they cannot be read
     finally:
         usb.util.dispose_resources(device)
     return Plugged(

@@ -30,8 +30,9 @@ class HidDevice(UsbDevice):
     endpoint_out: ClassVar[int | None] = 0x02
     packet_size: ClassVar[int] = 64
     interval: ClassVar[int] = 1
-    queue_length: ClassVar[int] = 64
-    """Reports kept for a host that does not ask; the oldest is lost first, as in hidraw's queue."""
+    queue_length: ClassVar[int] = 63
+    """Reports kept for a host that does not ask; what comes then is lost, as with hidraw's queue
+    (a ring of 64 places, one of them free)."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -41,7 +42,7 @@ class HidDevice(UsbDevice):
         self.endpoints = tuple(
             Endpoint(address, INTERRUPT, self.packet_size, self.interval) for address in addresses
         )
-        self._reports: deque[bytes] = deque(maxlen=self.queue_length)
+        self._reports: deque[bytes] = deque()
 
     # -- what a model adds -----------------------------------------------------------------------
 
@@ -60,7 +61,8 @@ class HidDevice(UsbDevice):
 
     def push(self, report: bytes) -> None:
         """Queues an input report for the host."""
-        self._reports.append(bytes(report))
+        if len(self._reports) < self.queue_length:
+            self._reports.append(bytes(report))
 
     def take_report(self) -> bytes | None:
         """Returns the oldest queued input report, None where there is none."""

@@ -10,21 +10,16 @@ import numpy as np
 
 from hapticbridge.check.observation import quiet
 from hapticbridge.errors import HapticBridgeError, StudyError
+from hapticbridge.study.chart.convergence import Order, convergence_orders
 from hapticbridge.study.chart.engine_run import EngineRun, PeerWork
 from hapticbridge.study.chart.front import pareto_front
 from hapticbridge.study.chart.measurement import Measurement
 from hapticbridge.study.chart.score import Score
-from hapticbridge.study.chart.setting import OWN, SHIPPED, Setting
+from hapticbridge.study.chart.setting import OWN, SHIPPED, Setting, who
 from hapticbridge.study.chart.timing import REPEATS, interleaved_costs, machine, one_core
 from hapticbridge.study.chart.workload import Panel, Run, Workload
 from hapticbridge.study.engines.base import Engine
 from hapticbridge.study.engines.library import open_engine
-
-ORDER_POINTS = 3
-"""How many of the smallest steps an order of convergence is fitted to."""
-
-RESOLVED = 1e-5
-"""Error in JND below which a reference's own error may count: no order is fitted to it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,46 +51,22 @@ class Chart:
     def front(self, panel: Panel) -> list[Measurement]:
         """Returns the Pareto front, cheapest first.
 
-        Of the points that are sound and render the coupling that was asked for: a weld, or a tool
-        that is where the handle is, renders another one, however well it converges.
+        Of the points that are sound and comparable, and render the coupling that was asked for: a
+        weld, or a tool that is where the handle is, renders another one, however well it converges.
         """
-        points = [each for each in self.of(panel) if each.is_sound and each.setting.method.has_law]
+        points = [
+            each
+            for each in self.of(panel)
+            if each.is_sound and each.is_comparable and each.setting.method.has_law
+        ]
         chosen = pareto_front(
             [each.cost.median for each in points], [each.score.felt for each in points]
         )
         return [points[index] for index in chosen]
 
-    def orders(self, panel: Panel) -> dict[str, float]:
-        """Returns by method the power of the period that its error goes with."""
+    def orders(self, panel: Panel) -> dict[str, Order]:
+        """Returns by method how its error goes with the period."""
         return convergence_orders(self.of(panel))
-
-
-def convergence_orders(points: Sequence[Measurement]) -> dict[str, float]:
-    """Fits felt ~ T^p to the smallest steps of each method, all else as usual.
-
-    Returns:
-        p by method or engine; nan where there are fewer than three points, or an error is below
-        ``RESOLVED``.
-    """
-    series: dict[str, list[tuple[float, float]]] = {}
-    for each in points:
-        if each.is_usual:
-            value = (each.setting.period, each.score.felt)
-            series.setdefault(who(each.setting), []).append(value)
-    found = {}
-    for name, values in series.items():
-        period, felt = np.array(sorted(values)[:ORDER_POINTS]).T
-        is_clear = period.size == ORDER_POINTS and np.isfinite(felt).all()
-        is_clear = bool(is_clear and (felt > RESOLVED).all())
-        found[name] = (
-            float(np.polyfit(np.log(period), np.log(felt), 1)[0]) if is_clear else float("nan")
-        )
-    return found
-
-
-def who(setting: Setting) -> str:
-    """Returns the method's name, or the engine's where it is another."""
-    return setting.method.name if setting.engine == OWN else setting.engine
 
 
 def measure_chart(
@@ -154,8 +125,16 @@ def measure_chart(
         )
         where = machine(core)
     tell(total)
+    apart = {} if workload.references is None else workload.references.disagreement()
     measurements = tuple(
-        Measurement(panel.key, setting, cost, scores[panel.key], run.chosen)
+        Measurement(
+            panel.key,
+            setting,
+            cost,
+            scores[panel.key],
+            run.chosen,
+            limit_apart=0.0 if panel.is_truth else apart.get(setting.method.name, 0.0),
+        )
         for panel in workload.panels
         for (setting, run, scores), cost in zip(runs, costs, strict=True)
         # what another engine converges to is no error of its own
@@ -163,7 +142,7 @@ def measure_chart(
     )
     label = runs[baseline][0].label
     engines = {each.engine.name: each.engine for _, each, _ in runs if isinstance(each, EngineRun)}
-    return Chart(workload, measurements, skipped, where, label, tuple(_notes(workload)), engines)
+    return Chart(workload, measurements, skipped, where, label, tuple(_notes(apart)), engines)
 
 
 def _opened(workload: Workload, setting: Setting, peer_work: Callable[[], PeerWork]) -> Run:
@@ -192,12 +171,13 @@ def _baseline(settings: Sequence[Setting], failed: Set[int]) -> int:
     return min(range(len(settings)), key=distance)
 
 
-def _notes(workload: Workload) -> Iterator[str]:
-    apart = {} if workload.references is None else workload.references.disagreement()
-    if apart:
-        listed = ", ".join(f"{name} {felt:.2g}" for name, felt in apart.items())
+def _notes(apart: Mapping[str, float]) -> Iterator[str]:
+    if len(apart) > 1:
+        central = min(apart, key=lambda name: apart[name])
+        listed = ", ".join(f"{name} {felt:.2g}" for name, felt in apart.items() if name != central)
         yield (
-            "How far the methods' own limits lie from that of the first method, in JND: "
-            f"{listed}. Limits that agree are those of one model; a limit far away is another "
-            "model's, however well its method converges."
+            "How far the methods' own limits lie from the one that most of them are near, that of "
+            f"{central}, in JND: {listed}. A point that is nearer to its own limit than that limit "
+            "is to the others cannot be compared with them: it is drawn pale, and is neither on "
+            "the front nor recommended."
         )

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
 
 from hapticbridge.picture import new_figure
-from hapticbridge.study.chart.chart import Chart, who
+from hapticbridge.study.chart.chart import Chart
+from hapticbridge.study.chart.convergence import Order
 from hapticbridge.study.chart.measurement import Measurement
 from hapticbridge.study.chart.recommendation import JND, recommended
 from hapticbridge.study.chart.score import Verdict
+from hapticbridge.study.chart.setting import who
 from hapticbridge.study.chart.workload import Panel
 
 WIDTH, HEIGHT = 8.0, 5.6
@@ -24,6 +27,12 @@ FLOOR = 1e-4
 
 CEILING = 1e3
 """Error in JND above which they are drawn at the upper edge, with those that diverged."""
+
+NARROW = 30.0
+"""Ratio of the ends of an axis up to which more than the powers of ten are named, no unit."""
+
+PALE = 0.2
+"""Opacity of points that cannot be compared with those of other methods, no unit."""
 
 UNTIMED = 1.0
 """Cost in s per s at which points are drawn where none was timed."""
@@ -90,9 +99,7 @@ def _draw_panel(axes: Axes, chart: Chart, panel: Panel, colours: dict[str, str])
         mine = [each for each in points if who(each.setting) == name]
         if not mine:
             continue
-        order = orders.get(name, float("nan"))
-        told = f"{name} (order {round(order, 1) + 0.0:.1f})" if np.isfinite(order) else name
-        axes.plot([], [], "-", color=colour, lw=2, label=told)
+        axes.plot([], [], "-", color=colour, lw=2, label=_named(name, mine, orders.get(name)))
         line = [each for each in mine if each.is_usual]
         axes.plot(
             [drawn_cost(each, points) for each in line],
@@ -118,6 +125,9 @@ def _draw_panel(axes: Axes, chart: Chart, panel: Panel, colours: dict[str, str])
     )  # fmt: skip
     axes.set_xscale("log")
     axes.set_yscale("log")
+    axes.yaxis.set_major_formatter("{x:g}")
+    low, high = axes.get_ylim()
+    axes.yaxis.set_minor_formatter("{x:g}" if high < NARROW * low else NullFormatter())
     axes.set_xlabel("cost: processor seconds per simulated second (1 = real time on one core)")
     axes.set_ylabel("error (just noticeable differences)")
     kind = "error against" if panel.is_truth else "NOT the truth: difference from"
@@ -132,7 +142,34 @@ def _draw_panel(axes: Axes, chart: Chart, panel: Panel, colours: dict[str, str])
         axes.plot(
             [], [], mark, color="grey", mfc="grey" if is_filled else "white", ms=6, label=told
         )
+    for told in _explained(points, orders.values()):
+        axes.plot([], [], " ", label=told)
     axes.legend(fontsize="x-small", loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
+
+
+def _named(name: str, points: Sequence[Measurement], order: Order | None) -> str:
+    """Returns a legend's words for a method: its order, and its limit where that is another."""
+    told = [] if order is None else [order.words]
+    if not all(each.is_comparable for each in points):
+        told.append(f"limit {points[0].limit_apart:.2g} off")
+    return f"{name} ({', '.join(told)})" if told else name
+
+
+def _explained(points: Sequence[Measurement], orders: Collection[Order]) -> list[str]:
+    """Returns what the words and edges of a panel mean, for those that it has."""
+    said = []
+    if any(order.is_level for order in orders):
+        said.append("level: smaller steps gain nothing")
+    if not all(order.is_settled for order in orders):
+        said.append("order ?: not settled at these steps")
+    if not all(each.is_comparable for each in points):
+        said.append(
+            "pale: nearer to its own limit than\n"
+            "that is to most others' (off, in JND):\nnot comparable"
+        )
+    if any(each.score.felt < FLOOR for each in points):
+        said.append(f"at the lower edge: {FLOOR:g} JND or less")
+    return said
 
 
 def _draw_point(axes: Axes, each: Measurement, place: float, colour: str) -> None:
@@ -147,7 +184,7 @@ def _draw_point(axes: Axes, each: Measurement, place: float, colour: str) -> Non
         mfc=colour if is_filled else "white",
         ms=5.5 if each.is_usual else 3.5,
         elinewidth=0.6,
-        alpha=0.9,
+        alpha=0.9 if each.is_comparable else PALE,
     )
 
 

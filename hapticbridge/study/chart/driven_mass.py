@@ -13,10 +13,10 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.mechanics.coupled_mass import exact_mass_response
 from hapticbridge.scene import load_scene
 from hapticbridge.study.chart.engine_run import PeerWork, work_of
-from hapticbridge.study.chart.scene_run import SceneRun, Stage, Stages, Take
+from hapticbridge.study.chart.scene_run import Stage, Stages, Take
 from hapticbridge.study.chart.score import Score, diverged, score_of
-from hapticbridge.study.chart.setting import Setting
-from hapticbridge.study.chart.workload import Panel, References, Run
+from hapticbridge.study.chart.staged import Staged
+from hapticbridge.study.chart.workload import Panel
 from hapticbridge.tick import TICK_DTYPE
 
 MASS, INERTIA = 0.1, 9e-6
@@ -103,7 +103,7 @@ def exact_records(coupling: Coupling, grid: float, mass: float = MASS) -> NDArra
     return records
 
 
-class DrivenMass:
+class DrivenMass(Staged):
     """The workload.
 
     Args:
@@ -116,21 +116,16 @@ class DrivenMass:
     about = "a free mass moved and turned by the handle, without contact"
     panels: Sequence[Panel] = (PANEL,)
     has_contact = False
-    references: References | None = None
 
     def __init__(self, coupling: Coupling, grid: float, finest: float) -> None:
-        self.coupling = coupling
         self._grid = grid
         self._reference = exact_records(coupling, grid)
         self._finest = finest
         self._duration = grid * self._reference.size
-        self._stages = Stages(
-            lambda: Stage(load_scene("point_mass"), handle_path, self._duration, coupling)
+        super().__init__(
+            coupling,
+            Stages(lambda: Stage(load_scene("point_mass"), handle_path, self._duration, coupling)),
         )
-
-    def run(self, setting: Setting) -> Run:
-        """Prepares a point."""
-        return SceneRun(self._stages.for_method(setting), setting, self._judge)
 
     def peer_work(self) -> PeerWork:
         """Describes the mass to other engines."""

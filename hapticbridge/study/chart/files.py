@@ -5,13 +5,15 @@ from __future__ import annotations
 import csv
 import io
 import json
-import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from matplotlib.figure import Figure
+
 from hapticbridge.errors import StudyError
+from hapticbridge.jsonable import jsonable
 from hapticbridge.picture import write_picture
 from hapticbridge.provenance import versions
 from hapticbridge.study.chart.chart import Chart
@@ -19,7 +21,8 @@ from hapticbridge.study.chart.drawing import draw_chart
 from hapticbridge.study.chart.page import chart_page
 from hapticbridge.study.chart.recommendation import recommendation
 
-ENDINGS = ("png", "svg", "csv", "json", "html")
+PICTURES = ("png", "svg")
+ENDINGS = (*PICTURES, "csv", "json", "html")
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,8 +38,13 @@ class ChartFiles:
     said: Mapping[str, Any]
 
 
-def prepared_files(folder: Path, name: str) -> dict[str, Path]:
+def prepared_files(folder: Path, name: str, endings: Sequence[str] = ENDINGS) -> dict[str, Path]:
     """Makes the folder and proves that every file can be written, before anything is computed.
+
+    Args:
+        folder: To write into.
+        name: Of the files, without ending.
+        endings: Of the files.
 
     Raises:
         StudyError: It cannot, or a scene of this name lies there, whose hand path is ``NAME.csv``.
@@ -46,7 +54,7 @@ def prepared_files(folder: Path, name: str) -> dict[str, Path]:
             f"'{folder}' holds the scene {name}.xml, and its hand path {name}.csv would be "
             "overwritten; name another folder"
         )
-    paths = {ending: folder / f"{name}.{ending}" for ending in ENDINGS}
+    paths = {ending: folder / f"{name}.{ending}" for ending in endings}
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for path in paths.values():
@@ -79,15 +87,33 @@ def write_chart(chart: Chart, paths: Mapping[str, Path]) -> ChartFiles:
         "json": json.dumps(said, indent=2, allow_nan=False) + "\n",
         "html": chart_page(chart),
     }
+    write_files(paths, texts, draw_chart(chart))
+    return ChartFiles(dict(paths), said)
+
+
+def write_files(paths: Mapping[str, Path], texts: Mapping[str, str], figure: Figure) -> None:
+    """Writes texts by ending, in their order, and then the picture as PNG and SVG.
+
+    Raises:
+        HapticBridgeError: A file cannot be written.
+    """
     for ending, text in texts.items():
         try:
             paths[ending].write_text(text, encoding="utf-8", newline="")
         except OSError as error:
             raise StudyError(f"cannot write '{paths[ending]}': {error.strerror}") from None
-    figure = draw_chart(chart)
-    write_picture(figure, paths["png"])
-    write_picture(figure, paths["svg"])
-    return ChartFiles(dict(paths), said)
+    for ending in PICTURES:
+        write_picture(figure, paths[ending])
+
+
+def csv_text(rows: Sequence[Mapping[str, object]]) -> str:
+    """Returns rows as CSV with a header; a row that lacks a column leaves it empty."""
+    text = io.StringIO()
+    names = dict.fromkeys(name for row in rows for name in row)
+    writer = csv.DictWriter(text, names, restval="", lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue()
 
 
 def table_of(chart: Chart) -> str:
@@ -100,13 +126,7 @@ def table_of(chart: Chart) -> str:
         | {"on_front": int(id(each) in fronts[each.panel]), "machine": chart.machine}
         for each in chart.measurements
     ]
-    text = io.StringIO()
-    # other engines have a column of their own
-    names = dict.fromkeys(name for row in rows for name in row)
-    writer = csv.DictWriter(text, names, restval="", lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    return text.getvalue()
+    return csv_text(rows)
 
 
 def summary_of(chart: Chart) -> dict[str, Any]:
@@ -120,8 +140,19 @@ def summary_of(chart: Chart) -> dict[str, Any]:
             "recommendation": recommendation(
                 chart.of(panel), chart.machine, is_truth=panel.is_truth
             ),
-            "front": [each.setting.label for each in chart.front(panel)],
-            "convergence_orders": chart.orders(panel),
+            "front": [
+                {
+                    "setting": each.setting.label,
+                    "cost": each.cost.median,
+                    "error": each.score.felt,
+                    "verdict": each.score.verdict,
+                }
+                for each in chart.front(panel)
+            ],
+            "convergence_orders": {
+                name: asdict(order) | {"is_settled": order.is_settled}
+                for name, order in chart.orders(panel).items()
+            },
         }
         for panel in chart.workload.panels
     ]
@@ -146,16 +177,5 @@ def summary_of(chart: Chart) -> dict[str, Any]:
         "panels": panels,
         "points": points,
     }
-    known: dict[str, Any] = _known(said)
-    return known
-
-
-def _known(value: Any) -> Any:
-    """Returns a value for JSON, which knows neither NaN nor infinity."""
-    if isinstance(value, Mapping):
-        return {key: _known(inner) for key, inner in value.items()}
-    if isinstance(value, list):
-        return [_known(inner) for inner in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
+    found: dict[str, Any] = jsonable(said)
+    return found

@@ -21,6 +21,9 @@ class Measurement:
         cost: What it cost.
         score: How wrong it was.
         chosen: Contacts and solver as the engine got them, by name.
+        limit_apart: Where errors are counted from each method's own limit: how far that limit
+            lies from the one that most methods agree on, in JND. 0 where they are counted from
+            the truth.
     """
 
     panel: str
@@ -28,6 +31,15 @@ class Measurement:
     cost: Cost
     score: Score
     chosen: Mapping[str, str | int] = field(default_factory=dict)
+    limit_apart: float = 0.0
+
+    @property
+    def is_comparable(self) -> bool:
+        """Whether its error can be compared with those of other methods.
+
+        Not where it is smaller than the distance of what the methods' errors are counted from.
+        """
+        return not self.score.felt < self.limit_apart
 
     @property
     def is_sound(self) -> bool:
@@ -64,4 +76,5 @@ class Measurement:
             "rotational_damping_used": used.rotational_damping,
             **{f"cost_{name}": value for name, value in asdict(self.cost).items()},
             **{f"error_{name}": value for name, value in asdict(self.score).items()},
+            "limit_apart": self.limit_apart,
         }

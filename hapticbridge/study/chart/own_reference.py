@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from hapticbridge.check.felt import felt_error
 from hapticbridge.errors import HapticBridgeError, StudyError
 from hapticbridge.kernel.step import simulate
-from hapticbridge.rendering import Method
+from hapticbridge.rendering import METHODS, Method
 from hapticbridge.study.chart.scene_run import Stage, Stages, Take
 from hapticbridge.study.chart.score import NAN, Score, diverged, score_of
 from hapticbridge.study.chart.setting import OWN, Setting
@@ -90,19 +90,19 @@ class OwnReferences:
         )
 
     def disagreement(self) -> dict[str, float]:
-        """Returns how far each method's limit is from the first one's, in just noticeable ones.
+        """Returns how far each method's limit is from the central one in JND, 0 for that one.
 
+        Central is the limit whose median distance to all is least: the one that most agree on. It
+        is that of a method that renders the coupling that was asked for, if there is one.
         Where limits agree, they are likely the motion of the model; where not, at most one is.
         """
-        found = {name: each for name, each in self._found.items() if each is not None}
-        if not found:
-            return {}
-        first = next(iter(found.values()))
-        return {
-            name: felt_error(first.records, each.records).felt
-            for name, each in found.items()
-            if each is not first
-        }
+        found = {name: each.records for name, each in self._found.items() if each is not None}
+        centers = [name for name in found if METHODS[name].has_law] or list(found)
+        apart = [
+            {name: felt_error(found[center], each).felt for name, each in found.items()}
+            for center in centers
+        ]
+        return min(apart, key=lambda row: float(np.median(list(row.values()))), default={})
 
 
 def fine_records(

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import pairwise
 
 from jinja2 import Environment, PackageLoader, select_autoescape
 
-from hapticbridge.study.chart.chart import Chart, who
+from hapticbridge.study.chart.chart import Chart
+from hapticbridge.study.chart.convergence import Order
 from hapticbridge.study.chart.drawing import (
     CEILING,
     FLOOR,
     MARKS,
+    NARROW,
     colours_of,
     drawn_cost,
     drawn_error,
@@ -19,6 +22,7 @@ from hapticbridge.study.chart.drawing import (
 from hapticbridge.study.chart.measurement import Measurement
 from hapticbridge.study.chart.recommendation import JND, recommendation, recommended
 from hapticbridge.study.chart.score import Verdict
+from hapticbridge.study.chart.setting import who
 from hapticbridge.study.chart.workload import Panel
 
 WIDTH, HEIGHT = 860, 420
@@ -49,6 +53,7 @@ class Spot:
     colour: str
     name: str
     is_usual: bool
+    is_comparable: bool
     told: str
 
 
@@ -82,9 +87,11 @@ class Scale:
         return round(self.start + share * (self.end - self.start), 1)
 
     def ticks(self) -> list[Tick]:
-        """Returns a tick for every power of ten within the axis."""
-        first, last = math.ceil(math.log10(self.low)), math.floor(math.log10(self.high))
-        return [Tick(self.at(10.0**n), f"{10.0**n:g}") for n in range(first, last + 1)]
+        """Returns a tick for every power of ten within the axis; on a short one 2 and 5 too."""
+        first, last = math.floor(math.log10(self.low)), math.ceil(math.log10(self.high))
+        steps = (1, 2, 5) if self.high < NARROW * self.low else (1,)
+        values = [step * 10.0**n for n in range(first, last + 1) for step in steps]
+        return [Tick(self.at(v), f"{v:g}") for v in values if self.low <= v <= self.high]
 
     @classmethod
     def around(cls, values: list[float], start: float, end: float) -> Scale:
@@ -107,7 +114,7 @@ class PanelPage:
     jnd: float
     recommendation: str
     front: list[dict[str, str]]
-    orders: dict[str, str]
+    orders: dict[str, Order]
 
 
 def panel_page(chart: Chart, panel: Panel) -> PanelPage:
@@ -130,6 +137,7 @@ def panel_page(chart: Chart, panel: Panel) -> PanelPage:
             colour=colours[who(each.setting)],
             name=who(each.setting),
             is_usual=each.is_usual,
+            is_comparable=each.is_comparable,
             told=described(each),
         )
         for each in points
@@ -139,12 +147,9 @@ def panel_page(chart: Chart, panel: Panel) -> PanelPage:
         for name, colour in colours.items()
     ]
     front = chart.front(panel)
-    stairs = []
-    for before, after in zip(front, [*front[1:], None], strict=True):
-        x, y = place(before)
-        stairs.append(f"{x},{y}")
-        if after is not None:
-            stairs.append(f"{place(after)[0]},{y}")
+    stairs = [f"{x},{y}" for x, y in map(place, front[:1])]
+    for before, after in pairwise(map(place, front)):
+        stairs += [f"{after[0]},{before[1]}", f"{after[0]},{after[1]}"]
     best = recommended(points)
     return PanelPage(
         panel=panel,
@@ -167,11 +172,7 @@ def panel_page(chart: Chart, panel: Panel) -> PanelPage:
             }
             for each in front
         ],
-        orders={
-            name: f"{round(order, 2) + 0.0:.2f}"
-            for name, order in chart.orders(panel).items()
-            if math.isfinite(order)
-        },
+        orders=chart.orders(panel),
     )
 
 
@@ -205,6 +206,8 @@ def described(each: Measurement) -> str:
         for name, value, factor, unit in numbers
         if math.isfinite(value)
     ]
+    if not each.is_comparable:
+        said.append(f"its own limit lies {each.limit_apart:.2g} JND from what most converge to")
     return "\n".join([*said, MARKS[score.verdict][2]])
 
 
@@ -225,4 +228,5 @@ def chart_page(chart: Chart) -> str:
         size=(WIDTH, HEIGHT),
         margins=(LEFT, RIGHT, TOP, BOTTOM),
         edges=(FLOOR, CEILING),
+        pale=not all(each.is_comparable for each in chart.measurements),
     )

@@ -13,10 +13,10 @@ from hapticbridge.study.chart.engine_run import PeerWork, work_of
 from hapticbridge.study.chart.own_reference import REFINEMENT, OwnReferences
 from hapticbridge.study.chart.peg_path import DURATION, JUDGED, POSES, end_of_hold, peg_path
 from hapticbridge.study.chart.rigid_peg import resting_peg
-from hapticbridge.study.chart.scene_run import SceneRun, Stage, Stages, Take
+from hapticbridge.study.chart.scene_run import Stage, Stages, Take
 from hapticbridge.study.chart.score import Score, diverged, score_of
-from hapticbridge.study.chart.setting import Setting
-from hapticbridge.study.chart.workload import Panel, References, Run
+from hapticbridge.study.chart.staged import Staged
+from hapticbridge.study.chart.workload import Panel
 from hapticbridge.tick import TICK_DTYPE
 
 SETTLED = Panel(
@@ -44,7 +44,7 @@ def _scene() -> Scene:
     return load_scene("peg_in_hole", friction=0.0)
 
 
-class PegInHole:
+class PegInHole(Staged):
     """The workload.
 
     Args:
@@ -65,7 +65,6 @@ class PegInHole:
     def __init__(
         self, coupling: Coupling, grid: float, finest: float, refinement: int = REFINEMENT
     ) -> None:
-        self.coupling = coupling
         resting = [resting_peg(coupling, *POSES[index]) for index in JUDGED]
         self._reference = np.zeros(len(JUDGED), TICK_DTYPE)
         self._reference["tool_position"] = [each.position for each in resting]
@@ -74,13 +73,9 @@ class PegInHole:
         self._reference["wrench_on_tool"] = [each.wrench for each in resting]
         self._finest = finest
         self._duration = grid * round(DURATION / grid)
-        self._stages = Stages(lambda: Stage(_scene(), peg_path, self._duration, coupling))
-        self._limits = OwnReferences(self._stages, grid, finest, MOVING_TIME, refinement)
-        self.references: References | None = self._limits
-
-    def run(self, setting: Setting) -> Run:
-        """Prepares a point."""
-        return SceneRun(self._stages.for_method(setting), setting, self._judge)
+        stages = Stages(lambda: Stage(_scene(), peg_path, self._duration, coupling))
+        self._limits = OwnReferences(stages, grid, finest, MOVING_TIME, refinement)
+        super().__init__(coupling, stages, self._limits)
 
     def peer_work(self) -> PeerWork:
         """Describes the peg to other engines."""

@@ -18,8 +18,11 @@ JND = 1.0
 SHARE = 0.5
 """Share of a core that the simulation may take; the rest is for the device and for waking up."""
 
-ALIKE = 0.02
-"""Relative difference of two errors that decides nothing, no unit."""
+ALIKE = 0.05
+"""Relative difference of two errors that decides nothing, no unit: where they differ by more, so do
+the two digits that are said of them."""
+
+ALONE = " No other time step bears this out, so it may be luck."
 
 TOLERANCE = 1e-9
 """Relative: 1/(1 ms) is 1000 Hz but for rounding."""
@@ -29,14 +32,16 @@ def recommended(points: Sequence[Measurement]) -> Measurement | None:
     """Returns the point to use, None where there is none.
 
     Of the points at ``RATE`` or above, with an error below ``JND`` here and at every smaller step,
-    a passive environment, a solver that runs to its tolerance, at most ``SHARE`` of a core and no
-    hazard on a real device (``Method.hazard``): the cheapest; of those whose spread of cost meets
-    its own, the most accurate; and where errors are the same within ``ALIKE``, one with the
-    usual contacts.
+    a passive environment, a solver that runs to its tolerance, at most ``SHARE`` of a core, an
+    error that can be compared with others' (``Measurement.is_comparable``) and no hazard on a real
+    device (``Method.hazard``): those that a second step bears out, if there are any; of them the
+    cheapest; of those whose spread of cost meets its own, the most accurate; and where errors are
+    the same within ``ALIKE``, one with the usual contacts.
     """
     fit = [each for each in points if _is_fast(each) and not _objections(each, points)]
     if not fit:
         return None
+    fit = [each for each in fit if is_borne_out(each, points)] or fit
     cheapest = min(fit, key=lambda each: each.cost.median)
     alike = [each for each in fit if each.cost.low <= cheapest.cost.high]
     least = min(each.score.felt for each in alike)
@@ -58,7 +63,11 @@ def recommendation(points: Sequence[Measurement], machine: str, *, is_truth: boo
     if not is_truth:
         goal += " (counted from the method's own limit at small steps, not from the truth)"
     if best is not None:
-        return f"{goal}, use {best.setting.label}: {_numbers(best)}.{_passed_over(best, points)}"
+        alone = "" if is_borne_out(best, points) else ALONE
+        return (
+            f"{goal}, use {best.setting.label}: {_numbers(best)}.{alone}"
+            f"{_passed_over(best, points)}"
+        )
     fast = [each for each in points if _is_fast(each) and np.isfinite(each.score.felt)]
     if not fast:
         return f"{goal}, nothing was tried that runs at this rate."
@@ -66,6 +75,24 @@ def recommendation(points: Sequence[Measurement], machine: str, *, is_truth: boo
     return (
         f"{goal}, no point does it all. Nearest is {nearest.setting.label}: {_numbers(nearest)}; "
         f"but {' and '.join(_objections(nearest, points))}."
+    )
+
+
+def is_borne_out(each: Measurement, points: Sequence[Measurement]) -> bool:
+    """Returns whether another time step, all else alike, has an error below ``JND`` as well.
+
+    What was tried at one step alone may be right by luck.
+    """
+
+    def settings_but_steps(point: Measurement) -> tuple[object, ...]:
+        setting = point.setting
+        return setting.method.name, setting.engine, setting.contact, setting.iterations
+
+    return any(
+        other.score.felt < JND
+        and other.setting.timestep != each.setting.timestep
+        and settings_but_steps(other) == settings_but_steps(each)
+        for other in points
     )
 
 
@@ -96,6 +123,10 @@ def _objections(each: Measurement, points: Sequence[Measurement]) -> list[str]:
         found.append(f"its error is {each.score.felt:.2g} JND")
     elif not steady < JND:
         found.append(f"its error grows to {steady:.2g} JND at a smaller step, so it is luck")
+    if not each.is_comparable:
+        found.append(
+            f"its own limit lies {each.limit_apart:.2g} JND from what most methods converge to"
+        )
     if each.setting.iterations is not None:
         found.append("its solver is cut short")
     if not each.is_sound:

@@ -11,17 +11,15 @@ import numpy as np
 
 from hapticbridge.check.felt import WEBER
 from hapticbridge.coupling import Coupling
-from hapticbridge.errors import StudyError
-from hapticbridge.kernel.scheme import DIRECT, WELD
 from hapticbridge.mechanics import Impact, ImpactBody, resolve_impact
 from hapticbridge.pose import quaternion_exp
 from hapticbridge.scene import Scene
 from hapticbridge.study.chart.engine_run import PeerWork
-from hapticbridge.study.chart.scene_run import SceneRun, Stage, Stages, Take
+from hapticbridge.study.chart.scene_run import Stage, Stages, Take
 from hapticbridge.study.chart.score import Score, Verdict, diverged
-from hapticbridge.study.chart.setting import Setting
 from hapticbridge.study.chart.spinning_body import still
-from hapticbridge.study.chart.workload import Panel, References, Run
+from hapticbridge.study.chart.staged import Staged
+from hapticbridge.study.chart.workload import Panel
 from hapticbridge.study.engines.task import Body, Pose, Shape, Task, Velocity
 from hapticbridge.study.maps.rigs import scene_of
 
@@ -127,7 +125,7 @@ def rigid_impacts() -> Impact:
     return resolve_impact(rod, [SLIDE, -APPROACH], FRICTION, 0.0)
 
 
-class RodImpact:
+class RodImpact(Staged):
     """The workload.
 
     Args:
@@ -138,25 +136,16 @@ class RodImpact:
     name = "rod_impact"
     about = "a rod taps the floor at four angles, with friction"
     panels: Sequence[Panel] = (PANEL,)
+    needs_tool = "lets no tool fall by itself"
     has_contact = True
-    references: References | None = None
 
     def __init__(self, coupling: Coupling, grid: float) -> None:
-        self.coupling = coupling
         self._rigid = rigid_impacts()
         self._duration = duration = grid * max(1, round(DURATION / grid))
         starts = [falls_at(angle) for angle in ANGLES]
-        self._stages = Stages(lambda: Stage(rod_scene(), still, duration, coupling, starts=starts))
-
-    def run(self, setting: Setting) -> Run:
-        """Prepares a point.
-
-        Raises:
-            StudyError: The method does without the tool's own dynamics.
-        """
-        if setting.method.scheme in (WELD, DIRECT):
-            raise StudyError(f"method '{setting.method.name}' lets no tool fall by itself")
-        return SceneRun(self._stages.for_method(setting), setting, self._judge)
+        super().__init__(
+            coupling, Stages(lambda: Stage(rod_scene(), still, duration, coupling, starts=starts))
+        )
 
     def peer_work(self) -> PeerWork:
         """Describes the falls to other engines: of a free rod, which stays in its plane."""

@@ -17,10 +17,11 @@ from hapticbridge.rendering import IMPLICIT
 from hapticbridge.scene import load_scene
 from hapticbridge.study.chart.engine_run import PeerWork
 from hapticbridge.study.chart.own_reference import OwnReferences
-from hapticbridge.study.chart.scene_run import Path, SceneRun, Stage, Stages, Take
+from hapticbridge.study.chart.scene_run import Path, Stage, Stages, Take
 from hapticbridge.study.chart.score import Score
 from hapticbridge.study.chart.setting import Setting
-from hapticbridge.study.chart.workload import Panel, References, Run
+from hapticbridge.study.chart.staged import Staged
+from hapticbridge.study.chart.workload import Panel
 from hapticbridge.tick import TICK_DTYPE
 
 COUPLING = Coupling(1000.0, 1.0, 1.0, 1e-3)
@@ -42,7 +43,7 @@ REFINEMENT = 8
 than 1 ms by default. Scenes cost many times what a peg does."""
 
 
-class SceneMotion:
+class SceneMotion(Staged):
     """The workload.
 
     Args:
@@ -72,18 +73,17 @@ class SceneMotion:
                 "(t,x,y,z[,qw,qx,qy,qz]) beside it"
             )
         self.name = first.name
-        self.coupling = coupling
         touched = _first_contact(Stage(first, path_of(motion), motion.duration, coupling))
         self.has_contact = touched is not None
         needed = motion.duration if touched is None else touched + AFTER_CONTACT
         duration = float(np.clip(needed, SHORTEST, LONGEST))
         self.speed = max(1.0, needed / duration)
         duration = grid * max(1, round(duration / grid))
-        self._stages = Stages(
+        stages = Stages(
             lambda: Stage(load_scene(scene), path_of(motion, self.speed), duration, coupling)
         )
-        self._limits = OwnReferences(self._stages, grid, finest, duration, refinement)
-        self.references: References | None = self._limits
+        self._limits = OwnReferences(stages, grid, finest, duration, refinement)
+        super().__init__(coupling, stages, self._limits)
         told = "" if self.speed == 1 else f", {self.speed:.3g} times as fast"
         self.about = f"the scene's own hand path, {duration:g} s of it{told}"
         self.panels: Sequence[Panel] = (
@@ -95,10 +95,6 @@ class SceneMotion:
                 is_truth=False,
             ),
         )
-
-    def run(self, setting: Setting) -> Run:
-        """Prepares a point."""
-        return SceneRun(self._stages.for_method(setting), setting, self._judge)
 
     def peer_work(self) -> PeerWork:
         """Refuses: convergence to a method's own limit means nothing across engines.

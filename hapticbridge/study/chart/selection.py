@@ -79,7 +79,8 @@ def settings_for(
 
     Every method at every period. At 1 ms, or the period nearest to it, also: every method with 2, 4
     and 8 substeps, unless it cannot divide a tick; and where something can touch, the methods of
-    ``VARIED`` with every contact setting, and with few solver iterations.
+    ``VARIED`` with every contact setting, and with few solver iterations. The contact settings are
+    tried at the next smaller period too: what is right at one step alone is right by luck.
 
     Args:
         methods: Which.
@@ -97,12 +98,20 @@ def settings_for(
     if has_contact:
         varied = [method for method in methods if method.name in VARIED]
         points += [
-            Setting(method, usual, contact=contact)
+            Setting(method, period, contact=contact)
             for method in varied
             for contact in CONTACTS
             if contact != SHIPPED
+            for period in _with_neighbour(usual, periods)
         ]
         points += [
             Setting(method, usual, iterations=count) for method in varied for count in ITERATIONS
         ]
     return points
+
+
+def _with_neighbour(usual: float, periods: Sequence[float]) -> list[float]:
+    """Returns a period and the next smaller one; where there is none, the next larger one."""
+    others = [period for period in periods if period != usual]
+    smaller = [period for period in others if period < usual]
+    return [usual, *([max(smaller)] if smaller else [min(others)] if others else [])]

@@ -85,6 +85,11 @@ class Setting:
         return ", ".join(parts)
 
 
+def who(setting: Setting) -> str:
+    """Returns the method's name, or the engine's where it is another."""
+    return setting.method.name if setting.engine == OWN else setting.engine
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class ShippedOptions:
     """What of a scene a setting changes, as its file says it."""

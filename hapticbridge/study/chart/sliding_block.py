@@ -11,13 +11,12 @@ from scipy.linalg import expm
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Motion
 from hapticbridge.errors import StudyError
-from hapticbridge.kernel.scheme import DIRECT, WELD
 from hapticbridge.scene import Scene
 from hapticbridge.study.chart.engine_run import PeerWork, motion_along
-from hapticbridge.study.chart.scene_run import SceneRun, Stage, Stages, Take
+from hapticbridge.study.chart.scene_run import Stage, Stages, Take
 from hapticbridge.study.chart.score import Score, diverged, score_of
-from hapticbridge.study.chart.setting import Setting
-from hapticbridge.study.chart.workload import Panel, References, Run
+from hapticbridge.study.chart.staged import Staged
+from hapticbridge.study.chart.workload import Panel
 from hapticbridge.study.engines.task import Body, Pose, Shape, Task
 from hapticbridge.study.maps.rigs import scene_of
 from hapticbridge.tick import TICK_DTYPE
@@ -154,7 +153,7 @@ def exact_sliding(
     return handle_place(times) - stretch, k * stretch + b * rate
 
 
-class SlidingBlock:
+class SlidingBlock(Staged):
     """The workload.
 
     Args:
@@ -169,11 +168,10 @@ class SlidingBlock:
     name = "sliding_block"
     about = "a block on the floor is pulled at a constant speed: stick, breakaway, slide"
     panels: Sequence[Panel] = (PANEL,)
+    needs_tool = "pulls by no spring of known stiffness"
     has_contact = True
-    references: References | None = None
 
     def __init__(self, coupling: Coupling, grid: float, finest: float) -> None:
-        self.coupling = coupling
         self._grid = grid
         self._finest = finest
         count = round(DURATION / grid)
@@ -182,19 +180,9 @@ class SlidingBlock:
         self._reference["tool_quaternion"][:, 0] = 1.0
         self._reference["wrench_on_tool"][:, 0] = force
         self._place = place
-        self._stages = Stages(lambda: Stage(block_scene(), pulled, grid * count, coupling))
-
-    def run(self, setting: Setting) -> Run:
-        """Prepares a point.
-
-        Raises:
-            StudyError: The method does without the tool's own dynamics.
-        """
-        if setting.method.scheme in (WELD, DIRECT):
-            raise StudyError(
-                f"method '{setting.method.name}' pulls by no spring of known stiffness"
-            )
-        return SceneRun(self._stages.for_method(setting), setting, self._judge)
+        super().__init__(
+            coupling, Stages(lambda: Stage(block_scene(), pulled, grid * count, coupling))
+        )
 
     def peer_work(self) -> PeerWork:
         """Describes the block to other engines: a free box, which the coupling keeps upright."""

@@ -10,19 +10,18 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
-from hapticbridge.check.felt import FORCE_FLOOR, LEVER
+from hapticbridge.check.felt import FORCE_FLOOR, LEVER, tool_angles
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import StudyError
-from hapticbridge.kernel.scheme import DIRECT, WELD
 from hapticbridge.mechanics import integrate_rotation
 from hapticbridge.scene import Scene
 from hapticbridge.study.chart.engine_run import PeerWork, work_of
-from hapticbridge.study.chart.scene_run import SceneRun, Stage, Stages, Take
+from hapticbridge.study.chart.scene_run import Stage, Stages, Take
 from hapticbridge.study.chart.score import Score, diverged, score_of
-from hapticbridge.study.chart.setting import Setting
-from hapticbridge.study.chart.workload import Panel, References, Run
+from hapticbridge.study.chart.staged import Staged
+from hapticbridge.study.chart.workload import Panel
 from hapticbridge.study.engines.task import Velocity
-from hapticbridge.study.maps.rigs import scene_of
+from hapticbridge.study.maps.rigs import free_body, scene_of
 from hapticbridge.tick import TICK_DTYPE
 
 MASS = 0.3
@@ -52,23 +51,10 @@ PANEL = Panel(
     f"angle counts as the torque that {FELT_STIFFNESS:g} N m/rad would make of it",
 )
 
-_BODY = f"""
-<mujoco model="spinning_body">
-  <option gravity="0 0 0"/>
-  <worldbody>
-    <body name="tool">
-      <freejoint/>
-      <inertial pos="0 0 0" mass="{MASS!r}" diaginertia="{" ".join(map(repr, INERTIA))}"/>
-      <geom type="sphere" size="0.01" mass="0" contype="0" conaffinity="0"/>
-      <site name="grip"/>
-    </body>
-  </worldbody>
-</mujoco>"""
-
 
 def spinning_scene() -> Scene:
     """Returns the body as a scene, at rest."""
-    return scene_of(_BODY)
+    return scene_of(free_body(MASS, INERTIA))
 
 
 def set_spinning(scene: Scene) -> None:
@@ -120,7 +106,7 @@ def orientations_by_dop853(grid: float, count: int) -> NDArray[np.float64]:
     return np.asarray(np.where(found[:, :1] < 0, -found, found))
 
 
-class SpinningBody:
+class SpinningBody(Staged):
     """The workload.
 
     Args:
@@ -135,32 +121,26 @@ class SpinningBody:
     name = "spinning_body"
     about = "a body with three moments of inertia tumbles freely, held in its place by the coupling"
     panels: Sequence[Panel] = (PANEL,)
+    needs_tool = "lets no tool turn by itself"
     has_contact = False
-    references: References | None = None
 
     def __init__(self, coupling: Coupling, grid: float, finest: float) -> None:
         if coupling.rotational_stiffness or coupling.rotational_damping:
             raise StudyError("the spinning body must be free to turn: K_r and B_r must be 0")
-        self.coupling = coupling
         self._grid = grid
         self._finest = finest
         count = round(DURATION / grid)
         self._reference = np.zeros(count, TICK_DTYPE)
         self._reference["tool_quaternion"] = exact_orientations(grid, count)
         self._energy = 0.5 * float(np.sum(np.array(INERTIA) * np.square(SPIN)))
-        self._stages = Stages(
-            lambda: Stage(spinning_scene(), still, grid * count, coupling, starts=(set_spinning,))
+        super().__init__(
+            coupling,
+            Stages(
+                lambda: Stage(
+                    spinning_scene(), still, grid * count, coupling, starts=(set_spinning,)
+                )
+            ),
         )
-
-    def run(self, setting: Setting) -> Run:
-        """Prepares a point.
-
-        Raises:
-            StudyError: The method does without the tool's own dynamics.
-        """
-        if setting.method.scheme in (WELD, DIRECT):
-            raise StudyError(f"method '{setting.method.name}' lets no tool turn by itself")
-        return SceneRun(self._stages.for_method(setting), setting, self._judge)
 
     def peer_work(self) -> PeerWork:
         """Describes the body to other engines, with its spin."""
@@ -181,12 +161,6 @@ class SpinningBody:
             verdict=take.environment,
             energy=float(np.max(np.abs(records["kinetic"] - self._energy))),
         )
-        torque = FELT_STIFFNESS * angles(self._reference, records)
+        torque = FELT_STIFFNESS * tool_angles(self._reference, records)
         turned = float(np.sqrt(np.mean(torque**2))) / (LEVER * FORCE_FLOOR)
         return {PANEL.key: replace(score, felt=max(score.felt, turned))}
-
-
-def angles(first: NDArray[np.void], second: NDArray[np.void]) -> NDArray[np.float64]:
-    """Returns the angles between the tools of two records in rad, shape (n,)."""
-    cosine = np.abs(np.sum(first["tool_quaternion"] * second["tool_quaternion"], axis=1))
-    return np.asarray(2 * np.arccos(np.minimum(cosine, 1.0)))

@@ -54,6 +54,23 @@ class Work:
 
 
 @dataclass(frozen=True, slots=True)
+class Growth:
+    """How the time of a tick goes with the size: time ~ size^p.
+
+    Attributes:
+        exponent: p, fitted to the larger sizes; no unit.
+        low: Least p from one of these sizes to the next.
+        high: Largest. Far from ``low``, the growth is no power of the size.
+        start: Smallest size of the fit.
+    """
+
+    exponent: float
+    low: float
+    high: float
+    start: float
+
+
+@dataclass(frozen=True, slots=True)
 class WorkChart:
     """Everything that was measured.
 
@@ -73,27 +90,36 @@ class WorkChart:
         """Returns the variants that a family was measured with."""
         return [variant for variant in VARIANTS if self.of(family, variant)]
 
-    def exponent(self, family: Family, variant: Variant) -> float:
-        """Returns p of time ~ size^p at the family's larger sizes; nan for fewer than two."""
+    def growth(self, family: Family, variant: Variant) -> Growth | None:
+        """Returns how the time goes with the larger sizes; None for fewer than two."""
         points = self.of(family, variant)
-        return growth_exponent(
+        return growth_of(
             np.array([each.size for each in points], dtype=np.float64),
             np.array([each.time.median for each in points]),
         )
 
 
-def growth_exponent(sizes: NDArray[np.float64], times: NDArray[np.float64]) -> float:
+def growth_of(sizes: NDArray[np.float64], times: NDArray[np.float64]) -> Growth | None:
     """Fits time ~ size^p to the sizes from ``LARGE`` of the largest on.
 
+    Args:
+        sizes: > 0, rising, shape (n,).
+        times: In s, > 0, shape (n,).
+
     Returns:
-        p; nan for fewer than two such sizes.
+        None for fewer than two such sizes.
     """
-    if not sizes.size:
-        return float("nan")
-    large = sizes >= LARGE * sizes.max() * (1 - 1e-9)
+    large = sizes >= LARGE * sizes.max(initial=0.0) * (1 - 1e-9)
     if np.count_nonzero(large) < 2:
-        return float("nan")
-    return float(np.polyfit(np.log(sizes[large]), np.log(times[large]), 1)[0])
+        return None
+    size, time = np.log(sizes[large]), np.log(times[large])
+    local = np.diff(time) / np.diff(size)
+    return Growth(
+        exponent=float(np.polyfit(size, time, 1)[0]),
+        low=float(local.min()),
+        high=float(local.max()),
+        start=float(sizes[large][0]),
+    )
 
 
 def measure_work(

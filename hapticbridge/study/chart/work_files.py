@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
-import math
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -15,14 +12,24 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from hapticbridge.check.cost import TICK_SHARE
-from hapticbridge.errors import StudyError
-from hapticbridge.picture import new_figure, write_picture
-from hapticbridge.study.chart.tick_times import USUAL
-from hapticbridge.study.chart.work import Work, WorkChart
+from hapticbridge.picture import new_figure
+from hapticbridge.study.chart.files import PICTURES, csv_text, write_files
+from hapticbridge.study.chart.tick_times import USUAL, VARIANTS
+from hapticbridge.study.chart.work import Growth, Work, WorkChart
 from hapticbridge.study.chart.work_scenes import FAMILIES, Family
 
 RATE = 1000.0
 """Hz that a paragraph asks for."""
+
+WORK_ENDINGS = (*PICTURES, "csv", "json")
+"""Of the files; there is no page."""
+
+HOLDS = f"A rate is held where 99 of 100 ticks take at most {100 * TICK_SHARE:g} % of its period"
+"""What the paragraph means by that."""
+
+ROOM = 15.0
+"""How far the axis of time goes beyond half of a tick, a ratio without unit: the legend stands
+above the curves."""
 
 COLOURS = ("#1a5fb4", "#e08a00", "#2e8b57", "#b3261e")
 
@@ -30,10 +37,15 @@ COLOURS = ("#1a5fb4", "#e08a00", "#2e8b57", "#b3261e")
 def draw_work(chart: WorkChart) -> Figure:
     """Draws the tick's time over the count, a panel for each way to grow."""
     figure = new_figure(8, 7)
-    panels = figure.subplots(2, 2)
+    panels = figure.subplots(2, 2, sharey=True)
     for axes, family in zip(panels.ravel(), FAMILIES, strict=True):
         _draw_family(axes, chart, family)
-    figure.suptitle(f"Processor time of a tick at 1 kHz\n{chart.machine}", fontsize="medium")
+    figure.suptitle(
+        "Processor time of a tick at 1 kHz; n^p (least and largest p between two sizes)\n"
+        f"{chart.machine}",
+        fontsize="medium",
+        parse_math=False,
+    )
     return figure
 
 
@@ -45,8 +57,8 @@ def _draw_family(axes: Axes, chart: WorkChart, family: Family) -> None:
     for variant, colour in zip(chart.variants(family), COLOURS, strict=False):
         points = chart.of(family, variant)
         sizes = [each.size for each in points]
-        exponent = chart.exponent(family, variant)
-        told = variant.name if math.isnan(exponent) else f"{variant.name}: n^{exponent:.2f}"
+        growth = chart.growth(family, variant)
+        told = variant.name if growth is None else f"{variant.name}: {_power(growth)}"
         axes.plot(
             sizes, [1e6 * p.time.median for p in points], "o-", color=colour, ms=4, label=told
         )
@@ -61,7 +73,9 @@ def _draw_family(axes: Axes, chart: WorkChart, family: Family) -> None:
     axes.set_yscale("log")
     axes.set_ylabel("processor time of a tick (µs)", fontsize="small")
     axes.grid(visible=True, alpha=0.3)
-    axes.legend(fontsize="x-small", loc="lower right")
+    low, high = axes.get_ylim()
+    axes.set_ylim(low, max(high, ROOM * 1e6 * TICK_SHARE / RATE))
+    axes.legend(fontsize="xx-small", loc="upper left")
 
 
 def paragraph(chart: WorkChart) -> str:
@@ -77,71 +91,68 @@ def paragraph(chart: WorkChart) -> str:
         said.append(
             f"{family.unit}: {1e6 * points[0].time.median:.3g} µs a tick for {points[0].size}, "
             f"{1e6 * last.time.median:.3g} µs for {last.size}"
-            f"{_grows(chart.exponent(family, USUAL))}; {most}"
+            f"{_grows(chart.growth(family, USUAL))}; {most}"
         )
         said += [_against(chart, family, last)] if len(chart.variants(family)) > 1 else []
-    return ". ".join(each[0].upper() + each[1:] for each in said if each) + "."
+    told = [each[0].upper() + each[1:] for each in said if each]
+    return ". ".join([*told, HOLDS]) + "."
 
 
-def _grows(exponent: float) -> str:
-    return "" if math.isnan(exponent) else f" (growing as n^{exponent:.2f})"
+def _grows(growth: Growth | None) -> str:
+    return "" if growth is None else f" (growing as {_power(growth)} from {growth.start:g} on)"
+
+
+def _power(growth: Growth) -> str:
+    return f"n^{growth.exponent:.2f} ({growth.low:.2f} to {growth.high:.2f})"
 
 
 def _against(chart: WorkChart, family: Family, last: Work) -> str:
     """Says what islands and sleep are worth at the largest size."""
-    found = {
-        variant.name: chart.of(family, variant)[-1].time.median
-        for variant in chart.variants(family)
-    }
-    names = list(found)
-    if len(names) < 4:
+    found = [chart.of(family, variant)[-1] for variant in chart.variants(family)]
+    if len(found) < len(VARIANTS):
         return ""
-    islands, sleep = found[names[1]] / found[names[0]], found[names[2]] / found[names[3]]
+    usual, undivided, bare, asleep = found
     return (
-        f"without islands a tick with {last.size} {family.unit} takes {islands:.2f} times as long, "
-        f"and sleep, which a bridge refuses, would make MuJoCo's step {sleep:.3g} times as fast"
+        f"without islands a tick with {last.size} {family.unit} takes {_ratio(undivided, usual)} "
+        "times as long, and sleep, which a bridge refuses, would make MuJoCo's step "
+        f"{_ratio(bare, asleep)} times as fast"
     )
 
 
-def write_work(chart: WorkChart, folder: Path) -> tuple[dict[str, Path], dict[str, Any]]:
-    """Writes ``work.png``, ``.csv`` and ``.json``.
+def _ratio(slow: Work, fast: Work) -> str:
+    """Returns a ratio of medians with the least and the largest that the rounds leave possible."""
+    least, most = slow.low / fast.high, slow.high / fast.low
+    return f"{slow.time.median / fast.time.median:.3g} ({least:.3g} to {most:.3g})"
 
-    Returns:
-        Paths by ending, and what is in the JSON file.
+
+def write_work(chart: WorkChart, paths: Mapping[str, Path]) -> dict[str, Any]:
+    """Writes picture, table and JSON; returns what is in the JSON file.
+
+    Args:
+        chart: What was measured.
+        paths: By ending, as ``prepared_files`` returned them.
 
     Raises:
         HapticBridgeError: A file cannot be written.
     """
-    paths = {ending: folder / f"work.{ending}" for ending in ("png", "csv", "json")}
     rows = [_row(each) | {"machine": chart.machine} for each in chart.points]
-    table = io.StringIO()
-    writer = csv.DictWriter(table, rows[0], lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    exponents = {
+    growths = {
         family.name: {
-            variant.name: None if math.isnan(p := chart.exponent(family, variant)) else p
+            variant.name: None if growth is None else asdict(growth)
             for variant in chart.variants(family)
+            for growth in (chart.growth(family, variant),)
         }
         for family in FAMILIES
     }
     said = {
         "machine": chart.machine,
         "paragraph": paragraph(chart),
-        "exponents": exponents,
+        "growth": growths,
         "points": rows,
     }
-    texts: Mapping[str, str] = {
-        "csv": table.getvalue(),
-        "json": json.dumps(said, indent=2, allow_nan=False) + "\n",
-    }
-    for ending, text in texts.items():
-        try:
-            paths[ending].write_text(text, encoding="utf-8", newline="")
-        except OSError as error:
-            raise StudyError(f"cannot write '{paths[ending]}': {error.strerror}") from None
-    write_picture(draw_work(chart), paths["png"])
-    return paths, said
+    texts = {"csv": csv_text(rows), "json": json.dumps(said, indent=2, allow_nan=False) + "\n"}
+    write_files(paths, texts, draw_work(chart))
+    return said
 
 
 def _row(each: Work) -> dict[str, object]:

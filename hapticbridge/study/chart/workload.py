@@ -52,7 +52,7 @@ class References(Protocol):
     """What each method converges to."""
 
     def disagreement(self) -> dict[str, float]:
-        """Returns how far each limit lies from the first method's in JND, by method."""
+        """Returns how far each limit lies from the one that most agree on in JND, by method."""
 
 
 class Workload(Protocol):

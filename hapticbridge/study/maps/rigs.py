@@ -10,6 +10,7 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
+from numpy.typing import ArrayLike
 
 from hapticbridge.device import Motion
 from hapticbridge.scene import Scene, load_scene
@@ -28,6 +29,28 @@ def scene_of(mjcf: str) -> Scene:
         path = Path(folder) / "rig.xml"
         path.write_text(mjcf, encoding="utf-8")
         return load_scene(path)
+
+
+def free_body(mass: float, inertia: ArrayLike) -> str:
+    """Returns the MJCF of a free tool in nothing: no gravity, no contact, held by its centre.
+
+    Args:
+        mass: In kg.
+        inertia: Principal moments about its centre in kg m², shape (3,).
+    """
+    moments = " ".join(map(repr, np.asarray(inertia, float).tolist()))
+    return f"""
+<mujoco>
+  <option gravity="0 0 0"/>
+  <worldbody>
+    <body name="tool">
+      <freejoint/>
+      <inertial pos="0 0 0" mass="{mass!r}" diaginertia="{moments}"/>
+      <geom type="sphere" size="0.01" mass="0" contype="0" conaffinity="0"/>
+      <site name="grip"/>
+    </body>
+  </worldbody>
+</mujoco>"""
 
 
 def free_tool_and_wall() -> Scene:

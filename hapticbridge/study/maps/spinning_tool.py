@@ -20,7 +20,7 @@ from hapticbridge.ledger import Ledger
 from hapticbridge.rendering import METHODS, prepare
 from hapticbridge.scene import Scene
 from hapticbridge.study.maps.bisection import largest_stable
-from hapticbridge.study.maps.rigs import loop_in, scene_of
+from hapticbridge.study.maps.rigs import free_body, loop_in, scene_of
 from hapticbridge.study.maps.tumbling import INERTIA, MIDDLE, OBLIQUE, PERIOD, TICKS
 from hapticbridge.tick import SAMPLE_DTYPE, TICK_DTYPE
 from hapticbridge.workspace import run_parameters
@@ -40,19 +40,6 @@ diverged beyond doubt, and before MuJoCo warns of numbers that are not finite.""
 
 CHUNK = 2
 """Ticks after which that is looked at; five beyond it, MuJoCo would warn."""
-
-_TOOL = f"""
-<mujoco>
-  <option gravity="0 0 0"/>
-  <worldbody>
-    <body name="tool">
-      <freejoint/>
-      <inertial pos="0 0 0" mass="{MASS!r}" diaginertia="{" ".join(map(repr, INERTIA.tolist()))}"/>
-      <geom type="sphere" size="0.01" mass="0" contype="0" conaffinity="0"/>
-      <site name="grip"/>
-    </body>
-  </worldbody>
-</mujoco>"""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -158,7 +145,7 @@ def speed_of_cut(method: str, stiffness: float) -> float:
 
 def spinning_scene() -> Scene:
     """Loads the tool, floating free of gravity."""
-    return scene_of(_TOOL)
+    return scene_of(free_body(MASS, INERTIA))
 
 
 def _set_spin(scene: Scene, omega: NDArray[np.float64]) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
@@ -13,6 +12,7 @@ from typing import Any
 from matplotlib.figure import Figure
 
 from hapticbridge.errors import StudyError
+from hapticbridge.jsonable import jsonable
 from hapticbridge.picture import write_picture
 from hapticbridge.study.sweep import sweep
 from hapticbridge.study.table import Table
@@ -153,23 +153,12 @@ def run_map(
         "paragraph": finding.paragraph,
         "boundary": finding.boundary,
     }
-    text = json.dumps(_known(said), indent=2, allow_nan=False)
+    text = json.dumps(jsonable(said), indent=2, allow_nan=False)
     try:
         files["json"].write_text(text + "\n", encoding="utf-8")
     except OSError as error:
         raise StudyError(f"cannot write '{files['json']}': {error.strerror}") from None
     return MapFiles(files["png"], files[form], files["json"], finding, failed)
-
-
-def _known(value: Any) -> Any:
-    """Returns a value for JSON, which knows neither NaN nor infinity: they become None."""
-    if isinstance(value, Mapping):
-        return {key: _known(inner) for key, inner in value.items()}
-    if isinstance(value, list | tuple):
-        return [_known(inner) for inner in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
 
 
 def _check_writable(path: Path) -> None:

@@ -1,0 +1,21 @@
+"""Facts as JSON can hold them: it knows neither NaN nor infinity."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+
+def jsonable(value: Any) -> Any:
+    """Returns a value with None in place of every number in it that is not finite.
+
+    Args:
+        value: Numbers, text, and mappings, lists and tuples of them, as deep as they go; tuples
+            come back as lists.
+    """
+    if isinstance(value, Mapping):
+        return {key: jsonable(inner) for key, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [jsonable(inner) for inner in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
