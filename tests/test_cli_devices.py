@@ -138,14 +138,12 @@ def test_the_rules_name_every_product_once_and_sort_before_the_seat(call: Called
     assert RULES_FILE in out
 
 
-def test_a_usb_device_is_listed_by_the_kernels_word_where_libusb_is_missing(
-    bus: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_usb_device_is_listed_by_the_kernels_word_where_libusb_is_missing(bus: Path) -> None:
     plug(bus, "1-1", "0403:cb48", name="FALCON HAPTIC", serial="FT000001")
     (device,) = plugged_devices()
     assert (device.family, device.name, device.serial) == ("falcon", "FALCON HAPTIC", "FT000001")
     assert device.problem is not None
-    assert "libusb" in device.problem
+    assert device.problem.startswith("no permission to open /dev/bus/usb/001/003")
 
 
 def test_the_bus_is_read_without_opening_anything(

@@ -136,17 +136,17 @@ def test_lost_frames_are_counted_and_the_newest_pose_is_used() -> None:
     model.lose = set(range(model.frames + 3, model.frames + 6))
     flags = [read(device, seam)[0] for _ in range(10)]
     assert flags.count(STALE) == 3
-    assert (device.lost, device.damaged) == (3, 0)
+    assert (device.states.lost, device.states.damaged) == (3, 0)
 
 
 def test_a_sequence_that_wraps_loses_nothing() -> None:
     device, model, seam = still()
     model._sequence = 65534
     read(device, seam)
-    jump = device.lost
+    jump = device.states.lost
     for _ in range(5):
         read(device, seam)
-    assert device.lost == jump
+    assert device.states.lost == jump
 
 
 def test_a_frame_with_a_wrong_crc_is_dropped_counted_and_missed() -> None:
@@ -155,10 +155,10 @@ def test_a_frame_with_a_wrong_crc_is_dropped_counted_and_missed() -> None:
     model.motion = (0.5,) * 12
     model.damage = {model.frames + 1}
     flag, sample = read(device, seam)
-    assert (flag, device.damaged) == (STALE, 1)
+    assert (flag, device.states.damaged) == (STALE, 1)
     assert sample["position"][0] == 0.0
     flag, sample = read(device, seam)
-    assert (flag, device.lost, sample["position"][0]) == (0, 1, 0.5)
+    assert (flag, device.states.lost, sample["position"][0]) == (0, 1, 0.5)
 
 
 def test_a_repeated_frame_is_nothing_new() -> None:
@@ -171,7 +171,7 @@ def test_a_repeated_frame_is_nothing_new() -> None:
     assert device.read(np.zeros(1, SAMPLE_DTYPE)) == 0
     model.push(report)
     assert device.read(np.zeros(1, SAMPLE_DTYPE)) == STALE
-    assert (device.repeated, device.lost) == (2, 0)
+    assert (device.states.repeated, device.states.lost) == (2, 0)
 
 
 def test_the_newest_of_several_frames_is_taken() -> None:
@@ -180,7 +180,7 @@ def test_the_newest_of_several_frames_is_taken() -> None:
     seam.advance(seam.now + 3 * PERIOD)
     model.motion = (0.2,) * 12
     assert read(device, seam)[1]["position"][0] == np.float32(0.2)
-    assert device.lost == 0
+    assert device.states.lost == 0
 
 
 def test_after_a_pause_the_pose_is_a_fresh_one_though_the_queue_is_full_of_old_ones() -> None:
@@ -194,7 +194,9 @@ def test_after_a_pause_the_pose_is_a_fresh_one_though_the_queue_is_full_of_old_o
         assert device.read(sample) == 0
         assert sample[0]["position"][0] == np.float32(0.2)
         assert seam.now - before <= 2.1e-3
-    assert device.lost == pytest.approx(2000 - 63, abs=2)  # of the stall; the first is no loss
+    assert device.states.lost == pytest.approx(
+        2000 - 63, abs=2
+    )  # of the stall; the first is no loss
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 1e31])
@@ -271,8 +273,8 @@ def test_the_watchdog_of_the_device_lets_go_20_ms_after_the_last_force_frame() -
     seam.advance(seam.now + 0.0002)
     assert not model.wrench.any()
     read(device, seam)
-    assert device._state is not None
-    assert device._state.status & 2
+    assert device.states.newest is not None
+    assert device.states.newest.status & 2
 
 
 def test_closing_switches_the_motors_off() -> None:
@@ -300,7 +302,7 @@ def test_arbitrary_reports_never_make_a_pose_that_is_none(reports: list[bytes]) 
         model.push(report)
     sample = np.zeros(1, SAMPLE_DTYPE)
     assert device.read(sample) == STALE
-    assert device.damaged == len(reports)
+    assert device.states.damaged == len(reports)
     assert np.isfinite(sample["position"]).all()
     assert np.linalg.norm(sample["quaternion"]) == pytest.approx(1.0, abs=1e-12)
 

@@ -98,9 +98,9 @@ def test_lost_and_damaged_frames_are_flagged_and_the_run_stays_passive(tmp_path:
         bridge.run(0.5)
     ticks = hb.read_recording(tmp_path / "run.mcap").ticks
     stale = int(np.count_nonzero(ticks["flags"] & int(TickFlag.STALE_SAMPLE)))
-    assert device.lost == len(model.lose | model.damage)
-    assert device.damaged == len(model.damage - model.lose)
-    assert stale >= device.lost
+    assert device.states.lost == len(model.lose | model.damage)
+    assert device.states.damaged == len(model.damage - model.lose)
+    assert stale >= device.states.lost
     assert hb.audit(tmp_path / "run.mcap").verdict == "passive"
 
 

@@ -81,7 +81,7 @@ class Plugged:
 
     Attributes:
         family: The family's name.
-        name: What the device calls itself, else the model's name.
+        name: What the device calls itself, else the model's name; printable, and so is the serial.
         serial: Its serial number, empty where it has none or does not tell.
         path: Where it is opened: a device node.
         vendor: Its numbers.
@@ -99,9 +99,18 @@ class Plugged:
     transport: str
     problem: str | None
 
+    def __post_init__(self) -> None:
+        for field in ("name", "serial"):
+            object.__setattr__(self, field, printable(getattr(self, field)))
+
     def __str__(self) -> str:
         serial = f", serial {self.serial}" if self.serial else ""
         return f"{self.name} ({self.vendor:04x}:{self.product:04x}{serial})"
+
+
+def printable(text: str) -> str:
+    """Returns text that a device sent, without codes that a terminal would obey."""
+    return "".join(letter if letter.isprintable() else "�" for letter in text).strip()
 
 
 def permission_problem(path: str) -> str:

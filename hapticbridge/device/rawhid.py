@@ -18,10 +18,10 @@ from hapticbridge.device.rawhid_frame import (
     LONGEST_WATCHDOG_MS,
     State,
     Status,
-    decoded,
     force_frame,
 )
 from hapticbridge.device.rawhid_sheet import CHANGES, asked, data_sheet, reports
+from hapticbridge.device.rawhid_stream import StateStream
 from hapticbridge.device.transport_hid import HidLink, Link
 from hapticbridge.errors import DeviceError, DeviceLost
 from hapticbridge.pose import canonical, quaternion_exp
@@ -57,9 +57,7 @@ class RawHidDevice:
 
     Attributes:
         info: Its data sheet.
-        lost: State frames that never came, by their sequence, since the first read.
-        damaged: Reports that were no valid frame.
-        repeated: State frames that came twice.
+        states: The newest state, and how many were lost or damaged on the way.
 
     Raises:
         DeviceError: It does not speak the protocol, another version of it, or its data sheet is
@@ -69,11 +67,10 @@ class RawHidDevice:
     def __init__(self, link: Link, name: str, changes: Mapping[str, Any] | None = None) -> None:
         self._link, self._name = link, name
         self._sequence = 0
-        self.lost = self.damaged = self.repeated = 0
+        self.states = StateStream(name)
         self.info = data_sheet(name, *asked(link, name), dict(changes or {}))
         self._mask = np.array([float(axis in self.info.axes) for axis in AXES])
         self._sample = np.zeros(1, SAMPLE_DTYPE)
-        self._state: State | None = None
         self._period, self._silent_ticks = 0.0, 0
         self._watchdog_ms = LONGEST_WATCHDOG_MS
         self._is_open, self._has_begun = True, False
@@ -93,20 +90,20 @@ class RawHidDevice:
         self._period = checked_period(period)
         watchdog = max(SHORTEST_WATCHDOG, WATCHDOG_PERIODS * period)
         self._watchdog_ms = min(math.ceil(1e3 * watchdog), LONGEST_WATCHDOG_MS)
-        self.lost = self.damaged = self.repeated = 0
-        self._silent_ticks, self._state, self._has_begun = 0, None, False
+        self._silent_ticks, self._has_begun = 0, False
+        self.states = states = StateStream(self._name)
         self._link.take()
         for report in reports(self._link, FIRST_STATE_MS):
-            if self._is_newest(report):
+            if states.takes(report):
                 break
-        if self._state is None:
+        if states.newest is None:
             raise DeviceError(f"{self._name} sends no state frames")
-        if self._state.status & Status.NOT_READY:
+        if states.newest.status & Status.NOT_READY:
             raise DeviceError(
                 f"{self._name} does not know its pose yet: home or calibrate it, as its builder "
                 "says, and start again"
             )
-        self._fill()
+        self._fill(states.newest)
         return self._sample.copy()
 
     def read(self, sample: NDArray[np.void]) -> int:
@@ -123,13 +120,14 @@ class RawHidDevice:
             DeviceError: It has not been started, has restarted, reports a fault, or a number that
                 is not finite.
         """
-        if self._state is None:
+        states = self.states
+        if states.newest is None:
             raise DeviceError(f"{self._name} is read before it was started")
         is_new = False
         for report in self._link.take():
-            is_new |= self._is_newest(report)
+            is_new |= states.takes(report)
         if not self._has_begun:  # between the start and the loop nobody took what was sent
-            self._has_begun, self.lost = True, 0
+            self._has_begun, states.lost = True, 0
         if not is_new:
             self._silent_ticks += 1
             silence = self._silent_ticks * self._period
@@ -138,9 +136,9 @@ class RawHidDevice:
             sample[0] = self._sample[0]
             return int(TickFlag.STALE_SAMPLE)
         self._silent_ticks = 0
-        if self._state.status & (Status.FAULT | Status.NOT_READY):
+        if states.newest.status & (Status.FAULT | Status.NOT_READY):
             raise DeviceError(f"{self._name} reports a fault of its own and gives no force")
-        self._fill()
+        self._fill(states.newest)
         sample[0] = self._sample[0]
         return 0
 
@@ -174,45 +172,25 @@ class RawHidDevice:
     @property
     def velocity(self) -> NDArray[np.float64]:
         """Velocity in m/s and angular velocity in rad/s as last reported, shape (6,); 0 before."""
-        numbers = (0.0,) * 12 if self._state is None else self._state.numbers
+        state = self.states.newest
+        numbers = (0.0,) * 12 if state is None else state.numbers
         moving: NDArray[np.float64] = np.array(numbers[6:]) * self._mask
         return moving
 
     @property
     def on_the_way(self) -> int:
         """How many force frames the device had not obeyed yet when it sent its newest state."""
-        return 0 if self._state is None else (self._sequence - self._state.echo) & 0xFFFF
+        state = self.states.newest
+        return 0 if state is None else (self._sequence - state.echo) & 0xFFFF
 
-    def _is_newest(self, report: bytes) -> bool:
-        """Takes a report if it is a state frame that is newer than the last one."""
-        state = decoded(report)
-        if not isinstance(state, State):
-            self.damaged += state is None
-            return False
-        last, self._state = self._state, state
-        if last is not None:
-            if state.sequence == last.sequence and state.time_us == last.time_us:
-                self.repeated += 1
-                return False
-            # the clock wraps after 71.6 min; half of that backwards is taken for backwards
-            if (state.time_us - last.time_us) & 0x80000000:
-                raise DeviceError(
-                    f"{self._name} has restarted in mid-run; its pose may count from elsewhere"
-                )
-            self.lost += (state.sequence - last.sequence - 1) & 0xFFFF
-        if not state.is_finite or max(map(abs, state.numbers)) > LARGEST:
-            raise DeviceError(f"{self._name} reports a number that is not finite")
-        return True
-
-    def _fill(self) -> None:
-        """Makes a sample of the newest state; axes that the device lacks stay where they are."""
-        assert self._state is not None
-        pose = self._mask * self._state.numbers[:6]
+    def _fill(self, state: State) -> None:
+        """Makes a sample of a state; axes that the device lacks stay where they are."""
+        pose = self._mask * state.numbers[:6]
         sample = self._sample[0]
         sample["position"] = pose[:3]
         x, y, z = pose[3:].tolist()
         sample["quaternion"] = canonical(quaternion_exp((x, y, z)))
-        sample["buttons"] = self._state.buttons
+        sample["buttons"] = state.buttons
 
     def _next(self) -> int:
         self._sequence = (self._sequence + 1) & 0xFFFF

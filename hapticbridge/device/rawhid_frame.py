@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hapticbridge.device.base import AXES
+from hapticbridge.device.plugged import printable
 
 FRAME_BYTES = 64
 """What a full-speed interrupt transfer carries, and Teensy's raw HID report holds."""
@@ -238,6 +239,5 @@ def decoded(frame: bytes) -> State | Numbers | str | None:
     if kind == Kind.SHEET and page == NUMBERS_PAGE:
         return Numbers(*_NUMBERS.unpack_from(frame)[5:])
     if kind == Kind.SHEET and page == NAME_PAGE:
-        text = _NAME.unpack_from(frame)[6].split(b"\0")[0].decode(errors="replace")
-        return "".join(letter if letter.isprintable() else "�" for letter in text).strip()
+        return printable(_NAME.unpack_from(frame)[6].split(b"\0")[0].decode(errors="replace"))
     return None

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from emulated.hid_seam import HidSeam
 from numpy.typing import NDArray
 
+from emulated.hid_seam import HidSeam
 from hapticbridge.device import Device
 
 
