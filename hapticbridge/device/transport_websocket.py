@@ -92,7 +92,7 @@ class WebSocketLink:
             raise DeviceError(f"{name} does not run: nobody answers at {host}:{port}") from None
         try:
             own.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            connection = client.connect(
+            opening = client.connect(
                 f"ws://{host}:{port}",
                 sock=own,
                 compression=None,
@@ -102,6 +102,7 @@ class WebSocketLink:
                 max_size=LARGEST_MESSAGE,
                 max_queue=None,
             )
+            connection = opening.__enter__()  # what newer versions ask for; close() is the exit
         except Exception as error:
             own.close()
             raise DeviceError(
