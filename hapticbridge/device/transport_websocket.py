@@ -89,7 +89,10 @@ class WebSocketLink:
             # our own socket, because a proxy that the environment names must not come in between
             own = socket.create_connection((host, port), OPEN_TIMEOUT)
         except (OSError, OverflowError, UnicodeError):
-            raise DeviceError(f"{name} does not run: nobody answers at {host}:{port}") from None
+            raise DeviceError(
+                f"{name} does not run: nobody answers at {host}:{port}; start it, or say where it "
+                "listens with service=HOST:PORT"
+            ) from None
         try:
             own.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             opening = client.connect(

@@ -46,6 +46,7 @@ class Stub:
 
     Attributes:
         now: Time in s that the device is at.
+        begin: Time in s at which the hand sets out on its path.
     """
 
     def __init__(self, kind: int = OMEGA3, path: Motion | None = None) -> None:
@@ -56,6 +57,7 @@ class Stub:
         self.dhd = Dhd(file)
         self.library = ctypes.CDLL(file)
         self.library.stub_force.restype = c_double
+        self.begin = 0.0
         self._path = None if path is None else path.relative()
         self.call("reset", kind)
         self.call("call", CALL)
@@ -79,7 +81,9 @@ class Stub:
     def advance(self, now: float) -> None:
         if self._path is not None:
             table = self._path.table
-            place = [float(np.interp(now, table[:, 0], table[:, 1 + i])) for i in range(3)]
+            place = [
+                float(np.interp(now - self.begin, table[:, 0], table[:, 1 + i])) for i in range(3)
+            ]
             self.call("target", *place)
         self.call("advance", float(now))
 
