@@ -245,11 +245,13 @@ def test_a_spec_names_the_library_the_device_and_its_numbers() -> None:
     assert stub.call("gravity") == 0
     device.close()
     stub.call("count", 2)
-    with pytest.raises(DeviceError, match="2 devices .*choose one with serial=, one of '0', '1'"):
+    with pytest.raises(DeviceError, match=r"2 devices .*choose one with serial=, one of '0', '1'"):
         open_device(f"forcedimension:library={stub.file}")
     open_device(f"forcedimension:library={stub.file},serial=1").close()
     stub.call("count", 0)
-    with pytest.raises(DeviceError, match="is plugged in .looked for a device of Force Dimension"):
+    with pytest.raises(
+        DeviceError, match=r"is plugged in \(looked for a device of Force Dimension"
+    ):
         open_device(f"forcedimension:library={stub.file}")
     for option, words in (
         ("gravity=2", "gravity = 2"),

@@ -75,12 +75,17 @@ def test_whatever_breaks_trips_with_every_row_kept(
 ) -> None:
     stub = guided()
     device = stub.opened(numbers=NUMBERS)
+
+    def breaks(tick: int) -> None:
+        if tick == 150:
+            stub.call(hook, value)
+
     recording = tmp_path / "run.mcap"
     with (
         pytest.raises(SafetyTrip, match=words),
         hb.Bridge("peg_in_hole", device, clock=DrivingClock(stub), recording=recording) as bridge,
     ):
-        bridge.run(1.0, on_tick=lambda tick: tick == 150 and stub.call(hook, value) and None)
+        bridge.run(1.0, on_tick=breaks)
     np.testing.assert_array_equal(hb.read_recording(recording).ticks["tick"], np.arange(150))
     stub.advance(stub.now + 0.05)  # where the library failed, its watchdog does it
     assert not stub.force().any()

@@ -263,7 +263,7 @@ def test_a_service_without_devices_says_so() -> None:
     bench = Bench()
     bench.service.devices.clear()
     with pytest.raises(
-        DeviceError, match="no device .haply. is plugged in .looked for a device of the Inverse"
+        DeviceError, match=r"no device 'haply' is plugged in \(looked for a device of the Inverse"
     ):
         bench.opened()
 
