@@ -54,7 +54,7 @@ def test_an_omega_has_three_axes_and_obeys_forces_on_them() -> None:
     np.testing.assert_allclose(stub.force(), [1.0, -0.5, 0.3, 0, 0, 0])
     device.close()
     device.close()
-    assert not stub.force().any()
+    assert not stub.command().any()
     assert stub.call("enabled") == 0
     assert stub.call("closed") == 1
 

@@ -103,6 +103,22 @@ def test_a_service_slower_than_the_loop_gets_the_newest_force_and_no_queue() -> 
     assert device._under_way <= MOST_UNDER_WAY
 
 
+def test_of_the_forces_that_wait_for_a_slow_service_the_newest_goes_first() -> None:
+    bench = Bench(work=2.7e-3)
+    device = bench.opened()
+    device.start(PERIOD)
+    sample, wrench, answers = np.zeros(1, SAMPLE_DTYPE), np.zeros(6), 0
+    for k in range(100):
+        bench.time.advance(bench.time.now + PERIOD)
+        if device.read(sample) == 0 and k > 10:
+            (entry,) = json.loads(bench.link.last_sent)["inverse3"]
+            assert entry["commands"]["set_cursor_force"]["vector"]["x"] == 0.01 * (k - 1)
+            answers += 1
+        wrench[0] = 0.01 * k
+        device.write(wrench)
+    assert answers > 20
+
+
 @pytest.mark.parametrize(("travel", "work"), [(1e-4, 5e-5), (4e-4, 1e-4), (8e-4, 5e-4)])
 def test_rate_and_delay_are_measured(travel: float, work: float) -> None:
     device = Bench(travel=travel, work=work).opened()
@@ -167,6 +183,9 @@ def test_a_loop_that_was_away_finds_the_service_alive() -> None:
     ticks(bench, device, 5)
     bench.time.advance(bench.time.now + 0.5)
     assert ticks(bench, device, 5) == [0] * 5
+    device.start(PERIOD)
+    bench.time.advance(bench.time.now + 0.5)  # before the loop's first question
+    assert ticks(bench, device, 5) == [int(TickFlag.STALE_SAMPLE), 0, 0, 0, 0]
 
 
 @pytest.mark.parametrize(
@@ -181,6 +200,12 @@ def test_a_loop_that_was_away_finds_the_service_alive() -> None:
         (
             '{"inverse3": [{"device_id": "049D", "state": {"cursor_position": '
             '{"x": NaN, "y": 0, "z": 0}}}]}',
+            DeviceError,
+            "reports no position",
+        ),
+        (
+            '{"inverse3": [{"device_id": "049D", "state": {"cursor_position": '
+            '{"x": 0, "y": 0, "z": NaN}}}]}',
             DeviceError,
             "reports no position",
         ),

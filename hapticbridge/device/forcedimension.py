@@ -8,14 +8,11 @@ from dataclasses import replace
 from hapticbridge.device import usb_search
 from hapticbridge.device.base import DATA_SHEET_UNITS, checked_number
 from hapticbridge.device.dhd_library import Dhd, located
-from hapticbridge.device.forcedimension_device import ForceDimensionDevice
+from hapticbridge.device.forcedimension_device import MEASURED, ForceDimensionDevice
 from hapticbridge.device.plugged import Family, Plugged, Tell, UsbId, chosen
 from hapticbridge.errors import DeviceError
 
-_NUMBERS = (
-    "mass", "damping", "rotational_inertia", "rotational_damping", "friction", "resolution",
-    "force_limit", "torque_limit",
-)  # fmt: skip
+_NUMBERS = (*MEASURED, "force_limit", "torque_limit")
 
 
 def open_forcedimension(options: Mapping[str, object], tell: Tell) -> ForceDimensionDevice:

@@ -40,6 +40,11 @@ SHORTEST_WATCHDOG, WATCHDOG_PERIODS = 0.02, 10
 """The watchdog asked for is ten periods of the loop, but not less than 20 ms, for an ordinary
 kernel's stalls; the library takes no more than 32 ms."""
 
+MEASURED = (
+    "mass", "damping", "rotational_inertia", "rotational_damping", "friction", "resolution",
+)  # fmt: skip
+"""Numbers of the data sheet that nobody knows but who measured them."""
+
 FARTHEST = 10.0
 """In m: a position beyond is none."""
 
@@ -109,12 +114,7 @@ class ForceDimensionDevice:
             self.info = DeviceInfo(
                 name=self._name,
                 axes=AXES if self._turns else AXES[:3],
-                mass=known.get("mass"),
-                damping=known.get("damping"),
-                rotational_inertia=known.get("rotational_inertia"),
-                rotational_damping=known.get("rotational_damping"),
-                friction=known.get("friction"),
-                resolution=known.get("resolution"),
+                **{name: known.get(name) for name in MEASURED},
                 force_limit=limits[0],
                 torque_limit=limits[1],
                 speed_limit=SPEED_LIMIT,

@@ -47,6 +47,7 @@ STUB void stub_spoil(double value) { s.spoiled = value; }
 STUB void stub_buttons(int mask) { s.buttons = mask; }
 STUB void stub_watchdog(int has) { s.has_watchdog = has; }
 STUB double stub_force(int axis) { return s.enabled ? s.command[axis] : 0.0; }
+STUB double stub_command(int axis) { return s.command[axis]; }
 STUB int stub_gravity(void) { return s.gravity; }
 STUB int stub_watchdog_steps(void) { return s.watchdog; }
 STUB int stub_enabled(void) { return s.enabled; }

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from hapticbridge.device import Motion
 from hapticbridge.device.dhd_library import Dhd
@@ -56,7 +57,7 @@ class Stub:
         self.file = file
         self.dhd = Dhd(file)
         self.library = ctypes.CDLL(file)
-        self.library.stub_force.restype = c_double
+        self.library.stub_force.restype = self.library.stub_command.restype = c_double
         self.begin = 0.0
         self._path = None if path is None else path.relative()
         self.call("reset", kind)
@@ -67,8 +68,13 @@ class Stub:
         given = [c_int(a) if isinstance(a, int) else c_double(a) for a in arguments]
         return int(getattr(self.library, f"stub_{name}")(*given))
 
-    def force(self) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+    def force(self) -> NDArray[np.float64]:
+        """Returns what the motors give: nothing while they are off."""
         return np.array([self.library.stub_force(axis) for axis in range(6)])
+
+    def command(self) -> NDArray[np.float64]:
+        """Returns what they were told last."""
+        return np.array([self.library.stub_command(axis) for axis in range(6)])
 
     @property
     def now(self) -> float:

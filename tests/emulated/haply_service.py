@@ -157,13 +157,16 @@ class VirtualLink:
         work: Time in s that the service takes for each message, one after the other.
 
     Attributes:
-        now: Time in s of the service and of the connection.
+        clock: Time in s of the service and of the connection.
+        last_sent: The last message.
+        is_dropped: Whether the connection has dropped; ``is_silent``: whether answers get lost.
     """
 
     def __init__(self, service: HaplyService, travel: float = 1e-4, work: float = 5e-5) -> None:
         self.service = service
         self.clock = 0.0
         self.is_dropped = self.is_closed = self.is_silent = False
+        self.last_sent = ""
         self._travel, self._work, self._free = travel, work, 0.0
         self._there: deque[tuple[float, str]] = deque()
         self._back: deque[tuple[float, str]] = deque([(0.0, service.inventory())])
@@ -186,6 +189,7 @@ class VirtualLink:
     def send(self, message: str) -> None:
         if self.is_dropped:
             raise DeviceLost("the connection has dropped")
+        self.last_sent = message
         self._there.append((self.clock + self._travel, message))
 
     def take(self) -> list[str]:
