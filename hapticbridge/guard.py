@@ -73,12 +73,12 @@ def limits_for(info: DeviceInfo, limits: Limits | None) -> Limits:
 def refuse_simulated_time(info: DeviceInfo, clock: Clock) -> None:
     """Refuses a clock that runs ahead of a device that lives in real time.
 
-    That is a device with motors, and one that follows a hand at a rate of its own and without end.
+    That is a device with motors, and one that follows a hand without end, some time after it.
 
     Raises:
         DeviceError: It is so.
     """
-    follows = info.is_prescribed and info.rate is not None and info.duration is None
+    follows = info.is_prescribed and info.delay != 0.0 and info.duration is None
     if (info.is_real or follows) and isinstance(clock, SimulatedClock):
         raise DeviceError(
             f"the device '{info.name}' moves in real time, so the loop cannot run as fast as it "

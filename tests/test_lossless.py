@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import mujoco
 import numpy as np
 import pytest
-from kernel_runs import IDENTITY, Array
+from kernel_runs import Array
+from lossless_runs import ARM, LOSSLESS, SPUN, T, circling, distance, led, scene_of, tapping
 from rendering_runs import FREE_MASS
 from scipy.spatial.transform import Rotation
 
@@ -16,108 +16,11 @@ from hapticbridge.certificate import default_coupling
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import SimulatedDevice
 from hapticbridge.errors import HapticBridgeError
-from hapticbridge.kernel.parameters import RunParameters
-from hapticbridge.kernel.state import Binding
-from hapticbridge.kernel.step import OK, after_step, before_step, simulate
-from hapticbridge.ledger import Ledger
-from hapticbridge.passivity import WorstHand
-from hapticbridge.rendering import METHODS, prepare
-from hapticbridge.scene import Scene, load_scene
+from hapticbridge.passivity import SampledLoop, WorstHand
+from hapticbridge.rendering import METHODS
+from hapticbridge.scene import load_scene
 from hapticbridge.study.closed_loop import ClosedLoop
-from hapticbridge.tick import SAMPLE_DTYPE, TICK_DTYPE, TickFlag
-
-LOSSLESS = METHODS["lossless"]
-T = 1e-3
-
-SPUN = """
-<mujoco>
-  <option gravity="0 0 0"/>
-  <worldbody>
-    <body><freejoint/>
-      <inertial pos="0.01 0 0.02" mass="0.2" diaginertia="1e-4 2e-4 3e-4"/>
-      <site name="grip" pos="0.03 0 0"/>
-    </body>
-  </worldbody>
-  <keyframe><key name="home" qvel="0 0 0 30 0 40"/></keyframe>
-</mujoco>"""
-"""A free tool held off its centre of mass, turning at 50 rad/s about no principal axis."""
-
-ARM = """
-<mujoco>
-  <option gravity="0 0 {gravity}"/>
-  <default><geom type="capsule" size="0.01" contype="0" conaffinity="0"/></default>
-  <worldbody>
-    <body><joint axis="0 0 1" stiffness="{spring}"/><geom fromto="0 0 0 0.2 0 0" mass="0.2"/>
-      <body pos="0.2 0 0"><joint axis="0 1 0"/><geom fromto="0 0 0 0.2 0 0" mass="0.2"/>
-        <body pos="0.2 0 0"><joint axis="0 1 0"/><geom fromto="0 0 0 0.1 0 0" mass="0.1"/>
-          <site name="grip" pos="0.1 0 0"/>
-        </body>
-      </body>
-    </body>
-  </worldbody>
-  <keyframe><key name="home" qpos="0.1 -0.5 1"/></keyframe>
-</mujoco>"""
-
-
-def scene_of(xml: str, folder: Path) -> Scene:
-    path = folder / "scene.xml"
-    path.write_text(xml, encoding="utf-8")
-    return load_scene(path)
-
-
-def bound(scene: Scene, method: str, asked: Coupling, period: float) -> Binding:
-    """Returns a kernel bound to a scene at its start, rendering what is asked for."""
-    used = METHODS[method].used(asked, period)
-    prepare(scene, asked, period, 1, METHODS[method], warns=False)
-    parameters = RunParameters(
-        grip=scene.grip,
-        period=period,
-        substeps=1,
-        coupling=used,
-        force_limit=1e30,
-        torque_limit=1e30,
-        ramp_ticks=0,
-        device_origin=IDENTITY,
-        handle_origin=scene.grip_pose(),
-        device_start=IDENTITY,
-        scheme=METHODS[method].scheme,
-    )
-    return Binding(scene.model, scene.data, parameters)
-
-
-def led(
-    scene: Scene,
-    method: str,
-    asked: Coupling,
-    path: Array,
-    period: float,
-    turn: Array | None = None,
-) -> tuple[np.ndarray, Ledger]:
-    """Leads a scene through handle positions (n, 3) and quaternions, one per period."""
-    samples = np.zeros(len(path), SAMPLE_DTYPE)
-    samples["position"] = path
-    samples["quaternion"] = (1.0, 0.0, 0.0, 0.0) if turn is None else turn
-    binding = bound(scene, method, asked, period)
-    rows = np.zeros(len(path), TICK_DTYPE)
-    assert simulate(binding.state, samples, binding.row, rows) == len(path)
-    return rows, Ledger.of(binding.state)
-
-
-def circling(period: float, frequency: float, duration: float = 1.0) -> Array:
-    t = period * np.arange(1, round(duration / period) + 1)
-    w = 2 * np.pi * frequency * t
-    return np.column_stack([0.02 * np.sin(w), 0.02 * (1 - np.cos(w)), 0.01 * np.sin(w)])
-
-
-def distance(rows: np.ndarray, reference: np.ndarray) -> tuple[float, float]:
-    """Returns RMS distances in m and rad from a reference of more ticks."""
-    every = len(reference) // len(rows)
-    same = reference[every - 1 :: every]
-    away = np.linalg.norm(rows["tool_position"] - same["tool_position"], axis=1)
-    turned = Rotation.from_quat(rows["tool_quaternion"], scalar_first=True)
-    turned *= Rotation.from_quat(same["tool_quaternion"], scalar_first=True).inv()
-    return float(np.sqrt(np.mean(away**2))), float(np.sqrt(np.mean(turned.magnitude() ** 2)))
-
+from hapticbridge.tick import TickFlag
 
 # --- accuracy -------------------------------------------------------------------------------------
 
@@ -246,14 +149,52 @@ def test_worst_hand_needs_half_kt_and_the_damping_used(
     assert outcome.is_stable == (share > 1)
 
 
+FLOOR = """
+<mujoco>
+  <option cone="elliptic" gravity="0 0 -9.81"/>
+  <default><geom condim="1" solref="0.002 1" solimp="0.99 0.999 0.0001"/></default>
+  <worldbody>
+    <geom type="plane" size="1 1 0.1"/>
+    <body pos="0 0 0.01"><joint type="slide" axis="0 0 1"/>
+      <geom size="0.01" mass="0.01"/><site name="grip"/></body>
+  </worldbody>
+</mujoco>"""
+"""Ten grams that lie on a floor; free, they would need 7 to 9 % less under the implicit form."""
+
+
+def stays(loop: ClosedLoop, asked: Coupling, method: str, hand: WorstHand, axis: int) -> bool:
+    knock = np.zeros(6)
+    knock[axis] = -1e-6  # on the floor its force stays below the weight
+    device = SimulatedDevice(damping=hand.damping, hand=hand)
+    return loop.run(device, asked, METHODS[method], ticks=2000, knock=knock).is_stable
+
+
+@pytest.mark.parametrize("method", ["implicit", "compensated", "lossless"])
+def test_tool_on_a_floor_needs_half_kt_and_the_damping_used(method: str, tmp_path: Path) -> None:
+    asked = Coupling(1000.0, 2.0, 1.0, 0.002)
+    used = METHODS[method].used(asked, T)
+    loop = ClosedLoop(scene_of(FLOOR, tmp_path))
+    for share in (0.98, 1.01):
+        hand = WorstHand(share * (0.5 * used.stiffness * T + used.damping), np.pi / T, T)
+        assert stays(loop, asked, method, hand, 2) == (share > 1)
+
+
+@pytest.mark.parametrize("mass", [0.01, 0.1])
+def test_free_tool_behind_the_compensated_coupling_needs_what_its_spectrum_says(
+    mass: float, tmp_path: Path
+) -> None:
+    asked = Coupling(1000.0, 2.0, 1.0, 0.002)
+    theory = SampledLoop(METHODS["compensated"].used(asked, T), T, mass)
+    worst = theory.worst_frequency()
+    needed = float(theory.damping_spectrum(worst))
+    assert needed < 0.5 * 1.0 + 1.0  # K T/2 + B', which a wall needs
+    loop = ClosedLoop(scene_of(FREE_MASS.format(mass=mass), tmp_path))
+    for share in (0.97, 1.03):
+        hand = WorstHand(share * needed, worst, T, complex(theory.response(worst)))
+        assert stays(loop, asked, "compensated", hand, 0) == (share > 1)
+
+
 # --- contact --------------------------------------------------------------------------------------
-
-
-def tapping(period: float, frequency: float = 2.0) -> Array:
-    t = period * np.arange(1, round(2.0 / period) + 1)
-    path = np.zeros((t.size, 3))
-    path[:, 0] = 0.008 * (1 - np.cos(2 * np.pi * frequency * t))
-    return path
 
 
 def test_tool_changes_over_before_it_touches_and_back_after() -> None:
@@ -275,7 +216,7 @@ def test_tool_changes_over_before_it_touches_and_back_after() -> None:
     assert step <= others
 
 
-def test_touch_and_go_errs_less_than_implicit() -> None:
+def test_touch_and_go_errs_by_less_than_a_third_of_implicit() -> None:
     scene = load_scene("virtual_wall")
     asked = Coupling(2400.0, 1.7, 1.0, 0.002)
     errors = {}
@@ -283,23 +224,7 @@ def test_touch_and_go_errs_less_than_implicit() -> None:
         fine, _ = led(scene, method, asked, tapping(T / 32, 4.0), T / 32)
         rows, _ = led(scene, method, asked, tapping(T, 4.0), T)
         errors[method] = distance(rows, fine)[0]
-    assert errors["lossless"] < 0.4 * errors["implicit"]
-
-
-def test_without_the_change_over_contact_creates_more_energy() -> None:
-    scene = load_scene("virtual_wall")
-    samples = np.zeros(2000, SAMPLE_DTYPE)
-    samples["position"], samples["quaternion"][:, 0] = tapping(T, 4.0), 1.0
-    share = {}
-    for is_seen in (True, False):
-        binding = bound(scene, "lossless", Coupling(6000.0, 3.5, 1.0, 0.002), T)
-        if not is_seen:  # nothing of the scene belongs to the tool's tree, so nothing is near it
-            binding._owned["geom_in_tree"][:] = 0
-        rows = np.zeros(2000, TICK_DTYPE)
-        assert simulate(binding.state, samples, binding.row, rows) == 2000
-        share[is_seen] = Ledger.of(binding.state).slack_share
-    assert share[True] == 0
-    assert share[False] > 0.02
+    assert errors["lossless"] < errors["implicit"] / 3
 
 
 def test_joint_friction_and_constraints_keep_a_tool_implicit() -> None:
@@ -316,25 +241,7 @@ def replace_damping(asked: Coupling) -> Coupling:
     return METHODS["compensated"].rendered(LOSSLESS.used(asked, T), T)
 
 
-# --- ports, records, audit ------------------------------------------------------------------------
-
-
-def test_work_of_an_applied_force_is_metered_and_balanced(tmp_path: Path) -> None:
-    scene = scene_of(FREE_MASS.format(mass=0.1), tmp_path)
-    binding = bound(scene, "lossless", Coupling(1000.0, 5.0, 1.0, 0.005), T)
-    sample = np.zeros(1, SAMPLE_DTYPE)
-    sample["quaternion"][:, 0] = 1.0
-    state, row = binding.state, binding.row
-    for k in range(1000):
-        if k in (50, 200):  # set, and set again to another value, as a user's input would
-            scene.data.qfrc_applied[0] = 2.0 if k == 50 else -1.0
-        assert before_step(state, sample, row, 0, T) == OK
-        mujoco.mj_step(scene.model, scene.data)
-        assert after_step(state, row, 0) == OK
-        assert abs(float(row["environment_energy"][0])) < 1e-5
-    # at rest the spring holds the force: 1 N at 1000 N/m
-    assert float(row["tool_position"][0, 0]) == pytest.approx(-1e-3, rel=1e-3)
-    assert float(row["external_work"][0]) == pytest.approx(2 * 2e-3 + 1.0 * 3e-3, rel=2e-2)
+# --- records, audit -------------------------------------------------------------------------------
 
 
 def test_recording_is_simulated_again_bit_for_bit_and_its_law_is_checked(tmp_path: Path) -> None:

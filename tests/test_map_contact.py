@@ -20,9 +20,10 @@ from hapticbridge.errors import StudyError
 from hapticbridge.rendering import METHODS
 from hapticbridge.scene import load_scene
 from hapticbridge.scene.contact_rule import SUGGESTED
-from hapticbridge.study.maps import contact, contact_search
+from hapticbridge.study.maps import contact, contact_methods, contact_search
 from hapticbridge.study.maps.contact import CONTACT, evaluate, points
 from hapticbridge.study.maps.contact_agreement import agreement, exceptions
+from hapticbridge.study.maps.contact_methods import COMPARED, RIGS, cases_of, method_runs
 from hapticbridge.study.maps.contact_picture import PANELS
 from hapticbridge.study.maps.contact_rigs import (
     ContactRun,
@@ -150,6 +151,20 @@ def test_the_audit_of_a_bridge_names_the_tick_at_which_the_map_sees_a_contact_cr
         assert mapped.first_active == -1
 
 
+@pytest.mark.parametrize("rig", RIGS)
+def test_methods_meet_the_same_hands_and_come_and_go(rig: str) -> None:
+    runs = {
+        method: list(method_runs(rig, method, [(1000.0, 0.1, 0.0, hand) for hand in (0, 1)]))
+        for method in COMPARED
+    }
+    for one, other in zip(runs["lossless"], runs["compensated"], strict=True):
+        assert one.depth > 0
+        # the same contact, but not the same approach to it
+        assert one.peak_force == pytest.approx(other.peak_force, rel=0.2)
+        assert one.peak_force != other.peak_force
+    assert len(cases_of(rig, 0.1)) == {"taps": 40, "mouth": 80}[rig]
+
+
 def of(environment: str, depth: float, *, created: float = 0.0, first: int = -1) -> ContactRun:
     return ContactRun(environment, created, 10 * created, first, 1e3 * depth, depth)
 
@@ -210,6 +225,11 @@ def search_row(name: str, mass: float, *verdicts: str, depth: float = 1e-4) -> R
     return point | {"treatment": name, "mass": mass}, counted(*verdicts, depth=depth)
 
 
+def method_row(rig: str, method: str, *verdicts: str) -> Row:
+    point = grid_row(rig, method, 0.0, (0.0, 0.0), "strict")[0]
+    return point | {"mass": 0.1}, counted(*verdicts)
+
+
 SETTINGS = ((0.5, 8.0), (2.0, 2.0), (1.0, 1.0))
 """τ = 60.8, 15.2 and 1.9 steps: strict, for heavy tools alone and none by the rule."""
 
@@ -226,6 +246,9 @@ WRITTEN = [
     search_row("damped: 0.0005 8", 0.3, "strict", "strict", depth=5e-4),
     search_row("MuJoCo's default 0.02 1", 0.03, "strict", depth=2e-3),
     search_row("4 substeps, 0.002 1", 0.03, "strict", depth=1e-5),
+    *(method_row("taps", method, "strict", "strict") for method in COMPARED),
+    method_row("mouth", "implicit", "strict", "active"),
+    method_row("mouth", "lossless", "strict", "within slack"),
 ]
 
 
@@ -253,6 +276,12 @@ def test_boundary_and_paragraph_follow_from_a_made_up_table() -> None:
     assert "least deep is 'damped: 0.0005 8', median 0.40 mm and at most 1.50 mm, 4 times" in said
     assert "takes 60.8 ms to come back" in said
     assert "with substeps '4 substeps, 0.002 1' is too, at 0.01 mm" in said
+    assert "tapping on a wall, as shipped: 'implicit' is strict in 2 of 2 runs, active in 0" in said
+    assert (
+        "the hole, as shipped: 'implicit' is strict in 1 of 2 runs, active in 1, makes 10" in said
+    )
+    assert "; 'lossless' is strict in 1 of 2 runs, active in 0, makes 0 mJ at most." in said
+    assert len(finding.boundary["methods"]) == 5
     assert "strict in 3 of 5 runs and uses up to 0.75 of the slack, at 0.30 and at most" in said
 
 
@@ -266,17 +295,19 @@ def test_a_rule_that_does_not_hold_is_said_not_to() -> None:
     assert "1 of 2 that it has within the slack for 30 g stayed there, and 2 of 2 for" in said
 
 
-@pytest.mark.parametrize("rig", ["peg", "search", "wall"])
+@pytest.mark.parametrize("rig", ["peg", "search", "wall", "methods"])
 def test_a_rig_that_fails_is_named_and_the_others_are_read(rig: str) -> None:
-    rows: list[Row] = [(at, "E" if at["rig"] == rig else got) for at, got in WRITTEN]
+    rigs = RIGS if rig == "methods" else (rig,)
+    rows: list[Row] = [(at, "E" if at["rig"] in rigs else got) for at, got in WRITTEN]
     finding = CONTACT.read(written(rows))
     said = finding.paragraph
     assert (f"On the peg's grid {MISSING}." in said) == (rig == "peg")
     assert (f"In the search {MISSING}." in said) == (rig == "search")
     assert (f"On a wall under 'implicitfast' {MISSING}." in said) == (rig == "wall")
+    assert (f"Of the methods {MISSING}." in said) == (rig == "methods")
     assert "nan" not in said
     texts = [MISSING in [text.get_text() for text in axes.texts] for axes in finding.figure.axes]
-    assert sum(texts) == {"peg": 2, "search": 1, "wall": 4}[rig]
+    assert sum(texts) == {"peg": 2, "search": 1, "wall": 4, "methods": 1}[rig]
 
 
 def as_if(point: Point) -> dict[str, float | int]:
@@ -310,7 +341,14 @@ def test_map_at_reduced_resolution_agrees_with_the_rule(
     monkeypatch.setattr(contact, "peg_runs", few)
     monkeypatch.setattr(contact_search, "peg_runs", few)
     names = (SHIPPED, "damped: 0.0005 8")
-    chosen = [p for p in points(1) if p["rig"] != "search" or p["treatment"] in names]
+    monkeypatch.setattr(contact_methods, "HANDS", 1)
+    chosen = [
+        p
+        for p in points(1)
+        if p["rig"] not in ("search", *RIGS)
+        or p["treatment"] in names
+        or (p["rig"] in RIGS and p["mass"] == 0.1)
+    ]
     files = run_map(
         replace(CONTACT, points=lambda _: chosen), tmp_path, executor=ThreadPoolExecutor(2)
     )
@@ -319,6 +357,11 @@ def test_map_at_reduced_resolution_agrees_with_the_rule(
     rule = files.finding.boundary["rule"]
     assert rule["strict"]["strict"] == rule["strict"]["cells"] > 0
     assert rule["abrupt"]["strict"] < rule["abrupt"]["cells"]
+    methods = files.finding.boundary["methods"]
+    assert [(one["rig"], one["method"]) for one in methods] == [
+        (rig, method) for rig in RIGS for method in COMPARED
+    ]
+    assert [one["runs"] for one in methods] == [2] * 3 + [4] * 3
     shipped, damped = files.finding.boundary["search"]
     assert shipped["active"] > 0
     assert damped["strict"] == damped["runs"]

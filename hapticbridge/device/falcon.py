@@ -7,33 +7,35 @@ arrives; so from a sample to the force that answers it as many whole ticks pass 
 come back: two at 1 kHz, because the bridge holds a reply for up to 1 ms.
 
 The device's frame: x to the right, y away from the user, z up, in m from the middle of the
-workspace, 0.125 m before the base. Which of its own axes point right and up, the signs of motors
-and encoders, and the bits of lights and homing are as libnifalcon's source has them: no real
-Falcon has moved under this code yet.
+workspace, 0.125 m before the base. Axes, signs and bits are as libnifalcon's source has them: no
+real Falcon has moved under this code yet.
 """
 
 from __future__ import annotations
 
 import array
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.device.base import DeviceInfo, checked_number, checked_period
-from hapticbridge.device.falcon_boot import Link, ask, read_firmware
+from hapticbridge.device.falcon_boot import READ_FROM, WRITE_TO, Link, ask, read_firmware
 from hapticbridge.device.falcon_motion import (
     BELIEVED,
+    FORCE_LIMIT,
     MOTION_DTYPE,
     PLACE,
     SPEED_LIMIT,
+    UNFELT_TORQUE_LIMIT,
     believe,
     command,
     resolution,
 )
 from hapticbridge.device.falcon_packets import SIZE, ReplyStream, Request
-from hapticbridge.device.falcon_start import SILENCE, bring_up, home, silent
+from hapticbridge.device.falcon_start import LONGEST_PERIOD, SILENCE, bring_up, home, silent
 from hapticbridge.device.falcon_timing import measured_timing
 from hapticbridge.device.hex_log import HexLog
 from hapticbridge.device.plugged import Family, Tell, UsbId, chosen, tell_nobody
@@ -42,17 +44,6 @@ from hapticbridge.device.usb_search import find
 from hapticbridge.errors import DeviceError, DeviceLost
 from hapticbridge.jit import direct
 from hapticbridge.tick import SAMPLE_DTYPE, TickFlag
-
-FORCE_LIMIT = 8.0
-"""In N: what CHAI3D lets applications ask of a Falcon; the maker's figure is above 8.9 N."""
-
-LONGEST_PERIOD = 0.02
-"""In s. It is asked once a tick; slower, two lost replies would already count as silence."""
-
-READ_FROM, WRITE_TO = 0x81, 0x02
-"""Addresses of its bulk endpoints."""
-
-_NOTHING_RECORDED = 0.5  # N m, of torques that are recorded and have no motor: the usual limit
 
 
 class FalconDevice:
@@ -75,7 +66,6 @@ class FalconDevice:
 
     Raises:
         DeviceError: It has no program and none was named, does not take it, or was not homed.
-        DeviceLost: It is gone.
     """
 
     def __init__(
@@ -106,7 +96,7 @@ class FalconDevice:
                 friction=friction,
                 resolution=resolution(),
                 force_limit=FORCE_LIMIT,
-                torque_limit=_NOTHING_RECORDED,
+                torque_limit=UNFELT_TORQUE_LIMIT,
                 speed_limit=SPEED_LIMIT,
                 rate=rate,
                 delay=delay,
@@ -131,8 +121,7 @@ class FalconDevice:
             period: The loop's period in s, at most 0.02.
 
         Raises:
-            DeviceError: The period is out of range, or the encoders say what no grip can.
-            DeviceLost: It is gone or silent.
+            DeviceError: The period is out of range, no grip has its encoders, or it is gone.
         """
         if checked_period(period) > LONGEST_PERIOD:
             raise DeviceError(
@@ -169,8 +158,7 @@ class FalconDevice:
             0, or ``TickFlag.STALE_SAMPLE`` where the sample repeats the last one.
 
         Raises:
-            DeviceError: ``start`` has not been called.
-            DeviceLost: It is gone, or gave nothing to believe for 50 ms.
+            DeviceError: It was not started, is gone, or gave nothing to believe for 50 ms.
         """
         if not self._is_started:
             raise DeviceError(f"{self._name} is read before it was started")
@@ -224,30 +212,30 @@ def open_falcon(options: Mapping[str, object], tell: Tell, backend: Any = None) 
     """Finds a Falcon and opens it.
 
     Args:
-        options: ``serial``, ``firmware`` (a file), ``mass``, ``damping``, ``friction`` (numbers or
-            their text), ``log`` (a file for the bytes).
+        options: Those of ``FAMILY``: names of files and numbers in SI units.
         tell: Told what the user should know or do.
         backend: A pyusb backend; None takes libusb.
 
     Raises:
-        DeviceError: There is none, it cannot be opened, or an option is not valid.
-        DeviceLost: It is gone.
+        DeviceError: There is none, it cannot be opened, is lost, or an option is not valid.
     """
     numbers = {
         name: checked_number(name, options[name], unit, is_positive=name == "mass")
         for name, unit in _NUMBERS.items()
         if options.get(name) is not None
     }
-    firmware, log = (
-        None if options.get(name) is None else str(options[name]) for name in ("firmware", "log")
-    )
-    if firmware is not None:
+    files = {name: str(options[name]) for name in ("firmware", "log") if options.get(name)}
+    firmware = files.get("firmware")
+    if firmware:
         read_firmware(firmware)  # a wrong name is said before anything moves
     plugged = chosen(FAMILY, find(FAMILY, backend), options.get("serial"))
+    log = HexLog(files.get("log"))
     link = UsbLink.open(
-        plugged, FAMILY, read_from=READ_FROM, write_to=WRITE_TO, backend=backend, log=HexLog(log)
+        plugged, FAMILY, read_from=READ_FROM, write_to=WRITE_TO, backend=backend, log=log
     )
-    return FalconDevice(link, name=str(plugged), firmware=firmware, tell=tell, **numbers)
+    device = FalconDevice(link, name=str(plugged), firmware=firmware, tell=tell, **numbers)
+    device.info = replace(device.info, serial=plugged.serial)
+    return device
 
 
 _NUMBERS = {"mass": "kg", "damping": "N s/m", "friction": "N"}

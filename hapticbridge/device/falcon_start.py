@@ -17,6 +17,9 @@ from hapticbridge.errors import DeviceError, DeviceLost
 SILENCE = 0.05
 """In s: a Falcon that gave no reply that can be believed for so long is lost. Fifty replies."""
 
+LONGEST_PERIOD = 0.02
+"""In s. It is asked once a tick; slower, two lost replies would already count as silence."""
+
 HOMING_TIME = 60.0
 """In s: how long the user has to move the grip through its range."""
 

@@ -21,6 +21,7 @@ from hapticbridge.kernel.native import (
     mj_rne,
     mj_solve_m,
 )
+from hapticbridge.kernel.ports import add_body_wrenches
 from hapticbridge.pose import Vector
 
 LARGEST_SHARE_BACK = 1e-3
@@ -62,14 +63,27 @@ def carry(state: NDArray[np.void], force: Vector, torque: Vector) -> None:
 
 
 @compiled
+def write_external(state: NDArray[np.void], result: int) -> None:
+    """Writes what the user applies, to joints and to bodies, as generalised forces."""
+    s = state[0]
+    users, external = floats(s.qfrc_applied, s.nv), floats(result, s.nv)
+    for i in range(s.nv):
+        external[i] = users[i]
+    add_body_wrenches(state, result)
+
+
+@compiled
 def write_half_step(state: NDArray[np.void]) -> None:
-    """Writes (T/2) M⁻¹ [2 Jᵀr − c(q, u) + p] of the tool's tree; needs ``carry`` and the bias."""
+    """Writes (T/2) M⁻¹ [2 Jᵀr − c(q, u) + p] of the tool's tree.
+
+    Needs ``carry``, the bias and ``write_external``.
+    """
     s = state[0]
     carried, bias = floats(s.generalised, s.nv), floats(s.bias_at_u, s.nv)
-    passive, users = floats(s.qfrc_passive, s.nv), floats(s.qfrc_applied, s.nv)
+    passive, external = floats(s.qfrc_passive, s.nv), floats(s.external, s.nv)
     kick, half = floats(s.kept, s.nv), floats(s.half_step, s.nv)
     for i in range(s.nv):
-        kick[i] = 2.0 * carried[i] - bias[i] + users[i]
+        kick[i] = 2.0 * carried[i] - bias[i] + external[i]
         if s.has_passive:
             kick[i] += passive[i]
     mj_solve_m(s.model, s.data, s.half_step, s.kept, np.int32(1))
@@ -100,6 +114,7 @@ def settle(state: NDArray[np.void], work: float) -> None:
     """
     s = state[0]
     write_bias(state, s.qvel, s.bias_at_u)
+    write_external(state, s.external)
     if s.has_passive:
         mj_passive(s.model, s.data)
     write_half_step(state)

@@ -66,6 +66,7 @@ _POINTERS = (
     "dof_in_tree",
     "last_written",
     "carried_force",
+    "external",
     "velocity",
     "half_step",
     "bias_at_u",

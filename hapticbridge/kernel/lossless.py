@@ -11,9 +11,11 @@ passive and applied forces. In the step after it
 
     qfrc_applied = J_kᵀ r_k + c(q_k, u_k) − c(q_k, v_k)
 
-puts the bias at v where MuJoCo takes it at u. In contact half of a wrench that is a step late would
-create energy, so the tool changes over to the implicit form, with the same B', before it touches,
-and back after it has been free for a while; both ways keep S.
+puts the bias at v where MuJoCo takes it at u. What the user applies enters as the mean of now and
+before. In contact half of a wrench that is a step late would create energy, so the tool changes
+over to the implicit form before it touches, and back after it has been free for a while; both ways
+keep S. B' stays the same, so that one device condition holds on both sides: with more in contact, a
+device that bears only the less would be thrown off for ever (``passivity.compensation``).
 
 The trees that the tool does not belong to are MuJoCo's alone: for them v = u.
 """
@@ -30,10 +32,11 @@ from hapticbridge.kernel.balanced_velocity import (
     keep_carried,
     settle,
     write_bias,
+    write_external,
     write_half_step,
 )
 from hapticbridge.kernel.midpoint import midpoint_torque, twist_in_tool
-from hapticbridge.kernel.native import floats, mj_factor_m, mj_passive
+from hapticbridge.kernel.native import floats, ints, mj_factor_m, mj_passive
 from hapticbridge.pose import Quaternion, Vector, conjugate, dot, rotated, scaled, subtract
 
 HOLD_TICKS = 5
@@ -49,7 +52,9 @@ _GAINS = 10  # doubles that an actuator has for its gain, and for its bias (mjNG
 def apply_carried(state: NDArray[np.void]) -> None:
     """Before the step: applies what is carried over, beside what the user applies.
 
-    The user writes the same array. What is not what was written here last is the user's.
+    The user writes the same array. What is not what was written here last is the user's. Where
+    that changes from p to p', a lossless step takes ½(p + p'): then v gains T M⁻¹ p', and the work
+    h p'·u of the external port is exact. With all of p', a force that varies would create energy.
     """
     s = state[0]
     applied, users = floats(s.qfrc_written, s.nv), floats(s.qfrc_applied, s.nv)
@@ -58,6 +63,13 @@ def apply_carried(state: NDArray[np.void]) -> None:
         if applied[i] != last[i]:
             users[i] = applied[i]
         applied[i] = users[i] + own[i]
+    if s.is_midpoint:
+        write_external(state, s.kept)
+        before, after = floats(s.external, s.nv), floats(s.kept, s.nv)
+        in_tree = ints(s.dof_in_tree, s.nv)
+        for i in range(s.nv):
+            applied[i] += 0.5 * in_tree[i] * (before[i] - after[i])
+    for i in range(s.nv):
         last[i] = applied[i]
 
 
@@ -100,6 +112,7 @@ def _enter(state: NDArray[np.void], force: Vector, torque: Vector) -> None:
     u, v, half = floats(s.qvel, s.nv), floats(s.velocity, s.nv), floats(s.half_step, s.nv)
     for i in range(s.nv):
         v[i] = u[i]
+    write_external(state, s.external)
     if s.has_passive:
         mj_passive(s.model, s.data)
     for _ in range(2):

@@ -82,6 +82,36 @@ def _actuator_work(state: NDArray[np.void]) -> float:
 
 
 @compiled
+def add_body_wrenches(state: NDArray[np.void], result: int, clears: bool = False) -> bool:
+    """Adds ``xfrc_applied``, as generalised forces at the positions as they are, to an address.
+
+    Args:
+        state: The bound state.
+        result: Address of a number per degree of freedom.
+        clears: Whether to clear these first, where a body is loaded.
+
+    Returns:
+        Whether a body is loaded; else nothing was written.
+    """
+    s = state[0]
+    wrenches = floats(s.xfrc_applied, 6 * s.nbody)
+    found = False
+    for body in range(1, s.nbody):
+        is_loaded = False
+        for i in range(6 * body, 6 * body + 6):
+            is_loaded = is_loaded or wrenches[i] != 0.0
+        if is_loaded:
+            if clears and not found:
+                floats(result, s.nv)[:] = 0.0
+            found = True
+            force = s.xfrc_applied + 48 * body
+            mj_apply_ft(
+                s.model, s.data, force, force + 24, s.xipos + 24 * body, np.int32(body), result
+            )
+    return found
+
+
+@compiled
 def _applied_work(state: NDArray[np.void]) -> float:
     """Work of ``qfrc_applied``, ``xfrc_applied`` and passive gravity compensation."""
     s = state[0]
@@ -97,21 +127,11 @@ def _applied_work(state: NDArray[np.void]) -> float:
         )
         for i in range(nv):
             power += compensation[i] * is_passive[i] * qvel[i]
-    wrenches = floats(s.xfrc_applied, 6 * s.nbody)
-    for body in range(1, s.nbody):
-        is_loaded = False
-        for i in range(6 * body, 6 * body + 6):
-            is_loaded = is_loaded or wrenches[i] != 0.0
-        if is_loaded:
-            # positions are still those of the step's start, where MuJoCo applied the wrench
-            generalised = floats(s.scratch, nv)
-            generalised[:] = 0.0
-            force = s.xfrc_applied + 48 * body
-            mj_apply_ft(
-                s.model, s.data, force, force + 24, s.xipos + 24 * body, np.int32(body), s.scratch
-            )
-            for i in range(nv):
-                power += generalised[i] * qvel[i]
+    # positions are still those of the step's start, where MuJoCo applied the wrenches
+    if add_body_wrenches(state, s.scratch, clears=True):
+        generalised = floats(s.scratch, nv)
+        for i in range(nv):
+            power += generalised[i] * qvel[i]
     return float(s.timestep * power)
 
 

@@ -116,14 +116,18 @@ class Binding:
     def _bind_lossless(self, model: mujoco.MjModel) -> None:
         state, nv = self.state, max(model.nv, 1)
         body = int(model.site_bodyid[int(state["grip_site_id"][0])])
-        tree = tree_of_tool(model, body)
+        first = int(state["coupling_actuator_id"][0])
+        tree = tree_of_tool(model, body, range(first, first + len(COUPLING_ACTUATORS)))
         owned: dict[str, NDArray[np.generic]] = {
             "geom_in_tree": np.ascontiguousarray(tree.geoms, dtype=np.int32),
             "joint_in_tree": np.ascontiguousarray(tree.joints, dtype=np.int32),
             "dof_in_tree": np.ascontiguousarray(tree.dofs, dtype=np.int32),
             "wrench_buffer": np.zeros(6),
         }
-        names = "last_written carried_force velocity half_step bias_at_u bias_at_v generalised kept"
+        names = (
+            "last_written carried_force external velocity half_step bias_at_u bias_at_v "
+            "generalised kept"
+        )
         owned |= {name: np.zeros(nv) for name in names.split()}
         # what the user applies is kept apart from what is written for MuJoCo
         users = np.zeros(nv)

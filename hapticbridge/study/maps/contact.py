@@ -1,4 +1,4 @@
-"""Map ``contact``: which settings of MuJoCo's contact create energy, and one that never did."""
+"""Map ``contact``: which settings of MuJoCo's contact, and which methods, create energy."""
 
 from __future__ import annotations
 
@@ -8,6 +8,13 @@ from typing import Any
 import numpy as np
 
 from hapticbridge.study.maps.contact_agreement import agreement, exceptions, verdicts
+from hapticbridge.study.maps.contact_methods import (
+    RIGS,
+    compared,
+    method_points,
+    methods_found,
+    of_methods,
+)
 from hapticbridge.study.maps.contact_picture import DAMPING_RATIO, PANELS, STEPS, draw
 from hapticbridge.study.maps.contact_rigs import peg_runs, summary, until_active, wall_runs
 from hapticbridge.study.maps.contact_search import SEARCH_MASSES, search, searched
@@ -18,12 +25,13 @@ from hapticbridge.study.table import Table
 
 
 def points(count: int) -> Sequence[Point]:
-    """Returns timeconst by dampratio for every panel and K, and the search, ``count`` in all."""
+    """Returns timeconst by dampratio a panel and K, search and methods, ``count`` in all."""
     searches: list[Point] = [
         _point("search", name, "implicit", mass=mass)
         for name in TREATMENTS
         for mass in SEARCH_MASSES
     ]
+    searches += [_point(rig, "", method, mass=mass) for rig, method, mass in method_points()]
     side = max(2, round((max(0, count - len(searches)) / 6) ** 0.5))
     grid = [
         _point(rig, "", method, stiffness=k, steps=float(s), dampratio=float(ratio))
@@ -47,6 +55,8 @@ def evaluate(point: Point) -> Mapping[str, float | int]:
     """
     if point["rig"] == "search":
         return search(str(point["treatment"]), float(point["mass"]))
+    if point["rig"] in RIGS:
+        return compared(str(point["rig"]), str(point["method"]), float(point["mass"]))
     solref = float(point["steps"]) * PERIOD, float(point["dampratio"])
     treatment = Treatment(solref, method=str(point["method"]))
     runs = wall_runs if point["rig"] == "wall" else peg_runs
@@ -54,19 +64,21 @@ def evaluate(point: Point) -> Mapping[str, float | int]:
 
 
 def read(table: Table) -> Finding:
-    """Draws verdicts over timeconst and dampratio with the rule on top, and the search below.
+    """Draws verdicts over timeconst and dampratio with the rule on top, methods and search below.
 
     Raises:
         StudyError: No point was computed at all.
     """
     table = computed(table, "contact")
     found = [searched(table, name) for name in TREATMENTS if np.any(table["treatment"] == name)]
+    methods = methods_found(table)
     rule, worse = agreement(table), exceptions(table)
     said = [_of_rule(rule, len(worse)), _of_fast(table), _of_search(found), _of_shipped(found)]
+    said.append(of_methods(methods) or f"Of the methods {MISSING}.")
     return Finding(
-        draw(table, found),
+        draw(table, found, methods),
         " ".join(filter(None, said)),
-        {"period": PERIOD, "rule": rule, "search": found, "exceptions": worse},
+        {"period": PERIOD, "rule": rule, "search": found, "methods": methods, "exceptions": worse},
     )
 
 
@@ -132,7 +144,7 @@ CONTACT = StabilityMap(
     name="contact",
     about="settings of MuJoCo's contact: energy that they create on a wall and in a hole, and the "
     "search for one that creates none",
-    default_points=315,
+    default_points=333,
     points=points,
     evaluate=evaluate,
     read=read,

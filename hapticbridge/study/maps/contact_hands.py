@@ -1,4 +1,4 @@
-"""The hands of the map ``contact``: one that taps, a recorded one, and random ones that push."""
+"""The hands of the map ``contact``: ones that tap, a recorded one, and random ones that push."""
 
 from __future__ import annotations
 
@@ -26,6 +26,18 @@ def tapping(frequency: float) -> Motion:
     path = np.zeros((time.size, 3))
     path[:, 0] = 0.008 * (1 - np.cos(2 * np.pi * frequency * time))
     return Motion(time, path)
+
+
+@cache
+def random_taps(seed: int) -> tuple[Motion, Hand]:
+    """Returns a random hand that taps: 1 to 6 Hz, 0 to 6 mm behind the wall's face, 1 s."""
+    random = np.random.default_rng(seed)
+    time = np.linspace(0.0, 1.0, 301)
+    path = np.zeros((time.size, 3))
+    size, frequency = random.uniform(5e-3, 8e-3), random.uniform(1.0, 6.0)
+    path[:, 0] = size * (1 - np.cos(2 * np.pi * frequency * time))
+    hand = Hand(stiffness=random.uniform(800, 3000), damping=random.uniform(5, 30))
+    return Motion(time, path), hand
 
 
 @cache

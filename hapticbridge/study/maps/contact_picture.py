@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from hapticbridge.picture import new_figure
 from hapticbridge.scene.contact_rule import contact_numbers
 from hapticbridge.study.maps.contact_agreement import LINES, is_in, verdicts
+from hapticbridge.study.maps.contact_methods import HANDS, draw_methods
 from hapticbridge.study.maps.contact_search import draw_search
 from hapticbridge.study.maps.contact_treatments import PERIOD, SHIPPED_SOLIMP
 from hapticbridge.study.maps.verdicts import COLOURS, VERDICTS, draw_verdicts
@@ -35,22 +36,28 @@ PANELS = (
 )
 """Rig, method, K in N/m and title."""
 
+BESIDE = (1.0, 1.22)
+"""Width of bars and of the columns beside them, as a ratio."""
+
 CONTOUR = 160
 """Points along each axis from which the rule's lines are drawn; more make them smoother."""
 
 Array = NDArray[np.float64]
 
 
-def draw(table: Table, found: Sequence[Mapping[str, Any]]) -> Figure:
-    """Draws verdicts over timeconst and dampratio with the rule on top, and the search below.
+def draw(
+    table: Table, found: Sequence[Mapping[str, Any]], methods: Sequence[Mapping[str, Any]]
+) -> Figure:
+    """Draws verdicts over timeconst and dampratio with the rule on top, methods and search below.
 
     Args:
         table: Of the map.
         found: What each treatment of the search came to.
+        methods: What each method came to on each rig.
     """
-    figure = new_figure(8, 13)
-    halves = figure.subfigures(2, 1, squeeze=False, height_ratios=(1, 1.05))
-    above, below = halves[:, 0]
+    figure = new_figure(8, 16)
+    parts = figure.subfigures(3, 1, squeeze=False, height_ratios=(1, 0.4, 1.05))
+    above, between, below = parts[:, 0]
     rows = above.add_gridspec(2, 3)
     for column, (rig, method, stiffness, title) in enumerate(PANELS):
         for row, k in enumerate(stiffness):
@@ -61,7 +68,13 @@ def draw(table: Table, found: Sequence[Mapping[str, Any]]) -> Figure:
                 axes.set_xlabel("timeconst / T")
             if column == 0:
                 axes.set_ylabel("dampratio")
-    draw_search(below.add_subplot(below.add_gridspec(1, 2, width_ratios=(1, 1.22))[0]), found)
+    draw_methods(between.add_subplot(between.add_gridspec(1, 2, width_ratios=BESIDE)[0]), methods)
+    between.suptitle(
+        f"The methods on the contact as shipped, {HANDS} hands each: taps on a wall, and in and "
+        "out of the hole's mouth;\ntools and K as below, B = 1.25 K T felt",
+        fontsize="small",
+    )
+    draw_search(below.add_subplot(below.add_gridspec(1, 2, width_ratios=BESIDE)[0]), found)
     below.suptitle(
         "The search on the peg: 30, 100 and 300 g, K = 1000 and 6000 N/m, friction 0 and 0.42,\n"
         "one recorded and two random hands",

@@ -109,9 +109,11 @@ def wall_runs(
     coupling = Coupling(stiffness, WALL_DAMPING, 1.0, 1e-3)  # the rail lets nothing turn
     for mass, hand in cases:
         treatment.apply(loop.scene.model, 0.0)
-        _set_mass(loop, "tool", mass)
-        device = _device(coupling, tapping((3.0, 6.0)[hand]), Hand(stiffness=2000.0, damping=25.0))
-        records, run = _run(loop, device, coupling, treatment, 1000)
+        set_mass(loop, "tool", mass)
+        device = firm_device(
+            coupling, tapping((3.0, 6.0)[hand]), Hand(stiffness=2000.0, damping=25.0)
+        )
+        records, run = run_once(loop, device, coupling, treatment, 1000)
         # the face is 10 mm from where the tool's surface starts
         depth = max(0.0, float(records["tool_position"][:, 0].max()) - 0.01)
         yield replace(run, depth=depth)
@@ -126,10 +128,10 @@ def peg_runs(
     loop = loop_in("peg_in_hole", "contact", start_in_hole)
     for mass, friction, hand in cases:
         treatment.apply(loop.scene.model, friction)
-        _set_mass(loop, "peg", mass)
+        set_mass(loop, "peg", mass)
         device, coupling = peg_device(stiffness, hand)
-        records, run = _run(loop, device, coupling, treatment, ticks_of(device))
-        yield replace(run, depth=_depth(loop, records))
+        records, run = run_once(loop, device, coupling, treatment, ticks_of(device))
+        yield replace(run, depth=deepest(loop, records))
 
 
 def peg_device(stiffness: float, hand: int) -> tuple[SimulatedDevice, Coupling]:
@@ -137,7 +139,7 @@ def peg_device(stiffness: float, hand: int) -> tuple[SimulatedDevice, Coupling]:
     per_k, rotational_damping = PEG_ROTATION
     coupling = Coupling(stiffness, PEG_DAMPING, per_k * stiffness, rotational_damping)
     path, holder = recorded() if hand == 0 else random_push(hand)
-    return _device(coupling, path, holder), coupling
+    return firm_device(coupling, path, holder), coupling
 
 
 def ticks_of(device: SimulatedDevice) -> int:
@@ -145,13 +147,14 @@ def ticks_of(device: SimulatedDevice) -> int:
     return int((device.info.duration or 0.0) / PERIOD)
 
 
-def _run(
+def run_once(
     loop: ClosedLoop,
     device: SimulatedDevice,
     coupling: Coupling,
     treatment: Treatment,
     ticks: int,
 ) -> tuple[NDArray[np.void], ContactRun]:
+    """Returns a run's records, and what it came to but for its depth."""
     outcome = loop.run(
         device,
         coupling,
@@ -172,7 +175,8 @@ def _run(
     return outcome.records, run
 
 
-def _device(coupling: Coupling, path: Motion, hand: Hand) -> SimulatedDevice:
+def firm_device(coupling: Coupling, path: Motion, hand: Hand) -> SimulatedDevice:
+    """Returns a hand with a device that bears the coupling with a margin."""
     half = PERIOD / 2
     return SimulatedDevice(
         damping=DEVICE_MARGIN * (coupling.stiffness * half + coupling.damping),
@@ -185,7 +189,8 @@ def _device(coupling: Coupling, path: Motion, hand: Hand) -> SimulatedDevice:
     )
 
 
-def _set_mass(loop: ClosedLoop, body: str, mass: float) -> None:
+def set_mass(loop: ClosedLoop, body: str, mass: float) -> None:
+    """Gives a tool a mass in kg."""
     set_tool_mass(loop.scene.model, body, mass)
     mujoco.mj_setConst(loop.scene.model, loop.scene.data)
 
@@ -195,7 +200,7 @@ def start_in_hole(model: mujoco.MjModel) -> None:
     model.key_qpos[0, 2] = PEG_START
 
 
-def _depth(loop: ClosedLoop, records: NDArray[np.void]) -> float:
+def deepest(loop: ClosedLoop, records: NDArray[np.void]) -> float:
     """Returns the largest penetration in m, from the poses that were recorded."""
     model, data = loop.scene.model, loop.scene.data
     depth = 0.0

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
+from hapticbridge.study.maps.contact_bars import Columns, draw_bars
 from hapticbridge.study.maps.contact_rigs import peg_runs, summary
 from hapticbridge.study.maps.contact_treatments import TREATMENTS
-from hapticbridge.study.maps.verdicts import COLOURS, VERDICTS, say_missing
 from hapticbridge.study.table import Table
 
 SEARCH_MASSES = (0.03, 0.1, 0.3)
@@ -52,36 +52,16 @@ def searched(table: Table, name: str) -> dict[str, Any]:
     }
 
 
-COLUMNS = (
+COLUMNS: Columns = (
     ("most energy\nmade, J", 0.34, "created", 1.0, ".1e"),
     ("depth, mm:\nmedian", 0.66, "median_depth", 1e3, ".2f"),
     ("\nlargest", 0.9, "largest_depth", 1e3, ".2f"),
     ("steady depth,\n× shipped", 1.28, "static_depth", 1.0, ".3g"),
     ("\nτ, ms", 1.5, "relaxation", 1e3, ".3g"),
 )
-"""Of figures beside the bars: heading, right edge as a share of the bars' width, what stands there,
-its factor and format. The steady depth is computed, the others are measured."""
+"""Beside the bars. The steady depth is computed, the others are measured."""
 
 
 def draw_search(axes: Axes, found: Sequence[Mapping[str, Any]]) -> None:
     """Draws a bar a treatment, runs by verdict, with what they came to in columns beside it."""
-    if not found:
-        say_missing(axes)
-        return
-    places = np.arange(len(found))[::-1]
-    left = np.zeros(len(found))
-    for verdict, colour in zip(VERDICTS[:3], COLOURS[:3], strict=True):
-        width = np.array([one[verdict.replace(" ", "_")] for one in found])
-        axes.barh(places, width, left=left, color=colour, height=0.8)
-        left = left + width
-    beside = axes.get_yaxis_transform()
-    for heading, share, name, factor, form in COLUMNS:
-        edge = 1 + share
-        axes.text(edge, len(found) - 0.3, heading, transform=beside, size=7, ha="right")
-        for place, one in zip(places, found, strict=True):
-            text = format(factor * one[name], form)
-            axes.text(edge, place, text, transform=beside, size=8, ha="right", va="center")
-    axes.set_yticks(places, [one["treatment"] for one in found], size=8)
-    axes.set_xlim(0, max(left.max(), 1.0))
-    axes.set_ylim(-0.6, len(found) - 0.4)
-    axes.set_xlabel("runs by verdict")
+    draw_bars(axes, found, [one["treatment"] for one in found], COLUMNS)
