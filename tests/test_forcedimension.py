@@ -49,7 +49,7 @@ def started(kind: int = OMEGA3, **options: object) -> tuple[Stub, ForceDimension
 def test_an_omega_has_three_axes_and_obeys_forces_on_them() -> None:
     stub, device = started()
     assert (device.info.name, device.info.axes) == ("omega.3", ("x", "y", "z"))
-    assert device.serial == "4711"
+    assert device.info.serial == "4711"
     assert ticks(stub, device, 20) == [0] * 20
     np.testing.assert_allclose(stub.force(), [1.0, -0.5, 0.3, 0, 0, 0])
     device.close()

@@ -278,10 +278,17 @@ def test_one_of_several_is_chosen_by_its_number() -> None:
     device = bench.opened(serial="049E")
     device.start(PERIOD)
     ticks(bench, device, 10)
-    assert device.serial == "049E"
+    assert device.info.serial == "049E"
     first, second = bench.service.devices.values()
     assert second.force.any()
     assert not first.force.any()
+
+
+@pytest.mark.parametrize("device_id", ["", "../049D", 7, None, "x" * 65])
+def test_a_number_that_is_no_name_is_refused(device_id: object) -> None:
+    told = {"session_id": 1, "inverse3": [{"device_id": device_id}]}
+    with pytest.raises(DeviceError, match="without a device_id"):
+        messages.inventory(json.dumps(told))
 
 
 def test_a_service_without_devices_says_so() -> None:

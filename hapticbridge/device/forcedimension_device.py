@@ -67,7 +67,6 @@ class ForceDimensionDevice:
     Attributes:
         effector_mass: What the gravity compensation carries, in kg; None where it is not known.
         saturated: Writes at which a motor was at its end.
-        serial: Its serial number, empty where the library does not tell.
 
     Raises:
         DeviceError: It cannot be opened, or a limit that nobody can guess is missing.
@@ -97,16 +96,12 @@ class ForceDimensionDevice:
             self._name, self._turns = model.name, model.turns
             number = c_ushort()
             is_told = dhd["dhdGetSerialNumber"](byref(number), self._id) >= 0
-            self.serial = str(number.value) if is_told else ""
+            serial = str(number.value) if is_told else ""
             mass = c_double()
             is_told = dhd["dhdGetEffectorMass"](byref(mass), self._id) >= 0
             self.effector_mass = mass.value if is_told and mass.value > 0.0 else None
-            dhd.require(
-                "dhdSetGravityCompensation",
-                int(gravity),
-                self._id,
-                what=f"{self._name}: gravity compensation cannot be set",
-            )
+            what = f"{self._name}: gravity compensation cannot be set"
+            dhd.require("dhdSetGravityCompensation", int(gravity), self._id, what=what)
             known = dict(numbers or {})
             told = [float(dhd[call](self._id)) for call in ("dhdGetMaxForce", "dhdGetMaxTorque")]
             limits = limits_of(model, told, known)
@@ -123,6 +118,7 @@ class ForceDimensionDevice:
                 is_prescribed=False,
                 is_real=True,
                 duration=None,
+                serial=serial,
             )
         except BaseException:
             self.close()
@@ -230,9 +226,8 @@ class ForceDimensionDevice:
 
     def _get(self) -> int:
         if self._turns:
-            return self._require(
-                "dhdGetPositionAndOrientationFrame", *self._references, self._frame
-            )
+            name = "dhdGetPositionAndOrientationFrame"
+            return self._require(name, *self._references, self._frame)
         return self._require("dhdGetPosition", *self._references)
 
     def _send(self, values: tuple[float, ...] | list[float]) -> int:
@@ -241,8 +236,7 @@ class ForceDimensionDevice:
         return self._require("dhdSetForce", *values[:3])
 
     def _require(self, name: str, *arguments: object) -> int:
-        code = int(self._dhd[name](*arguments, self._id))
-        if code < 0:
+        if (code := int(self._dhd[name](*arguments, self._id))) < 0:
             raise DeviceLost(f"{self._name} is gone or failed: {self._dhd.last_error()}")
         return code
 

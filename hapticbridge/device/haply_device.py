@@ -112,6 +112,7 @@ class HaplyDevice:
                 is_prescribed=False,
                 is_real=True,
                 duration=None,
+                serial=listed.device_id,
                 **known,  # type: ignore[arg-type]
             )
         except BaseException:
@@ -120,11 +121,6 @@ class HaplyDevice:
         self._sample = np.zeros(1, SAMPLE_DTYPE)
         self._sample["quaternion"] = (1.0, 0.0, 0.0, 0.0)
         self._answered = self._read = 0.0
-
-    @property
-    def serial(self) -> str:
-        """What the service knows it by."""
-        return self._listed.device_id
 
     def start(self, period: float) -> NDArray[np.void]:
         """Asks for the state, without force.

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -32,6 +33,9 @@ GRIPS = ("wireless_verse_grip", "verse_grip")
 
 BUTTONS = ("a", "b", "c")
 """Bits 0, 1 and 2 of a sample's buttons."""
+
+
+_ID = re.compile(r"[0-9A-Za-z_-]{1,64}")  # it becomes part of a profile's file name
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,8 +158,8 @@ def force_message(listed: Listed, force: Sequence[float]) -> str:
 
 def _listed(entry: dict[str, Any]) -> Listed:
     device_id = entry.get("device_id")
-    if not isinstance(device_id, str) or not device_id:
-        raise DeviceError(f"{SERVICE} lists a device without device_id: {entry!r:.60}")
+    if not isinstance(device_id, str) or not _ID.fullmatch(device_id):
+        raise DeviceError(f"{SERVICE} lists a device without a device_id: {entry!r:.60}")
     config = entry.get("config")
     config = config if isinstance(config, dict) else {}
     raw = config.get("filters")
