@@ -2,13 +2,15 @@ from __future__ import annotations
 
 import json
 import os
+import socket
 from pathlib import Path
 
 import pytest
 from cli_cases import Called
 
 from hapticbridge.cli import devices as command
-from hapticbridge.device import hid_search, usb_bus, usb_search
+from hapticbridge.device import haply, hid_search, usb_bus, usb_search
+from hapticbridge.device.dhd_library import VARIABLE
 from hapticbridge.device.families import FAMILIES, RULES_FILE, plugged_devices, udev_rules
 from hapticbridge.device.plugged import Family, Plugged
 
@@ -163,7 +165,9 @@ def test_the_bus_is_read_without_opening_anything(
         assert first.is_permitted is answer
 
 
-@pytest.mark.parametrize("family", FAMILIES, ids=lambda family: family.name)
+@pytest.mark.parametrize(
+    "family", [f for f in FAMILIES if f.find is None], ids=lambda family: family.name
+)
 def test_running_on_a_device_that_is_not_there_is_one_sentence_that_helps(
     call: Called, family: Family, bus: Path
 ) -> None:
@@ -172,3 +176,32 @@ def test_running_on_a_device_that_is_not_there_is_one_sentence_that_helps(
     assert err.count("\n") == 1
     assert err.startswith(f"error: no device '{family.name}' is plugged in (looked for ")
     assert "'hapticbridge devices' lists what is, and what permission is missing" in err
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("haply", "the Inverse Service does not run: nobody answers at localhost:"),
+        ("forcedimension", "the library '/no/such.so' cannot be loaded"),
+    ],
+)
+def test_what_stands_between_us_and_a_device_is_said_to_be_missing(
+    call: Called, monkeypatch: pytest.MonkeyPatch, bus: Path, name: str, words: str
+) -> None:
+    monkeypatch.setenv(VARIABLE, "/no/such.so")
+    with socket.socket() as unused:
+        unused.bind(("localhost", 0))  # nobody listens there
+        place = ("localhost", unused.getsockname()[1])
+        monkeypatch.setattr(haply, "PLACE", place)
+        monkeypatch.setattr(haply.medium, "__defaults__", (place,))
+        monkeypatch.setattr(haply.find, "__defaults__", (place,))
+        code, out, err = call("run", "peg_in_hole", "--device", name)
+        assert (code, out, err.count("\n")) == (2, "", 1)
+        assert err.startswith(f"error: {words}")
+        code, out, _ = call("devices")
+        assert code == 0
+        assert f"  {words}" in out
+        code, out, _ = call("devices", "--json")
+    told = {f["name"]: f["medium"] for f in json.loads(out)["supported"]}
+    assert told[name].startswith(words)
+    assert told["rawhid"] is None
