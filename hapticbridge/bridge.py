@@ -21,7 +21,13 @@ from hapticbridge.clock import Clock, RealClock, period_of
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Device, device_for
 from hapticbridge.errors import DeviceError, HapticBridgeError, SafetyTrip, SceneError
-from hapticbridge.guard import Limits, limits_for, refuse_stretched_start, trip_reason
+from hapticbridge.guard import (
+    Limits,
+    limits_for,
+    refuse_simulated_time,
+    refuse_stretched_start,
+    trip_reason,
+)
 from hapticbridge.inputs import Write, apply_writes, input_writes
 from hapticbridge.jit import direct
 from hapticbridge.kernel.parameters import checked_substeps
@@ -114,6 +120,7 @@ class Bridge:
         self._path = Path(recording) if recording is not None else None
         self._is_live = live
         self.clock = clock or RealClock()
+        refuse_simulated_time(self.device.info, self.clock)
         self._sample = np.zeros(1, SAMPLE_DTYPE)
         self._inputs: deque[list[Write]] = deque()
         self._tick = self._overruns = self._skipped = 0

@@ -16,7 +16,7 @@ from rich.table import Table
 
 from hapticbridge.bridge import Bridge
 from hapticbridge.certificate import default_coupling, device_conditions
-from hapticbridge.cli.terminal import err, out, quantity
+from hapticbridge.cli.terminal import err, out, quantity, tell
 from hapticbridge.clock import RealClock, SimulatedClock, period_of
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo, device_for
@@ -46,8 +46,8 @@ class Run:
     grip: str = "grip"
     """Site on the tool that the hand holds."""
     device: str = "simulated"
-    """'simulated' (in the hand that the scene asks for), 'simulated:damping=5,hand_mass=1', or
-    'trajectory:FILE' (CSV or recording)."""
+    """'simulated' (in the hand that the scene asks for), 'simulated:damping=5,hand_mass=1',
+    'trajectory:FILE' (CSV or recording), or one that 'hapticbridge devices' lists."""
     duration: float | None = None
     """Seconds to run; by default until the device's motion ends, or until Ctrl-C."""
     record: Path | None = None
@@ -104,7 +104,7 @@ class Run:
         if self.record is not None and self.record.exists() and not self.overwrite:
             raise RecordingError(f"'{self.record}' exists; choose another file or add --overwrite")
         scene = load_scene(self.scene, self.grip, **settings_from(self.settings))
-        device = device_for(scene, self.device)
+        device = device_for(scene, self.device, tell)
         scales = self.scale, self.scale if self.force_scale is None else self.force_scale
         bridge = Bridge(
             scene,
@@ -142,7 +142,7 @@ class Run:
             values = asdict(summary) | {"verdict": summary.verdict}
             out.print_json(json.dumps(values | {"recording": str(self.record or "") or None}))
         else:
-            _print_summary(summary, bridge.laws)
+            _print_summary(summary, bridge)
         is_good = summary.verdict == "passive" and summary.is_certified is not False
         return 0 if is_good else 1
 
@@ -209,7 +209,8 @@ def _true_weld(felt: Coupling, asked: Coupling) -> str:
     )
 
 
-def _print_summary(summary: Summary, laws: int) -> None:
+def _print_summary(summary: Summary, bridge: Bridge) -> None:
+    laws, is_prescribed = bridge.laws, bridge.device.info.is_prescribed
     table = Table(show_header=False, box=None, pad_edge=False)
     table.add_row("ran", f"{summary.duration:.3f} s, {summary.ticks} ticks ({summary.stopped_by})")
     skipped = f" ({summary.skipped} deadlines skipped)" if summary.skipped else ""
@@ -241,7 +242,8 @@ def _print_summary(summary: Summary, laws: int) -> None:
             False: f"device not certified: b < {bound}",
             None: f"device unknown: b >= {bound} not checked",
         }
-        out.print(certified[summary.is_certified])
+        unfelt = "the device feels no force: there is nothing to certify"
+        out.print(unfelt if is_prescribed else certified[summary.is_certified])
     if summary.is_certified is False and method_named(summary.method).has_law and laws == 1:
         judge = "the audit judges" if summary.recording else "with --record FILE the audit judges"
         out.print(f"the device's port is not proven, nor metered while it runs: {judge} it")
