@@ -73,13 +73,13 @@ def limits_for(info: DeviceInfo, limits: Limits | None) -> Limits:
 def refuse_simulated_time(info: DeviceInfo, clock: Clock) -> None:
     """Refuses a clock that runs ahead of a device that lives in real time.
 
-    That is a device with motors, and one that follows a hand without ever ending by itself.
+    That is a device with motors, and one that follows a hand without end, some time after it.
 
     Raises:
         DeviceError: It is so.
     """
-    is_live = info.is_real or (info.is_prescribed and info.duration is None)
-    if is_live and isinstance(clock, SimulatedClock):
+    follows = info.is_prescribed and info.delay != 0.0 and info.duration is None
+    if (info.is_real or follows) and isinstance(clock, SimulatedClock):
         raise DeviceError(
             f"the device '{info.name}' moves in real time, so the loop cannot run as fast as it "
             "goes; leave out --fast (in code: the SimulatedClock)"

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from falcon_cases import Bench
 
-from hapticbridge.device import SimulatedDevice, falcon
+from hapticbridge.device import SimulatedDevice, falcon_start
 from hapticbridge.device.falcon import FalconDevice
 from hapticbridge.device.falcon_boot import read_firmware
 from hapticbridge.errors import DeviceError, DeviceLost
@@ -107,7 +107,7 @@ def test_an_unhomed_falcon_waits_until_the_grip_has_passed_its_zeros(tmp_path: P
 def test_a_grip_that_nobody_moves_is_not_waited_for_without_end(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(falcon, "HOMING_TIME", 2.0)
+    monkeypatch.setattr(falcon_start, "HOMING_TIME", 2.0)
     bench = Bench(SimulatedDevice(hand=None), is_homed=False)
     with pytest.raises(DeviceError, match="was not homed within 2 s"):
         bench.opened()

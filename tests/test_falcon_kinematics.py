@@ -20,9 +20,8 @@ from hapticbridge.device.falcon_kinematics import (
     ZERO_ANGLE,
     forward,
     inverse,
-    jacobian,
-    thigh_torques,
 )
+from hapticbridge.device.falcon_statics import jacobian, thigh_torques
 
 MIDDLE = np.array([0.0, 0.0, 0.125])
 

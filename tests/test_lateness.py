@@ -22,9 +22,7 @@ from hapticbridge.device.lateness import damping_for_delay, delay_ticks, felt_pe
 from hapticbridge.errors import DeviceError
 
 T = 1e-3
-SPRING = Coupling(
-    stiffness=1000.0, damping=0.0, rotational_stiffness=2.0, rotational_damping=0.0
-)
+SPRING = Coupling(stiffness=1000.0, damping=0.0, rotational_stiffness=2.0, rotational_damping=0.0)
 
 
 def info(**changes: Any) -> DeviceInfo:
@@ -112,5 +110,5 @@ def test_a_real_device_refuses_simulated_time() -> None:
     device = SimulatedDevice()
     Bridge("point_mass", device, clock=SimulatedClock())
     device.info = dataclasses.replace(device.info, is_real=True)
-    with pytest.raises(DeviceError, match="moves in real time.*--fast"):
+    with pytest.raises(DeviceError, match=r"moves in real time.*--fast"):
         Bridge("point_mass", device, clock=SimulatedClock())

@@ -13,12 +13,13 @@ from typing import Any
 import numpy as np
 import pytest
 import usb.core
-
 from emulated.falcon_model import FalconModel
 from emulated.handle import Handle
 from emulated.pyusb_backend import PyusbBackend
+
 from hapticbridge.device import SimulatedDevice
-from hapticbridge.device.falcon import FAMILY, READ_FROM, WRITE_TO, FalconDevice, open_falcon
+from hapticbridge.device.falcon import FAMILY, FalconDevice, open_falcon
+from hapticbridge.device.falcon_boot import READ_FROM, WRITE_TO
 from hapticbridge.device.falcon_packets import SIZE, encode
 from hapticbridge.device.hex_log import HexLog
 from hapticbridge.device.plugged import tell_nobody
@@ -164,9 +165,9 @@ def test_the_kernels_driver_is_sent_away() -> None:
 
 def test_of_two_the_serial_number_chooses() -> None:
     host = Host(falcon("A1"), falcon("B2"))
-    with pytest.raises(DeviceError, match="2 of falcon are plugged in; add serial='A1', 'B2'"):
+    with pytest.raises(DeviceError, match=r"2 devices 'falcon' are plugged in; .* 'A1', 'B2'"):
         open_falcon({}, tell_nobody, host)
-    with pytest.raises(DeviceError, match="no falcon has serial 'C3'"):
+    with pytest.raises(DeviceError, match="'falcon' has serial 'C3'"):
         open_falcon({"serial": "C3"}, tell_nobody, host)
     open_falcon({"serial": "B2"}, tell_nobody, host).close()
 
@@ -177,7 +178,7 @@ def test_of_two_the_serial_number_chooses() -> None:
         ({"damping": -1.0}, "damping = -1.0: must be a finite number >= 0 N s/m"),
         ({"mass": 0.0}, "mass = 0.0: must be a finite number > 0 kg"),
         ({"firmware": "/no/such/file"}, "firmware = '/no/such/file': cannot be read"),
-        ({}, "no falcon is plugged in .*0403:cb48.*hapticbridge devices"),
+        ({}, "no device 'falcon' is plugged in .*0403:cb48.*hapticbridge devices"),
     ],
 )
 def test_a_bad_option_is_refused_before_the_device_is_touched(
@@ -193,7 +194,8 @@ def test_packets_come_whole_and_as_they_are(opened: Open) -> None:
         link.control(request, value)
     link.take()
     assert link.write(question())
-    end, packets = time.monotonic() + LONGEST, []
+    end = time.monotonic() + LONGEST
+    packets: list[bytes] = []
     while time.monotonic() < end and not any(len(p) > 2 for p in packets):
         link.wait(0.1)
         packets += link.take()

@@ -22,24 +22,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.device.base import DeviceInfo, checked_number, checked_period
-from hapticbridge.device.falcon_boot import (
-    Link,
-    ask,
-    enter_run_mode,
-    read_firmware,
-    speaks,
-    upload,
-)
+from hapticbridge.device.falcon_boot import READ_FROM, WRITE_TO, Link, ask, read_firmware
 from hapticbridge.device.falcon_motion import (
     BELIEVED,
+    FORCE_LIMIT,
     MOTION_DTYPE,
     PLACE,
     SPEED_LIMIT,
+    UNFELT_TORQUE_LIMIT,
     believe,
     command,
     resolution,
 )
 from hapticbridge.device.falcon_packets import SIZE, ReplyStream, Request
+from hapticbridge.device.falcon_start import LONGEST_PERIOD, SILENCE, bring_up, home, silent
 from hapticbridge.device.falcon_timing import measured_timing
 from hapticbridge.device.hex_log import HexLog
 from hapticbridge.device.plugged import Family, Tell, UsbId, chosen, tell_nobody
@@ -48,23 +44,6 @@ from hapticbridge.device.usb_search import find
 from hapticbridge.errors import DeviceError, DeviceLost
 from hapticbridge.jit import direct
 from hapticbridge.tick import SAMPLE_DTYPE, TickFlag
-
-FORCE_LIMIT = 8.0
-"""In N: what CHAI3D lets applications ask of a Falcon; the maker's figure is above 8.9 N."""
-
-SILENCE = 0.05
-"""In s: a Falcon that gave no sample that can be believed for so long is lost. Fifty replies."""
-
-LONGEST_PERIOD = 0.02
-"""In s. It is asked once a tick; slower, two lost replies would already count as silence."""
-
-HOMING_TIME = 60.0
-"""In s: how long the user has to move the grip through its range."""
-
-READ_FROM, WRITE_TO = 0x81, 0x02
-"""Addresses of its bulk endpoints."""
-
-_NOTHING_RECORDED = 0.5  # N m, of torques that are recorded and have no motor: the usual limit
 
 
 class FalconDevice:
@@ -105,8 +84,8 @@ class FalconDevice:
         self._stream = ReplyStream()
         self._is_open, self._is_started = True, False
         try:
-            self._bring_up(firmware, tell)
-            self._home(tell)
+            bring_up(link, self._stream, name, firmware, tell)
+            home(link, self._stream, name, tell)
             rate, delay = measured_timing(link, self._stream, name)
             self.info = DeviceInfo(
                 name="falcon",
@@ -118,7 +97,7 @@ class FalconDevice:
                 friction=friction,
                 resolution=resolution(),
                 force_limit=FORCE_LIMIT,
-                torque_limit=_NOTHING_RECORDED,
+                torque_limit=UNFELT_TORQUE_LIMIT,
                 speed_limit=SPEED_LIMIT,
                 rate=rate,
                 delay=delay,
@@ -157,7 +136,7 @@ class FalconDevice:
         motion[0] = np.zeros((), MOTION_DTYPE)
         motion["position"] = PLACE
         if not ask(self._link, self._stream, Request.GREEN, SILENCE):
-            raise self._silent()
+            raise silent(self._name)
         if self._believe(motion, reply, sample, np.inf) != BELIEVED:
             raise DeviceError(
                 f"{self._name}: encoders at {reply['encoders'][0].tolist()} are no position of the "
@@ -201,7 +180,7 @@ class FalconDevice:
                 self._believed = now
                 flag = 0
         if now - self._believed > SILENCE:
-            raise self._silent()
+            raise silent(self._name)
         sample[:] = self._last
         return flag
 
@@ -231,55 +210,12 @@ class FalconDevice:
         finally:
             self._link.close()
 
-    def _bring_up(self, firmware: str | None, tell: Tell) -> None:
-        image = None if firmware is None else read_firmware(firmware)
-        enter_run_mode(self._link)
-        if speaks(self._link, self._stream):
-            return
-        if image is None:
-            raise DeviceError(
-                f"{self._name}: has no firmware (it forgets it without power); name the file with "
-                "the maker's program: falcon:firmware=FILE"
-            )
-        upload(self._link, image, self._name, tell)
-        enter_run_mode(self._link)
-        self._stream.clear()
-        if not speaks(self._link, self._stream):
-            raise DeviceError(
-                f"{self._name}: took '{firmware}', and does not answer; it is no firmware for it"
-            )
-
-    def _home(self, tell: Tell) -> None:
-        """Waits until every encoder has passed its zero; asks the user to see to it."""
-        end, is_told = self._link.now() + HOMING_TIME, False
-        heard = self._link.now()
-        while self._link.now() < end:
-            if ask(self._link, self._stream, Request.HOMING | Request.RED, SILENCE):
-                heard = self._link.now()
-                if self._stream.reply["homed"][0] == 7:
-                    if is_told:
-                        tell(f"{self._name}: homed")
-                    return
-            elif self._link.now() - heard > 2 * SILENCE:
-                raise self._silent()
-            if not is_told:
-                is_told = True
-                tell(f"{self._name}: pull the grip all the way out and push it back in, slowly")
-        raise DeviceError(
-            f"{self._name}: was not homed within {HOMING_TIME:g} s; open it again and move the "
-            "grip all the way out and in"
-        )
-
-    def _silent(self) -> DeviceLost:
-        return DeviceLost(f"{self._name}: gave no usable reply for {1e3 * SILENCE:g} ms")
-
 
 def open_falcon(options: Mapping[str, object], tell: Tell, backend: Any = None) -> FalconDevice:
     """Finds a Falcon and opens it.
 
     Args:
-        options: ``serial``, ``firmware`` (a file), ``mass``, ``damping``, ``friction`` (numbers or
-            their text), ``log`` (a file for the bytes).
+        options: Those of ``FAMILY``: names of files and numbers in SI units.
         tell: Told what the user should know or do.
         backend: A pyusb backend; None takes libusb.
 
@@ -292,14 +228,14 @@ def open_falcon(options: Mapping[str, object], tell: Tell, backend: Any = None) 
         for name, unit in _NUMBERS.items()
         if options.get(name) is not None
     }
-    firmware, log = (
-        None if options.get(name) is None else str(options[name]) for name in ("firmware", "log")
-    )
+    files = {name: str(options[name]) for name in ("firmware", "log") if options.get(name)}
+    firmware = files.get("firmware")
     if firmware is not None:
         read_firmware(firmware)  # a wrong name is said before anything moves
     plugged = chosen(FAMILY, find(FAMILY, backend), options.get("serial"))
+    log = HexLog(files.get("log"))
     link = UsbLink.open(
-        plugged, FAMILY, read_from=READ_FROM, write_to=WRITE_TO, backend=backend, log=HexLog(log)
+        plugged, FAMILY, read_from=READ_FROM, write_to=WRITE_TO, backend=backend, log=log
     )
     return FalconDevice(link, name=str(plugged), firmware=firmware, tell=tell, **numbers)
 

@@ -25,6 +25,9 @@ from hapticbridge.device.falcon_packets import SIZE, STATUS, ReplyStream, encode
 from hapticbridge.device.plugged import Tell
 from hapticbridge.errors import DeviceError
 
+READ_FROM, WRITE_TO = 0x81, 0x02
+"""Addresses of its bulk endpoints."""
+
 LARGEST_FIRMWARE = 65536
 """In bytes. The four images known have 7324 to 8492; a larger file is another file."""
 

@@ -1,4 +1,4 @@
-"""Geometry of the Falcon's three legs: thigh angles, grip position, and force to torque.
+"""Geometry of the Falcon's three legs: thigh angles and grip position.
 
 The maker's frame, in metres: z out of the base towards the user along the machine's axis, x to the
 right, y up; all three thighs at the encoders' zero put the grip at (0, 0, 0.1346). Leg i is turned
@@ -152,10 +152,16 @@ def closure(
 
 
 @compiled
-def _solve(
+def solve(
     rows: NDArray[np.float64], right: NDArray[np.float64], answer: NDArray[np.float64]
 ) -> float:
-    """Solves rows · answer = right by Cramer's rule; returns the determinant."""
+    """Solves rows · answer = right by Cramer's rule; returns the determinant.
+
+    Args:
+        rows: Shape (3, 3).
+        right: Shape (3,).
+        answer: Shape (3,), filled in place; unchanged where the determinant is 0.
+    """
     a, b, c = rows[0], rows[1], rows[2]
     x0, x1, x2 = (
         b[1] * c[2] - b[2] * c[1],
@@ -198,7 +204,7 @@ def forward(angles: NDArray[np.float64], position: NDArray[np.float64]) -> bool:
     for _ in range(STEPS):
         if not closure(point, angles, gaps, gradients, levers):
             return False
-        determinant = _solve(gradients, gaps, step)
+        determinant = solve(gradients, gaps, step)
         if not abs(determinant) >= FLATTEST:
             return False
         length = math.sqrt(step[0] ** 2 + step[1] ** 2 + step[2] ** 2)
@@ -212,61 +218,3 @@ def forward(angles: NDArray[np.float64], position: NDArray[np.float64]) -> bool:
             position[:] = point
             return True
     return False
-
-
-@compiled
-def jacobian(
-    position: NDArray[np.float64], angles: NDArray[np.float64], matrix: NDArray[np.float64]
-) -> bool:
-    """Writes ∂θ/∂p = −(∂h/∂θ)⁻¹ ∂h/∂p at a pose where the legs close.
-
-    Args:
-        position: Shape (3,), in m.
-        angles: Shape (3,), in rad, those of the position.
-        matrix: Shape (3, 3), in rad/m, filled in place.
-
-    Returns:
-        Whether there is one: no leg is stretched or folded.
-    """
-    gaps, gradients, levers = np.empty(3), np.empty((3, 3)), np.empty(3)
-    if not closure(position, angles, gaps, gradients, levers):
-        return False
-    for i in range(3):
-        if not abs(levers[i]) >= FLATTEST * THIGH:
-            return False
-    for i in range(3):
-        for j in range(3):
-            matrix[i, j] = -gradients[i, j] / levers[i]
-    return True
-
-
-@compiled
-def thigh_torques(
-    position: NDArray[np.float64],
-    angles: NDArray[np.float64],
-    force: NDArray[np.float64],
-    torques: NDArray[np.float64],
-) -> bool:
-    """Writes the thigh torques that push the grip with a force: τ = J⁻ᵀ F, J = ∂θ/∂p.
-
-    By virtual work τ·δθ = F·δp for every motion.
-
-    Args:
-        position: Shape (3,), in m.
-        angles: Shape (3,), in rad, those of the position.
-        force: Shape (3,), in N, in the maker's frame.
-        torques: Shape (3,), in N m, filled in place; zero where there is no answer.
-
-    Returns:
-        Whether there is an answer.
-    """
-    torques[:] = 0.0
-    gaps, gradients, levers = np.empty(3), np.empty((3, 3)), np.empty(3)
-    if not closure(position, angles, gaps, gradients, levers):
-        return False
-    answer = np.empty(3)
-    if not abs(_solve(gradients.T.copy(), force, answer)) >= FLATTEST:
-        return False
-    for i in range(3):
-        torques[i] = -levers[i] * answer[i]
-    return True

@@ -12,10 +12,9 @@ from hapticbridge.device.falcon_kinematics import (
     ZERO_ANGLE,
     forward,
     inverse,
-    jacobian,
-    thigh_torques,
 )
-from hapticbridge.device.falcon_packets import encode
+from hapticbridge.device.falcon_packets import Request, encode
+from hapticbridge.device.falcon_statics import jacobian, thigh_torques
 from hapticbridge.jit import compiled
 
 MOTION_DTYPE = np.dtype([("position", "<f8", 3), ("angles", "<f8", 3), ("motors", "<i8", 3)])
@@ -34,6 +33,13 @@ MOTOR_LIMIT = 4096.0
 """Motor units that a motor is sent at most. 9 N along the axis take 2259 on each, 9 N across it
 5200 on one; libnifalcon's users clamp at about as much."""
 
+FORCE_LIMIT = 8.0
+"""In N: what CHAI3D lets applications ask of a Falcon; the maker's figure is above 8.9 N."""
+
+UNFELT_TORQUE_LIMIT = 0.5
+"""In N m, that of the simulated device: no motor turns the grip, and only what is recorded is
+limited."""
+
 SPEED_LIMIT = 3.0
 """In m/s: faster motion is not believed. No figure was found; a hand that crosses the 0.1 m of the
 workspace in 33 ms is at its end."""
@@ -41,6 +47,9 @@ workspace in 33 ms is at its end."""
 MOST_COUNTS = 3000
 """Counts either side of zero that a thigh can turn to: -74° to 144°. The workspace takes -66° to
 114°; a whole turn further the same place would follow."""
+
+FLAGS = int(Request.GREEN)
+"""The light while the loop runs."""
 
 BELIEVED, OUT_OF_REACH, JUMP = 0, 1, 2
 
@@ -115,10 +124,6 @@ def command(
     for i in range(3):
         motion.motors[i] = round(share * UNITS_PER_TORQUE * torques[i])
     encode(motion.motors, FLAGS, packet)
-
-
-FLAGS = 2
-"""``Request.GREEN`` as compiled code can take it: the light while the loop runs."""
 
 
 def resolution() -> float:

@@ -12,7 +12,7 @@ import usb.core
 import usb.util
 
 from hapticbridge.device.plugged import Family, Plugged, permission_problem
-from hapticbridge.device.usb_bus import NODES, on_the_bus
+from hapticbridge.device.usb_bus import NODES, OnTheBus, on_the_bus
 
 
 def libusb() -> Any:
@@ -51,6 +51,11 @@ def find(family: Family, backend: Any = None) -> list[Plugged]:
 
 
 def _told_by_kernel(family: Family) -> list[Plugged]:
+    def problem(device: OnTheBus) -> str | None:
+        if libusb() is None:
+            return "libusb cannot be loaded; reinstall the package 'libusb-package'"
+        return None if device.is_permitted else permission_problem(str(device.node))
+
     return [
         Plugged(
             family=family.name,
@@ -60,7 +65,7 @@ def _told_by_kernel(family: Family) -> list[Plugged]:
             vendor=device.vendor,
             product=device.product,
             transport="usb",
-            problem=None if device.is_permitted else permission_problem(str(device.node)),
+            problem=problem(device),
         )
         for device in on_the_bus()
         if (model := family.model(device.vendor, device.product)) is not None
@@ -85,13 +90,15 @@ def node_of(device: Any) -> str:
 def _described(family: Family, device: Any) -> Plugged:
     node, problem, texts = node_of(device), None, ["", ""]
     try:
+        device.get_active_configuration()  # opens it; reading texts would hide why it cannot
         texts = [
             usb.util.get_string(device, index) or "" if index else ""
             for index in (device.iProduct, device.iSerialNumber)
         ]
-    except (usb.core.USBError, ValueError, NotImplementedError) as error:
-        is_refused = getattr(error, "errno", None) == errno.EACCES
-        problem = permission_problem(node) if is_refused else None
+    except usb.core.USBError as error:
+        problem = permission_problem(node) if error.errno == errno.EACCES else None
+    except (ValueError, NotImplementedError):
+        pass  # it has no texts, or they cannot be read
     finally:
         usb.util.dispose_resources(device)
     return Plugged(
