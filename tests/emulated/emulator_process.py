@@ -20,6 +20,10 @@ from emulated.usb_device import UsbDevice
 
 _PR_SET_TIMERSLACK = 29
 
+_SHORTEST = 5e-6
+"""In s. A model that wants to be asked again at once, over and over, would hold virtual time still,
+and the host that it waits for too."""
+
 
 class EmulatorProcess:
     """Plugs an emulated device in, from the moment of construction until ``unplug``.
@@ -103,7 +107,7 @@ def _serve(
             continue
         due = min(front.settle(now) or math.inf, unplug_time) if is_plugged else math.inf
         # poll() and epoll() would round the 1 ms of a device's timer up to the next millisecond
-        timeout = None if due == math.inf else max(0.0, due - time.monotonic())
+        timeout = None if due == math.inf else max(_SHORTEST, due - time.monotonic())
         files = [*front.files(), *([connection.fileno()] if is_watched else [])]
         for file in select.select(files, [], [], timeout)[0]:
             if file != connection.fileno():

@@ -170,12 +170,12 @@ class FalconModel(UsbDevice):
         return b"\x01\x60" + bytes(self._outbox.popleft()[1] for _ in range(ready))
 
     def next_time(self, now: float) -> float | None:
-        times = [self._last_sent + self._latency]
-        if self._inbox:
-            times.append(self._inbox[-1][0])
-        if self._event is not None and self._outbox:
-            times.append(self._outbox[-1][0])
-        return max(min(times), now)
+        times = [self._inbox[-1][0]] if self._inbox else []
+        if self.is_read_pending(0x81):  # else its timer fires unheard
+            times.append(self._last_sent + self._latency)
+            if self._event is not None and self._outbox:
+                times.append(self._outbox[-1][0])
+        return max(min(times), now) if times else None
 
     def advance(self, now: float) -> None:
         while self._inbox and self._inbox[0][0] <= now:

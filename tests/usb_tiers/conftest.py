@@ -1,7 +1,8 @@
 """What plugs emulated devices into the tier that these checks run in.
 
 ``HAPTICBRIDGE_TIER`` says where: ``umock`` (under umockdev's preload library) or ``uml`` (inside a
-User-Mode Linux). The checks are started there by ``emulated.tiers``, not by the project's pytest.
+User-Mode Linux); ``HAPTICBRIDGE_TIME`` may say ``virtual``. The checks are started there by
+``emulated.tiers``, not by the project's pytest.
 """
 
 from __future__ import annotations
@@ -26,6 +27,9 @@ _FRONT_ENDS: dict[str, dict[str, Callable[[Any], FrontEnd]]] = {
     "umock": {"umock": Umock},
     "uml": {"usbip": Usbip, "uhid": Uhid},
 }
+
+IS_TIME_VIRTUAL = os.environ.get("HAPTICBRIDGE_TIME") == "virtual"
+"""Whether time passes only while everything waits; then times can be asserted."""
 
 Plug = Callable[[Callable[[], UsbDevice]], EmulatorProcess]
 
@@ -53,3 +57,9 @@ def plug_usb() -> Iterator[Plug]:
 def plug_hid(request: pytest.FixtureRequest) -> Iterator[Plug]:
     """Plugs in a HID device, in each way that the tier has."""
     yield from _plugging(_FRONT_ENDS[TIER][request.param])
+
+
+@pytest.fixture
+def no_spin(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Lets the loop's clock sleep to its deadline; in virtual time a spin would hardly end."""
+    monkeypatch.setattr("hapticbridge.clock.SPIN_NS", 0)

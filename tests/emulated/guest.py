@@ -8,8 +8,8 @@ from __future__ import annotations
 import os
 import shlex
 import shutil
+import signal
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Mapping, Sequence
@@ -95,19 +95,22 @@ def run_in_guest(
         *(["time-travel=inf-cpu"] if is_virtual else []),
     ]
     start = time.monotonic()
+    # a group of its own: the guest's programs are processes of the host, and end with it
+    guest = subprocess.Popen(
+        arguments,
+        env={"PATH": os.environ["PATH"], "HOME": str(folder), "TMPDIR": _memory_folder()},
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        errors="replace",
+        start_new_session=True,
+    )
     try:
-        ended = subprocess.run(
-            arguments,
-            env={"PATH": os.environ["PATH"], "HOME": str(folder), "TMPDIR": _memory_folder()},
-            stdin=subprocess.DEVNULL,
-            capture_output=True,
-            text=True,
-            errors="replace",
-            timeout=timeout,
-            check=False,
-        )
-        console = ended.stdout + ended.stderr
+        console, _ = guest.communicate(timeout=timeout)
     except subprocess.TimeoutExpired:
+        os.killpg(guest.pid, signal.SIGKILL)
+        guest.communicate()
         console = f"the guest was stopped after {timeout:g} s"
     seconds = time.monotonic() - start
     output, status = folder / "output", folder / "status"
@@ -124,14 +127,10 @@ def python_environment() -> dict[str, str]:
         "TMPDIR": "/dev/shm",
         "PYTHONPATH": f"{CHECKOUT}:{CHECKOUT / 'tests'}",
         "PYTHONDONTWRITEBYTECODE": "1",
+        "PYTHONHASHSEED": "0",
         # numba uses a cache only where it may write; the guest may write to this one
         "NUMBA_CACHE_DIR": "/run/compiled",
     }
-
-
-def python() -> str:
-    """Returns the interpreter's path, which is the same in the guest."""
-    return sys.executable
 
 
 def _compiled_code() -> Path:
