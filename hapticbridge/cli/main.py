@@ -16,6 +16,7 @@ from rich.markup import escape
 from hapticbridge.cli.chart import ChartCommand
 from hapticbridge.cli.check import Check
 from hapticbridge.cli.devices import Devices
+from hapticbridge.cli.identify import Identify
 from hapticbridge.cli.judge import Audit, Repair
 from hapticbridge.cli.run import Run
 from hapticbridge.cli.scenes import Scenes
@@ -35,6 +36,7 @@ Command = (
     | Annotated[Repair, tyro.conf.subcommand("repair")]
     | Annotated[Zwidth, tyro.conf.subcommand("zwidth")]
     | Annotated[Bound, tyro.conf.subcommand("bound")]
+    | Annotated[Identify, tyro.conf.subcommand("identify")]
 )
 
 USAGE_ERROR, SAFETY_TRIP = 2, 3
