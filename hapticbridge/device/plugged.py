@@ -45,7 +45,7 @@ class Family:
     Attributes:
         name: What ``open_device`` knows it by.
         about: What it is, in a few words.
-        ids: Every product of the family.
+        ids: Every product of the family, none where it is a class.
         transport: ``hid`` (hidapi) or ``usb`` (pyusb).
         axes: Which axes it has, in words, because it may differ from unit to unit.
         force: What force it can show, in words.
@@ -54,6 +54,8 @@ class Family:
         open: Finds the device and opens it; takes the options and whom to tell.
         usage: Usage page and usage of the HID collection that speaks the protocol, where a product
             has several; None where any will do.
+        recognises: Tells from a HID report descriptor whether a device is one of them, for a family
+            that is a class and has no list of products; None for all others.
     """
 
     name: str
@@ -66,6 +68,7 @@ class Family:
     options: tuple[str, ...]
     open: Callable[[Mapping[str, object], Tell], Device]
     usage: tuple[int, int] | None = None
+    recognises: Callable[[bytes], bool] | None = None
 
     def model(self, vendor: int, product: int) -> str | None:
         """Returns the model that has these numbers, or None if it is none of the family."""
@@ -135,8 +138,11 @@ def chosen(family: Family, plugged: Sequence[Plugged], serial: object = None) ->
     """
     if not plugged:
         vendors = ", ".join(sorted({f"{usb_id.vendor:04x}" for usb_id in family.ids}))
-        is_one = len(family.ids) == 1
-        looked = str(family.ids[0]) if is_one else f"{len(family.ids)} products of {vendors}"
+        looked = f"{len(family.ids)} products of {vendors}"
+        if len(family.ids) == 1:
+            looked = str(family.ids[0])
+        elif family.recognises is not None:
+            looked = "any product, by what it says it can do"
         raise DeviceError(
             f"no device '{family.name}' is plugged in (looked for {looked}); 'hapticbridge "
             "devices' lists what is, and what permission is missing"
