@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from hapticbridge.device.hid_descriptor import INPUT, Field
-from hapticbridge.device.hid_layout import Layout, Place, as_number, element, place_of, required
+from hapticbridge.device.hid_layout import WIDEST, Layout, Place, as_number, element, place_of, required
+from hapticbridge.device.hid_search import CONTROLLERS
 from hapticbridge.device.pid_reports import forced_axes
 from hapticbridge.errors import DeviceError
 
@@ -13,6 +14,7 @@ X, Y = 0x00010030, 0x00010031
 MOST_BUTTONS = 63
 """Buttons that are told apart, as many as a sample has bits for."""
 
+_CONTROLLERS = {page << 16 | usage for page, usage in CONTROLLERS}
 _BUTTON_PAGE = 9
 
 
@@ -33,7 +35,14 @@ class Stick:
     """
 
     def __init__(self, layout: Layout) -> None:
-        fields = [field for field in layout.fields if field.kind == INPUT and field.size <= 32]
+        # some have a mouse or a keyboard beside the stick, with an X and Y of their own
+        fields = [
+            field
+            for field in layout.fields
+            if field.kind == INPUT
+            and field.size <= WIDEST
+            and _CONTROLLERS.intersection(field.collections[:1])
+        ]
         self._layout = layout
         self._axes = (
             required(place_of(fields, X), "an X axis"),
