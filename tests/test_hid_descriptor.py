@@ -144,6 +144,6 @@ def test_arbitrary_bytes_are_fields_or_a_refusal(raw: bytes) -> None:
         assert "\n" not in str(error)
         return
     for field in fields:
-        assert 0 <= field.offset
+        assert field.offset >= 0
         assert field.size > 0
         assert field.physical[0] <= field.physical[1] or field.minimum > field.maximum

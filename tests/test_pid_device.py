@@ -130,7 +130,7 @@ def test_a_host_that_dies_lets_go_of_the_stick(name: str) -> None:
 
 def test_the_faster_the_bus_the_shorter_the_life() -> None:
     for interval, restart in ((1e-3, RESTART), (2e-3, RESTART), (8e-3, 0.08)):
-        device, model, seam = opened()
+        device, model, _seam = opened()
         device = PidDevice(
             device._link, "fast", scale=sheet.Scale(NEWTONS, TRAVEL, np.ones(2)),
             intervals=(1e-3, interval),
@@ -141,7 +141,7 @@ def test_the_faster_the_bus_the_shorter_the_life() -> None:
 
 
 def test_only_what_has_changed_is_sent_and_restarts_are_few() -> None:
-    device, model, seam = started(PidStick())
+    device, model, _seam = started(PidStick())
     before = model.outputs
     for _ in range(10):
         device.write(wrench(1.0, 0.0))

@@ -44,9 +44,9 @@ class PidDevice:
 
     Each axis has a constant-force effect of its own with a fixed direction, so a tick sends one
     short report per axis whose count has changed, at most two. One effect with a direction would
-    need SetEffect (some 18 bytes) as soon as the angle changes, and SetConstantForce; pushing a peg
-    into its hole that is 1.98 reports a tick against 1.97, and between the two the force
-    points elsewhere; with two effects it is between the old force and the new one.
+    need SetEffect (some 18 bytes) as soon as the angle changes, and SetConstantForce. Pushing a peg
+    into its hole that is 1.62 reports a tick, against 1.44 with two effects; and between the two of
+    a tick its force would point elsewhere, where that of two effects is on its way.
 
     A silent stick is one at rest: many report only what changes. A pulled plug is an error of the
     next call.

@@ -3,7 +3,15 @@
 from __future__ import annotations
 
 from hapticbridge.device.hid_descriptor import INPUT, Field
-from hapticbridge.device.hid_layout import WIDEST, Layout, Place, as_number, element, place_of, required
+from hapticbridge.device.hid_layout import (
+    WIDEST,
+    Layout,
+    Place,
+    as_number,
+    element,
+    place_of,
+    required,
+)
 from hapticbridge.device.hid_search import CONTROLLERS
 from hapticbridge.device.pid_reports import forced_axes
 from hapticbridge.errors import DeviceError

@@ -106,8 +106,7 @@ def _part(kind: int, part: Part) -> bytes:
         return size + _item(kind, 3)
     usages = part.choices or (part.usage,)
     flags = 0 if part.choices else 2
-    body = b"".join(map(_usage, usages)) + range_ + scale + size + _item(kind, flags)
-    return body
+    return b"".join(map(_usage, usages)) + range_ + scale + size + _item(kind, flags)
 
 
 def descriptor(reports: Iterable[Report]) -> bytes:
@@ -179,11 +178,19 @@ USUAL: dict[str, Report] = {
             _bit("by_direction", PID | 0x56),
             _padding(5),
             Part(
-                name="direction", usage=ORDINAL | 1, bits=16, high=35999, within=PID | 0x57,
+                name="direction",
+                usage=ORDINAL | 1,
+                bits=16,
+                high=35999,
+                within=PID | 0x57,
                 unit=(0x14, -2),
             ),
             Part(
-                name="elevation", usage=ORDINAL | 2, bits=16, high=35999, within=PID | 0x57,
+                name="elevation",
+                usage=ORDINAL | 2,
+                bits=16,
+                high=35999,
+                within=PID | 0x57,
                 unit=(0x14, -2),
             ),
         ),

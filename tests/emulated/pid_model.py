@@ -16,7 +16,7 @@ import numpy as np
 
 from emulated.handle import Handle
 from emulated.hid_device import HidDevice
-from emulated.pid_layouts import FEATURE, IN, OUT, USUAL, Report, descriptor
+from emulated.pid_layouts import FEATURE, OUT, USUAL, Report, descriptor
 from emulated.usb_device import StallError
 from hapticbridge.device import SimulatedDevice
 
