@@ -37,7 +37,13 @@ from hapticbridge.kernel.step import OK, after_step, before_step
 from hapticbridge.ledger import Ledger
 from hapticbridge.provenance import attachments, describe_run
 from hapticbridge.recording.stream import RecordStream
-from hapticbridge.rendering import contact_stiffness_of, method_named, prepare, refuse_unknowing
+from hapticbridge.rendering import (
+    contact_stiffness_of,
+    default_method,
+    method_named,
+    prepare,
+    refuse_unknowing,
+)
 from hapticbridge.scene import Scene, load_scene
 from hapticbridge.signals import stopping_on_signals
 from hapticbridge.summary import Summary
@@ -56,13 +62,14 @@ class Bridge:
     Args:
         scene: A loaded scene, a name, or a path to MJCF.
         device: A device, or what ``open_device`` understands.
-        coupling: K and B; None chooses the stiffest safe one for the device's damping (80 % of the
-            bound, B = b/4, less where substeps need it; for a device of unknown damping, that of
-            the default simulated one).
+        coupling: K and B that should be felt; None chooses the stiffest safe one for the device's
+            damping (80 % of the bound, a quarter of b used as damping, less where substeps need it;
+            for a device of unknown damping, that of the default simulated one).
         rate: Ticks per second, 1 to 1e6.
         substeps: MuJoCo steps per tick, 1 to 100. With more than one the mean of their wrenches
             is sent, and the device needs another damping: ``certificate.needed_damping``.
-        method: How the tool is rendered; see ``rendering.METHODS``.
+        method: How the tool is rendered; see ``rendering.METHODS``. None: ``lossless``, or with
+            substeps, which that does not take, ``implicit``.
         contact_stiffness: K_c in N/m of method ``direct``; None takes the coupling's stiffness.
         i_know: Accept a method that may kick (``Method.hazard``) on a real device.
         recording: File to write (``.mcap``), or None; an existing file is replaced.
@@ -87,7 +94,7 @@ class Bridge:
         *,
         rate: float = 1000.0,
         substeps: int = 1,
-        method: str = "implicit",
+        method: str | None = None,
         contact_stiffness: float | None = None,
         i_know: bool = False,
         recording: str | Path | None = None,
@@ -102,8 +109,8 @@ class Bridge:
         self.scene = scene if isinstance(scene, Scene) else load_scene(scene)
         self.device = device_for(self.scene, device) if isinstance(device, str) else device
         self.period = period_of(rate)
-        self.method = method_named(method)
         self._substeps = checked_substeps(substeps)
+        self.method = default_method(substeps) if method is None else method_named(method)
         self._workspace = Workspace.of(scale, force_scale, axes, is_absolute=absolute)
         self.coupling = coupling or default_coupling(
             self.device.info,
@@ -278,7 +285,7 @@ class Bridge:
 
     @property
     def rendered(self) -> Coupling:
-        """What is felt: ``coupling``, but for damping that the method cannot go below."""
+        """``coupling``, but for damping below what the method can show; ``Method.rendered``."""
         return self.method.rendered(self.used, self.period / self._substeps)
 
     @property
@@ -306,6 +313,7 @@ class Bridge:
             self.parameters,
             self.device.info,
             self.method,
+            self.coupling,
             ticks=self._tick,
             overruns=self._overruns,
             skipped=self._skipped,

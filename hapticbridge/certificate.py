@@ -15,7 +15,7 @@ from hapticbridge.device.lateness import damping_for_delay, delay_ticks, felt_pe
 from hapticbridge.errors import CouplingError
 from hapticbridge.kernel.parameters import SLACK_SHARE, RunParameters, checked_substeps
 from hapticbridge.passivity import minimum_damping, stiffest_coupling
-from hapticbridge.rendering import IMPLICIT, Method
+from hapticbridge.rendering import Method, default_method
 
 UNKNOWN_DAMPING, UNKNOWN_ROTATIONAL_DAMPING = 2.0, 2e-3
 """N s/m and N m s/rad from which the default coupling follows where the device's are unknown: those
@@ -39,18 +39,20 @@ the bound with B = b/4 is 0.6 b + 0.25 b. More is stiffer and leaves less for an
 
 @dataclass(frozen=True, slots=True)
 class Condition:
-    """The device condition b >= scale · force_scale · (K T / 2 + B) on one kind of axis.
+    """The device condition b >= scale · force_scale · (K T / 2 + B') on one kind of axis.
 
     Attributes:
         axis: ``translation`` or ``rotation``.
         needed: The right-hand side in N s/m (rotation: N m s/rad).
         available: The device's damping b; None where unknown.
+        remedy: What to change if it does not hold.
         delay: After how many ticks a wrench answers a sample, 0 at best; None where unknown.
     """
 
     axis: str
     needed: float
     available: float | None
+    remedy: str = "lower stiffness or damping, or raise the rate"
     delay: int | None = 0
 
     @property
@@ -66,7 +68,7 @@ class Condition:
         relation = ">=" if self.holds else "<"
         text = f"{self.axis}: device damping {self.available:g} {relation} {self.needed:g} {unit}"
         if not self.holds:
-            return f"{text}; lower stiffness or damping, or raise the rate"
+            return f"{text}; {self.remedy}"
         if self.delay is None:
             return f"{text}, if it answers without delay, which is unknown"
         late = f", for a wall behind a delay of {self.delay} ticks: no bound holds for any scene"
@@ -82,7 +84,8 @@ def needed_damping(
 ) -> float:
     """Returns the damping b that a device needs behind a coupling, in N s/m or N m s/rad.
 
-    With one law a tick it is K T/2 + B. With n, over each of which the handle moves by the n-th
+    K and B are those of the law: B is what a method uses (``Method.used``), not what is felt. With
+    one law a tick it is K T/2 + B. With n, over each of which the handle moves by the n-th
     part of its step, and whose mean is sent, there is no such formula: b is the least for which
 
         Σ_k f̄_k·δh_{k+1} + (b/T) ‖δh_k‖² − Σ_i f_i·δx_i − ½ s ‖δx_i‖²_{K + nB/T} >= 0,
@@ -99,7 +102,7 @@ def needed_damping(
     1 to 0.01 kg 1.29, 1.65, 2.03.
 
     Args:
-        coupling: K and B.
+        coupling: K and B of the law.
         period: T in s, of the device.
         laws: n, 1 to ``MOST_SUBSTEPS``.
         axis: Which gains to take.
@@ -140,6 +143,7 @@ def device_conditions(
     scale: float,
     force_scale: float,
     laws: int = 1,
+    method: Method | None = None,
 ) -> tuple[Condition, ...]:
     """Returns the condition per kind of axis that the device has, if b of translation is known.
 
@@ -150,11 +154,13 @@ def device_conditions(
 
     Args:
         info: The device.
-        coupling: K and B.
+        coupling: K and B' of the law: what is used, not what is felt.
         period: T in s.
         scale: Handle motion per device motion.
         force_scale: Force on the device per force on the tool.
         laws: How often per tick the wrench is computed (substeps).
+        method: How the tool is rendered, which decides what helps where the damping is too low;
+            None: one that uses the damping as asked.
 
     References:
         Brown & Colgate 1997, eq. (6); sufficient for any environment that satisfies (14).
@@ -163,10 +169,12 @@ def device_conditions(
     if info.damping is not None:
         delay = delay_ticks(info, period)
         needed = scale * force_scale * _needed_on(info, coupling, period, laws)
-        conditions.append(Condition("translation", needed, info.damping, delay))
+        remedy = _remedy(method, coupling.damping)
+        conditions.append(Condition("translation", needed, info.damping, remedy, delay))
         if info.turns:
             needed = force_scale / scale * _needed_on(info, coupling, period, laws, "rotation")
-            conditions.append(Condition("rotation", needed, info.rotational_damping, delay))
+            remedy = _remedy(method, coupling.rotational_damping)
+            conditions.append(Condition("rotation", needed, info.rotational_damping, remedy, delay))
     return tuple(conditions)
 
 
@@ -180,6 +188,17 @@ def _needed_on(
     """Returns the damping needed by a device that has a rate and a delay of its own."""
     needed = needed_damping(coupling, felt_period(info, period), laws, axis)
     return needed + damping_for_delay(info, coupling, period, axis)
+
+
+def _remedy(method: Method | None, used: float) -> str:
+    """Returns what lowers the damping needed.
+
+    A method that takes its own damping off what is felt spends on B' what a softer spring or a
+    shorter period saves, or more, as long as there is some B': until then only B counts.
+    """
+    if method is None or method.lag == 0.0:
+        return "lower stiffness or damping, or raise the rate"
+    return "lower the damping" if used > 0 else "lower the stiffness, or raise the rate"
 
 
 def run_conditions(
@@ -198,6 +217,7 @@ def run_conditions(
         parameters.scale,
         parameters.force_scale,
         parameters.laws,
+        method,
     )
 
 
@@ -229,7 +249,7 @@ def condition_sentences(
 def is_run_certified(conditions: tuple[Condition, ...], method: Method) -> bool | None:
     """As ``is_certified``; None also where the conditions hold, but no coupling law makes them do.
 
-    For a weld b >= KT/2 + B is necessary with what it truly is, but nothing proves it enough.
+    For a weld b >= KT/2 + B' is necessary with what it truly is, but nothing proves it enough.
     """
     verdict = is_certified(conditions)
     return None if verdict and not method.has_law else verdict
@@ -248,13 +268,14 @@ def default_coupling(
     scale: float = 1.0,
     force_scale: float = 1.0,
     laws: int = 1,
-    method: Method = IMPLICIT,
+    method: Method | None = None,
 ) -> Coupling:
-    """Returns the stiffest coupling that is safe on a device: 80 % of the bound, B = b / 4.
+    """Returns the stiffest coupling that is safe on a device: 80 % of the bound, B' = b / 4.
 
-    It needs 85 % of b. Where several laws a tick or a delay need more, K and B are lowered together
-    until they need no more than that, each kind of axis by itself: ``needed_damping`` is linear in
-    the two.
+    It is what is to be felt: K and B = B' + what the method adds by itself, so that the method uses
+    B' without clipping. It needs 85 % of b. Where several laws a tick or a delay need more, K and
+    B' are lowered together until they need no more than that, each kind of axis by itself:
+    ``needed_damping`` is linear in the two.
 
     Args:
         info: The device; where its damping is unknown, ``UNKNOWN_DAMPING`` is assumed, of a real
@@ -263,8 +284,7 @@ def default_coupling(
         scale: Handle motion per device motion.
         force_scale: Force on the device per force on the tool.
         laws: How often per tick the wrench is computed (substeps).
-        method: How the tool is rendered. What is returned is what is felt: where the method's law
-            needs less damping than is felt, what the device has to bear is the law.
+        method: How the tool is rendered; None takes ``rendering.default_method``.
 
     Raises:
         CouplingError: The number of laws is out of range, or a scale is not finite and positive, or
@@ -282,7 +302,9 @@ def default_coupling(
     )
     rotational *= scale / force_scale
     coupling = stiffest_coupling(damping, rotational, felt_period(info, period))
-    if checked_substeps(laws, CouplingError) == 1 and not delay_ticks(info, period):
+    checked_substeps(laws, CouplingError)
+    method = default_method(laws) if method is None else method
+    if laws == 1 and not delay_ticks(info, period):
         return method.rendered(coupling, period)
     shrink = min(1.0, NEEDED_SHARE * damping / _needed_on(info, coupling, period, laws))
     needed = needed_damping(coupling, period, laws, "rotation")

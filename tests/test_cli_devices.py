@@ -143,7 +143,7 @@ def test_a_usb_device_is_listed_by_the_kernels_word_where_libusb_is_missing(bus:
     (device,) = plugged_devices()
     assert (device.family, device.name, device.serial) == ("falcon", "FALCON HAPTIC", "FT000001")
     assert device.problem is not None
-    assert device.problem.startswith("no permission to open /dev/bus/usb/001/003")
+    assert "libusb cannot be loaded" in device.problem
 
 
 def test_the_bus_is_read_without_opening_anything(

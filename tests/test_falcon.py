@@ -171,6 +171,9 @@ def test_a_pause_of_the_loop_is_not_the_devices_silence() -> None:
     device = bench.opened()
     device.start(PERIOD)
     looped(bench, device, 20)
+    bench.time.until(bench.time.now + 5e-3)
+    sample = np.zeros(1, SAMPLE_DTYPE)
+    device.read(sample)  # the last reply: nothing waits for the loop when it comes back
     bench.time.until(bench.time.now + 1.0)
     _, flags, _ = looped(bench, device, 20)
     assert (flags[3:] == 0).all()

@@ -20,6 +20,7 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo, SimulatedDevice
 from hapticbridge.device.lateness import damping_for_delay, delay_ticks, felt_period
 from hapticbridge.errors import DeviceError
+from hapticbridge.rendering import default_method
 
 T = 1e-3
 SPRING = Coupling(stiffness=1000.0, damping=0.0, rotational_stiffness=2.0, rotational_damping=0.0)
@@ -87,7 +88,8 @@ def test_no_delayed_device_is_certified_and_a_prompt_one_is() -> None:
 @pytest.mark.parametrize("laws", [1, 4])
 def test_the_default_coupling_meets_the_condition_with_margin(delay: float, laws: int) -> None:
     late = info(delay=delay)
-    coupling = default_coupling(late, T, laws=laws)
+    felt = default_coupling(late, T, laws=laws)
+    coupling = default_method(laws).used(felt, T / laws)
     (condition,) = device_conditions(late, coupling, T, 1.0, 1.0, laws)
     assert condition.needed <= NEEDED_SHARE * 2.0 * (1 + 1e-9)
     assert condition.needed > 0.7 * 2.0

@@ -15,7 +15,7 @@ ORDER = (
     ("scene",),
     ("rendering",),
     ("ledger", "inputs", "device"),
-    ("guard", "recording", "certificate"),
+    ("guard", "recording", "certificate", "felt"),
     ("provenance", "summary", "workspace"),
     ("bridge", "audit", "identify"),
     ("report", "study", "check"),

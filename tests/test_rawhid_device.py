@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -139,14 +140,17 @@ def test_lost_frames_are_counted_and_the_newest_pose_is_used() -> None:
     assert (device.states.lost, device.states.damaged) == (3, 0)
 
 
-def test_a_sequence_that_wraps_loses_nothing() -> None:
+@pytest.mark.parametrize("lost", [0, 1, 2])
+def test_losses_are_counted_across_the_sequences_wrap(lost: int) -> None:
     device, model, seam = still()
-    model._sequence = 65534
     read(device, seam)
-    jump = device.states.lost
+    model._sequence = 65533
+    read(device, seam)  # 65534
+    before = device.states.lost
+    model.lose = set(range(model.frames + 2, model.frames + 2 + lost))  # 0, 1
     for _ in range(5):
         read(device, seam)
-    assert device.states.lost == jump
+    assert device.states.lost - before == lost
 
 
 def test_a_frame_with_a_wrong_crc_is_dropped_counted_and_missed() -> None:
@@ -245,10 +249,12 @@ def test_a_device_that_must_be_homed_or_sends_nothing_does_not_start() -> None:
 
 def test_silence_is_borne_for_50_ms_and_then_the_device_is_lost() -> None:
     device, model, seam = still()
-    read(device, seam)
-    model.is_silent = True
-    for _ in range(round(LONGEST_SILENCE / PERIOD)):
-        assert read(device, seam)[0] == STALE
+    for _ in range(2):  # one frame, and all is forgiven
+        model.is_silent = False
+        assert read(device, seam)[0] == 0
+        model.is_silent = True
+        for _ in range(round(LONGEST_SILENCE / PERIOD)):
+            assert read(device, seam)[0] == STALE
     with pytest.raises(DeviceLost, match="has sent nothing for 51 ms"):
         read(device, seam)
 
@@ -283,6 +289,18 @@ def test_closing_switches_the_motors_off() -> None:
     device.close()
     assert not model.is_enabled
     assert not model.wrench.any()
+
+
+def test_the_log_that_the_user_asks_for_holds_every_frame(tmp_path: Path) -> None:
+    device, model, seam = opened(log=str(tmp_path / "wire.log"))
+    device.start(PERIOD)
+    device.write(PUSH)
+    read(device, seam)
+    device.close()
+    lines = (tmp_path / "wire.log").read_text().splitlines()
+    sent = [line.split(" > ")[1] for line in lines if " > " in line]
+    assert [line[:11] for line in sent] == ["00 48 01 3f"] * 2 + ["00 48 01 46"] * 2
+    assert len(lines) - len(sent) == model.frames + 2  # and both pages of the sheet
 
 
 def test_the_echo_counts_force_frames_on_the_way() -> None:

@@ -18,6 +18,7 @@ from hapticbridge.certificate import condition_sentences, is_run_certified, run_
 from hapticbridge.device import DeviceInfo
 from hapticbridge.device.lateness import delay_ticks
 from hapticbridge.errors import HapticBridgeError, RecordingError
+from hapticbridge.felt import coupling_sentences
 from hapticbridge.guard import Limits, limits_for
 from hapticbridge.jsonable import jsonable
 from hapticbridge.kernel.state import RunParameters
@@ -47,6 +48,7 @@ class AuditReport:
         ticks: Number of records.
         duration: Their number times the period, in s.
         conditions: The device condition per kind of axis, as sentences.
+        rendered: What was felt away from contact, and what was used, as sentences.
         unchecked: What records alone do not tell and only the re-simulation confirms, or nothing;
             without a re-simulation such a recording is not called passive but invalid.
         energies: Energies at the end, in J.
@@ -67,6 +69,7 @@ class AuditReport:
     ticks: int = 0
     duration: float = 0.0
     conditions: tuple[str, ...] = ()
+    rendered: tuple[str, ...] = ()
     unchecked: str = ""
     energies: dict[str, float] = field(default_factory=dict)
     events: dict[str, int] = field(default_factory=dict)
@@ -190,6 +193,9 @@ def _device_facts(info: DeviceInfo, parameters: RunParameters, method: Method) -
         return {
             "certified": is_run_certified(run_conditions(info, parameters, method), method),
             "conditions": condition_sentences(info, parameters, method),
+            "rendered": coupling_sentences(
+                parameters.coupling, method, parameters.period, parameters.substeps
+            ),
         }
     except HapticBridgeError as error:  # numbers beyond what the theory computes with
         raise RecordingError(f"the metadata are out of range: {error}") from None

@@ -22,7 +22,7 @@ from hapticbridge.device.plugged import RULES_COMMAND, Plugged
 class Devices:
     """List the haptic devices that are plugged in, and those that are supported.
 
-    Says of each that cannot be opened what is missing. Opens none and moves no motor. Example:
+    Says of each that cannot be opened what is missing. Moves no motor. Example:
 
         hapticbridge devices --udev-rules | sudo tee /etc/udev/rules.d/70-hapticbridge.rules
     """

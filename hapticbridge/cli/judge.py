@@ -91,11 +91,11 @@ def _print_report(report: AuditReport) -> None:
         out.print(f"  [yellow]{plain(report.resimulation)}[/]")
     elif report.resimulation:
         out.print(f"  simulated again: {report.resimulation}")
-    for condition in report.conditions:
-        out.print(f"  {plain(condition)}")
+    for sentence in (*report.rendered[:1], *report.conditions):
+        out.print(f"  {plain(sentence)}")
     if not report.conditions:
         out.print(
-            "  device condition b >= KT/2 + B: not applicable, the motion is prescribed or the "
+            "  device condition b >= KT/2 + B': not applicable, the motion is prescribed or the "
             "damping unknown"
         )
     if report.is_cut:

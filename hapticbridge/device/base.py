@@ -79,7 +79,7 @@ class DeviceInfo:
             is not there stays where it is, and no wrench acts on it.
         mass: Inertia felt at the handle in kg, > 0; None where unknown.
         damping: Physical damping b at the handle in N s/m, >= 0; None where unknown or where
-            the motion is prescribed. The bound b >= KT/2 + B is judged against it.
+            the motion is prescribed. The bound b >= KT/2 + B' is judged against it.
         rotational_inertia: In kg m², > 0; None where unknown.
         rotational_damping: In N m s/rad, >= 0; None where unknown.
         friction: Coulomb friction per axis in N, >= 0; None where unknown.

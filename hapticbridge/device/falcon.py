@@ -7,9 +7,8 @@ arrives; so from a sample to the force that answers it as many whole ticks pass 
 come back: two at 1 kHz, because the bridge holds a reply for up to 1 ms.
 
 The device's frame: x to the right, y away from the user, z up, in m from the middle of the
-workspace, 0.125 m before the base. Which of its own axes point right and up, the signs of motors
-and encoders, and the bits of lights and homing are as libnifalcon's source has them: no real
-Falcon has moved under this code yet.
+workspace, 0.125 m before the base. Axes, signs and bits are as libnifalcon's source has them: no
+real Falcon has moved under this code yet.
 """
 
 from __future__ import annotations
@@ -66,7 +65,6 @@ class FalconDevice:
 
     Raises:
         DeviceError: It has no program and none was named, does not take it, or was not homed.
-        DeviceLost: It is gone.
     """
 
     def __init__(
@@ -122,8 +120,7 @@ class FalconDevice:
             period: The loop's period in s, at most 0.02.
 
         Raises:
-            DeviceError: The period is out of range, or the encoders say what no grip can.
-            DeviceLost: It is gone or silent.
+            DeviceError: The period is out of range, no grip has its encoders, or it is gone.
         """
         if checked_period(period) > LONGEST_PERIOD:
             raise DeviceError(
@@ -160,8 +157,7 @@ class FalconDevice:
             0, or ``TickFlag.STALE_SAMPLE`` where the sample repeats the last one.
 
         Raises:
-            DeviceError: ``start`` has not been called.
-            DeviceLost: It is gone, or gave nothing to believe for 50 ms.
+            DeviceError: It was not started, is gone, or gave nothing to believe for 50 ms.
         """
         if not self._is_started:
             raise DeviceError(f"{self._name} is read before it was started")
@@ -220,8 +216,7 @@ def open_falcon(options: Mapping[str, object], tell: Tell, backend: Any = None) 
         backend: A pyusb backend; None takes libusb.
 
     Raises:
-        DeviceError: There is none, it cannot be opened, or an option is not valid.
-        DeviceLost: It is gone.
+        DeviceError: There is none, it cannot be opened, is lost, or an option is not valid.
     """
     numbers = {
         name: checked_number(name, options[name], unit, is_positive=name == "mass")
@@ -230,7 +225,7 @@ def open_falcon(options: Mapping[str, object], tell: Tell, backend: Any = None) 
     }
     files = {name: str(options[name]) for name in ("firmware", "log") if options.get(name)}
     firmware = files.get("firmware")
-    if firmware is not None:
+    if firmware:
         read_firmware(firmware)  # a wrong name is said before anything moves
     plugged = chosen(FAMILY, find(FAMILY, backend), options.get("serial"))
     log = HexLog(files.get("log"))

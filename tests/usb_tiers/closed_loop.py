@@ -9,15 +9,15 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 
-from benches import FALCON, falcon, rawhid
 from emulated.emulator_process import EmulatorProcess
 from emulated.usb_device import UsbDevice
 from emulated.usbip import Usbip
-from waiting import wait_for
 
 import hapticbridge.clock
 from hapticbridge.cli import main
 from hapticbridge.device.families import plugged_devices
+from usb_tiers.benches import FALCON, falcon, rawhid
+from usb_tiers.waiting import wait_for
 
 DEVICES: dict[str, tuple[Callable[[], UsbDevice], str]] = {
     "falcon": (falcon, FALCON),

@@ -20,7 +20,8 @@ from emulated.uhid import Uhid
 from emulated.umock import Umock
 from emulated.usb_device import UsbDevice
 from emulated.usbip import Usbip
-from waiting import wait_for
+
+from usb_tiers.waiting import wait_for
 
 TIER = os.environ["HAPTICBRIDGE_TIER"]
 _FRONT_ENDS: dict[str, dict[str, Callable[[Any], FrontEnd]]] = {
