@@ -21,23 +21,33 @@ ANVIL = """<mujoco model="anvil">
   <worldbody>
     <body name="anvil">
       <freejoint/>
-      <geom type="sphere" size="0.02" mass="200" contype="0" conaffinity="0"/>
+      <geom type="sphere" size="0.02" mass="20000" contype="0" conaffinity="0"/>
       <site name="grip"/>
     </body>
   </worldbody>
 </mujoco>"""
+
+RETREAT = """t,x,y,z,qw,qx,qy,qz
+0,0,0,0,1,0,0,0
+0.6,0,0,0,1,0,0,0
+1.6,0.01,0,0,1,0,0,0
+1.7,0.01,0,0,1,0,0,0
+1.8,0,0,0,1,0,0,0
+2.5,0,0,0,1,0,0,0
+"""
+"""In, slowly, while the force is full; out in a tenth of a second."""
 
 LOOSE = Hand(mass=0.01, damping=0.0, stiffness=60.0)
 """A hand that burns nothing: what the coupling creates stays and grows."""
 
 
 def held_to_an_anvil(
-    folder: Path, stiffness: float, delay: float | None = None
+    folder: Path, stiffness: float, delay: float | None = None, held: SimulatedDevice | None = None
 ) -> tuple[AuditReport, float]:
     """Returns the verdict, and how far the grip swings at the end in m; b = 2 N s/m, 1 kHz."""
     scene, path = folder / "anvil.xml", folder / "run.mcap"
     scene.write_text(ANVIL)
-    bench = Bench(SimulatedDevice(mass=0.4, damping=2.0, hand=LOOSE))
+    bench = Bench(held or SimulatedDevice(mass=0.4, damping=2.0, hand=LOOSE))
     device = bench.opened(damping=2.0)
     if delay is not None:
         device.info = dataclasses.replace(device.info, delay=delay)
@@ -71,3 +81,13 @@ def test_a_device_that_hides_its_delay_would_be_certified(tmp_path: Path) -> Non
     report, swing = held_to_an_anvil(tmp_path, 3000.0, delay=0.0)
     assert swing > 5e-3
     assert (report.verdict, report.certified) == ("passive", True)
+
+
+def test_a_quick_retreat_from_a_loaded_spring_is_no_kick(tmp_path: Path) -> None:
+    # the grip has left 2 ticks before its sample says so: what the spring held there is not counted
+    path = tmp_path / "hand.csv"
+    path.write_text(RETREAT)
+    firm = Hand(mass=0.3, damping=5.0, stiffness=2000.0)
+    held = SimulatedDevice(mass=0.4, damping=2.0, hand=firm, path=path)
+    report, _ = held_to_an_anvil(tmp_path, 700.0, held=held)
+    assert (report.verdict, report.certified) == ("passive", None)
