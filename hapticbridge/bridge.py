@@ -30,6 +30,7 @@ from hapticbridge.guard import (
 )
 from hapticbridge.inputs import Write, apply_writes, input_writes
 from hapticbridge.jit import direct
+from hapticbridge.kernel.layout import STATE_DTYPE
 from hapticbridge.kernel.parameters import checked_substeps
 from hapticbridge.kernel.publish import publish
 from hapticbridge.kernel.state import Binding
@@ -47,7 +48,7 @@ from hapticbridge.rendering import (
 from hapticbridge.scene import Scene, load_scene
 from hapticbridge.signals import stopping_on_signals
 from hapticbridge.summary import Summary
-from hapticbridge.tick import SAMPLE_DTYPE, TickFlag
+from hapticbridge.tick import SAMPLE_DTYPE, TICK_DTYPE, TickFlag
 from hapticbridge.workspace import Workspace, run_parameters
 
 _NO_FORCE = np.zeros(6)
@@ -328,9 +329,16 @@ class Bridge:
             raise HapticBridgeError("a bridge is entered once; make a new one for another run")
         self.scene.claim()
         resources.callback(self.scene.release)
-        scene, clock, info, method = self.scene, self.clock, self.device.info, self.method
+        scene, clock, method = self.scene, self.clock, self.method
         felt = prepare(scene, self.coupling, self.period, self._substeps, method)
+        self._stream = RecordStream(
+            self._path, self.period, live=self._is_live, is_lossless=clock.is_lossless
+        )
+        resources.callback(self._stream.close)
+        self._compile()
+        # last, because from here on the device is held, and its pose counts
         self._sample[:] = self.device.start(self.period)
+        info = self.device.info
         self.parameters = run_parameters(
             scene,
             self.coupling,
@@ -346,11 +354,6 @@ class Bridge:
         )
         self._binding = binding = Binding(scene.model, scene.data, self.parameters)
         refuse_stretched_start(binding.state, self._limits)
-        self._stream = RecordStream(
-            self._path, self.period, live=self._is_live, is_lossless=clock.is_lossless
-        )
-        resources.callback(self._stream.close)
-        self._compile()
         if self._stream.is_read:
             meta = describe_run(
                 scene, self.parameters, binding, method=method.name, device=info, clock=clock.name
@@ -360,7 +363,7 @@ class Bridge:
 
     def _compile(self) -> None:
         """Gets the machine code of the tick ready, so that the first one is not late."""
-        state, row, sample = self._binding.state, self._binding.row, self._sample
+        state, row, sample = np.zeros(1, STATE_DTYPE), np.zeros(1, TICK_DTYPE), self._sample
         rows, cursors = self._stream.rows, self._stream.cursors
         self._before_step = direct(before_step, state, sample, row, 0, 0.0)
         self._after_step = direct(after_step, state, row, 0)

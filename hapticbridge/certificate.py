@@ -64,7 +64,10 @@ class Condition:
         """Says it, with what to change if it does not hold."""
         unit = "N s/m" if self.axis == "translation" else "N m s/rad"
         if self.available is None:
-            return f"{self.axis}: device damping unknown, {self.needed:g} {unit} needed"
+            return (
+                f"{self.axis}: device damping unknown, {self.needed:g} {unit} needed; "
+                "'hapticbridge identify' measures it"
+            )
         relation = ">=" if self.holds else "<"
         text = f"{self.axis}: device damping {self.available:g} {relation} {self.needed:g} {unit}"
         if not self.holds:

@@ -250,7 +250,7 @@ def test_a_profile_says_the_scale_and_the_user_goes_before_it(
     profile = Profile("stick", "pid", "P1", None, "", quantities)
     asked = []
     monkeypatch.setattr(
-        sheet, "profile_of", lambda device, serial: asked.append((device, serial)) or profile
+        sheet, "profile_of", lambda *named: (asked.append(named), profile)[1]
     )
     model = PidStick()
     model.place = (1.0, 0.0)

@@ -11,7 +11,7 @@ from typing import Annotated
 import tyro
 from rich.table import Table
 
-from hapticbridge.cli.terminal import err, out, plain, print_json, progress, quantity
+from hapticbridge.cli.terminal import err, out, plain, print_json, progress, quantity, tell
 from hapticbridge.clock import RealClock, SimulatedClock, period_of
 from hapticbridge.device import AXES, open_device
 from hapticbridge.device.profile import Profile, own_folder
@@ -65,7 +65,7 @@ class Identify:
             if path is not None:
                 check_ending(path)
         self._check()
-        device = open_device(self.device)
+        device = open_device(self.device, tell=tell)
         try:
             axes = self._axes(device.info.axes)
             clock = RealClock() if device.info.is_real else SimulatedClock()
@@ -88,7 +88,7 @@ class Identify:
         profile = measured_profile(
             result,
             device=self.device.partition(":")[0],
-            serial=getattr(device, "serial", ""),
+            serial=device.info.serial,
             date=date.today().isoformat(),
             duration=self.duration,
         )

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import array
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -232,7 +233,9 @@ def open_falcon(options: Mapping[str, object], tell: Tell, backend: Any = None) 
     link = UsbLink.open(
         plugged, FAMILY, read_from=READ_FROM, write_to=WRITE_TO, backend=backend, log=log
     )
-    return FalconDevice(link, name=str(plugged), firmware=firmware, tell=tell, **numbers)
+    device = FalconDevice(link, name=str(plugged), firmware=firmware, tell=tell, **numbers)
+    device.info = replace(device.info, serial=plugged.serial)
+    return device
 
 
 _NUMBERS = {"mass": "kg", "damping": "N s/m", "friction": "N"}

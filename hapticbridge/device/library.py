@@ -13,6 +13,7 @@ from hapticbridge.device.families import FAMILIES, family_named
 from hapticbridge.device.hand import Hand
 from hapticbridge.device.motion_csv import read_motion
 from hapticbridge.device.plugged import Tell, tell_nobody
+from hapticbridge.device.profile import profile_named, profile_of
 from hapticbridge.device.scene_hand import scene_hand
 from hapticbridge.device.simulated import SimulatedDevice
 from hapticbridge.device.specification import parsed, refuse_unknown
@@ -42,7 +43,8 @@ def open_device(spec: str, *, tell: Tell = tell_nobody, **options: object) -> De
     - a device that is plugged in, by its family's name (``hapticbridge devices`` lists them), with
       options that the family has: ``spacemouse:speed=0.1,turn=1,dead_band=0.05``,
       ``rawhid:serial=12345,damping=2``, ``falcon:firmware=FILE``. ``serial`` picks one of several,
-      ``log=FILE`` keeps what went over the wire.
+      ``log=FILE`` keeps what went over the wire. What its driver does not know comes from the
+      profile of the unit or its kind, or from that of ``profile=NAME`` (or a file, or ``none``).
 
     Args:
         spec: The specification.
@@ -61,8 +63,17 @@ def open_device(spec: str, *, tell: Tell = tell_nobody, **options: object) -> De
     """
     name, _, rest = spec.partition(":")
     if (family := family_named(name)) is not None:
-        refuse_unknown(name, options, family.options)
-        return family.open({**options, **parsed(name, rest, family.options)}, tell)
+        valid = (*family.options, "profile")
+        refuse_unknown(name, options, valid)
+        asked = {**options, **parsed(name, rest, valid)}
+        wanted = asked.pop("profile", None)
+        chosen = None if wanted in (None, "none") else profile_named(str(wanted))
+        device = family.open(asked, tell)
+        if wanted is None:
+            chosen = profile_of(name, device.info.serial)
+        if chosen is not None:
+            device.info = chosen.fill(device.info)
+        return device
     if name not in _OPENERS:
         names = choices([*_OPENERS, *(family.name for family in FAMILIES)])
         raise DeviceError(f"unknown device '{name}'; there are {names}")

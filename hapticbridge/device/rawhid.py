@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -219,10 +220,12 @@ def open_rawhid(
     )
     changes = {key: value for key, value in options.items() if key in CHANGES}
     try:
-        return RawHidDevice(link, str(plugged), changes)
+        device = RawHidDevice(link, str(plugged), changes)
     except BaseException:
         link.close()
         raise
+    device.info = replace(device.info, serial=plugged.serial)
+    return device
 
 
 FAMILY = Family(

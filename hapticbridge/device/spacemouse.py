@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -219,10 +220,12 @@ def open_spacemouse(
         if key in _NUMBERS
     }
     try:
-        return SpaceMouseDevice(link, plugged.name, **numbers)
+        device = SpaceMouseDevice(link, plugged.name, **numbers)
     except BaseException:
         link.close()
         raise
+    device.info = replace(device.info, serial=plugged.serial)
+    return device
 
 
 _NUMBERS = ("speed", "turn", "dead_band", "force_limit", "torque_limit")
