@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 from emulated.hid_device import HidDevice
 from emulated.hid_seam import HidSeam
+from emulated.pid_layouts import ODD
+from emulated.pid_model import PidStick
 from emulated.rawhid_model import RawHid
 from emulated.spacemouse_model import SpaceMouse
 from emulated.ticking import Ticking
@@ -29,6 +31,7 @@ from hapticbridge.device import (
     SimulatedDevice,
     open_device,
 )
+from hapticbridge.device.pid import open_pid
 from hapticbridge.device.plugged import tell_nobody
 from hapticbridge.device.rawhid import open_rawhid
 from hapticbridge.device.spacemouse import open_spacemouse
@@ -93,6 +96,8 @@ DEVICES: dict[str, Callable[[Path], Device]] = {
         lambda: SpaceMouse(pushed, has_long_reports=True), open_spacemouse
     ),
     "falcon": falcon,
+    "stick": lambda _: ticking(lambda: PidStick(SimulatedDevice()), open_pid),
+    "odd stick": lambda _: ticking(lambda: PidStick(SimulatedDevice(), ODD), open_pid),
 }
 
 
@@ -266,7 +271,7 @@ def test_options_reach_the_device_and_the_specification_goes_before_the_code(
 @pytest.mark.parametrize(
     ("spec", "options", "words"),
     [
-        ("falcn", {}, "unknown device 'falcn'; there are 'falcon', 'rawhid', 'simul"),
+        ("falcn", {}, "unknown device 'falcn'; there are 'falcon', 'pid', 'rawhid'"),
         ("rawhid:colour=red", {}, "unknown option 'colour' of the rawhid device; there are 'd"),
         ("spacemouse", {"colour": 1}, "unknown option 'colour' of the spacemouse device"),
         ("spacemouse:speed=fast", {}, "speed = 'fast': must be a number"),

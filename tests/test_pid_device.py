@@ -240,7 +240,7 @@ def test_what_nobody_says_is_assumed_aloud_and_leaves_the_bound_unjudged() -> No
     assert not told
 
 
-def test_a_profile_says_the_scale_and_the_user_goes_before_it(
+def test_a_profile_says_the_scale_and_no_other_goes_with_its_numbers(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     quantities = {
@@ -248,17 +248,25 @@ def test_a_profile_says_the_scale_and_the_user_goes_before_it(
         "workspace": Quantity((0.05, 0.05, 0.05), "a ruler"),
     }
     profile = Profile("stick", "pid", "P1", None, "", quantities)
-    asked = []
-    monkeypatch.setattr(
-        sheet, "profile_of", lambda *named: (asked.append(named), profile)[1]
-    )
+    asked: list[tuple[str, str]] = []
+
+    def profile_of(device: str, serial: str) -> Profile:
+        asked.append((device, serial))
+        return profile
+
+    monkeypatch.setattr(sheet, "profile_of", profile_of)
     model = PidStick()
     model.place = (1.0, 0.0)
-    device = open_pid({"damping": 1.0}, tell_nobody, HidSeam(model))
+    device = open_pid({"damping": 1.0, "newtons": 7.0}, tell_nobody, HidSeam(model))
     assert asked == [("pid", "P1")]
     assert device.info.force_limit == 7.0
     assert device.start(PERIOD)["position"][0, 0] == pytest.approx(0.025)
-    assert open_pid({"newtons": 3.0}, tell_nobody, HidSeam(model)).info.force_limit == 3.0
+    with pytest.raises(DeviceError, match=r"newtons = 3\.0: .* was measured with 7, .* leave out"):
+        open_pid({"newtons": 3.0}, tell_nobody, HidSeam(model))
+    with pytest.raises(DeviceError, match=r"travel = 0\.1: .* was measured with 0\.05"):
+        open_pid({"travel": 0.1}, tell_nobody, HidSeam(model))
+    other = open_pid({"newtons": 3.0, "profile": "none"}, tell_nobody, HidSeam(model))
+    assert other.info.force_limit == 3.0
 
 
 @pytest.mark.parametrize(

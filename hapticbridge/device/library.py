@@ -63,10 +63,12 @@ def open_device(spec: str, *, tell: Tell = tell_nobody, **options: object) -> De
     """
     name, _, rest = spec.partition(":")
     if (family := family_named(name)) is not None:
-        valid = (*family.options, "profile")
+        valid = tuple(dict.fromkeys((*family.options, "profile")))
         refuse_unknown(name, options, valid)
         asked = {**options, **parsed(name, rest, valid)}
-        wanted = asked.pop("profile", None)
+        wanted = asked.get("profile")
+        if "profile" not in family.options:
+            asked.pop("profile", None)
         chosen = None if wanted in (None, "none") else profile_named(str(wanted))
         device = family.open(asked, tell)
         if wanted is None:

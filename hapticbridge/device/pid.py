@@ -61,7 +61,7 @@ class PidDevice:
 
     Attributes:
         info: Its data sheet.
-        serial: Its serial number.
+        workspace: Its travel along x, y and (it has none) z in m, as stated or assumed.
 
     Raises:
         DeviceError: It does not do what is needed; says what.
@@ -77,7 +77,7 @@ class PidDevice:
         intervals: tuple[float | None, float | None] = (None, None),
         serial: str = "",
     ) -> None:
-        self._link, self._name, self.serial = link, name, serial
+        self._link, self._name = link, name
         self._is_open = True
         try:
             layout = Layout(link.requests.report_descriptor())
@@ -86,7 +86,8 @@ class PidDevice:
         except DeviceError as error:
             raise DeviceError(f"{name} cannot be driven: {error}") from None
         self._effects = Effects(link, name, reports, intervals[1])
-        self.info = data_sheet(name, scale, self._stick.step, intervals, dict(known or {}))
+        self.info = data_sheet(name, serial, scale, self._stick.step, intervals, dict(known or {}))
+        self.workspace = (scale.travel,) * 3
         self._reach = np.array([0.5, -0.5]) * scale.travel
         self._shares = scale.signs / scale.newtons
         self._sample = np.zeros(1, SAMPLE_DTYPE)
@@ -178,8 +179,8 @@ def open_pid(options: Mapping[str, object], tell: Tell, api: HidApi | None = Non
     """Finds and opens a force-feedback stick.
 
     Args:
-        options: ``serial``, ``log``, ``newtons``, ``travel``, ``reverse``, and numbers of the data
-            sheet, ``CHANGES``.
+        options: ``serial``, ``log``, ``newtons``, ``travel``, ``reverse``, ``profile``, and numbers
+            of the data sheet, ``CHANGES``.
         tell: Told what had to be assumed.
         api: hidapi or what stands for it; its reports are then not sent by a thread.
 
@@ -218,7 +219,7 @@ FAMILY = Family(
     axes="2",
     force="a share of full scale; newtons= says what that is",
     rate="125 Hz to 1 kHz, one axis at a time",
-    options=("serial", "log", "newtons", "travel", "reverse", *CHANGES),
+    options=("serial", "log", "newtons", "travel", "reverse", "profile", *CHANGES),
     open=open_pid,
     recognises=has_force_feedback,
 )

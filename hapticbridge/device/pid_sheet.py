@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from hapticbridge.device.base import DeviceInfo, checked_number
 from hapticbridge.device.plugged import Tell
-from hapticbridge.device.profile import profile_of
+from hapticbridge.device.profile import profile_named, profile_of
 from hapticbridge.errors import DeviceError
 
 ASSUMED_NEWTONS = 10.0
@@ -55,7 +55,8 @@ def scale_of(
     """Returns the scale, and what else of the options is for the data sheet.
 
     What the user says goes first, then the unit's or the family's profile (``force_limit``: newtons
-    at full scale; ``workspace``: travel), then an assumption, of which the user is told.
+    at full scale; ``workspace``: travel), then an assumption, of which the user is told. What a
+    profile was measured with must not be changed: its b would be in other units than the force.
 
     Args:
         options: As given to ``open_device``.
@@ -63,15 +64,18 @@ def scale_of(
         tell: Takes the sentence.
 
     Raises:
-        DeviceError: A number is out of range, or states what nobody can know without the scale.
+        DeviceError: A number is out of range, contradicts the profile, or states what nobody can
+            know without the scale.
     """
-    profile = profile_of("pid", serial)
-    known = {} if profile is None else {k: q.value for k, q in profile.quantities.items()}
-    workspace = known.get("workspace")
-    stated = {
-        "newtons": options.get("newtons", known.get("force_limit")),
-        "travel": options.get("travel", workspace[0] if isinstance(workspace, tuple) else None),
-    }
+    measured = _measured_with(options.get("profile"), serial)
+    for name, value in measured.items():
+        asked = options.get(name, value)
+        if value is not None and asked != value:
+            raise DeviceError(
+                f"{name} = {asked!r}: the profile of this stick was measured with {value:g}, and "
+                f"its damping holds for that alone; leave out {name}=, or add profile=none"
+            )
+    stated = {name: options.get(name, value) for name, value in measured.items()}
     changes = {name: options[name] for name in CHANGES if name in options}
     missing = [f"{name}=" for name, value in stated.items() if value is None]
     if changes and missing:
@@ -98,8 +102,22 @@ def scale_of(
     return Scale(newtons, travel, signs), changes
 
 
+def _measured_with(named: object, serial: str) -> dict[str, float | None]:
+    """Returns the scale that a profile's numbers are in; None where it does not say."""
+    profile = profile_of("pid", serial) if named is None else None
+    if named not in (None, "none"):
+        profile = profile_named(str(named))
+    known = {} if profile is None else {k: q.value for k, q in profile.quantities.items()}
+    newtons, workspace = known.get("force_limit"), known.get("workspace")
+    return {
+        "newtons": newtons if isinstance(newtons, float) else None,
+        "travel": workspace[0] if isinstance(workspace, tuple) else None,
+    }
+
+
 def data_sheet(
     name: str,
+    serial: str,
     scale: Scale,
     step: tuple[float, ...],
     intervals: tuple[float | None, float | None],
@@ -112,6 +130,7 @@ def data_sheet(
 
     Args:
         name: What the device is called.
+        serial: Its serial number.
         scale: Newtons and metres.
         step: Least change of deflection per axis, of -1 to 1.
         intervals: Time per report from and to the device, in s; None where unknown.
@@ -125,6 +144,7 @@ def data_sheet(
     values: dict[str, Any] = dict.fromkeys(CHANGES) | known
     return DeviceInfo(
         name=name,
+        serial=serial,
         axes=_AXES,
         rotational_inertia=None,
         rotational_damping=None,
