@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from emulated.hid_seam import DrivingClock
 from emulated.pid_model import PidStick
+from emulated.planar_hand import planar_hand
 from pid_cases import LAYOUTS, NEWTONS, PERIOD, TRAVEL, opened
 
 import hapticbridge as hb
 from hapticbridge.device import SimulatedDevice
 from hapticbridge.errors import SafetyTrip
 from hapticbridge.identify import identify
-from hapticbridge.scene import scene_path
 from hapticbridge.tick import TickFlag
 
 MASS, DAMPING, WIDE = 0.25, 4.0, 0.12
@@ -23,19 +23,9 @@ AWAY_IS_UP = [[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]
 """The scene lies in x and z, the stick in x and y."""
 
 
-@pytest.fixture(scope="module", name="path")
-def _path(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The hand's way of putting the peg into the hole, laid down into the stick's plane."""
-    motion = np.genfromtxt(scene_path(SCENE).with_suffix(".csv"), delimiter=",", names=True)
-    rows = np.column_stack([motion["t"], motion["x"], motion["z"], 0.0 * motion["t"]])
-    file = tmp_path_factory.mktemp("pid") / "hand.csv"
-    np.savetxt(file, rows, delimiter=",", header="t,x,y,z", comments="")
-    return file
-
-
-def guided(path: Path, name: str = "usual") -> PidStick:
+def guided(name: str = "usual") -> PidStick:
     """Returns a stick in a hand that puts the peg into the hole."""
-    mechanics = SimulatedDevice(mass=MASS, damping=DAMPING, friction=0.05, path=path)
+    mechanics = SimulatedDevice(mass=MASS, damping=DAMPING, friction=0.05, path=planar_hand(SCENE))
     return PidStick(mechanics, LAYOUTS[name], newtons=NEWTONS, travel=WIDE)
 
 
@@ -48,9 +38,9 @@ def run(recording: Path, model: PidStick, seconds: float) -> tuple[hb.Summary, P
 
 
 @pytest.mark.parametrize("name", LAYOUTS)
-def test_a_scene_behind_a_stick_is_audited_passive(tmp_path: Path, path: Path, name: str) -> None:
+def test_a_scene_behind_a_stick_is_audited_passive(tmp_path: Path, name: str) -> None:
     recording = tmp_path / "run.mcap"
-    summary, model = run(recording, guided(path, name), 4.0)
+    summary, model = run(recording, guided(name), 4.0)
     report = hb.audit(recording)
     assert (report.verdict, report.resimulation) == ("passive", "bit for bit")
     # b would do, but what the firmware adds in delay nobody says
@@ -64,11 +54,9 @@ def test_a_scene_behind_a_stick_is_audited_passive(tmp_path: Path, path: Path, n
     assert not model.effects
 
 
-def test_two_effects_cost_no_more_reports_than_one_with_a_direction(
-    tmp_path: Path, path: Path
-) -> None:
+def test_two_effects_cost_no_more_reports_than_one_with_a_direction(tmp_path: Path) -> None:
     recording = tmp_path / "run.mcap"
-    _, model = run(recording, guided(path), 4.0)
+    _, model = run(recording, guided(), 4.0)
     force = hb.read_recording(recording).ticks["wrench_on_device"][:, :2]
     full = 32767 / NEWTONS
     two = np.count_nonzero(np.diff(np.rint(full * force), axis=0)) / len(force)
@@ -80,10 +68,10 @@ def test_two_effects_cost_no_more_reports_than_one_with_a_direction(
     assert model.outputs / len(force) < two + 0.06
 
 
-def test_the_loop_is_the_same_in_every_run(tmp_path: Path, path: Path) -> None:
+def test_the_loop_is_the_same_in_every_run(tmp_path: Path) -> None:
     rows = []
     for name in ("a", "b"):
-        run(tmp_path / f"{name}.mcap", guided(path), 0.2)
+        run(tmp_path / f"{name}.mcap", guided(), 0.2)
         ticks = hb.read_recording(tmp_path / f"{name}.mcap").ticks
         rows.append((ticks["device_position"].tobytes(), ticks["wrench_on_device"].tobytes()))
     assert rows[0] == rows[1]
@@ -98,10 +86,8 @@ def test_a_stick_of_125_hz_repeats_its_samples_and_every_repetition_is_flagged(
     assert np.count_nonzero(flags & int(TickFlag.STALE_SAMPLE)) == pytest.approx(350, abs=1)
 
 
-def test_unplugging_in_mid_run_trips_and_the_stick_lets_go_by_itself(
-    tmp_path: Path, path: Path
-) -> None:
-    device, model, seam = opened(guided(path), damping=DAMPING, travel=WIDE)
+def test_unplugging_in_mid_run_trips_and_the_stick_lets_go_by_itself(tmp_path: Path) -> None:
+    device, model, seam = opened(guided(), damping=DAMPING, travel=WIDE)
 
     def pull(tick: int) -> None:
         if tick == 900:

@@ -149,6 +149,22 @@ def _bit(name: str, usage: int, within: int = 0) -> Part:
     return Part(name=name, usage=usage, bits=1, high=1, within=within)
 
 
+def _envelope(number: int, index: int, bits: int) -> Report:
+    """Returns the report of what the model has no use for; the kernel wants it to be there."""
+    parts = ("attack_level", 0x5B), ("fade_level", 0x5D)
+    times = ("attack_time", 0x5C), ("fade_time", 0x5E)
+    return Report(
+        kind=OUT,
+        number=number,
+        usage=PID | 0x5A,
+        parts=(
+            _index(index),
+            *(Part(name=name, usage=PID | usage, bits=bits) for name, usage in parts),
+            *(_time(name, usage) for name, usage in times),
+        ),
+    )
+
+
 USUAL: dict[str, Report] = {
     "state": Report(
         kind=IN,
@@ -204,6 +220,7 @@ USUAL: dict[str, Report] = {
             Part(name="magnitude", usage=PID | 0x70, bits=16, low=-32767, high=32767),
         ),
     ),
+    "envelope": _envelope(2, 8, 8),
     "operation": Report(
         kind=OUT,
         number=10,
@@ -327,6 +344,7 @@ ODD: dict[str, Report] = {
             _bit("enable_x", DESKTOP | 0x30, PID | 0x55),
         ),
     ),
+    "envelope": _envelope(0x48, 6, 9),
     "load": Report(
         kind=FEATURE,
         number=0x22,

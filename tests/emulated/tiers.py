@@ -135,7 +135,8 @@ def _in_the_guest(folder: Path, command: Sequence[str], *, is_virtual: bool) -> 
 
 
 def _checks_in_virtual_time(folder: Path) -> list[Claim]:
-    run = _in_the_guest(folder, _pytest("/run/job/report.xml"), is_virtual=True)
+    command = _pytest("/run/job/report.xml", "*check_*.py")
+    run = _in_the_guest(folder, command, is_virtual=True)
     return claims_of(folder / "report.xml", run.output)
 
 
@@ -146,7 +147,7 @@ def _round_trips(folder: Path) -> list[Claim]:
 
 
 def _recorded(folder: Path, device: str, seconds: float) -> tuple[GuestRun, Path]:
-    """Runs ``hapticbridge run peg_in_hole`` on an emulated device in virtual time."""
+    """Runs ``hapticbridge run`` on an emulated device in virtual time."""
     folder.mkdir(exist_ok=True)
     program = ["-m", "usb_tiers.closed_loop"]
     command = [sys.executable, *program, device, f"{seconds:g}", "/run/job/run.mcap"]
@@ -156,7 +157,7 @@ def _recorded(folder: Path, device: str, seconds: float) -> tuple[GuestRun, Path
 def _closed_loop(device: str) -> Callable[[Path], list[Claim]]:
     def run(folder: Path) -> list[Claim]:
         ended, file = _recorded(folder, device, LOOP)
-        name = f"peg_in_hole on {device} for {LOOP:g} s of virtual time is audited passive"
+        name = f"a peg's insertion on {device} for {LOOP:g} s of virtual time is audited passive"
         if ended.status != 0:
             return [Claim(name, is_true=False, note=ended.output)]
         report = hb.audit(file)
@@ -181,6 +182,7 @@ def _the_same_every_time(folder: Path) -> list[Claim]:
 JOBS = (
     Job("C: closed loop on a Falcon", _kernel_missing, _closed_loop("falcon")),
     Job("C: closed loop on raw HID", _kernel_missing, _closed_loop("rawhid")),
+    Job("C: closed loop on a stick", _kernel_missing, _closed_loop("pid")),
     Job("C: checks in User-Mode Linux, virtual time", _kernel_missing, _checks_in_virtual_time),
     Job("C: 1 kHz loop, repeated", _kernel_missing, _the_same_every_time),
     Job("B: checks under umockdev", _umockdev_missing, _under_umockdev),
