@@ -9,12 +9,15 @@ from __future__ import annotations
 import fcntl
 import os
 import struct
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from emulated.emulator_process import EmulatorProcess
+from emulated.pid_model import PidStick
 
-from usb_tiers.benches import NEWTONS, free_stick
+import hapticbridge as hb
+from hapticbridge.device.families import plugged_devices
+from usb_tiers.benches import NEWTONS, STICK, free_stick
 from usb_tiers.conftest import Plug
 from usb_tiers.waiting import wait_for
 
@@ -54,16 +57,12 @@ class Evdev:
         os.close(self._file)
 
 
-@pytest.fixture(params=[False, True], ids=["usual", "odd"], name="is_odd")
-def _is_odd(request: pytest.FixtureRequest) -> Iterator[bool]:
-    yield request.param
-
-
 def _event_node() -> Path | None:
     found = list(Path("/sys/class/hidraw").glob("*/device/input/input*/event*"))
     return Path("/dev/input") / found[0].name if found else None
 
 
+@pytest.mark.parametrize("is_odd", [False, True], ids=["usual", "odd"])
 def test_the_kernels_driver_takes_the_stick_and_pushes_it_the_way_it_says(
     plug_usb: Plug, is_odd: bool
 ) -> None:
@@ -71,6 +70,7 @@ def test_the_kernels_driver_takes_the_stick_and_pushes_it_the_way_it_says(
     node = wait_for(_event_node)
     assert node is not None
     evdev = wait_for(lambda: _with_force(node))
+    assert evdev is not None
     effect = -1
     for direction, expected in (
         (_DOWN, (0.0, 1.0)),
@@ -80,10 +80,10 @@ def test_the_kernels_driver_takes_the_stick_and_pushes_it_the_way_it_says(
     ):
         effect = evdev.upload(direction, _FULL // 2, effect)
         evdev.play(effect, 1)
-        pushed = tuple(0.5 * NEWTONS * share for share in expected)
-        wait_for(lambda pushed=pushed: model.call("force") == pytest.approx(pushed, abs=0.03))  # type: ignore[misc]
+        x, y = (0.5 * NEWTONS * share for share in expected)
+        _wait_for_force(model, x, y)
     evdev.play(effect, 0)
-    wait_for(lambda: model.call("force") == (0.0, 0.0))
+    _wait_for_force(model, 0.0, 0.0)
     evdev.erase(effect)
     wait_for(lambda: not model.get("effects"))
     evdev.close()
@@ -96,3 +96,18 @@ def _with_force(node: Path) -> Evdev | None:
         return evdev
     evdev.close()
     return None
+
+
+def _wait_for_force(model: EmulatorProcess, x: float, y: float) -> None:
+    """Waits until the motors give a force in N, to within the kernel's rounding of angles: 1°."""
+    wait_for(lambda: model.call("force") == pytest.approx((x, y), abs=0.05))
+
+
+def test_a_sticks_rate_is_that_of_two_reports_through_the_endpoint_that_the_kernel_shows(
+    plug_usb: Plug,
+) -> None:
+    plug_usb(free_stick)
+    wait_for(plugged_devices)
+    device = hb.open_device(STICK)
+    device.close()
+    assert device.info.rate == pytest.approx(1.0 / (2 * 1e-3 * PidStick.interval))
