@@ -7,7 +7,7 @@ from emulated.pid_layouts import FEATURE as MODEL_FEATURE
 from emulated.pid_layouts import IN, OUT, Report, descriptor
 from hypothesis import given
 from hypothesis import strategies as st
-from pid_cases import LAYOUTS
+from pid_cases import LAYOUTS, MOUSE
 
 from hapticbridge.device.hid_descriptor import (
     FEATURE,
@@ -20,12 +20,6 @@ from hapticbridge.device.hid_layout import Layout, element, place_of
 from hapticbridge.errors import DeviceError
 
 KINDS = {IN: INPUT, OUT: OUTPUT, MODEL_FEATURE: FEATURE}
-
-MOUSE = bytes.fromhex(
-    "0501 0902 a101 0901 a100 0509 1901 2903 1500 2501 9503 7501 8102 9501 7505 8101"
-    "0501 0930 0931 1581 257f 7508 9502 8106 c0c0"
-)
-"""The mouse of the HID standard's appendix E.10."""
 
 
 def test_the_standards_own_mouse_is_read_as_the_standard_says() -> None:

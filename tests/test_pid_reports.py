@@ -9,7 +9,7 @@ from emulated.pid_layouts import OUT, PID, Part, Report, descriptor
 from emulated.pid_model import PidStick
 from hypothesis import given
 from hypothesis import strategies as st
-from pid_cases import LAYOUTS, opened
+from pid_cases import LAYOUTS, MOUSE, opened
 
 from hapticbridge.device.hid_layout import Layout
 from hapticbridge.device.pid_reports import (
@@ -213,6 +213,17 @@ def test_a_spoilt_descriptor_is_driven_or_refused_in_one_sentence(
     else:
         assert len(effect) > 1
         assert len(reports.magnitude(1).report(-reports.magnitude(1).full)) > 1
+
+
+def test_a_mouse_beside_the_stick_is_not_taken_for_it() -> None:
+    numbered = MOUSE[:6] + b"\x85\x70" + MOUSE[6:]
+    layout = Layout(numbered + descriptor(LAYOUTS["usual"].values()))
+    stick = Stick(layout)
+    assert not stick.takes(b"\x70\x00\x7f\x7f")
+    assert stick.deflection == [0.0, 0.0]
+    state = LAYOUTS["usual"]["state"]
+    assert stick.takes(state.packed(x=32767, y=-32767, button3=1))
+    assert (stick.deflection, stick.buttons) == ([1.0, -1.0], 0b100)
 
 
 @given(st.lists(st.binary(max_size=24), max_size=5), st.sampled_from(sorted(LAYOUTS)))

@@ -162,17 +162,25 @@ def test_of_each_kind_the_newest_report_is_sent_and_kinds_take_turns() -> None:
     assert handle.sent == [b"a0", b"b2", b"a2"]
 
 
-def test_a_report_of_set_up_is_sent_before_the_call_returns_and_what_waited_is_dropped() -> None:
+def test_a_report_of_set_up_is_sent_before_the_call_returns_and_what_waited_is_dropped(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(transport_hid, "LONGEST_WRITE", 10.0)
     handle = Handle()
     link = HidLink(handle, "slow")
     link.write(b"old")
     handle.entered.acquire()
     link.write(b"waits")
-    handle.gate.release(2)
+
+    class Opened(threading.Event):
+        def wait(self, timeout: float | None = None) -> bool:
+            handle.gate.release(10)  # only now, when what waits has been dropped
+            return super().wait(timeout)
+
+    link._is_idle = Opened()
     link.send(b"set-up")
     assert handle.sent == [b"old", b"set-up"]
     handle.result = -1
-    handle.gate.release()
     with pytest.raises(DeviceLost, match="slow did not take a report"):
         link.send(b"set-up")
     link.close()

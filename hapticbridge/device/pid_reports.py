@@ -44,8 +44,7 @@ DEVICE_CONTROL, CONTROL = _P | 0x95, _P | 0x96
 ENABLE, DISABLE, STOP_ALL, RESET = _P | 0x97, _P | 0x98, _P | 0x99, _P | 0x9A
 
 _MILLI = -3
-"""Power of ten of the unit that durations have where the device names none, s: the standard's
-examples and all drivers take milliseconds."""
+"""Power of ten, in s, of durations whose unit the device does not name: all drivers take ms."""
 
 _FULL_TURN = 360.0
 
