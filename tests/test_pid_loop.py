@@ -6,15 +6,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from emulated.hid_seam import DrivingClock
+from emulated.hid_seam import DrivingClock, HidSeam
 from emulated.pid_model import PidStick
 from emulated.planar_hand import planar_hand
 from pid_cases import LAYOUTS, NEWTONS, PERIOD, TRAVEL, opened
 
 import hapticbridge as hb
+import hapticbridge.device.pid_sheet as sheet
 from hapticbridge.device import SimulatedDevice
+from hapticbridge.device.pid import open_pid
+from hapticbridge.device.plugged import tell_nobody
+from hapticbridge.device.profile import read_profile
 from hapticbridge.errors import SafetyTrip
 from hapticbridge.identify import identify
+from hapticbridge.identify.measured_profile import measured_profile
 from hapticbridge.tick import TickFlag
 
 MASS, DAMPING, WIDE = 0.25, 4.0, 0.12
@@ -124,3 +129,29 @@ def test_identify_finds_what_is_behind_a_stick(seed: int) -> None:
     part = list(LAYOUTS.values())[seed % 2]["state"].part("x")
     step = TRAVEL / (part.high - part.low)
     assert result.resolution == pytest.approx(step, rel=1e-6)
+
+
+def test_what_was_identified_holds_with_the_scale_that_it_was_identified_with(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Assumed 10 N and 0.1 m: all that is measured is off by the same factors as the force."""
+    monkeypatch.setattr(sheet, "profile_of", lambda device, serial: None)
+    mechanics = SimulatedDevice(hand=None, mass=0.3, damping=2.0)
+    seam = HidSeam(PidStick(mechanics, newtons=NEWTONS, travel=TRAVEL))
+    device = open_pid({}, tell_nobody, seam)
+    result = identify(device, DrivingClock(seam), period=PERIOD, axes=("x",), duration=5.0)
+    device.close()
+    # N per m, and per m/s, in the assumed units of both
+    factor = (sheet.ASSUMED_NEWTONS / NEWTONS) / (sheet.ASSUMED_TRAVEL / TRAVEL)
+    assert result.fits["x"].damping.value == pytest.approx(factor * 2.0, rel=0.05)
+    profile = measured_profile(
+        result, device="pid", serial="P1", date="today", duration=5.0, workspace=device.workspace
+    )
+    file = tmp_path / "pid-P1.toml"
+    file.write_text(profile.to_toml())
+    told: list[str] = []
+    again = open_pid({"profile": str(file)}, told.append, HidSeam(PidStick()))
+    assert (again.info.force_limit, again.workspace) == (device.info.force_limit, device.workspace)
+    assert not told
+    info = read_profile(file).fill(again.info)
+    assert info.damping == pytest.approx(result.fits["x"].damping.least)
