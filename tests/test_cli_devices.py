@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 from cli_cases import Called
+from emulated.hid_seam import HidSeam
+from emulated.pid_model import PidStick
 
 from hapticbridge.cli import devices as command
 from hapticbridge.device import haply, hid_search, usb_bus, usb_search
@@ -205,3 +207,44 @@ def test_what_stands_between_us_and_a_device_is_said_to_be_missing(
     told = {f["name"]: f["medium"] for f in json.loads(out)["supported"]}
     assert told[name].startswith(words)
     assert told["rawhid"] is None
+
+
+def test_a_class_gets_a_rule_for_each_product_that_is_plugged_in(
+    bus: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert "# pid: " in udev_rules()
+    assert "# none is plugged in: plug it in, and write these rules again" in udev_rules()
+    seam = HidSeam(PidStick(serial="A"), PidStick(serial="B"), PidStick())
+    seam.plugged[2].product = 0x4802
+    monkeypatch.setattr(hid_search, "hid_api", lambda: seam)
+    plugged = plugged_devices()
+    assert [(one.family, one.serial, one.product) for one in plugged] == [
+        ("pid", "A", 0x4801),
+        ("pid", "B", 0x4801),
+        ("pid", "P1", 0x4802),
+    ]
+    rules = [line for line in udev_rules().splitlines() if "*:1209:" in line]
+    assert rules == [
+        f'SUBSYSTEM=="hidraw", KERNELS=="*:1209:480{n}.*", TAG+="uaccess"' for n in (1, 2)
+    ]
+
+
+def test_how_often_a_device_is_asked_is_read_where_the_kernel_shows_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(hid_search, "CLASS", tmp_path / "class")
+    interface = tmp_path / "1-1:1.0"
+    hid = interface / "0003:1209:4801.0001"
+    hid.mkdir(parents=True)
+    (hid / "report_descriptor").write_bytes(b"\x05\x01")
+    (tmp_path / "class/hidraw3").mkdir(parents=True)
+    (tmp_path / "class/hidraw3/device").symlink_to(hid)
+    assert hid_search.polling("/dev/hidraw3") == (None, None)
+    for name, direction, interval in (("ep_81", "in", "8ms"), ("ep_01", "out", "125us")):
+        (interface / name).mkdir()
+        (interface / name / "direction").write_text(direction + "\n")
+        (interface / name / "interval").write_text(interval + "\n")
+    assert hid_search.polling("/dev/hidraw3") == pytest.approx((8e-3, 125e-6))
+    assert hid_search.report_descriptor("/dev/hidraw3", None) == b"\x05\x01"
+    assert hid_search.report_descriptor("/dev/hidraw4", None) == b""
+    assert hid_search.polling("/dev/hidraw4") == (None, None)

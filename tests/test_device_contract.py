@@ -12,6 +12,8 @@ import pytest
 from emulated.dhd_stub import OMEGA3, SIGMA7, Stub
 from emulated.hid_device import HidDevice
 from emulated.hid_seam import HidSeam
+from emulated.pid_layouts import ODD
+from emulated.pid_model import PidStick
 from emulated.rawhid_model import RawHid
 from emulated.spacemouse_model import SpaceMouse
 from emulated.ticking import Ticking
@@ -32,6 +34,7 @@ from hapticbridge.device import (
     SimulatedDevice,
     open_device,
 )
+from hapticbridge.device.pid import open_pid
 from hapticbridge.device.plugged import tell_nobody
 from hapticbridge.device.rawhid import open_rawhid
 from hapticbridge.device.spacemouse import open_spacemouse
@@ -115,6 +118,8 @@ DEVICES: dict[str, Callable[[Path], Device]] = {
     "haply": haply,
     "omega.3": lambda _: force_dimension(OMEGA3),
     "sigma.7": lambda _: force_dimension(SIGMA7),
+    "stick": lambda _: ticking(lambda: PidStick(SimulatedDevice()), open_pid),
+    "odd stick": lambda _: ticking(lambda: PidStick(SimulatedDevice(), ODD), open_pid),
 }
 
 
@@ -291,7 +296,7 @@ def test_options_reach_the_device_and_the_specification_goes_before_the_code(
         (
             "falcn",
             {},
-            "unknown device 'falcn'; there are 'falcon', 'forcedimension', 'haply', 'rawh",
+            "unknown device 'falcn'; there are 'falcon', 'forcedimension', 'haply', 'pid'",
         ),
         ("haply:colour=red", {}, "unknown option 'colour' of the haply device; there are 'd"),
         ("forcedimension:colour=red", {}, "unknown option 'colour' of the forcedimension dev"),

@@ -45,7 +45,7 @@ class Family:
     Attributes:
         name: What ``open_device`` knows it by.
         about: What it is, in a few words.
-        ids: Every product of the family.
+        ids: Every product of the family, none where it is a class.
         transport: ``hid`` (hidapi), ``usb`` (pyusb), ``service`` (a program of the maker's that
             runs beside us) or ``library`` (one of the maker's that is loaded).
         axes: Which axes it has, in words, because it may differ from unit to unit.
@@ -58,6 +58,8 @@ class Family:
         find: Lists what is plugged in, where neither hidapi nor pyusb can tell.
         medium: Says in a sentence whether the service or library is there, likewise.
         sought: What is looked for, in words, where numbers on the USB bus do not say it.
+        recognises: Tells from a HID report descriptor whether a device is one of them, for a family
+            that is a class and has no list of products; None for all others.
     """
 
     name: str
@@ -73,6 +75,7 @@ class Family:
     find: Callable[[], list[Plugged]] | None = None
     medium: Callable[[], str] | None = None
     sought: str = ""
+    recognises: Callable[[bytes], bool] | None = None
 
     def model(self, vendor: int, product: int) -> str | None:
         """Returns the model that has these numbers, or None if it is none of the family."""
@@ -143,8 +146,11 @@ def chosen(family: Family, plugged: Sequence[Plugged], serial: object = None) ->
     """
     if not plugged:
         vendors = ", ".join(sorted({f"{usb_id.vendor:04x}" for usb_id in family.ids}))
-        is_one = len(family.ids) == 1
-        looked = str(family.ids[0]) if is_one else f"{len(family.ids)} products of {vendors}"
+        looked = f"{len(family.ids)} products of {vendors}"
+        if len(family.ids) == 1:
+            looked = str(family.ids[0])
+        elif family.recognises is not None:
+            looked = "any product, by what it says it can do"
         looked = family.sought or looked
         raise DeviceError(
             f"no device '{family.name}' is plugged in (looked for {looked}); 'hapticbridge "

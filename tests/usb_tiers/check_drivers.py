@@ -22,11 +22,15 @@ from usb_tiers.benches import (
     DAMPING,
     FALCON,
     MASS,
+    NEWTONS,
     PROGRAM,
+    STICK,
     falcon,
     free_falcon,
     free_rawhid,
+    free_stick,
     rawhid,
+    stick,
     unloaded_falcon,
 )
 from usb_tiers.conftest import IS_TIME_VIRTUAL, Plug
@@ -91,6 +95,32 @@ def test_a_written_force_moves_a_home_made_device_likewise(plug_hid: Plug) -> No
     moved = _held(device, 0.2, (0.5, 0.0, 0.0)) - start
     device.close()
     _require_pushed(moved, 0.2, 0.5)
+
+
+@pytest.mark.parametrize("is_odd", [False, True], ids=["usual", "odd"])
+def test_a_written_force_moves_a_force_feedback_stick_likewise(
+    plug_hid: Plug, is_odd: bool
+) -> None:
+    model = plug_hid(lambda: free_stick(is_odd=is_odd))
+    device = _opened(STICK)
+    start = _held(device, 0.01, (0.0, 0.0, 0.0))
+    moved = _held(device, 0.2, (0.5, 0.0, 0.0)) - start
+    assert model.call("force") == pytest.approx((0.5, 0.0), abs=2e-3 * NEWTONS)
+    device.close()
+    assert model.call("force") == (0.0, 0.0)
+    _require_pushed(moved, 0.2, 0.5)
+
+
+def test_a_stick_lets_go_of_a_host_that_says_nothing_any_more(plug_hid: Plug) -> None:
+    model = plug_hid(free_stick)
+    device = _opened(STICK)
+    _held(device, 0.05, (0.5, 0.0, 0.0))
+    assert model.call("force") != (0.0, 0.0)
+    life = max(effect.duration for effect in model.get("effects").values())
+    assert life <= 0.4
+    time.sleep(1.1 * life)
+    assert model.call("force") == (0.0, 0.0)
+    device.close()
 
 
 def test_a_falcon_takes_its_program_and_then_speaks(plug_usb: Plug, tmp_path: Path) -> None:
@@ -212,4 +242,14 @@ def test_a_home_made_device_pulled_out_of_a_run_loses_no_row_and_can_come_back(
     wait_for(lambda: not plugged_devices())
     plug_hid(rawhid)
     again = _opened("rawhid")
+    again.close()
+
+
+def test_a_stick_pulled_out_of_a_run_loses_no_row_and_can_come_back(
+    plug_hid: Plug, tmp_path: Path, no_spin: None
+) -> None:
+    _pulled_out_of_a_run(plug_hid(stick), STICK, tmp_path / "run.mcap")
+    wait_for(lambda: not plugged_devices())
+    plug_hid(stick)
+    again = _opened(STICK)
     again.close()
