@@ -2,15 +2,26 @@ from __future__ import annotations
 
 import json
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from cli_cases import Called
 
+from hapticbridge import bridge
 from hapticbridge.cli import devices as command
-from hapticbridge.device import hid_search, usb_bus, usb_search
+from hapticbridge.cli import run
+from hapticbridge.device import SimulatedDevice, hid_search, library, usb_bus, usb_search
 from hapticbridge.device.families import FAMILIES, RULES_FILE, plugged_devices, udev_rules
-from hapticbridge.device.plugged import Family, Plugged
+from hapticbridge.device.plugged import (
+    RULES_COMMAND,
+    Family,
+    Plugged,
+    access_problem,
+    permission_problem,
+)
+from hapticbridge.errors import DeviceError
+from hapticbridge.guard import Limits
 
 
 def plug(
@@ -105,9 +116,12 @@ def listed(problem: str | None, serial: str = "") -> Plugged:
         ([listed(None)], "next: hapticbridge run peg_in_hole --device rawhid\n"),
         ([listed(None, "A"), listed(None, "B")], "--device rawhid:serial=A\n"),
         (
-            [listed("no permission")],
-            "  not usable: no permission\nnext: hapticbridge devices",
+            [listed(permission_problem("/dev/hidraw0"))],
+            "whoever sits at the machine\nnext: hapticbridge devices",
         ),
+        # no rule would help, and one of two can be used
+        ([listed("no node"), listed(None, "B")], "next: hapticbridge run peg_in_hole --device"),
+        ([listed("no node")], "  not usable: no node\n"),
     ],
 )
 def test_it_says_what_to_do_next(
@@ -117,6 +131,7 @@ def test_it_says_what_to_do_next(
     code, out, _ = call("devices")
     assert code == 0
     assert words in out
+    assert ("udevadm" in out) is (RULES_COMMAND in (plugged[0].problem or ""))
     assert f"rawhid: {plugged[0]}".replace("\x1b", "�") in out
 
 
@@ -146,9 +161,44 @@ def test_a_usb_device_is_listed_by_the_kernels_word_where_libusb_is_missing(bus:
     assert "libusb cannot be loaded" in device.problem
 
 
-def test_the_bus_is_read_without_opening_anything(
-    bus: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_hid_device_is_listed_by_the_kernels_word_where_hidapi_is_missing(
+    call: Called, bus: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    plug(bus, "1-1", "16c0:0486", name="RawHID", serial="77", hidraw=True)
+    assert plugged_devices() == []  # where hidapi is there, it lists what has a node
+    monkeypatch.setattr(hid_search, "hid_api", lambda: None)
+    (device,) = plugged_devices()
+    assert (device.family, device.serial) == ("rawhid", "77")
+    code, _, err = call("run", "peg_in_hole", "--device", "rawhid")
+    assert code == 2
+    assert "hidapi cannot be loaded; 'pip install hidapi' brings it" in err
+
+
+@pytest.mark.parametrize(
+    ("is_there", "is_permitted", "words"),
+    [
+        (True, True, None),
+        (True, False, "no permission to open"),
+        (False, False, "there is no"),  # as root, who may open all that there is
+    ],
+)
+def test_a_node_that_is_not_there_yet_is_no_missing_permission(
+    is_there: bool,
+    is_permitted: bool,
+    words: str | None,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    node = tmp_path / "hidraw0"
+    if is_there:
+        node.touch()
+    monkeypatch.setattr(os, "access", lambda path, mode: is_permitted)
+    problem = access_problem(str(node))
+    assert (problem or "").startswith(words or "")
+    assert (problem is None) is (words is None)
+
+
+def test_the_bus_is_read_without_opening_anything(bus: Path) -> None:
     plug(bus, "1-1", "16c0:0486", name="RawHID", serial="77", hidraw=True)
     plug(bus, "1-22", "046d:c626")
     (bus / "1-3").mkdir()
@@ -158,9 +208,6 @@ def test_the_bus_is_read_without_opening_anything(
     assert (first.name, first.serial) == ("RawHID", "77")
     assert (first.has_hidraw, second.has_hidraw, second.name) == (True, False, "")
     assert str(second.node) == "/dev/bus/usb/001/004"
-    for answer in (True, False):
-        monkeypatch.setattr(os, "access", lambda path, mode, answer=answer: answer)
-        assert first.is_permitted is answer
 
 
 @pytest.mark.parametrize("family", FAMILIES, ids=lambda family: family.name)
@@ -172,3 +219,55 @@ def test_running_on_a_device_that_is_not_there_is_one_sentence_that_helps(
     assert err.count("\n") == 1
     assert err.startswith(f"error: no device '{family.name}' is plugged in (looked for ")
     assert "'hapticbridge devices' lists what is, and what permission is missing" in err
+
+
+class Counted(SimulatedDevice):
+    closed = 0
+
+    def close(self) -> None:
+        self.closed += 1
+        super().close()
+
+
+@pytest.mark.parametrize(
+    "option", [("--force-limit", "1e6"), ("--stiffness", "-1"), ("--ramp", "-1")]
+)
+def test_a_run_that_is_refused_after_the_device_was_opened_lets_it_go(
+    call: Called, monkeypatch: pytest.MonkeyPatch, option: tuple[str, str]
+) -> None:
+    device = Counted()
+    monkeypatch.setattr(run, "device_for", lambda *_: device)
+    code, _, err = call("run", "point_mass", *option)
+    assert (code, err.count("\n")) == (2, 1)
+    assert device.closed == 1
+
+
+def test_a_bridge_that_is_refused_lets_go_of_what_it_opened_and_of_nothing_else(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    opened, own = Counted(), Counted()
+    monkeypatch.setattr(bridge, "device_for", lambda *_: opened)
+    limits = Limits(force=1e6, torque=1.0)
+    with pytest.raises(DeviceError, match="force limit"):
+        bridge.Bridge("point_mass", "falcon", limits=limits)
+    with pytest.raises(DeviceError, match="force limit"):
+        bridge.Bridge("point_mass", own, limits=limits)
+    assert (opened.closed, own.closed) == (1, 0)
+    assert bridge.Bridge("point_mass", "falcon").device is opened
+    assert opened.closed == 1
+
+
+def test_a_device_whose_profile_is_broken_is_let_go(monkeypatch: pytest.MonkeyPatch) -> None:
+    device = Counted()
+    family = replace(FAMILIES[0], open=lambda *_: device)
+    monkeypatch.setattr(library, "family_named", lambda _: family)
+
+    def broken(*_: str) -> None:
+        raise DeviceError("broken profile")
+
+    monkeypatch.setattr(library, "profile_of", broken)
+    with pytest.raises(DeviceError, match="broken profile"):
+        library.open_device("falcon")
+    assert device.closed == 1
+    assert library.open_device("falcon:profile=none") is device
+    assert device.closed == 1
