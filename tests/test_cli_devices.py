@@ -2,16 +2,15 @@ from __future__ import annotations
 
 import json
 import os
-from dataclasses import replace
+import socket
 from pathlib import Path
 
 import pytest
 from cli_cases import Called
 
-from hapticbridge import bridge
 from hapticbridge.cli import devices as command
-from hapticbridge.cli import run
-from hapticbridge.device import SimulatedDevice, hid_search, library, usb_bus, usb_search
+from hapticbridge.device import haply, hid_search, usb_bus, usb_search
+from hapticbridge.device.dhd_library import VARIABLE
 from hapticbridge.device.families import FAMILIES, RULES_FILE, plugged_devices, udev_rules
 from hapticbridge.device.plugged import (
     RULES_COMMAND,
@@ -20,8 +19,6 @@ from hapticbridge.device.plugged import (
     access_problem,
     permission_problem,
 )
-from hapticbridge.errors import DeviceError
-from hapticbridge.guard import Limits
 
 
 def plug(
@@ -210,7 +207,9 @@ def test_the_bus_is_read_without_opening_anything(bus: Path) -> None:
     assert str(second.node) == "/dev/bus/usb/001/004"
 
 
-@pytest.mark.parametrize("family", FAMILIES, ids=lambda family: family.name)
+@pytest.mark.parametrize(
+    "family", [f for f in FAMILIES if f.find is None], ids=lambda family: family.name
+)
 def test_running_on_a_device_that_is_not_there_is_one_sentence_that_helps(
     call: Called, family: Family, bus: Path
 ) -> None:
@@ -221,53 +220,30 @@ def test_running_on_a_device_that_is_not_there_is_one_sentence_that_helps(
     assert "'hapticbridge devices' lists what is, and what permission is missing" in err
 
 
-class Counted(SimulatedDevice):
-    closed = 0
-
-    def close(self) -> None:
-        self.closed += 1
-        super().close()
-
-
 @pytest.mark.parametrize(
-    "option", [("--force-limit", "1e6"), ("--stiffness", "-1"), ("--ramp", "-1")]
+    ("name", "words"),
+    [
+        ("haply", "the Inverse Service does not run: nobody answers at localhost:"),
+        ("forcedimension", "the library '/no/such.so' cannot be loaded"),
+    ],
 )
-def test_a_run_that_is_refused_after_the_device_was_opened_lets_it_go(
-    call: Called, monkeypatch: pytest.MonkeyPatch, option: tuple[str, str]
+def test_what_stands_between_us_and_a_device_is_said_to_be_missing(
+    call: Called, monkeypatch: pytest.MonkeyPatch, bus: Path, name: str, words: str
 ) -> None:
-    device = Counted()
-    monkeypatch.setattr(run, "device_for", lambda *_: device)
-    code, _, err = call("run", "point_mass", *option)
-    assert (code, err.count("\n")) == (2, 1)
-    assert device.closed == 1
-
-
-def test_a_bridge_that_is_refused_lets_go_of_what_it_opened_and_of_nothing_else(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    opened, own = Counted(), Counted()
-    monkeypatch.setattr(bridge, "device_for", lambda *_: opened)
-    limits = Limits(force=1e6, torque=1.0)
-    with pytest.raises(DeviceError, match="force limit"):
-        bridge.Bridge("point_mass", "falcon", limits=limits)
-    with pytest.raises(DeviceError, match="force limit"):
-        bridge.Bridge("point_mass", own, limits=limits)
-    assert (opened.closed, own.closed) == (1, 0)
-    assert bridge.Bridge("point_mass", "falcon").device is opened
-    assert opened.closed == 1
-
-
-def test_a_device_whose_profile_is_broken_is_let_go(monkeypatch: pytest.MonkeyPatch) -> None:
-    device = Counted()
-    family = replace(FAMILIES[0], open=lambda *_: device)
-    monkeypatch.setattr(library, "family_named", lambda _: family)
-
-    def broken(*_: str) -> None:
-        raise DeviceError("broken profile")
-
-    monkeypatch.setattr(library, "profile_of", broken)
-    with pytest.raises(DeviceError, match="broken profile"):
-        library.open_device("falcon")
-    assert device.closed == 1
-    assert library.open_device("falcon:profile=none") is device
-    assert device.closed == 1
+    monkeypatch.setenv(VARIABLE, "/no/such.so")
+    with socket.socket() as unused:
+        unused.bind(("localhost", 0))  # nobody listens there
+        place = ("localhost", unused.getsockname()[1])
+        monkeypatch.setattr(haply, "PLACE", place)
+        monkeypatch.setattr(haply.medium, "__defaults__", (place,))
+        monkeypatch.setattr(haply.find, "__defaults__", (place,))
+        code, out, err = call("run", "peg_in_hole", "--device", name)
+        assert (code, out, err.count("\n")) == (2, "", 1)
+        assert err.startswith(f"error: {words}")
+        code, out, _ = call("devices")
+        assert code == 0
+        assert f"  {words}" in out
+        code, out, _ = call("devices", "--json")
+    told = {f["name"]: f["medium"] for f in json.loads(out)["supported"]}
+    assert told[name].startswith(words)
+    assert told["rawhid"] is None

@@ -45,6 +45,8 @@ class Devices:
         for family in FAMILIES:
             out.print(f"{family.name}: {plain(family.about)}")
             out.print(f"  axes {family.axes}; force {family.force}; rate {family.rate}")
+            if family.medium is not None:
+                out.print(f"  {plain(family.medium())}")
         out.print("[bold]plugged in[/bold]")
         for device in plugged:
             out.print(f"{device.family}: {plain(str(device))} at {plain(device.path)}")
@@ -83,6 +85,7 @@ def _facts(plugged: list[Plugged], unseen: list[str]) -> dict[str, Any]:
                 "force": family.force,
                 "rate": family.rate,
                 "options": list(family.options),
+                "medium": None if family.medium is None else family.medium(),
                 "ids": [{"id": str(usb_id), "model": usb_id.model} for usb_id in family.ids],
             }
             for family in FAMILIES

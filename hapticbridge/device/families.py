@@ -6,11 +6,13 @@ from collections.abc import Sequence
 
 from hapticbridge.device import hid_search, usb_search
 from hapticbridge.device.falcon import FAMILY as FALCON
+from hapticbridge.device.forcedimension import FAMILY as FORCE_DIMENSION
+from hapticbridge.device.haply import FAMILY as HAPLY
 from hapticbridge.device.plugged import Family, Plugged
 from hapticbridge.device.rawhid import FAMILY as RAWHID
 from hapticbridge.device.spacemouse import FAMILY as SPACEMOUSE
 
-FAMILIES: tuple[Family, ...] = (FALCON, SPACEMOUSE, RAWHID)
+FAMILIES: tuple[Family, ...] = (FALCON, SPACEMOUSE, RAWHID, HAPLY, FORCE_DIMENSION)
 """In the order in which they are listed."""
 
 RULES_FILE = "/etc/udev/rules.d/70-hapticbridge.rules"
@@ -30,6 +32,8 @@ def plugged_devices() -> list[Plugged]:
 
 def plugged_of(family: Family) -> list[Plugged]:
     """Lists a family's devices that are plugged in, with what keeps each from being opened."""
+    if family.find is not None:
+        return family.find()
     if family.transport == "hid":
         return hid_search.find(family)
     return usb_search.find(family)
@@ -61,6 +65,8 @@ def udev_rules(families: Sequence[Family] = FAMILIES) -> str:
         "#   sudo udevadm control --reload && sudo udevadm trigger",
     ]
     for family in families:
+        if not family.ids:
+            continue  # no node to open: a program of the maker's has it
         lines += ["", f"# {family.name}: {family.about}"]
         for usb_id in family.ids:
             vendor, product = f"{usb_id.vendor:04x}", f"{usb_id.product:04x}"

@@ -42,9 +42,10 @@ def open_device(spec: str, *, tell: Tell = tell_nobody, **options: object) -> De
       recording. All after the colon is the file's name, commas and colons too.
     - a device that is plugged in, by its family's name (``hapticbridge devices`` lists them), with
       options that the family has: ``spacemouse:speed=0.1,turn=1,dead_band=0.05``,
-      ``rawhid:serial=12345,damping=2``, ``falcon:firmware=FILE``. ``serial`` picks one of several,
-      ``log=FILE`` keeps what went over the wire. What its driver does not know comes from the
-      profile of the unit or its kind, or from that of ``profile=NAME`` (or a file, or ``none``).
+      ``rawhid:serial=12345,damping=2``, ``falcon:firmware=FILE``, ``haply:serial=049D``,
+      ``forcedimension:library=FILE``. ``serial`` picks one of several, ``log=FILE`` keeps what went
+      over the wire. What its driver does not know comes from the profile of the unit or its kind,
+      or from that of ``profile=NAME`` (or a file, or ``none``).
 
     Args:
         spec: The specification.

@@ -48,7 +48,8 @@ class Family:
         name: What ``open_device`` knows it by.
         about: What it is, in a few words.
         ids: Every product of the family.
-        transport: ``hid`` (hidapi) or ``usb`` (pyusb).
+        transport: ``hid`` (hidapi), ``usb`` (pyusb), ``service`` (a program of the maker's that
+            runs beside us) or ``library`` (one of the maker's that is loaded).
         axes: Which axes it has, in words, because it may differ from unit to unit.
         force: What force it can show, in words.
         rate: How often it reports, in words.
@@ -56,18 +57,24 @@ class Family:
         open: Finds the device and opens it; takes the options and whom to tell.
         usage: Usage page and usage of the HID collection that speaks the protocol, where a product
             has several; None where any will do.
+        find: Lists what is plugged in, where neither hidapi nor pyusb can tell.
+        medium: Says in a sentence whether the service or library is there, likewise.
+        sought: What is looked for, in words, where numbers on the USB bus do not say it.
     """
 
     name: str
     about: str
     ids: tuple[UsbId, ...]
-    transport: Literal["hid", "usb"]
+    transport: Literal["hid", "usb", "service", "library"]
     axes: str
     force: str
     rate: str
     options: tuple[str, ...]
     open: Callable[[Mapping[str, object], Tell], Device]
     usage: tuple[int, int] | None = None
+    find: Callable[[], list[Plugged]] | None = None
+    medium: Callable[[], str] | None = None
+    sought: str = ""
 
     def model(self, vendor: int, product: int) -> str | None:
         """Returns the model that has these numbers, or None if it is none of the family."""
@@ -86,9 +93,9 @@ class Plugged:
         name: What the device calls itself, else the model's name; printable, and so is the serial.
         serial: Its serial number, empty where it has none or does not tell.
         path: Where it is opened: a device node.
-        vendor: Its numbers.
+        vendor: Its numbers on the USB bus; 0 where whoever lists it does not tell.
         product: Likewise.
-        transport: ``hid`` or ``usb``.
+        transport: As the family's.
         problem: Why it cannot be opened, and what to do, in one sentence; None where it can.
     """
 
@@ -106,8 +113,9 @@ class Plugged:
             object.__setattr__(self, field, printable(getattr(self, field)))
 
     def __str__(self) -> str:
-        serial = f", serial {self.serial}" if self.serial else ""
-        return f"{self.name} ({self.vendor:04x}:{self.product:04x}{serial})"
+        numbers = f"{self.vendor:04x}:{self.product:04x}" if self.vendor else ""
+        facts = ", ".join(filter(None, (numbers, f"serial {self.serial}" if self.serial else "")))
+        return f"{self.name} ({facts})" if facts else self.name
 
 
 def printable(text: str) -> str:
@@ -148,6 +156,7 @@ def chosen(family: Family, plugged: Sequence[Plugged], serial: object = None) ->
         vendors = ", ".join(sorted({f"{usb_id.vendor:04x}" for usb_id in family.ids}))
         is_one = len(family.ids) == 1
         looked = str(family.ids[0]) if is_one else f"{len(family.ids)} products of {vendors}"
+        looked = family.sought or looked
         raise DeviceError(
             f"no device '{family.name}' is plugged in (looked for {looked}); 'hapticbridge "
             "devices' lists what is, and what permission is missing"

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from emulated.hid_device import HidDevice
+from emulated.timed import Timed
 from hapticbridge.device.hid_search import HidHandle
 
 
@@ -125,7 +126,7 @@ class DrivingClock:
     name = "simulated"
     is_lossless = True
 
-    def __init__(self, seam: HidSeam) -> None:
+    def __init__(self, seam: Timed) -> None:
         self._seam = seam
         self._period = self._now = self._origin = 0
 
