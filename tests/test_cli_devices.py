@@ -14,7 +14,13 @@ from hapticbridge.cli import devices as command
 from hapticbridge.device import haply, hid_search, usb_bus, usb_search
 from hapticbridge.device.dhd_library import VARIABLE
 from hapticbridge.device.families import FAMILIES, RULES_FILE, plugged_devices, udev_rules
-from hapticbridge.device.plugged import Family, Plugged
+from hapticbridge.device.plugged import (
+    RULES_COMMAND,
+    Family,
+    Plugged,
+    access_problem,
+    permission_problem,
+)
 
 
 def plug(
@@ -109,9 +115,12 @@ def listed(problem: str | None, serial: str = "") -> Plugged:
         ([listed(None)], "next: hapticbridge run peg_in_hole --device rawhid\n"),
         ([listed(None, "A"), listed(None, "B")], "--device rawhid:serial=A\n"),
         (
-            [listed("no permission")],
-            "  not usable: no permission\nnext: hapticbridge devices",
+            [listed(permission_problem("/dev/hidraw0"))],
+            "whoever sits at the machine\nnext: hapticbridge devices",
         ),
+        # no rule would help, and one of two can be used
+        ([listed("no node"), listed(None, "B")], "next: hapticbridge run peg_in_hole --device"),
+        ([listed("no node")], "  not usable: no node\n"),
     ],
 )
 def test_it_says_what_to_do_next(
@@ -121,6 +130,7 @@ def test_it_says_what_to_do_next(
     code, out, _ = call("devices")
     assert code == 0
     assert words in out
+    assert ("udevadm" in out) is (RULES_COMMAND in (plugged[0].problem or ""))
     assert f"rawhid: {plugged[0]}".replace("\x1b", "�") in out
 
 
@@ -150,9 +160,44 @@ def test_a_usb_device_is_listed_by_the_kernels_word_where_libusb_is_missing(bus:
     assert "libusb cannot be loaded" in device.problem
 
 
-def test_the_bus_is_read_without_opening_anything(
-    bus: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_hid_device_is_listed_by_the_kernels_word_where_hidapi_is_missing(
+    call: Called, bus: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    plug(bus, "1-1", "16c0:0486", name="RawHID", serial="77", hidraw=True)
+    assert plugged_devices() == []  # where hidapi is there, it lists what has a node
+    monkeypatch.setattr(hid_search, "hid_api", lambda: None)
+    (device,) = plugged_devices()
+    assert (device.family, device.serial) == ("rawhid", "77")
+    code, _, err = call("run", "peg_in_hole", "--device", "rawhid")
+    assert code == 2
+    assert "hidapi cannot be loaded; 'pip install hidapi' brings it" in err
+
+
+@pytest.mark.parametrize(
+    ("is_there", "is_permitted", "words"),
+    [
+        (True, True, None),
+        (True, False, "no permission to open"),
+        (False, False, "there is no"),  # as root, who may open all that there is
+    ],
+)
+def test_a_node_that_is_not_there_yet_is_no_missing_permission(
+    is_there: bool,
+    is_permitted: bool,
+    words: str | None,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    node = tmp_path / "hidraw0"
+    if is_there:
+        node.touch()
+    monkeypatch.setattr(os, "access", lambda path, mode: is_permitted)
+    problem = access_problem(str(node))
+    assert (problem or "").startswith(words or "")
+    assert (problem is None) is (words is None)
+
+
+def test_the_bus_is_read_without_opening_anything(bus: Path) -> None:
     plug(bus, "1-1", "16c0:0486", name="RawHID", serial="77", hidraw=True)
     plug(bus, "1-22", "046d:c626")
     (bus / "1-3").mkdir()
@@ -162,9 +207,6 @@ def test_the_bus_is_read_without_opening_anything(
     assert (first.name, first.serial) == ("RawHID", "77")
     assert (first.has_hidraw, second.has_hidraw, second.name) == (True, False, "")
     assert str(second.node) == "/dev/bus/usb/001/004"
-    for answer in (True, False):
-        monkeypatch.setattr(os, "access", lambda path, mode, answer=answer: answer)
-        assert first.is_permitted is answer
 
 
 @pytest.mark.parametrize(

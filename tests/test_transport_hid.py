@@ -248,7 +248,7 @@ def test_the_log_holds_what_went_over_the_wire(
     link = HidLink.open(plugged, seam, is_overlapped=False, log=HexLog())
     link.write(b"\0" + b"\x12" * 64)
     link.take()
-    assert not (tmp_path / "wire.log").exists()
+    assert (tmp_path / "wire.log").read_text() == ""
     link.close()
     first, second = (tmp_path / "wire.log").read_text().splitlines()
     assert first.split(" ", 2)[1:] == [">", "00 " + " ".join(["12"] * 64)]
@@ -271,9 +271,14 @@ def test_a_log_that_is_full_keeps_the_newest_and_says_what_it_dropped(
 def test_a_log_that_cannot_be_written_says_so_and_one_that_is_off_keeps_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    log = HexLog(tmp_path / "no" / "wire.log")
-    log.add(">", b"\0")
     with pytest.raises(DeviceError, match=r"the log .* cannot be written: No such file"):
+        HexLog(tmp_path / "no" / "wire.log")
+    (tmp_path / "full").mkdir()
+    log = HexLog(tmp_path / "full" / "wire.log")
+    log.add(">", b"\0")
+    (tmp_path / "full" / "wire.log").unlink()
+    (tmp_path / "full" / "wire.log").mkdir()
+    with pytest.raises(DeviceError, match=r"the log .* cannot be written: Is a directory"):
         log.close()
     log.close()
     monkeypatch.delenv(VARIABLE, raising=False)
@@ -315,6 +320,7 @@ class Listing:
 def test_a_node_that_may_not_be_opened_is_listed_with_what_to_do(
     is_permitted: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    (tmp_path / "hidraw3").touch()
     node = str(tmp_path / "hidraw3")
     monkeypatch.setattr(hid_search, "hid_api", lambda: Listing(node))
     monkeypatch.setattr(os, "access", lambda path, mode: is_permitted)

@@ -56,19 +56,20 @@ class Devices:
             out.print("none; 'simulated' and 'trajectory:FILE' need none")
         for sentence in unseen:
             out.print(f"[yellow]warning:[/yellow] {plain(sentence)}")
-        if any(device.problem for device in plugged):
+        usable = [device for device in plugged if device.problem is None]
+        if any(RULES_COMMAND in (device.problem or "") for device in plugged):
             out.print(
                 f"next: {RULES_COMMAND} | sudo tee {RULES_FILE}, "
                 "then sudo udevadm control --reload && sudo udevadm trigger"
             )
-        elif plugged:
-            out.print(f"next: hapticbridge run peg_in_hole --device {_specification(plugged)}")
+        elif usable:
+            specification = _specification(usable[0], plugged)
+            out.print(f"next: hapticbridge run peg_in_hole --device {specification}")
         return 0
 
 
-def _specification(plugged: list[Plugged]) -> str:
-    """Returns what to type for the first device; its serial where there are more like it."""
-    first = plugged[0]
+def _specification(first: Plugged, plugged: list[Plugged]) -> str:
+    """Returns what to type for a device; its serial where there are more like it."""
     is_only = sum(device.family == first.family for device in plugged) == 1
     return first.family if is_only else f"{first.family}:serial={first.serial or first.path}"
 

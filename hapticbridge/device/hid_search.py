@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import importlib
-import os
 import re
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Protocol, cast
 
-from hapticbridge.device.plugged import Family, Plugged, permission_problem
-from hapticbridge.device.usb_bus import on_the_bus
+from hapticbridge.device.plugged import Family, Plugged, access_problem
+from hapticbridge.device.usb_bus import members, on_the_bus
+
+NO_NODE = (
+    "the kernel gives it no hidraw node; load its driver (for 046d: 'sudo modprobe hid_logitech') "
+    "and plug it in again"
+)
+NO_HIDAPI = "hidapi cannot be loaded; 'pip install hidapi' brings it"
 
 CLASS = Path("/sys/class/hidraw")
 """Where Linux shows HID devices to everybody; absent on other systems."""
@@ -85,10 +90,10 @@ def find(family: Family, api: HidApi | None = None) -> list[Plugged]:
     Args:
         family: What to look for.
         api: hidapi or what stands for it; None takes the real one. Only then the USB bus is asked
-            too, for devices that the kernel gave no hidraw node.
+            too, for devices without a hidraw node, and for all of them where hidapi is missing.
 
     Returns:
-        One entry per device, none where hidapi is missing.
+        One entry per device.
     """
     module = hid_api() if api is None else api
     found: dict[str, Plugged] = {}
@@ -108,7 +113,7 @@ def find(family: Family, api: HidApi | None = None) -> list[Plugged]:
             model = None
         if model is None:
             continue
-        is_closed = api is None and path.startswith("/") and not os.access(path, os.R_OK | os.W_OK)
+        is_node = api is None and path.startswith("/")
         found[path] = Plugged(
             family=family.name,
             name=entry.get("product_string") or model,
@@ -117,9 +122,13 @@ def find(family: Family, api: HidApi | None = None) -> list[Plugged]:
             vendor=vendor,
             product=product,
             transport="hid",
-            problem=permission_problem(path) if is_closed else None,
+            problem=access_problem(path) if is_node else None,
         )
-    return [*found.values(), *(_without_node(family) if api is None else [])]
+    if api is not None:
+        return list(found.values())
+    unlisted = (d for d in on_the_bus() if module is None or not d.has_hidraw)
+    problem = NO_NODE if module is not None else NO_HIDAPI
+    return [*found.values(), *members(family, unlisted, lambda _: problem)]
 
 
 def report_descriptor(path: str, api: HidApi | None) -> bytes:
@@ -171,23 +180,3 @@ def polling(path: str) -> tuple[float | None, float | None]:
     except (OSError, ValueError):
         pass  # it was just unplugged
     return found.get("in"), found.get("out")
-
-
-def _without_node(family: Family) -> list[Plugged]:
-    """Lists the family's devices on the USB bus that have no hidraw node at all."""
-    return [
-        Plugged(
-            family=family.name,
-            name=device.name or model,
-            serial=device.serial,
-            path=str(device.node),
-            vendor=device.vendor,
-            product=device.product,
-            transport="hid",
-            problem="the kernel gives it no hidraw node; load its driver (for 046d: "
-            "'sudo modprobe hid_logitech') and plug it in again",
-        )
-        for device in on_the_bus()
-        if not device.has_hidraw
-        and (model := family.model(device.vendor, device.product)) is not None
-    ]

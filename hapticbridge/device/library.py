@@ -72,10 +72,14 @@ def open_device(spec: str, *, tell: Tell = tell_nobody, **options: object) -> De
             asked.pop("profile", None)
         chosen = None if wanted in (None, "none") else profile_named(str(wanted))
         device = family.open(asked, tell)
-        if wanted is None:
-            chosen = profile_of(name, device.info.serial)
-        if chosen is not None:
-            device.info = chosen.fill(device.info)
+        try:
+            if wanted is None:
+                chosen = profile_of(name, device.info.serial)
+            if chosen is not None:
+                device.info = chosen.fill(device.info)
+        except BaseException:
+            device.close()
+            raise
         return device
     if name not in _OPENERS:
         names = choices([*_OPENERS, *(family.name for family in FAMILIES)])

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 from hapticbridge.device.base import Device
@@ -130,6 +132,15 @@ def permission_problem(path: str) -> str:
         f"no permission to open {path}; '{RULES_COMMAND}' prints the rule that grants it to "
         "whoever sits at the machine"
     )
+
+
+def access_problem(path: str) -> str | None:
+    """Says why this user cannot open a node that the kernel has told of; None where nothing."""
+    if os.access(path, os.R_OK | os.W_OK):
+        return None
+    if not Path(path).exists():
+        return f"there is no {path} yet, or none in this container; try again in a second"
+    return permission_problem(path)
 
 
 def chosen(family: Family, plugged: Sequence[Plugged], serial: object = None) -> Plugged:

@@ -34,13 +34,13 @@ from usb_tiers.benches import (
     unloaded_falcon,
 )
 from usb_tiers.conftest import IS_TIME_VIRTUAL, Plug
-from usb_tiers.waiting import wait_for
+from usb_tiers.waiting import usable_devices, wait_for
 
 PERIOD = 1e-3
 
 
 def _opened(specification: str, count: int = 1) -> Device:
-    wait_for(lambda: len(plugged_devices()) >= count)
+    wait_for(lambda: len(usable_devices()) >= count)
     device = hb.open_device(specification)
     device.start(PERIOD)
     return device
@@ -173,7 +173,7 @@ def test_a_stalled_endpoint_ends_a_run_in_words(plug_usb: Plug) -> None:
 def test_two_home_made_devices_at_once_are_told_apart(plug_hid: Plug) -> None:
     for serial in ("left", "right"):
         plug_hid(lambda serial=serial: free_rawhid(serial))  # type: ignore[misc]
-    wait_for(lambda: len(plugged_devices()) == 2)
+    wait_for(lambda: len(usable_devices()) == 2)
     with pytest.raises(DeviceError, match=r"left.*right|right.*left"):
         hb.open_device("rawhid")
     left, right = (_opened(f"rawhid:serial={serial}", 2) for serial in ("left", "right"))
@@ -201,7 +201,7 @@ def _deflected(now: float) -> tuple[float, ...]:
 
 def _pulled_out_of_a_run(model: EmulatorProcess, specification: str, file: Path) -> None:
     """Pulls a device out half a second after its run's start; no row may be lost before that."""
-    wait_for(plugged_devices)
+    wait_for(usable_devices)
     times: list[float] = []
 
     def on_tick(tick: int) -> None:

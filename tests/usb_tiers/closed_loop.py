@@ -15,9 +15,8 @@ from emulated.usbip import Usbip
 
 import hapticbridge.clock
 from hapticbridge.cli import main
-from hapticbridge.device.families import plugged_devices
 from usb_tiers.benches import FALCON, STICK, falcon, rawhid, stick
-from usb_tiers.waiting import wait_for
+from usb_tiers.waiting import usable_devices, wait_for
 
 DEVICES: dict[str, tuple[Callable[[], UsbDevice], str, tuple[str, ...]]] = {
     "falcon": (falcon, FALCON, ("peg_in_hole",)),
@@ -38,7 +37,7 @@ def run(device: str, seconds: str, file: str) -> int:
     # where time stands still while a program runs, a spin would hardly end
     hapticbridge.clock.SPIN_NS = 0
     with EmulatorProcess(make, Usbip):
-        wait_for(plugged_devices)
+        wait_for(usable_devices)
         options = ["--device", specification, "--duration", seconds, "--record", file]
         return main(["run", *scene, *options])
 
