@@ -58,14 +58,18 @@ class RecordingFile:
     computed_digest: str
     problems: tuple[str, ...]
 
-    def blocks(self, size: int = BLOCK) -> Iterator[NDArray[np.void]]:
-        """Yields the records in order, ``TICK_DTYPE``, in blocks of ``size``; the last is shorter.
+    def blocks(self, size: int | None = None) -> Iterator[NDArray[np.void]]:
+        """Yields the records in order, ``TICK_DTYPE``, in blocks of one size; the last is shorter.
 
         A block is the caller's to keep.
+
+        Args:
+            size: Records, >= 1; ``BLOCK`` by default.
 
         Raises:
             RecordingError: The file cannot be read, or is not what it was when it was opened.
         """
+        size = size or BLOCK
         runs: list[NDArray[np.void]] = []
         found = 0
         for _ in _passes(self.path, runs.append):
