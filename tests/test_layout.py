@@ -17,7 +17,7 @@ ORDER = (
     ("ledger", "inputs", "device"),
     ("guard", "recording", "certificate"),
     ("provenance", "summary", "workspace"),
-    ("bridge", "audit"),
+    ("bridge", "audit", "compare", "export"),
     ("report", "study", "check"),
     ("cli",),
 )
