@@ -21,9 +21,16 @@ from hapticbridge.clock import Clock, RealClock, period_of
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Device, device_for
 from hapticbridge.errors import DeviceError, HapticBridgeError, SafetyTrip, SceneError
-from hapticbridge.guard import Limits, limits_for, refuse_stretched_start, trip_reason
+from hapticbridge.guard import (
+    Limits,
+    limits_for,
+    refuse_simulated_time,
+    refuse_stretched_start,
+    trip_reason,
+)
 from hapticbridge.inputs import Write, apply_writes, input_writes
 from hapticbridge.jit import direct
+from hapticbridge.kernel.layout import STATE_DTYPE
 from hapticbridge.kernel.parameters import checked_substeps
 from hapticbridge.kernel.publish import publish
 from hapticbridge.kernel.state import Binding
@@ -31,11 +38,17 @@ from hapticbridge.kernel.step import OK, after_step, before_step
 from hapticbridge.ledger import Ledger
 from hapticbridge.provenance import attachments, describe_run
 from hapticbridge.recording.stream import RecordStream
-from hapticbridge.rendering import contact_stiffness_of, method_named, prepare, refuse_unknowing
+from hapticbridge.rendering import (
+    contact_stiffness_of,
+    default_method,
+    method_named,
+    prepare,
+    refuse_unknowing,
+)
 from hapticbridge.scene import Scene, load_scene
 from hapticbridge.signals import stopping_on_signals
 from hapticbridge.summary import Summary
-from hapticbridge.tick import SAMPLE_DTYPE, TickFlag
+from hapticbridge.tick import SAMPLE_DTYPE, TICK_DTYPE, TickFlag
 from hapticbridge.workspace import Workspace, run_parameters
 
 _NO_FORCE = np.zeros(6)
@@ -50,13 +63,14 @@ class Bridge:
     Args:
         scene: A loaded scene, a name, or a path to MJCF.
         device: A device, or what ``open_device`` understands.
-        coupling: K and B; None chooses the stiffest safe one for the device's damping (80 % of the
-            bound, B = b/4, less where substeps need it; for a device of unknown damping, that of
-            the default simulated one).
+        coupling: K and B that should be felt; None chooses the stiffest safe one for the device's
+            damping (80 % of the bound, a quarter of b used as damping, less where substeps need it;
+            for a device of unknown damping, that of the default simulated one).
         rate: Ticks per second, 1 to 1e6.
         substeps: MuJoCo steps per tick, 1 to 100. With more than one the mean of their wrenches
             is sent, and the device needs another damping: ``certificate.needed_damping``.
-        method: How the tool is rendered; see ``rendering.METHODS``.
+        method: How the tool is rendered; see ``rendering.METHODS``. None: ``lossless``, or with
+            substeps, which that does not take, ``implicit``.
         contact_stiffness: K_c in N/m of method ``direct``; None takes the coupling's stiffness.
         i_know: Accept a method that may kick (``Method.hazard``) on a real device.
         recording: File to write (``.mcap``), or None; an existing file is replaced.
@@ -81,7 +95,7 @@ class Bridge:
         *,
         rate: float = 1000.0,
         substeps: int = 1,
-        method: str = "implicit",
+        method: str | None = None,
         contact_stiffness: float | None = None,
         i_know: bool = False,
         recording: str | Path | None = None,
@@ -96,8 +110,8 @@ class Bridge:
         self.scene = scene if isinstance(scene, Scene) else load_scene(scene)
         self.device = device_for(self.scene, device) if isinstance(device, str) else device
         self.period = period_of(rate)
-        self.method = method_named(method)
         self._substeps = checked_substeps(substeps)
+        self.method = default_method(substeps) if method is None else method_named(method)
         self._workspace = Workspace.of(scale, force_scale, axes, is_absolute=absolute)
         self.coupling = coupling or default_coupling(
             self.device.info,
@@ -114,6 +128,7 @@ class Bridge:
         self._path = Path(recording) if recording is not None else None
         self._is_live = live
         self.clock = clock or RealClock()
+        refuse_simulated_time(self.device.info, self.clock)
         self._sample = np.zeros(1, SAMPLE_DTYPE)
         self._inputs: deque[list[Write]] = deque()
         self._tick = self._overruns = self._skipped = 0
@@ -271,7 +286,7 @@ class Bridge:
 
     @property
     def rendered(self) -> Coupling:
-        """What is felt: ``coupling``, but for damping that the method cannot go below."""
+        """``coupling``, but for damping below what the method can show; ``Method.rendered``."""
         return self.method.rendered(self.used, self.period / self._substeps)
 
     @property
@@ -299,6 +314,7 @@ class Bridge:
             self.parameters,
             self.device.info,
             self.method,
+            self.coupling,
             ticks=self._tick,
             overruns=self._overruns,
             skipped=self._skipped,
@@ -313,9 +329,16 @@ class Bridge:
             raise HapticBridgeError("a bridge is entered once; make a new one for another run")
         self.scene.claim()
         resources.callback(self.scene.release)
-        scene, clock, info, method = self.scene, self.clock, self.device.info, self.method
+        scene, clock, method = self.scene, self.clock, self.method
         felt = prepare(scene, self.coupling, self.period, self._substeps, method)
+        self._stream = RecordStream(
+            self._path, self.period, live=self._is_live, is_lossless=clock.is_lossless
+        )
+        resources.callback(self._stream.close)
+        self._compile()
+        # last, because from here on the device is held, and its pose counts
         self._sample[:] = self.device.start(self.period)
+        info = self.device.info
         self.parameters = run_parameters(
             scene,
             self.coupling,
@@ -331,11 +354,6 @@ class Bridge:
         )
         self._binding = binding = Binding(scene.model, scene.data, self.parameters)
         refuse_stretched_start(binding.state, self._limits)
-        self._stream = RecordStream(
-            self._path, self.period, live=self._is_live, is_lossless=clock.is_lossless
-        )
-        resources.callback(self._stream.close)
-        self._compile()
         if self._stream.is_read:
             meta = describe_run(
                 scene, self.parameters, binding, method=method.name, device=info, clock=clock.name
@@ -345,7 +363,7 @@ class Bridge:
 
     def _compile(self) -> None:
         """Gets the machine code of the tick ready, so that the first one is not late."""
-        state, row, sample = self._binding.state, self._binding.row, self._sample
+        state, row, sample = np.zeros(1, STATE_DTYPE), np.zeros(1, TICK_DTYPE), self._sample
         rows, cursors = self._stream.rows, self._stream.cursors
         self._before_step = direct(before_step, state, sample, row, 0, 0.0)
         self._after_step = direct(after_step, state, row, 0)

@@ -11,14 +11,19 @@ import numpy as np
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo
+from hapticbridge.device.lateness import damping_for_delay, delay_ticks, felt_period
 from hapticbridge.errors import CouplingError
 from hapticbridge.kernel.parameters import SLACK_SHARE, RunParameters, checked_substeps
 from hapticbridge.passivity import minimum_damping, stiffest_coupling
-from hapticbridge.rendering import IMPLICIT, Method
+from hapticbridge.rendering import Method, default_method
 
 UNKNOWN_DAMPING, UNKNOWN_ROTATIONAL_DAMPING = 2.0, 2e-3
 """N s/m and N m s/rad from which the default coupling follows where the device's are unknown: those
 of the default simulated device. Larger ones would feel stiffer and be safe on fewer devices."""
+
+UNKNOWN_REAL_DAMPING, UNKNOWN_REAL_ROTATIONAL_DAMPING = 0.2, 2e-4
+"""The same for a device that moves a motor: a tenth, the low end of what desktop devices are
+believed to have, because almost no maker publishes it."""
 
 
 LOWEST_FREQUENCY, FREQUENCIES = 3e-3, 60
@@ -34,17 +39,21 @@ the bound with B = b/4 is 0.6 b + 0.25 b. More is stiffer and leaves less for an
 
 @dataclass(frozen=True, slots=True)
 class Condition:
-    """The device condition b >= scale · force_scale · (K T / 2 + B) on one kind of axis.
+    """The device condition b >= scale · force_scale · (K T / 2 + B') on one kind of axis.
 
     Attributes:
         axis: ``translation`` or ``rotation``.
         needed: The right-hand side in N s/m (rotation: N m s/rad).
         available: The device's damping b; None where unknown.
+        remedy: What to change if it does not hold.
+        delay: After how many ticks a wrench answers a sample, 0 at best; None where unknown.
     """
 
     axis: str
     needed: float
     available: float | None
+    remedy: str = "lower stiffness or damping, or raise the rate"
+    delay: int | None = 0
 
     @property
     def holds(self) -> bool | None:
@@ -55,10 +64,18 @@ class Condition:
         """Says it, with what to change if it does not hold."""
         unit = "N s/m" if self.axis == "translation" else "N m s/rad"
         if self.available is None:
-            return f"{self.axis}: device damping unknown, {self.needed:g} {unit} needed"
+            return (
+                f"{self.axis}: device damping unknown, {self.needed:g} {unit} needed; "
+                "'hapticbridge identify' measures it"
+            )
         relation = ">=" if self.holds else "<"
         text = f"{self.axis}: device damping {self.available:g} {relation} {self.needed:g} {unit}"
-        return text if self.holds else f"{text}; lower stiffness or damping, or raise the rate"
+        if not self.holds:
+            return f"{text}; {self.remedy}"
+        if self.delay is None:
+            return f"{text}, if it answers without delay, which is unknown"
+        late = f", for a wall behind a delay of {self.delay} ticks: no bound holds for any scene"
+        return f"{text}{late}" if self.delay else text
 
 
 @cache
@@ -70,7 +87,8 @@ def needed_damping(
 ) -> float:
     """Returns the damping b that a device needs behind a coupling, in N s/m or N m s/rad.
 
-    With one law a tick it is K T/2 + B. With n, over each of which the handle moves by the n-th
+    K and B are those of the law: B is what a method uses (``Method.used``), not what is felt. With
+    one law a tick it is K T/2 + B. With n, over each of which the handle moves by the n-th
     part of its step, and whose mean is sent, there is no such formula: b is the least for which
 
         Σ_k f̄_k·δh_{k+1} + (b/T) ‖δh_k‖² − Σ_i f_i·δx_i − ½ s ‖δx_i‖²_{K + nB/T} >= 0,
@@ -87,7 +105,7 @@ def needed_damping(
     1 to 0.01 kg 1.29, 1.65, 2.03.
 
     Args:
-        coupling: K and B.
+        coupling: K and B of the law.
         period: T in s, of the device.
         laws: n, 1 to ``MOST_SUBSTEPS``.
         axis: Which gains to take.
@@ -128,32 +146,62 @@ def device_conditions(
     scale: float,
     force_scale: float,
     laws: int = 1,
+    method: Method | None = None,
 ) -> tuple[Condition, ...]:
     """Returns the condition per kind of axis that the device has, if b of translation is known.
 
     A handle that moves ``scale`` times as far and a force that returns ``force_scale`` times as
     large make the coupling scale · force_scale times as stiff for the device; angles are not
-    scaled, so torques return by force_scale / scale.
+    scaled, so torques return by force_scale / scale. A device's own rate and delay count
+    (``device.lateness``).
 
     Args:
         info: The device.
-        coupling: K and B.
+        coupling: K and B' of the law: what is used, not what is felt.
         period: T in s.
         scale: Handle motion per device motion.
         force_scale: Force on the device per force on the tool.
         laws: How often per tick the wrench is computed (substeps).
+        method: How the tool is rendered, which decides what helps where the damping is too low;
+            None: one that uses the damping as asked.
 
     References:
         Brown & Colgate 1997, eq. (6); sufficient for any environment that satisfies (14).
     """
     conditions = []
     if info.damping is not None:
-        needed = scale * force_scale * needed_damping(coupling, period, laws)
-        conditions.append(Condition("translation", needed, info.damping))
+        delay = delay_ticks(info, period)
+        needed = scale * force_scale * _needed_on(info, coupling, period, laws)
+        remedy = _remedy(method, coupling.damping)
+        conditions.append(Condition("translation", needed, info.damping, remedy, delay))
         if info.turns:
-            needed = force_scale / scale * needed_damping(coupling, period, laws, "rotation")
-            conditions.append(Condition("rotation", needed, info.rotational_damping))
+            needed = force_scale / scale * _needed_on(info, coupling, period, laws, "rotation")
+            remedy = _remedy(method, coupling.rotational_damping)
+            conditions.append(Condition("rotation", needed, info.rotational_damping, remedy, delay))
     return tuple(conditions)
+
+
+def _needed_on(
+    info: DeviceInfo,
+    coupling: Coupling,
+    period: float,
+    laws: int,
+    axis: Literal["translation", "rotation"] = "translation",
+) -> float:
+    """Returns the damping needed by a device that has a rate and a delay of its own."""
+    needed = needed_damping(coupling, felt_period(info, period), laws, axis)
+    return needed + damping_for_delay(info, coupling, period, axis)
+
+
+def _remedy(method: Method | None, used: float) -> str:
+    """Returns what lowers the damping needed.
+
+    A method that takes its own damping off what is felt spends on B' what a softer spring or a
+    shorter period saves, or more, as long as there is some B': until then only B counts.
+    """
+    if method is None or method.lag == 0.0:
+        return "lower stiffness or damping, or raise the rate"
+    return "lower the damping" if used > 0 else "lower the stiffness, or raise the rate"
 
 
 def run_conditions(
@@ -172,6 +220,7 @@ def run_conditions(
         parameters.scale,
         parameters.force_scale,
         parameters.laws,
+        method,
     )
 
 
@@ -203,16 +252,17 @@ def condition_sentences(
 def is_run_certified(conditions: tuple[Condition, ...], method: Method) -> bool | None:
     """As ``is_certified``; None also where the conditions hold, but no coupling law makes them do.
 
-    For a weld b >= KT/2 + B is necessary with what it truly is, but nothing proves it enough.
+    For a weld b >= KT/2 + B' is necessary with what it truly is, but nothing proves it enough.
     """
     verdict = is_certified(conditions)
     return None if verdict and not method.has_law else verdict
 
 
 def is_certified(conditions: tuple[Condition, ...]) -> bool | None:
-    """Returns whether all conditions hold; None where a damping is unknown that decides it."""
+    """Returns whether all conditions hold; None where unknown, or where a delay forbids a proof."""
     held = {condition.holds for condition in conditions}
-    return False if False in held else None if None in held or not held else True
+    is_late = any(condition.delay != 0 for condition in conditions)
+    return False if False in held else None if None in held or not held or is_late else True
 
 
 def damping_margin(conditions: tuple[Condition, ...]) -> float | None:
@@ -234,21 +284,23 @@ def default_coupling(
     scale: float = 1.0,
     force_scale: float = 1.0,
     laws: int = 1,
-    method: Method = IMPLICIT,
+    method: Method | None = None,
 ) -> Coupling:
-    """Returns the stiffest coupling that is safe on a device: 80 % of the bound, B = b / 4.
+    """Returns the stiffest coupling that is safe on a device: 80 % of the bound, B' = b / 4.
 
-    It needs 85 % of b. Where several laws a tick need more, K and B are lowered together until they
-    need no more than that, each kind of axis by itself: ``needed_damping`` is linear in the two.
+    It is what is to be felt: K and B = B' + what the method adds by itself, so that the method uses
+    B' without clipping. It needs 85 % of b. Where several laws a tick or a delay need more, K and
+    B' are lowered together until they need no more than that, each kind of axis by itself:
+    ``needed_damping`` is linear in the two.
 
     Args:
-        info: The device; where its damping is unknown, ``UNKNOWN_DAMPING`` is assumed.
+        info: The device; where its damping is unknown, ``UNKNOWN_DAMPING`` is assumed, of a real
+            one ``UNKNOWN_REAL_DAMPING``.
         period: T in s.
         scale: Handle motion per device motion.
         force_scale: Force on the device per force on the tool.
         laws: How often per tick the wrench is computed (substeps).
-        method: How the tool is rendered. What is returned is what is felt: where the method's law
-            needs less damping than is felt, what the device has to bear is the law.
+        method: How the tool is rendered; None takes ``rendering.default_method``.
 
     Raises:
         CouplingError: The number of laws is out of range, or a scale is not finite and positive, or
@@ -257,14 +309,23 @@ def default_coupling(
     for name, value in (("scale", scale), ("force_scale", force_scale)):
         if not math.isfinite(value) or value <= 0:
             raise CouplingError(f"{name} is {value!r}; it must be finite and > 0")
-    damping = (info.damping or UNKNOWN_DAMPING) / (scale * force_scale)
-    rotational = info.rotational_damping or UNKNOWN_ROTATIONAL_DAMPING
+    damping = info.damping or (UNKNOWN_REAL_DAMPING if info.is_real else UNKNOWN_DAMPING)
+    damping /= scale * force_scale
+    rotational = info.rotational_damping or (
+        UNKNOWN_REAL_ROTATIONAL_DAMPING
+        if info.is_real and info.turns
+        else UNKNOWN_ROTATIONAL_DAMPING
+    )
     rotational *= scale / force_scale
-    coupling = stiffest_coupling(damping, rotational, period)
-    if checked_substeps(laws, CouplingError) == 1:
+    coupling = stiffest_coupling(damping, rotational, felt_period(info, period))
+    checked_substeps(laws, CouplingError)
+    method = default_method(laws) if method is None else method
+    if laws == 1 and not delay_ticks(info, period):
         return method.rendered(coupling, period)
-    shrink = min(1.0, NEEDED_SHARE * damping / needed_damping(coupling, period, laws))
+    shrink = min(1.0, NEEDED_SHARE * damping / _needed_on(info, coupling, period, laws))
     needed = needed_damping(coupling, period, laws, "rotation")
+    if info.turns:
+        needed = _needed_on(info, coupling, period, laws, "rotation")
     shrink_rotation = min(1.0, NEEDED_SHARE * rotational / needed)
     shrunk = Coupling(
         stiffness=shrink * coupling.stiffness,

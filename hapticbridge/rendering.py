@@ -52,8 +52,10 @@ class Method:
             where no coupling law gives the wrench.
         compensated: Whether the actuators get the extra K h of damping, h the time step, that makes
             the implicit integration of velocity alone one of position too.
-        lag: Share of K h that the method's integration adds to the damping, and
-            which it therefore takes off the damping asked for; no unit.
+        lag: Share of K h that is taken off the damping asked for, because the integration adds it;
+            no unit.
+        adds: Share of K h that the integration adds to the damping, whether it is taken off or
+            not; None where it adds another amount, or takes some away.
     """
 
     name: str
@@ -64,6 +66,7 @@ class Method:
     discretization: str = "backward"
     compensated: bool = False
     lag: float = 0.0
+    adds: float | None = None
 
     @property
     def step(self) -> Callable[[Any, Any], None]:
@@ -125,7 +128,10 @@ class Method:
         return self._with_damping(coupling, timestep, law_damping)
 
     def rendered(self, used: Coupling, timestep: float) -> Coupling:
-        """Returns what a tool feels where ``used`` is the law: B = B' + lag K h."""
+        """Returns what must be asked for where ``used`` is the law: B = B' + lag K h.
+
+        It is what is felt, but for methods that take nothing off what they add (``adds``).
+        """
         return self._with_damping(used, timestep, felt_damping)
 
     def _with_damping(
@@ -158,6 +164,7 @@ IMPLICIT = Method(
     hazard="",
     scheme=COUPLED,
     integrator="discrete",
+    adds=IMPLICIT_LAG,
 )
 
 COMPENSATED = replace(
@@ -175,6 +182,7 @@ LOSSLESS_COUPLING = Method(
     scheme=LOSSLESS,
     integrator="discrete",
     lag=MIDPOINT_LAG,
+    adds=MIDPOINT_LAG,
 )
 
 METHODS = {
@@ -198,6 +206,7 @@ METHODS = {
             scheme=COUPLED,
             integrator="implicitfast",
             compensated=True,
+            adds=IMPLICIT_LAG,
         ),
         *(
             Method(
@@ -246,6 +255,16 @@ _ARGUMENTS = Arguments(SceneError)
 MEASURED_AGAIN = 1e-6
 """Relative difference at which a weld measured again is another one; no unit. Probing by 1e-6 m
 leaves 1e-10 of rounding, another processor hardly more."""
+
+
+def default_method(substeps: int = 1) -> Method:
+    """Returns the method that is taken where none is asked for.
+
+    ``lossless`` where a tick is one MuJoCo step: on every shipped scene it is strict without
+    contact, uses no more slack than ``implicit`` in it, and is ten times and more as accurate away
+    from it. It takes no substeps; with them, ``implicit``.
+    """
+    return LOSSLESS_COUPLING if substeps == 1 else IMPLICIT
 
 
 def method_named(name: str) -> Method:

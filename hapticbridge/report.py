@@ -14,9 +14,11 @@ from numpy.typing import NDArray
 from hapticbridge.audit import AuditReport
 from hapticbridge.device import DATA_SHEET_UNITS
 from hapticbridge.errors import RecordingError
+from hapticbridge.felt import coupling_sentences
 from hapticbridge.picture import inline_svg, new_figure, write_picture
 from hapticbridge.provenance import parameters_of
 from hapticbridge.recording import Recording
+from hapticbridge.rendering import method_named
 
 BINS = 1500
 """Points per curve at most; each is drawn as its least and greatest value in a bin, so that no peak
@@ -63,7 +65,7 @@ FACTS = {
     "ramp_ticks": "",
     "scene_sha256": "",
 }
-"""Metadata that a page shows, with their units."""
+"""Metadata that a page shows, with their units; the gains are those of the law, B' and not B."""
 
 DEVICE_FACTS = {"name": "", "axes": ""} | DATA_SHEET_UNITS
 """What a page shows of the device's data sheet, with units."""
@@ -114,13 +116,13 @@ def draw_recording(recording: Recording) -> Figure:
     position_axes.set_ylabel("way from the start (mm)")
     energy_axes.set_ylabel("energy (mJ)")
     energy_axes.set_xlabel("time (s)")
-    coupling = parameters.coupling
-    title = (
-        f"{meta.get('scene', '')}: {meta.get('method', '')}, K = {coupling.stiffness:g} N/m, "
-        f"B = {coupling.damping:g} N s/m, {1 / parameters.period:g} Hz"
-    )
+    method = method_named(meta.get("method", ""))
+    told = coupling_sentences(
+        parameters.coupling, method, parameters.period, parameters.substeps
+    ) or ("no coupling law",)
+    title = f"{meta.get('scene', '')}: method {method.name}, {1 / parameters.period:g} Hz"
     # a control code would make a broken SVG
-    title = "".join(letter if letter.isprintable() else "�" for letter in title)
+    title = "".join(letter if letter.isprintable() else "�" for letter in title) + f"\n{told[0]}"
     figure.suptitle(title, fontsize="medium", parse_math=False)
     for axes in (force_axes, position_axes, energy_axes):
         axes.grid(alpha=0.3)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from hapticbridge.certificate import condition_sentences, is_run_certified, run_conditions
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo
+from hapticbridge.felt import coupling_sentences
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.ledger import Ledger
 from hapticbridge.rendering import Method
@@ -34,14 +35,16 @@ class Summary:
         method: How the tool was rendered.
         about: What that means, in a sentence.
         hazard: What it may do on a real device, in a sentence; empty for ``implicit``.
-        coupling: The coupling asked for.
-        felt: The coupling that the tool was truly held by, where it is not the one asked for (a
-            weld: the stiffest axis, as measured at the start).
+        coupling: The coupling asked for: what should be felt.
+        used: That of the law, whose damping B' the device condition counts.
+        rendered: What is felt away from contact, and what is used, in sentences.
+        felt: The coupling that the tool was truly held by, where no law says it (a weld: the
+            stiffest axis, as measured at the start).
         fault: Tick and port (``environment`` or ``device``) of the first fault, or None. Behind a
             coupling law the device's port is not metered while it runs: a certified device needs
             no watch, and of another the audit of its recording tells.
         conditions: What the device must satisfy, as sentences.
-        is_certified: Whether b >= scale · force_scale · (KT/2 + B) holds for the device in
+        is_certified: Whether b >= scale · force_scale · (KT/2 + B') holds for the device in
             translation and rotation; None where its damping is unknown, or where no coupling law
             makes that condition enough.
         stopped_by: ``duration``, ``signal`` or ``caller``.
@@ -62,6 +65,8 @@ class Summary:
     about: str
     hazard: str
     coupling: Coupling
+    used: Coupling
+    rendered: tuple[str, ...]
     felt: Coupling | None
     fault: tuple[int, str] | None
     conditions: tuple[str, ...]
@@ -81,6 +86,7 @@ class Summary:
         parameters: RunParameters,
         info: DeviceInfo,
         method: Method,
+        asked: Coupling,
         *,
         ticks: int,
         overruns: int,
@@ -96,6 +102,7 @@ class Summary:
             parameters: Of the run.
             info: The device.
             method: How the tool was rendered.
+            asked: The coupling asked for.
             ticks: Ticks that were done.
             overruns: Ticks that started a period or more after their deadline.
             skipped: Deadlines that were skipped for it.
@@ -119,7 +126,11 @@ class Summary:
             method=method.name,
             about=method.about,
             hazard=method.hazard,
-            coupling=parameters.coupling,
+            coupling=asked,
+            used=parameters.coupling,
+            rendered=coupling_sentences(
+                parameters.coupling, method, parameters.period, parameters.substeps
+            ),
             felt=parameters.felt,
             fault=ledger.fault,
             conditions=condition_sentences(info, parameters, method),

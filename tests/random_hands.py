@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from hapticbridge.certificate import default_coupling
 from hapticbridge.device import Hand, Motion, SimulatedDevice
-from hapticbridge.rendering import IMPLICIT
+from hapticbridge.rendering import default_method
 from hapticbridge.study.closed_loop import ClosedLoop, LoopOutcome
 
 T = 1e-3
@@ -42,4 +42,4 @@ def shaken(loop: ClosedLoop, motion: Motion, hand: Hand | None = None) -> LoopOu
     device = SimulatedDevice(path=motion, hand=hand or Hand())
     coupling = default_coupling(device.info, T, 1.0, 1.0)
     ticks = round(motion.duration / T)
-    return loop.run(device, coupling, IMPLICIT, ticks=ticks, keep_records=True)
+    return loop.run(device, coupling, default_method(), ticks=ticks, keep_records=True)

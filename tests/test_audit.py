@@ -29,6 +29,7 @@ from hapticbridge.provenance import (
     parameters_of,
 )
 from hapticbridge.recording import Recording, read_recording
+from hapticbridge.rendering import METHODS
 from hapticbridge.scene import scene_names
 from hapticbridge.scene.library import scene_path
 from hapticbridge.tick import CLOCK_FIELDS, TICK_DTYPE
@@ -202,21 +203,25 @@ def test_strict_refuses_what_the_slack_allows(tmp_path: Path) -> None:
     ("stiffness", "rotational_stiffness", "certified"),
     [(2999.0, 2.99, True), (3001.0, 2.99, False), (2999.0, 3.01, False)],
 )
-def test_certificate_is_the_device_condition(
-    tmp_path: Path, stiffness: float, rotational_stiffness: float, certified: bool
+@pytest.mark.parametrize("method", ["implicit", "lossless", "compensated"])
+def test_certificate_is_the_device_condition_with_what_is_used(
+    tmp_path: Path, method: str, stiffness: float, rotational_stiffness: float, certified: bool
 ) -> None:
     path = tmp_path / "run.mcap"
     # b = 2 N s/m and 2e-3 N m s/rad at 1 ms: K < 2 (2 − 0.5) / 1e-3 and the thousandth of it
-    coupling = Coupling(
+    used = Coupling(
         stiffness=stiffness,
         damping=0.5,
         rotational_stiffness=rotational_stiffness,
         rotational_damping=5e-4,
     )
-    recorded(path, "point_mass", "simulated", coupling, duration=0.05)
+    felt = METHODS[method].rendered(used, 1e-3)
+    recorded(path, "point_mass", "simulated", felt, duration=0.05, method=method)
+    assert float(read_recording(path).meta["damping"]) == pytest.approx(0.5)  # the law's
     report = audit(path)
     assert report.verdict == "passive"
     assert report.certified is certified
+    assert "B' = 0.5" in report.rendered[0]
     assert report.exit_code == (0 if certified else 1)
     assert any("<" in sentence for sentence in report.conditions) is not certified
 
@@ -224,7 +229,7 @@ def test_certificate_is_the_device_condition(
 def test_scales_enter_the_device_condition(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     coupling = Coupling(
-        stiffness=2000, damping=0.5, rotational_stiffness=2, rotational_damping=5e-4
+        stiffness=2000, damping=1.5, rotational_stiffness=2, rotational_damping=1.5e-3
     )
     recorded(path, "point_mass", "simulated", coupling, duration=0.05, scale=1.2)
     assert audit(path).certified is False  # 1.44 · 1.5 N s/m > 2

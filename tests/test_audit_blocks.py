@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +15,12 @@ from recording_cases import random_rows, same, write
 
 from hapticbridge.audit import audit
 from hapticbridge.bridge import Bridge
+from hapticbridge.coupling import Coupling
+from hapticbridge.device import DeviceInfo, SimulatedDevice
 from hapticbridge.errors import RecordingError
 from hapticbridge.recording import open_recording, read_recording, reader
+
+TOO_STIFF = Coupling(stiffness=9000, damping=0.5, rotational_stiffness=1, rotational_damping=1e-3)
 
 
 @pytest.fixture(scope="module")
@@ -59,6 +64,22 @@ def test_the_report_does_not_depend_on_the_blocks(
     assert whole.energies["slack"] > 0
     monkeypatch.setattr(reader, "BLOCK", 13)
     assert audit(path) == whole
+
+
+def test_a_device_that_answers_late_is_judged_alike_where_blocks_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What a late device is given depends on motion that stands in the next block."""
+    path = tmp_path / "late.mcap"
+    late = DeviceInfo.from_json(SimulatedDevice().info.to_json())
+    recorded(path, "virtual_wall", "simulated:damping=0.5", TOO_STIFF, duration=0.5)
+    meta = {"device": replace(late, damping=0.5, delay=3e-3).to_json()}
+    path = rewritten(read_recording(path), tmp_path / "told.mcap", meta=meta)
+    whole = audit(path)
+    assert (whole.verdict, whole.port) == ("active", "device")
+    for size in (2, 40):
+        monkeypatch.setattr(reader, "BLOCK", size)
+        assert audit(path) == whole
 
 
 def test_pauses_and_inputs_are_repeated_where_blocks_end(

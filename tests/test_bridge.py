@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -131,20 +132,31 @@ def test_caller_can_stop(tmp_path: Path) -> None:
 
 
 def test_default_coupling_is_that_of_the_rule() -> None:
-    expected = Coupling(
+    used = Coupling(
         stiffness=2400.0, damping=0.5, rotational_stiffness=2.4, rotational_damping=5e-4
     )
+    felt = replace(used, damping=0.5 + 1.2, rotational_damping=5e-4 + 1.2e-3)  # and K T/2
     for device in ("simulated", ScriptedDevice(still)):
-        for name in ("stiffness", "damping", "rotational_stiffness", "rotational_damping"):
-            coupling = fast("point_mass", device).coupling
-            assert getattr(coupling, name) == pytest.approx(getattr(expected, name), rel=1e-12)
+        bridge = fast("point_mass", device)
+        for found, expected in ((bridge.used, used), (bridge.coupling, felt)):
+            for name in ("stiffness", "damping", "rotational_stiffness", "rotational_damping"):
+                assert getattr(found, name) == pytest.approx(getattr(expected, name), rel=1e-12)
+        assert bridge.rendered == bridge.coupling  # nothing is clipped
+
+
+def test_method_by_itself_is_lossless_or_implicit_with_substeps() -> None:
+    assert fast("point_mass").method.name == "lossless"
+    halved = fast("point_mass", substeps=2)
+    assert halved.method.name == "implicit"
+    with halved as bridge:
+        assert bridge.run(0.01).is_certified is True
 
 
 def test_default_coupling_follows_damping_rate_and_scales() -> None:
     # 80 % of 2 (b − b/4) / T = 1.2 b / T
-    coupling = fast("point_mass", "simulated:damping=5", rate=500).coupling
-    assert coupling.stiffness == pytest.approx(3000)
-    assert coupling.damping == pytest.approx(1.25)
+    bridge = fast("point_mass", "simulated:damping=5", rate=500)
+    assert bridge.coupling.stiffness == pytest.approx(3000)
+    assert bridge.used.damping == pytest.approx(1.25)
     scaled = fast("point_mass", "simulated", scale=2.0)
     assert scaled.coupling.stiffness == pytest.approx(600)
     with scaled as bridge:

@@ -232,10 +232,12 @@ def test_table_says_what_contacts_and_solver_really_were() -> None:
             ("as shipped", None),
             ("damped", None),
             ("soft", None),
+            ("direct", None),
             ("pyramidal cone", 5),
         )
     ]
     chosen = [each.chosen for each in measure_chart(workload, settings, repeats=1).measurements]
-    assert [each["solref"] for each in chosen] == ["0.002 1", "0.0005 8", "0.02 1", "0.002 1"]
-    assert [each["cone"] for each in chosen] == ["elliptic"] * 3 + ["pyramidal"]
-    assert [each["solver_iterations"] for each in chosen] == [100, 100, 100, 5]
+    given = ["0.002 1", "0.0005 8", "0.02 1", "-1e+06 -2000", "0.002 1"]
+    assert [each["solref"] for each in chosen] == given
+    assert [each["cone"] for each in chosen] == ["elliptic"] * 4 + ["pyramidal"]
+    assert [each["solver_iterations"] for each in chosen] == [100, 100, 100, 100, 5]

@@ -34,12 +34,12 @@ def test_zwidth_names_lines_limit_corner_and_next_command(
 ) -> None:
     told = Told(ZWIDTH, capsys)
     assert told.code == 0
-    assert "passive for any hand 4000 N/m 2 N s/m b > K T/2 + B" in told.words
+    assert "passive for any hand 4000 N/m 2 N s/m b > K T/2 + B'" in told.words
     assert "free of limit cycles 10000 N/m 5 N s/m" in told.words
     assert "stable without a hand 4013.4 N/m" in told.words
     assert "limited by: passive for any hand" in told.out
-    assert "use K = 2400 N/m, B = 0.5 N s/m" in told.out
-    assert told.out.endswith("next: hapticbridge run SCENE --stiffness 2400 --damping 0.5\n")
+    assert "use K = 2400 N/m, B = 1.7 N s/m felt (lossless adds KT/2 to its B' = 0.5)" in told.words
+    assert told.out.endswith("next: hapticbridge run SCENE --stiffness 2400 --damping 1.7\n")
 
 
 def test_next_command_of_zwidth_runs_and_is_certified(capsys: pytest.CaptureFixture[str]) -> None:
@@ -49,6 +49,18 @@ def test_next_command_of_zwidth_runs_and_is_certified(capsys: pytest.CaptureFixt
     told = Told(f"{command} --fast --duration 0.05 --json", capsys)
     assert told.code == 0
     assert told.json()["is_certified"] is True
+
+
+@pytest.mark.parametrize("command", [ZWIDTH, "bound --stiffness 2000 --device-damping 2"])
+def test_next_command_is_rendered_as_it_is_asked_for(
+    command: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = Told(command, capsys).out.split("next: hapticbridge ")[1].replace("SCENE", "point_mass")
+    told = Told(f"{run.strip()} --fast --duration 0.05", capsys)
+    assert told.code == 0
+    assert "warning" not in told.err
+    asked = run.split("--damping ")[1].strip()
+    assert f"B = {asked} N s/m felt" in told.out
 
 
 def test_zwidth_as_json_holds_the_whole_region(capsys: pytest.CaptureFixture[str]) -> None:
@@ -77,40 +89,78 @@ def test_bound_shows_every_alternative(capsys: pytest.CaptureFixture[str]) -> No
     told = Told(BOUND, capsys)
     assert told.code == 0
     for row in (
-        r"as asked \(backward difference\) 2 N s/m 500 Hz",
-        r"half the period 1\.5 N s/m 1000 Hz",
-        r"low-pass of 1 ms on the damper 1\.333 N s/m 500 Hz",
-        r"Tustin's damper none suffices 500 Hz",
-        r"one sample of delay, against a wall 2\.5 N s/m 166\.7 Hz",
-        r"one sample of delay, any environment none suffices -",
+        r"method lossless: B = 1 felt, B' = 0 1 N s/m every frequency",
+        r"method compensated: B = 2 felt, B' = 0 1 N s/m every frequency",
+        r"method implicit: B = 3 felt, B' = 1 2 N s/m 500 Hz",
+        r"B' = B at half the period 1\.5 N s/m 1000 Hz",
+        r"B' = B, low-pass of 1 ms on the damper 1\.333 N s/m 500 Hz",
+        r"B' = B, Tustin's damper none suffices 500 Hz",
+        r"B' = B, one tick late, against a wall 2\.5 N s/m 166\.7 Hz",
+        r"B' = B, one tick late, any environment none suffices -",
         r"lossless line of that stiffness 2 N s/m every frequency",
     ):
         assert re.search(row, told.words)
 
 
-def test_bound_judges_a_device(capsys: pytest.CaptureFixture[str]) -> None:
-    told = Told(f"{BOUND} --device-damping 1.5", capsys)
-    assert told.code == 1
-    assert "device damping 1.5 < 2 N s/m" in told.out
-    for change in ("1000 N/m", "2000 Hz", "0.5 N s/m", "a device with 2 N s/m"):
-        assert change in told.out
-    told = Told(f"{BOUND} --device-damping 2.5", capsys)
-    assert told.code == 0
-    assert "up to K = 3000 N/m" in told.out
-    assert "next: hapticbridge run SCENE --stiffness 2000 --damping 1\n" in told.out
-
-
-@pytest.mark.parametrize("damping", [0.5, 1.0])
-def test_no_rate_helps_where_the_damper_alone_is_too_much(
-    damping: float, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize(
+    ("coupling", "needed", "changes"),
+    [
+        # B' = B − K T/2 > 0: K T/2 + B' = B, whatever K and the rate are
+        ("--stiffness 2400 --damping 3", "3", ["lower the damping to 2 N s/m, or"]),
+        # B' = 0: K T/2, whatever B is
+        (
+            "--stiffness 5000 --damping 1",
+            "2.5",
+            ["lower the stiffness to 4000 N/m, or", "raise the rate to 1250 Hz, or"],
+        ),
+        (
+            "--stiffness 5000 --damping 3",
+            "3",
+            [
+                "lower the damping to 2 N s/m, and lower the stiffness to 4000 N/m or raise the "
+                "rate to 1250 Hz, or"
+            ],
+        ),
+    ],
+)
+def test_bound_judges_a_device_and_says_what_helps(
+    coupling: str, needed: str, changes: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    told = Told(f"{BOUND} --device-damping {damping}", capsys)
+    told = Told(f"bound {coupling} --device-damping 2", capsys)
     assert told.code == 1
-    assert "raise the rate" not in told.out
-    assert "lower the coupling's damping below" in told.out
+    changes = [*changes, f"take a device with {needed} N s/m"]
+    assert f"device damping 2 < {needed} N s/m: not passive in any hand {' '.join(changes)}" in (
+        told.words
+    )
+    # each piece of advice is right, and only just
+    rate = 1000.0
+    for change in changes[:-1]:
+        stiffness, damping = (float(word) for word in coupling.split()[1::2])
+        if found := re.search(r"damping to ([0-9.]+)", change):
+            damping = float(found[1])
+        if found := re.search(r"stiffness to ([0-9.]+)", change):
+            stiffness = float(found[1])
+        elif found := re.search(r"rate to ([0-9.]+)", change):
+            rate = float(found[1])
+        for share, code in ((1.0, 0), (0.99, 1)):
+            command = f"bound --stiffness {stiffness} --damping {damping} --rate {rate}"
+            assert Told(f"{command} --device-damping {2 * share}", capsys).code == code
 
 
-@pytest.mark.parametrize(("device", "code", "holds"), [("", 0, None), ("1.5", 1, False)])
+def test_bound_tells_what_a_device_bears(capsys: pytest.CaptureFixture[str]) -> None:
+    told = Told("bound --stiffness 2000 --damping 1.5 --device-damping 2", capsys)
+    assert told.code == 0
+    assert "any K up to 4000 N/m with any B up to 2 N s/m" in told.out
+    assert "cannot show" not in told.out
+    assert "next: hapticbridge run SCENE --stiffness 2000 --damping 1.5\n" in told.out
+    assert Told("bound --stiffness 4000 --damping 2 --device-damping 2", capsys).code == 0
+    assert Told("bound --stiffness 4001 --damping 2 --device-damping 2", capsys).code == 1
+    assert Told("bound --stiffness 4000 --damping 2.01 --device-damping 2", capsys).code == 1
+    told = Told("bound --stiffness 2000 --damping 0.5 --device-damping 2", capsys)
+    assert "method lossless cannot show less than B = 1 N s/m" in told.words
+
+
+@pytest.mark.parametrize(("device", "code", "holds"), [("", 0, None), ("0.9", 1, False)])
 def test_bound_as_json_is_valid_and_null_where_none_suffices(
     device: str, code: int, holds: bool | None, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -118,10 +168,11 @@ def test_bound_as_json_is_valid_and_null_where_none_suffices(
     facts = told.json()
     assert told.code == code
     assert facts["holds"] is holds
-    assert facts["largest_stiffness"] == (1000 if device else None)
-    assert facts["frequency_hz"] == pytest.approx(500)
+    assert facts["largest_stiffness"] == (0 if device else None)  # B alone is too much
+    assert facts["frequency_hz"] is None  # without damper it is every frequency
+    assert (facts["method"], facts["used_damping"]) == ("lossless", 0.0)
     assert [way["needed"] is None for way in facts["alternatives"]] == [
-        *(False, False, False, True, False, True, False, False, False)
+        *(False, False, False, False, False, True, False, True, False)
     ]
 
 
@@ -178,8 +229,8 @@ def test_bound_of_a_plain_spring_names_no_frequency(capsys: pytest.CaptureFixtur
     assert "500 Hz" not in told.words
     facts = Told("bound --stiffness 2000 --json", capsys).json()
     assert facts["frequency_hz"] is None
-    assert facts["alternatives"][3] == {
-        "name": "Tustin's damper", "needed": 1.0, "frequency_hz": None
+    assert facts["alternatives"][5] == {
+        "name": "B' = B, Tustin's damper", "needed": 1.0, "frequency_hz": None
     }  # fmt: skip
 
 
@@ -193,6 +244,7 @@ def test_a_heavy_device_is_limited_by_the_hand(capsys: pytest.CaptureFixture[str
     "command",
     [
         "zwidth --damping 1e300",
+        "zwidth --damping 1e30 --rate 1e6",
         "zwidth --damping 1e-300",
         "zwidth --damping 2 --mass 1e300",
         "zwidth --damping 2 --friction 1e300 --resolution 1e-5",
@@ -219,7 +271,6 @@ def test_extreme_numbers_are_refused_in_one_line(
 @pytest.mark.parametrize(
     "command",
     [
-        "zwidth --damping 1e30 --rate 1e6",
         "zwidth --damping 1e-30 --mass 1e30 --rate 1",
         "zwidth --damping 2 --friction 1e30 --resolution 1e-30",
         "zwidth --damping 2 --delay 3 --filter-time 1e25",

@@ -322,17 +322,18 @@ def test_random_hands_are_the_same_for_the_same_seed_and_within_their_ranges() -
         random_hand(-1)
 
 
+@pytest.mark.parametrize("name", ["implicit", "lossless"])
 def test_no_random_passive_hand_turns_a_certified_coupling_unstable_or_active(
-    point_mass: ClosedLoop,
+    name: str, point_mass: ClosedLoop
 ) -> None:
-    info = SimulatedDevice().info
-    coupling = default_coupling(info, T)
-    assert is_certified(device_conditions(info, coupling, T, 1.0, 1.0))
+    info, method = SimulatedDevice().info, METHODS[name]
+    coupling = default_coupling(info, T, method=method)
+    assert is_certified(device_conditions(info, method.used(coupling, T), T, 1.0, 1.0))
     for seed in range(50):
         outcome = point_mass.run(
             SimulatedDevice(hand=random_hand(seed), path=STILL),
             coupling,
-            METHODS["implicit"],
+            method,
             ticks=6000,  # its windows hold most of a swing of the slowest hand
             knock=np.array([1e-3, -5e-4, 2e-4, 0.02, 0.01, -0.02]),
         )

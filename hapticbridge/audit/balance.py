@@ -37,6 +37,7 @@ SUMS = (
     "device_energy",
     "device_throughput",
     "slack",
+    "given",
     "burnt",
     "kept",
 )
@@ -135,6 +136,8 @@ class Balance:
         parameters: RunParameters,
         before: Reached,
         resumed: Array,
+        late: int = 0,
+        following: NDArray[np.void] | None = None,
     ) -> Balance:
         """Computes everything from records.
 
@@ -143,6 +146,9 @@ class Balance:
             parameters: The run's.
             before: What the ticks before them left.
             resumed: Ticks at which the run went on after a pause without force.
+            late: After how many ticks a wrench answers a sample: what was sent in row k acted on
+                the motion between rows k + late and k + late + 1.
+            following: The records after these, as many as ``late``, or fewer where they end.
         """
         sums = before.sums
         motion = Motion.of(ticks, before.handle, before.tool)
@@ -167,6 +173,8 @@ class Balance:
         device_work = np.sum(sent[:, :3] * device_step, axis=1)
         device_work += np.sum(sent[:, 3:] * device_turn, axis=1)
         device_energy = summed(device_work, sums["device_energy"])
+        later = _later(ticks, following, late) if late else (device_step, device_turn)
+        given = np.sum(sent[:, :3] * later[0], axis=1) + np.sum(sent[:, 3:] * later[1], axis=1)
 
         position, orientation = _handle(ticks, parameters)
         stored = ticks["kinetic"] + ticks["potential"] - before.start_energy
@@ -185,13 +193,14 @@ class Balance:
                 passed=passed_shares(ticks, parameters),
                 since_start=running,
                 share_before=before.share,
+                has_end=not late,
             )
             kept_sum = summed(parts, sums["kept"])
             kept = kept_sum + held
         burnt = np.zeros(len(ticks))
         if parameters.device_damping is not None:
             interval = np.diff(ticks["read_ns"], prepend=before.read_ns) * 1e-9
-            parts = burnt_by_damping(parameters, device_step, device_turn, interval, running > 0)
+            parts = burnt_by_damping(parameters, *later, interval, running > 0)
             burnt = summed(parts, sums["burnt"])
         linear, angular = _slack_gains(parameters)
         slack = 0.5 * linear * np.sum(motion.tool_step**2, axis=1)
@@ -202,6 +211,7 @@ class Balance:
             "device_energy": device_energy,
             "device_throughput": summed(np.abs(device_work), sums["device_throughput"]),
             "slack": summed(slack, sums["slack"]),
+            "given": summed(given, sums["given"]),
             "burnt": burnt,
             "kept": kept_sum,
         }
@@ -219,7 +229,7 @@ class Balance:
             device_throughput=totals["device_throughput"],
             environment_energy=created,
             slack=totals["slack"],
-            kicked=_kicked(parameters, device_energy, burnt, lost + kept),
+            kicked=_kicked(parameters, totals["given"], burnt, lost + kept),
             reached=Reached(
                 handle=np.concatenate([last["handle_position"], last["handle_quaternion"]]),
                 tool=np.concatenate([last["tool_position"], last["tool_quaternion"]]),
@@ -252,6 +262,19 @@ def _kicked(parameters: RunParameters, given: Array, burnt: Array, taken: Array)
     if parameters.device_damping is None or (parameters.has_law and parameters.laws > 1):
         return np.zeros(len(given))
     return np.asarray(given - burnt + parameters.force_scale / parameters.scale * taken)
+
+
+def _later(
+    ticks: NDArray[np.void], following: NDArray[np.void] | None, late: int
+) -> tuple[Array, Array]:
+    """Returns the device's steps and turns ``late`` rows on; none where the records end by then."""
+    rows = ticks if following is None else np.concatenate([ticks, following])
+    moved = []
+    for field, of in (("device_position", steps), ("device_quaternion", turns)):
+        change = of(rows[field], rows[field][0])[late : late + len(ticks)]
+        missing = np.zeros((len(ticks) - len(change), 3))
+        moved.append(np.concatenate([change, missing]))
+    return moved[0], moved[1]
 
 
 def _handle(ticks: NDArray[np.void], parameters: RunParameters) -> tuple[Array, Array]:

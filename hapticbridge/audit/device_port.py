@@ -67,6 +67,7 @@ def kept_behind_a_law(
     passed: tuple[Array, Array],
     since_start: Array,
     share_before: float = 0.0,
+    has_end: bool = True,
 ) -> tuple[Array, Array]:
     """Returns what coupling and tool took up of what the handle gave, in J of the scene.
 
@@ -86,6 +87,9 @@ def kept_behind_a_law(
         passed: c, the share of force and of torque that the guard let through, (n,) each.
         since_start: Ticks since the force began to rise, (n,).
         share_before: r of the tick before the first of these.
+        has_end: Whether r_k V(e_k) is counted. It stands for what a device at e_k could still be
+            given; where the device is no longer there, because the sample is old, only what it was
+            given by then counts.
 
     Returns:
         What is summed over the ticks, each tick's part of it, and r V(e); (n,) each.
@@ -110,7 +114,8 @@ def kept_behind_a_law(
         found = spring + 0.5 * b / parameters.period * np.sum(de**2, axis=1)
         taken = np.where(since_start > 0, c * w, 0.0)
         summed += taken - rise * found
-        held += share * spring
+        if has_end:
+            held += share * spring
     return summed, held
 
 

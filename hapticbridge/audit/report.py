@@ -32,6 +32,7 @@ class AuditReport:
         ticks: Number of records.
         duration: Their number times the period, in s.
         conditions: The device condition per kind of axis, as sentences.
+        rendered: What was felt away from contact, and what was used, as sentences.
         unchecked: What records alone do not tell and only the re-simulation confirms, or nothing;
             without a re-simulation such a recording is not called passive but invalid.
         damping_margin: Least share of the device's damping that the coupling leaves, 1 − needed / b
@@ -55,6 +56,7 @@ class AuditReport:
     ticks: int = 0
     duration: float = 0.0
     conditions: tuple[str, ...] = ()
+    rendered: tuple[str, ...] = ()
     unchecked: str = ""
     damping_margin: float | None = None
     energies: dict[str, float] = field(default_factory=dict)

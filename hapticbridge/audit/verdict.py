@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections import deque
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +25,9 @@ from hapticbridge.certificate import (
     run_conditions,
 )
 from hapticbridge.device import DeviceInfo
+from hapticbridge.device.lateness import delay_ticks
 from hapticbridge.errors import HapticBridgeError, RecordingError
+from hapticbridge.felt import coupling_sentences
 from hapticbridge.guard import Limits, limits_for
 from hapticbridge.kernel.state import RunParameters
 from hapticbridge.provenance import STARTS, meta_start, parameters_of
@@ -76,7 +81,7 @@ def audit(path: str | Path, *, strict: bool = False) -> AuditReport:
         return _invalid(facts, fault)
     passed = _Passed(recording, parameters, is_watched=facts["certified"] is not True)
     try:
-        fault = passed.by(resumed)
+        fault = passed.by(resumed, delay_ticks(info, parameters.period) or 0)
         facts["energies"] = passed.judgement.energies
         if fault:
             return _invalid(facts, fault)
@@ -133,6 +138,9 @@ def _device_facts(info: DeviceInfo, parameters: RunParameters, method: Method) -
             "certified": is_run_certified(conditions, method),
             "conditions": condition_sentences(info, parameters, method),
             "damping_margin": damping_margin(conditions),
+            "rendered": coupling_sentences(
+                parameters.coupling, method, parameters.period, parameters.substeps
+            ),
         }
     except HapticBridgeError as error:  # numbers beyond what the theory computes with
         raise RecordingError(f"the metadata are out of range: {error}") from None
@@ -176,11 +184,12 @@ class _Passed:
         except RecordingError as error:
             self._error = error
 
-    def by(self, resumed: NDArray[np.float64]) -> Fault | None:
+    def by(self, resumed: NDArray[np.float64], late: int) -> Fault | None:
         """Looks at every tick; returns the earliest fault of the records themselves.
 
         Args:
             resumed: Ticks at which the run went on after a pause without force.
+            late: After how many ticks a wrench answers a sample.
 
         Raises:
             RecordingError: The metadata do not say what the ledger counts from.
@@ -190,8 +199,9 @@ class _Passed:
         handle, tool = starts["handle_start"], starts["tool_start"]
         reached = Reached.at_start(self._parameters, handle, tool, energy)
         fault = None
-        for ticks in self._recording.blocks():
-            balance = Balance.of(ticks, self._parameters, reached, resumed)
+        late = min(late, self._recording.count)
+        for ticks, following in _with_following(self._recording.blocks(), late):
+            balance = Balance.of(ticks, self._parameters, reached, resumed, late, following)
             reached = balance.reached
             self.judgement.add(ticks, balance)
             fault = fault or physics_fault(ticks, balance)
@@ -211,3 +221,16 @@ class _Passed:
         if self._error is not None:
             raise self._error
         return self._simulation.outcome()
+
+
+def _with_following(
+    blocks: Iterable[NDArray[np.void]], count: int
+) -> Iterator[tuple[NDArray[np.void], NDArray[np.void]]]:
+    """Yields blocks, each with as many of the records after it, or fewer where they end."""
+    waiting: deque[NDArray[np.void]] = deque()
+    for block in chain(blocks, [None]):
+        if block is not None:
+            waiting.append(block)
+        while waiting and (block is None or sum(map(len, waiting)) - len(waiting[0]) >= count):
+            ticks = waiting.popleft()
+            yield ticks, np.concatenate([ticks[:0], *waiting])[:count]

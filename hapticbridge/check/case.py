@@ -20,6 +20,7 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo, Motion, SimulatedDevice
 from hapticbridge.device.motion import lissajous
 from hapticbridge.errors import DeviceError, SceneError
+from hapticbridge.rendering import default_method
 from hapticbridge.scene import Scene, SceneSource, compile_scene
 
 DEFAULT_PERIOD = 1e-3
@@ -47,7 +48,7 @@ class Case:
         scene: The scene as it runs, with handle and coupling.
         places: Where things are written.
         info: Data sheet of the device that it is checked for.
-        coupling: K and B.
+        coupling: K and B that should be felt.
         period: T in s.
         scale: Handle motion per device motion, without unit.
         motion: Of the handle.
@@ -81,6 +82,11 @@ class Case:
         """The compiled scene, with the handle and the time step that it runs at."""
         return self.scene.model
 
+    @property
+    def used(self) -> Coupling:
+        """The coupling whose law gives the wrench, in the method that a bridge takes by itself."""
+        return default_method().used(self.coupling, self.period)
+
 
 def open_case(
     source: SceneSource,
@@ -98,7 +104,7 @@ def open_case(
     Args:
         source: What ``read_scene`` returned; it stays as it is.
         grip: Name of the site on the tool.
-        coupling: K and B; None takes the default of the simulated device.
+        coupling: K and B that should be felt; None takes the default of the simulated device.
         period: T in s; None takes ``DEFAULT_PERIOD``.
         scale: Handle motion per device motion.
         workspace: Edge of the cube that the device reaches, in m, > 0.

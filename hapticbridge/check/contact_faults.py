@@ -141,7 +141,7 @@ def inertia_of(case: Case, pair: tuple[int, int], setting: ContactSetting) -> fl
     """Returns the inertia in kg that the contact of two geoms has, the least that was seen.
 
     Where they did not meet it is that of their centres at the start: 1/m = Σ 1/m_i, plus the
-    coupling's share h B + h² K at the tool, with a pyramidal cone times that of its edges.
+    coupling's share h B' + h² K at the tool, with a pyramidal cone times that of its edges.
     """
     model = case.model
     seen = case.observation.meetings.get(pair) if case.observation else None
@@ -149,7 +149,7 @@ def inertia_of(case: Case, pair: tuple[int, int], setting: ContactSetting) -> fl
         return seen.inertia
     is_tool = tool_geoms(model, case.scene.grip)
     step, inverse = float(model.opt.timestep), 0.0
-    share = step * case.coupling.damping + step**2 * case.coupling.stiffness
+    share = step * case.used.damping + step**2 * case.used.stiffness
     for geom in pair:
         inertia = body_inertia(model, case.scene.data, int(model.geom_bodyid[geom]))
         inverse += 1.0 / (inertia + (share if is_tool[geom] else 0.0))

@@ -166,7 +166,7 @@ def _time_ticks(
         times[k] = clock() - begin
         if code != OK:
             raise SceneError(f"scene '{scene.name}' is not finite in tick {k} of its motion")
-        contacts[k], rows[k] = data.ncon, data.nefc
+        contacts[k], rows[k] = int(row["contacts"][0]), data.nefc  # what is near is no contact
     ring.close()
     return 1e-9 * times, contacts, rows
 
@@ -186,7 +186,7 @@ def _time_stages(
         mujoco.mj_step(model, data)
         spent[k] = durations - earlier
         after_step(state, row, 0)
-        contacts[k] = data.ncon
+        contacts[k] = int(row["contacts"][0])
     stages = {name: spent[WARM_UP:, timer] for name, timer in STAGES.items()}
     whole = spent[WARM_UP:, int(_TIMER.mjTIMER_STEP)]
     stages[REST] = np.maximum(whole - sum(stages.values()), 0.0)

@@ -9,10 +9,12 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticbridge.certificate import needed_damping
 from hapticbridge.check.motion import samples_of
 from hapticbridge.check.rehearsal import Rehearsal, rehearse
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Motion
+from hapticbridge.rendering import default_method
 from hapticbridge.scene import Scene, SceneSource, compile_scene
 
 
@@ -21,7 +23,7 @@ class Setting:
     """How a scene is run.
 
     Attributes:
-        coupling: K and B.
+        coupling: K and B that should be felt.
         period: T in s.
         substeps: MuJoCo steps per tick.
     """
@@ -29,6 +31,13 @@ class Setting:
     coupling: Coupling
     period: float = 1e-3
     substeps: int = 1
+
+    @property
+    def needed_damping(self) -> float:
+        """Damping in N s/m that a device needs behind the method that a bridge would take."""
+        method = default_method(self.substeps)
+        used = method.used(self.coupling, self.period / self.substeps)
+        return needed_damping(used, self.period, method.laws(self.substeps))
 
 
 @dataclass(slots=True)

@@ -53,7 +53,7 @@ class Meeting:
         deepest: How deep one was in the other at most, in m; negative where they never overlapped.
         force: Largest normal force in N of one contact.
         inertia: Least that MuJoCo saw at one of their contacts, in kg, the coupling's share of
-            h B + h² K included; inf if no contact carried ``LEAST_FORCE``.
+            h B' + h² K included; inf if no contact carried ``LEAST_FORCE``.
         softest: Least stiffness in N/m of such a contact; inf if none.
         stiffest: The largest; 0 if none.
     """

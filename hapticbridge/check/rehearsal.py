@@ -19,7 +19,7 @@ from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.state import Binding
 from hapticbridge.kernel.step import simulate
 from hapticbridge.ledger import Ledger
-from hapticbridge.rendering import prepare
+from hapticbridge.rendering import default_method, prepare
 from hapticbridge.scene import Scene
 from hapticbridge.tick import TICK_DTYPE
 
@@ -62,7 +62,7 @@ def rehearse(
     Args:
         scene: Changed in place: reset, with the coupling's gains and the time step set.
         samples: Poses counted from the first, ``SAMPLE_DTYPE``, as ``samples_of`` returns them.
-        coupling: K and B.
+        coupling: K and B that should be felt.
         period: T in s.
         substeps: MuJoCo steps per tick.
 
@@ -95,10 +95,13 @@ def rehearsal_parameters(
 ) -> RunParameters:
     """Puts a scene to its start for a rehearsal, and returns what ``Binding`` needs.
 
+    The method is the one that a bridge takes by itself.
+
     Raises:
         SceneError: A value is out of range.
     """
-    prepare(scene, coupling, period, substeps, warns=False)
+    method = default_method(substeps)
+    prepare(scene, coupling, period, substeps, method, warns=False)
     # an error inside the C symbol would end the process, so MuJoCo takes its first step in Python
     mujoco.mj_step(scene.model, scene.data)
     scene.reset()
@@ -106,11 +109,12 @@ def rehearsal_parameters(
         grip=scene.grip,
         period=period,
         substeps=substeps,
-        coupling=coupling,
+        coupling=method.used(coupling, period / substeps),
         force_limit=_UNLIMITED,
         torque_limit=_UNLIMITED,
         ramp_ticks=0,
         device_origin=_IDENTITY,
         handle_origin=scene.grip_pose(),
         device_start=_IDENTITY,
+        scheme=method.scheme,
     )

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from hapticbridge.certificate import needed_damping
 from hapticbridge.check.draft import Draft
 from hapticbridge.check.felt import FeltError, felt_error
 from hapticbridge.check.rehearsal import Rehearsal
@@ -116,9 +115,7 @@ class Judge:
         """
         done = draft.rehearsed(self.motion)
         felt = felt_error(self.rehearsal.records, done.records)
-        needed = needed_damping(
-            draft.setting.coupling, draft.setting.period, draft.setting.substeps
-        )
+        needed = draft.setting.needed_damping
         verdict = self._refusal(done, felt, needed)
         cost = done.seconds / (self.seconds * self.motion.duration)
         if not verdict and not is_last_word and cost > CLEARLY_MORE * share:
@@ -142,10 +139,7 @@ class Judge:
     def _refusal(self, done: Rehearsal, felt: FeltError, needed: float) -> str:
         """Returns why a version cannot be, whatever it saves; empty if it can."""
         ranks = [_ENVIRONMENTS.index(each.environment) for each in (done, self.rehearsal)]
-        asked = self.original.setting
-        bearable = max(
-            self.device_damping, needed_damping(asked.coupling, asked.period, asked.substeps)
-        )
+        bearable = max(self.device_damping, self.original.setting.needed_damping)
         if done.warnings > self.rehearsal.warnings:
             return WARNS
         if ranks[0] > ranks[1]:

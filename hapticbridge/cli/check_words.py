@@ -32,7 +32,7 @@ def print_case(case: Case) -> None:
     out.print(f"[bold]{plain(case.scene.name)}[/]  {plain(str(case.source.path))}")
     out.print(
         f"  motion: {plain(case.motion_name)}, {case.motion.duration:.3g} s, {size} mm; "
-        f"coupling: {case.coupling.stiffness:.4g} N/m, {case.coupling.damping:.3g} N s/m, "
+        f"coupling: {case.coupling.stiffness:.4g} N/m, {case.coupling.damping:.3g} N s/m felt, "
         f"{1 / case.period:.4g} Hz"
     )
 

@@ -4,27 +4,25 @@ from __future__ import annotations
 
 import json
 import math
-import shlex
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated
 
 import tyro
-from rich.markup import escape
-from rich.table import Table
 
 from hapticbridge.bridge import Bridge
-from hapticbridge.certificate import default_coupling, device_conditions
-from hapticbridge.cli.terminal import err, out, quantity
+from hapticbridge.certificate import default_coupling
+from hapticbridge.cli.run_words import announce, announce_measured, print_summary
+from hapticbridge.cli.terminal import err, out, tell
 from hapticbridge.clock import RealClock, SimulatedClock, period_of
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo, device_for
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.guard import Limits
-from hapticbridge.rendering import IMPLICIT, method_named
+from hapticbridge.kernel.parameters import checked_substeps
+from hapticbridge.rendering import Method, default_method, method_named
 from hapticbridge.scene import load_scene, settings_from
-from hapticbridge.summary import Summary
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,22 +44,24 @@ class Run:
     grip: str = "grip"
     """Site on the tool that the hand holds."""
     device: str = "simulated"
-    """'simulated' (in the hand that the scene asks for), 'simulated:damping=5,hand_mass=1', or
-    'trajectory:FILE' (CSV or recording)."""
+    """'simulated' (in the hand that the scene asks for), 'simulated:damping=5,hand_mass=1',
+    'trajectory:FILE' (CSV or recording), or one that 'hapticbridge devices' lists."""
     duration: float | None = None
     """Seconds to run; by default until the device's motion ends, or until Ctrl-C."""
     record: Path | None = None
     """File to record to (.mcap)."""
     overwrite: bool = False
     """Replace the recording if the file exists."""
-    method: str = IMPLICIT.name
-    """How the tool is rendered: 'implicit' (the coupling inside MuJoCo's implicit step),
-    'compensated' (the same, with the damping that the step adds taken off the coupling's),
-    'lossless' (half inside the step, half carried over: second order away from contact),
-    'implicitfast' or 'implicitfast:compensated' (the same actuators under that integrator, with K T
-    more damping), 'explicit', 'explicit:implicitfast' or 'explicit:rk4' (applied as a force and
-    held, under Euler or the integrator named), 'weld' (MuJoCo's weld constraint), 'direct' (a tool
-    without mass, no coupling). All but the first three exist to be compared."""
+    method: str | None = None
+    """How the tool is rendered: 'lossless' (half of the coupling inside MuJoCo's implicit step,
+    half carried over: second order away from contact; the default), 'implicit' (all of it inside
+    the step, which adds K T to the damping that is felt; the default with substeps, which
+    'lossless' does not take), 'compensated' (the same, with that K T taken off the coupling's
+    damping), 'implicitfast' or 'implicitfast:compensated' (the same actuators under that
+    integrator, with K T more damping), 'explicit', 'explicit:implicitfast' or 'explicit:rk4'
+    (applied as a force and held, under Euler or the integrator named), 'weld' (MuJoCo's weld
+    constraint), 'direct' (a tool without mass, no coupling). All but the first three exist to be
+    compared."""
     contact_stiffness: float | None = None
     """Stiffness per contact in N/m of method 'direct'; by default that of the coupling."""
     i_know: bool = False
@@ -75,11 +75,12 @@ class Run:
     stiffness: float | None = None
     """Coupling stiffness K in N/m; by default the stiffest that is safe on the device."""
     damping: float | None = None
-    """Coupling damping B in N s/m."""
+    """Coupling damping B in N s/m that is to be felt; of it 'lossless' uses B' = B - KT/2 and
+    'compensated' B - KT, 0 at least, and the device needs KT/2 + B'."""
     rotational_stiffness: float | None = None
     """Rotational coupling stiffness in N m/rad."""
     rotational_damping: float | None = None
-    """Rotational coupling damping in N m s/rad."""
+    """Rotational coupling damping in N m s/rad, likewise."""
     scale: float = 1.0
     """Handle motion per device motion."""
     force_scale: float | None = None
@@ -104,7 +105,7 @@ class Run:
         if self.record is not None and self.record.exists() and not self.overwrite:
             raise RecordingError(f"'{self.record}' exists; choose another file or add --overwrite")
         scene = load_scene(self.scene, self.grip, **settings_from(self.settings))
-        device = device_for(scene, self.device)
+        device = device_for(scene, self.device, tell)
         scales = self.scale, self.scale if self.force_scale is None else self.force_scale
         bridge = Bridge(
             scene,
@@ -131,119 +132,31 @@ class Run:
             live=not self.as_json,
         )
         if not self.as_json:
-            _announce(bridge, scales)
+            announce(bridge, scales, self.substeps, is_method_asked=self.method is not None)
         with ExitStack() as stack:
             with err.status("preparing (the first run on a machine compiles for about 20 s) …"):
                 stack.enter_context(bridge)
             if not self.as_json:
-                _announce_measured(bridge)
+                announce_measured(bridge)
             summary = bridge.run(self.duration)
         if self.as_json:
             values = asdict(summary) | {"verdict": summary.verdict}
             out.print_json(json.dumps(values | {"recording": str(self.record or "") or None}))
         else:
-            _print_summary(summary, bridge.laws)
+            print_summary(summary, bridge.laws, is_felt=not device.info.is_prescribed)
         is_good = summary.verdict == "passive" and summary.is_certified is not False
         return 0 if is_good else 1
+
+    def _method(self) -> Method:
+        if self.method is None:
+            return default_method(checked_substeps(self.substeps))
+        return method_named(self.method)
 
     def _coupling(self, info: DeviceInfo, scales: tuple[float, float]) -> Coupling:
         """Returns the default coupling with what the user asked for put in its place."""
         asked = {field.name: getattr(self, field.name) for field in fields(Coupling)}
         given = {name: value for name, value in asked.items() if value is not None}
-        method = method_named(self.method)
+        method = self._method()
         laws = method.laws(self.substeps)
         default = default_coupling(info, period_of(self.rate), *scales, laws, method)
         return replace(default, **given)
-
-
-def _announce(bridge: Bridge, scales: tuple[float, float]) -> None:
-    """Says what will be rendered, and whether the device bears it, before any force is on."""
-    coupling = bridge.coupling
-    err.print(
-        f"[bold]{escape(bridge.scene.name)}[/bold] on {escape(bridge.device.info.name)}: "
-        f"K = {coupling.stiffness:g} N/m, B = {coupling.damping:g} N s/m, "
-        f"K_r = {coupling.rotational_stiffness:g} N m/rad, "
-        f"B_r = {coupling.rotational_damping:g} N m s/rad, {1 / bridge.period:g} Hz"
-    )
-    if bridge.method != IMPLICIT:
-        err.print(f"method {bridge.method.name}: {escape(bridge.method.about)}")
-        if bridge.method.hazard:
-            err.print(f"[yellow]warning:[/yellow] {escape(bridge.method.hazard)}")
-    felt = bridge.rendered
-    if not (
-        math.isclose(felt.damping, coupling.damping)
-        and math.isclose(felt.rotational_damping, coupling.rotational_damping)
-    ):
-        err.print(
-            f"[yellow]warning:[/yellow] what is felt is B = {felt.damping:g} N s/m, "
-            f"B_r = {felt.rotational_damping:g} N m s/rad: method {bridge.method.name} cannot show "
-            "less damping at this stiffness and rate; lower the stiffness or raise the rate"
-        )
-    if not bridge.method.has_law:
-        return  # told when the scene is prepared and the weld measured: ``_announce_measured``
-    conditions = device_conditions(
-        bridge.device.info, bridge.used, bridge.period, *scales, bridge.laws
-    )
-    for condition in conditions:
-        if not condition.holds:
-            err.print(f"[yellow]warning:[/yellow] {condition.sentence()}")
-
-
-def _announce_measured(bridge: Bridge) -> None:
-    """Says what the device must bear where no coupling law tells it, before any force is on."""
-    if bridge.method.has_law:
-        return
-    felt = bridge.parameters.felt
-    if felt is not None:
-        err.print(_true_weld(felt, bridge.coupling))
-    for sentence in bridge.conditions():
-        err.print(f"[yellow]warning:[/yellow] {escape(sentence)}")
-
-
-def _true_weld(felt: Coupling, asked: Coupling) -> str:
-    return (
-        f"the weld is {felt.stiffness:.4g} N/m, {felt.damping:.4g} N s/m, "
-        f"{felt.rotational_stiffness:.4g} N m/rad, {felt.rotational_damping:.4g} N m s/rad in its "
-        f"stiffest directions at the start; asked for: {asked.stiffness:.4g}, {asked.damping:.4g}, "
-        f"{asked.rotational_stiffness:.4g}, {asked.rotational_damping:.4g}"
-    )
-
-
-def _print_summary(summary: Summary, laws: int) -> None:
-    table = Table(show_header=False, box=None, pad_edge=False)
-    table.add_row("ran", f"{summary.duration:.3f} s, {summary.ticks} ticks ({summary.stopped_by})")
-    skipped = f" ({summary.skipped} deadlines skipped)" if summary.skipped else ""
-    table.add_row("overruns", f"{summary.overruns}{skipped}, records dropped {summary.dropped}")
-    table.add_row(
-        "peak", f"{quantity(summary.peak_force, 'N')}, {quantity(summary.peak_torque, 'N m')}"
-    )
-    for name, joules in summary.energies.items():
-        if joules:  # a scene without motors or springs has no news of them
-            table.add_row(name.replace("_", " "), quantity(joules, "J"))
-    out.print(table)
-    used = f", {summary.slack_share:.0%} of the slack used" if summary.slack_share else ""
-    out.print(f"environment [bold]{summary.verdict}[/bold] ({summary.environment}{used})")
-    if summary.fault is not None:
-        tick, port = summary.fault
-        out.print(f"from tick {tick} on, at port {port}")
-    if summary.method != IMPLICIT.name:
-        out.print(f"method {escape(summary.method)}: {escape(summary.about)}")
-    if summary.felt is not None:
-        out.print(_true_weld(summary.felt, summary.coupling))
-    if summary.is_certified is None and summary.conditions:
-        for sentence in summary.conditions:
-            out.print(escape(sentence))
-        out.print("nothing proves that the device bears this")
-    else:
-        bound = "KT/2 + B" if laws == 1 else f"what {laws} substeps need"
-        certified = {
-            True: f"device certified: b >= {bound}",
-            False: f"device not certified: b < {bound}",
-            None: f"device unknown: b >= {bound} not checked",
-        }
-        out.print(certified[summary.is_certified])
-    if summary.is_certified is False and method_named(summary.method).has_law and laws == 1:
-        judge = "the audit judges" if summary.recording else "with --record FILE the audit judges"
-        out.print(f"the device's port is not proven, nor metered while it runs: {judge} it")
-    if summary.recording is not None:
-        out.print(f"next: hapticbridge audit {escape(shlex.quote(str(summary.recording)))}")

@@ -14,10 +14,19 @@ from rich.table import Table
 from hapticbridge.cli.terminal import err, out, plain, print_json
 from hapticbridge.clock import period_of
 from hapticbridge.coupling import Coupling
-from hapticbridge.passivity import ZWidth, maximum_stiffness, z_width
+from hapticbridge.felt import coupling_sentences
+from hapticbridge.passivity import ZWidth, z_width
+from hapticbridge.passivity.compensation import largest_felt_damping, law_damping
 from hapticbridge.passivity.grid import scalar
 from hapticbridge.picture import check_ending, write_picture
-from hapticbridge.study.theory import Alternative, alternatives, draw_alternatives, draw_z_width
+from hapticbridge.rendering import default_method
+from hapticbridge.study.theory import (
+    Alternative,
+    alternatives,
+    draw_alternatives,
+    draw_z_width,
+    recommended,
+)
 
 DEFAULT_RATE = 1000.0
 """Hz; what 'hapticbridge run' takes by itself, so that it need not be told."""
@@ -77,8 +86,8 @@ class Zwidth:
                 filter_time=self.filter_time,
             )
         # the run command has no low-pass to offer, and without it this corner is not passive
-        corner = z.corner
-        command = _next_command(corner.stiffness, corner.damping, self.rate)
+        felt = recommended(z)
+        command = _next_command(felt.stiffness, felt.damping, self.rate)
         told = None if z.filter_time else command
         if self.as_json:
             print_json(_z_width_facts(z, told))
@@ -107,6 +116,8 @@ def _z_width_facts(z: ZWidth, command: str | None) -> dict[str, object]:
         "corner": {
             "stiffness": z.corner.stiffness,
             "damping": z.corner.damping,
+            "felt_damping": recommended(z).damping,
+            "method": default_method().name,
             "limited_by": z.corner_limited_by,
         },
         "notes": list(z.notes),
@@ -115,7 +126,7 @@ def _z_width_facts(z: ZWidth, command: str | None) -> dict[str, object]:
 
 
 def _print_z_width(z: ZWidth, command: str | None) -> None:
-    table = Table("line", "K at B = 0", "B at K = 0", "because", box=None, pad_edge=False)
+    table = Table("line", "K at B' = 0", "B' at K = 0", "because", box=None, pad_edge=False)
     for line in z.lines:
         stiffness = f"{line.stiffness[0]:.5g} N/m"
         reason = line.reason if line.is_required else f"not kept: {line.reason}"
@@ -125,11 +136,8 @@ def _print_z_width(z: ZWidth, command: str | None) -> None:
     out.print(f"limited by: {z.corner_limited_by} ({reason})")
     for note in z.notes:
         out.print(f"note: {note}")
-    corner = z.corner
-    out.print(
-        f"use K = {corner.stiffness:.4g} N/m, B = {corner.damping:.3g} N s/m "
-        "(80 % of the limit at a quarter of its damping)"
-    )
+    (told,) = coupling_sentences(z.corner, default_method(), z.period, 1)
+    out.print(f"use {told}: 80 % of the limit at a quarter of its damping")
     if command is None:
         out.print(
             "'hapticbridge run' has no low-pass: leave --filter-time out for a run's coupling"
@@ -140,9 +148,10 @@ def _print_z_width(z: ZWidth, command: str | None) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Bound:
-    """The damping that a coupling needs from its device, and what each alternative would need.
+    """The damping that a device needs to show a coupling, and what each alternative would need.
 
-    Exit code 1 if --device-damping is given and does not suffice. Example:
+    K and B are what is felt: the default method uses B' = B - KT/2 of it, 0 at least. Exit code 1
+    if --device-damping is given and does not suffice. Example:
 
         hapticbridge bound --stiffness 2000 --damping 1 --rate 1000
     """
@@ -150,7 +159,7 @@ class Bound:
     stiffness: float
     """Coupling stiffness K in N/m."""
     damping: float = 0.0
-    """Coupling damping B in N s/m."""
+    """Coupling damping B in N s/m that is to be felt."""
     rate: float = DEFAULT_RATE
     """Ticks per second."""
     filter_time: float | None = None
@@ -189,6 +198,8 @@ class Bound:
             "needed": ways[0].needed,
             "frequency_hz": _hertz(ways[0]),
             "holds": None if b is None else b >= ways[0].needed,
+            "method": default_method().name,
+            "used_damping": law_damping(self.stiffness, self.damping, period, default_method().lag),
             "largest_stiffness": self._largest_stiffness(period),
             "alternatives": [
                 {
@@ -201,15 +212,15 @@ class Bound:
         }
 
     def _largest_stiffness(self, period: float) -> float | None:
-        """Returns the largest K beside this B; None without a device, 0 where B is too much."""
-        if self.device_damping is None:
+        """Returns the largest K that the device bears; None without a device, 0 if none."""
+        b = self.device_damping
+        if b is None:
             return None
-        if self.damping >= self.device_damping:
-            return 0.0
-        return maximum_stiffness(self.device_damping, period, self.damping)
+        return 2 * b / period if self.damping <= b else 0.0
 
     def _print(self, ways: tuple[Alternative, ...], period: float) -> None:
-        b = self.device_damping
+        b, method = self.device_damping, default_method()
+        out.print("B is felt, B' is what the damper uses; the device needs b >= KT/2 + B'")
         table = Table("", "damping needed", "most at", box=None, pad_edge=False)
         if b is not None:
             table.add_column("holds")
@@ -218,24 +229,38 @@ class Bound:
             verdict = [] if b is None else ["yes" if b >= way.needed else "no"]
             table.add_row(way.name, amount, _where(way), *verdict)
         out.print(table)
+        least = method.lag * self.stiffness * period
+        if self.damping < least:
+            out.print(
+                f"method {method.name} cannot show less than B = {least:.4g} N s/m at this "
+                "stiffness and rate"
+            )
         if b is None:
             return
-        needed, largest = ways[0].needed, self._largest_stiffness(period)
+        needed = ways[0].needed
         if b >= needed:
             out.print(f"device damping {b:g} >= {needed:.4g} N s/m: passive in any hand")
-            out.print(f"at B = {self.damping:g} N s/m it bears up to K = {largest:.4g} N/m")
-            out.print(f"next: {plain(_next_command(self.stiffness, self.damping, self.rate))}")
+            out.print(f"it bears any K up to {2 * b / period:.4g} N/m with any B up to {b:g} N s/m")
+            shown = max(self.damping, least)
+            out.print(f"next: {plain(_next_command(self.stiffness, shown, self.rate))}")
             return
         out.print(f"device damping {b:g} < {needed:.4g} N s/m: [red]not passive in any hand[/]")
-        if largest:
-            rate = self.stiffness / (2 * (b - self.damping))
-            out.print(f"  lower the stiffness to {largest:.4g} N/m, or")
-            out.print(f"  raise the rate to {rate:.4g} Hz, or")
-        spare = b - self.stiffness * period / 2
-        if spare > 0:
-            out.print(f"  lower the coupling's damping to {spare:.4g} N s/m, or")
-        elif not largest:
-            out.print(f"  lower the coupling's damping below {b:g} N s/m and the stiffness, or")
+        self._print_remedies(b, needed, period)
+
+    def _print_remedies(self, b: float, needed: float, period: float) -> None:
+        lag, changes = default_method().lag, []
+        if law_damping(self.stiffness, self.damping, period, lag) > 0:
+            stiffness = min(self.stiffness, 2 * b / period)
+            most = largest_felt_damping(b, stiffness, period, lag)
+            changes.append(f"lower the damping to {most:.4g} N s/m")
+        if self.stiffness * period > 2 * b:
+            changes.append(f"lower the stiffness to {2 * b / period:.4g} N/m")
+            changes.append(f"raise the rate to {self.stiffness / (2 * b):.4g} Hz")
+        if len(changes) == 3:
+            out.print(f"  {changes[0]}, and {changes[1]} or {changes[2]}, or")
+        else:
+            for change in changes:
+                out.print(f"  {change}, or")
         out.print(f"  take a device with {needed:.4g} N s/m")
 
 

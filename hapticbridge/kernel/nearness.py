@@ -12,8 +12,13 @@ from hapticbridge.kernel.ports import LIMIT_TENDON
 LIMIT_JOINT = 3  # mjtConstraint as a plain integer: the compiler reads no enumeration
 
 REACH = 5e-4
-"""Distance in m at which something is near: how far a tool at 0.5 m/s comes in a tick of 1 ms. Less
-lets a fast tool touch before the change, more makes the tool implicit in free space more often."""
+"""Distance in m within which a contact counts as near: how far a tool at 0.5 m/s comes in a tick of
+1 ms. Less lets a fast tool touch before the change, more makes the tool implicit sooner and longer.
+
+To change over only when the next step would have the contact's force, told from the distance and
+the approach at its start, errs less (tapping on a wall at 4 Hz 0.25 of the implicit form instead of
+0.31, at 1 Hz 0.35 instead of 0.50) and is not done: a peg led into its hole then uses 1.4 % of the
+slack instead of 0.9 %, and 2 of 20 hands on a planar peg use some that use none so."""
 
 
 @compiled

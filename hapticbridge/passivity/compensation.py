@@ -17,6 +17,11 @@ b > (T/2) Re[(1 − w) H]/(1 − cos θ) is hardest at θ = π: there 1 + w = 0,
 whatever it weighs, H = K + 2B'/T, and the right-hand side is K T/2 + B'. Below it the tool yields
 and needs less. A wall is the tool of infinite mass.
 
+**And for the compensated one.** Its tool is G = (T²/m)/(1 − w)². At θ = π it yields by T²/(4m), so
+that H = 1/(1/(K + 2B'/T) + T²/(4m)) and the right-hand side is (T/2) H, below K T/2 + B'; at no θ
+does a free tool ask for more than a wall, for which it is K T/2 + B' again. In contact the lossless
+coupling is the implicit form with the same B', so its condition does not change there.
+
 **Damping that changes from tick to tick**, as where a tool goes over to another form in contact.
 With B'_k, handle motion d_k, tool motion δx_k, e_k = e_{k−1} + d_k − δx_k and δe_k = d_k − δx_k,
 
@@ -92,6 +97,29 @@ def needed_for_felt(stiffness: float, felt: float, period: float, lag: float) ->
         Brown & Colgate 1997, eq. (6), for the law with B'; derived above.
     """
     return 0.5 * stiffness * _period(period) + law_damping(stiffness, felt, period, lag)
+
+
+def largest_felt_damping(
+    device_damping: float, stiffness: float, period: float, lag: float
+) -> float:
+    """Returns the largest B in N s/m that a device of damping b can show beside K.
+
+        B = b + (λ − ½) K T    for K T/2 <= b, else 0: no damping is low enough
+
+    Args:
+        device_damping: b in N s/m, finite and > 0.
+        stiffness: K in N/m, finite and >= 0.
+        period: T in s, finite and > 0: of the device and of the integration.
+        lag: λ, finite and >= 0.
+
+    Raises:
+        CouplingError: An argument is out of range.
+    """
+    available = scalar("device damping", device_damping, "N s/m", positive=True)
+    per_tick = scalar("stiffness", stiffness, "N/m") * _period(period)
+    if per_tick > 2 * available:
+        return 0.0
+    return available + (scalar("lag", lag, "") - 0.5) * per_tick
 
 
 def _period(period: float) -> float:

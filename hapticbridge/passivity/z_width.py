@@ -1,4 +1,8 @@
-"""Z-width: which stiffness and damping a device can show, and what limits it."""
+"""Z-width: which stiffness and damping a device can show, and what limits it.
+
+B is the damping of the coupling's law here, that is B' where a method adds damping by itself and
+more is felt (``compensation``); the sentences say B'.
+"""
 
 from __future__ import annotations
 
@@ -156,7 +160,7 @@ def z_width(
     lines = [_passive_line(loop, damping, passive_damping)]
     if allowed is not None:
         stiffness = np.maximum(0.0, 2 * (allowed - damping) / loop.period)
-        because = "f_c >= K Δ/2 + B Δ/T"
+        because = "f_c >= K Δ/2 + B' Δ/T"
         lines.append(LimitLine(NO_LIMIT_CYCLES, because, stiffness, allowed, is_kept))
     if mass is not None:
         heft = scalar("mass", mass, "kg", positive=True)
@@ -185,7 +189,8 @@ def z_width(
 
 
 def _passive_line(loop: PassiveLine, damping: _Array, largest: float) -> LimitLine:
-    name, reason = ANY_HAND, "b > K T/2 + B T/(T + 2τ)" if loop.filter_time else "b > K T/2 + B"
+    reason = "b > K T/2 + B' T/(T + 2τ)" if loop.filter_time else "b > K T/2 + B'"
+    name = ANY_HAND
     if loop.delay:
         name, reason = WALL, "at the worst frequency"
     return LimitLine(name, reason, loop.stiffness(damping), largest, is_required=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from textwrap import wrap
 
 import numpy as np
@@ -17,14 +17,10 @@ from hapticbridge.passivity import (
     transmission_line_spectrum,
     worst_frequency,
 )
-from hapticbridge.passivity.compensation import (
-    IMPLICIT_LAG,
-    MIDPOINT_LAG,
-    felt_damping,
-    law_damping,
-)
+from hapticbridge.passivity.compensation import felt_damping
 from hapticbridge.passivity.spectrum import Discretization
 from hapticbridge.picture import new_figure
+from hapticbridge.rendering import COMPENSATED, IMPLICIT, Method, default_method
 
 _Array = NDArray[np.float64]
 
@@ -61,17 +57,18 @@ class Alternative:
     spectrum: tuple[_Array, _Array] | None
 
 
-def alternatives(coupling: Coupling, period: float, filter_time: float) -> tuple[Alternative, ...]:
-    """Returns what a coupling needs as it is, and what each way around the bound would need.
+def alternatives(felt: Coupling, period: float, filter_time: float) -> tuple[Alternative, ...]:
+    """Returns what a device needs to show a coupling, by method and by each way around the bound.
 
-    In this order: as asked (backward difference); half the period; a first-order low-pass behind
-    the damper; Tustin's damper; one sample of delay against a wall, and for any environment; a
-    lossless transmission line of the same static stiffness, of impedance Z = K T and one sample
-    each way, ended by the device; the coupling as felt under the methods ``compensated`` and
-    ``lossless``, whose laws have less damping than is felt.
+    First the methods with a guarantee, the default one leading: each uses the damping B' of
+    ``Method.used``, and where that would be below zero more is felt than asked for. Then laws that
+    use B' = B: at half the period; with a first-order low-pass behind the damper; with Tustin's
+    damper; with one sample of delay against a wall, and for any environment. Last a lossless
+    transmission line of the same static stiffness, of impedance Z = K T and one sample each way,
+    ended by the device.
 
     Args:
-        coupling: K and B; the translation counts.
+        felt: K and B that should be felt; the translation counts.
         period: T in s, finite and > 0.
         filter_time: τ in s of the low-pass, >= 0.
 
@@ -88,7 +85,7 @@ def alternatives(coupling: Coupling, period: float, filter_time: float) -> tuple
         scheme: Discretization = "backward",
         delay: int = 0,
         low_pass: float = 0.0,
-        law: Coupling = coupling,
+        law: Coupling = felt,
     ) -> Alternative:
         needed = minimum_damping(
             law, step, discretization=scheme, delay=delay, filter_time=low_pass
@@ -102,23 +99,23 @@ def alternatives(coupling: Coupling, period: float, filter_time: float) -> tuple
         worst = worst_frequency(law, step, discretization=scheme, delay=delay, filter_time=low_pass)
         return Alternative(name, needed, float(worst), (frequency, spectrum))
 
-    def rendered(name: str, lag: float) -> Alternative:
-        k = coupling.stiffness
-        damping = law_damping(k, coupling.damping, period, lag)
-        felt = felt_damping(k, damping, period, lag)
-        return way(f"method {name}, B = {felt:.4g} felt", law=replace(coupling, damping=damping))
+    def by(method: Method) -> Alternative:
+        used = method.used(felt, period)
+        shown = felt_damping(used.stiffness, used.damping, period, method.adds or 0.0)
+        name = f"method {method.name}: B = {shown:.4g} felt, B' = {used.damping:.4g}"
+        return way(name, law=used)
 
-    asked = way("as asked (backward difference)")
+    methods = [by(method) for method in dict.fromkeys((default_method(), COMPENSATED, IMPLICIT))]
     frequency = _frequencies(period)
-    line = transmission_line_spectrum(coupling.stiffness * period, period, frequency)
+    line = transmission_line_spectrum(felt.stiffness * period, period, frequency)
     # the phase of (1 − z⁻¹)z/C passes through π on its way to Nyquist, whatever K and B
-    anywhere = Alternative("one sample of delay, any environment", float("inf"), None, None)
+    anywhere = Alternative("B' = B, one tick late, any environment", float("inf"), None, None)
     return (
-        asked,
-        way("half the period", step=period / 2),
-        way(f"low-pass of {1e3 * filter_time:g} ms on the damper", low_pass=filter_time),
-        way("Tustin's damper", scheme="tustin"),
-        way("one sample of delay, against a wall", delay=1),
+        *methods,
+        way("B' = B at half the period", step=period / 2),
+        way(f"B' = B, low-pass of {1e3 * filter_time:g} ms on the damper", low_pass=filter_time),
+        way("B' = B, Tustin's damper", scheme="tustin"),
+        way("B' = B, one tick late, against a wall", delay=1),
         anywhere,
         Alternative(
             "lossless line of that stiffness",
@@ -126,8 +123,6 @@ def alternatives(coupling: Coupling, period: float, filter_time: float) -> tuple
             None,
             (frequency, line),
         ),
-        rendered("compensated", IMPLICIT_LAG),
-        rendered("lossless", MIDPOINT_LAG),
     )
 
 
@@ -173,6 +168,11 @@ def draw_alternatives(
     return figure
 
 
+def recommended(z: ZWidth) -> Coupling:
+    """Returns the corner as it is felt by the default method, which so uses its B' unclipped."""
+    return default_method().rendered(z.corner, z.period)
+
+
 def draw_z_width(z: ZWidth) -> Figure:
     """Draws the couplings that a device can show: region, limiting lines, corner to use.
 
@@ -198,7 +198,8 @@ def draw_z_width(z: ZWidth) -> Figure:
     corner = z.corner
     axes.plot(corner.damping, corner.stiffness, "o", color="black", ms=7, label="to be used")
     axes.annotate(
-        f"K = {corner.stiffness:.4g} N/m\nB = {corner.damping:.3g} N s/m",
+        f"K = {corner.stiffness:.4g} N/m\nB' = {corner.damping:.3g} N s/m\n"
+        f"B = {recommended(z).damping:.3g} N s/m felt",
         (corner.damping, corner.stiffness),
         xytext=(0, -10),
         textcoords="offset points",
@@ -210,7 +211,7 @@ def draw_z_width(z: ZWidth) -> Figure:
     highest = max(float(line.stiffness.max()) for line in z.lines)
     axes.set_ylim(0, min(1.08 * highest, HIGHEST_SHOWN * region))
     axes.set_xlim(0, z.damping[-1])
-    axes.set_xlabel("coupling damping B (N s/m)")
+    axes.set_xlabel("damping that the coupling uses, B' (N s/m)")
     axes.set_ylabel("coupling stiffness K (N/m)")
     axes.grid(alpha=0.3)
     facts = [f"b = {z.device_damping:g} N s/m", f"{1 / z.period:g} Hz"]
