@@ -19,6 +19,7 @@ ORDER = (
     ("provenance", "summary", "workspace"),
     ("bridge", "audit", "identify", "compare", "export"),
     ("report", "study", "check"),
+    ("whatif",),  # runs the bridge and asks the audit, which must not know of either
     ("cli",),
 )
 RANK = {name: rank for rank, names in enumerate(ORDER) for name in names}
