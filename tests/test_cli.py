@@ -22,7 +22,7 @@ from hapticbridge.scene import scene_names
 from hapticbridge.scene.library import scene_path
 from hapticbridge.tick import TICK_DTYPE
 
-COMMANDS = ("run", "audit", "scenes", "check", "repair")
+COMMANDS = ("run", "audit", "scenes", "check", "export", "compare", "repair")
 
 
 HINGED = """<mujoco>
