@@ -131,7 +131,7 @@ def test_any_executor_gives_the_same_table(runs: Path) -> None:
 def test_jobs_are_processes_at_most(monkeypatch: pytest.MonkeyPatch, runs: Path) -> None:
     counts = []
 
-    class Counting(workers.ProcessPoolExecutor):
+    class Counting:
         def __init__(self, count: int, *_arguments: Any, **_options: Any) -> None:
             counts.append(count)
             raise OSError("no processes in this test")
@@ -145,9 +145,10 @@ def test_jobs_are_processes_at_most(monkeypatch: pytest.MonkeyPatch, runs: Path)
         assert counts.pop() == processes
     assert len(audit_all(files, jobs=None)) == len(files)  # few: in this process
     assert not counts
-    for jobs in (0, -1, 1.5):
+    wrong: Any
+    for wrong in (0, -1, 1.5):
         with pytest.raises(StudyError, match="jobs is"):
-            audit_all(files, jobs=jobs)  # type: ignore[arg-type]
+            audit_all(files, jobs=wrong)
 
 
 def test_a_worker_that_fails_is_a_row_and_no_end(
