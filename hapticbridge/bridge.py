@@ -31,7 +31,7 @@ from hapticbridge.guard import (
 from hapticbridge.inputs import Write, apply_writes, input_writes
 from hapticbridge.jit import direct
 from hapticbridge.kernel.layout import STATE_DTYPE
-from hapticbridge.kernel.parameters import checked_substeps
+from hapticbridge.kernel.parameters import checked_substeps, refuse_substeps
 from hapticbridge.kernel.publish import publish
 from hapticbridge.kernel.state import Binding
 from hapticbridge.kernel.step import OK, after_step, before_step
@@ -112,6 +112,7 @@ class Bridge:
         self.period = period_of(rate)
         self._substeps = checked_substeps(substeps)
         self.method = default_method(substeps) if method is None else method_named(method)
+        refuse_substeps(self.method.scheme, substeps)
         self._workspace = Workspace.of(scale, force_scale, axes, is_absolute=absolute)
         self.coupling = coupling or default_coupling(
             self.device.info,
