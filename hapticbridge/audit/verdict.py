@@ -12,9 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.audit.balance import Balance, Reached
+from hapticbridge.audit.balance import Balance
 from hapticbridge.audit.judgement import Judgement
 from hapticbridge.audit.physics import physics_fault
+from hapticbridge.audit.reached import Reached
 from hapticbridge.audit.replay import Replay, Resimulation
 from hapticbridge.audit.report import AuditReport
 from hapticbridge.audit.structure import Fault, file_fault, structure_fault
