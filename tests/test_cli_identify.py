@@ -39,6 +39,26 @@ def test_as_json_it_tells_the_same(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 @pytest.mark.parametrize(
+    ("device", "axis", "told"),
+    [
+        (FREE, "rx", "none of x, y, z was measured"),
+        ("simulated:hand=none,damping=0", "x", "damping may be zero"),
+    ],
+)
+def test_a_z_width_that_is_not_known_is_not_drawn_and_it_says_why(
+    device: str, axis: str, told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Without x, y or z it once said that the damping may be zero, and drew nothing, silently."""
+    width = tmp_path / "width.png"
+    words = ["identify", device, "--axes", axis, "--duration", "2", "--zwidth", str(width)]
+    assert main(words) == 0
+    captured = capsys.readouterr()
+    assert told in captured.out and told in " ".join(captured.err.split())
+    assert "not measured: " in captured.out
+    assert not width.exists()
+
+
+@pytest.mark.parametrize(
     ("words", "told"),
     [
         (["simulated"], "were not commanded: let go of it"),
@@ -47,6 +67,7 @@ def test_as_json_it_tells_the_same(capsys: pytest.CaptureFixture[str]) -> None:
         ([FREE, "--duration", "0.5"], "--duration is 0.5 s; it must be 2 to 600"),
         ([FREE, "--force-share", "1.5"], "--force-share is 1.5; it must be 0.001 to 1"),
         ([FREE, "--plot", "fit.txt"], "does not end like a picture"),
+        ([FREE, "--plot", "a.png", "--zwidth", "a.png"], "--plot and --zwidth both name 'a.png'"),
         (["no-such-device"], "unknown device 'no-such-device'"),
     ],
 )

@@ -9,7 +9,7 @@ from scipy.integrate import solve_ivp
 
 from hapticbridge.clock import SimulatedClock
 from hapticbridge.device import SimulatedDevice
-from hapticbridge.identify import Identification, fit_axis, identify
+from hapticbridge.identify import Estimate, Identification, fit_axis, identify
 from hapticbridge.identify.identification import step_of
 from hapticbridge.tick import TickFlag
 
@@ -202,3 +202,16 @@ def test_the_step_of_a_position_is_exact(step: float) -> None:
 def test_a_position_without_steps_has_none() -> None:
     assert step_of(np.sin(np.linspace(0.0, 30.0, 4000))) == 0.0
     assert step_of(np.array([np.nan, 1.0, 1.0])) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("estimate", "told"),
+    [
+        (Estimate(4.6e-10, 6e-4), "0 ± 0.0006"),
+        (Estimate(-2e-10, 6e-4), "0 ± 0.0006"),
+        (Estimate(1.98765, 0.008), "1.988 ± 0.008"),
+        (Estimate(0.25, 0.0), "0.25 ± 0"),
+    ],
+)
+def test_an_estimate_tells_no_digits_that_mean_nothing(estimate: Estimate, told: str) -> None:
+    assert estimate.told() == told

@@ -27,7 +27,7 @@ from hapticbridge.device.profile import Profile, own_folder
 from hapticbridge.errors import HapticBridgeError, choices
 from hapticbridge.felt import coupling_sentences
 from hapticbridge.identify import Identification, identify
-from hapticbridge.identify.fit import CONFIDENCE, Estimate
+from hapticbridge.identify.fit import CONFIDENCE
 from hapticbridge.identify.identification import DURATION, FORCE_SHARE, TRAVEL
 from hapticbridge.identify.measured_profile import measured_profile
 from hapticbridge.identify.picture import draw_identification
@@ -76,6 +76,8 @@ class Identify:
             if path is not None:
                 check_ending(path)
         self._check()
+        if self.plot is not None and self.plot == self.zwidth:
+            raise HapticBridgeError(f"--plot and --zwidth both name '{self.plot}'")
         device = open_device(self.device, tell=tell)
         try:
             axes = self._axes(device.info.axes)
@@ -117,6 +119,8 @@ class Identify:
         ):
             if target is not None and figure is not None:
                 write_figure(figure, target)
+        if self.zwidth is not None and z is None:
+            tell(f"'{self.zwidth}' is not drawn: {_why_none(result)}")
         return 0
 
     def _check(self) -> None:
@@ -184,9 +188,9 @@ def _print(result: Identification, z: ZWidth | None) -> None:
             if (len(axis) == 2) == turns:
                 table.add_row(
                     axis,
-                    _told(fit.mass),
-                    _told(fit.damping),
-                    _told(fit.friction),
+                    fit.mass.told(),
+                    fit.damping.told(),
+                    fit.friction.told(),
                     f"{1e3 * fit.delay.value:.2f} ± {1e3 * fit.delay.half_width:.2f}",
                 )
         if table.row_count:
@@ -199,8 +203,10 @@ def _print(result: Identification, z: ZWidth | None) -> None:
         step = quantity(result.resolution, "m") if result.resolution else "none seen"
         out.print(f"resolution {step}")
     out.print(f"± holds the true value with {CONFIDENCE:.0%}")
+    if left := [axis for axis in result.info.axes if axis not in result.fits]:
+        out.print(f"not measured: {', '.join(left)}; a profile takes axes of a kind for alike")
     if z is None:
-        out.print("damping may be zero: no coupling is safe for any hand")
+        out.print(_why_none(result))
         return
     out.print(
         f"with the lower ends (b = {z.device_damping:.4g} N s/m) the largest safe stiffness is "
@@ -212,8 +218,10 @@ def _print(result: Identification, z: ZWidth | None) -> None:
     out.print(f"next: {plain(next_command(felt.stiffness, felt.damping, 1.0 / z.period))}")
 
 
-def _told(estimate: Estimate) -> str:
-    return f"{estimate.value:.4g} ± {estimate.half_width:.1g}"
+def _why_none(result: Identification) -> str:
+    if result.of_all("damping", turns=False) is None:
+        return "none of x, y, z was measured: the stiffness that the device can show is not known"
+    return "damping may be zero: no coupling is safe for any hand"
 
 
 def _facts(result: Identification, z: ZWidth | None, path: Path | None) -> dict[str, object]:

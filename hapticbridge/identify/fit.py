@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -67,6 +68,13 @@ class Estimate:
     def most(self) -> float:
         """Upper end of the interval."""
         return self.value + self.half_width
+
+    def told(self) -> str:
+        """Returns the value and its half-width, without digits that the half-width makes void."""
+        value = self.value
+        if self.half_width > 0.0:
+            value = round(value, -math.floor(math.log10(self.half_width))) + 0.0  # no −0
+        return f"{value:.4g} ± {self.half_width:.1g}"
 
 
 @dataclass(frozen=True, slots=True)
