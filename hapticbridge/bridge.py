@@ -2,7 +2,7 @@
 
     device ──sample──▶ handle ──▶ scene stepped by MuJoCo ──▶ wrench, energies ──▶ device, recording
 
-``Bridge.run`` is the loop; the arithmetic before and after MuJoCo's step is in ``kernel.step``.
+``Bridge._loop`` is the loop; the arithmetic before and after MuJoCo's step is in ``kernel.step``.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
 
+import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -24,12 +25,15 @@ from hapticbridge.errors import DeviceError, HapticBridgeError, SafetyTrip, Scen
 from hapticbridge.guard import Limits, limits_for, refuse_stretched_start, trip_reason
 from hapticbridge.inputs import Write, apply_writes, input_writes
 from hapticbridge.jit import direct
+from hapticbridge.kernel.after import answer_step, close_tick
+from hapticbridge.kernel.ahead import can_split
 from hapticbridge.kernel.parameters import checked_substeps
 from hapticbridge.kernel.publish import publish
 from hapticbridge.kernel.state import Binding
-from hapticbridge.kernel.step import OK, after_step, before_step
+from hapticbridge.kernel.step import BAD_SAMPLE, HALF_DONE, OK, before_step
 from hapticbridge.ledger import Ledger
 from hapticbridge.provenance import attachments, describe_run
+from hapticbridge.realtime import Grant, check_pace, real_time, warn_of_refusals
 from hapticbridge.recording.stream import RecordStream
 from hapticbridge.rendering import (
     contact_stiffness_of,
@@ -75,6 +79,11 @@ class Bridge:
         absolute: Take the device's poses as poses in the scene instead of relative to its start.
         limits: Limits on the wrench, within the device's own; None takes these.
         live: Draw a status line on stderr, from the recorder's process.
+        pipelined: Compute what needs no new sample once the wrench is out, where scene and method
+            let it (``kernel.ahead``): the same numbers to the bit, the wrench sooner. Between two
+            ticks ``scene.data`` then holds the contacts of the new positions, without forces.
+        realtime: Ask the system for real time while the loop runs (``realtime.real_time``); what it
+            refuses is warned of once, with the command that grants it. None: for a real device.
 
     Raises:
         HapticBridgeError: An argument is out of range; the message says which and what is valid.
@@ -99,6 +108,8 @@ class Bridge:
         absolute: bool = False,
         limits: Limits | None = None,
         live: bool = False,
+        pipelined: bool = True,
+        realtime: bool | None = None,
     ) -> None:
         self.scene = scene if isinstance(scene, Scene) else load_scene(scene)
         self.device = device_for(self.scene, device) if isinstance(device, str) else device
@@ -120,7 +131,10 @@ class Bridge:
         self._contact_stiffness = contact_stiffness
         self._path = Path(recording) if recording is not None else None
         self._is_live = live
+        self._is_pipelined = pipelined
         self.clock = clock or RealClock()
+        self._is_realtime = self._wants_real_time(realtime)
+        self._grants: tuple[Grant, ...] = ()
         self._sample = np.zeros(1, SAMPLE_DTYPE)
         self._inputs: deque[list[Write]] = deque()
         self._tick = self._overruns = self._skipped = 0
@@ -172,53 +186,73 @@ class Bridge:
                 first, where it still could be.
             HapticBridgeError: The bridge is not open, or the duration is out of range.
         """
-        last, code, read, failure = self._last_tick(duration), OK, 0, ""
+        last, reason = self._last_tick(duration), ""
         self._resume()
+        with ExitStack() as stack:
+            stack.enter_context(stopping_on_signals(self._stop_on_signal))
+            if self._is_realtime:
+                self._note_grants(stack.enter_context(real_time()))
+            self.clock.start(round(self.period * 1e9))
+            try:
+                reason = self._loop(last, on_tick)
+            except DeviceError as error:
+                reason = f"tick {self._tick}: {error}"
+            finally:
+                unsent = self._silence()
+        if reason or unsent:
+            self._trip(reason or unsent)
+        self._stopped_by = self._stopped_by or "duration"
+        return self.summary()
+
+    def _loop(self, last: int, on_tick: Callable[[int], None] | None) -> str:
+        """The ticks, until the last; returns why the kernel refused one, or nothing."""
         state, row = self._binding.state, self._binding.row
         model, data, substeps = self.scene.model, self.scene.data, range(self._substeps)
         stream, records, cursors = self._stream, self._stream.rows, self._stream.cursors
-        sample, wrench = self._sample, row["wrench_on_device"][0]
-        before, after, hand_over = self._before_step, self._after_step, self._publish
+        sample, wrench = self._sample, state["wrench_on_device"][0]
+        before, answer, close = self._before_step, self._answer_step, self._close_tick
         read_device, write_device = self.device.read, self.device.write
-        clock, wait, now = self.clock, self.clock.wait, self.clock.now
-        inputs, step = self._inputs, self.method.step
-        with stopping_on_signals(self._stop_on_signal):
-            clock.start(round(self.period * 1e9))
-            try:
-                while self._tick != last and not self._stopped_by:
-                    deadline, wake, skipped = wait()
-                    if on_tick is not None:
-                        on_tick(self._tick)
-                    if inputs:
-                        self._apply_inputs()
-                    news = read_device(sample)
-                    read_before, read = read, now()
-                    elapsed = 1e-9 * (read - read_before)
-                    for substep in substeps:
-                        code = before(state, sample, row, substep, elapsed)
-                        if code != OK:
-                            break
-                        step(model, data)
-                        code = after(state, row, substep)
-                    if code != OK:
-                        break
-                    write_device(wrench)
-                    write = now()
-                    flags = news | stream.lost | (self._overrun(skipped) if skipped else 0)
-                    while not hand_over(row, records, cursors, deadline, wake, read, write, flags):
-                        if not stream.makes_room(may_wait=not self._stopped_by):
-                            break
-                    else:
-                        stream.lost = 0
-                    self._tick += 1
-            except DeviceError as error:
-                failure = f"tick {self._tick}: {error}"
-            finally:
-                unsent = self._silence()
-        if code != OK or failure or unsent:
-            self._trip(failure or (unsent if code == OK else trip_reason(code, self._tick)))
-        self._stopped_by = self._stopped_by or "duration"
-        return self.summary()
+        wait, now, hand_over = self.clock.wait, self.clock.now, self._publish
+        inputs, read = self._inputs, 0
+        whole_step, second_half, first_half = (
+            self.method.step,
+            mujoco.mj_step2,
+            mujoco.mj_fwdPosition,
+        )
+        is_ahead = self._is_pipelined and can_split(model, self.method.scheme)
+        while self._tick != last and not self._stopped_by:
+            deadline, wake, skipped = wait()
+            if on_tick is not None:
+                on_tick(self._tick)
+            if inputs:
+                self._apply_inputs()
+            news = read_device(sample)
+            read_before, read = read, now()
+            elapsed = 1e-9 * (read - read_before)
+            for substep in substeps:
+                code = before(state, sample, row, substep, elapsed)
+                if code == BAD_SAMPLE:
+                    return trip_reason(code, self._tick)
+                step = second_half if code == HALF_DONE else whole_step
+                step(model, data)
+                code = answer(state, row, substep)
+            if code != OK:
+                return trip_reason(code, self._tick)
+            write_device(wrench)
+            write = now()
+            if is_ahead:
+                first_half(model, data)
+            code = close(state, row, is_ahead)
+            if code != OK:
+                return trip_reason(code, self._tick)
+            flags = news | stream.lost | (self._overrun(skipped) if skipped else 0)
+            while not hand_over(row, records, cursors, deadline, wake, read, write, flags):
+                if not stream.makes_room(may_wait=not self._stopped_by):
+                    break
+            else:
+                stream.lost = 0
+            self._tick += 1
+        return ""
 
     def stop(self) -> None:
         """Ends the run after the present tick; may be called from ``on_tick`` or a thread."""
@@ -231,6 +265,21 @@ class Bridge:
         except DeviceError as error:
             return f"zero force could not be sent: {error}"
         return ""
+
+    def _wants_real_time(self, asked: bool | None) -> bool:
+        if asked and self.clock.name != RealClock.name:
+            raise HapticBridgeError(
+                f"real time was asked for with a {self.clock.name} clock; only a real one has it"
+            )
+        is_default = self.device.info.is_real and self.clock.name == RealClock.name
+        return is_default if asked is None else asked
+
+    def _note_grants(self, grants: tuple[Grant, ...]) -> None:
+        """Says once what was refused, and records what was granted."""
+        if grants != self._grants:
+            warn_of_refusals(grants)
+        self._grants = grants
+        self._event("real_time", **{grant.name: grant.sentence for grant in grants})
 
     def _stop_on_signal(self) -> None:
         self._stopped_by = "signal"
@@ -339,6 +388,8 @@ class Bridge:
         )
         self._binding = binding = Binding(scene.model, scene.data, self.parameters)
         refuse_stretched_start(binding.state, self._limits)
+        if clock.name == RealClock.name:
+            check_pace(scene, method, self.period, self._substeps, is_real=info.is_real)
         self._stream = RecordStream(
             self._path, self.period, live=self._is_live, is_lossless=clock.is_lossless
         )
@@ -356,7 +407,8 @@ class Bridge:
         state, row, sample = self._binding.state, self._binding.row, self._sample
         rows, cursors = self._stream.rows, self._stream.cursors
         self._before_step = direct(before_step, state, sample, row, 0, 0.0)
-        self._after_step = direct(after_step, state, row, 0)
+        self._answer_step = direct(answer_step, state, row, 0)
+        self._close_tick = direct(close_tick, state, row, True)
         self._publish = direct(publish, row, rows, cursors, 0, 0, 0, 0, 0)
 
     def _last_tick(self, duration: float | None) -> int:
