@@ -22,18 +22,32 @@ from hapticbridge.clock import Clock, RealClock, period_of
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Device, device_for
 from hapticbridge.errors import DeviceError, HapticBridgeError, SafetyTrip, SceneError
-from hapticbridge.guard import Limits, limits_for, refuse_stretched_start, trip_reason
+from hapticbridge.guard import (
+    Limits,
+    limits_for,
+    refuse_simulated_time,
+    refuse_stretched_start,
+    trip_reason,
+)
 from hapticbridge.inputs import Write, apply_writes, input_writes
 from hapticbridge.jit import direct
 from hapticbridge.kernel.after import answer_step, close_tick
 from hapticbridge.kernel.ahead import can_split
+from hapticbridge.kernel.layout import STATE_DTYPE
 from hapticbridge.kernel.parameters import checked_substeps
 from hapticbridge.kernel.publish import publish
 from hapticbridge.kernel.state import Binding
 from hapticbridge.kernel.step import BAD_SAMPLE, HALF_DONE, OK, before_step
 from hapticbridge.ledger import Ledger
 from hapticbridge.provenance import attachments, describe_run
-from hapticbridge.realtime import Grant, check_pace, real_time, warn_of_refusals
+from hapticbridge.realtime import (
+    Grant,
+    check_pace,
+    memory_at_rest,
+    real_time,
+    wants_real_time,
+    warn_of_refusals,
+)
 from hapticbridge.recording.stream import RecordStream
 from hapticbridge.rendering import (
     contact_stiffness_of,
@@ -45,7 +59,7 @@ from hapticbridge.rendering import (
 from hapticbridge.scene import Scene, load_scene
 from hapticbridge.signals import stopping_on_signals
 from hapticbridge.summary import Summary
-from hapticbridge.tick import SAMPLE_DTYPE, TickFlag
+from hapticbridge.tick import SAMPLE_DTYPE, TICK_DTYPE, TickFlag
 from hapticbridge.workspace import Workspace, run_parameters
 
 _NO_FORCE = np.zeros(6)
@@ -133,7 +147,8 @@ class Bridge:
         self._is_live = live
         self._is_pipelined = pipelined
         self.clock = clock or RealClock()
-        self._is_realtime = self._wants_real_time(realtime)
+        refuse_simulated_time(self.device.info, self.clock)
+        self._is_realtime = wants_real_time(realtime, self.clock, is_real=self.device.info.is_real)
         self._grants: tuple[Grant, ...] = ()
         self._sample = np.zeros(1, SAMPLE_DTYPE)
         self._inputs: deque[list[Write]] = deque()
@@ -266,20 +281,12 @@ class Bridge:
             return f"zero force could not be sent: {error}"
         return ""
 
-    def _wants_real_time(self, asked: bool | None) -> bool:
-        if asked and self.clock.name != RealClock.name:
-            raise HapticBridgeError(
-                f"real time was asked for with a {self.clock.name} clock; only a real one has it"
-            )
-        is_default = self.device.info.is_real and self.clock.name == RealClock.name
-        return is_default if asked is None else asked
-
     def _note_grants(self, grants: tuple[Grant, ...]) -> None:
         """Says once what was refused, and records what was granted."""
-        if grants != self._grants:
-            warn_of_refusals(grants)
-        self._grants = grants
-        self._event("real_time", **{grant.name: grant.sentence for grant in grants})
+        if not self._tick:
+            warn_of_refusals(self._grants + grants)
+        answers = {grant.name: grant.sentence for grant in self._grants + grants}
+        self._event("real_time", **answers)
 
     def _stop_on_signal(self) -> None:
         self._stopped_by = "signal"
@@ -370,9 +377,21 @@ class Bridge:
             raise HapticBridgeError("a bridge is entered once; make a new one for another run")
         self.scene.claim()
         resources.callback(self.scene.release)
-        scene, clock, info, method = self.scene, self.clock, self.device.info, self.method
+        scene, clock, method = self.scene, self.clock, self.method
         felt = prepare(scene, self.coupling, self.period, self._substeps, method)
+        self._stream = RecordStream(
+            self._path, self.period, live=self._is_live, is_lossless=clock.is_lossless
+        )
+        resources.callback(self._stream.close)
+        self._compile()
+        if clock.name == RealClock.name:
+            is_real = self.device.info.is_real
+            check_pace(scene, method, self.period, self._substeps, is_real=is_real)
+        if self._is_realtime:
+            self._grants = resources.enter_context(memory_at_rest())
+        # last, because from here on the device is held, and its pose counts
         self._sample[:] = self.device.start(self.period)
+        info = self.device.info
         self.parameters = run_parameters(
             scene,
             self.coupling,
@@ -388,13 +407,6 @@ class Bridge:
         )
         self._binding = binding = Binding(scene.model, scene.data, self.parameters)
         refuse_stretched_start(binding.state, self._limits)
-        if clock.name == RealClock.name:
-            check_pace(scene, method, self.period, self._substeps, is_real=info.is_real)
-        self._stream = RecordStream(
-            self._path, self.period, live=self._is_live, is_lossless=clock.is_lossless
-        )
-        resources.callback(self._stream.close)
-        self._compile()
         if self._stream.is_read:
             meta = describe_run(
                 scene, self.parameters, binding, method=method.name, device=info, clock=clock.name
@@ -404,7 +416,7 @@ class Bridge:
 
     def _compile(self) -> None:
         """Gets the machine code of the tick ready, so that the first one is not late."""
-        state, row, sample = self._binding.state, self._binding.row, self._sample
+        state, row, sample = np.zeros(1, STATE_DTYPE), np.zeros(1, TICK_DTYPE), self._sample
         rows, cursors = self._stream.rows, self._stream.cursors
         self._before_step = direct(before_step, state, sample, row, 0, 0.0)
         self._answer_step = direct(answer_step, state, row, 0)

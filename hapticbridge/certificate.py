@@ -11,6 +11,7 @@ import numpy as np
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo
+from hapticbridge.device.lateness import damping_for_delay, delay_ticks, felt_period
 from hapticbridge.errors import CouplingError
 from hapticbridge.kernel.parameters import SLACK_SHARE, RunParameters, checked_substeps
 from hapticbridge.passivity import minimum_damping, stiffest_coupling
@@ -19,6 +20,10 @@ from hapticbridge.rendering import Method, default_method
 UNKNOWN_DAMPING, UNKNOWN_ROTATIONAL_DAMPING = 2.0, 2e-3
 """N s/m and N m s/rad from which the default coupling follows where the device's are unknown: those
 of the default simulated device. Larger ones would feel stiffer and be safe on fewer devices."""
+
+UNKNOWN_REAL_DAMPING, UNKNOWN_REAL_ROTATIONAL_DAMPING = 0.2, 2e-4
+"""The same for a device that moves a motor: a tenth, the low end of what desktop devices are
+believed to have, because almost no maker publishes it."""
 
 
 LOWEST_FREQUENCY, FREQUENCIES = 3e-3, 60
@@ -41,12 +46,14 @@ class Condition:
         needed: The right-hand side in N s/m (rotation: N m s/rad).
         available: The device's damping b; None where unknown.
         remedy: What to change if it does not hold.
+        delay: After how many ticks a wrench answers a sample, 0 at best; None where unknown.
     """
 
     axis: str
     needed: float
     available: float | None
     remedy: str = "lower stiffness or damping, or raise the rate"
+    delay: int | None = 0
 
     @property
     def holds(self) -> bool | None:
@@ -57,10 +64,18 @@ class Condition:
         """Says it, with what to change if it does not hold."""
         unit = "N s/m" if self.axis == "translation" else "N m s/rad"
         if self.available is None:
-            return f"{self.axis}: device damping unknown, {self.needed:g} {unit} needed"
+            return (
+                f"{self.axis}: device damping unknown, {self.needed:g} {unit} needed; "
+                "'hapticbridge identify' measures it"
+            )
         relation = ">=" if self.holds else "<"
         text = f"{self.axis}: device damping {self.available:g} {relation} {self.needed:g} {unit}"
-        return text if self.holds else f"{text}; {self.remedy}"
+        if not self.holds:
+            return f"{text}; {self.remedy}"
+        if self.delay is None:
+            return f"{text}, if it answers without delay, which is unknown"
+        late = f", for a wall behind a delay of {self.delay} ticks: no bound holds for any scene"
+        return f"{text}{late}" if self.delay else text
 
 
 @cache
@@ -137,7 +152,8 @@ def device_conditions(
 
     A handle that moves ``scale`` times as far and a force that returns ``force_scale`` times as
     large make the coupling scale · force_scale times as stiff for the device; angles are not
-    scaled, so torques return by force_scale / scale.
+    scaled, so torques return by force_scale / scale. A device's own rate and delay count
+    (``device.lateness``).
 
     Args:
         info: The device.
@@ -154,14 +170,27 @@ def device_conditions(
     """
     conditions = []
     if info.damping is not None:
-        needed = scale * force_scale * needed_damping(coupling, period, laws)
+        delay = delay_ticks(info, period)
+        needed = scale * force_scale * _needed_on(info, coupling, period, laws)
         remedy = _remedy(method, coupling.damping)
-        conditions.append(Condition("translation", needed, info.damping, remedy))
+        conditions.append(Condition("translation", needed, info.damping, remedy, delay))
         if info.turns:
-            needed = force_scale / scale * needed_damping(coupling, period, laws, "rotation")
+            needed = force_scale / scale * _needed_on(info, coupling, period, laws, "rotation")
             remedy = _remedy(method, coupling.rotational_damping)
-            conditions.append(Condition("rotation", needed, info.rotational_damping, remedy))
+            conditions.append(Condition("rotation", needed, info.rotational_damping, remedy, delay))
     return tuple(conditions)
+
+
+def _needed_on(
+    info: DeviceInfo,
+    coupling: Coupling,
+    period: float,
+    laws: int,
+    axis: Literal["translation", "rotation"] = "translation",
+) -> float:
+    """Returns the damping needed by a device that has a rate and a delay of its own."""
+    needed = needed_damping(coupling, felt_period(info, period), laws, axis)
+    return needed + damping_for_delay(info, coupling, period, axis)
 
 
 def _remedy(method: Method | None, used: float) -> str:
@@ -230,9 +259,10 @@ def is_run_certified(conditions: tuple[Condition, ...], method: Method) -> bool 
 
 
 def is_certified(conditions: tuple[Condition, ...]) -> bool | None:
-    """Returns whether all conditions hold; None where a damping is unknown that decides it."""
+    """Returns whether all conditions hold; None where unknown, or where a delay forbids a proof."""
     held = {condition.holds for condition in conditions}
-    return False if False in held else None if None in held or not held else True
+    is_late = any(condition.delay != 0 for condition in conditions)
+    return False if False in held else None if None in held or not held or is_late else True
 
 
 def default_coupling(
@@ -246,12 +276,13 @@ def default_coupling(
     """Returns the stiffest coupling that is safe on a device: 80 % of the bound, B' = b / 4.
 
     It is what is to be felt: K and B = B' + what the method adds by itself, so that the method uses
-    B' without clipping. It needs 85 % of b. Where several laws a tick need more, K and B' are
-    lowered together until they need no more than that, each kind of axis by itself:
+    B' without clipping. It needs 85 % of b. Where several laws a tick or a delay need more, K and
+    B' are lowered together until they need no more than that, each kind of axis by itself:
     ``needed_damping`` is linear in the two.
 
     Args:
-        info: The device; where its damping is unknown, ``UNKNOWN_DAMPING`` is assumed.
+        info: The device; where its damping is unknown, ``UNKNOWN_DAMPING`` is assumed, of a real
+            one ``UNKNOWN_REAL_DAMPING``.
         period: T in s.
         scale: Handle motion per device motion.
         force_scale: Force on the device per force on the tool.
@@ -265,16 +296,23 @@ def default_coupling(
     for name, value in (("scale", scale), ("force_scale", force_scale)):
         if not math.isfinite(value) or value <= 0:
             raise CouplingError(f"{name} is {value!r}; it must be finite and > 0")
-    damping = (info.damping or UNKNOWN_DAMPING) / (scale * force_scale)
-    rotational = info.rotational_damping or UNKNOWN_ROTATIONAL_DAMPING
+    damping = info.damping or (UNKNOWN_REAL_DAMPING if info.is_real else UNKNOWN_DAMPING)
+    damping /= scale * force_scale
+    rotational = info.rotational_damping or (
+        UNKNOWN_REAL_ROTATIONAL_DAMPING
+        if info.is_real and info.turns
+        else UNKNOWN_ROTATIONAL_DAMPING
+    )
     rotational *= scale / force_scale
-    coupling = stiffest_coupling(damping, rotational, period)
+    coupling = stiffest_coupling(damping, rotational, felt_period(info, period))
     checked_substeps(laws, CouplingError)
     method = default_method(laws) if method is None else method
-    if laws == 1:
+    if laws == 1 and not delay_ticks(info, period):
         return method.rendered(coupling, period)
-    shrink = min(1.0, NEEDED_SHARE * damping / needed_damping(coupling, period, laws))
+    shrink = min(1.0, NEEDED_SHARE * damping / _needed_on(info, coupling, period, laws))
     needed = needed_damping(coupling, period, laws, "rotation")
+    if info.turns:
+        needed = _needed_on(info, coupling, period, laws, "rotation")
     shrink_rotation = min(1.0, NEEDED_SHARE * rotational / needed)
     shrunk = Coupling(
         stiffness=shrink * coupling.stiffness,

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticbridge.clock import Clock, SimulatedClock
 from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import DeviceError
 from hapticbridge.kernel.step import BAD_SAMPLE
@@ -67,6 +68,22 @@ def limits_for(info: DeviceInfo, limits: Limits | None) -> Limits:
                 f"{name} limit is {asked:g} {unit}; the device '{info.name}' bears {most:g} {unit}"
             )
     return limits
+
+
+def refuse_simulated_time(info: DeviceInfo, clock: Clock) -> None:
+    """Refuses a clock that runs ahead of a device that lives in real time.
+
+    That is a device with motors, and one that follows a hand without end, some time after it.
+
+    Raises:
+        DeviceError: It is so.
+    """
+    follows = info.is_prescribed and info.delay != 0.0 and info.duration is None
+    if (info.is_real or follows) and isinstance(clock, SimulatedClock):
+        raise DeviceError(
+            f"the device '{info.name}' moves in real time, so the loop cannot run as fast as it "
+            "goes; leave out --fast (in code: the SimulatedClock)"
+        )
 
 
 def refuse_stretched_start(state: NDArray[np.void], limits: Limits) -> None:

@@ -17,7 +17,7 @@ ORDER = (
     ("ledger", "inputs", "device"),
     ("guard", "recording", "certificate", "felt"),
     ("provenance", "summary", "workspace", "realtime"),
-    ("bridge", "audit"),
+    ("bridge", "audit", "identify"),
     ("report", "study", "check", "doctor"),
     ("cli",),
 )

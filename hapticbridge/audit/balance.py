@@ -115,6 +115,7 @@ class Balance:
         tool_start: Array,
         start_energy: float,
         resumed: Array,
+        late: int = 0,
     ) -> Balance:
         """Computes everything from records.
 
@@ -125,6 +126,8 @@ class Balance:
             tool_start: Tool pose (7,) before the first tick.
             start_energy: Kinetic plus potential energy before the first tick, in J.
             resumed: Ticks at which the run went on after a pause without force.
+            late: After how many ticks a wrench answers a sample: what was sent in row k acted on
+                the motion between rows k + late and k + late + 1.
         """
         coupling, period = parameters.coupling, parameters.period
         handle_step = steps(ticks["handle_position"], handle_start[:3])
@@ -164,12 +167,14 @@ class Balance:
         device_start = np.array(parameters.device_start)
         sent = np.concatenate([np.zeros((1, 6)), ticks["wrench_on_device"][:-1]])
         sent[np.isin(ticks["tick"], resumed)] = 0.0
-        device_work = np.sum(
-            sent[:, :3] * steps(ticks["device_position"], device_start[:3]), axis=1
-        )
-        device_work += np.sum(
-            sent[:, 3:] * turns(ticks["device_quaternion"], device_start[3:]), axis=1
-        )
+        device_step = steps(ticks["device_position"], device_start[:3])
+        device_turn = turns(ticks["device_quaternion"], device_start[3:])
+        device_work = np.sum(sent[:, :3] * device_step, axis=1)
+        device_work += np.sum(sent[:, 3:] * device_turn, axis=1)
+        given = device_work
+        if late:
+            given = np.sum(sent[:, :3] * _later(device_step, late), axis=1)
+            given += np.sum(sent[:, 3:] * _later(device_turn, late), axis=1)
 
         position, orientation = _handle(ticks, parameters)
         stored = ticks["kinetic"] + ticks["potential"] - start_energy
@@ -186,6 +191,7 @@ class Balance:
                 work=works,
                 passed=passed_shares(ticks, parameters),
                 since_start=since_start(ticks, resumed),
+                has_end=not late,
             )
         linear, angular = _slack_gains(parameters)
         slack = 0.5 * linear * np.sum(tool_step**2, axis=1)
@@ -203,7 +209,7 @@ class Balance:
             device_throughput=np.cumsum(np.abs(device_work)),
             environment_energy=created,
             slack=np.cumsum(slack),
-            kicked=_kicked(ticks, parameters, np.cumsum(device_work), lost + kept, resumed),
+            kicked=_kicked(ticks, parameters, np.cumsum(given), lost + kept, resumed, late),
         )
 
 
@@ -227,6 +233,7 @@ def _kicked(
     given: Array,
     taken: Array,
     resumed: Array,
+    late: int,
 ) -> Array:
     """Returns Σ w·δp − Σ b‖δp‖²/t + what scene and coupling took up, in the device's scale."""
     if parameters.device_damping is None or (parameters.has_law and parameters.laws > 1):
@@ -234,12 +241,17 @@ def _kicked(
     start = np.array(parameters.device_start)
     burnt = burnt_by_damping(
         parameters,
-        steps(ticks["device_position"], start[:3]),
-        turns(ticks["device_quaternion"], start[3:]),
+        _later(steps(ticks["device_position"], start[:3]), late),
+        _later(turns(ticks["device_quaternion"], start[3:]), late),
         np.diff(ticks["read_ns"], prepend=0) * 1e-9,
         since_start(ticks, resumed) > 0,
     )
     return np.asarray(given - burnt + parameters.force_scale / parameters.scale * taken)
+
+
+def _later(moved: Array, late: int) -> Array:
+    """Returns each row's motion ``late`` rows on; none where the recording has ended by then."""
+    return np.concatenate([moved[late:], np.zeros_like(moved[:late])]) if late else moved
 
 
 def _handle(ticks: NDArray[np.void], parameters: RunParameters) -> tuple[Array, Array]:

@@ -66,6 +66,7 @@ def kept_behind_a_law(
     work: tuple[Array, Array],
     passed: tuple[Array, Array],
     since_start: Array,
+    has_end: bool = True,
 ) -> Array:
     """Returns what coupling and tool took up of what the handle gave, (n,) in J of the scene.
 
@@ -84,6 +85,9 @@ def kept_behind_a_law(
         work: Of force and of torque on the tool in each tick, (n,) each in J.
         passed: c, the share of force and of torque that the guard let through, (n,) each.
         since_start: Ticks since the force began to rise, (n,).
+        has_end: Whether r_k V(e_k) is counted. It stands for what a device at e_k could still be
+            given; where the device is no longer there, because the sample is old, only what it was
+            given by then counts.
 
     References:
         Brown & Colgate 1997, eq. (6); here summed over time instead of frequency by frequency.
@@ -104,7 +108,9 @@ def kept_behind_a_law(
         spring = _spring_energy(k, np.linalg.norm(e, axis=1), limit)
         found = spring + 0.5 * b / parameters.period * np.sum(de**2, axis=1)
         taken = np.where(since_start > 0, c * w, 0.0)
-        kept += np.cumsum(taken) + share * spring - np.cumsum(rise * found)
+        kept += np.cumsum(taken) - np.cumsum(rise * found)
+        if has_end:
+            kept += share * spring
     return kept
 
 

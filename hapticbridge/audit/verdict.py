@@ -16,6 +16,7 @@ from hapticbridge.audit.replay import replay
 from hapticbridge.audit.structure import TOLERANCE, Fault, structure_fault
 from hapticbridge.certificate import condition_sentences, is_run_certified, run_conditions
 from hapticbridge.device import DeviceInfo
+from hapticbridge.device.lateness import delay_ticks
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.felt import coupling_sentences
 from hapticbridge.guard import Limits, limits_for
@@ -135,6 +136,7 @@ def audit(path: str | Path, *, strict: bool = False) -> AuditReport:
             np.array(starts["tool_start"]),
             starts["start_kinetic"][0] + starts["start_potential"][0],
             resumed,
+            delay_ticks(info, parameters.period) or 0,
         )
         facts["energies"] = _energies(ticks, balance)
         fault = physics_fault(ticks, balance)

@@ -15,6 +15,8 @@ from rich.markup import escape
 
 from hapticbridge.cli.chart import ChartCommand
 from hapticbridge.cli.check import Check
+from hapticbridge.cli.devices import Devices
+from hapticbridge.cli.identify import Identify
 from hapticbridge.cli.judge import Audit, Repair
 from hapticbridge.cli.run import Run
 from hapticbridge.cli.scenes import Scenes
@@ -27,12 +29,14 @@ Command = (
     Annotated[Run, tyro.conf.subcommand("run")]
     | Annotated[Audit, tyro.conf.subcommand("audit")]
     | Annotated[Scenes, tyro.conf.subcommand("scenes")]
+    | Annotated[Devices, tyro.conf.subcommand("devices")]
     | Annotated[Check, tyro.conf.subcommand("check")]
     | Annotated[Stability, tyro.conf.subcommand("stability")]
     | Annotated[ChartCommand, tyro.conf.subcommand("chart")]
     | Annotated[Repair, tyro.conf.subcommand("repair")]
     | Annotated[Zwidth, tyro.conf.subcommand("zwidth")]
     | Annotated[Bound, tyro.conf.subcommand("bound")]
+    | Annotated[Identify, tyro.conf.subcommand("identify")]
 )
 
 USAGE_ERROR, SAFETY_TRIP = 2, 3

@@ -14,7 +14,7 @@ import tyro
 from hapticbridge.bridge import Bridge
 from hapticbridge.certificate import default_coupling
 from hapticbridge.cli.run_words import announce, announce_measured, print_summary
-from hapticbridge.cli.terminal import err, out
+from hapticbridge.cli.terminal import err, out, tell
 from hapticbridge.clock import RealClock, SimulatedClock, period_of
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo, device_for
@@ -44,8 +44,8 @@ class Run:
     grip: str = "grip"
     """Site on the tool that the hand holds."""
     device: str = "simulated"
-    """'simulated' (in the hand that the scene asks for), 'simulated:damping=5,hand_mass=1', or
-    'trajectory:FILE' (CSV or recording)."""
+    """'simulated' (in the hand that the scene asks for), 'simulated:damping=5,hand_mass=1',
+    'trajectory:FILE' (CSV or recording), or one that 'hapticbridge devices' lists."""
     duration: float | None = None
     """Seconds to run; by default until the device's motion ends, or until Ctrl-C."""
     record: Path | None = None
@@ -108,7 +108,7 @@ class Run:
         if self.record is not None and self.record.exists() and not self.overwrite:
             raise RecordingError(f"'{self.record}' exists; choose another file or add --overwrite")
         scene = load_scene(self.scene, self.grip, **settings_from(self.settings))
-        device = device_for(scene, self.device)
+        device = device_for(scene, self.device, tell)
         scales = self.scale, self.scale if self.force_scale is None else self.force_scale
         bridge = Bridge(
             scene,
@@ -147,7 +147,7 @@ class Run:
             values = asdict(summary) | {"verdict": summary.verdict}
             out.print_json(json.dumps(values | {"recording": str(self.record or "") or None}))
         else:
-            print_summary(summary, bridge.laws)
+            print_summary(summary, bridge.laws, is_felt=not device.info.is_prescribed)
         is_good = summary.verdict == "passive" and summary.is_certified is not False
         return 0 if is_good else 1
 

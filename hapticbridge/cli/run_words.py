@@ -90,8 +90,14 @@ def _true_weld(felt: Coupling, asked: Coupling) -> str:
     )
 
 
-def print_summary(summary: Summary, laws: int) -> None:
-    """Prints what a run was, whether the device bears it, and what to do next."""
+def print_summary(summary: Summary, laws: int, *, is_felt: bool = True) -> None:
+    """Prints what a run was, whether the device bears it, and what to do next.
+
+    Args:
+        summary: Of the run.
+        laws: How often per tick the wrench was computed.
+        is_felt: Whether the device moves by force at all.
+    """
     table = Table(show_header=False, box=None, pad_edge=False)
     table.add_row("ran", f"{summary.duration:.3f} s, {summary.ticks} ticks ({summary.stopped_by})")
     skipped = f" ({summary.skipped} deadlines skipped)" if summary.skipped else ""
@@ -125,7 +131,8 @@ def print_summary(summary: Summary, laws: int) -> None:
             False: f"device not certified: b < {bound}",
             None: f"device unknown: b >= {bound} not checked",
         }
-        out.print(certified[summary.is_certified])
+        unfelt = "the device feels no force: there is nothing to certify"
+        out.print(certified[summary.is_certified] if is_felt else unfelt)
     if summary.is_certified is False and method_named(summary.method).has_law and laws == 1:
         judge = "the audit judges" if summary.recording else "with --record FILE the audit judges"
         out.print(f"the device's port is not proven, nor metered while it runs: {judge} it")

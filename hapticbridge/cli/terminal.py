@@ -30,6 +30,11 @@ def plain(text: str) -> str:
     return escape("".join(letter if letter.isprintable() else "�" for letter in text))
 
 
+def tell(sentence: str) -> None:
+    """Prints what the user should know or do while a device is opened, on stderr."""
+    err.print(plain(sentence))
+
+
 def print_error(error: Exception) -> None:
     """Prints what went wrong on stderr, in one line."""
     err.print(f"[red]error:[/red] {plain(' '.join(str(error).splitlines()))}")

@@ -93,6 +93,7 @@ class DeviceInfo:
         is_prescribed: Whether its motion does not react to force.
         is_real: Whether it moves a motor in somebody's hand.
         duration: Time in s after which its motion ends by itself, >= 0; None where it does not.
+        serial: The unit's serial number; empty where it has none.
 
     Raises:
         DeviceError: A value is of the wrong type, not finite, or out of range.
@@ -114,10 +115,13 @@ class DeviceInfo:
     is_prescribed: bool
     is_real: bool
     duration: float | None
+    serial: str = ""
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not self.name:
             raise DeviceError(f"device name = {self.name!r}: must be a text that is not empty")
+        if not isinstance(self.serial, str):
+            raise DeviceError(f"serial = {self.serial!r}: must be a text")
         if not isinstance(self.axes, tuple | list) or not self.axes:
             raise DeviceError(f"axes = {self.axes!r}: must be one or more of {choices(AXES)}")
         if tuple(self.axes) != tuple(axis for axis in AXES if axis in self.axes):

@@ -9,10 +9,14 @@ from pathlib import Path
 from typing import Any
 
 from hapticbridge.device.base import Device
+from hapticbridge.device.families import FAMILIES, family_named
 from hapticbridge.device.hand import Hand
 from hapticbridge.device.motion_csv import read_motion
+from hapticbridge.device.plugged import Tell, tell_nobody
+from hapticbridge.device.profile import profile_named, profile_of
 from hapticbridge.device.scene_hand import scene_hand
 from hapticbridge.device.simulated import SimulatedDevice
+from hapticbridge.device.specification import parsed, refuse_unknown
 from hapticbridge.device.trajectory import ReplayDevice, TrajectoryDevice
 from hapticbridge.errors import DeviceError, choices
 from hapticbridge.scene import Scene
@@ -24,7 +28,7 @@ _SIMULATED_OPTIONS = (*inspect.signature(SimulatedDevice).parameters, *_HAND_OPT
 _LIMITS = ("force_limit", "torque_limit", "speed_limit")
 
 
-def open_device(spec: str, **options: object) -> Device:
+def open_device(spec: str, *, tell: Tell = tell_nobody, **options: object) -> Device:
     """Opens a device by what a user would type.
 
     Specifications are a name, or a name, a colon and what the device needs to know:
@@ -36,26 +40,47 @@ def open_device(spec: str, **options: object) -> Device:
       file's name.
     - ``trajectory:FILE``: follows a CSV file (``read_motion``) or repeats the device motion of a
       recording. All after the colon is the file's name, commas and colons too.
+    - a device that is plugged in, by its family's name (``hapticbridge devices`` lists them), with
+      options that the family has: ``spacemouse:speed=0.1,turn=1,dead_band=0.05``,
+      ``rawhid:serial=12345,damping=2``, ``falcon:firmware=FILE``. ``serial`` picks one of several,
+      ``log=FILE`` keeps what went over the wire. What its driver does not know comes from the
+      profile of the unit or its kind, or from that of ``profile=NAME`` (or a file, or ``none``).
 
     Args:
         spec: The specification.
+        tell: Takes sentences for the user while the device is opened: what to do, how far it is.
         **options: The same parameters from code. What the specification says goes first; a
             trajectory takes ``force_limit`` (N), ``torque_limit`` (N m) and ``speed_limit`` (m/s).
 
     Returns:
-        The device, not yet started.
+        The device, not yet started. A real one is claimed, so that a missing one is refused at
+        once.
 
     Raises:
-        DeviceError: The name, an option or a value is not valid, or the file is not a motion.
+        DeviceError: The name, an option or a value is not valid, the file is not a motion, or the
+            device is not plugged in or may not be opened.
         RecordingError: The file is a recording that cannot be read.
     """
     name, _, rest = spec.partition(":")
+    if (family := family_named(name)) is not None:
+        valid = (*family.options, "profile")
+        refuse_unknown(name, options, valid)
+        asked = {**options, **parsed(name, rest, valid)}
+        wanted = asked.pop("profile", None)
+        chosen = None if wanted in (None, "none") else profile_named(str(wanted))
+        device = family.open(asked, tell)
+        if wanted is None:
+            chosen = profile_of(name, device.info.serial)
+        if chosen is not None:
+            device.info = chosen.fill(device.info)
+        return device
     if name not in _OPENERS:
-        raise DeviceError(f"unknown device '{name}'; there are {choices(_OPENERS)}")
+        names = choices([*_OPENERS, *(family.name for family in FAMILIES)])
+        raise DeviceError(f"unknown device '{name}'; there are {names}")
     return _OPENERS[name](rest, options)
 
 
-def device_for(scene: Scene, spec: str) -> Device:
+def device_for(scene: Scene, spec: str, tell: Tell = tell_nobody) -> Device:
     """Opens a device for a scene; the simulated one does what the scene is there for.
 
     Its hand is the one that the scene asks for (``scene_hand``) and follows ``NAME.csv`` beside the
@@ -64,6 +89,7 @@ def device_for(scene: Scene, spec: str) -> Device:
     Args:
         scene: The scene that the device will move in.
         spec: What ``open_device`` understands.
+        tell: Takes sentences for the user, likewise.
 
     Raises:
         DeviceError: See ``open_device``.
@@ -71,20 +97,21 @@ def device_for(scene: Scene, spec: str) -> Device:
     """
     name, _, rest = spec.partition(":")
     if name != "simulated":
-        return open_device(spec)
+        return open_device(spec, tell=tell)
     options: dict[str, object] = {}
-    if "hand" not in _parsed(rest):
+    if "hand" not in parsed(name, rest, _SIMULATED_OPTIONS):
         hand = asdict(scene_hand(scene))
         options |= {_HAND_PREFIX + field: value for field, value in hand.items()}
     path = scene.path.with_suffix(".csv")
     if path.is_file():
         options["path"] = path
-    return open_device(spec, **options)
+    return open_device(spec, tell=tell, **options)
 
 
 def _open_simulated(rest: str, options: Mapping[str, object]) -> Device:
-    parameters: dict[str, Any] = {**options, **_parsed(rest)}
-    _refuse_unknown("simulated", parameters, _SIMULATED_OPTIONS)
+    refuse_unknown("simulated", options, _SIMULATED_OPTIONS)
+    asked = parsed("simulated", rest, _SIMULATED_OPTIONS)
+    parameters: dict[str, Any] = {**options, **asked}
     changes = {name: parameters.pop(name) for name in _HAND_OPTIONS if name in parameters}
     if "hand" not in parameters:
         parameters["hand"] = Hand(
@@ -102,7 +129,7 @@ def _open_simulated(rest: str, options: Mapping[str, object]) -> Device:
 
 
 def _open_trajectory(rest: str, options: Mapping[str, object]) -> Device:
-    _refuse_unknown("trajectory", options, _LIMITS)
+    refuse_unknown("trajectory", options, _LIMITS)
     limits: dict[str, Any] = dict(options)
     if not rest:
         raise DeviceError("trajectory needs a file: 'trajectory:FILE', a CSV file or a recording")
@@ -125,42 +152,6 @@ _OPENERS: dict[str, Callable[[str, Mapping[str, object]], Device]] = {
     "simulated": _open_simulated,
     "trajectory": _open_trajectory,
 }
-
-
-def _parsed(text: str) -> dict[str, object]:
-    """Reads ``name=value,name=value``; ``path`` takes the rest, ``hand`` is text, else numbers."""
-    values: dict[str, object] = {}
-    while text:
-        name, equals, text = text.partition("=")
-        name = name.strip()
-        if not equals:
-            raise DeviceError(f"'{name}' is no option; options are written name=value")
-        if name in values:
-            raise DeviceError(f"{name} is there twice")
-        if name == "path":
-            value, text = text, ""
-        else:
-            value, _, text = text.partition(",")
-        values[name] = _value(name, value.strip())
-    return values
-
-
-def _value(name: str, text: str) -> object:
-    if name in ("path", "hand") or name not in _SIMULATED_OPTIONS:
-        return text
-    try:
-        return int(text) if name == "delay" else float(text)
-    except ValueError:
-        kind = "a whole number" if name == "delay" else "a number"
-        raise DeviceError(f"{name} = '{text}': must be {kind}") from None
-
-
-def _refuse_unknown(device: str, options: Mapping[str, object], valid: tuple[str, ...]) -> None:
-    unknown = [name for name in options if name not in valid]
-    if unknown:
-        raise DeviceError(
-            f"unknown option '{unknown[0]}' of the {device} device; there are {choices(valid)}"
-        )
 
 
 def _is_recording(path: Path) -> bool:

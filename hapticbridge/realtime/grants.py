@@ -17,6 +17,8 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+from hapticbridge.clock import Clock, RealClock
+from hapticbridge.errors import HapticBridgeError
 from hapticbridge.realtime.remedies import PRIORITY, way_to_grant
 
 if sys.platform != "win32":
@@ -48,6 +50,37 @@ class Grant:
     remedy: str = ""
 
 
+def wants_real_time(asked: bool | None, clock: Clock, *, is_real: bool) -> bool:
+    """Tells whether a run asks for real time.
+
+    Args:
+        asked: What the user said; None: for a real device, in real time.
+        clock: What drives the loop.
+        is_real: Whether the device moves a motor in somebody's hand.
+
+    Raises:
+        HapticBridgeError: It was asked for where time is not real.
+    """
+    if asked and clock.name != RealClock.name:
+        raise HapticBridgeError(
+            f"real time is asked for, and a {clock.name} clock: they exclude each other"
+        )
+    return is_real and clock.name == RealClock.name if asked is None else asked
+
+
+@contextmanager
+def memory_at_rest() -> Iterator[tuple[Grant, ...]]:
+    """Locks the process's memory and stops the garbage collector; undone at the end.
+
+    It takes a third of a second, so it is to be done before a device is held.
+
+    Yields:
+        One answer per request.
+    """
+    with ExitStack() as restore:
+        yield _collector(restore), _memory(restore)
+
+
 @contextmanager
 def real_time(core: int | None = None) -> Iterator[tuple[Grant, ...]]:
     """Asks for real time for the calling thread; gives everything back at the end.
@@ -62,9 +95,8 @@ def real_time(core: int | None = None) -> Iterator[tuple[Grant, ...]]:
         One answer per request.
     """
     with ExitStack() as restore:
-        requests = (_collector, _memory, _timer, lambda stack: _core(stack, core), _scheduling)
         # the priority comes last, so that no other request runs, or waits, under it
-        yield tuple(request(restore) for request in requests)
+        yield _timer(restore), _core(restore, core), _scheduling(restore)
 
 
 def warn_of_refusals(grants: tuple[Grant, ...]) -> None:

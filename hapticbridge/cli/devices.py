@@ -1,0 +1,91 @@
+"""``hapticbridge devices``."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Annotated, Any
+
+import tyro
+
+from hapticbridge.cli.terminal import out, plain, print_json
+from hapticbridge.device.families import (
+    FAMILIES,
+    RULES_FILE,
+    blind_spots,
+    plugged_devices,
+    udev_rules,
+)
+from hapticbridge.device.plugged import RULES_COMMAND, Plugged
+
+
+@dataclass(frozen=True, slots=True)
+class Devices:
+    """List the haptic devices that are plugged in, and those that are supported.
+
+    Says of each that cannot be opened what is missing. Moves no motor. Example:
+
+        hapticbridge devices --udev-rules | sudo tee /etc/udev/rules.d/70-hapticbridge.rules
+    """
+
+    udev_rules: bool = False
+    """Print the udev rules that let whoever sits at the machine open the devices, and no more."""
+    as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
+    """Print the lists as JSON."""
+
+    def execute(self) -> int:
+        """Prints the lists; returns the exit code, 0 also where nothing is plugged in."""
+        if self.udev_rules:
+            out.out(udev_rules(), end="")
+            return 0
+        plugged, unseen = plugged_devices(), blind_spots()
+        if self.as_json:
+            print_json(_facts(plugged, unseen))
+            return 0
+        out.print("[bold]supported[/bold]")
+        for family in FAMILIES:
+            out.print(f"{family.name}: {plain(family.about)}")
+            out.print(f"  axes {family.axes}; force {family.force}; rate {family.rate}")
+        out.print("[bold]plugged in[/bold]")
+        for device in plugged:
+            out.print(f"{device.family}: {plain(str(device))} at {plain(device.path)}")
+            if device.problem:
+                out.print(f"  [yellow]not usable:[/yellow] {plain(device.problem)}")
+        if not plugged:
+            out.print("none; 'simulated' and 'trajectory:FILE' need none")
+        for sentence in unseen:
+            out.print(f"[yellow]warning:[/yellow] {plain(sentence)}")
+        if any(device.problem for device in plugged):
+            out.print(
+                f"next: {RULES_COMMAND} | sudo tee {RULES_FILE}, "
+                "then sudo udevadm control --reload && sudo udevadm trigger"
+            )
+        elif plugged:
+            out.print(f"next: hapticbridge run peg_in_hole --device {_specification(plugged)}")
+        return 0
+
+
+def _specification(plugged: list[Plugged]) -> str:
+    """Returns what to type for the first device; its serial where there are more like it."""
+    first = plugged[0]
+    is_only = sum(device.family == first.family for device in plugged) == 1
+    return first.family if is_only else f"{first.family}:serial={first.serial or first.path}"
+
+
+def _facts(plugged: list[Plugged], unseen: list[str]) -> dict[str, Any]:
+    return {
+        "supported": [
+            {
+                "name": family.name,
+                "about": family.about,
+                "transport": family.transport,
+                "axes": family.axes,
+                "force": family.force,
+                "rate": family.rate,
+                "options": list(family.options),
+                "ids": [{"id": str(usb_id), "model": usb_id.model} for usb_id in family.ids],
+            }
+            for family in FAMILIES
+        ],
+        "plugged": [asdict(device) for device in plugged],
+        "warnings": unseen,
+    }

@@ -1,0 +1,219 @@
+"""``hapticbridge identify``."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass
+from datetime import date
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.table import Table
+
+from hapticbridge.cli.terminal import err, out, plain, print_json, progress, quantity, tell
+from hapticbridge.clock import RealClock, SimulatedClock, period_of
+from hapticbridge.device import AXES, open_device
+from hapticbridge.device.profile import Profile, own_folder
+from hapticbridge.errors import HapticBridgeError, choices
+from hapticbridge.identify import Identification, identify
+from hapticbridge.identify.fit import CONFIDENCE, Estimate
+from hapticbridge.identify.identification import DURATION, FORCE_SHARE, TRAVEL
+from hapticbridge.identify.measured_profile import measured_profile
+from hapticbridge.identify.picture import draw_identification
+from hapticbridge.passivity import ZWidth, z_width
+from hapticbridge.picture import check_ending, write_picture
+from hapticbridge.study.theory import draw_z_width
+
+
+@dataclass(frozen=True, slots=True)
+class Identify:
+    """Measure a device's mass, damping, friction, resolution and delay: let go of it first.
+
+    Each axis moves by itself for some seconds, with little force and travel; Ctrl-C leaves no
+    force. The result is a profile, which 'run' takes by itself for the same unit. Example:
+        hapticbridge identify simulated:hand=none,damping=1.5,friction=0.1 --plot fit.png
+    """
+
+    device: tyro.conf.Positional[str]
+    """As 'run --device' takes it."""
+    axes: tuple[str, ...] = ()
+    """Which axes (x y z rx ry rz); by default all that the device has."""
+    duration: float = DURATION
+    """Seconds per axis."""
+    travel: float = TRAVEL[0]
+    """Travel to each side in m."""
+    turn: float = TRAVEL[1]
+    """Turn to each side in rad."""
+    force_share: float = FORCE_SHARE
+    """Share of the device's force limit that may be used, 0 to 1."""
+    rate: float = 1000.0
+    """Ticks per second."""
+    save: Path | None = None
+    """Write the profile to this file; by default into the folder of your own profiles, for a real
+    device only."""
+    plot: Path | None = None
+    """Draw the fit into this picture (.png, .svg or .pdf)."""
+    zwidth: Path | None = None
+    """Draw the stiffness and damping that the device can show into this picture."""
+    as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
+    """Print the result as JSON."""
+
+    def execute(self) -> int:
+        """Measures and prints; returns the exit code."""
+        for path in (self.plot, self.zwidth):
+            if path is not None:
+                check_ending(path)
+        self._check()
+        device = open_device(self.device, tell=tell)
+        try:
+            axes = self._axes(device.info.axes)
+            clock = RealClock() if device.info.is_real else SimulatedClock()
+            with progress("identifying") as show:
+                result = identify(
+                    device,
+                    clock,
+                    period=period_of(self.rate),
+                    axes=axes,
+                    duration=self.duration,
+                    travel=(self.travel, self.turn),
+                    force_share=self.force_share,
+                    progress=lambda axis, share: show(
+                        axes.index(axis) + share, len(axes), f"axis {axis}"
+                    ),
+                )
+        finally:
+            device.close()
+        z = _z_width(result)
+        profile = measured_profile(
+            result,
+            device=self.device.partition(":")[0],
+            serial=device.info.serial,
+            date=date.today().isoformat(),
+            duration=self.duration,
+        )
+        path = self._write(profile, is_real=device.info.is_real)
+        if self.as_json:
+            print_json(_facts(result, z, path))
+        else:
+            _print(result, z)
+            if path is not None:
+                out.print(f"wrote {plain(str(path))}")
+        for target, figure in (
+            (self.plot, draw_identification(result) if self.plot else None),
+            (self.zwidth, draw_z_width(z) if self.zwidth and z else None),
+        ):
+            if target is not None and figure is not None:
+                write_picture(figure, target)
+                err.print(f"wrote {plain(str(target))}")
+        return 0
+
+    def _check(self) -> None:
+        for name, least, most, unit in (
+            ("duration", 2.0, 600.0, "s"),
+            ("travel", 1e-4, 1.0, "m"),
+            ("turn", 1e-3, 3.0, "rad"),
+            ("force_share", 1e-3, 1.0, ""),
+        ):
+            value = getattr(self, name)
+            if not least <= value <= most:
+                told = name.replace("_", "-")
+                raise HapticBridgeError(
+                    f"--{told} is {value!r} {unit}".rstrip() + f"; it must be {least:g} to {most:g}"
+                )
+
+    def _axes(self, present: tuple[str, ...]) -> tuple[str, ...]:
+        for axis in self.axes:
+            if axis not in present:
+                raise HapticBridgeError(f"--axes {axis}: the device has {choices(present)}")
+        return tuple(axis for axis in AXES if axis in (self.axes or present))
+
+    def _write(self, profile: Profile, *, is_real: bool) -> Path | None:
+        path = self.save
+        if path is None:
+            if not is_real:
+                return None
+            path = own_folder() / f"{'-'.join(filter(None, (profile.device, profile.serial)))}.toml"
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(profile.to_toml(), encoding="utf-8")
+        except OSError as error:
+            raise HapticBridgeError(f"cannot write '{path}': {error.strerror}") from None
+        return path
+
+
+def _z_width(result: Identification) -> ZWidth | None:
+    """Returns the couplings that are safe with the lower ends of what was measured."""
+    damping = result.of_all("damping", turns=False)
+    mass = result.of_all("mass", turns=False)
+    friction = result.of_all("friction", turns=False)
+    delay = result.of_all("delay", turns=False, most=True)
+    if damping is None or mass is None or friction is None or delay is None:
+        return None
+    if damping.least <= 0.0:
+        return None
+    period = result.runs[next(iter(result.runs))].period
+    late = delay.least / period  # the interval must leave zero for a delay to be one
+    return z_width(
+        damping.least,
+        period,
+        mass=mass.least,
+        friction=max(friction.least, 0.0),
+        resolution=result.resolution or 0.0,
+        delay=math.ceil(delay.most / period) if late > 0.05 else 0,
+    )
+
+
+def _print(result: Identification, z: ZWidth | None) -> None:
+    for turns, units in ((False, ("kg", "N s/m", "N")), (True, ("kg m²", "N m s/rad", "N m"))):
+        names = zip(("mass", "damping", "friction"), units, strict=True)
+        headings = [f"{name} ({unit})" for name, unit in names]
+        table = Table("axis", *headings, "delay (ms)", box=None, pad_edge=False)
+        for axis, fit in result.fits.items():
+            if (len(axis) == 2) == turns:
+                table.add_row(
+                    axis,
+                    _told(fit.mass),
+                    _told(fit.damping),
+                    _told(fit.friction),
+                    f"{1e3 * fit.delay.value:.2f} ± {1e3 * fit.delay.half_width:.2f}",
+                )
+        if table.row_count:
+            out.print(table)
+    out.print(
+        f"period {1e3 * result.period:.4g} ms, spread {quantity(result.period_spread, 's')}, "
+        f"one in a thousand longer than {1e3 * result.period_most:.4g} ms"
+    )
+    if result.resolution is not None:
+        step = quantity(result.resolution, "m") if result.resolution else "none seen"
+        out.print(f"resolution {step}")
+    out.print(f"± holds the true value with {CONFIDENCE:.0%}")
+    if z is None:
+        out.print("damping may be zero: no coupling is safe for any hand")
+        return
+    out.print(
+        f"with the lower ends (b = {z.device_damping:.4g} N s/m) the largest safe stiffness is "
+        f"{z.limit[0]:.4g} N/m at B = 0; use K = {z.corner.stiffness:.4g} N/m, "
+        f"B = {z.corner.damping:.3g} N s/m ({z.corner_limited_by})"
+    )
+
+
+def _told(estimate: Estimate) -> str:
+    return f"{estimate.value:.4g} ± {estimate.half_width:.1g}"
+
+
+def _facts(result: Identification, z: ZWidth | None, path: Path | None) -> dict[str, object]:
+    return {
+        "device": result.info.name,
+        "axes": {axis: asdict(fit) for axis, fit in result.fits.items()},
+        "resolution": result.resolution,
+        "period": result.period,
+        "period_spread": result.period_spread,
+        "period_most": result.period_most,
+        "confidence": CONFIDENCE,
+        "largest_stiffness": None if z is None else float(z.limit[0]),
+        "coupling": None
+        if z is None
+        else {"stiffness": z.corner.stiffness, "damping": z.corner.damping},
+        "profile": None if path is None else str(path),
+    }

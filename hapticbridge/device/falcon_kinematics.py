@@ -1,0 +1,220 @@
+"""Geometry of the Falcon's three legs: thigh angles and grip position.
+
+The maker's frame, in metres: z out of the base towards the user along the machine's axis, x to the
+right, y up; all three thighs at the encoders' zero put the grip at (0, 0, 0.1346). Leg i is turned
+by φ_i about z; in its own frame (u outwards, v sideways, w = z), measured from the hip's axis,
+
+    u = x cos φ + y sin φ − r,    v = −x sin φ + y cos φ − s,    w = z
+
+The thigh of length a swings by θ in the plane (u, w). The shin is a parallelogram of side b that
+leans sideways by v + f, between two short links d and e along the leg's plane, and ends at the grip
+plate, c inwards of the grip's own point. The leg closes where
+
+    h(p, θ) = √((u + c − a cos θ)² + (w − a sin θ)²) − L(v) = 0,    L(v) = √(b² − (v + f)²) + d + e
+
+h is a length: its gradient along p is nearly of length one, so Newton's steps are well scaled.
+Because of d + e this is no sphere, and the grip's position has no closed form; θ has.
+
+Every function says by its result whether there is an answer; none returns a number that is not
+finite.
+
+References:
+    Stamper 1997 (the mechanism); the lengths are those of libnifalcon's source (2019).
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticbridge.jit import compiled
+
+THIGH, SHIN = 0.060, 0.1025
+"""a and b in m: thigh, and the parallelogram's long side."""
+
+PLATE, LINKS = 0.01443, 2 * 0.01125
+"""c and d + e in m: from the grip's point to the plate's joint, and the two links of the shin."""
+
+SIDEWAYS, HIP_OUT, HIP_SIDEWAYS = -0.025, 0.0400, -0.02309
+"""f, r and s in m: the plate's joint beside the leg's plane, the hip's axis outwards and beside."""
+
+LEG_ANGLES = np.radians([105.0, -15.0, -135.0])
+"""φ in rad: a third of a turn apart, 15° off the maker's frame."""
+
+RADIANS_PER_COUNT = 2 * math.pi / (4 * 320) * 0.01425 / 0.110
+"""Thigh angle per encoder count: 320 slots read four times a turn, on a shaft of 14.25 mm that
+drives a sector of 110 mm. 6.36e-4 rad."""
+
+ZERO_ANGLE = math.radians(35.0)
+"""Thigh angle in rad at which a homed encoder reads 0."""
+
+LARGEST_RADIUS, NEAREST, FARTHEST = 0.075, 0.060, 0.190
+"""In m: distance from the axis and along it beyond which no grip is believed to be. The workspace
+is 0.1 m wide and 0.075 to 0.175 m from the base; more is a wrong encoder, less would refuse a grip
+that leans at its stop."""
+
+STEPS = 12
+"""Newton steps at most; from the middle of the workspace 6 reach its corners, 2 are usual."""
+
+LONGEST_STEP = 0.02
+"""In m: Newton's steps are cut to it, a fifth of the workspace, so that the first one from far away
+does not leave the place where the legs can lean."""
+
+CLOSED = 1e-14
+"""In m: how well the legs must close. Rounding leaves 3e-17; a fifth of an atom is far below any
+encoder's step."""
+
+FLATTEST = 0.03
+"""Smallest |det| of the legs' directions, and smallest lever as a share of the thigh, no unit. In
+the middle of the workspace they are 0.8 and 0.98, at its rim 0.07 and 0.05; at 0 a leg is stretched
+or folded, and two positions answer to the same angles."""
+
+_COS, _SIN = np.cos(LEG_ANGLES), np.sin(LEG_ANGLES)
+
+
+@compiled
+def is_within_reach(position: NDArray[np.float64]) -> bool:
+    """Returns whether a grip can be there: near enough to the axis, and neither too near nor far.
+
+    Args:
+        position: Shape (3,), in m.
+    """
+    aside = math.sqrt(position[0] ** 2 + position[1] ** 2)
+    return aside <= LARGEST_RADIUS and NEAREST <= position[2] <= FARTHEST
+
+
+@compiled
+def inverse(position: NDArray[np.float64], angles: NDArray[np.float64]) -> bool:
+    """Writes the thigh angles of a grip position; returns whether every leg reaches it.
+
+        θ = atan2(w, u + c) − arccos((ρ² + a² − L²) / (2 a ρ)),    ρ² = (u + c)² + w²
+
+    the smaller of the two angles: the knee outside.
+
+    Args:
+        position: Shape (3,), in m, in the maker's frame.
+        angles: Shape (3,), in rad, filled in place; unchanged where there is no answer.
+    """
+    found = np.empty(3)
+    for i in range(3):
+        out = position[0] * _COS[i] + position[1] * _SIN[i] - HIP_OUT + PLATE
+        lean = -position[0] * _SIN[i] + position[1] * _COS[i] - HIP_SIDEWAYS + SIDEWAYS
+        height = position[2]
+        squared = SHIN * SHIN - lean * lean
+        distance = math.sqrt(out * out + height * height)
+        if not (squared > 0.0 and distance > 0.0):
+            return False
+        length = math.sqrt(squared) + LINKS
+        cosine = (distance**2 + THIGH**2 - length**2) / (2.0 * THIGH * distance)
+        if not (-1.0 <= cosine <= 1.0):
+            return False
+        found[i] = math.atan2(height, out) - math.acos(cosine)
+    angles[:] = found
+    return True
+
+
+@compiled
+def closure(
+    position: NDArray[np.float64],
+    angles: NDArray[np.float64],
+    gaps: NDArray[np.float64],
+    gradients: NDArray[np.float64],
+    levers: NDArray[np.float64],
+) -> bool:
+    """Writes how far each leg is from closing, and how that changes; returns whether it can be.
+
+    Args:
+        position: Shape (3,), in m.
+        angles: Shape (3,), in rad.
+        gaps: h of each leg in m, shape (3,), filled in place.
+        gradients: ∂h/∂p, a row per leg, no unit, shape (3, 3), filled in place.
+        levers: ∂h/∂θ in m, shape (3,), filled in place; negative with the knee outside.
+    """
+    for i in range(3):
+        out = position[0] * _COS[i] + position[1] * _SIN[i] - HIP_OUT + PLATE
+        lean = -position[0] * _SIN[i] + position[1] * _COS[i] - HIP_SIDEWAYS + SIDEWAYS
+        height = position[2]
+        across, along = THIGH * math.cos(angles[i]), THIGH * math.sin(angles[i])
+        squared = SHIN * SHIN - lean * lean
+        distance = math.sqrt((out - across) ** 2 + (height - along) ** 2)
+        if not (squared > 0.0 and distance > 0.0):
+            return False
+        side = math.sqrt(squared)
+        gaps[i] = distance - side - LINKS
+        outwards, sideways = (out - across) / distance, lean / side
+        gradients[i, 0] = outwards * _COS[i] - sideways * _SIN[i]
+        gradients[i, 1] = outwards * _SIN[i] + sideways * _COS[i]
+        gradients[i, 2] = (height - along) / distance
+        levers[i] = (out * along - height * across) / distance
+    return True
+
+
+@compiled
+def solve(
+    rows: NDArray[np.float64], right: NDArray[np.float64], answer: NDArray[np.float64]
+) -> float:
+    """Solves rows · answer = right by Cramer's rule; returns the determinant.
+
+    Args:
+        rows: Shape (3, 3).
+        right: Shape (3,).
+        answer: Shape (3,), filled in place; unchanged where the determinant is 0.
+    """
+    a, b, c = rows[0], rows[1], rows[2]
+    x0, x1, x2 = (
+        b[1] * c[2] - b[2] * c[1],
+        b[2] * c[0] - b[0] * c[2],
+        b[0] * c[1] - b[1] * c[0],
+    )
+    determinant = a[0] * x0 + a[1] * x1 + a[2] * x2
+    if determinant == 0.0:
+        return 0.0
+    y0, y1, y2 = (
+        c[1] * a[2] - c[2] * a[1],
+        c[2] * a[0] - c[0] * a[2],
+        c[0] * a[1] - c[1] * a[0],
+    )
+    z0, z1, z2 = (
+        a[1] * b[2] - a[2] * b[1],
+        a[2] * b[0] - a[0] * b[2],
+        a[0] * b[1] - a[1] * b[0],
+    )
+    answer[0] = (right[0] * x0 + right[1] * y0 + right[2] * z0) / determinant
+    answer[1] = (right[0] * x1 + right[1] * y1 + right[2] * z1) / determinant
+    answer[2] = (right[0] * x2 + right[1] * y2 + right[2] * z2) / determinant
+    return float(determinant)
+
+
+@compiled
+def forward(angles: NDArray[np.float64], position: NDArray[np.float64]) -> bool:
+    """Moves a grip position to where the thigh angles put it; returns whether that is anywhere.
+
+    Newton's method on the three closures, from the position that is there: in a loop the last one.
+    The answer must lie within the reach, have every knee outside, and be no place where a leg is
+    stretched or folded.
+
+    Args:
+        angles: Shape (3,), in rad.
+        position: Shape (3,), in m: where to begin; moved in place, unchanged without an answer.
+    """
+    point, step = position.copy(), np.empty(3)
+    gaps, gradients, levers = np.empty(3), np.empty((3, 3)), np.empty(3)
+    for _ in range(STEPS):
+        if not closure(point, angles, gaps, gradients, levers):
+            return False
+        determinant = solve(gradients, gaps, step)
+        if not abs(determinant) >= FLATTEST:
+            return False
+        length = math.sqrt(step[0] ** 2 + step[1] ** 2 + step[2] ** 2)
+        point -= step * min(1.0, LONGEST_STEP / max(length, LONGEST_STEP))
+        if max(abs(gaps[0]), abs(gaps[1]), abs(gaps[2])) < CLOSED:
+            for i in range(3):
+                if not levers[i] <= -FLATTEST * THIGH:
+                    return False
+            if not is_within_reach(point):
+                return False
+            position[:] = point
+            return True
+    return False

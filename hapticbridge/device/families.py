@@ -1,0 +1,76 @@
+"""All hardware that there is a codec for: what is supported, what is plugged in, and its rules."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from hapticbridge.device import hid_search, usb_search
+from hapticbridge.device.falcon import FAMILY as FALCON
+from hapticbridge.device.plugged import Family, Plugged
+from hapticbridge.device.rawhid import FAMILY as RAWHID
+from hapticbridge.device.spacemouse import FAMILY as SPACEMOUSE
+
+FAMILIES: tuple[Family, ...] = (FALCON, SPACEMOUSE, RAWHID)
+"""In the order in which they are listed."""
+
+RULES_FILE = "/etc/udev/rules.d/70-hapticbridge.rules"
+"""Where the rules go. The number must be below 73: ``73-seat-late.rules`` is what turns the tag
+``uaccess`` into a permission, and rules are read in the order of their names."""
+
+
+def family_named(name: str) -> Family | None:
+    """Returns the family that ``open_device`` knows by a name, or None."""
+    return next((family for family in FAMILIES if family.name == name), None)
+
+
+def plugged_devices() -> list[Plugged]:
+    """Lists every device of every family that is plugged in; empty where there is no USB."""
+    return [device for family in FAMILIES for device in plugged_of(family)]
+
+
+def plugged_of(family: Family) -> list[Plugged]:
+    """Lists a family's devices that are plugged in, with what keeps each from being opened."""
+    if family.transport == "hid":
+        return hid_search.find(family)
+    return usb_search.find(family)
+
+
+def blind_spots() -> list[str]:
+    """Says what keeps devices from being seen at all, one sentence each; empty where nothing."""
+    spots = []
+    if hid_search.hid_api() is None:
+        spots.append("hidapi cannot be loaded, so HID devices are not seen: 'pip install hidapi'")
+    if usb_search.libusb() is None:
+        spots.append(
+            "libusb cannot be loaded, so USB devices cannot be opened: 'pip install libusb-package'"
+        )
+    return spots
+
+
+def udev_rules(families: Sequence[Family] = FAMILIES) -> str:
+    """Returns the udev rules that let whoever sits at the machine open these devices.
+
+    A HID device is matched by its kernel name, ``BUS:VENDOR:PRODUCT.NUMBER``, which it has over
+    Bluetooth too, where there is no USB parent to look at.
+    """
+    lines = [
+        "# Lets whoever sits at the machine open haptic devices. Written by",
+        "# 'hapticbridge devices --udev-rules'. Its number must stay below 73: 73-seat-late.rules",
+        "# turns the tag into a permission. To install it:",
+        f"#   hapticbridge devices --udev-rules | sudo tee {RULES_FILE}",
+        "#   sudo udevadm control --reload && sudo udevadm trigger",
+    ]
+    for family in families:
+        lines += ["", f"# {family.name}: {family.about}"]
+        for usb_id in family.ids:
+            vendor, product = f"{usb_id.vendor:04x}", f"{usb_id.product:04x}"
+            if family.transport == "hid":
+                kernels = f"*:{vendor}:{product}.*".upper()
+                match = f'SUBSYSTEM=="hidraw", KERNELS=="{kernels}"'
+            else:
+                match = (
+                    'SUBSYSTEM=="usb", ENV{DEVTYPE}=="usb_device", '
+                    f'ATTR{{idVendor}}=="{vendor}", ATTR{{idProduct}}=="{product}"'
+                )
+            lines += [f"# {usb_id.model}", f'{match}, TAG+="uaccess"']
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,161 @@
+"""What kinds of hardware the project drives, and what of it is plugged in: two plain records."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from hapticbridge.device.base import Device
+from hapticbridge.errors import DeviceError, choices
+
+Tell = Callable[[str], None]
+"""Takes a sentence for the user while a device is opened or started: a prompt, how far it is."""
+
+RULES_COMMAND = "hapticbridge devices --udev-rules"
+"""What prints the udev rules; sentences about a missing permission name it."""
+
+
+def tell_nobody(_sentence: str) -> None:
+    """Says nothing: where a script opens a device, nobody may be reading."""
+
+
+@dataclass(frozen=True, slots=True)
+class UsbId:
+    """A vendor's and product's number on the USB bus, and what is sold under it.
+
+    Attributes:
+        vendor: 16 bits.
+        product: 16 bits.
+        model: The maker's name for it.
+    """
+
+    vendor: int
+    product: int
+    model: str
+
+    def __str__(self) -> str:
+        return f"{self.vendor:04x}:{self.product:04x}"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Family:
+    """Devices that one codec drives: an entry in the list of what is supported.
+
+    Attributes:
+        name: What ``open_device`` knows it by.
+        about: What it is, in a few words.
+        ids: Every product of the family.
+        transport: ``hid`` (hidapi) or ``usb`` (pyusb).
+        axes: Which axes it has, in words, because it may differ from unit to unit.
+        force: What force it can show, in words.
+        rate: How often it reports, in words.
+        options: Names that ``open`` understands.
+        open: Finds the device and opens it; takes the options and whom to tell.
+        usage: Usage page and usage of the HID collection that speaks the protocol, where a product
+            has several; None where any will do.
+    """
+
+    name: str
+    about: str
+    ids: tuple[UsbId, ...]
+    transport: Literal["hid", "usb"]
+    axes: str
+    force: str
+    rate: str
+    options: tuple[str, ...]
+    open: Callable[[Mapping[str, object], Tell], Device]
+    usage: tuple[int, int] | None = None
+
+    def model(self, vendor: int, product: int) -> str | None:
+        """Returns the model that has these numbers, or None if it is none of the family."""
+        for usb_id in self.ids:
+            if (usb_id.vendor, usb_id.product) == (vendor, product):
+                return usb_id.model
+        return None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Plugged:
+    """A device that is plugged in.
+
+    Attributes:
+        family: The family's name.
+        name: What the device calls itself, else the model's name; printable, and so is the serial.
+        serial: Its serial number, empty where it has none or does not tell.
+        path: Where it is opened: a device node.
+        vendor: Its numbers.
+        product: Likewise.
+        transport: ``hid`` or ``usb``.
+        problem: Why it cannot be opened, and what to do, in one sentence; None where it can.
+    """
+
+    family: str
+    name: str
+    serial: str
+    path: str
+    vendor: int
+    product: int
+    transport: str
+    problem: str | None
+
+    def __post_init__(self) -> None:
+        for field in ("name", "serial"):
+            object.__setattr__(self, field, printable(getattr(self, field)))
+
+    def __str__(self) -> str:
+        serial = f", serial {self.serial}" if self.serial else ""
+        return f"{self.name} ({self.vendor:04x}:{self.product:04x}{serial})"
+
+
+def printable(text: str) -> str:
+    """Returns text that a device sent, without codes that a terminal would obey."""
+    return "".join(letter if letter.isprintable() else "�" for letter in text).strip()
+
+
+def permission_problem(path: str) -> str:
+    """Says that a node may not be opened, and how to get that permission."""
+    return (
+        f"no permission to open {path}; '{RULES_COMMAND}' prints the rule that grants it to "
+        "whoever sits at the machine"
+    )
+
+
+def chosen(family: Family, plugged: Sequence[Plugged], serial: object = None) -> Plugged:
+    """Returns the device to open.
+
+    Args:
+        family: What was looked for.
+        plugged: What of it is plugged in.
+        serial: The serial number, or path, that the user asked for; None: there must be just one.
+
+    Raises:
+        DeviceError: None is plugged in, or not that one, or several and none was asked for, or it
+            may not be opened; says what to do.
+    """
+    if not plugged:
+        vendors = ", ".join(sorted({f"{usb_id.vendor:04x}" for usb_id in family.ids}))
+        is_one = len(family.ids) == 1
+        looked = str(family.ids[0]) if is_one else f"{len(family.ids)} products of {vendors}"
+        raise DeviceError(
+            f"no device '{family.name}' is plugged in (looked for {looked}); 'hapticbridge "
+            "devices' lists what is, and what permission is missing"
+        )
+    names = choices(device.serial or device.path for device in plugged)
+    if serial is None:
+        if len(plugged) > 1:
+            raise DeviceError(
+                f"{len(plugged)} devices '{family.name}' are plugged in; choose one with "
+                f"serial=, one of {names}"
+            )
+        device = plugged[0]
+    else:
+        wanted = [d for d in plugged if str(serial) in (d.serial, d.path)]
+        if not wanted:
+            raise DeviceError(
+                f"no device '{family.name}' has serial '{serial}'; plugged in: {names}"
+            )
+        device = wanted[0]
+    if device.problem is not None:
+        raise DeviceError(f"{device}: {device.problem}")
+    return device

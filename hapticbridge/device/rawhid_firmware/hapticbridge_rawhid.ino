@@ -1,0 +1,146 @@
+// A one-axis haptic device for hapticbridge on a Teensy 3.2, 3.6, 4.0 or 4.1: a paddle on a capstan
+// drive (as on the Hapkit), a quadrature encoder on the motor, and a driver with a PWM and a
+// direction pin.
+//
+// Tools > USB Type > Raw HID. Files: this sketch, hb_protocol.h and hb_protocol.cpp in one folder.
+// Needs only Teensyduino (its Encoder library and IntervalTimer). Then, on the computer:
+//
+//   hapticbridge devices
+//   hapticbridge run peg_in_hole --device rawhid --force-limit 1
+//
+// What YOU fill in for your device is between the two lines of === below: pins, dimensions, the
+// motor, and three functions. All else is the protocol and stays. The numbers here are an example's:
+// MEASURE YOURS. Nothing of this has been run on a real device yet.
+//
+// Before the first run: paddle unloaded, hand on the power switch, DUTY_LIMIT at 0.2. Push the
+// paddle: if it runs away instead of resisting, swap the motor's wires or the sign in motor_write().
+
+#include <Encoder.h>
+#include <math.h>
+#include <string.h>
+
+#include "hb_protocol.h"
+
+// ======================================================================== your device, part 1: facts
+
+const int PIN_ENCODER_A = 2, PIN_ENCODER_B = 3;
+const int PIN_PWM = 5, PIN_DIRECTION = 8;
+const int PIN_BUTTON = 12;  // to ground; 255 if there is none
+
+const float COUNTS_PER_TURN = 4.0f * 500.0f;  // of the motor's encoder, all four edges
+const float MOTOR_PULLEY = 0.005f;            // m, radius that the cable runs on
+const float SECTOR = 0.075f;                  // m, radius of the driven sector
+const float HANDLE = 0.070f;                  // m, from the paddle's axis to the grip
+
+const float TORQUE_CONSTANT = 0.0136f;  // N m/A, the motor's data sheet
+const float RESISTANCE = 2.5f;          // ohm, winding, driver and wires together
+const float SUPPLY = 12.0f;             // V, what the driver gets
+const float DUTY_LIMIT = 0.2f;          // of full PWM, 0 to 1; raise it once it is known to be safe
+const float PWM_FREQUENCY = 36000.0f;   // Hz, above hearing; what the driver bears
+
+// metres of handle per radian of the motor, and per count of the encoder
+const float TRAVEL = HANDLE * MOTOR_PULLEY / SECTOR;
+const float STEP = TRAVEL * 6.2831853f / COUNTS_PER_TURN;
+
+const uint32_t STATE_PERIOD_US = 1010;  // see send_state() before you make it shorter
+const uint32_t CONTROL_PERIOD_US = 500;
+
+HbSheet my_sheet() {
+  HbSheet sheet;
+  sheet.axes = HB_X;
+  sheet.rate = 1e6f / STATE_PERIOD_US;
+  sheet.mass = NAN;     // kg at the handle: swing it, or leave it unknown
+  sheet.damping = NAN;  // N s/m at the handle: coast-down with the motor off; the bound needs it
+  sheet.rotational_inertia = NAN;
+  sheet.rotational_damping = NAN;
+  sheet.friction = NAN;  // N at the handle: what just moves it, with a spring balance
+  sheet.resolution = STEP;
+  sheet.force_limit = DUTY_LIMIT * SUPPLY / RESISTANCE * TORQUE_CONSTANT / TRAVEL;
+  sheet.torque_limit = NAN;  // it does not turn
+  sheet.speed_limit = 2.0f;  // m/s, faster than a hand moves it
+  sheet.delay = 1e-6f * CONTROL_PERIOD_US;
+  sheet.name = "one-axis capstan paddle";
+  return sheet;
+}
+
+// ================================================================== your device, part 2: three hooks
+
+Encoder encoder(PIN_ENCODER_A, PIN_ENCODER_B);
+volatile bool is_saturated = false;
+
+void motor_setup() {
+  pinMode(PIN_DIRECTION, OUTPUT);
+  pinMode(PIN_PWM, OUTPUT);
+  analogWriteResolution(10);
+  analogWriteFrequency(PIN_PWM, PWM_FREQUENCY);
+  analogWrite(PIN_PWM, 0);
+  if (PIN_BUTTON != 255) pinMode(PIN_BUTTON, INPUT_PULLUP);
+  encoder.write(0);  // the pose at power-on is x = 0: hold the paddle upright
+}
+
+// Puts a force at the handle on the motor. Called from an interrupt, 2000 times a second, and with
+// zero when the watchdog has struck: it must not wait, print or allocate.
+void motor_write(const HbWrench& wrench) {
+  const float torque = wrench.force[0] * TRAVEL;
+  float duty = torque / TORQUE_CONSTANT * RESISTANCE / SUPPLY;
+  is_saturated = fabsf(duty) > DUTY_LIMIT;
+  if (duty > DUTY_LIMIT) duty = DUTY_LIMIT;
+  if (duty < -DUTY_LIMIT) duty = -DUTY_LIMIT;
+  digitalWrite(PIN_DIRECTION, duty < 0.0f ? LOW : HIGH);
+  analogWrite(PIN_PWM, (int)(fabsf(duty) * 1023.0f + 0.5f));
+}
+
+// Says where the handle is. Called from loop(), once per state frame.
+void motion_read(HbMotion& motion) {
+  static float last = 0.0f;
+  motion.position[0] = STEP * (float)encoder.read();
+  motion.velocity[0] = (motion.position[0] - last) / (1e-6f * STATE_PERIOD_US);
+  last = motion.position[0];
+  motion.buttons = PIN_BUTTON != 255 && digitalRead(PIN_BUTTON) == LOW ? 1 : 0;
+  // set HB_FAULT here if your driver has a fault pin, HB_NOT_READY while your device must be homed
+  motion.status = is_saturated ? HB_SATURATED : 0;
+}
+
+// ========================================================================= the protocol: leave it
+
+HbDevice device(my_sheet());
+IntervalTimer control;
+
+// In an interrupt, so that a loop() that hangs cannot leave a force on the motor: then no force
+// frame is taken either, and the watchdog of the last one runs out here.
+void control_tick() { motor_write(device.wrench(micros())); }
+
+void setup() {
+  motor_setup();
+  control.begin(control_tick, CONTROL_PERIOD_US);
+}
+
+// Sends one state frame per period. On full speed the host fetches one report a millisecond; a
+// device that makes them faster, be it by 50 ppm, fills the queue of four in the USB driver, and
+// from then on every pose is 4 ms old. So the period is 1 % longer than the host's.
+void send_state(uint32_t now_us) {
+  static uint32_t last_us = 0;
+  if (now_us - last_us < STATE_PERIOD_US) return;
+  last_us += STATE_PERIOD_US;
+  if (now_us - last_us >= STATE_PERIOD_US) last_us = now_us;  // late: do not catch up by a burst
+  HbMotion motion;
+  memset(&motion, 0, sizeof motion);
+  motion_read(motion);
+  uint8_t frame[HB_FRAME_BYTES];
+  noInterrupts();  // control_tick() uses the same device
+  device.state(motion, now_us, frame);
+  interrupts();
+  RawHID.send(frame, 0);
+}
+
+void loop() {
+  uint8_t frame[HB_FRAME_BYTES];
+  while (RawHID.recv(frame, 0) > 0) {
+    noInterrupts();
+    device.receive(frame, micros());
+    const bool has_answer = device.answer(frame);
+    interrupts();
+    if (has_answer) RawHID.send(frame, 100);
+  }
+  send_state(micros());
+}

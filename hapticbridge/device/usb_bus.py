@@ -1,0 +1,88 @@
+"""What the kernel says is on the USB bus, read from sysfs: needs no libusb and no permission."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+BUS = Path("/sys/bus/usb/devices")
+"""Where Linux lists what is plugged in; absent on a machine without USB and on other systems."""
+
+NODES = Path("/dev/bus/usb")
+"""Where libusb opens a device: a folder per bus, a node per device."""
+
+
+@dataclass(frozen=True, slots=True)
+class OnTheBus:
+    """One device on the USB bus.
+
+    Attributes:
+        vendor: 16 bits.
+        product: 16 bits.
+        name: Its product string, empty where it has none.
+        serial: Its serial number, likewise.
+        node: What libusb opens.
+        has_hidraw: Whether any of its interfaces has a hidraw node.
+    """
+
+    vendor: int
+    product: int
+    name: str
+    serial: str
+    node: Path
+    has_hidraw: bool
+
+    @property
+    def is_permitted(self) -> bool:
+        """Whether this user may read and write the node."""
+        return os.access(self.node, os.R_OK | os.W_OK)
+
+
+def on_the_bus(bus: Path | None = None) -> list[OnTheBus]:
+    """Lists the devices on the USB bus, in the order of their places on it.
+
+    Args:
+        bus: The folder of sysfs that lists them; None takes ``BUS``.
+
+    Returns:
+        Empty where there is no bus. A device that goes away meanwhile is left out.
+    """
+    folder = BUS if bus is None else bus
+    found = []
+    try:
+        entries = sorted(folder.iterdir())
+    except OSError:
+        return []
+    for entry in entries:
+        try:
+            numbers = [
+                int(_text(entry / name), base)
+                for name, base in (("idVendor", 16), ("idProduct", 16), ("busnum", 10))
+            ]
+            device = int(_text(entry / "devnum"))
+        except (OSError, ValueError):
+            continue  # an interface and not a device, or one that has just gone
+        vendor, product, number = numbers
+        found.append(
+            OnTheBus(
+                vendor=vendor,
+                product=product,
+                name=_text_or_nothing(entry / "product"),
+                serial=_text_or_nothing(entry / "serial"),
+                node=NODES / f"{number:03d}" / f"{device:03d}",
+                has_hidraw=any(entry.glob("*/*/hidraw/hidraw*")),
+            )
+        )
+    return found
+
+
+def _text(path: Path) -> str:
+    return path.read_text(encoding="utf-8", errors="replace").strip()
+
+
+def _text_or_nothing(path: Path) -> str:
+    try:
+        return _text(path)
+    except OSError:
+        return ""

@@ -1,0 +1,181 @@
+"""The force of a run that identifies an axis: tones that stay within a travel, tick by tick."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticbridge.jit import compiled
+from hapticbridge.pose import conjugate, product, quaternion_log
+
+Record: TypeAlias = Any
+"""A structured scalar inside compiled code, where fields are attributes; NumPy's type has none."""
+
+LOWEST, HIGHEST, TONES = 0.7, 12.0, 9
+"""In Hz, and how many between them, evenly in their logarithm. Low ones show damping and friction,
+high ones mass; above 12 Hz an axis of 1 kg moves less than an encoder sees, below 0.7 Hz a run of
+12 s holds too few swings."""
+
+_TILT = -0.3  # amplitude over frequency: all tones then move a damped axis by similar amounts
+
+START_SHARE = 0.03
+"""Share of the force limit with which the signal starts. It grows until the axis moves."""
+
+GROWTH, SHRINKING = 0.7, 0.5
+"""Time in s in which the signal grows e-fold while the axis moves less than asked, and shrinks
+while it moves more. Faster overshoots the travel, slower wastes the run."""
+
+ENOUGH, TOO_MUCH = 0.4, 0.6
+"""Shares of the travel between which the signal is left as it is; the largest deflection overshoots
+them by about as much again, on a heavy device of little damping."""
+
+_RESCUE = 0.05
+"""Time in s in which the signal shrinks while the axis is beyond the travel, as a light one is that
+has just broken away from its friction."""
+
+_MEMORY = 0.7  # s for which the largest deflection is remembered: half of the slowest swing
+
+CENTRING = (40.0, 0.1)
+"""Stiffness in N/m and N m/rad of the spring that keeps every axis near its start. It is part of
+the known force, so it does not disturb the fit. Stiffer leaves less travel to the signal."""
+
+CALMING = (1.0, 1e-3)
+"""Damping in N s/m and N m s/rad, of the motion over the last ``SPAN``, without which a heavy
+device of little damping would swing for ever. More would hide the damping that is looked for."""
+
+SPAN = 0.01
+"""In s: an encoder's steps of 0.1 mm then make 0.01 N of noise."""
+
+WEIGHT_TIME = 2.0
+"""Time in s in which the centring spring's integral takes over a weight."""
+
+OK, FAR, TURNED_FAR, FAST, TURNED_FAST, BAD_POSE = range(6)
+
+STATE_DTYPE = np.dtype(
+    [
+        ("tick", "<i8"),
+        ("axis", "<i8"),
+        ("period", "<f8"),
+        ("present", "<f8", 6),
+        ("force", "<f8", 2),
+        ("travel", "<f8", 2),
+        ("farthest", "<f8", 2),
+        ("fastest", "<f8", 2),
+        ("position", "<f8", 3),
+        ("quaternion", "<f8", 4),
+        ("place", "<f8", 6),
+        ("before", "<f8", 6),
+        ("weight", "<f8", 6),
+        ("amplitude", "<f8"),
+        ("reach", "<f8"),
+    ]
+)
+"""Of one run: period T in s, which axes there are (1 or 0), limits on force, travel, distance and
+speed per kind of axis, the pose at the start, the displacement from it (m, then rotation vector in
+rad), now and one tick ago, the integral of the springs in N and N m, and the signal's."""
+
+
+def signal(axis_index: int, ticks: int, period: float) -> NDArray[np.float64]:
+    """Returns tones of random phase between −1 and 1, another one for each axis, the same always.
+
+    Args:
+        axis_index: 0 to 5.
+        ticks: n.
+        period: T in s.
+    """
+    generator = np.random.default_rng(axis_index)
+    frequencies = np.geomspace(LOWEST, HIGHEST, TONES)
+    phases = generator.uniform(0.0, 2.0 * np.pi, TONES)
+    time = period * np.arange(ticks)
+    tones = np.sin(2.0 * np.pi * frequencies[:, None] * time + phases[:, None])
+    summed = (frequencies**_TILT) @ tones
+    return np.asarray(summed / np.abs(summed).max())
+
+
+@compiled
+def next_wrench(
+    states: NDArray[np.void],
+    samples: NDArray[np.void],
+    past: NDArray[np.float64],
+    tone: float,
+    ticks_passed: int,
+    wrench: NDArray[np.float64],
+) -> int:
+    """Computes the wrench of a tick from its sample; returns ``OK`` or what is wrong.
+
+        F = a s(t) − k q − B q̇ − (k/τ) ∫ q
+
+    Args:
+        states: ``STATE_DTYPE``, shape (1,).
+        samples: The device's sample, ``SAMPLE_DTYPE``, shape (1,).
+        past: Displacements of the last ``SPAN``, shape (n, 6), overwritten in turn.
+        tone: s of this tick.
+        ticks_passed: Periods since the last call.
+        wrench: Filled in, shape (6,).
+    """
+    s = states[0]
+    code = _displace(s, samples[0], ticks_passed * s.period)
+    if code != OK:
+        return code
+    deflection = abs(s.place[s.axis])
+    s.reach = max(deflection, s.reach * math.exp(-s.period / _MEMORY))
+    kind = 0 if s.axis < 3 else 1
+    if deflection > s.travel[kind]:
+        s.amplitude *= math.exp(-s.period / _RESCUE)
+    elif s.reach > TOO_MUCH * s.travel[kind]:
+        s.amplitude *= math.exp(-s.period / SHRINKING)
+    elif s.reach < ENOUGH * s.travel[kind]:
+        s.amplitude = min(s.amplitude * math.exp(s.period / GROWTH), s.force[kind])
+    oldest = past[s.tick % len(past)]
+    for i in range(6):
+        spring = CENTRING[0] if i < 3 else CENTRING[1]
+        damper = CALMING[0] if i < 3 else CALMING[1]
+        speed = (s.place[i] - oldest[i]) / (len(past) * s.period)
+        oldest[i] = s.place[i]
+        s.weight[i] -= spring * s.place[i] * s.period / WEIGHT_TIME
+        wrench[i] = s.present[i] * (s.weight[i] - spring * s.place[i] - damper * speed)
+    wrench[s.axis] += s.amplitude * tone
+    for j in range(2):
+        size = math.sqrt(wrench[3 * j] ** 2 + wrench[3 * j + 1] ** 2 + wrench[3 * j + 2] ** 2)
+        if size > s.force[j]:
+            for i in range(3 * j, 3 * j + 3):
+                wrench[i] *= s.force[j] / size
+    s.tick += 1
+    return OK
+
+
+@compiled
+def _displace(s: Record, sample: Record, time: float) -> int:
+    """Computes the displacement from the start; the first sample is the start."""
+    q = sample.quaternion
+    square = q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]
+    total = square + sample.position[0] + sample.position[1] + sample.position[2]
+    if not math.isfinite(total) or not 0.25 < square < 4.0:
+        return BAD_POSE
+    if s.tick == 0:
+        s.position[:] = sample.position
+        s.quaternion[:] = sample.quaternion
+    turn = quaternion_log(
+        product(
+            (q[0], q[1], q[2], q[3]),
+            conjugate((s.quaternion[0], s.quaternion[1], s.quaternion[2], s.quaternion[3])),
+        )
+    )
+    for i in range(3):
+        s.before[i] = s.place[i]
+        s.before[3 + i] = s.place[3 + i]
+        s.place[i] = sample.position[i] - s.position[i]
+        s.place[3 + i] = turn[i]
+    for j in range(2):
+        square = moved = 0.0
+        for i in range(3 * j, 3 * j + 3):
+            square += s.place[i] ** 2
+            moved += (s.place[i] - s.before[i]) ** 2
+        if not square <= s.farthest[j] ** 2:
+            return TURNED_FAR if j else FAR
+        if not moved <= (s.fastest[j] * time) ** 2:
+            return TURNED_FAST if j else FAST
+    return OK

@@ -1,0 +1,60 @@
+"""What was measured of a device as a profile, which every later run can take."""
+
+from __future__ import annotations
+
+from hapticbridge.device.profile import Profile, Quantity
+from hapticbridge.identify.fit import Estimate
+from hapticbridge.identify.identification import Identification
+
+_FIELDS = {
+    "mass": ("mass", False),
+    "damping": ("damping", False),
+    "friction": ("friction", False),
+    "rotational_inertia": ("mass", True),
+    "rotational_damping": ("damping", True),
+}
+
+
+def measured_profile(
+    result: Identification, *, device: str, serial: str, date: str, duration: float
+) -> Profile:
+    """Returns a profile of the unit: of each kind of axis the values that promise least.
+
+    Args:
+        result: What ``identify`` returned.
+        device: Name of the driver.
+        serial: Of the unit; may be empty.
+        date: When, as the file should say it.
+        duration: Seconds per axis, likewise.
+    """
+    info = result.info
+    source = f"identified on {date}: {duration:g} s per axis ({', '.join(result.fits)}), unheld"
+    quantities: dict[str, Quantity] = {}
+    for name, (field, turns) in _FIELDS.items():
+        found = result.of_all(field, turns=turns)
+        if found is not None:
+            quantities[name] = _quantity(found, source)
+    if result.resolution is not None:
+        quantities["resolution"] = Quantity(result.resolution, source)
+    late = [
+        found
+        for turns in (False, True)
+        if (found := result.of_all("delay", turns=turns, most=True)) is not None
+    ]
+    quantities["delay"] = _quantity(max(late, key=lambda delay: delay.most), source)
+    for name in ("force_limit", "torque_limit", "speed_limit"):
+        quantities[name] = Quantity(float(getattr(info, name)), "the driver's, not measured")
+    return Profile(
+        name=f"{info.name} {serial}".strip(),
+        device=device,
+        serial=serial,
+        axes=info.axes,
+        about="",
+        quantities=quantities,
+    )
+
+
+def _quantity(found: Estimate, source: str) -> Quantity:
+    # friction and delay are not negative; what is measured of zero may be
+    value = max(found.value, 0.0)
+    return Quantity(value, source, (min(max(found.least, 0.0), value), max(found.most, value)))

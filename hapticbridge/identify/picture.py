@@ -1,0 +1,67 @@
+"""How well the law fits: what resists an axis, against its speed."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from hapticbridge.identify.fit import AxisFit
+from hapticbridge.identify.identification import Identification
+from hapticbridge.identify.weak_form import windows
+from hapticbridge.picture import new_figure
+
+_COLOURS = {"x": "#a51d2d", "y": "#1b7837", "z": "#1a5fb4"}
+
+
+def draw_identification(result: Identification) -> Figure:
+    """Draws, for each axis, the force that neither its mass nor a constant takes, over the speed.
+
+    Each point is one window: F − M x'' − c against x'. A device that obeys the law lies on the
+    line b x' + f_c sign(x').
+
+    Args:
+        result: What ``identify`` returned.
+    """
+    kinds = [turns for turns in (False, True) if any((len(a) == 2) == turns for a in result.fits)]
+    figure = new_figure(8, 4.0 * len(kinds) + 0.3)
+    panels = figure.subplots(len(kinds), 1, squeeze=False)[:, 0]
+    for panel, turns in zip(panels, kinds, strict=True):
+        for axis, fit in result.fits.items():
+            if (len(axis) == 2) == turns:
+                _draw_axis(panel, result, axis, fit)
+        panel.axhline(0.0, color="#777777", lw=0.8)
+        panel.axvline(0.0, color="#777777", lw=0.8)
+        panel.set_xlabel("angular velocity (rad/s)" if turns else "velocity (m/s)")
+        panel.set_ylabel("torque F − M x'' − c (N m)" if turns else "force F − M x'' − c (N)")
+        panel.grid(alpha=0.3)
+        panel.legend(fontsize="small", loc="upper left")
+    figure.suptitle(
+        f"What resists {result.info.name}: points measured, lines b v + f_c sign(v)",
+        fontsize="medium",
+        parse_math=False,
+    )
+    return figure
+
+
+def _draw_axis(panel: Axes, result: Identification, axis: str, fit: AxisFit) -> None:
+    run, colour = result.runs[axis], _COLOURS[axis[-1]]
+    turns = len(axis) == 2
+    step = 0.0 if turns else result.resolution or 0.0
+    found = windows(run.position, run.force, run.period, fit.window, step, fit.delay.value)
+    area = found.columns[:, 3]
+    speed = found.columns[:, 1] / area
+    rest = found.right / area - fit.mass.value * found.columns[:, 0] / area - fit.offset.value
+    panel.plot(speed, rest, ".", color=colour, ms=3, alpha=0.5)
+    most = float(np.abs(speed).max())
+    line = np.linspace(-most, most, 400)
+    force = fit.damping.value * line + fit.friction.value * np.sign(line)
+    units = ("N m s/rad", "N m") if turns else ("N s/m", "N")
+    panel.plot(
+        line,
+        force,
+        color=colour,
+        lw=1.5,
+        label=f"{axis}: b = {fit.damping.value:.3g} ± {fit.damping.half_width:.1g} {units[0]}, "
+        f"f_c = {fit.friction.value:.2g} ± {fit.friction.half_width:.1g} {units[1]}",
+    )

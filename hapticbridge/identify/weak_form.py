@@ -1,0 +1,129 @@
+"""The equation of motion of one axis, averaged over windows so that nothing is differentiated.
+
+An axis of a device that nobody holds obeys, under a force F that acts d late,
+
+    M x'' + b x' + f_c sign(x') + c = F(t − d)
+
+with a constant c (weight, an offset of the motor). Multiplied by a bump φ(t) that vanishes with its
+derivatives at both ends of a window, and integrated by parts, it is linear in M, b, f_c and c:
+
+    M ∫φ'' x − b ∫φ' x + f_c s ∫φ + c ∫φ = ∫φ F(t − d)
+
+where s = ±1 is the direction of motion, so only windows are used in which the axis keeps moving one
+way. F is held over each period, so its integral is exact. The integrals of x are sums over the
+samples. x'' jumps at the samples, where F does; but the leading error of such a sum, of second
+order in T, telescopes to nothing because x and x' are continuous: what is left is of fourth order.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.polynomial import Polynomial
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+_BUMP = Polynomial([0.0, 4.0, -4.0]) ** 4
+"""φ over a window of unit length, 1 in its middle: smooth enough that φ'' and its own first
+derivative vanish at the ends, so that a sum over samples is as good as an integral."""
+
+OVERLAP = 4
+"""Windows begin every 1/OVERLAP of their length, without unit. More use the samples better, by
+little: neighbours see the same errors. Fewer leave out what lies between."""
+
+_PARTS = 8
+"""Into how many parts of a window must each bring motion, so that a stick within is noticed."""
+
+LEAST_STEPS = 6
+"""Steps of resolution that a window must cross. Below, the rounding of the position is no longer
+small beside the motion."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Windows:
+    """The equations of all windows in which an axis kept moving one way.
+
+    Attributes:
+        columns: Factors of M, b, f_c, c and of a change of d, shape (n, 5).
+        right: ∫φ F(t − d), in N s, shape (n,).
+        begin: First sample of each window, shape (n,).
+        position: ∫φ x, in m s, shape (n,): the column of a spring.
+        excess: ∫φ e(t − d), in N s, where e is what F exceeds half of its largest value by, shape
+            (n,): the column of a motor that gives less than it is told.
+    """
+
+    columns: Array
+    right: Array
+    begin: NDArray[np.int64]
+    position: Array
+    excess: Array
+
+
+def windows(
+    position: Array, force: Array, period: float, length: float, resolution: float, delay: float
+) -> Windows:
+    """Returns the averaged equations of motion of a run.
+
+    Args:
+        position: x in m (or an angle in rad) at the samples, shape (n,).
+        force: F in N (or N m), held from each sample to the next, shape (n,).
+        period: T in s.
+        length: Of a window, in s; at least 16 periods.
+        resolution: Step of the position in m, 0 where it is exact.
+        delay: d in s, from a write until the force acts, 0 or more.
+    """
+    count = max(round(length / period), 16)
+    length = count * period
+    nodes = np.arange(count + 1) / count
+    trapezoid = np.full(count + 1, period)
+    trapezoid[[0, -1]] *= 0.5
+    first, second = _BUMP.deriv(1)(nodes) / length, _BUMP.deriv(2)(nodes) / length**2
+    late = delay / period
+    held = int(np.ceil(late))  # whole periods before the window whose force still acts within it
+    grid = np.arange(-held, count + 1)
+    # F(t − d) of sample k acts from (k + late) T to (k + 1 + late) T: the bump's area in between
+    inside = np.clip((grid + late) / count, 0.0, 1.0)
+    weight = np.diff(_BUMP.integ()(inside)) * length
+    slope = np.diff(_BUMP(inside))  # ∫φ' over the same spans
+    area = float(_BUMP.integ()(1.0)) * length
+    step = max(count // OVERLAP, 1)
+    begin = np.arange(held, len(position) - count, step)
+    x = np.lib.stride_tricks.sliding_window_view(position, count + 1)[begin]
+    half = 0.5 * float(np.abs(force).max())
+    excess = np.sign(force) * np.maximum(np.abs(force) - half, 0.0)
+    f, e = (
+        np.lib.stride_tricks.sliding_window_view(values, count + held)[begin - held]
+        for values in (force, excess)
+    )
+    direction = _direction(x, resolution)
+    moves = direction != 0.0
+    x, f, e = x[moves], f[moves], e[moves]
+    begin, direction = begin[moves], direction[moves]
+    x = x - x[:, :1]  # ∫φ' and ∫φ'' vanish: only rounding depends on where the window lies
+    ones = np.full(len(begin), area)
+    columns = np.stack(
+        [
+            x @ (trapezoid * second),
+            -(x @ (trapezoid * first)),
+            direction * area,
+            ones,
+            -(f @ slope),
+        ],
+        axis=1,
+    )
+    bump = _BUMP(nodes) * trapezoid
+    absolute = position[begin] * area + x @ bump
+    return Windows(columns, f @ weight, begin, absolute, e @ weight)
+
+
+def _direction(x: Array, resolution: float) -> Array:
+    """Returns ±1 where a window keeps moving one way, 0 where it does not."""
+    steps = np.diff(x, axis=1)
+    edges = np.linspace(0, steps.shape[1], _PARTS + 1).astype(np.int64)[:-1]
+    travelled = np.add.reduceat(steps, edges, axis=1)
+    is_long = np.abs(x[:, -1] - x[:, 0]) >= LEAST_STEPS * resolution
+    up = (steps >= 0.0).all(axis=1) & (travelled > 0.0).all(axis=1)
+    down = (steps <= 0.0).all(axis=1) & (travelled < 0.0).all(axis=1)
+    return np.where(is_long, up.astype(np.float64) - down.astype(np.float64), 0.0)

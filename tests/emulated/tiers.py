@@ -1,0 +1,221 @@
+"""What is run where: the jobs of tiers B and C, what each needs, and what it found.
+
+Tier A, in process, is the project's ordinary tests. Tier B is real hidapi and libusb under
+umockdev's preload library. Tier C is a User-Mode Linux: real libraries on a real kernel. Run as a
+program, it runs all jobs and prints what ran and what was skipped and why.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import subprocess
+import sys
+import tempfile
+import time
+import xml.etree.ElementTree as ET
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from hashlib import sha256
+from pathlib import Path
+
+import hapticbridge as hb
+from emulated.guest import CHECKOUT, NO_KERNEL, GuestRun, kernel, python_environment, run_in_guest
+from emulated.umock_sysfs import make_test_bed
+
+PRELOAD = "libumockdev-preload.so.0"
+NO_UMOCKDEV = "no umockdev; 'apt-get install umockdev libusb-1.0-0' brings it"
+
+CHECKS = CHECKOUT / "tests/usb_tiers"
+LIMIT = 300.0
+"""In s of this machine's time per job: ten times what the longest takes on two free cores."""
+
+LOOP = 10.0
+"""In s of virtual time: how long the closed loops run."""
+
+REPEATS, REPEATED_LOOP = 3, 1.0
+"""How many runs must be the same to the bit, and how long each is, in s of virtual time."""
+
+
+@dataclass(frozen=True)
+class Claim:
+    """One thing that a job found.
+
+    Attributes:
+        name: What is claimed.
+        is_true: Whether it held.
+        note: What was measured, or how it failed.
+    """
+
+    name: str
+    is_true: bool
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class Job:
+    """Something to run in a tier.
+
+    Attributes:
+        name: Its tier and what it does there.
+        missing: Says what this machine lacks for it, None where nothing.
+        run: Runs it, with an empty folder to write to.
+    """
+
+    name: str
+    missing: Callable[[], str | None]
+    run: Callable[[Path], list[Claim]]
+
+
+def _umockdev_missing() -> str | None:
+    try:
+        ctypes.CDLL(PRELOAD)
+    except OSError:
+        return NO_UMOCKDEV
+    return None
+
+
+def _kernel_missing() -> str | None:
+    return None if kernel() is not None else NO_KERNEL
+
+
+def _pytest(report: str, files: str = "check_*.py", only: str = "test") -> list[str]:
+    """Returns the command that runs checks, apart from the project's own tests."""
+    paths = sorted(str(path) for path in CHECKS.glob(files))
+    plain = ["--rootdir", str(CHECKS), "-c", os.devnull, "-p", "no:cacheprovider"]
+    form = ["--tb=short", "-q", f"--junitxml={report}", "-o", "junit_family=xunit1"]
+    return [sys.executable, "-m", "pytest", *plain, *form, "-k", only, *paths]
+
+
+def claims_of(report: Path, otherwise: str) -> list[Claim]:
+    """Reads a report; where there is none, the only claim is that the job ran."""
+    if not report.is_file():
+        return [Claim("the job ran", is_true=False, note=otherwise)]
+    claims = []
+    for case in ET.parse(report).getroot().iter("testcase"):
+        failures = [*case.iter("failure"), *case.iter("error")]
+        measured = [f"{one.get('value')} {one.get('name')}" for one in case.iter("property")]
+        note = "\n".join(failure.text or "" for failure in failures) or ", ".join(measured)
+        name = case.get("name", "").removeprefix("test_").replace("_", " ")
+        claims.append(Claim(name, is_true=not failures, note=note))
+    return claims
+
+
+def _under_umockdev(folder: Path) -> list[Claim]:
+    bed, report = folder / "bed", folder / "report.xml"
+    make_test_bed(bed)
+    variables = {
+        "LD_PRELOAD": PRELOAD,
+        "UMOCKDEV_DIR": str(bed),
+        "HAPTICBRIDGE_TIER": "umock",
+        "PYTHONPATH": f"{CHECKOUT}:{CHECKOUT / 'tests'}",
+    }
+    try:
+        ended = subprocess.run(
+            [*_pytest(str(report)), f"--basetemp={folder / 'files'}"],
+            env=os.environ | variables,
+            capture_output=True,
+            text=True,
+            timeout=LIMIT,
+            check=False,
+        )
+    except subprocess.TimeoutExpired:
+        return [Claim("the job ran", is_true=False, note=f"stopped after {LIMIT:g} s")]
+    return claims_of(report, ended.stdout + ended.stderr)
+
+
+def _in_the_guest(folder: Path, command: Sequence[str], *, is_virtual: bool) -> GuestRun:
+    variables = python_environment() | {"HAPTICBRIDGE_TIER": "uml"}
+    if is_virtual:
+        variables["HAPTICBRIDGE_TIME"] = "virtual"
+    return run_in_guest(
+        command, folder, environment=variables, is_virtual=is_virtual, timeout=LIMIT
+    )
+
+
+def _checks_in_virtual_time(folder: Path) -> list[Claim]:
+    run = _in_the_guest(folder, _pytest("/run/job/report.xml"), is_virtual=True)
+    return claims_of(folder / "report.xml", run.output)
+
+
+def _round_trips(folder: Path) -> list[Claim]:
+    command = _pytest("/run/job/report.xml", "check_bench.py", "come_back_through")
+    run = _in_the_guest(folder, command, is_virtual=False)
+    return claims_of(folder / "report.xml", run.output)
+
+
+def _recorded(folder: Path, device: str, seconds: float) -> tuple[GuestRun, Path]:
+    """Runs ``hapticbridge run peg_in_hole`` on an emulated device in virtual time."""
+    folder.mkdir(exist_ok=True)
+    program = ["-m", "usb_tiers.closed_loop"]
+    command = [sys.executable, *program, device, f"{seconds:g}", "/run/job/run.mcap"]
+    return _in_the_guest(folder, command, is_virtual=True), folder / "run.mcap"
+
+
+def _closed_loop(device: str) -> Callable[[Path], list[Claim]]:
+    def run(folder: Path) -> list[Claim]:
+        ended, file = _recorded(folder, device, LOOP)
+        name = f"peg_in_hole on {device} for {LOOP:g} s of virtual time is audited passive"
+        if ended.status != 0:
+            return [Claim(name, is_true=False, note=ended.output)]
+        report = hb.audit(file)
+        is_whole = report.ticks == round(1000 * LOOP) and not report.is_cut
+        note = f"{report.ticks} ticks, {report.verdict} ({report.environment})"
+        return [Claim(name, is_whole and report.verdict == "passive", note)]
+
+    return run
+
+
+def _the_same_every_time(folder: Path) -> list[Claim]:
+    name = f"a 1 kHz loop in virtual time is the same to the bit in {REPEATS} runs"
+    digests = []
+    for number in range(REPEATS):
+        ended, file = _recorded(folder / str(number), "rawhid", REPEATED_LOOP)
+        if ended.status != 0:
+            return [Claim(name, is_true=False, note=ended.output)]
+        digests.append(sha256(hb.read_recording(file).ticks.tobytes()).hexdigest()[:16])
+    return [Claim(name, len(set(digests)) == 1, ", ".join(sorted(set(digests))))]
+
+
+JOBS = (
+    Job("C: closed loop on a Falcon", _kernel_missing, _closed_loop("falcon")),
+    Job("C: closed loop on raw HID", _kernel_missing, _closed_loop("rawhid")),
+    Job("C: checks in User-Mode Linux, virtual time", _kernel_missing, _checks_in_virtual_time),
+    Job("C: 1 kHz loop, repeated", _kernel_missing, _the_same_every_time),
+    Job("B: checks under umockdev", _umockdev_missing, _under_umockdev),
+    Job("C: round trips on the wall clock", _kernel_missing, _round_trips),
+)
+
+
+def _found(job: Job) -> tuple[list[Claim], float]:
+    """Runs a job in a folder of its own; returns its claims and how long it took, in s."""
+    start = time.monotonic()
+    if job.missing() is not None:
+        return [], 0.0
+    with tempfile.TemporaryDirectory(prefix="hapticbridge-") as name:
+        return job.run(Path(name).resolve()), time.monotonic() - start
+
+
+def main() -> int:
+    """Runs all jobs and prints a table; returns 1 where a claim did not hold, else 0.
+
+    A guest has one processor, so as many run at once as this machine has.
+    """
+    is_good = True
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        for job, (claims, seconds) in zip(JOBS, pool.map(_found, JOBS), strict=True):
+            if (reason := job.missing()) is not None:
+                print(f"skipped  {job.name}: {reason}", flush=True)
+                continue
+            print(f"ran      {job.name}: {len(claims)} claims in {seconds:.1f} s")
+            for claim in claims:
+                mark = "ok  " if claim.is_true else "FAIL"
+                print(f"    {mark} {claim.name}" + (f": {claim.note}" if claim.note else ""))
+                is_good &= claim.is_true
+            sys.stdout.flush()
+    return 0 if is_good else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

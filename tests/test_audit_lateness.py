@@ -1,0 +1,93 @@
+"""A device whose samples are old is kicked by couplings that a prompt one would bear."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+from falcon_cases import Bench
+
+from hapticbridge.audit import AuditReport, audit
+from hapticbridge.bridge import Bridge
+from hapticbridge.coupling import Coupling
+from hapticbridge.device import Hand, SimulatedDevice
+from hapticbridge.recording import read_recording
+
+ANVIL = """<mujoco model="anvil">
+  <option timestep="0.001" integrator="discrete" cone="elliptic" gravity="0 0 0">
+    <flag diagexact="enable"/>
+  </option>
+  <worldbody>
+    <body name="anvil">
+      <freejoint/>
+      <geom type="sphere" size="0.02" mass="20000" contype="0" conaffinity="0"/>
+      <site name="grip"/>
+    </body>
+  </worldbody>
+</mujoco>"""
+
+RETREAT = """t,x,y,z,qw,qx,qy,qz
+0,0,0,0,1,0,0,0
+0.6,0,0,0,1,0,0,0
+1.6,0.01,0,0,1,0,0,0
+1.7,0.01,0,0,1,0,0,0
+1.8,0,0,0,1,0,0,0
+2.5,0,0,0,1,0,0,0
+"""
+"""In, slowly, while the force is full; out in a tenth of a second."""
+
+LOOSE = Hand(mass=0.01, damping=0.0, stiffness=60.0)
+"""A hand that burns nothing: what the coupling creates stays and grows."""
+
+
+def held_to_an_anvil(
+    folder: Path, stiffness: float, delay: float | None = None, held: SimulatedDevice | None = None
+) -> tuple[AuditReport, float]:
+    """Returns the verdict, and how far the grip swings at the end in m; b = 2 N s/m, 1 kHz."""
+    scene, path = folder / "anvil.xml", folder / "run.mcap"
+    scene.write_text(ANVIL)
+    bench = Bench(held or SimulatedDevice(mass=0.4, damping=2.0, hand=LOOSE))
+    device = bench.opened(damping=2.0)
+    if delay is not None:
+        device.info = dataclasses.replace(device.info, delay=delay)
+    coupling = Coupling(
+        stiffness=stiffness, damping=0.05, rotational_stiffness=0.1, rotational_damping=1e-4
+    )
+    clock = bench.clock(2e-4)
+    with Bridge(scene, device, coupling, recording=path, clock=clock) as bridge:
+        bridge.run(duration=2.5)
+    swing = np.ptp(read_recording(path).ticks["device_position"][-500:], axis=0).max()
+    return audit(path), float(swing)
+
+
+def test_a_coupling_within_the_delayed_bound_stays_quiet(tmp_path: Path) -> None:
+    # K (T/2 + 2 T) = 1.75 N s/m
+    report, swing = held_to_an_anvil(tmp_path, 700.0)
+    assert (report.verdict, report.certified) == ("passive", None)
+    assert swing < 1e-3
+
+
+def test_a_coupling_that_forgets_the_delay_kicks_and_the_audit_says_so(tmp_path: Path) -> None:
+    # K T/2 + B = 1.55 N s/m would be borne without the delay; with it 7.5 N s/m are needed
+    report, swing = held_to_an_anvil(tmp_path, 3000.0)
+    assert swing > 5e-3
+    assert report.certified is False
+    assert (report.verdict, report.port) == ("active", "device")
+    assert report.resimulation == "bit for bit"
+
+
+def test_a_device_that_hides_its_delay_would_be_certified(tmp_path: Path) -> None:
+    report, swing = held_to_an_anvil(tmp_path, 3000.0, delay=0.0)
+    assert swing > 5e-3
+    assert (report.verdict, report.certified) == ("passive", True)
+
+
+def test_a_quick_retreat_from_a_loaded_spring_is_no_kick(tmp_path: Path) -> None:
+    # the grip has left 2 ticks before its sample says so: what the spring held there is not counted
+    path = tmp_path / "hand.csv"
+    path.write_text(RETREAT)
+    firm = Hand(mass=0.3, damping=5.0, stiffness=2000.0)
+    held = SimulatedDevice(mass=0.4, damping=2.0, hand=firm, path=path)
+    report, _ = held_to_an_anvil(tmp_path, 700.0, held=held)
+    assert (report.verdict, report.certified) == ("passive", None)

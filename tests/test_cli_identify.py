@@ -1,0 +1,58 @@
+"""``hapticbridge identify`` from the command line."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from hapticbridge.cli import main
+from hapticbridge.device.profile import read_profile
+
+FREE = "simulated:hand=none,damping=1.5,friction=0.1,resolution=2e-5"
+
+
+def test_it_prints_draws_and_saves_what_it_measured(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    profile, fit, width = (tmp_path / name for name in ("p.toml", "fit.png", "width.svg"))
+    words = ["identify", FREE, "--axes", "x", "rx", "--save", str(profile)]
+    assert main([*words, "--plot", str(fit), "--zwidth", str(width)]) == 0
+    told = capsys.readouterr().out
+    assert "resolution 20 µm" in told
+    assert "the largest safe stiffness is 29" in told  # 2 b / T at the lower end of b
+    assert fit.read_bytes().startswith(b"\x89PNG") and "<svg" in width.read_text(encoding="utf-8")
+    found = read_profile(profile)
+    damping = found.quantities["damping"]
+    assert damping.value == pytest.approx(1.5, rel=0.01)
+    assert damping.interval is not None and damping.interval[0] < 1.5 < damping.interval[1]
+    assert found.quantities["rotational_damping"].value == pytest.approx(2e-3, rel=0.01)
+
+
+def test_as_json_it_tells_the_same(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["identify", FREE, "--axes", "y", "--duration", "5", "--json"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert facts["axes"]["y"]["damping"]["value"] == pytest.approx(1.5, rel=0.02)
+    assert facts["largest_stiffness"] == pytest.approx(3000, rel=0.03)
+    assert facts["profile"] is None
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["simulated"], "were not commanded: let go of it"),
+        ([FREE, "--axes", "q"], "--axes q: the device has 'rx', 'ry', 'rz', 'x', 'y', 'z'"),
+        ([FREE, "--travel", "nan"], "--travel is nan m; it must be 0.0001 to 1"),
+        ([FREE, "--duration", "0.5"], "--duration is 0.5 s; it must be 2 to 600"),
+        ([FREE, "--force-share", "1.5"], "--force-share is 1.5; it must be 0.001 to 1"),
+        ([FREE, "--plot", "fit.txt"], "does not end like a picture"),
+        (["no-such-device"], "unknown device 'no-such-device'"),
+    ],
+)
+def test_bad_input_gets_one_sentence(
+    words: list[str], told: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["identify", *words]) == 2
+    error = capsys.readouterr().err
+    assert told in error and "Traceback" not in error

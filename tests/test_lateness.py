@@ -1,0 +1,116 @@
+"""What a device's own rate and delay do to its condition, its default coupling, and its verdict."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hapticbridge.bridge import Bridge
+from hapticbridge.certificate import (
+    NEEDED_SHARE,
+    default_coupling,
+    device_conditions,
+    is_certified,
+)
+from hapticbridge.clock import SimulatedClock
+from hapticbridge.coupling import Coupling
+from hapticbridge.device import DeviceInfo, SimulatedDevice
+from hapticbridge.device.lateness import damping_for_delay, delay_ticks, felt_period
+from hapticbridge.errors import DeviceError
+from hapticbridge.rendering import default_method
+
+T = 1e-3
+SPRING = Coupling(stiffness=1000.0, damping=0.0, rotational_stiffness=2.0, rotational_damping=0.0)
+
+
+def info(**changes: Any) -> DeviceInfo:
+    real = {"axes": ("x", "y", "z"), "is_real": True, "rate": 1000.0, "delay": 0.0}
+    return dataclasses.replace(SimulatedDevice(damping=2.0).info, **{**real, **changes})
+
+
+@pytest.mark.parametrize(
+    ("delay", "ticks"), [(0.0, 0), (1e-6, 1), (1e-3, 1), (1.23e-3, 2), (2e-3, 2), (None, None)]
+)
+def test_a_delay_counts_in_whole_ticks_upwards(delay: float | None, ticks: int | None) -> None:
+    assert delay_ticks(info(delay=delay), T) == ticks
+
+
+def test_a_device_slower_than_the_loop_is_judged_by_its_own_period() -> None:
+    assert felt_period(info(rate=500.0), T) == 2e-3
+    assert felt_period(info(rate=4000.0), T) == T
+    assert felt_period(info(rate=None), T) == T
+    assert felt_period(info(rate=500.0, is_prescribed=True), T) == T
+    (slow,) = device_conditions(info(rate=500.0), SPRING, T, 1.0, 1.0)
+    assert slow.needed == pytest.approx(SPRING.stiffness * 2e-3 / 2)
+
+
+@pytest.mark.parametrize("ticks", [1, 2, 5])
+def test_a_spring_behind_a_delay_needs_half_a_period_and_the_delay(ticks: int) -> None:
+    late = info(delay=ticks * T)
+    (condition,) = device_conditions(late, SPRING, T, 1.0, 1.0)
+    # Colgate & Schenkel: b > K (T/2 + d T) against a wall
+    assert condition.needed == pytest.approx(SPRING.stiffness * T * (0.5 + ticks), rel=1e-6)
+
+
+def test_a_damper_behind_a_delay_needs_no_less_than_without() -> None:
+    for damping in (0.01, 0.3, 3.0):
+        coupling = dataclasses.replace(SPRING, damping=damping)
+        assert damping_for_delay(info(delay=2e-3), coupling, T) >= 0.0
+        (condition,) = device_conditions(info(delay=2e-3), coupling, T, 1.0, 1.0)
+        # the condition at a frequency of its own, written out: any frequency gives a lower bound
+        theta = np.linspace(1e-3, np.pi, 2000)
+        wall = SPRING.stiffness * T / 2 * np.sin(2.5 * theta) / np.sin(theta / 2)
+        wall -= damping * np.cos(3 * theta)
+        assert condition.needed >= wall.max() - 1e-9
+        assert condition.needed >= SPRING.stiffness * T / 2 + damping - 1e-9
+
+
+def test_no_delayed_device_is_certified_and_a_prompt_one_is() -> None:
+    soft = dataclasses.replace(SPRING, stiffness=100.0)
+    prompt, late, unknown = (
+        device_conditions(info(delay=delay), soft, T, 1.0, 1.0) for delay in (0.0, 2e-3, None)
+    )
+    assert is_certified(prompt) is True
+    assert is_certified(late) is None
+    assert is_certified(unknown) is None
+    assert "for a wall behind a delay of 2 ticks: no bound holds for any scene" in (
+        late[0].sentence()
+    )
+    assert "without delay, which is unknown" in unknown[0].sentence()
+    stiff = device_conditions(info(delay=2e-3), SPRING, T, 1.0, 1.0)
+    assert is_certified(stiff) is False
+
+
+@pytest.mark.parametrize("delay", [0.0, 1e-3, 1.23e-3])
+@pytest.mark.parametrize("laws", [1, 4])
+def test_the_default_coupling_meets_the_condition_with_margin(delay: float, laws: int) -> None:
+    late = info(delay=delay)
+    felt = default_coupling(late, T, laws=laws)
+    coupling = default_method(laws).used(felt, T / laws)
+    (condition,) = device_conditions(late, coupling, T, 1.0, 1.0, laws)
+    assert condition.needed <= NEEDED_SHARE * 2.0 * (1 + 1e-9)
+    assert condition.needed > 0.7 * 2.0
+
+
+def test_a_real_device_of_unknown_damping_is_taken_for_one_of_a_tenth() -> None:
+    unknown = default_coupling(info(damping=None), T)
+    simulated = default_coupling(info(damping=None, is_real=False), T)
+    assert unknown.stiffness == pytest.approx(0.1 * simulated.stiffness)
+    assert unknown == default_coupling(info(damping=0.2), T)
+    # nobody turns a device without such axes: its tool may be held as firmly as any
+    assert unknown.rotational_stiffness == simulated.rotational_stiffness
+    turning = info(damping=None, axes=("x", "rx"), rotational_damping=None)
+    assert default_coupling(turning, T).rotational_stiffness == pytest.approx(
+        0.1 * simulated.rotational_stiffness
+    )
+
+
+def test_a_real_device_refuses_simulated_time() -> None:
+    device = SimulatedDevice()
+    Bridge("point_mass", device, clock=SimulatedClock())
+    device.info = dataclasses.replace(device.info, is_real=True)
+    with pytest.raises(DeviceError, match=r"moves in real time.*--fast"):
+        Bridge("point_mass", device, clock=SimulatedClock())

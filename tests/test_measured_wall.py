@@ -1,0 +1,92 @@
+"""The stiffest wall found by trying, against the one that theory predicts."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from hapticbridge.clock import SimulatedClock
+from hapticbridge.device import SimulatedDevice
+from hapticbridge.identify.wall import MeasuredLimit, measure_limit, try_wall
+from hapticbridge.passivity import WorstHand, free_device_stiffness
+
+PERIOD = 1e-3
+
+
+def limit_of(device: SimulatedDevice, damping: float, force: float = 5.0) -> MeasuredLimit:
+    device.start(PERIOD)
+    clock = SimulatedClock()
+    clock.start(round(PERIOD * 1e9))
+    return measure_limit(
+        device,
+        clock,
+        damping=damping,
+        period=PERIOD,
+        force=force,
+        first_stiffness=200.0,
+        most_stiffness=1e6,
+    )
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_a_free_device_bears_what_its_closed_loop_predicts(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    mass = float(np.exp(rng.uniform(np.log(0.05), np.log(1.0))))
+    damping = float(np.exp(rng.uniform(np.log(0.3), np.log(4.0))))
+    delay = int(rng.integers(0, 3))
+    coupling = float(rng.uniform(0.0, 0.5)) * damping
+    device = SimulatedDevice(mass=mass, damping=damping, hand=None, delay=delay, resolution=1e-7)
+    predicted = free_device_stiffness(damping, PERIOD, mass, coupling, delay=delay)
+    assert limit_of(device, coupling).stiffness == pytest.approx(float(predicted), rel=0.03)
+
+
+@pytest.mark.parametrize("coupling", [0.0, 0.5, 1.2])
+def test_in_the_worst_hand_it_bears_the_bound_of_colgate_and_schenkel(coupling: float) -> None:
+    """At Nyquist the hand is the device's damper alone: K = 2 (b − B)/T."""
+    device = SimulatedDevice(damping=2.0, hand=WorstHand(2.0, np.pi / PERIOD, PERIOD))
+    bound = 2.0 * (2.0 - coupling) / PERIOD
+    assert limit_of(device, coupling).stiffness == pytest.approx(bound, rel=0.05)
+
+
+def test_a_wall_just_below_the_limit_dies_down_and_one_just_above_grows() -> None:
+    device = SimulatedDevice(hand=None)
+    found = limit_of(device, 0.5)
+    assert found.not_borne is not None and found.not_borne < 1.03 * found.borne
+    assert all(trial.is_borne == (trial.growth < 1.0) for trial in found.trials)
+    assert min(t.stiffness for t in found.trials if not t.is_borne) == found.not_borne
+
+
+def test_a_wall_far_too_stiff_stays_within_the_force_and_ends_without() -> None:
+    device = SimulatedDevice(hand=None)
+    device.start(PERIOD)
+    clock = SimulatedClock()
+    clock.start(round(PERIOD * 1e9))
+    trial = try_wall(device, clock, 1e5, 0.0, period=PERIOD, force=3.0)
+    assert not trial.is_borne
+    assert trial.peak <= 3.0
+    assert trial.energy > 0.0  # the wall fed the device, which is what makes it grow
+    assert (device.stepper[0]["written"][0] == 0.0).all()
+
+
+def test_a_damper_too_strong_for_the_device_is_borne_at_no_stiffness() -> None:
+    """Without a wall a free device bears B < m/T · (something near 2): far above, nothing."""
+    device = SimulatedDevice(mass=0.05, damping=0.5, hand=None)
+    found = limit_of(device, 200.0)
+    assert found.borne == 0.0
+
+
+def test_what_bears_everything_says_so() -> None:
+    device = SimulatedDevice(hand=None, damping=50.0)
+    device.start(PERIOD)
+    clock = SimulatedClock()
+    clock.start(round(PERIOD * 1e9))
+    found = measure_limit(
+        device,
+        clock,
+        damping=0.0,
+        period=PERIOD,
+        force=5.0,
+        first_stiffness=200.0,
+        most_stiffness=1000.0,
+    )
+    assert (found.borne, found.not_borne, found.stiffness) == (1000.0, None, 1000.0)

@@ -1,0 +1,81 @@
+"""Drivers, libraries and kernel on emulated devices: tiers B and C, where this machine can."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from emulated.guest import NO_KERNEL, kernel, run_in_guest
+from emulated.tiers import JOBS, Claim, Job, claims_of, main
+
+
+@pytest.mark.parametrize("job", JOBS, ids=lambda job: job.name)
+def test_what_a_tier_claims_holds(job: Job, tmp_path: Path) -> None:
+    if (reason := job.missing()) is not None:
+        pytest.skip(reason)
+    claims = job.run(tmp_path)
+    failed = [f"{claim.name}: {claim.note}" for claim in claims if not claim.is_true]
+    assert not failed, "\n".join(failed)
+    assert claims
+
+
+def test_a_kernel_that_is_named_goes_before_the_cached_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    cached, named = tmp_path / "hapticbridge/uml/linux", tmp_path / "named"
+    for place in (cached, named):
+        place.parent.mkdir(parents=True, exist_ok=True)
+        place.write_text("")
+        place.chmod(0o755)
+    monkeypatch.setenv("HAPTICBRIDGE_UML", str(named))
+    assert kernel() == named
+    monkeypatch.delenv("HAPTICBRIDGE_UML")
+    assert kernel() == cached
+    cached.chmod(0o644)
+    assert kernel() != cached
+
+
+def test_a_job_that_cannot_run_is_skipped_with_the_reason_and_a_false_claim_fails_the_run(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    skipped = Job("C: skipped", lambda: NO_KERNEL, lambda _: [Claim("never", is_true=False)])
+    good = Job("B: good", lambda: None, lambda _: [Claim("true", is_true=True, note="5 trips/s")])
+    bad = Job("B: bad", lambda: None, lambda _: [Claim("false", is_true=False, note="why")])
+    monkeypatch.setattr("emulated.tiers.JOBS", (skipped, good))
+    assert main() == 0
+    said = capsys.readouterr().out
+    assert f"skipped  C: skipped: {NO_KERNEL}" in said
+    assert "ok   true: 5 trips/s" in said
+    monkeypatch.setattr("emulated.tiers.JOBS", (skipped, good, bad))
+    assert main() == 1
+    assert "FAIL false: why" in capsys.readouterr().out
+
+
+def test_a_report_is_read_claim_by_claim_and_a_missing_one_is_a_failure(tmp_path: Path) -> None:
+    report = tmp_path / "report.xml"
+    (nothing,) = claims_of(report, "the guest's last words")
+    assert (nothing.is_true, nothing.note) == (False, "the guest's last words")
+    report.write_text(
+        "<testsuites><testsuite>"
+        '<testcase name="test_it_holds"><properties><property name="trips/s" value="9"/>'
+        '</properties></testcase><testcase name="test_it_fails"><failure>why</failure></testcase>'
+        '<testcase name="test_it_breaks"><error>how</error></testcase>'
+        "</testsuite></testsuites>"
+    )
+    assert claims_of(report, "") == [
+        Claim("it holds", is_true=True, note="9 trips/s"),
+        Claim("it fails", is_true=False, note="why"),
+        Claim("it breaks", is_true=False, note="how"),
+    ]
+
+
+@pytest.mark.skipif(kernel() is None, reason=NO_KERNEL)
+def test_a_guest_says_how_its_command_ended_and_one_that_hangs_is_stopped(tmp_path: Path) -> None:
+    command = ["sh", "-c", 'echo "$WHAT"; test -e /dev/uhid && exit 7']
+    ended = run_in_guest(command, tmp_path, environment={"WHAT": "it's here"}, is_virtual=True)
+    assert (ended.status, ended.output) == (7, "it's here\n")
+    endless = ["sh", "-c", "echo begun; while :; do :; done"]
+    stopped = run_in_guest(endless, tmp_path, environment={}, is_virtual=True, timeout=3.0)
+    assert stopped.status is None
+    assert stopped.output == "begun\nthe guest was stopped after 3 s"

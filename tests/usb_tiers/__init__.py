@@ -1,0 +1,1 @@
+"""Checks that run inside tiers B and C, started by ``emulated.tiers``."""

@@ -1,0 +1,55 @@
+"""The emulated devices that the checks plug in, each with mechanics and a hand behind it."""
+
+from __future__ import annotations
+
+from emulated.falcon_model import FalconModel
+from emulated.handle import Handle
+from emulated.rawhid_model import Claims, RawHid
+
+from hapticbridge.device import SimulatedDevice
+from hapticbridge.scene import load_scene
+
+MASS, DAMPING, FRICTION = 0.5, 5.0, 0.3
+"""kg, N s/m, N per axis: of a Falcon's order; nobody has measured one."""
+
+RESOLUTION = 50e-6
+"""m: about a Falcon's encoder step in the middle of its workspace."""
+
+FALCON = f"falcon:mass={MASS},damping={DAMPING},friction={FRICTION}"
+"""The Falcon does not know its own mechanics; whoever opens it says them."""
+
+PROGRAM = bytes(range(256)) * 31
+"""Stands for the maker's program: about its size, and every byte value in it."""
+
+
+def mechanics() -> SimulatedDevice:
+    """Returns a handle in a hand that pushes the peg into its hole."""
+    path = load_scene("peg_in_hole").path.with_suffix(".csv")
+    return SimulatedDevice(mass=MASS, damping=DAMPING, friction=FRICTION, path=path)
+
+
+def falcon() -> FalconModel:
+    """Returns a Falcon that runs its program and has found its zeros."""
+    return FalconModel(Handle(mechanics()))
+
+
+def free_falcon() -> FalconModel:
+    """Returns a Falcon that nobody holds, without friction."""
+    return FalconModel(Handle(SimulatedDevice(mass=MASS, damping=DAMPING, hand=None)))
+
+
+def unloaded_falcon() -> FalconModel:
+    """Returns a Falcon that has just got power: only its loader runs."""
+    return FalconModel(Handle(mechanics()), program=None, valid=PROGRAM)
+
+
+def rawhid(serial: str = "R1") -> RawHid:
+    """Returns a home-made device."""
+    claims = Claims(mass=MASS, damping=DAMPING, friction=FRICTION, resolution=RESOLUTION)
+    return RawHid(mechanics(), claims, serial=serial)
+
+
+def free_rawhid(serial: str = "R1") -> RawHid:
+    """Returns a home-made device that nobody holds, without friction."""
+    claims = Claims(mass=MASS, damping=DAMPING)
+    return RawHid(SimulatedDevice(mass=MASS, damping=DAMPING, hand=None), claims, serial=serial)

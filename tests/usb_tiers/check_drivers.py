@@ -1,0 +1,215 @@
+"""The real drivers on emulated devices, through real libraries and, in Linux, a real kernel."""
+
+from __future__ import annotations
+
+import math
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from emulated.emulator_process import EmulatorProcess
+from emulated.falcon_model import Faults
+from emulated.spacemouse_model import SpaceMouse
+from numpy.typing import NDArray
+
+import hapticbridge as hb
+from hapticbridge.device import Device
+from hapticbridge.device.families import plugged_devices
+from hapticbridge.errors import DeviceError, DeviceLost, SafetyTrip
+from hapticbridge.tick import SAMPLE_DTYPE
+from usb_tiers.benches import (
+    DAMPING,
+    FALCON,
+    MASS,
+    PROGRAM,
+    falcon,
+    free_falcon,
+    free_rawhid,
+    rawhid,
+    unloaded_falcon,
+)
+from usb_tiers.conftest import IS_TIME_VIRTUAL, Plug
+from usb_tiers.waiting import wait_for
+
+PERIOD = 1e-3
+
+
+def _opened(specification: str, count: int = 1) -> Device:
+    wait_for(lambda: len(plugged_devices()) >= count)
+    device = hb.open_device(specification)
+    device.start(PERIOD)
+    return device
+
+
+def _held(device: Device, seconds: float, force: tuple[float, float, float]) -> NDArray[np.float64]:
+    """Holds a force for a time at the loop's rate; returns the last position."""
+    sample, wrench = np.zeros(1, SAMPLE_DTYPE), np.array([*force, 0.0, 0.0, 0.0])
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        device.read(sample)
+        device.write(wrench)
+        time.sleep(PERIOD)
+    device.read(sample)
+    return np.array(sample["position"][0])
+
+
+def _require_pushed(moved: NDArray[np.float64], seconds: float, force: float) -> None:
+    """Asserts that mass and damping were moved by a constant force along x, and only there."""
+    rate = DAMPING / MASS
+    expected = force / DAMPING * (seconds - (1.0 - math.exp(-rate * seconds)) / rate)
+    if IS_TIME_VIRTUAL:
+        # steps of encoders and motors, and some ms on the way
+        assert moved[0] == pytest.approx(expected, rel=0.1)
+    else:
+        # a busy machine stalls the loop, and the device's watchdog then takes the force away
+        assert 0.1 * expected < moved[0]
+    assert np.abs(moved[1:]).max() < 0.3e-3
+
+
+def _refuses_to_go_on(device: Device) -> str:
+    """Runs until the device is lost; returns what it says."""
+    with pytest.raises(DeviceLost) as lost:
+        _held(device, 5.0, (0.0, 0.0, 0.0))
+    device.close()
+    return str(lost.value)
+
+
+def test_a_written_force_moves_a_falcon_as_its_mass_and_damping_say(plug_usb: Plug) -> None:
+    plug_usb(free_falcon)
+    device = _opened("falcon")
+    start = _held(device, 0.01, (0.0, 0.0, 0.0))
+    moved = _held(device, 0.2, (0.5, 0.0, 0.0)) - start
+    device.close()
+    _require_pushed(moved, 0.2, 0.5)
+
+
+def test_a_written_force_moves_a_home_made_device_likewise(plug_hid: Plug) -> None:
+    plug_hid(free_rawhid)
+    device = _opened("rawhid")
+    start = _held(device, 0.01, (0.0, 0.0, 0.0))
+    moved = _held(device, 0.2, (0.5, 0.0, 0.0)) - start
+    device.close()
+    _require_pushed(moved, 0.2, 0.5)
+
+
+def test_a_falcon_takes_its_program_and_then_speaks(plug_usb: Plug, tmp_path: Path) -> None:
+    model = plug_usb(unloaded_falcon)
+    file = tmp_path / "program.bin"
+    file.write_bytes(PROGRAM)
+    with pytest.raises(DeviceError, match="firmware"):
+        _opened("falcon")
+    device = _opened(f"falcon:firmware={file}")
+    device.close()
+    assert model.get("uploaded") == PROGRAM
+
+
+def test_a_falcon_with_the_wrong_program_is_refused(plug_usb: Plug, tmp_path: Path) -> None:
+    plug_usb(unloaded_falcon)
+    file = tmp_path / "wrong.bin"
+    file.write_bytes(PROGRAM[::-1])
+    with pytest.raises(DeviceError, match="no firmware for it"):
+        _opened(f"falcon:firmware={file}")
+
+
+def test_garbage_between_a_falcons_packets_changes_no_pose(plug_usb: Plug) -> None:
+    model = plug_usb(free_falcon)
+    device = _opened("falcon")
+    clean = _held(device, 0.02, (0.0, 0.0, 0.0))
+    model.set("faults", Faults(noise=b"\x00<AAAAAA>\xff<<"))
+    noisy = _held(device, 0.1, (0.0, 0.0, 0.0))
+    device.close()
+    assert noisy.tolist() == clean.tolist()
+
+
+def test_damaged_frames_of_a_home_made_device_change_no_pose(plug_hid: Plug) -> None:
+    model = plug_hid(free_rawhid)
+    device = _opened("rawhid")
+    frames = model.get("frames")
+    model.set("damage", set(range(frames, frames + 10_000, 2)))
+    moved = _held(device, 0.1, (0.0, 0.0, 0.0))
+    assert moved.tolist() == [0.0, 0.0, 0.0]
+    assert device.states.damaged > 10  # type: ignore[attr-defined]
+    device.close()
+
+
+def test_a_stalled_endpoint_ends_a_run_in_words(plug_usb: Plug) -> None:
+    model = plug_usb(falcon)
+    device = _opened("falcon")
+    model.set("halted", {0x81})
+    assert "halted" in _refuses_to_go_on(device)
+
+
+def test_two_home_made_devices_at_once_are_told_apart(plug_hid: Plug) -> None:
+    for serial in ("left", "right"):
+        plug_hid(lambda serial=serial: free_rawhid(serial))  # type: ignore[misc]
+    wait_for(lambda: len(plugged_devices()) == 2)
+    with pytest.raises(DeviceError, match=r"left.*right|right.*left"):
+        hb.open_device("rawhid")
+    left, right = (_opened(f"rawhid:serial={serial}", 2) for serial in ("left", "right"))
+    still = _held(right, 0.01, (0.0, 0.0, 0.0))
+    assert _held(left, 0.1, (0.5, 0.0, 0.0))[0] > 1e-3
+    assert _held(right, 0.01, (0.0, 0.0, 0.0)).tolist() == still.tolist()
+    left.close()
+    right.close()
+
+
+@pytest.mark.parametrize("has_long_reports", [False, True], ids=["short", "long"])
+def test_a_deflected_spacemouse_moves_the_handle(plug_hid: Plug, has_long_reports: bool) -> None:
+    plug_hid(lambda: SpaceMouse(_deflected, has_long_reports=has_long_reports))
+    device = _opened("spacemouse")
+    moved = _held(device, 0.3, (0.0, 0.0, 0.0))
+    device.close()
+    assert moved[0] > 1e-3
+    assert np.abs(moved[1:]).max() < 0.1 * moved[0]
+
+
+def _deflected(now: float) -> tuple[float, ...]:
+    """Half way to the right, and no more."""
+    return (0.5, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+def _pulled_out_of_a_run(model: EmulatorProcess, specification: str, file: Path) -> None:
+    """Pulls a device out half a second after its run's start; no row may be lost before that."""
+    wait_for(plugged_devices)
+    times: list[float] = []
+
+    def on_tick(tick: int) -> None:
+        times.append(time.monotonic())
+        if tick == 0:
+            model.unplug(after=0.5)
+
+    with (
+        pytest.raises(SafetyTrip, match="gone"),
+        hb.Bridge("peg_in_hole", specification, recording=file) as bridge,
+    ):
+        bridge.run(5.0, on_tick)
+    recording = hb.read_recording(file)
+    ticks = recording.ticks["tick"]
+    assert ticks.tolist() == list(range(len(ticks)))
+    # the tick in which the device was found to be gone may have its row or not
+    assert len(times) - len(ticks) in (0, 1)
+    assert any(event["event"] == "trip" for event in recording.events)
+    if IS_TIME_VIRTUAL:
+        # times are those of the ticks' beginnings, one period before the next
+        assert 0.5 - PERIOD <= times[-1] - times[0] <= 0.502
+
+
+def test_a_falcon_pulled_out_of_a_run_loses_no_row_and_can_come_back(
+    plug_usb: Plug, tmp_path: Path, no_spin: None
+) -> None:
+    _pulled_out_of_a_run(plug_usb(falcon), FALCON, tmp_path / "run.mcap")
+    wait_for(lambda: not plugged_devices())
+    plug_usb(falcon)
+    again = _opened("falcon")
+    again.close()
+
+
+def test_a_home_made_device_pulled_out_of_a_run_loses_no_row_and_can_come_back(
+    plug_hid: Plug, tmp_path: Path, no_spin: None
+) -> None:
+    _pulled_out_of_a_run(plug_hid(rawhid), "rawhid", tmp_path / "run.mcap")
+    wait_for(lambda: not plugged_devices())
+    plug_hid(rawhid)
+    again = _opened("rawhid")
+    again.close()

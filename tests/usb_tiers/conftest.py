@@ -1,0 +1,66 @@
+"""What plugs emulated devices into the tier that these checks run in.
+
+``HAPTICBRIDGE_TIER`` says where: ``umock`` (under umockdev's preload library) or ``uml`` (inside a
+User-Mode Linux); ``HAPTICBRIDGE_TIME`` may say ``virtual``. The checks are started there by
+``emulated.tiers``, not by the project's pytest.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import pytest
+from emulated.emulator_process import EmulatorProcess
+from emulated.front_end import FrontEnd
+from emulated.uhid import Uhid
+from emulated.umock import Umock
+from emulated.usb_device import UsbDevice
+from emulated.usbip import Usbip
+
+from usb_tiers.waiting import wait_for
+
+TIER = os.environ["HAPTICBRIDGE_TIER"]
+_FRONT_ENDS: dict[str, dict[str, Callable[[Any], FrontEnd]]] = {
+    "umock": {"umock": Umock},
+    "uml": {"usbip": Usbip, "uhid": Uhid},
+}
+
+IS_TIME_VIRTUAL = os.environ.get("HAPTICBRIDGE_TIME") == "virtual"
+"""Whether time passes only while everything waits; then times can be asserted."""
+
+Plug = Callable[[Callable[[], UsbDevice]], EmulatorProcess]
+
+
+def _plugging(front_end: Callable[[Any], FrontEnd]) -> Iterator[Plug]:
+    before = _present()
+    with ExitStack() as plugged:
+        yield lambda make: plugged.enter_context(EmulatorProcess(make, front_end))
+    # a kernel takes devices away in its own time; the next check must not find this one's
+    wait_for(lambda: _present() == before)
+
+
+def _present() -> set[Path]:
+    folders = (Path("/sys/bus/usb/devices"), Path("/sys/class/hidraw"))
+    return {entry for folder in folders if folder.is_dir() for entry in folder.iterdir()}
+
+
+@pytest.fixture
+def plug_usb() -> Iterator[Plug]:
+    """Plugs in a device that is more than HID."""
+    yield from _plugging(Umock if TIER == "umock" else Usbip)
+
+
+@pytest.fixture(params=_FRONT_ENDS[TIER])
+def plug_hid(request: pytest.FixtureRequest) -> Iterator[Plug]:
+    """Plugs in a HID device, in each way that the tier has."""
+    yield from _plugging(_FRONT_ENDS[TIER][request.param])
+
+
+@pytest.fixture
+def no_spin(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Lets the loop's clock sleep to its deadline; in virtual time a spin would hardly end."""
+    monkeypatch.setattr("hapticbridge.clock.SPIN_NS", 0)
