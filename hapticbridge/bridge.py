@@ -31,13 +31,14 @@ from hapticbridge.guard import (
 )
 from hapticbridge.inputs import Write, apply_writes, input_writes
 from hapticbridge.jit import direct
-from hapticbridge.kernel.after import answer_step, close_tick
+from hapticbridge.kernel.after import answer_step
 from hapticbridge.kernel.ahead import can_split
+from hapticbridge.kernel.codes import BAD_RESULT, BAD_SAMPLE, HALF_DONE, OK, RING_FULL
 from hapticbridge.kernel.layout import STATE_DTYPE
 from hapticbridge.kernel.parameters import checked_substeps
-from hapticbridge.kernel.publish import publish
+from hapticbridge.kernel.publish import finish_tick, publish
 from hapticbridge.kernel.state import Binding
-from hapticbridge.kernel.step import BAD_SAMPLE, HALF_DONE, OK, before_step
+from hapticbridge.kernel.step import before_step
 from hapticbridge.ledger import Ledger
 from hapticbridge.provenance import attachments, describe_run
 from hapticbridge.realtime import (
@@ -94,8 +95,9 @@ class Bridge:
         limits: Limits on the wrench, within the device's own; None takes these.
         live: Draw a status line on stderr, from the recorder's process.
         pipelined: Compute what needs no new sample once the wrench is out, where scene and method
-            let it (``kernel.ahead``): the same numbers to the bit, the wrench sooner. Between two
-            ticks ``scene.data`` then holds the contacts of the new positions, without forces.
+            let it (``kernel.ahead``): the same numbers to the bit, the wrench sooner, the whole
+            tick 5 % longer. Between two ticks ``scene.data`` then holds the contacts of the new
+            positions, without forces. None: in real time, where a device waits.
         realtime: Ask the system for real time while the loop runs (``realtime.real_time``); what it
             refuses is warned of once, with the command that grants it. None: for a real device.
 
@@ -122,7 +124,7 @@ class Bridge:
         absolute: bool = False,
         limits: Limits | None = None,
         live: bool = False,
-        pipelined: bool = True,
+        pipelined: bool | None = None,
         realtime: bool | None = None,
     ) -> None:
         self.scene = scene if isinstance(scene, Scene) else load_scene(scene)
@@ -145,8 +147,8 @@ class Bridge:
         self._contact_stiffness = contact_stiffness
         self._path = Path(recording) if recording is not None else None
         self._is_live = live
-        self._is_pipelined = pipelined
         self.clock = clock or RealClock()
+        self._is_pipelined = self.clock.name == RealClock.name if pipelined is None else pipelined
         refuse_simulated_time(self.device.info, self.clock)
         self._is_realtime = wants_real_time(realtime, self.clock, is_real=self.device.info.is_real)
         self._grants: tuple[Grant, ...] = ()
@@ -225,7 +227,7 @@ class Bridge:
         model, data, substeps = self.scene.model, self.scene.data, range(self._substeps)
         stream, records, cursors = self._stream, self._stream.rows, self._stream.cursors
         sample, wrench = self._sample, state["wrench_on_device"][0]
-        before, answer, close = self._before_step, self._answer_step, self._close_tick
+        before, answer, finish = self._before_step, self._answer_step, self._finish_tick
         read_device, write_device = self.device.read, self.device.write
         wait, now, hand_over = self.clock.wait, self.clock.now, self._publish
         inputs, read = self._inputs, 0
@@ -257,15 +259,16 @@ class Bridge:
             write = now()
             if is_ahead:
                 first_half(model, data)
-            code = close(state, row, is_ahead)
-            if code != OK:
-                return trip_reason(code, self._tick)
             flags = news | stream.lost | (self._overrun(skipped) if skipped else 0)
-            while not hand_over(row, records, cursors, deadline, wake, read, write, flags):
-                if not stream.makes_room(may_wait=not self._stopped_by):
-                    break
-            else:
-                stream.lost = 0
+            stream.lost = 0
+            code = finish(
+                state, row, records, cursors, deadline, wake, read, write, flags, is_ahead
+            )
+            if code == BAD_RESULT:
+                return trip_reason(code, self._tick)
+            while code == RING_FULL and stream.makes_room(may_wait=not self._stopped_by):
+                is_taken = hand_over(row, records, cursors, deadline, wake, read, write, flags)
+                code = OK if is_taken else RING_FULL
             self._tick += 1
         return ""
 
@@ -420,8 +423,8 @@ class Bridge:
         rows, cursors = self._stream.rows, self._stream.cursors
         self._before_step = direct(before_step, state, sample, row, 0, 0.0)
         self._answer_step = direct(answer_step, state, row, 0)
-        self._close_tick = direct(close_tick, state, row, True)
         self._publish = direct(publish, row, rows, cursors, 0, 0, 0, 0, 0)
+        self._finish_tick = direct(finish_tick, state, row, rows, cursors, 0, 0, 0, 0, 0, True)
 
     def _last_tick(self, duration: float | None) -> int:
         if duration is None:

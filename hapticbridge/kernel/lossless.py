@@ -108,7 +108,8 @@ def _enter(state: NDArray[np.void], force: Vector, torque: Vector) -> None:
     u = v − (T/2) M⁻¹ [Jᵀf − c(q, u) + p] stands on both sides; two passes leave O(T³).
     """
     s = state[0]
-    mj_factor_m(s.model, s.data)
+    if not s.has_positions:
+        mj_factor_m(s.model, s.data)
     carry(state, scaled(0.5, force), scaled(0.5, torque))
     u, v, half = floats(s.qvel, s.nv), floats(s.velocity, s.nv), floats(s.half_step, s.nv)
     for i in range(s.nv):
@@ -137,7 +138,8 @@ def finish_lossless(state: NDArray[np.void]) -> None:
     s = state[0]
     force, torque = vector_of(s.wrench_on_tool), vector_of(s.wrench_on_tool[3:6])
     if s.was_midpoint:
-        mj_factor_m(s.model, s.data)
+        if not s.has_positions:
+            mj_factor_m(s.model, s.data)
         rest = subtract(force, vector_of(s.applied_half))
         carry(state, rest, subtract(torque, vector_of(s.applied_half[3:6])))
         settle(state, s.law_work)

@@ -158,7 +158,7 @@ def _memory(restore: ExitStack) -> Grant:
         name,
         False,
         f"memory could not be locked ({reason}; the limit 'ulimit -l' is "
-        f"{shown_limit(limit, 1024)}): a page that the system took away makes a tick late",
+        f"{shown_limit(limit, 1024)} kB): a page that the system took away makes a tick late",
         way_to_grant(),
     )
 
@@ -197,7 +197,7 @@ def _core(restore: ExitStack, core: int | None) -> Grant:
 def _isolated_cores() -> set[int]:
     """Returns the cores that the kernel gives no work of its own (``isolcpus``)."""
     try:
-        text = ISOLATED.read_text(encoding="ascii").strip()
+        text = ISOLATED.read_text(encoding="utf-8").strip()
     except OSError:
         return set()
     cores: set[int] = set()

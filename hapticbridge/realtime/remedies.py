@@ -25,7 +25,11 @@ CONTAINER = f"docker run --cap-add=SYS_NICE --cap-add=IPC_LOCK --ulimit rtprio={
 """For a container, whose administrator has no more rights than it was given."""
 
 
+def is_administrator() -> bool:
+    """Tells whether this process has the administrator's number, whatever that is worth here."""
+    return hasattr(os, "geteuid") and os.geteuid() == 0
+
+
 def way_to_grant() -> str:
     """Returns the shortest command for whoever runs this process."""
-    is_administrator = hasattr(os, "geteuid") and os.geteuid() == 0
-    return CONTAINER if is_administrator else SHELL
+    return CONTAINER if is_administrator() else SHELL
