@@ -35,7 +35,7 @@ from hapticbridge.kernel.after import answer_step
 from hapticbridge.kernel.ahead import can_split
 from hapticbridge.kernel.codes import BAD_RESULT, BAD_SAMPLE, HALF_DONE, OK, RING_FULL
 from hapticbridge.kernel.layout import STATE_DTYPE
-from hapticbridge.kernel.parameters import checked_substeps
+from hapticbridge.kernel.parameters import checked_substeps, refuse_substeps
 from hapticbridge.kernel.publish import finish_tick, publish
 from hapticbridge.kernel.state import Binding
 from hapticbridge.kernel.step import before_step
@@ -132,6 +132,7 @@ class Bridge:
         self.period = period_of(rate)
         self._substeps = checked_substeps(substeps)
         self.method = default_method(substeps) if method is None else method_named(method)
+        refuse_substeps(self.method.scheme, substeps)
         self._workspace = Workspace.of(scale, force_scale, axes, is_absolute=absolute)
         self.coupling = coupling or default_coupling(
             self.device.info,

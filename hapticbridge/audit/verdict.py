@@ -18,7 +18,7 @@ from hapticbridge.certificate import condition_sentences, is_run_certified, run_
 from hapticbridge.device import DeviceInfo
 from hapticbridge.device.lateness import delay_ticks
 from hapticbridge.errors import HapticBridgeError, RecordingError
-from hapticbridge.felt import coupling_sentences
+from hapticbridge.felt import coupling_sentences, was_always_held
 from hapticbridge.guard import Limits, limits_for
 from hapticbridge.jsonable import jsonable
 from hapticbridge.kernel.state import RunParameters
@@ -48,7 +48,8 @@ class AuditReport:
         ticks: Number of records.
         duration: Their number times the period, in s.
         conditions: The device condition per kind of axis, as sentences.
-        rendered: What was felt away from contact, and what was used, as sentences.
+        rendered: What was felt away from contact, or everywhere if the tool was never let go, and
+            what was used, as sentences.
         unchecked: What records alone do not tell and only the re-simulation confirms, or nothing;
             without a re-simulation such a recording is not called passive but invalid.
         energies: Energies at the end, in J.
@@ -117,7 +118,7 @@ def audit(path: str | Path, *, strict: bool = False) -> AuditReport:
         parameters = replace(
             parameters, device_damping=burning, device_rotational_damping=rotational
         )
-        facts |= _device_facts(info, parameters, method)
+        facts |= _device_facts(info, parameters, method, recording.ticks)
     except RecordingError as error:
         return _invalid(facts, Fault(str(error)))
     facts["duration"] = len(recording.ticks) * parameters.period
@@ -188,13 +189,19 @@ def _device_and_method(
     return info, method
 
 
-def _device_facts(info: DeviceInfo, parameters: RunParameters, method: Method) -> dict[str, Any]:
+def _device_facts(
+    info: DeviceInfo, parameters: RunParameters, method: Method, ticks: NDArray[np.void]
+) -> dict[str, Any]:
     try:
         return {
             "certified": is_run_certified(run_conditions(info, parameters, method), method),
             "conditions": condition_sentences(info, parameters, method),
             "rendered": coupling_sentences(
-                parameters.coupling, method, parameters.period, parameters.substeps
+                parameters.coupling,
+                method,
+                parameters.period,
+                parameters.substeps,
+                is_always_held=was_always_held(ticks),
             ),
         }
     except HapticBridgeError as error:  # numbers beyond what the theory computes with

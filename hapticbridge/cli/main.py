@@ -13,6 +13,7 @@ import mujoco
 import tyro
 from rich.markup import escape
 
+from hapticbridge.cli.bound import Bound
 from hapticbridge.cli.chart import ChartCommand
 from hapticbridge.cli.check import Check
 from hapticbridge.cli.devices import Devices
@@ -23,7 +24,7 @@ from hapticbridge.cli.run import Run
 from hapticbridge.cli.scenes import Scenes
 from hapticbridge.cli.stability import Stability
 from hapticbridge.cli.terminal import err, out, print_error
-from hapticbridge.cli.theory import Bound, Zwidth
+from hapticbridge.cli.zwidth import Zwidth
 from hapticbridge.errors import HapticBridgeError, SafetyTrip
 
 Command = (

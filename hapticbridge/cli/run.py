@@ -79,7 +79,7 @@ class Run:
     """Coupling stiffness K in N/m; by default the stiffest that is safe on the device."""
     damping: float | None = None
     """Coupling damping B in N s/m that is to be felt; of it 'lossless' uses B' = B - KT/2 and
-    'compensated' B - KT, 0 at least, and the device needs KT/2 + B'."""
+    'compensated' B - KT, 0 at least, and the device needs KT/2 + B'. The others use it as it is."""
     rotational_stiffness: float | None = None
     """Rotational coupling stiffness in N m/rad."""
     rotational_damping: float | None = None
