@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from emulated.hid_seam import HidSeam
+from emulated.dhd_stub import Stub
+from emulated.hid_seam import DrivingClock
 from emulated.rawhid_model import RawHid
 from falcon_cases import Bench
+from haply_cases import Bench as HaplyBench
 from rawhid_cases import opened
 
 from hapticbridge.clock import Clock
@@ -17,43 +19,36 @@ from hapticbridge.identify import AxisFit, identify
 PERIOD = 1e-3
 
 
-class SeamClock:
-    """A loop's clock that moves the device behind a seam."""
-
-    name = "virtual"
-    is_lossless = True
-
-    def __init__(self, seam: HidSeam) -> None:
-        self._seam = seam
-        self._period_ns = self._time = 0
-        self._next = 0.0
-
-    def start(self, period_ns: int) -> None:
-        self._period_ns, self._next = period_ns, self._seam.now
-
-    def wait(self) -> tuple[int, int, int]:
-        self._next += 1e-9 * self._period_ns
-        self._seam.advance(self._next)
-        self._time += self._period_ns
-        return self._time, self._time, 0
-
-    def now(self) -> int:
-        return self._time
+def _unheld(numbers: dict[str, float]) -> SimulatedDevice:
+    return SimulatedDevice(hand=None, **numbers)  # type: ignore[arg-type]
 
 
-def _falcon(mechanics: SimulatedDevice) -> tuple[Device, Clock]:
-    bench = Bench(mechanics)
+def _falcon(numbers: dict[str, float]) -> tuple[Device, Clock]:
+    bench = Bench(_unheld(numbers))
     return bench.opened(), bench.clock()
 
 
-def _rawhid(mechanics: SimulatedDevice) -> tuple[Device, Clock]:
-    device, _, seam = opened(RawHid(mechanics))
-    return device, SeamClock(seam)
+def _rawhid(numbers: dict[str, float]) -> tuple[Device, Clock]:
+    device, _, seam = opened(RawHid(_unheld(numbers)))
+    return device, DrivingClock(seam)
 
 
-DRIVERS: dict[str, Callable[[SimulatedDevice], tuple[Device, Clock]]] = {
+def _haply(numbers: dict[str, float]) -> tuple[Device, Clock]:
+    bench = HaplyBench(_unheld(numbers), resolution=1e-5)
+    return bench.opened(force_limit=8.0), DrivingClock(bench.time)
+
+
+def _forcedimension(numbers: dict[str, float]) -> tuple[Device, Clock]:
+    stub = Stub()
+    stub.call("mechanics", numbers["mass"], numbers["damping"], numbers["friction"], 1e-5)
+    return stub.opened(), DrivingClock(stub)
+
+
+DRIVERS: dict[str, Callable[[dict[str, float]], tuple[Device, Clock]]] = {
     "falcon": _falcon,
     "rawhid": _rawhid,
+    "haply": _haply,
+    "forcedimension": _forcedimension,
 }
 
 
@@ -69,7 +64,7 @@ def mechanics(seed: int) -> dict[str, float]:
 
 def identified(driver: str, seed: int, axis: str, duration: float = 10.0) -> AxisFit:
     """Returns what is measured of a random device that nobody holds."""
-    device, clock = DRIVERS[driver](SimulatedDevice(hand=None, **mechanics(seed)))  # type: ignore[arg-type]
+    device, clock = DRIVERS[driver](mechanics(seed))
     try:
         found = identify(device, clock, period=PERIOD, axes=(axis,), duration=duration)
     finally:

@@ -102,6 +102,7 @@ class Identify:
             serial=device.info.serial,
             date=date.today().isoformat(),
             duration=self.duration,
+            workspace=getattr(device, "workspace", None),
         )
         path = self._write(profile, is_real=device.info.is_real)
         if self.as_json:
