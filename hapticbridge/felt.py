@@ -35,7 +35,12 @@ def is_always_held(model: mujoco.MjModel, grip: str) -> bool:
 
 def was_always_held(ticks: NDArray[np.void]) -> bool:
     """Tells the same of a run, from its records: no tick was lossless. False without a record."""
-    return len(ticks) > 0 and not (ticks["flags"] & int(TickFlag.MIDPOINT)).any()
+    return was_never_lossless(len(ticks), int(np.bitwise_or.reduce(ticks["flags"])))
+
+
+def was_never_lossless(count: int, flags: int) -> bool:
+    """Tells it from how many records there are, and all flags that any of them has."""
+    return count > 0 and not flags & int(TickFlag.MIDPOINT)
 
 
 def coupling_sentences(
