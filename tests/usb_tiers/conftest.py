@@ -23,7 +23,7 @@ from emulated.usbip import Usbip
 
 from usb_tiers.waiting import wait_for
 
-TIER = os.environ["HAPTICBRIDGE_TIER"]
+TIER = os.environ.get("HAPTICBRIDGE_TIER", "")  # empty where pytest only passes by
 _FRONT_ENDS: dict[str, dict[str, Callable[[Any], FrontEnd]]] = {
     "umock": {"umock": Umock},
     "uml": {"usbip": Usbip, "uhid": Uhid},
