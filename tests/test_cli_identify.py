@@ -30,6 +30,17 @@ def test_it_prints_draws_and_saves_what_it_measured(
     assert found.quantities["rotational_damping"].value == pytest.approx(2e-3, rel=0.01)
 
 
+def test_a_profile_that_cannot_be_written_costs_no_measurement(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "file").write_text("", encoding="utf-8")
+    place = str(tmp_path / "file" / "p.toml")
+    assert main(["identify", FREE, "--axes", "x", "--duration", "5", "--save", place]) == 2
+    told = capsys.readouterr()
+    assert "resolution 20 µm" in told.out
+    assert "cannot write" in told.err and "Traceback" not in told.err
+
+
 def test_as_json_it_tells_the_same(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["identify", FREE, "--axes", "y", "--duration", "5", "--json"]) == 0
     facts = json.loads(capsys.readouterr().out)

@@ -106,13 +106,15 @@ class Identify:
             duration=self.duration,
             workspace=getattr(device, "workspace", None),
         )
-        path = self._write(profile, is_real=device.info.is_real)
+        path = self._place(profile, is_real=device.info.is_real)
+        # first, so that a file that cannot be written costs nothing that was measured
         if self.as_json:
             print_json(_facts(result, z, path))
         else:
             _print(result, z)
-            if path is not None:
-                out.print(f"wrote {plain(str(path))}")
+        if path is not None:
+            _write(profile, path)
+            tell(f"wrote {path}")
         for target, figure in (
             (self.plot, draw_identification(result) if self.plot else None),
             (self.zwidth, draw_z_width(z) if self.zwidth and z else None),
@@ -143,18 +145,19 @@ class Identify:
                 raise HapticBridgeError(f"--axes {axis}: the device has {choices(present)}")
         return tuple(axis for axis in AXES if axis in (self.axes or present))
 
-    def _write(self, profile: Profile, *, is_real: bool) -> Path | None:
-        path = self.save
-        if path is None:
-            if not is_real:
-                return None
-            path = own_folder() / f"{'-'.join(filter(None, (profile.device, profile.serial)))}.toml"
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_text(profile.to_toml(), encoding="utf-8")
-        except OSError as error:
-            raise HapticBridgeError(f"cannot write '{path}': {error.strerror}") from None
-        return path
+    def _place(self, profile: Profile, *, is_real: bool) -> Path | None:
+        """Returns where the profile goes; None where it is not kept."""
+        if self.save is not None or not is_real:
+            return self.save
+        return own_folder() / f"{'-'.join(filter(None, (profile.device, profile.serial)))}.toml"
+
+
+def _write(profile: Profile, path: Path) -> None:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(profile.to_toml(), encoding="utf-8")
+    except OSError as error:
+        raise HapticBridgeError(f"cannot write '{path}': {error.strerror}") from None
 
 
 def _z_width(result: Identification) -> ZWidth | None:
