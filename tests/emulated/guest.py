@@ -27,15 +27,18 @@ NO_KERNEL = "no User-Mode Linux kernel: scripts/build_uml builds one, or HAPTICB
 def kernel() -> Path | None:
     """Returns the guest's kernel, None where there is none.
 
-    Looked for in ``HAPTICBRIDGE_UML``, in the cache folder to which ``scripts/build_uml`` builds,
-    and in a folder shared between checkouts.
+    ``HAPTICBRIDGE_UML`` names it, or none by naming what is no program; else it is looked for in
+    the cache folder to which ``scripts/build_uml`` builds, and in a folder shared by checkouts.
     """
     named = os.environ.get("HAPTICBRIDGE_UML")
-    places = [
-        *([Path(named)] if named else []),
-        Path(platformdirs.user_cache_dir("hapticbridge", appauthor=False)) / "uml/linux",
-        CHECKOUT.parent / "shared/usblab/uml/min/linux",
-    ]
+    places = (
+        [Path(named)]
+        if named
+        else [
+            Path(platformdirs.user_cache_dir("hapticbridge", appauthor=False)) / "uml/linux",
+            CHECKOUT.parent / "shared/usblab/uml/min/linux",
+        ]
+    )
     return next((place for place in places if os.access(place, os.X_OK)), None)
 
 
