@@ -28,8 +28,8 @@ FORCE_SHARE = 0.5
 """Share of the device's force limit that the signal may use."""
 
 UNLIKELY_SPRING = (1.0, 1e-3)
-"""Stiffness in N/m and N m/rad from which on somebody or something holds the device. Our choice: simulated
-free devices show less than 0.1, the softest hand tried 3."""
+"""Stiffness in N/m and N m/rad from which on somebody or something holds the device. Our choice:
+simulated free devices show less than 0.1, the softest hand tried 3."""
 
 UNEXPLAINED_SHARE = 0.1
 """Share of the applied force that may stay unexplained. A simulated free
