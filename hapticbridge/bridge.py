@@ -265,11 +265,7 @@ class Bridge:
         Raises:
             SceneError: A name does not exist or has the wrong count of numbers.
         """
-        if not self.method.meters_inputs:
-            raise SceneError(
-                f"method '{self.method.name}' cannot meter the work of inputs; use 'implicit'"
-            )
-        self._inputs.append(
+        self.repeat_input(
             input_writes(
                 self.scene.model,
                 ctrl=ctrl,
@@ -278,6 +274,14 @@ class Bridge:
                 body_wrench=body_wrench,
             )
         )
+
+    def repeat_input(self, writes: list[Write]) -> None:
+        """As ``set_input``, with the writes that a recording's event ``input`` holds."""
+        if not self.method.meters_inputs:
+            raise SceneError(
+                f"method '{self.method.name}' cannot meter the work of inputs; use 'implicit'"
+            )
+        self._inputs.append(writes)
 
     @property
     def used(self) -> Coupling:

@@ -265,6 +265,19 @@ def is_certified(conditions: tuple[Condition, ...]) -> bool | None:
     return False if False in held else None if None in held or not held or is_late else True
 
 
+def damping_margin(conditions: tuple[Condition, ...]) -> float | None:
+    """Returns the least share of the device's damping that is left, 1 − needed / b.
+
+    Negative where more is needed than there is; None where no damping is known.
+    """
+    shares = [
+        1.0 - condition.needed / condition.available if condition.available else -math.inf
+        for condition in conditions
+        if condition.available is not None
+    ]
+    return min(shares, default=None)
+
+
 def default_coupling(
     info: DeviceInfo,
     period: float,

@@ -15,6 +15,7 @@ from rich.markup import escape
 
 from hapticbridge.cli.chart import ChartCommand
 from hapticbridge.cli.check import Check
+from hapticbridge.cli.data import Compare, Export
 from hapticbridge.cli.devices import Devices
 from hapticbridge.cli.identify import Identify
 from hapticbridge.cli.judge import Audit, Repair
@@ -33,6 +34,8 @@ Command = (
     | Annotated[Check, tyro.conf.subcommand("check")]
     | Annotated[Stability, tyro.conf.subcommand("stability")]
     | Annotated[ChartCommand, tyro.conf.subcommand("chart")]
+    | Annotated[Export, tyro.conf.subcommand("export")]
+    | Annotated[Compare, tyro.conf.subcommand("compare")]
     | Annotated[Repair, tyro.conf.subcommand("repair")]
     | Annotated[Zwidth, tyro.conf.subcommand("zwidth")]
     | Annotated[Bound, tyro.conf.subcommand("bound")]

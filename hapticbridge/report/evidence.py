@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -9,13 +10,14 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.audit.balance import Balance
+from hapticbridge.audit.balance import Balance, Reached
 from hapticbridge.device import DeviceInfo
 from hapticbridge.device.lateness import delay_ticks
 from hapticbridge.errors import HapticBridgeError
 from hapticbridge.kernel.state import RunParameters
 from hapticbridge.provenance import MODEL_ATTACHMENT, STARTS, meta_start, parameters_of
 from hapticbridge.recording import Recording
+from hapticbridge.recording.reader import BLOCK
 from hapticbridge.rendering import Method, method_named
 from hapticbridge.report.curves import DRAWABLE
 
@@ -75,7 +77,13 @@ class Evidence:
             parameters = replace(
                 parameters, device_damping=linear, device_rotational_damping=rotational
             )
-            balance = _balance(recording, parameters, info)
+            energies = np.concatenate(
+                [
+                    (each.environment_energy, each.slack, each.kicked)
+                    for each in _balances(recording, parameters, info)
+                ],
+                axis=1,
+            )
         except HapticBridgeError:
             return None
         return cls(
@@ -85,29 +93,34 @@ class Evidence:
             info=info,
             method=method,
             time=ticks["tick"] * parameters.period,
-            created=balance.environment_energy,
-            allowed=balance.slack,
-            kicked=balance.kicked,
+            created=energies[0],
+            allowed=energies[1],
+            kicked=energies[2],
             model=_model(recording),
         )
 
 
-def _balance(recording: Recording, parameters: RunParameters, info: DeviceInfo) -> Balance:
+def _balances(
+    recording: Recording, parameters: RunParameters, info: DeviceInfo
+) -> Iterator[Balance]:
+    """Yields the balance block by block: of a long run one takes many times the records' room."""
     starts = {name: np.array(meta_start(recording.meta, name)) for name in STARTS}
     resumed = [
         float(event["tick"])
         for event in recording.events
         if event.get("event") == "resume" and isinstance(event.get("tick"), int)
     ]
-    return Balance.of(
-        recording.ticks,
-        parameters,
-        starts["handle_start"],
-        starts["tool_start"],
-        float(starts["start_kinetic"][0] + starts["start_potential"][0]),
-        np.array(resumed),
-        delay_ticks(info, parameters.period) or 0,
-    )
+    ticks, late = recording.ticks, delay_ticks(info, parameters.period) or 0
+    energy = float(starts["start_kinetic"][0] + starts["start_potential"][0])
+    reached = Reached.at_start(parameters, starts["handle_start"], starts["tool_start"], energy)
+    for begin in range(0, len(ticks), BLOCK):
+        end = begin + BLOCK
+        following = ticks[end : end + late]
+        balance = Balance.of(
+            ticks[begin:end], parameters, reached, np.array(resumed), late, following
+        )
+        reached = balance.reached
+        yield balance
 
 
 def _model(recording: Recording) -> mujoco.MjModel | None:

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from hapticbridge.audit import AuditReport
-from hapticbridge.audit.balance import turn_between
+from hapticbridge.audit.differences import turn_between
 from hapticbridge.picture import new_figure
 from hapticbridge.report.curves import AXES, COLOURS, decimated, finish
 from hapticbridge.report.evidence import Evidence

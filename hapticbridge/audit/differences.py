@@ -1,0 +1,67 @@
+"""From tick to tick, over whole arrays: steps, turns, sums, and the time since the force rose."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+def quaternion_product(a: Array, b: Array) -> Array:
+    """Returns a ⊗ b over arrays (…, 4), scalar first."""
+    scalar = a[..., :1] * b[..., :1] - np.sum(a[..., 1:] * b[..., 1:], axis=-1, keepdims=True)
+    vector = a[..., :1] * b[..., 1:] + b[..., :1] * a[..., 1:] + np.cross(a[..., 1:], b[..., 1:])
+    return np.concatenate([scalar, vector], axis=-1)
+
+
+def conjugate(q: Array) -> Array:
+    """Returns the inverse of unit quaternions (…, 4)."""
+    return np.asarray(q * np.array([1.0, -1.0, -1.0, -1.0]))
+
+
+def turn_between(a: Array, b: Array) -> Array:
+    """Returns the rotation vectors (…, 3) in the world frame that take a to b, in rad."""
+    q = quaternion_product(b, conjugate(a))
+    q = np.where(q[..., :1] < 0, -q, q)
+    sine = np.linalg.norm(q[..., 1:], axis=-1, keepdims=True)
+    angle = 2 * np.arctan2(sine, q[..., :1])
+    with np.errstate(invalid="ignore", divide="ignore"):
+        factor = np.where(sine > 0, angle / sine, 2.0)
+    return np.asarray(factor * q[..., 1:])
+
+
+def steps(values: Array, before: Array) -> Array:
+    """Returns v_k − v_{k−1} over rows, with v_{−1} = before."""
+    return np.diff(values, axis=0, prepend=before[None])
+
+
+def turns(values: Array, before: Array) -> Array:
+    """Returns the rotation vectors from each orientation's predecessor to it."""
+    return turn_between(np.concatenate([before[None], values[:-1]]), values)
+
+
+def product_conjugate(values: Array, before: Array) -> Array:
+    """Returns q_k ⊗ q_{k−1}⁻¹ over rows (n, 4), with q_{−1} = before."""
+    return quaternion_product(values, conjugate(np.concatenate([before[None], values[:-1]])))
+
+
+def summed(values: Array, before: float) -> Array:
+    """Returns the sums up to each of the values, of what was before too.
+
+    They are added one after the other, so that sums over blocks are those over the whole, to the
+    bit.
+    """
+    return np.cumsum(np.concatenate([[before], values]))[1:]
+
+
+def rotate(q: Array, v: Array) -> Array:
+    """Returns R(q) v over rows, q (n, 4) and v (n, 3)."""
+    pure = np.concatenate([np.zeros((len(v), 1)), v], axis=1)
+    return quaternion_product(quaternion_product(q, pure), conjugate(q))[:, 1:]
+
+
+def since_start(ticks: NDArray[np.void], resumed: Array) -> Array:
+    """Returns how many ticks ago the force began to rise, at the start or after a pause."""
+    starts = np.concatenate([[0.0], np.sort(resumed)])
+    return np.asarray(ticks["tick"] - starts[np.searchsorted(starts, ticks["tick"], "right") - 1])
