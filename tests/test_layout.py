@@ -18,7 +18,7 @@ ORDER = (
     ("guard", "recording", "certificate", "felt"),
     ("provenance", "summary", "workspace"),
     ("bridge", "audit", "identify", "compare", "export"),
-    ("report", "study", "check"),
+    ("report", "film", "study", "check"),
     ("whatif",),  # runs the bridge and asks the audit, which must not know of either
     ("cli",),
 )

@@ -19,6 +19,7 @@ from hapticbridge.cli.data import Compare, Export
 from hapticbridge.cli.devices import Devices
 from hapticbridge.cli.identify import Identify
 from hapticbridge.cli.judge import Audit, Repair
+from hapticbridge.cli.render import Render
 from hapticbridge.cli.run import Run
 from hapticbridge.cli.scenes import Scenes
 from hapticbridge.cli.stability import Stability
@@ -29,6 +30,7 @@ from hapticbridge.errors import HapticBridgeError, SafetyTrip
 Command = (
     Annotated[Run, tyro.conf.subcommand("run")]
     | Annotated[Audit, tyro.conf.subcommand("audit")]
+    | Annotated[Render, tyro.conf.subcommand("render")]
     | Annotated[Scenes, tyro.conf.subcommand("scenes")]
     | Annotated[Devices, tyro.conf.subcommand("devices")]
     | Annotated[Check, tyro.conf.subcommand("check")]

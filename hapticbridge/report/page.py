@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import json
 from dataclasses import asdict
 from pathlib import Path
@@ -13,6 +14,7 @@ from hapticbridge.audit import AuditReport
 from hapticbridge.device import DATA_SHEET_UNITS
 from hapticbridge.errors import RecordingError
 from hapticbridge.picture import inline_svg
+from hapticbridge.provenance import meta_float
 from hapticbridge.recording import Recording
 from hapticbridge.report.cause import likely_cause
 from hapticbridge.report.curves import draw_recording
@@ -61,13 +63,32 @@ def _mapping(text: str) -> dict[str, object]:
         return {}
 
 
-def write_report(recording: Recording, report: AuditReport, path: Path) -> None:
+def telling_time(recording: Recording, report: AuditReport) -> float:
+    """Returns when a picture tells most of a run: at its fault, or at the largest force, in s.
+
+    Args:
+        recording: With one tick at least.
+        report: The audit's verdict on it.
+
+    Raises:
+        RecordingError: The recording does not tell its period.
+    """
+    tick = report.tick
+    if tick is None:
+        tick = int(np.argmax(np.linalg.norm(recording.ticks["wrench_on_tool"][:, :3], axis=1)))
+    return tick * meta_float(recording.meta, "period_s")
+
+
+def write_report(
+    recording: Recording, report: AuditReport, path: Path, scene: bytes | None = None
+) -> None:
     """Writes one self-contained HTML page, of less than 1 MB however long the run was.
 
     Args:
         recording: What was judged.
         report: The audit's verdict on it.
         path: Where to; an existing file is replaced.
+        scene: A picture of the scene as PNG, if there is one; ``telling_time`` says when.
 
     Raises:
         RecordingError: The page cannot be written.
@@ -86,6 +107,7 @@ def write_report(recording: Recording, report: AuditReport, path: Path) -> None:
         host=_mapping(recording.meta.get("host", "")),
         events=recording.events[:MOST_EVENTS],
         more_events=max(len(recording.events) - MOST_EVENTS, 0),
+        scene=scene and base64.b64encode(scene).decode(),
         run=None if evidence is None else _drawn(evidence, report),
         curves="" if evidence is not None else _bare_curves(recording),
     )
