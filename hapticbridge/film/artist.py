@@ -26,6 +26,11 @@ QUALITY = 7
 """Of a film, 0 to 10 as imageio-ffmpeg counts: at 7 the coupling's thin lines stay sharp."""
 
 
+TOOL_ALPHA = 0.5
+"""Of moving bodies: grip, handle and spring are inside the tool, and would not be seen through a
+solid one; below 0.4 the tool itself is hard to see."""
+
+
 class Camera:
     """MuJoCo's free camera on a stage, as the scene's file sets it.
 
@@ -42,7 +47,9 @@ class Camera:
         self._camera, self._shown = mujoco.MjvCamera(), mujoco.MjvOption()
         mujoco.mjv_defaultFreeCamera(model, self._camera)
         self._shown.sitegroup[:] = 0  # grip and handle are points for the computer
-        for flag in (mujoco.mjtVisFlag.mjVIS_CONTACTPOINT, mujoco.mjtVisFlag.mjVIS_CONTACTFORCE):
+        flags = mujoco.mjtVisFlag
+        model.vis.map.alpha = TOOL_ALPHA
+        for flag in (flags.mjVIS_CONTACTPOINT, flags.mjVIS_CONTACTFORCE, flags.mjVIS_TRANSPARENT):
             self._shown.flags[flag] = True
         self.renderer = mujoco.Renderer(model, height, width)
 
