@@ -37,7 +37,7 @@ from hapticbridge.kernel.state import Binding
 from hapticbridge.kernel.step import OK, after_step, before_step
 from hapticbridge.ledger import Ledger
 from hapticbridge.provenance import attachments, describe_run
-from hapticbridge.recording.stream import RecordStream
+from hapticbridge.recording.stream import Onlooker, RecordStream
 from hapticbridge.rendering import (
     contact_stiffness_of,
     default_method,
@@ -82,6 +82,8 @@ class Bridge:
         absolute: Take the device's poses as poses in the scene instead of relative to its start.
         limits: Limits on the wrench, within the device's own; None takes these.
         live: Draw a status line on stderr, from the recorder's process.
+        onlooker: Who looks at the run from another process, as ``view.Window`` does; it is started
+            when the bridge is entered and closed when it is left.
 
     Raises:
         HapticBridgeError: An argument is out of range; the message says which and what is valid.
@@ -106,6 +108,7 @@ class Bridge:
         absolute: bool = False,
         limits: Limits | None = None,
         live: bool = False,
+        onlooker: Onlooker | None = None,
     ) -> None:
         self.scene = scene if isinstance(scene, Scene) else load_scene(scene)
         self.device = device_for(self.scene, device) if isinstance(device, str) else device
@@ -126,7 +129,7 @@ class Bridge:
         contact_stiffness_of(self.method, self.coupling, contact_stiffness)  # refused here already
         self._contact_stiffness = contact_stiffness
         self._path = Path(recording) if recording is not None else None
-        self._is_live = live
+        self._is_live, self._onlooker = live, onlooker
         self.clock = clock or RealClock()
         refuse_simulated_time(self.device.info, self.clock)
         self._sample = np.zeros(1, SAMPLE_DTYPE)
@@ -336,7 +339,11 @@ class Bridge:
         scene, clock, method = self.scene, self.clock, self.method
         felt = prepare(scene, self.coupling, self.period, self._substeps, method)
         self._stream = RecordStream(
-            self._path, self.period, live=self._is_live, is_lossless=clock.is_lossless
+            self._path,
+            self.period,
+            live=self._is_live,
+            is_lossless=clock.is_lossless,
+            onlooker=self._onlooker,
         )
         resources.callback(self._stream.close)
         self._compile()

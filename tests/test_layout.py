@@ -18,7 +18,7 @@ ORDER = (
     ("guard", "recording", "certificate", "felt"),
     ("provenance", "summary", "workspace"),
     ("bridge", "audit", "identify", "compare", "export"),
-    ("report", "film", "study", "check"),
+    ("report", "film", "view", "study", "check"),
     ("whatif",),  # runs the bridge and asks the audit, which must not know of either
     ("cli",),
 )

@@ -76,6 +76,16 @@ class Rerun:
         self._binding = Binding(model, data, parameters)
         _check_start(recording, self._binding.state)
 
+    def warm_up(self) -> None:
+        """Compiles what ``add`` needs, so that the first call takes no longer than others."""
+        binding = self._binding
+        simulate(binding.state, np.zeros(0, SAMPLE_DTYPE), binding.row, np.zeros(0, TICK_DTYPE))
+
+    @property
+    def slack(self) -> float:
+        """What the environment may have created by now, in J."""
+        return float(self._binding.state["slack"][0])
+
     def note(self, event: Mapping[str, Any]) -> None:
         """Takes an event of a run that still goes on; those that change nothing are passed over."""
         if event.get("event") in CHANGES:

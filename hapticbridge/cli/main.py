@@ -25,12 +25,14 @@ from hapticbridge.cli.scenes import Scenes
 from hapticbridge.cli.stability import Stability
 from hapticbridge.cli.terminal import err, out, print_error
 from hapticbridge.cli.theory import Bound, Zwidth
+from hapticbridge.cli.view import View
 from hapticbridge.errors import HapticBridgeError, SafetyTrip
 
 Command = (
     Annotated[Run, tyro.conf.subcommand("run")]
     | Annotated[Audit, tyro.conf.subcommand("audit")]
     | Annotated[Render, tyro.conf.subcommand("render")]
+    | Annotated[View, tyro.conf.subcommand("view")]
     | Annotated[Scenes, tyro.conf.subcommand("scenes")]
     | Annotated[Devices, tyro.conf.subcommand("devices")]
     | Annotated[Check, tyro.conf.subcommand("check")]

@@ -58,6 +58,7 @@ class Stage:
         model: The scene.
         data: Its state at the tick last shown, with contacts as they were solved.
         row: The record of that tick, one element of ``TICK_DTYPE``.
+        passed: The records since the tick shown before, that one not among them.
         reference: The largest force on the tool in the run, in N, or ``LEAST_REFERENCE``.
 
     Raises:
@@ -78,7 +79,7 @@ class Stage:
         self._rest = self.recording.blocks()
         self._block = next(self._rest)
         self._at = 0  # in the block
-        self.row = self._block[:1]
+        self.row = self.passed = self._block[:1]
         forces = (block["wrench_on_tool"][:, :3] for block in self.recording.blocks())
         largest = (float(np.linalg.norm(force, axis=1).max()) for force in forces)
         self.reference = max(LEAST_REFERENCE, *largest)
@@ -88,6 +89,11 @@ class Stage:
     def duration(self) -> float:
         """Of the run in s."""
         return self.recording.count * self.parameters.period
+
+    @property
+    def slack(self) -> float:
+        """What the environment may have created by the tick shown, in J."""
+        return self._run.slack
 
     def tick_at(self, time: float) -> int:
         """Returns the tick that is shown at a time in s from the start.
@@ -107,6 +113,7 @@ class Stage:
         Raises:
             RecordingError: The run, simulated again, is another one.
         """
+        passed = []
         while self._run.done <= tick:
             if self._at == len(self._block):
                 self._block, self._at = next(self._rest), 0
@@ -114,7 +121,9 @@ class Stage:
             recorded = self._block[self._at : end]
             again = self._run.add(recorded)
             self._refuse_another_run(recorded, again)
+            passed.append(recorded)
             self._at, self.row = end, recorded[-1:]
+        self.passed = np.concatenate(passed) if passed else self.row
         mujoco.mj_copyData(self.data, self.model, self._run.data)
         # contacts stay as the tick solved them; only what is drawn is brought to its end
         mujoco.mj_kinematics(self.model, self.data)
