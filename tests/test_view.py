@@ -266,7 +266,7 @@ def test_a_browser_sees_the_tool_move_with_the_slider(replay: Replay, tmp_path: 
         reds = []
         for moment in (0.0, 1.2):
             theatre.slider.value = moment
-            theatre._page.show(replay.at(moment))
+            theatre.show(moment)
             page.wait_for("new Promise(done => setTimeout(() => done(true), 2500))")
             page.picture(tmp_path / "shown.png")
             pixels = np.asarray(Image.open(tmp_path / "shown.png").convert("RGB"), dtype=int)

@@ -18,7 +18,7 @@ PLACE = 1e-4
 """How far in m the tool of the run simulated again may be from where the record says: less than a
 pixel of any picture here. Beyond it the picture would not be of this run."""
 
-LONGEST_ARROW = 0.5
+LONGEST_ARROW = 0.8
 """Of the scene's extent, without unit: how long the arrow of the largest force is drawn."""
 
 LEAST_REFERENCE = 0.1

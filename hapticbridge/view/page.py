@@ -151,7 +151,7 @@ class Page:
             point_shape="circle",
             visible=False,
         )
-        centre, away = np.array(model.stat.center), 1.6 * extent
+        centre, away = np.array(model.stat.center), 1.25 * extent
         self._server.initial_camera.look_at = tuple(centre)
         self._server.initial_camera.position = tuple(centre + away * np.array([0.7, -0.8, 0.6]))
         self._server.initial_camera.near = 0.01 * extent

@@ -6,6 +6,7 @@ import threading
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import viser
 
 from hapticbridge.film.stage import Stage
@@ -94,11 +95,16 @@ class Theatre:
             dict(stage.recording.meta),
             stage.reference,
         )
-        self._page.status.content = f"recording of {stage.duration:g} s"
         if len(replay.trace) > 1:
             self._page.plot(*replay.trace.curves())
-        self._page.show(replay.sights[0])
-        self.slider.on_update(lambda _: self._page.show(replay.at(self.slider.value)))
+        self.show(0.0)
+        self.slider.on_update(lambda _: self.show(self.slider.value))
+
+    def show(self, moment: float) -> None:
+        """Shows the instant nearest to a time in s."""
+        sight = self._replay.at(moment)
+        self._page.show(sight)
+        self._page.status.content = f"**{sight.time:.3f} s**, {np.linalg.norm(sight.force):.2f} N"
 
     def play(self, is_over: threading.Event) -> None:
         """Moves the slider with the time where that is asked for, until it is over."""
@@ -106,7 +112,7 @@ class Theatre:
             if self._playing.value:
                 following = self.slider.value + FRAME
                 self.slider.value = 0.0 if following > self.slider.max else following
-                self._page.show(self._replay.at(self.slider.value))
+                self.show(self.slider.value)
 
     def close(self) -> None:
         """Ends serving."""
