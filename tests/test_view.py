@@ -29,7 +29,7 @@ from hapticbridge.clock import SimulatedClock
 from hapticbridge.errors import HapticBridgeError
 from hapticbridge.recording import Recording, Ring, read_recording
 from hapticbridge.view.address import COOKIE, Address
-from hapticbridge.view.trace import Trace
+from hapticbridge.view.trace import LINES, Trace
 from hapticbridge.view.window import Window
 
 pytest.importorskip("viser", reason="needs the extra 'view'")
@@ -39,7 +39,6 @@ from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 
 from hapticbridge.view.live import Show
-from hapticbridge.view.page import LINES
 from hapticbridge.view.props import props_of
 from hapticbridge.view.replay import Replay, Theatre
 

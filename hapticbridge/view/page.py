@@ -16,21 +16,11 @@ from hapticbridge.kernel.state import RunParameters
 from hapticbridge.rendering import method_named
 from hapticbridge.view.props import props_of
 from hapticbridge.view.sight import Sight
+from hapticbridge.view.trace import PLOTS
 
 Array = NDArray[np.float64]
 
 COLOURS = ("#1a5fb4", "#b3261e", "#2e7d32", "#e66100")
-
-PLOTS: tuple[tuple[str, tuple[str, ...]], ...] = (
-    ("Force (N)", ("on the tool",)),
-    ("Energy per port (mJ)", ("coupling", "device", "environment")),
-    ("Passivity margin (mJ)", ("allowed − created",)),
-    ("Lateness of a tick (µs)", ("latest",)),
-)
-"""The curves: title with unit, and the lines in each."""
-
-LINES = sum(len(names) for _, names in PLOTS)
-"""How many lines there are in all plots, in their order."""
 
 _HAND = (230, 97, 0)
 _CONTACT = (77, 208, 225)

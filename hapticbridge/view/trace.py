@@ -7,9 +7,18 @@ from collections import deque
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.view.page import LINES
-
 Array = NDArray[np.float64]
+
+PLOTS: tuple[tuple[str, tuple[str, ...]], ...] = (
+    ("Force (N)", ("on the tool",)),
+    ("Energy per port (mJ)", ("coupling", "device", "environment")),
+    ("Passivity margin (mJ)", ("allowed − created",)),
+    ("Lateness of a tick (µs)", ("latest",)),
+)
+"""The curves: title with unit, and the lines in each."""
+
+LINES = sum(len(names) for _, names in PLOTS)
+"""How many lines there are in all plots, in their order."""
 
 
 class Trace:
@@ -52,6 +61,6 @@ class Trace:
         return len(self._points)
 
     def curves(self) -> tuple[Array, list[Array]]:
-        """Returns times in s, and the lines of ``page.PLOTS`` in its units, newest last."""
+        """Returns times in s, and the lines of ``PLOTS`` in its units, newest last."""
         table = np.array(self._points, dtype=np.float64).reshape(len(self._points), 1 + LINES)
         return table[:, 0].copy(), [table[:, 1 + line].copy() for line in range(LINES)]
