@@ -231,9 +231,13 @@ class Bridge:
         self._stopped_by = self._stopped_by or "duration"
         return self.summary()
 
-    def stop(self) -> None:
-        """Ends the run after the present tick; may be called from ``on_tick`` or a thread."""
-        self._stopped_by = "caller"
+    def stop(self, by: str = "caller") -> None:
+        """Ends the run after the present tick; may be called from ``on_tick`` or a thread.
+
+        Args:
+            by: Who wants it, for the summary and the recording's event ``stop``; not empty.
+        """
+        self._stopped_by = by or "caller"
 
     def _silence(self) -> str:
         """Commands zero force; returns why that failed, or nothing."""

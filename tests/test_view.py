@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import contextlib
 import http.client
+import io
 import json
 import os
 import signal
 import socket
 import sys
+import threading
+import types
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +34,7 @@ from hapticbridge.errors import HapticBridgeError
 from hapticbridge.recording import Recording, Ring, read_recording
 from hapticbridge.view.address import COOKIE, Address
 from hapticbridge.view.trace import LINES, Trace
-from hapticbridge.view.window import Window
+from hapticbridge.view.window import STOP, Window
 
 pytest.importorskip("viser", reason="needs the extra 'view'")
 
@@ -309,6 +313,52 @@ def test_a_killed_view_and_ten_deaf_browsers_do_not_touch_the_run(
     assert (summary.ticks, summary.dropped, summary.overruns) == (1500, 0, 0)
     report = audit(path)
     assert (report.verdict, report.resimulation) == ("passive", "bit for bit")
+
+
+def test_the_button_of_the_page_stops_the_run_and_the_recording_says_who_did(
+    floor: Path, tmp_path: Path
+) -> None:
+    path, window = tmp_path / "run.mcap", Window(Address("127.0.0.1", 0))
+    scene = str(floor.with_name("floor.xml"))
+    with (
+        Bridge(scene, ScriptedDevice(pressed), LOOSE, recording=path, onlooker=window) as bridge,
+        browser(tmp_path) as tab,
+    ):
+        window.on_stop = partial(bridge.stop, "view")
+        page = tab()
+        page.open(window.url)
+        button = "[...document.querySelectorAll('button')].find(b => b.innerText == 'stop the run')"
+        page.wait_for(f"!!{button}")
+        presser = threading.Timer(1.0, page.value, [f"{button}.click()"])
+        presser.start()
+        summary = bridge.run(60.0)
+        presser.join()
+    assert summary.stopped_by == "view"
+    assert 0 < summary.ticks < 60_000
+    stop = read_recording(path).events[-1]
+    assert (stop["event"], stop["reason"]) == ("stop", "view")
+    assert audit(path).verdict == "passive"
+
+
+@pytest.mark.parametrize(
+    ("said", "times"),
+    [
+        (STOP, 1),
+        (STOP + STOP, 1),
+        (b'{"command": "stop", "force": 99}\n', 0),
+        (b'{"command": "stiffness", "value": 1e9}\n', 0),
+        (b"x" * 100_000 + b"\n" + STOP, 0),
+        (b"", 0),
+    ],
+)
+def test_a_run_obeys_one_command_once_and_nothing_else(said: bytes, times: int) -> None:
+    window = Window(Address("127.0.0.1", 0))
+    heard: list[bool] = []
+    window.on_stop = partial(heard.append, True)
+    process = types.SimpleNamespace(stdout=io.BytesIO(said))
+    window._process = process  # type: ignore[assignment] # of a process, only what it says
+    window._listen()
+    assert len(heard) == times
 
 
 def test_a_view_that_cannot_be_served_is_said_before_the_run(floor: Path, call: Called) -> None:

@@ -6,6 +6,7 @@ import json
 import math
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, fields, replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -142,13 +143,15 @@ class Run:
             live=not self.as_json,
             onlooker=window,
         )
+        if window is not None:
+            window.on_stop = partial(bridge.stop, "view")
         if not self.as_json:
             announce(bridge, scales, self.substeps, is_method_asked=self.method is not None)
         with ExitStack() as stack:
             with err.status("preparing (the first run on a machine compiles for about 20 s) …"):
                 stack.enter_context(bridge)
             if window is not None:
-                tell_address(window.address, window.url)
+                tell_address(window.address, window.url, "watch the run and stop it")
             if not self.as_json:
                 announce_measured(bridge)
             summary = bridge.run(self.duration)

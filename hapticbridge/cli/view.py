@@ -40,15 +40,15 @@ class View:
         with progress("simulating again") as show:
             replay = Replay(self.file, show)
         theatre = Theatre(replay, address)
-        tell_address(address, theatre.url)
+        tell_address(address, theatre.url, "watch the recording")
         with contextlib.suppress(KeyboardInterrupt):
             theatre.play(threading.Event())
         theatre.close()
         return 0
 
 
-def tell_address(address: Address, url: str) -> None:
-    """Prints what to open in a browser, and who can."""
+def tell_address(address: Address, url: str, power: str) -> None:
+    """Prints what to open in a browser, and what whoever has the address can do."""
     err.print(f"view: {plain(url)}")
     if not address.is_loopback:
-        err.print("[yellow]warning:[/yellow] anyone with this address can watch the run")
+        err.print(f"[yellow]warning:[/yellow] anyone with this address can {power}")

@@ -18,6 +18,7 @@ from typing import IO, Any
 
 import mujoco
 import numpy as np
+import viser
 from numpy.typing import NDArray
 
 from hapticbridge.audit.rerun import Rerun
@@ -31,6 +32,7 @@ from hapticbridge.view.page import Page
 from hapticbridge.view.server import serve
 from hapticbridge.view.sight import Sight
 from hapticbridge.view.trace import Trace
+from hapticbridge.view.window import STOP
 
 FRAME = 1 / 30
 """Seconds between two pictures; eyes and the page's own drawing see no more."""
@@ -164,6 +166,19 @@ def _follow(show: Show, page: Page, inbox: queue.SimpleQueue[dict[str, Any] | No
         time.sleep(max(0.0, FRAME - (time.monotonic() - began)))
 
 
+def _add_stop_button(server: viser.ViserServer, answers: int, *, is_shared: bool) -> None:
+    button = server.gui.add_button("stop the run", color="red")
+    if is_shared:
+        server.gui.add_markdown("Anyone with this address can watch this run, and stop it.")
+
+    def press(_: object) -> None:
+        button.disabled = True
+        with contextlib.suppress(OSError):
+            os.write(answers, STOP)
+
+    button.on_click(press)
+
+
 def run() -> None:
     """Runs the process."""
     _calm()
@@ -179,6 +194,7 @@ def run() -> None:
     except HapticBridgeError as error:
         print(json.dumps({"error": str(error)}), file=answers, flush=True)
         return
+    _add_stop_button(server, answers.fileno(), is_shared=not address.is_loopback)
     print(json.dumps({"url": address.url(server.get_port())}), file=answers, flush=True)
     inbox: queue.SimpleQueue[dict[str, Any] | None] = queue.SimpleQueue()
     threading.Thread(target=_listen, args=(stream, inbox), daemon=True).start()

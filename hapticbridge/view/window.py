@@ -8,7 +8,7 @@ import json
 import subprocess
 import sys
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from queue import SimpleQueue
 from typing import IO, cast
@@ -16,6 +16,9 @@ from typing import IO, cast
 from hapticbridge.errors import HapticBridgeError
 from hapticbridge.recording import Attachment
 from hapticbridge.view.address import Address
+
+STOP = b'{"command": "stop"}\n'
+"""What the process says when the run is to stop."""
 
 _BOOTSTRAP = """
 import sys
@@ -46,6 +49,8 @@ class Window:
 
     Attributes:
         address: Likewise.
+        on_stop: Called once, from a thread, when somebody presses the page's button: the one
+            command that a page has. Whatever else its process may say is not listened to.
         url: What to open in a browser, once it is shown.
 
     Raises:
@@ -58,6 +63,7 @@ class Window:
         self._outbox: SimpleQueue[bytes | None] = SimpleQueue()
         self._process: subprocess.Popen[bytes] | None = None
         self.url = ""
+        self.on_stop: Callable[[], None] | None = None
 
     def start(
         self, ring: str, metadata: Mapping[str, str], attachments: Sequence[Attachment]
@@ -94,6 +100,7 @@ class Window:
             reason = answer.get("error", "its process ended before it served anything")
             raise HapticBridgeError(f"the view cannot be shown: {reason}")
         self.url = str(answer["url"])
+        threading.Thread(target=self._listen, daemon=True).start()
 
     def event(self, event: Mapping[str, object]) -> None:
         """Tells the process what happened; never waits and never raises."""
@@ -113,6 +120,13 @@ class Window:
     def process_id(self) -> int | None:
         """Of the process; None before it is started."""
         return None if self._process is None else self._process.pid
+
+    def _listen(self) -> None:
+        process = self._process
+        with contextlib.suppress(OSError, ValueError):
+            said = cast(IO[bytes], process and process.stdout).readline(len(STOP))
+            if said == STOP and self.on_stop is not None:
+                self.on_stop()
 
     def _send(self) -> None:
         process = self._process
