@@ -31,7 +31,7 @@ from hapticbridge.guard import (
 from hapticbridge.inputs import Write, apply_writes, input_writes
 from hapticbridge.jit import direct
 from hapticbridge.kernel.layout import STATE_DTYPE
-from hapticbridge.kernel.parameters import checked_substeps
+from hapticbridge.kernel.parameters import checked_substeps, refuse_substeps
 from hapticbridge.kernel.publish import publish
 from hapticbridge.kernel.state import Binding
 from hapticbridge.kernel.step import OK, after_step, before_step
@@ -111,27 +111,34 @@ class Bridge:
         onlooker: Onlooker | None = None,
     ) -> None:
         self.scene = scene if isinstance(scene, Scene) else load_scene(scene)
-        self.device = device_for(self.scene, device) if isinstance(device, str) else device
         self.period = period_of(rate)
         self._substeps = checked_substeps(substeps)
         self.method = default_method(substeps) if method is None else method_named(method)
+        refuse_substeps(self.method.scheme, substeps)
         self._workspace = Workspace.of(scale, force_scale, axes, is_absolute=absolute)
-        self.coupling = coupling or default_coupling(
-            self.device.info,
-            self.period,
-            self._workspace.scale,
-            self._workspace.force_scale,
-            self.laws,
-            self.method,
-        )
-        self._limits = limits_for(self.device.info, limits)
-        refuse_unknowing(self.method, is_real=self.device.info.is_real, i_know=i_know)
-        contact_stiffness_of(self.method, self.coupling, contact_stiffness)  # refused here already
-        self._contact_stiffness = contact_stiffness
         self._path = Path(recording) if recording is not None else None
         self._is_live, self._onlooker = live, onlooker
         self.clock = clock or RealClock()
-        refuse_simulated_time(self.device.info, self.clock)
+        with ExitStack() as refused:
+            if isinstance(device, str):
+                device = device_for(self.scene, device)
+                refused.callback(device.close)  # else nobody could, if it is refused
+            self.device = device
+            self.coupling = coupling or default_coupling(
+                device.info,
+                self.period,
+                self._workspace.scale,
+                self._workspace.force_scale,
+                self.laws,
+                self.method,
+            )
+            self._limits = limits_for(device.info, limits)
+            refuse_unknowing(self.method, is_real=device.info.is_real, i_know=i_know)
+            # refused here already
+            contact_stiffness_of(self.method, self.coupling, contact_stiffness)
+            refuse_simulated_time(device.info, self.clock)
+            refused.pop_all()
+        self._contact_stiffness = contact_stiffness
         self._sample = np.zeros(1, SAMPLE_DTYPE)
         self._inputs: deque[list[Write]] = deque()
         self._tick = self._overruns = self._skipped = 0

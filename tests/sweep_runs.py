@@ -13,7 +13,7 @@ import sweep_functions as functions
 from hapticbridge.study.points import grid
 from hapticbridge.study.sweep import sweep
 from hapticbridge.study.table import Table
-from hapticbridge.study.workers import InThisProcess as Inline
+from hapticbridge.study.workers import InThisProcess
 
 POINTS = grid(stiffness=[1000, 3000.0, 1e4 / 3], damping=np.linspace(0.1, 0.3, 3), tool="peg")
 
@@ -23,7 +23,7 @@ def computed(scratch: Path) -> Counter[int]:
 
 
 def serial(function: Callable[[Any], Any] = functions.bound, points: Any = POINTS) -> Table:
-    return sweep(function, points, executor=Inline())
+    return sweep(function, points, executor=InThisProcess())
 
 
 def parts(folder: Path) -> list[Path]:

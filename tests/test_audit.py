@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from hapticbridge.audit import audit
-from hapticbridge.audit.balance import Balance, Reached
+from hapticbridge.audit.balance import Balance
 from hapticbridge.audit.differences import turn_between
+from hapticbridge.audit.reached import Reached
 from hapticbridge.bridge import Bridge
 from hapticbridge.clock import SimulatedClock
 from hapticbridge.coupling import Coupling

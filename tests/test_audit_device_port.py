@@ -12,8 +12,9 @@ from audit_cases import ScriptedDevice, recorded
 from random_hands import random_motion
 
 from hapticbridge.audit import audit
-from hapticbridge.audit.balance import Balance, Reached
+from hapticbridge.audit.balance import Balance
 from hapticbridge.audit.device_port import kept_behind_a_law
+from hapticbridge.audit.reached import Reached
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import SimulatedDevice
 from hapticbridge.guard import Limits

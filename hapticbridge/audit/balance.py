@@ -27,67 +27,14 @@ from hapticbridge.audit.differences import (
     turns,
 )
 from hapticbridge.audit.law import Motion, wrench_by_law
+from hapticbridge.audit.reached import Reached
 from hapticbridge.kernel.state import RunParameters
 
 Array = NDArray[np.float64]
 
-SUMS = (
-    "coupling_work",
-    "throughput",
-    "device_energy",
-    "device_throughput",
-    "slack",
-    "given",
-    "burnt",
-    "kept",
-)
-"""What is summed over ticks."""
-
 SLACK_SHARE = 0.5
 """Share of the slack that counts where several laws are computed in a tick, without unit: as
 ``certificate.needed_damping`` assumes."""
-
-
-@dataclass(frozen=True, slots=True)
-class Reached:
-    """Where a recording has got to: what the balance of its next ticks begins with.
-
-    Attributes:
-        handle: Handle pose (7,) in the tick before.
-        tool: Tool pose (7,).
-        device: Device pose (7,).
-        sent: Wrench that was sent to the device, (6,).
-        read_ns: When the device was read, in ns.
-        start_energy: Kinetic plus potential energy before the first tick, in J.
-        share: Of the wrench that the ramp let through.
-        sums: The cumulative energies so far, in J.
-    """
-
-    handle: Array
-    tool: Array
-    device: Array
-    sent: Array
-    read_ns: int
-    start_energy: float
-    share: float
-    sums: dict[str, float]
-
-    @classmethod
-    def at_start(
-        cls, parameters: RunParameters, handle: Array, tool: Array, start_energy: float
-    ) -> Reached:
-        """Returns what the first tick begins with.
-
-        Args:
-            parameters: The run's.
-            handle: Handle pose (7,) before the first tick.
-            tool: Tool pose (7,) before the first tick.
-            start_energy: Kinetic plus potential energy before the first tick, in J.
-        """
-        device = np.array(parameters.device_start)
-        return cls(
-            handle, tool, device, np.zeros(6), 0, start_energy, 0.0, dict.fromkeys(SUMS, 0.0)
-        )
 
 
 @dataclass(frozen=True, slots=True)

@@ -32,7 +32,8 @@ class AuditReport:
         ticks: Number of records.
         duration: Their number times the period, in s.
         conditions: The device condition per kind of axis, as sentences.
-        rendered: What was felt away from contact, and what was used, as sentences.
+        rendered: What was felt away from contact, or everywhere if the tool was never let go, and
+            what was used, as sentences.
         unchecked: What records alone do not tell and only the re-simulation confirms, or nothing;
             without a re-simulation such a recording is not called passive but invalid.
         damping_margin: Least share of the device's damping that the coupling leaves, 1 − needed / b

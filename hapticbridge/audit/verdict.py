@@ -12,9 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.audit.balance import Balance, Reached
+from hapticbridge.audit.balance import Balance
 from hapticbridge.audit.judgement import Judgement
 from hapticbridge.audit.physics import physics_fault
+from hapticbridge.audit.reached import Reached
 from hapticbridge.audit.replay import Replay, Resimulation
 from hapticbridge.audit.report import AuditReport
 from hapticbridge.audit.structure import Fault, file_fault, structure_fault
@@ -27,7 +28,7 @@ from hapticbridge.certificate import (
 from hapticbridge.device import DeviceInfo
 from hapticbridge.device.lateness import delay_ticks
 from hapticbridge.errors import HapticBridgeError, RecordingError
-from hapticbridge.felt import coupling_sentences
+from hapticbridge.felt import coupling_sentences, was_never_lossless
 from hapticbridge.guard import Limits, limits_for
 from hapticbridge.kernel.state import RunParameters
 from hapticbridge.provenance import STARTS, meta_start, parameters_of
@@ -70,7 +71,7 @@ def audit(path: str | Path, *, strict: bool = False) -> AuditReport:
         parameters = replace(
             parameters, device_damping=burning, device_rotational_damping=rotational
         )
-        facts |= _device_facts(info, parameters, method)
+        facts |= _device_facts(info, parameters, method, recording)
     except RecordingError as error:
         return _invalid(facts, Fault(str(error)))
     facts["duration"] = recording.count * parameters.period
@@ -131,7 +132,9 @@ def _device_and_method(
     return info, method
 
 
-def _device_facts(info: DeviceInfo, parameters: RunParameters, method: Method) -> dict[str, Any]:
+def _device_facts(
+    info: DeviceInfo, parameters: RunParameters, method: Method, recording: RecordingFile
+) -> dict[str, Any]:
     try:
         conditions = run_conditions(info, parameters, method)
         return {
@@ -139,7 +142,11 @@ def _device_facts(info: DeviceInfo, parameters: RunParameters, method: Method) -
             "conditions": condition_sentences(info, parameters, method),
             "damping_margin": damping_margin(conditions),
             "rendered": coupling_sentences(
-                parameters.coupling, method, parameters.period, parameters.substeps
+                parameters.coupling,
+                method,
+                parameters.period,
+                parameters.substeps,
+                is_always_held=was_never_lossless(recording.count, recording.flags),
             ),
         }
     except HapticBridgeError as error:  # numbers beyond what the theory computes with

@@ -13,6 +13,7 @@ import mujoco
 import tyro
 from rich.markup import escape
 
+from hapticbridge.cli.bound import Bound
 from hapticbridge.cli.chart import ChartCommand
 from hapticbridge.cli.check import Check
 from hapticbridge.cli.data import Compare, Export
@@ -24,8 +25,8 @@ from hapticbridge.cli.run import Run
 from hapticbridge.cli.scenes import Scenes
 from hapticbridge.cli.stability import Stability
 from hapticbridge.cli.terminal import err, out, print_error
-from hapticbridge.cli.theory import Bound, Zwidth
 from hapticbridge.cli.view import View
+from hapticbridge.cli.zwidth import Zwidth
 from hapticbridge.errors import HapticBridgeError, SafetyTrip
 
 Command = (

@@ -41,7 +41,7 @@ class ParquetSink:
             "hapticbridge.events": json.dumps(recording.events),
         }
         self._schema = self._arrow.schema(fields, metadata=about)
-        # a dictionary would make one value of two NaNs that differ in their bits
+        # hardly a number comes twice: a dictionary would only take room
         self._writer = parquet.ParquetWriter(
             path, self._schema, compression="zstd", use_dictionary=False
         )

@@ -141,6 +141,7 @@ _RUNNING_COUNTS = (
     "active_contacts",
     "is_midpoint",
     "is_held",
+    "lossless_ticks",
     "hold",
     "equality_rows",
     "first_unstrict",

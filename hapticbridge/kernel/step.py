@@ -232,6 +232,7 @@ def after_step(state: NDArray[np.void], row: NDArray[np.void], substep: int) -> 
         return OK
     judge_environment(state, moved, turned)
     s.flags = MIDPOINT if was_midpoint else 0
+    s.lossless_ticks += was_midpoint
     square = dot(force, force) + dot(torque, torque)
     # MuJoCo ignores a control beyond its limit, so a wrench that is to be applied must stay below
     if not math.isfinite(square + s.environment_energy) or (

@@ -36,6 +36,7 @@ class RecordingFile:
         path: The file.
         count: How many records it holds.
         last_tick: Number of the last record's tick; -1 without records.
+        flags: All flags that any record has.
         events: Its events in order; each has ``event`` and ``time_ns`` (since the run's start).
         meta: Metadata as text; empty if it was damaged.
         attachments: Attached files by name.
@@ -50,6 +51,7 @@ class RecordingFile:
     path: Path
     count: int
     last_tick: int
+    flags: int
     events: list[dict[str, Any]]
     meta: dict[str, str]
     attachments: dict[str, bytes]
@@ -145,13 +147,14 @@ def _described(
         keeps: Whether it does.
     """
     digest = layout.Digest()
-    count, last = 0, -1
+    count, last, flags = 0, -1, 0
 
     def take(run: NDArray[np.void]) -> None:
-        nonlocal count, last
+        nonlocal count, last, flags
         digest.add_ticks(run)
         count += run.size
         last = int(run["tick"][-1]) if run.size else last
+        flags |= int(np.bitwise_or.reduce(run["flags"]))
         if keeps:
             runs.append(run)
 
@@ -171,6 +174,7 @@ def _described(
         "path": path,
         "count": count,
         "last_tick": last,
+        "flags": flags,
         "events": [event for _, event in contents.events],
         "meta": meta,
         "attachments": {item.name: item.data for item in contents.attachments},

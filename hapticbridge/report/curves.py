@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from hapticbridge.errors import RecordingError
-from hapticbridge.felt import coupling_sentences
+from hapticbridge.felt import coupling_sentences, was_always_held
 from hapticbridge.picture import new_figure, write_picture
 from hapticbridge.provenance import parameters_of
 from hapticbridge.recording import Recording
@@ -96,7 +96,11 @@ def draw_recording(recording: Recording) -> Figure:
     energy_axes.set_xlabel("time (s)")
     method = method_named(meta.get("method", ""))
     told = coupling_sentences(
-        parameters.coupling, method, parameters.period, parameters.substeps
+        parameters.coupling,
+        method,
+        parameters.period,
+        parameters.substeps,
+        is_always_held=was_always_held(ticks),
     ) or ("no coupling law",)
     title = f"{meta.get('scene', '')}: method {method.name}, {1 / parameters.period:g} Hz"
     # a control code would make a broken SVG

@@ -10,7 +10,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.audit.balance import Balance, Reached
+from hapticbridge.audit.balance import Balance
+from hapticbridge.audit.reached import Reached
 from hapticbridge.device import DeviceInfo
 from hapticbridge.device.lateness import delay_ticks
 from hapticbridge.errors import HapticBridgeError

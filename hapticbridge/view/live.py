@@ -119,6 +119,7 @@ def _told(stream: IO[bytes]) -> tuple[dict[str, Any], RecordingFile]:
         path=Path("live"),
         count=0,
         last_tick=-1,
+        flags=0,
         events=[],
         meta=job["metadata"],
         attachments=files,

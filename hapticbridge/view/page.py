@@ -10,7 +10,7 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from hapticbridge.felt import coupling_sentences
+from hapticbridge.felt import coupling_sentences, is_always_held
 from hapticbridge.film.stage import LONGEST_ARROW, force_colour
 from hapticbridge.kernel.state import RunParameters
 from hapticbridge.rendering import method_named
@@ -49,7 +49,7 @@ class Page:
         self._extent = float(model.stat.extent)
         self._build_scene(model)
         server.gui.set_panel_label(f"hapticbridge: {facts.get('scene', '')}")
-        self._words = server.gui.add_markdown(_told(parameters, facts))
+        self._words = server.gui.add_markdown(_told(model, parameters, facts))
         self.status = server.gui.add_markdown("waiting for the first tick")
         self._plots = []
         for title, names in PLOTS:
@@ -156,10 +156,14 @@ class Page:
             self._pushes.points = np.stack([places, tips], axis=1).astype(np.float32)
 
 
-def _told(parameters: RunParameters, facts: dict[str, str]) -> str:
+def _told(model: mujoco.MjModel, parameters: RunParameters, facts: dict[str, str]) -> str:
     method = method_named(facts.get("method", ""))
     sentences = coupling_sentences(
-        parameters.coupling, method, parameters.period, parameters.substeps
+        parameters.coupling,
+        method,
+        parameters.period,
+        parameters.substeps,
+        is_always_held=is_always_held(model, parameters.grip),
     )
     lines = [f"Method **{method.name}**, {1 / parameters.period:g} Hz", *sentences]
     lines.append("Orange: force in the hand. Spring: green at rest, red at the largest force.")

@@ -10,28 +10,28 @@ from matplotlib.figure import Figure
 from hapticbridge.errors import RecordingError
 from hapticbridge.picture import new_figure, write_picture
 from hapticbridge.report import DRAWABLE, decimated
-from hapticbridge.whatif.what_if import WhatIf
+from hapticbridge.whatif.outcome import WhatIf
 
 _STYLES = (("#555555", "-", 2.2), ("#1a5fb4", "-", 1.1), ("#b3261e", "--", 1.1))
 """Colour, line and width in points per run; the recorded one is behind the others."""
 
 
 def figure_of(found: WhatIf) -> Figure:
-    """Draws force on the device, way of tool and handle, and energy created against the slack.
+    """Draws the force on the device, the way of the handle, and what the environment created.
 
     Raises:
         RecordingError: A run holds nothing, or a number beyond what can be drawn.
     """
     figure = new_figure(8, 9)
     force_axes, way_axes, energy_axes = figure.subplots(3, 1, sharex=True)
-    origin = found.runs[0].ticks["tool_position"][0]
+    origin = found.runs[0].ticks["handle_position"][0]
     for run, (colour, line, width) in zip(found.runs, _STYLES, strict=False):
         ticks = run.ticks
         if not len(ticks):
             continue
         time = ticks["tick"] * run.period
         force = np.linalg.norm(ticks["wrench_on_device"][:, :3], axis=1)
-        way = 1e3 * np.linalg.norm(ticks["tool_position"] - origin, axis=1)
+        way = 1e3 * np.linalg.norm(ticks["handle_position"] - origin, axis=1)
         energy = 1e3 * ticks["environment_energy"]
         for axes, values in ((force_axes, force), (way_axes, way), (energy_axes, energy)):
             if not (np.abs(values) < DRAWABLE).all():
@@ -39,7 +39,7 @@ def figure_of(found: WhatIf) -> Figure:
             axes.plot(*decimated(time, values), color=colour, ls=line, lw=width, label=run.name)
     energy_axes.axhline(0.0, color="black", lw=0.6)
     force_axes.set_ylabel("force on the device (N)")
-    way_axes.set_ylabel("tool's distance from its start (mm)")
+    way_axes.set_ylabel("handle's distance from its start (mm)")
     energy_axes.set_ylabel("energy that the environment\ncreated (+) or dissipated (−) (mJ)")
     energy_axes.set_xlabel("time (s)")
     for axes in (force_axes, way_axes, energy_axes):
