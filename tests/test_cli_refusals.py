@@ -41,6 +41,7 @@ BAD_RUNS: list[tuple[tuple[object, ...], str]] = [
     (("point_mass", "--force-scale", 0), "force_scale"),
     (("point_mass", "--ramp", -1), "ramp"),
     (("point_mass", "--ramp", 1e300), "ramp"),
+    (("point_mass", "--realtime"), "exclude each other"),
     (("point_mass", "--record", "no/such/folder/run.mcap"), "folder"),
 ]
 

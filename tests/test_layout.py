@@ -16,9 +16,9 @@ ORDER = (
     ("rendering",),
     ("ledger", "inputs", "device"),
     ("guard", "recording", "certificate", "felt"),
-    ("provenance", "summary", "workspace"),
+    ("provenance", "summary", "workspace", "realtime"),
     ("bridge", "audit", "identify", "compare", "export"),
-    ("report", "film", "view", "study", "check"),
+    ("report", "film", "view", "study", "check", "doctor"),
     ("whatif",),  # runs the bridge and asks the audit, which must not know of either
     ("cli",),
 )

@@ -18,6 +18,7 @@ from hapticbridge.cli.chart import ChartCommand
 from hapticbridge.cli.check import Check
 from hapticbridge.cli.data import Compare, Export
 from hapticbridge.cli.devices import Devices
+from hapticbridge.cli.doctor import Doctor
 from hapticbridge.cli.identify import Identify
 from hapticbridge.cli.judge import Audit, Repair
 from hapticbridge.cli.render import Render
@@ -39,6 +40,7 @@ Command = (
     | Annotated[Check, tyro.conf.subcommand("check")]
     | Annotated[Stability, tyro.conf.subcommand("stability")]
     | Annotated[ChartCommand, tyro.conf.subcommand("chart")]
+    | Annotated[Doctor, tyro.conf.subcommand("doctor")]
     | Annotated[Export, tyro.conf.subcommand("export")]
     | Annotated[Compare, tyro.conf.subcommand("compare")]
     | Annotated[Repair, tyro.conf.subcommand("repair")]
