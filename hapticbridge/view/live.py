@@ -134,7 +134,9 @@ def _told(stream: IO[bytes]) -> tuple[dict[str, Any], RecordingFile]:
 def _calm() -> None:
     if sys.platform == "linux":
         with contextlib.suppress(OSError):
-            os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+            # idle: whoever else wakes on this core takes it at once; niceness alone lets a loop
+            # without real-time priority wait for the rest of a slice
+            os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
     if hasattr(os, "nice"):
         os.nice(BEHIND)
 
