@@ -29,7 +29,7 @@ NO_UMOCKDEV = "no umockdev; 'apt-get install umockdev libusb-1.0-0' brings it"
 
 CHECKS = CHECKOUT / "tests/usb_tiers"
 LIMIT = 600.0
-"""In s of this machine's time per job: far beyond what the longest takes, even on a busy machine."""
+"""In s of this machine's time per job: far beyond what the longest takes, even on a busy one."""
 
 LOOP = 10.0
 """In s of virtual time: how long the closed loops run."""
