@@ -49,7 +49,7 @@ from hapticbridge.realtime import (
     wants_real_time,
     warn_of_refusals,
 )
-from hapticbridge.recording.stream import RecordStream
+from hapticbridge.recording.stream import Onlooker, RecordStream
 from hapticbridge.rendering import (
     contact_stiffness_of,
     default_method,
@@ -94,6 +94,8 @@ class Bridge:
         absolute: Take the device's poses as poses in the scene instead of relative to its start.
         limits: Limits on the wrench, within the device's own; None takes these.
         live: Draw a status line on stderr, from the recorder's process.
+        onlooker: Who looks at the run from another process, as ``view.Window`` does; it is started
+            when the bridge is entered and closed when it is left.
         pipelined: Compute what needs no new sample once the wrench is out, where scene and method
             let it (``kernel.ahead``): the same numbers to the bit, the wrench sooner, the whole
             tick 5 % longer. Between two ticks ``scene.data`` then holds the contacts of the new
@@ -124,6 +126,7 @@ class Bridge:
         absolute: bool = False,
         limits: Limits | None = None,
         live: bool = False,
+        onlooker: Onlooker | None = None,
         pipelined: bool | None = None,
         realtime: bool | None = None,
     ) -> None:
@@ -134,7 +137,7 @@ class Bridge:
         refuse_substeps(self.method.scheme, substeps)
         self._workspace = Workspace.of(scale, force_scale, axes, is_absolute=absolute)
         self._path = Path(recording) if recording is not None else None
-        self._is_live = live
+        self._is_live, self._onlooker = live, onlooker
         self.clock = clock or RealClock()
         self._is_pipelined = self.clock.name == RealClock.name if pipelined is None else pipelined
         self._grants: tuple[Grant, ...] = ()
@@ -279,9 +282,13 @@ class Bridge:
             self._tick += 1
         return ""
 
-    def stop(self) -> None:
-        """Ends the run after the present tick; may be called from ``on_tick`` or a thread."""
-        self._stopped_by = "caller"
+    def stop(self, by: str = "caller") -> None:
+        """Ends the run after the present tick; may be called from ``on_tick`` or a thread.
+
+        Args:
+            by: Who wants it, for the summary and the recording's event ``stop``; not empty.
+        """
+        self._stopped_by = by or "caller"
 
     def _silence(self) -> str:
         """Commands zero force; returns why that failed, or nothing."""
@@ -394,7 +401,11 @@ class Bridge:
         scene, clock, method = self.scene, self.clock, self.method
         felt = prepare(scene, self.coupling, self.period, self._substeps, method)
         self._stream = RecordStream(
-            self._path, self.period, live=self._is_live, is_lossless=clock.is_lossless
+            self._path,
+            self.period,
+            live=self._is_live,
+            is_lossless=clock.is_lossless,
+            onlooker=self._onlooker,
         )
         resources.callback(self._stream.close)
         self._compile()

@@ -49,7 +49,7 @@ class Summary:
         is_certified: Whether b >= scale · force_scale · (KT/2 + B') holds for the device in
             translation and rotation; None where its damping is unknown, or where no coupling law
             makes that condition enough.
-        stopped_by: ``duration``, ``signal`` or ``caller``.
+        stopped_by: ``duration``, ``signal``, ``caller``, or who else called ``Bridge.stop``.
         recording: The file, if one was written.
     """
 

@@ -18,7 +18,7 @@ ORDER = (
     ("guard", "recording", "certificate", "felt"),
     ("provenance", "summary", "workspace", "realtime"),
     ("bridge", "audit", "identify", "compare", "export"),
-    ("report", "study", "check", "doctor"),
+    ("report", "film", "view", "study", "check", "doctor"),
     ("whatif",),  # runs the bridge and asks the audit, which must not know of either
     ("cli",),
 )

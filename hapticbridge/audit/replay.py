@@ -2,41 +2,15 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
-from collections import deque
 from dataclasses import dataclass
-from typing import Any
 
-import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.errors import HapticBridgeError, RecordingError
-from hapticbridge.inputs import apply_writes
-from hapticbridge.kernel.state import COUPLING_ACTUATORS, Binding, RunParameters
-from hapticbridge.kernel.step import simulate
-from hapticbridge.provenance import (
-    MODEL_ATTACHMENT,
-    STARTS,
-    STATE_ATTACHMENT,
-    meta_start,
-    processor,
-    restore_state,
-    start_of,
-    versions,
-)
+from hapticbridge.audit.rerun import FOREIGN_TOLERANCE, Rerun, is_same_processor, obstacle
+from hapticbridge.kernel.state import RunParameters
 from hapticbridge.recording import RecordingFile
-from hapticbridge.rendering import check_prepared, method_named
-from hapticbridge.tick import CLOCK_FIELDS, SAMPLE_DTYPE, TICK_DTYPE, TickFlag
-
-DECISIVE = ("hapticbridge", "mujoco", "numba")
-"""Packages whose versions must match for a run to be repeated to the bit."""
-
-FOREIGN_TOLERANCE = 1e-9
-"""Allowed difference, relative to a field's largest value, where the processor differs: other
-vector instructions round differently. Larger would hide tampering, smaller would refuse honest
-recordings."""
+from hapticbridge.tick import CLOCK_FIELDS, TICK_DTYPE, TickFlag
 
 NOT_RUN = "not re-simulated"
 
@@ -88,25 +62,13 @@ class Resimulation:
     """
 
     def __init__(self, recording: RecordingFile, parameters: RunParameters) -> None:
-        self._is_same_processor = _is_same_processor(recording)
+        self._is_same_processor = is_same_processor(recording)
         self._first: tuple[int, str, float] | None = None
         self._off = dict.fromkeys(_COMPARED, 0.0)
         self._largest = dict.fromkeys(_COMPARED, 0.0)
-        self._done, self._is_over = 0, False
-        self._changes = deque(e for e in recording.events if e.get("event") in ("input", "resume"))
-        self._changed = 0
-        self._obstacle = _obstacle(recording)
-        if self._obstacle:
-            return
-        model = _model(recording, parameters)
-        self._data = data = mujoco.MjData(model)
-        # an error inside the C symbol would end the process, so MuJoCo takes its first step in
-        # Python
-        restore_state(model, data, recording.attachments[STATE_ATTACHMENT])
-        method_named(recording.meta.get("method", "")).step(model, data)
-        restore_state(model, data, recording.attachments[STATE_ATTACHMENT])
-        self._binding = Binding(model, data, parameters)
-        _check_start(recording, self._binding.state)
+        self._obstacle = obstacle(recording)
+        if not self._obstacle:
+            self._run = Rerun(recording, parameters)
 
     def add(self, ticks: NDArray[np.void]) -> None:
         """Simulates the next records, ``TICK_DTYPE``, at least one.
@@ -114,28 +76,11 @@ class Resimulation:
         Raises:
             RecordingError: An event among them is damaged.
         """
-        if self._obstacle or self._is_over:
+        if self._obstacle or self._run.is_over:
             return
-        samples = np.zeros(len(ticks), SAMPLE_DTYPE)
-        samples["position"], samples["quaternion"] = (
-            ticks["device_position"],
-            ticks["device_quaternion"],
-        )
-        samples["buttons"] = ticks["buttons"]
-        rows = np.zeros(len(ticks), TICK_DTYPE)
-        done = 0
-        while done < len(ticks) and not self._is_over:
-            end = len(ticks)
-            if self._changes:
-                end = min(self._due(self._changes[0]) - self._done, end)
-            binding = self._binding
-            count = simulate(binding.state, samples[done:end], binding.row, rows[done:end])
-            self._is_over = count < end - done
-            done += count
-            if self._changes and done == end < len(ticks):
-                self._apply(self._changes.popleft())
-        self._compare(ticks[:done], rows[:done])
-        self._done += done
+        start = self._run.done
+        again = self._run.add(ticks)
+        self._compare(ticks[: len(again)], again, start)
 
     def outcome(self) -> Replay:
         """Says how the records agree with what was simulated, when there are no more.
@@ -145,37 +90,19 @@ class Resimulation:
         """
         if self._obstacle:
             return Replay(f"{NOT_RUN}: {self._obstacle}")
-        while self._changes and not self._is_over:
-            self._due(self._changes[0])
-            self._apply(self._changes.popleft())
+        self._run.finish()
         off = max(self._off[name] / max(self._largest[name], 1.0) for name in _COMPARED)
-        if self._is_over and self._first is None:
-            return Replay("disagrees", self._done, "tool_position", float("nan"))
+        if self._run.is_over and self._first is None:
+            return Replay("disagrees", self._run.done, "tool_position", float("nan"))
         if self._first is None:
             return Replay("bit for bit")
-        if not self._is_over and not self._is_same_processor and off <= FOREIGN_TOLERANCE:
+        if not self._run.is_over and not self._is_same_processor and off <= FOREIGN_TOLERANCE:
             return Replay("within 1e-9 (other processor)")
         return Replay("disagrees", *self._first)
 
-    def _due(self, event: dict[str, Any]) -> int:
-        tick = event.get("tick")
-        if not isinstance(tick, int) or tick < self._changed:
-            raise RecordingError(f"event '{event['event']}' names tick {tick!r}, out of order")
-        return tick
-
-    def _apply(self, event: dict[str, Any]) -> None:
-        self._changed = int(event["tick"])
-        if event["event"] == "resume":
-            self._binding.resume()
-            return
-        try:
-            apply_writes(self._data, event.get("writes", []))
-        except (HapticBridgeError, TypeError, ValueError) as error:
-            raise RecordingError(
-                f"event 'input' at tick {event.get('tick')} is damaged: {error}"
-            ) from None
-
-    def _compare(self, recorded_rows: NDArray[np.void], again: NDArray[np.void]) -> None:
+    def _compare(
+        self, recorded_rows: NDArray[np.void], again: NDArray[np.void], start: int
+    ) -> None:
         if not len(again):
             return
         first: tuple[int, str, float] | None = None
@@ -193,76 +120,4 @@ class Resimulation:
             if first is None or at < first[0]:
                 first = (at, name, float(difference[at]))
         if first is not None and self._first is None:
-            self._first = (self._done + first[0], *first[1:])
-
-
-def _obstacle(recording: RecordingFile) -> str:
-    try:
-        recorded = dict(json.loads(recording.meta.get("versions", "")))
-    except (ValueError, TypeError, RecursionError):
-        return "the metadata name no versions"
-    present = versions()
-    for name in DECISIVE:
-        if recorded.get(name) != present[name]:
-            return f"recorded with {name} {recorded.get(name, 'unknown')}, here is {present[name]}"
-    missing = [n for n in (MODEL_ATTACHMENT, STATE_ATTACHMENT) if n not in recording.attachments]
-    return f"the file has no attachment '{missing[0]}'" if missing else ""
-
-
-def _model(recording: RecordingFile, parameters: RunParameters) -> mujoco.MjModel:
-    content = recording.attachments[MODEL_ATTACHMENT]
-    if hashlib.sha256(content).hexdigest() != recording.meta.get("scene_sha256"):
-        raise RecordingError("the attached model is not the one of scene_sha256")
-    try:
-        model = mujoco.MjModel.from_binary_path(
-            MODEL_ATTACHMENT, assets={MODEL_ATTACHMENT: content}
-        )
-    except ValueError as error:
-        raise RecordingError(f"the attached model cannot be loaded: {error}") from None
-    for name in (*COUPLING_ACTUATORS, parameters.grip):
-        kind = mujoco.mjtObj.mjOBJ_SITE if name == parameters.grip else mujoco.mjtObj.mjOBJ_ACTUATOR
-        if mujoco.mj_name2id(model, kind, name) < 0:
-            raise RecordingError(f"the attached model has no '{name}'")
-    method = method_named(recording.meta.get("method", ""))
-    step = parameters.period / parameters.substeps
-    forces, torques = method.gains(parameters.coupling, step)
-    for axis, name in enumerate(COUPLING_ACTUATORS):
-        actuator_id = model.actuator(name).id
-        factor, stiffness, damping = forces if axis < 3 else torques
-        bias = model.actuator_biasprm[actuator_id].tolist()
-        gain = float(model.actuator_gainprm[actuator_id, 0])
-        if (bias[1], bias[2], gain) != (-stiffness, -damping, factor):
-            raise RecordingError(
-                f"the attached model's coupling has K = {-bias[1]!r}, B = {gain!r} in {name}, "
-                f"the metadata say {stiffness!r}, {factor!r}"
-            )
-    try:
-        check_prepared(model, parameters, method)
-    except HapticBridgeError as error:
-        raise RecordingError(f"the attached model does not fit the metadata: {error}") from None
-    if model.opt.timestep != parameters.period / parameters.substeps:
-        raise RecordingError(
-            f"the attached model's timestep is {model.opt.timestep!r} s, the metadata's period "
-            f"{parameters.period!r} s with {parameters.substeps} substeps"
-        )
-    return model
-
-
-def _check_start(recording: RecordingFile, state: NDArray[np.void]) -> None:
-    """Refuses metadata that do not repeat the start of the attached scene."""
-    for name in STARTS:
-        recorded = meta_start(recording.meta, name)
-        present = start_of(state, name)
-        if not np.allclose(recorded, present, rtol=FOREIGN_TOLERANCE, atol=FOREIGN_TOLERANCE) or (
-            _is_same_processor(recording) and recorded != present
-        ):
-            raise RecordingError(
-                f"metadata '{name}' is {recorded}, the attached scene starts with {present}"
-            )
-
-
-def _is_same_processor(recording: RecordingFile) -> bool:
-    try:
-        return bool(json.loads(recording.meta["host"])["processor"] == processor())
-    except (KeyError, TypeError, ValueError, RecursionError):
-        return True
+            self._first = (start + first[0], *first[1:])

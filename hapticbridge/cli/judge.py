@@ -14,10 +14,11 @@ from hapticbridge.audit import AuditReport, audit
 from hapticbridge.cli.judge_many import print_audits, print_unreadable
 from hapticbridge.cli.judge_what_if import print_what_if
 from hapticbridge.cli.terminal import err, out, plain, progress, quantity
-from hapticbridge.errors import RecordingError
+from hapticbridge.errors import HapticBridgeError, RecordingError
+from hapticbridge.film import Shot, still
 from hapticbridge.picture import check_ending
-from hapticbridge.recording import read_recording, repair
-from hapticbridge.report import plot_recording, write_report
+from hapticbridge.recording import Recording, read_recording, repair
+from hapticbridge.report import plot_recording, telling_time, write_report
 from hapticbridge.study.audits import (
     audit_all,
     check_table_name,
@@ -27,6 +28,9 @@ from hapticbridge.study.audits import (
     write_audits,
 )
 from hapticbridge.whatif import changes_from, draw_what_if, what_if
+
+SCENE_SIZE = 640, 400
+"""Of the scene's picture on a page, in pixels: some 50 kB of a page's megabyte."""
 
 _USUAL_EVENTS = ("start", "stop", "input")
 _COLOURS = {"passive": "green", "active": "red", "invalid": "magenta"}
@@ -137,10 +141,20 @@ class Audit:
             if self.plot is not None:
                 plot_recording(recording, self.plot)
             if self.report is not None:
-                write_report(recording, report, self.report)
+                write_report(recording, report, self.report, _scene_picture(recording, report))
         for written in (self.plot, self.report):
             if written is not None:
                 err.print(f"wrote {plain(str(written))}")
+
+
+def _scene_picture(recording: Recording, report: AuditReport) -> bytes | None:
+    """Returns a picture of the scene; nothing where it cannot be drawn, which is no fault of it."""
+    try:
+        at = telling_time(recording, report)
+        return still(report.path, Shot(at=at, width=SCENE_SIZE[0], height=SCENE_SIZE[1]))
+    except (HapticBridgeError, ValueError) as error:
+        err.print(f"no picture of the scene: {plain(str(error))}")
+        return None
 
 
 def _print_report(report: AuditReport) -> None:

@@ -21,16 +21,20 @@ from hapticbridge.cli.devices import Devices
 from hapticbridge.cli.doctor import Doctor
 from hapticbridge.cli.identify import Identify
 from hapticbridge.cli.judge import Audit, Repair
+from hapticbridge.cli.render import Render
 from hapticbridge.cli.run import Run
 from hapticbridge.cli.scenes import Scenes
 from hapticbridge.cli.stability import Stability
 from hapticbridge.cli.terminal import err, out, print_error
+from hapticbridge.cli.view import View
 from hapticbridge.cli.zwidth import Zwidth
 from hapticbridge.errors import HapticBridgeError, SafetyTrip
 
 Command = (
     Annotated[Run, tyro.conf.subcommand("run")]
     | Annotated[Audit, tyro.conf.subcommand("audit")]
+    | Annotated[Render, tyro.conf.subcommand("render")]
+    | Annotated[View, tyro.conf.subcommand("view")]
     | Annotated[Scenes, tyro.conf.subcommand("scenes")]
     | Annotated[Devices, tyro.conf.subcommand("devices")]
     | Annotated[Check, tyro.conf.subcommand("check")]

@@ -6,6 +6,7 @@ import json
 import math
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, fields, replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -15,6 +16,7 @@ from hapticbridge.bridge import Bridge
 from hapticbridge.certificate import default_coupling
 from hapticbridge.cli.run_words import announce, announce_measured, print_summary
 from hapticbridge.cli.terminal import err, out, tell
+from hapticbridge.cli.view import tell_address
 from hapticbridge.clock import RealClock, SimulatedClock, period_of
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Device, DeviceInfo, device_for
@@ -23,6 +25,7 @@ from hapticbridge.guard import Limits
 from hapticbridge.kernel.parameters import checked_substeps
 from hapticbridge.rendering import Method, default_method, method_named
 from hapticbridge.scene import Scene, load_scene, settings_from
+from hapticbridge.view import Address, Window
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,6 +101,13 @@ class Run:
     """Largest torque on the device in N m; by default the device's own."""
     ramp: float = 0.5
     """Seconds over which the force rises at the start."""
+    view: bool = False
+    """Show the run in a browser, from a process of its own; needs the extra 'view'."""
+    host: str = "127.0.0.1"
+    """Address to serve the view on; another than this machine's own needs the token that is
+    printed."""
+    port: int = 8080
+    """Port to serve the view on; 0: any that is free."""
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
     """Print the summary as JSON."""
 
@@ -107,13 +117,14 @@ class Run:
             raise HapticBridgeError(f"duration is {self.duration!r} s; it must be finite and > 0")
         if self.record is not None and self.record.exists() and not self.overwrite:
             raise RecordingError(f"'{self.record}' exists; choose another file or add --overwrite")
+        window = Window(Address(self.host, self.port)) if self.view else None
         scene = load_scene(self.scene, self.grip, **settings_from(self.settings))
         with ExitStack() as stack:
             device = device_for(scene, self.device, tell)
             stack.callback(device.close)  # what is refused from here on must not leave it claimed
-            return self._feel(scene, device, stack)
+            return self._feel(scene, device, stack, window)
 
-    def _feel(self, scene: Scene, device: Device, stack: ExitStack) -> int:
+    def _feel(self, scene: Scene, device: Device, stack: ExitStack, window: Window | None) -> int:
         """Runs the bridge on a device that is open; returns the exit code."""
         scales = self.scale, self.scale if self.force_scale is None else self.force_scale
         bridge = Bridge(
@@ -139,12 +150,17 @@ class Run:
                 ramp=self.ramp,
             ),
             live=not self.as_json,
+            onlooker=window,
             realtime=self.realtime or None,
         )
+        if window is not None:
+            window.on_stop = partial(bridge.stop, "view")
         if not self.as_json:
             announce(bridge, scales, self.substeps, is_method_asked=self.method is not None)
         with err.status("preparing (the first run on a machine compiles for about 20 s) …"):
             stack.enter_context(bridge)
+        if window is not None:
+            tell_address(window.address, window.url, "watch the run and stop it")
         if not self.as_json:
             announce_measured(bridge)
         summary = bridge.run(self.duration)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +27,27 @@ RING_POLL = 1e-3
 """How often a run in simulated time looks whether the recorder made room, in s."""
 
 
+class Onlooker(Protocol):
+    """Looks at a run from another process; the loop neither waits for it nor asks it anything."""
+
+    def start(
+        self, ring: str, metadata: Mapping[str, str], attachments: Sequence[Attachment]
+    ) -> None:
+        """Starts looking.
+
+        Args:
+            ring: Name of the ring, as ``Ring.attach`` takes it; what attaches must free nothing.
+            metadata: Of the run, as a recording has them.
+            attachments: Likewise.
+        """
+
+    def event(self, event: Mapping[str, object]) -> None:
+        """Takes an event; must neither wait nor raise."""
+
+    def close(self) -> None:
+        """Ends looking; must not raise."""
+
+
 class RecordStream:
     """Where the loop leaves its records and events; it never waits in real time.
 
@@ -39,6 +61,7 @@ class RecordStream:
         live: Whether the recorder's process shows the state of the run on standard error.
         is_lossless: Whether the loop may wait for the recorder (simulated time) instead of losing
             records.
+        onlooker: Who looks at the newest records beside the recorder, unasked and unwaited for.
 
     Attributes:
         rows: The ring's records, ``TICK_DTYPE``.
@@ -51,11 +74,21 @@ class RecordStream:
         RecordingError: There is no room for the ring.
     """
 
-    def __init__(self, path: Path | None, period: float, *, live: bool, is_lossless: bool) -> None:
+    def __init__(
+        self,
+        path: Path | None,
+        period: float,
+        *,
+        live: bool,
+        is_lossless: bool,
+        onlooker: Onlooker | None = None,
+    ) -> None:
         self._path, self._is_live, self._is_lossless = path, live, is_lossless
         self._is_read = path is not None or live
         capacity = min(round(RING_SECONDS / period), MOST_RECORDS)
-        self._ring = Ring.shared(capacity) if self._is_read else Ring.local(capacity)
+        self._onlooker = onlooker
+        is_shared = self._is_read or onlooker is not None
+        self._ring = Ring.shared(capacity) if is_shared else Ring.local(capacity)
         self.rows, self.cursors = self._ring.rows, self._ring.cursors
         if not self._is_read:
             self.cursors[TAIL] = NOBODY_READS
@@ -65,7 +98,7 @@ class RecordStream:
     @property
     def is_read(self) -> bool:
         """Whether anybody reads the records, so that ``start`` is to be called."""
-        return self._is_read
+        return self._is_read or self._onlooker is not None
 
     def start(self, metadata: Mapping[str, str], attachments: Sequence[Attachment]) -> None:
         """Starts the recorder's process and waits until the file is open.
@@ -73,8 +106,13 @@ class RecordStream:
         Raises:
             RecordingError: The process cannot be started, or the file cannot be written.
         """
-        self.recorder = Recorder(self._ring, self._path, metadata, attachments, live=self._is_live)
-        self.recorder.wait_until_ready()
+        if self._is_read:
+            self.recorder = Recorder(
+                self._ring, self._path, metadata, attachments, live=self._is_live
+            )
+            self.recorder.wait_until_ready()
+        if self._onlooker is not None:
+            self._onlooker.start(str(self._ring.name), metadata, attachments)
 
     def makes_room(self, *, may_wait: bool) -> bool:
         """Answers a ring that refused a record: try it again, or it is lost.
@@ -106,8 +144,11 @@ class RecordStream:
             time_ns: When, in ns since the start of the run.
             **details: What else is to be known of it.
         """
+        told = {"event": event, "tick": tick, **details}
         if self.recorder is not None:
-            self.recorder.event({"event": event, "tick": tick, **details}, time_ns)
+            self.recorder.event(told, time_ns)
+        if self._onlooker is not None:
+            self._onlooker.event(told)
 
     def latest(self, count: int) -> NDArray[np.void]:
         """Returns copies of the newest records, oldest first."""
@@ -123,4 +164,6 @@ class RecordStream:
             if self.recorder is not None:
                 self.recorder.close()
         finally:
+            if self._onlooker is not None:
+                self._onlooker.close()
             self._ring.close()

@@ -1,0 +1,227 @@
+"""A recorded run, simulated again: the whole scene at every tick, not only what was recorded."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections import deque
+from collections.abc import Mapping
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticbridge.errors import HapticBridgeError, RecordingError
+from hapticbridge.inputs import apply_writes
+from hapticbridge.kernel.state import COUPLING_ACTUATORS, Binding, RunParameters
+from hapticbridge.kernel.step import simulate
+from hapticbridge.provenance import (
+    MODEL_ATTACHMENT,
+    STARTS,
+    STATE_ATTACHMENT,
+    meta_start,
+    processor,
+    restore_state,
+    start_of,
+    versions,
+)
+from hapticbridge.recording import RecordingFile
+from hapticbridge.rendering import check_prepared, method_named
+from hapticbridge.tick import SAMPLE_DTYPE, TICK_DTYPE
+
+DECISIVE = ("hapticbridge", "mujoco", "numba")
+"""Packages whose versions must match for a run to be repeated to the bit."""
+
+FOREIGN_TOLERANCE = 1e-9
+"""Allowed difference, relative to a field's largest value, where the processor differs: other
+vector instructions round differently. Larger would hide tampering, smaller would refuse honest
+recordings."""
+
+CHANGES = ("input", "resume")
+"""Events that change what the next ticks compute."""
+
+
+class Rerun:
+    """Simulates a recorded device motion again, through what the recording carries.
+
+    Args:
+        recording: What is simulated again, without an ``obstacle``. Its events are taken as they
+            fall due; more may be told with ``note``.
+        parameters: Of the recorded run.
+
+    Attributes:
+        model: The attached scene.
+        data: Its state after the last tick that was simulated.
+        done: How many ticks that are.
+        is_over: Whether a sample or a result was not finite, so that nothing follows.
+
+    Raises:
+        RecordingError: The attachments contradict the metadata, so the file was changed.
+    """
+
+    def __init__(self, recording: RecordingFile, parameters: RunParameters) -> None:
+        self._changes: deque[Mapping[str, Any]] = deque()
+        for event in recording.events:
+            self.note(event)
+        self._changed = 0
+        self.done, self.is_over = 0, False
+        self.model = model = _model(recording, parameters)
+        self.data = data = mujoco.MjData(model)
+        # an error inside the C symbol would end the process, so MuJoCo takes its first step in
+        # Python
+        restore_state(model, data, recording.attachments[STATE_ATTACHMENT])
+        method_named(recording.meta.get("method", "")).step(model, data)
+        restore_state(model, data, recording.attachments[STATE_ATTACHMENT])
+        self._binding = Binding(model, data, parameters)
+        _check_start(recording, self._binding.state)
+
+    def warm_up(self) -> None:
+        """Compiles what ``add`` needs, so that the first call takes no longer than others."""
+        binding = self._binding
+        simulate(binding.state, np.zeros(0, SAMPLE_DTYPE), binding.row, np.zeros(0, TICK_DTYPE))
+
+    @property
+    def slack(self) -> float:
+        """What the environment may have created by now, in J."""
+        return float(self._binding.state["slack"][0])
+
+    def note(self, event: Mapping[str, Any]) -> None:
+        """Takes an event of a run that still goes on; those that change nothing are passed over."""
+        if event.get("event") in CHANGES:
+            self._changes.append(event)
+
+    def add(self, ticks: NDArray[np.void]) -> NDArray[np.void]:
+        """Simulates the next ticks.
+
+        Args:
+            ticks: Their records, ``TICK_DTYPE``, at least one; only the device's samples are used.
+
+        Returns:
+            Records as simulated; fewer where it ``is_over``.
+
+        Raises:
+            RecordingError: An event among them is damaged.
+        """
+        samples = np.zeros(len(ticks), SAMPLE_DTYPE)
+        samples["position"], samples["quaternion"] = (
+            ticks["device_position"],
+            ticks["device_quaternion"],
+        )
+        samples["buttons"] = ticks["buttons"]
+        rows = np.zeros(len(ticks), TICK_DTYPE)
+        done = 0
+        while done < len(ticks) and not self.is_over:
+            end = len(ticks)
+            if self._changes:
+                end = min(self._due(self._changes[0]) - self.done, end)
+            binding = self._binding
+            count = simulate(binding.state, samples[done:end], binding.row, rows[done:end])
+            self.is_over = count < end - done
+            done += count
+            if self._changes and done == end < len(ticks):
+                self._apply(self._changes.popleft())
+        self.done += done
+        return rows[:done]
+
+    def finish(self) -> None:
+        """Applies the events after the last tick.
+
+        Raises:
+            RecordingError: One of them is damaged.
+        """
+        while self._changes and not self.is_over:
+            self._due(self._changes[0])
+            self._apply(self._changes.popleft())
+
+    def _due(self, event: Mapping[str, Any]) -> int:
+        tick = event.get("tick")
+        if not isinstance(tick, int) or tick < self._changed:
+            raise RecordingError(f"event '{event['event']}' names tick {tick!r}, out of order")
+        return tick
+
+    def _apply(self, event: Mapping[str, Any]) -> None:
+        self._changed = int(event["tick"])
+        if event["event"] == "resume":
+            self._binding.resume()
+            return
+        try:
+            apply_writes(self.data, event.get("writes", []))
+        except (HapticBridgeError, TypeError, ValueError) as error:
+            raise RecordingError(
+                f"event 'input' at tick {event.get('tick')} is damaged: {error}"
+            ) from None
+
+
+def obstacle(recording: RecordingFile) -> str:
+    """Returns why a run cannot be simulated again here, or nothing."""
+    try:
+        recorded = dict(json.loads(recording.meta.get("versions", "")))
+    except (ValueError, TypeError, RecursionError):
+        return "the metadata name no versions"
+    present = versions()
+    for name in DECISIVE:
+        if recorded.get(name) != present[name]:
+            return f"recorded with {name} {recorded.get(name, 'unknown')}, here is {present[name]}"
+    missing = [n for n in (MODEL_ATTACHMENT, STATE_ATTACHMENT) if n not in recording.attachments]
+    return f"the file has no attachment '{missing[0]}'" if missing else ""
+
+
+def _model(recording: RecordingFile, parameters: RunParameters) -> mujoco.MjModel:
+    content = recording.attachments[MODEL_ATTACHMENT]
+    if hashlib.sha256(content).hexdigest() != recording.meta.get("scene_sha256"):
+        raise RecordingError("the attached model is not the one of scene_sha256")
+    try:
+        model = mujoco.MjModel.from_binary_path(
+            MODEL_ATTACHMENT, assets={MODEL_ATTACHMENT: content}
+        )
+    except ValueError as error:
+        raise RecordingError(f"the attached model cannot be loaded: {error}") from None
+    for name in (*COUPLING_ACTUATORS, parameters.grip):
+        kind = mujoco.mjtObj.mjOBJ_SITE if name == parameters.grip else mujoco.mjtObj.mjOBJ_ACTUATOR
+        if mujoco.mj_name2id(model, kind, name) < 0:
+            raise RecordingError(f"the attached model has no '{name}'")
+    method = method_named(recording.meta.get("method", ""))
+    step = parameters.period / parameters.substeps
+    forces, torques = method.gains(parameters.coupling, step)
+    for axis, name in enumerate(COUPLING_ACTUATORS):
+        actuator_id = model.actuator(name).id
+        factor, stiffness, damping = forces if axis < 3 else torques
+        bias = model.actuator_biasprm[actuator_id].tolist()
+        gain = float(model.actuator_gainprm[actuator_id, 0])
+        if (bias[1], bias[2], gain) != (-stiffness, -damping, factor):
+            raise RecordingError(
+                f"the attached model's coupling has K = {-bias[1]!r}, B = {gain!r} in {name}, "
+                f"the metadata say {stiffness!r}, {factor!r}"
+            )
+    try:
+        check_prepared(model, parameters, method)
+    except HapticBridgeError as error:
+        raise RecordingError(f"the attached model does not fit the metadata: {error}") from None
+    if model.opt.timestep != parameters.period / parameters.substeps:
+        raise RecordingError(
+            f"the attached model's timestep is {model.opt.timestep!r} s, the metadata's period "
+            f"{parameters.period!r} s with {parameters.substeps} substeps"
+        )
+    return model
+
+
+def _check_start(recording: RecordingFile, state: NDArray[np.void]) -> None:
+    """Refuses metadata that do not repeat the start of the attached scene."""
+    for name in STARTS:
+        recorded = meta_start(recording.meta, name)
+        present = start_of(state, name)
+        if not np.allclose(recorded, present, rtol=FOREIGN_TOLERANCE, atol=FOREIGN_TOLERANCE) or (
+            is_same_processor(recording) and recorded != present
+        ):
+            raise RecordingError(
+                f"metadata '{name}' is {recorded}, the attached scene starts with {present}"
+            )
+
+
+def is_same_processor(recording: RecordingFile) -> bool:
+    """Returns whether a run was recorded on this model of processor, as far as it says."""
+    try:
+        return bool(json.loads(recording.meta["host"])["processor"] == processor())
+    except (KeyError, TypeError, ValueError, RecursionError):
+        return True

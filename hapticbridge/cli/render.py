@@ -1,0 +1,49 @@
+"""``hapticbridge render``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+from hapticbridge.cli.terminal import err, out, plain, progress
+from hapticbridge.errors import RecordingError
+from hapticbridge.film import Shot, draw
+
+
+@dataclass(frozen=True, slots=True)
+class Render:
+    """Draw a recorded run without a display: a picture, or a film of it.
+
+    EGL or OSMesa draws, whichever works; MUJOCO_GL chooses. The handle is a ghost, the coupling a
+    line that turns red with its force, the arrow the force in the hand. Examples:
+
+        hapticbridge render run.mcap run.png --at 2.5
+        hapticbridge render run.mcap run.mp4
+    """
+
+    file: tyro.conf.Positional[Path]
+    """The recording (.mcap)."""
+    output: tyro.conf.Positional[Path]
+    """The picture (.png), or the film (.mp4, extra 'view')."""
+    at: float | None = None
+    """Seconds from the start; by default the last tick. For pictures only."""
+    width: int = 800
+    """In pixels, even."""
+    height: int = 600
+    """In pixels, even."""
+    fps: int = 30
+    """Frames per second of a film."""
+    overwrite: bool = False
+    """Replace the picture or film if the file exists."""
+
+    def execute(self) -> int:
+        """Draws; returns the exit code."""
+        if self.output.exists() and not self.overwrite:
+            raise RecordingError(f"'{self.output}' exists; choose another file or add --overwrite")
+        shot = Shot(at=self.at, width=self.width, height=self.height, fps=self.fps)
+        with err.status("drawing …"), progress("drawing") as show:
+            renderer = draw(self.file, self.output, shot, show)
+        out.print(f"wrote {plain(str(self.output))} (drawn with {renderer})")
+        return 0

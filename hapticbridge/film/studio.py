@@ -1,0 +1,200 @@
+"""Draws a recorded run off-screen, with whichever renderer works here."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import threading
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Any, cast
+
+from hapticbridge.arguments import Arguments
+from hapticbridge.errors import HapticBridgeError, RecordingError
+
+RENDERERS = ("egl", "osmesa")
+"""What draws without a display: EGL with a graphics card or Mesa, OSMesa on the processor alone."""
+
+ENDINGS = (".mp4", ".png")
+"""What a film's or a picture's name may end in."""
+
+PATIENCE = 120.0
+"""Longest wait for a renderer, in s; a machine that compiles anew needs half a minute."""
+
+MOST_PIXELS = 4096
+"""Of a side of a picture; drivers refuse much more."""
+
+_BOOTSTRAP = """
+import sys
+from mujoco.rendering.classic.gl_context import GLContext
+GLContext(16, 16).free()
+print('{"ready": true}', flush=True)
+sys.path.insert(0, sys.argv[1])
+from hapticbridge.film.artist import run
+run()
+"""
+# the renderer first, so that whatever fails later is not taken for one that does not work
+
+_NONE_WORKS = (
+    "neither EGL nor OSMesa works here, so nothing can be drawn off-screen; on Debian: apt install "
+    "libegl1 libgl1-mesa-dri, or libosmesa6"
+)
+
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Shot:
+    """What to draw.
+
+    Attributes:
+        at: Time in s from the start of the run; None: the last tick, or the whole run as a film.
+        width: In pixels, 16 to 4096 and even.
+        height: Likewise.
+        fps: Frames per second of a film, 1 to 120.
+
+    Raises:
+        HapticBridgeError: A value is out of range.
+    """
+
+    at: float | None = None
+    width: int = 800
+    height: int = 600
+    fps: int = 30
+
+    def __post_init__(self) -> None:
+        check = Arguments(HapticBridgeError)
+        for name in ("width", "height"):
+            side = check.whole(name, getattr(self, name), least=16, most=MOST_PIXELS)
+            if side % 2:
+                raise HapticBridgeError(f"{name} is {side} pixels; films need an even number")
+        check.whole("fps", self.fps, least=1, most=120)
+        if self.at is not None:
+            check.number("time", self.at, "s", least=0.0)
+
+
+def draw(
+    recording: str | Path,
+    out: str | Path,
+    shot: Shot | None = None,
+    progress: Progress | None = None,
+) -> str:
+    """Draws a recording into a file.
+
+    Every body stands where the run, simulated again, has it, and the tool where its record says.
+
+    Args:
+        recording: The file.
+        out: ``.png`` for one picture, ``.mp4`` for a film as long as the run; an existing file is
+            replaced.
+        shot: When and how large; the last tick at 800 × 600 by default.
+        progress: Called with frames done and to do.
+
+    Returns:
+        The renderer that drew it.
+
+    Raises:
+        HapticBridgeError: No renderer works here, the file's ending is unknown, or a film is asked
+            for without the extra 'view'.
+        RecordingError: The recording cannot be drawn, or the file not written.
+    """
+    shot, target = shot or Shot(), Path(out)
+    _check_target(target, shot)
+    asked = os.environ.get("MUJOCO_GL")
+    job = {"recording": str(recording), "out": str(target), "at": shot.at}
+    job |= {"width": shot.width, "height": shot.height, "fps": shot.fps}
+    for renderer in [asked] if asked else RENDERERS:
+        if _draw_with(renderer, job, progress):
+            return renderer
+    if asked:
+        raise HapticBridgeError(f"MUJOCO_GL={asked} does not work here; try egl or osmesa")
+    raise HapticBridgeError(_NONE_WORKS)
+
+
+def still(recording: str | Path, shot: Shot) -> bytes:
+    """Returns a picture of a recording as PNG.
+
+    Raises:
+        HapticBridgeError: As ``draw``.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "still.png"
+        draw(recording, file, shot)
+        return file.read_bytes()
+
+
+def _check_target(target: Path, shot: Shot) -> None:
+    ending = target.suffix.lower()
+    if ending not in ENDINGS:
+        raise HapticBridgeError(
+            f"'{target}' is neither a picture nor a film; endings: {', '.join(ENDINGS)}"
+        )
+    if not target.absolute().parent.is_dir():
+        raise HapticBridgeError(f"cannot write '{target}': its folder does not exist")
+    if ending == ".mp4" and shot.at is not None:
+        raise HapticBridgeError("a film shows the whole run; a time goes with a picture (.png)")
+    if ending == ".mp4" and importlib.util.find_spec("imageio_ffmpeg") is None:
+        raise HapticBridgeError("a film needs the extra 'view': pip install 'hapticbridge[view]'")
+
+
+def _draw_with(renderer: str, job: dict[str, Any], progress: Progress | None) -> bool:
+    """Draws in a process of its own; returns whether its renderer works.
+
+    Raises:
+        RecordingError: It works, but the recording cannot be drawn.
+    """
+    package = str(Path(__file__).resolve().parents[2])
+    # -P: a file in the user's working folder must not stand in for a module
+    command = [sys.executable, "-P", "-c", _BOOTSTRAP, package]
+    environment = {**os.environ, "MUJOCO_GL": renderer}
+    environment.pop("PYOPENGL_PLATFORM", None)  # of another renderer, if one was tried in here
+    process = subprocess.Popen(
+        command,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        env=environment,
+        text=True,
+    )
+    watch = threading.Timer(PATIENCE, process.kill)
+    watch.start()
+    try:
+        with process:
+            told, told_by = cast(IO[str], process.stdin), cast(IO[str], process.stdout)
+            print(json.dumps(job), file=told, flush=True)
+            return _followed(_answers(told_by), watch, progress)
+    except BrokenPipeError:
+        return False  # it ended before it was told anything
+    finally:
+        watch.cancel()
+        process.kill()
+
+
+def _answers(lines: IO[str]) -> Iterator[dict[str, Any]]:
+    for line in lines:
+        if line.startswith("{"):  # drivers print, too
+            yield json.loads(line)
+
+
+def _followed(
+    answers: Iterator[dict[str, Any]], watch: threading.Timer, progress: Progress | None
+) -> bool:
+    is_ready = False
+    for answer in answers:
+        if "ready" in answer:
+            is_ready = True
+            watch.cancel()
+        elif "frame" in answer and progress is not None:
+            progress(answer["frame"], answer["frames"])
+        elif "error" in answer:
+            raise RecordingError(answer["error"])
+        elif "done" in answer:
+            return True
+    if is_ready:
+        raise RecordingError("the process that draws died in the middle of it")
+    return False

@@ -1,0 +1,134 @@
+"""What a page draws and judges by: a run's records, and the energies that they give."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticbridge.audit.balance import Balance
+from hapticbridge.audit.reached import Reached
+from hapticbridge.device import DeviceInfo
+from hapticbridge.device.lateness import delay_ticks
+from hapticbridge.errors import HapticBridgeError
+from hapticbridge.kernel.state import RunParameters
+from hapticbridge.provenance import MODEL_ATTACHMENT, STARTS, meta_start, parameters_of
+from hapticbridge.recording import Recording
+from hapticbridge.recording.reader import BLOCK
+from hapticbridge.rendering import Method, method_named
+from hapticbridge.report.curves import DRAWABLE
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Evidence:
+    """A run that can be drawn: n ticks, and per tick what each port has given and may give.
+
+    Attributes:
+        ticks: The records, ``TICK_DTYPE``, n >= 1.
+        events: What happened.
+        parameters: The run's.
+        info: The device.
+        method: How the tool was rendered.
+        time: Of each tick in s, (n,).
+        created: What the environment has created so far, (n,) in J.
+        allowed: Its slack: what it may have created so far, (n,) in J.
+        kicked: What the device was given beyond what is paid for, (n,) in J; zero throughout where
+            that cannot be told (``Balance.kicked``).
+        model: The compiled scene; None if the file lacks it or this MuJoCo cannot load it.
+    """
+
+    ticks: NDArray[np.void]
+    events: list[dict[str, Any]]
+    parameters: RunParameters
+    info: DeviceInfo
+    method: Method
+    time: Array
+    created: Array
+    allowed: Array
+    kicked: Array
+    model: mujoco.MjModel | None
+
+    @property
+    def lateness(self) -> Array:
+        """How long after its deadline each tick began, (n,) in s."""
+        return np.asarray(1e-9 * (self.ticks["wake_ns"] - self.ticks["deadline_ns"]))
+
+    @classmethod
+    def of(cls, recording: Recording) -> Evidence | None:
+        """Returns what can be drawn of a recording; None for a damaged one, or one without ticks.
+
+        Args:
+            recording: As it was read; it need not have passed an audit.
+        """
+        ticks = recording.ticks
+        fields = (name for name in ticks.dtype.names or () if ticks.dtype[name].base.kind == "f")
+        if not len(ticks) or not all((np.abs(ticks[name]) < DRAWABLE).all() for name in fields):
+            return None
+        try:
+            parameters = parameters_of(recording.meta)
+            info = DeviceInfo.from_json(recording.meta.get("device", ""))
+            method = method_named(recording.meta.get("method", ""))
+            linear, rotational = info.burning_damping
+            parameters = replace(
+                parameters, device_damping=linear, device_rotational_damping=rotational
+            )
+            energies = np.concatenate(
+                [
+                    (each.environment_energy, each.slack, each.kicked)
+                    for each in _balances(recording, parameters, info)
+                ],
+                axis=1,
+            )
+        except HapticBridgeError:
+            return None
+        return cls(
+            ticks=ticks,
+            events=recording.events,
+            parameters=parameters,
+            info=info,
+            method=method,
+            time=ticks["tick"] * parameters.period,
+            created=energies[0],
+            allowed=energies[1],
+            kicked=energies[2],
+            model=_model(recording),
+        )
+
+
+def _balances(
+    recording: Recording, parameters: RunParameters, info: DeviceInfo
+) -> Iterator[Balance]:
+    """Yields the balance block by block: of a long run one takes many times the records' room."""
+    starts = {name: np.array(meta_start(recording.meta, name)) for name in STARTS}
+    resumed = [
+        float(event["tick"])
+        for event in recording.events
+        if event.get("event") == "resume" and isinstance(event.get("tick"), int)
+    ]
+    ticks, late = recording.ticks, delay_ticks(info, parameters.period) or 0
+    energy = float(starts["start_kinetic"][0] + starts["start_potential"][0])
+    reached = Reached.at_start(parameters, starts["handle_start"], starts["tool_start"], energy)
+    for begin in range(0, len(ticks), BLOCK):
+        end = begin + BLOCK
+        following = ticks[end : end + late]
+        balance = Balance.of(
+            ticks[begin:end], parameters, reached, np.array(resumed), late, following
+        )
+        reached = balance.reached
+        yield balance
+
+
+def _model(recording: Recording) -> mujoco.MjModel | None:
+    content = recording.attachments.get(MODEL_ATTACHMENT)
+    if content is None:
+        return None
+    try:
+        return mujoco.MjModel.from_binary_path(MODEL_ATTACHMENT, assets={MODEL_ATTACHMENT: content})
+    except ValueError:
+        return None

@@ -1,0 +1,119 @@
+"""A recorded run on the page, with a slider for its time."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import viser
+
+from hapticbridge.film.stage import Stage
+from hapticbridge.view.address import Address
+from hapticbridge.view.page import Page
+from hapticbridge.view.server import serve, stop
+from hapticbridge.view.sight import Sight
+from hapticbridge.view.trace import Trace
+
+FRAME = 1 / 30
+"""Seconds between two instants that can be chosen, unless there would be more than ``MOST``."""
+
+MOST = 18_000
+"""Instants of a run at most: ten minutes at 30 a second, some 30 MB. A longer run has longer
+steps."""
+
+Progress = Callable[[int, int], None]
+
+
+class Replay:
+    """Every instant of a recorded run, ready to be shown in any order.
+
+    Args:
+        path: The recording.
+        progress: Called with instants done and to do.
+
+    Attributes:
+        stage: The run, at its end.
+        sights: Its instants.
+        step: Seconds between two of them.
+        trace: Its curves.
+
+    Raises:
+        RecordingError: It is no recording, or cannot be simulated again here.
+    """
+
+    def __init__(self, path: str | Path, progress: Progress | None = None) -> None:
+        self.stage = stage = Stage(path)
+        self.step = max(FRAME, stage.duration / MOST)
+        self.sights: list[Sight] = []
+        self.trace = Trace()
+        count = max(1, int(stage.duration / self.step) + 1)
+        period = stage.parameters.period
+        for number in range(count):
+            stage.show(stage.tick_at(min(number * self.step, stage.duration)))
+            self.sights.append(Sight.of(stage.model, stage.data, stage.row, period))
+            self.trace.add(stage.passed, stage.slack, period)
+            if progress is not None:
+                progress(number + 1, count)
+
+    def at(self, moment: float) -> Sight:
+        """Returns the instant nearest to a time in s."""
+        number = round(moment / self.step)
+        return self.sights[min(max(number, 0), len(self.sights) - 1)]
+
+
+class Theatre:
+    """Serves a replay.
+
+    Args:
+        replay: What is shown.
+        address: Where.
+
+    Attributes:
+        url: What to open in a browser.
+
+    Raises:
+        HapticBridgeError: The page cannot be served.
+    """
+
+    def __init__(self, replay: Replay, address: Address) -> None:
+        self._replay = replay
+        self._server: viser.ViserServer = serve(address)
+        self.url = address.url(self._server.get_port())
+        stage = replay.stage
+        last = replay.sights[-1].time
+        with self._server.gui.add_folder(None):
+            self.slider = self._server.gui.add_slider(
+                "time (s)", 0.0, max(last, replay.step), 1e-3, 0.0
+            )
+            self._playing = self._server.gui.add_checkbox("play", initial_value=False)
+        self._page = Page(
+            self._server,
+            stage.model,
+            stage.parameters,
+            dict(stage.recording.meta),
+            stage.reference,
+        )
+        if len(replay.trace) > 1:
+            self._page.plot(*replay.trace.curves())
+        self.show(0.0)
+        self.slider.on_update(lambda _: self.show(self.slider.value))
+
+    def show(self, moment: float) -> None:
+        """Shows the instant nearest to a time in s."""
+        sight = self._replay.at(moment)
+        self._page.show(sight)
+        self._page.status.content = f"**{sight.time:.3f} s**, {np.linalg.norm(sight.force):.2f} N"
+
+    def play(self, is_over: threading.Event) -> None:
+        """Moves the slider with the time where that is asked for, until it is over."""
+        while not is_over.wait(FRAME):
+            if self._playing.value:
+                following = self.slider.value + FRAME
+                self.slider.value = 0.0 if following > self.slider.max else following
+                self.show(self.slider.value)
+
+    def close(self) -> None:
+        """Ends serving."""
+        stop(self._server)

@@ -1,0 +1,123 @@
+"""viser's server behind our own door."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import http.client
+import io
+import logging
+import threading
+from collections.abc import Awaitable, Callable, Iterator
+from typing import Any
+
+import viser
+import viser._messages
+import websockets.asyncio.server
+from websockets.datastructures import Headers
+from websockets.http11 import Request, Response
+
+from hapticbridge.errors import HapticBridgeError
+from hapticbridge.view.address import COOKIE, LOOPBACK, Address
+
+Process = Callable[[Any, Request], Response | Awaitable[Response | None] | None]
+
+MOST_MESSAGE = 1 << 16
+"""Bytes of a message from a browser; what it sends here are button presses and camera poses, some
+hundred bytes."""
+
+_SERVING = threading.Lock()
+
+
+def serve(address: Address) -> viser.ViserServer:
+    """Starts viser's server where every request, of pages and of sockets, is asked for first.
+
+    Raises:
+        HapticBridgeError: It did not come to listen at this address alone.
+    """
+    with _SERVING, _behind(address), contextlib.redirect_stdout(io.StringIO()):
+        server = viser.ViserServer(host=address.host, port=address.port, verbose=False)
+    if address.port and server.get_port() != address.port:  # viser takes the next one instead
+        stop(server)
+        raise HapticBridgeError(f"port {address.port} is in use; choose another with --port")
+    if not _is_guarded(server.get_port(), address):
+        stop(server)
+        raise HapticBridgeError("this version of viser lets everybody in; nothing is served")
+    # viser would carry the page to a server of its own on the internet if a browser asked for it
+    for message in (viser._messages.ShareUrlRequest, viser._messages.ShareUrlDisconnect):
+        server._websock_server.unregister_handler(message)
+    server.gui.configure_theme(
+        control_width="large",
+        show_logo=False,
+        show_share_button=False,
+    )
+    server.gui.main_panel.dock_right()
+    return server
+
+
+def stop(server: viser.ViserServer) -> None:
+    """Stops serving."""
+    with contextlib.redirect_stdout(io.StringIO()):  # viser says so, in the middle of our answers
+        server.stop()
+
+
+def _is_guarded(port: int, address: Address) -> bool:
+    """Knocks as a stranger would: another version of viser may have another door."""
+    host = LOOPBACK[0] if address.host in ("", "0.0.0.0") else address.host
+    knock = http.client.HTTPConnection(host, port, timeout=10.0)
+    try:
+        knock.request("GET", "/", headers={"Host": "stranger.invalid"})
+        return knock.getresponse().status == http.HTTPStatus.FORBIDDEN
+    except OSError:
+        return False
+    finally:
+        knock.close()
+
+
+@contextlib.contextmanager
+def _behind(address: Address) -> Iterator[None]:
+    """Puts the door before whatever is served meanwhile; viser has no place for it of its own."""
+    module: Any = websockets.asyncio.server
+    plain = module.serve
+
+    def guarded(*args: Any, process_request: Process | None = None, **options: Any) -> Any:
+        options["max_size"] = MOST_MESSAGE
+        door = _door(address, process_request)
+        return plain(*args, process_request=door, **options)
+
+    # viser looks the name up in its server's thread, which runs once ViserServer() returns
+    module.serve = guarded
+    logging.getLogger("websockets.server").setLevel(logging.CRITICAL)  # refusals are no news
+    try:
+        yield
+    finally:
+        module.serve = plain
+
+
+def _door(address: Address, inner: Process | None) -> Process:
+    async def ask(connection: Any, request: Request) -> Response | None:
+        # repeated headers would let one through for another
+        headers = {name.lower(): request.headers.get_all(name) for name in request.headers}
+        repeated = any(len(headers.get(name, [])) > 1 for name in ("host", "origin", "cookie"))
+        first = {name: values[0] for name, values in headers.items()}
+        reason = "a header is repeated" if repeated else address.refusal(request.path, first)
+        if reason:
+            return _refused(reason)
+        answer: Any = None if inner is None else inner(connection, request)
+        if asyncio.iscoroutine(answer):
+            answer = await answer
+        if isinstance(answer, Response) and address.is_in_query(request.path):
+            cookie = f"{COOKIE}={address.token}; Path=/; HttpOnly; SameSite=Strict"
+            answer.headers["Set-Cookie"] = cookie
+        return answer if isinstance(answer, Response) else None
+
+    return ask
+
+
+def _refused(reason: str) -> Response:
+    body = f"hapticbridge: {reason}\n".encode()
+    headers = Headers(
+        {"Content-Type": "text/plain; charset=utf-8", "Content-Length": str(len(body))}
+    )
+    headers["Connection"] = "close"
+    return Response(403, "Forbidden", headers, body)

@@ -1,0 +1,70 @@
+"""What the page shows of one instant: numbers alone, made by the run and drawn by the page."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+MOST_CONTACTS = 32
+"""Contacts that are shown; more are a heap in which nobody sees one."""
+
+
+@dataclass(frozen=True, slots=True)
+class Sight:
+    """One instant of a run.
+
+    Attributes:
+        time: Since the start of the run in s.
+        places: Where each body is, (nbody, 3) in m.
+        turns: How each is turned, quaternions (nbody, 4).
+        handle: Where the handle is, (3,) in m.
+        grip: Where the grip on the tool is, (3,) in m.
+        force: On the tool, (3,) in N; the hand feels the opposite.
+        contact_places: Shape (n, 3), n <= ``MOST_CONTACTS``, in m.
+        contact_forces: In the world frame, (n, 3) in N.
+    """
+
+    time: float
+    places: Array
+    turns: Array
+    handle: Array
+    grip: Array
+    force: Array
+    contact_places: Array
+    contact_forces: Array
+
+    @classmethod
+    def of(
+        cls, model: mujoco.MjModel, data: mujoco.MjData, row: NDArray[np.void], period: float
+    ) -> Sight:
+        """Looks at a scene.
+
+        Args:
+            model: The scene.
+            data: After the tick; a copy whose body poses may be refreshed here.
+            row: Of the tick, one element of ``TICK_DTYPE``.
+            period: T in s.
+        """
+        # contacts stay as the tick solved them; only what is drawn is brought to its end
+        mujoco.mj_kinematics(model, data)
+        count = min(data.ncon, MOST_CONTACTS)
+        forces = np.zeros((count, 3))
+        wrench = np.zeros(6)
+        for index in range(count):
+            mujoco.mj_contactForce(model, data, index, wrench)
+            forces[index] = data.contact.frame[index].reshape(3, 3).T @ wrench[:3]
+        return cls(
+            time=float(row["tick"][0]) * period,
+            places=data.xpos.copy(),
+            turns=data.xquat.copy(),
+            handle=row["handle_position"][0].copy(),
+            grip=row["tool_position"][0].copy(),
+            force=row["wrench_on_tool"][0, :3].copy(),
+            contact_places=np.array(data.contact.pos[:count]).reshape(count, 3),
+            contact_forces=forces,
+        )

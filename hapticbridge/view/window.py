@@ -1,0 +1,138 @@
+"""The view as the bridge sees it: a process that is told what happens, and never asked."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import json
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from queue import SimpleQueue
+from typing import IO, cast
+
+from hapticbridge.errors import HapticBridgeError
+from hapticbridge.recording import Attachment
+from hapticbridge.view.address import Address
+
+STOP = b'{"command": "stop"}\n'
+"""What the process says when the run is to stop."""
+
+_BOOTSTRAP = """
+import sys
+sys.path.insert(0, sys.argv[1])
+from hapticbridge.view.live import run
+run()
+"""
+
+
+def check_view() -> None:
+    """Checks that a page can be served, before anything is started for it.
+
+    Raises:
+        HapticBridgeError: The extra 'view' is not installed.
+    """
+    if importlib.util.find_spec("viser") is None:
+        raise HapticBridgeError("a page needs the extra 'view': pip install 'hapticbridge[view]'")
+
+
+class Window:
+    """Starts the process of the live view; an ``Onlooker`` of a bridge.
+
+    Whatever becomes of it, the loop goes on: records are read from the ring without a word to the
+    bridge, and events leave through a thread of their own.
+
+    Args:
+        address: Where the page is served.
+
+    Attributes:
+        address: Likewise.
+        on_stop: Called once, from a thread, when somebody presses the page's button: the one
+            command that a page has. Whatever else its process may say is not listened to.
+        url: What to open in a browser, once it is shown.
+
+    Raises:
+        HapticBridgeError: The extra 'view' is not installed.
+    """
+
+    def __init__(self, address: Address) -> None:
+        check_view()
+        self.address = address
+        self._outbox: SimpleQueue[bytes | None] = SimpleQueue()
+        self._process: subprocess.Popen[bytes] | None = None
+        self.url = ""
+        self.on_stop: Callable[[], None] | None = None
+
+    def start(
+        self, ring: str, metadata: Mapping[str, str], attachments: Sequence[Attachment]
+    ) -> None:
+        """Starts the process and waits until the page is there.
+
+        Raises:
+            HapticBridgeError: The page cannot be served.
+        """
+        files = {item.name: item.data for item in attachments}
+        job = {
+            "ring": ring,
+            "metadata": dict(metadata),
+            "attachments": [[name, len(data)] for name, data in files.items()],
+            "host": self.address.host,
+            "port": self.address.port,
+            "token": self.address.token,
+        }
+        package = str(Path(__file__).resolve().parents[2])
+        self._process = subprocess.Popen(
+            # -P: a file in the user's working folder must not stand in for a module
+            [sys.executable, "-P", "-c", _BOOTSTRAP, package],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,  # Ctrl-C reaches the bridge alone
+        )
+        for piece in (json.dumps(job).encode() + b"\n", *files.values()):
+            self._outbox.put(piece)
+        threading.Thread(target=self._send, daemon=True).start()
+        answer = json.loads(cast(IO[bytes], self._process.stdout).readline() or b"{}")
+        if "url" not in answer:
+            self.close()
+            reason = answer.get("error", "its process ended before it served anything")
+            raise HapticBridgeError(f"the view cannot be shown: {reason}")
+        self.url = str(answer["url"])
+        threading.Thread(target=self._listen, daemon=True).start()
+
+    def event(self, event: Mapping[str, object]) -> None:
+        """Tells the process what happened; never waits and never raises."""
+        self._outbox.put(json.dumps(event).encode() + b"\n")
+
+    def close(self) -> None:
+        """Ends the process."""
+        self._outbox.put(None)
+        if self._process is not None:
+            self._process.terminate()
+            self._process.wait()
+            for stream in (self._process.stdin, self._process.stdout):
+                with contextlib.suppress(OSError):
+                    cast(IO[bytes], stream).close()
+
+    @property
+    def process_id(self) -> int | None:
+        """Of the process; None before it is started."""
+        return None if self._process is None else self._process.pid
+
+    def _listen(self) -> None:
+        process = self._process
+        with contextlib.suppress(OSError, ValueError):
+            said = cast(IO[bytes], process and process.stdout).readline(len(STOP))
+            if said == STOP and self.on_stop is not None:
+                self.on_stop()
+
+    def _send(self) -> None:
+        process = self._process
+        stream = cast(IO[bytes], process and process.stdin)
+        # a process that died is told no more; the queue then grows by an event now and then
+        with contextlib.suppress(OSError, ValueError):
+            while (piece := self._outbox.get()) is not None:
+                stream.write(piece)
+                stream.flush()

@@ -1,0 +1,239 @@
+"""Recordings drawn off-screen: where the tool is seen, and what is said where nothing can be."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+from audit_cases import recorded, rewritten
+from cli_cases import Called
+from PIL import Image
+
+from hapticbridge.errors import HapticBridgeError, RecordingError
+from hapticbridge.film import Shot, draw, still
+from hapticbridge.film.artist import film_ticks
+from hapticbridge.film.stage import Stage, force_colour
+from hapticbridge.film.studio import RENDERERS
+from hapticbridge.recording import read_recording
+
+LOOK = """
+import json, sys
+sys.path.insert(0, sys.argv[1])
+import mujoco, numpy as np
+from hapticbridge.film.artist import Camera
+from hapticbridge.film.stage import Stage
+stage = Stage(sys.argv[2])
+camera = Camera(stage, 320, 240)
+for tick in map(int, sys.argv[3:]):
+    rows, columns = np.nonzero(camera.segments(tick) == stage.model.geom("tool").id)
+    seen = camera.renderer.scene.camera[0], camera.renderer.scene.camera[1]
+    view = {name: np.mean([getattr(c, "frustum_" + name) for c in seen]).item()
+            for name in ("near", "top", "bottom", "center", "width")}
+    view |= {name: np.mean([getattr(c, name) for c in seen], axis=0).tolist()
+             for name in ("pos", "forward", "up")}
+    view["middle"] = [columns.mean() + .5, rows.mean() + .5]
+    print(json.dumps({"count": len(rows), **view}))
+"""
+"""What a process with a renderer sees of the tool, and from where."""
+
+SCENE = """<mujoco model="two">
+  <option timestep="0.001" integrator="discrete" gravity="0 0 0"/>
+  <statistic center="0 0 0" extent="0.2"/>
+  <worldbody>
+    <light pos="0 0 1"/>
+    <geom type="plane" size="0.2 0.2 0.01" pos="0 0 -0.05" rgba="0.9 0.9 0.9 1"/>
+    <body name="tool">
+      <freejoint/>
+      <geom name="tool" size="0.01" mass="0.1" rgba="0 0 1 1" contype="0" conaffinity="0"/>
+      <site name="grip"/>
+    </body>
+  </worldbody>
+</mujoco>"""
+
+
+@pytest.fixture(scope="module")
+def sway(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A ball that follows a hand through the picture."""
+    folder = tmp_path_factory.mktemp("film")
+    (folder / "scene.xml").write_text(SCENE)
+    (folder / "hand.csv").write_text("t,x,y,z\n0,0,0,0\n0.2,0.06,0.03,0.02\n0.3,-0.05,0,0.05\n")
+    path = folder / "sway.mcap"
+    recorded(path, str(folder / "scene.xml"), f"trajectory:{folder / 'hand.csv'}")
+    return path
+
+
+def looked_at(path: Path, ticks: tuple[int, ...]) -> list[dict[str, Any]]:
+    """Returns what a process with a renderer sees at ticks; skips where none works."""
+    package = str(Path(__file__).parents[1])
+    command = [sys.executable, "-c", LOOK, package, str(path), *map(str, ticks)]
+    for renderer in RENDERERS:
+        environment = {**os.environ, "MUJOCO_GL": renderer}
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+        if done.returncode == 0:
+            return [json.loads(line) for line in done.stdout.splitlines()]
+    pytest.skip("neither EGL nor OSMesa works here (Debian: apt install libosmesa6)")
+
+
+def drawn_or_skip(*arguments: Any, **options: Any) -> None:
+    try:
+        draw(*arguments, **options)
+    except RecordingError:
+        raise
+    except HapticBridgeError as error:
+        pytest.skip(str(error))
+
+
+def test_the_tool_is_seen_where_the_record_says(sway: Path) -> None:
+    ticks = (0, 200, 300)
+    middles = []
+    records = read_recording(sway).ticks
+    for tick, seen in zip(ticks, looked_at(sway, ticks), strict=True):
+        forward, up = np.array(seen["forward"]), np.array(seen["up"])
+        right = np.cross(forward, up)
+        at = records["tool_position"][tick] - seen["pos"]
+        # a pinhole: the frustum's window at its near plane is the picture, 240 pixels high
+        per_pixel = (seen["top"] - seen["bottom"]) / 240 / seen["near"]
+        depth = at @ forward
+        column = 160 + (at @ right) / depth / per_pixel
+        row = 120 - (at @ up) / depth / per_pixel
+        assert seen["count"] > 20
+        # a ball's outline is not centred on its middle in perspective, and pixels are whole
+        assert np.allclose(seen["middle"], (column, row), atol=1.0)
+        middles.append(seen["middle"])
+    assert np.ptp(middles, axis=0).max() > 50  # it moved across the picture
+
+
+def test_picture_shows_the_moment_asked_for(sway: Path, call: Called, tmp_path: Path) -> None:
+    picture = tmp_path / "early.png"
+    asked = ("render", sway, picture, "--at", "0.2", "--width", "160", "--height", "120")
+    code, out, err = call(*asked)
+    if code and "off-screen" in err:
+        pytest.skip(err)
+    assert (code, f"wrote {picture}" in out) == (0, True)
+    pixels = np.asarray(Image.open(picture).convert("RGB"), dtype=int)
+    assert pixels.shape == (120, 160, 3)
+    ball = np.nonzero(pixels[..., 2] > 2 * pixels[..., 0] + 20)[1]
+    assert ball.size > 5
+    (seen,) = looked_at(sway, (200,))  # 320 pixels wide
+    assert ball.mean() == pytest.approx(seen["middle"][0] / 2, abs=4)
+    code, _, err = call(*asked)
+    assert (code, "exists" in err) == (2, True)
+
+
+# imageio-ffmpeg leaves its pipes to the garbage collector
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_film_has_a_frame_for_every_thirtieth_of_a_second(sway: Path, tmp_path: Path) -> None:
+    ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="a film needs the extra 'view'")
+    film, told = tmp_path / "sway.mp4", []
+    shot = Shot(width=160, height=120)
+    drawn_or_skip(sway, film, shot, lambda *done: told.append(done))
+    frames = ffmpeg.read_frames(str(film))
+    facts = next(frames)
+    assert facts["source_size"] == (160, 120)
+    assert facts["fps"] == pytest.approx(30)
+    assert told[-1] == (9, 9)
+    assert sum(1 for _ in frames) == 9
+
+
+def test_frames_of_a_film_keep_the_time_of_the_run(sway: Path) -> None:
+    stage = Stage(sway)
+    assert list(film_ticks(stage, 30))[:4] == [0, 33, 67, 100]
+    assert stage.tick_at(stage.duration) == stage.recording.count - 1
+
+
+def test_stage_stands_where_a_second_run_of_the_scene_does(sway: Path) -> None:
+    stage = Stage(sway)
+    for tick in (0, 150, 300):
+        stage.show(tick)
+        recorded_at = read_recording(sway).ticks["tool_position"][tick]
+        np.testing.assert_allclose(stage.data.site("grip").xpos, recorded_at, atol=1e-12)
+        assert stage.row["tick"][0] == tick
+    handle = stage.data.mocap_pos[stage.model.body("handle").mocapid[0]]
+    np.testing.assert_allclose(handle, stage.row["handle_position"][0], atol=1e-12)
+
+
+def test_coupling_is_drawn_from_tool_to_handle_in_the_colour_of_its_force(sway: Path) -> None:
+    stage = Stage(sway)
+    stage.show(250)
+    scene = mujoco.MjvScene(stage.model, maxgeom=10)
+    stage.add_coupling(scene)
+    ghost, spring, arrow = scene.geoms[: scene.ngeom]
+    row = stage.row[0]
+    force = row["wrench_on_tool"][:3]
+    np.testing.assert_allclose(ghost.pos, row["handle_position"], atol=1e-7)
+    middle = 0.5 * (row["handle_position"] + row["tool_position"])
+    np.testing.assert_allclose(spring.pos, middle, atol=1e-7)
+    strength = float(np.linalg.norm(force))
+    np.testing.assert_allclose(spring.rgba[:3], force_colour(strength, stage.reference), atol=1e-6)
+    # mjv_connector turns a geom's z axis from one end to the other: the hand feels -f
+    assert arrow.mat[:, 2] @ force == pytest.approx(-strength, rel=1e-5)
+
+
+def test_spring_is_green_at_rest_and_red_from_the_reference_on() -> None:
+    rest, full = force_colour(0.0, 2.0), force_colour(2.0, 2.0)
+    assert rest[1] > rest[0]
+    assert full[0] > full[1]
+    assert np.array_equal(force_colour(9.0, 2.0), full)
+
+
+def test_a_changed_record_is_not_drawn(sway: Path, tmp_path: Path) -> None:
+    recording = read_recording(sway)
+    ticks = recording.ticks.copy()
+    ticks["tool_position"][100, 0] += 2e-4
+    stage = Stage(rewritten(recording, tmp_path / "moved.mcap", ticks=ticks))
+    stage.show(99)
+    with pytest.raises(RecordingError, match="record of tick 100"):
+        stage.show(100)
+    ticks["tool_position"][100, 0] -= 1.5e-4
+    Stage(rewritten(recording, tmp_path / "nearly.mcap", ticks=ticks)).show(100)
+
+
+def test_where_no_renderer_works_a_sentence_says_what_to_install(
+    sway: Path, call: Called, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("hapticbridge.film.studio.RENDERERS", ("disable",))
+    monkeypatch.delenv("MUJOCO_GL", raising=False)
+    code, _, err = call("render", sway, tmp_path / "a.png")
+    assert code == 2
+    assert "libosmesa6" in err
+    monkeypatch.setenv("MUJOCO_GL", "disable")
+    with pytest.raises(HapticBridgeError, match="MUJOCO_GL=disable does not work"):
+        still(sway, Shot())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (("a.gif",), "neither a picture nor a film"),
+        (("nowhere/a.png",), "folder does not exist"),
+        (("a.mp4", "--at", "0.1"), "a film shows the whole run"),
+        (("a.png", "--at", "-1"), "time is -1 s"),
+        (("a.png", "--width", "17"), "even number"),
+        (("a.png", "--height", "0"), "height is 0"),
+        (("a.mp4", "--fps", "0"), "fps is 0"),
+    ],
+)
+def test_bad_wishes_are_refused_in_a_sentence(
+    arguments: tuple[str, ...], told: str, sway: Path, call: Called, tmp_path: Path
+) -> None:
+    code, _, err = call("render", sway, tmp_path / arguments[0], *arguments[1:])
+    assert code == 2
+    assert told in err
+
+
+def test_a_time_beyond_the_run_and_a_run_of_another_version_are_refused(
+    sway: Path, tmp_path: Path
+) -> None:
+    with pytest.raises(RecordingError, match="lasts from 0 to 0\\.3"):
+        Stage(sway).tick_at(0.4)
+    versions = json.dumps({"mujoco": "3.0.0", "hapticbridge": "0.1.0", "numba": "0"})
+    other = rewritten(read_recording(sway), tmp_path / "old.mcap", meta={"versions": versions})
+    with pytest.raises(RecordingError, match="recorded with mujoco 3"):
+        Stage(other)

@@ -1,0 +1,395 @@
+"""The page of a run: what it shows, whom it answers, and that the loop never notices it."""
+
+from __future__ import annotations
+
+import contextlib
+import http.client
+import io
+import json
+import os
+import signal
+import socket
+import sys
+import threading
+import types
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+from audit_cases import ScriptedDevice, recorded
+from chromium import browser
+from cli_cases import Called
+from PIL import Image
+from report_runs import LOOSE
+from test_view_address import OUTSIDE, outside
+
+from hapticbridge.audit import audit
+from hapticbridge.bridge import Bridge
+from hapticbridge.clock import SimulatedClock
+from hapticbridge.errors import HapticBridgeError
+from hapticbridge.recording import Recording, Ring, read_recording
+from hapticbridge.view.address import COOKIE, Address
+from hapticbridge.view.trace import LINES, Trace
+from hapticbridge.view.window import STOP, Window
+
+pytest.importorskip("viser", reason="needs the extra 'view'")
+
+import websockets.exceptions
+from websockets.sync.client import connect
+from websockets.typing import Subprotocol
+
+from hapticbridge.view.live import Show
+from hapticbridge.view.props import props_of
+from hapticbridge.view.replay import Replay, Theatre
+
+# viser's threads and sockets end with the process
+pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+
+FLOOR = """<mujoco model="floor">
+  <option timestep="0.001" integrator="discrete" cone="elliptic" gravity="0 0 0"/>
+  <statistic center="0 0 0" extent="0.2"/>
+  <worldbody>
+    <light pos="0 0 1"/>
+    <geom type="plane" size="0.1 0.1 0.01"/>
+    <body name="ball" pos="0 0 0.03">
+      <freejoint/>
+      <geom type="sphere" size="0.02" mass="0.1" rgba="1 0 0 1"/>
+      <site name="grip"/>
+    </body>
+  </worldbody>
+</mujoco>"""
+
+
+def pressed(tick: int) -> tuple[float, ...]:
+    return (min(1e-4 * tick, 0.04), 0, max(-1e-4 * tick, -0.012), 1, 0, 0, 0)
+
+
+@pytest.fixture(scope="module")
+def floor(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A ball that is moved aside and pressed onto a floor, and held there."""
+    folder = tmp_path_factory.mktemp("view")
+    scene, path = folder / "floor.xml", folder / "floor.mcap"
+    scene.write_text(FLOOR)
+    recorded(path, str(scene), ScriptedDevice(pressed), LOOSE, duration=1.5)
+    return path
+
+
+@pytest.fixture(scope="module")
+def replay(floor: Path) -> Replay:
+    return Replay(floor)
+
+
+@contextlib.contextmanager
+def served(replay: Replay, address: Address) -> Iterator[tuple[Theatre, int]]:
+    theatre = Theatre(replay, address)
+    try:
+        yield theatre, int(theatre.url.split(":")[2].split("/")[0])
+    finally:
+        theatre.close()
+
+
+def test_sights_stand_where_the_record_says_and_contacts_carry_the_force(replay: Replay) -> None:
+    records = read_recording(replay.stage.recording.path).ticks
+    ball = replay.stage.model.body("ball").id
+    for moment in (0.0, 0.4, 1.2):
+        sight = replay.at(moment)
+        row = records[round(sight.time * 1000)]
+        np.testing.assert_allclose(sight.places[ball], row["tool_position"], atol=1e-9)
+        np.testing.assert_allclose(sight.handle, row["handle_position"])
+    still = replay.at(1.5)
+    assert np.linalg.norm(still.force) > 1
+    assert len(still.contact_places) == 1
+    # at rest what the coupling pushes the floor gives back
+    np.testing.assert_allclose(still.contact_forces.sum(axis=0), -still.force, atol=2e-2)
+    assert not len(replay.at(0.0).contact_places)
+
+
+def test_curves_are_those_of_the_record(replay: Replay) -> None:
+    time, lines = replay.trace.curves()
+    records = read_recording(replay.stage.recording.path).ticks
+    assert len(lines) == LINES
+    force = np.linalg.norm(records["wrench_on_tool"][:, :3], axis=1)
+    assert lines[0].max() == pytest.approx(force.max())  # peaks between two instants are kept
+    assert lines[2][-1] == pytest.approx(1e3 * records["device_energy"][-1])
+    created = 1e-3 * lines[3]
+    assert (1e-3 * lines[4] + created)[-1] == pytest.approx(replay.stage.slack)
+    assert time[-1] == pytest.approx(1.499)
+
+
+def test_late_ticks_are_seen_however_short(floor: Path) -> None:
+    rows = read_recording(floor).ticks[:40].copy()
+    rows["wake_ns"] = rows["deadline_ns"] + 1000
+    rows["wake_ns"][7] += 250_000
+    trace = Trace()
+    trace.add(rows, 0.0, 1e-3)
+    assert trace.curves()[1][-1].tolist() == [251.0]
+
+
+def test_every_shape_is_drawn_at_its_size(tmp_path: Path) -> None:
+    shapes = {
+        "box": ("0.1 0.2 0.3", (0.1, 0.2, 0.3)),
+        "sphere": ("0.1", (0.1, 0.1, 0.1)),
+        "ellipsoid": ("0.1 0.2 0.3", (0.1, 0.2, 0.3)),
+        "capsule": ("0.1 0.2", (0.1, 0.1, 0.3)),
+        "cylinder": ("0.1 0.2", (0.1, 0.1, 0.2)),
+        "plane": ("0.1 0.2 1", (0.1, 0.2, 0.0)),
+    }
+    geoms = "".join(
+        f'<geom type="{kind}" size="{size}" rgba="1 0 0 0.5"/>'
+        for kind, (size, _) in shapes.items()
+    )
+    hidden = '<geom size="1" group="3"/><geom size="1" rgba="1 1 1 0"/>'
+    text = f"<mujoco><worldbody>{geoms}{hidden}</worldbody></mujoco>"
+    props = props_of(mujoco.MjModel.from_xml_string(text))
+    assert len(props) == len(shapes)
+    for prop, (_, half) in zip(props, shapes.values(), strict=True):
+        np.testing.assert_allclose(prop.corners.max(axis=0), half, rtol=0.02, atol=1e-9)
+        np.testing.assert_allclose(
+            prop.corners.min(axis=0), np.negative(half), rtol=0.02, atol=1e-9
+        )
+        assert (prop.colour, prop.opacity) == ((255, 0, 0), 0.5)
+
+
+def live(recording: Recording, capacity: int) -> tuple[Show, Ring]:
+    ring = Ring.local(capacity)
+    ring.cursors[1] = 1 << 62  # nobody frees anything
+    return Show(ring, recording), ring
+
+
+def test_live_view_follows_the_ring_and_reads_it_without_freeing_anything(floor: Path) -> None:
+    recording = read_recording(floor)
+    show, ring = live(recording, 4096)
+    ring.cursors[1] = 0
+    assert show.look() is None
+    for start, end in ((0, 33), (33, 700), (700, 1500)):
+        ring.append(recording.ticks[start:end])
+        sight = show.look()
+        assert sight is not None
+        row = recording.ticks[end - 1]
+        ball = sight.places[show.model.body("ball").id]
+        np.testing.assert_allclose(ball, row["tool_position"], atol=1e-9)
+    assert sight is not None
+    assert len(sight.contact_places) == 1
+    assert show.look() is None
+    assert ring.cursors[1] == 0
+    assert not show.is_lost
+
+
+def test_a_view_that_fell_behind_says_so_and_goes_on(floor: Path) -> None:
+    recording = read_recording(floor)
+    show, ring = live(recording, 64)
+    ring.rows[:50] = recording.ticks[:50]
+    ring.cursors[0] = 50
+    assert show.look() is not None
+    assert not show.is_lost
+    ring.rows[:] = recording.ticks[200:264][np.argsort(np.arange(200, 264) % 64)]
+    ring.cursors[0] = 264
+    sight = show.look()
+    assert sight is not None
+    assert show.is_lost
+    np.testing.assert_array_equal(sight.grip, recording.ticks["tool_position"][263])
+
+
+def answer(
+    host: str, port: int, path: str = "/", method: str = "GET", **headers: str
+) -> tuple[int, str, str]:
+    """Returns status, cookie and body of a request."""
+    client = http.client.HTTPConnection(host, port, timeout=20)
+    with contextlib.closing(client):
+        client.request(method, path, headers=headers)
+        got = client.getresponse()
+        return got.status, got.getheader("Set-Cookie") or "", got.read().decode("utf-8", "ignore")
+
+
+def is_let_in(host: str, port: int, path: str = "/", **options: Any) -> bool:
+    try:
+        with connect(
+            f"ws://{host}:{port}{path}", subprotocols=[Subprotocol("viser-v0")], **options
+        ):
+            return True
+    except websockets.exceptions.InvalidStatus as refused:
+        assert refused.response.status_code == 403
+        return False
+
+
+def test_the_server_answers_its_own_page_alone(replay: Replay) -> None:
+    with served(replay, Address("127.0.0.1", 0)) as (theatre, port):
+        assert theatre.url == f"http://127.0.0.1:{port}/"
+        assert answer("127.0.0.1", port)[0] == 200
+        assert answer("127.0.0.1", port, Host="evil.example")[0] == 403
+        assert answer("127.0.0.1", port, Origin="http://evil.example")[0] == 403
+        assert is_let_in("127.0.0.1", port)
+        assert is_let_in("127.0.0.1", port, origin=f"http://127.0.0.1:{port}")
+        assert not is_let_in("127.0.0.1", port, origin="http://evil.example")
+        # a second Host beside the right one, as a careless proxy might read it
+        assert not is_let_in("127.0.0.1", port, additional_headers={"Host": "evil.example"})
+        # viser's own way out to the internet is gone
+        handlers = theatre._server._websock_server._incoming_handlers
+        assert not any(handlers[kind] for kind in handlers if "ShareUrl" in kind.__name__)
+        with socket.socket() as probe, pytest.raises(OSError, match="refused"):
+            probe.connect((OUTSIDE, port))  # served on loopback's first address alone
+
+
+def test_another_address_needs_the_token(replay: Replay) -> None:
+    address = outside()
+    with served(replay, address) as (_, port):
+        status, cookie, _ = answer(OUTSIDE, port)
+        assert (status, cookie) == (403, "")
+        assert answer(OUTSIDE, port, "/?token=wrong")[0] == 403
+        assert not is_let_in(OUTSIDE, port)
+        assert not is_let_in(OUTSIDE, port, additional_headers={"Cookie": f"{COOKIE}=wrong"})
+        status, cookie, _ = answer(OUTSIDE, port, f"/?token={address.token}")
+        assert status == 200
+        assert cookie == f"{COOKIE}={address.token}; Path=/; HttpOnly; SameSite=Strict"
+        kept = {"Cookie": cookie.split(";")[0]}
+        assert answer(OUTSIDE, port, **kept)[0] == 200
+        assert is_let_in(OUTSIDE, port, additional_headers=kept)
+        assert not is_let_in(OUTSIDE, port, additional_headers=kept, origin="http://evil.example")
+
+
+def test_a_port_in_use_is_said_and_not_exchanged(replay: Replay) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        with pytest.raises(HapticBridgeError, match=f"port {port} is in use"):
+            Theatre(replay, Address("127.0.0.1", port))
+
+
+def test_a_browser_sees_the_tool_move_with_the_slider(replay: Replay, tmp_path: Path) -> None:
+    with served(replay, Address("127.0.0.1", 0)) as (theatre, _), browser(tmp_path) as tab:
+        page = tab()
+        page.open(theatre.url)
+        page.wait_for("document.body.innerText.includes('Passivity margin')")
+        page.wait_for("document.querySelectorAll('canvas').length >= 5")
+        reds = []
+        for moment in (0.0, 1.2):
+            theatre.slider.value = moment
+            theatre.show(moment)
+            page.wait_for("new Promise(done => setTimeout(() => done(true), 2500))")
+            page.picture(tmp_path / "shown.png")
+            pixels = np.asarray(Image.open(tmp_path / "shown.png").convert("RGB"), dtype=int)
+            is_red = (pixels[..., 0] > 100) & (pixels[..., 1:].max(axis=2) < 60)
+            assert is_red[:, :600].sum() > 50
+            reds.append(np.argwhere(is_red[:, :600]).mean(axis=0))
+        assert np.abs(reds[1] - reds[0]).max() > 20  # it was moved 4 cm aside
+        own = ("data:", "blob:", theatre.url)
+        assert [request[:99] for request in page.requests if not request.startswith(own)] == []
+        assert page.complaints == []
+
+
+def test_a_killed_view_and_ten_deaf_browsers_do_not_touch_the_run(
+    floor: Path, tmp_path: Path
+) -> None:
+    path, window = tmp_path / "run.mcap", Window(Address("127.0.0.1", 0))
+    deaf: list[Any] = []
+
+    def disturb(tick: int) -> None:
+        if tick == 100:
+            address = window.url.replace("http", "ws")
+            version = [Subprotocol(f"viser-v{sys.modules['viser'].__version__}")]
+            deaf.extend(connect(address, subprotocols=version) for _ in range(10))
+        if tick == 700:
+            assert window.process_id is not None
+            os.kill(window.process_id, signal.SIGKILL)
+
+    scene = floor.with_name("floor.xml")
+    with Bridge(
+        str(scene),
+        ScriptedDevice(pressed),
+        LOOSE,
+        recording=path,
+        clock=SimulatedClock(),
+        onlooker=window,
+    ) as bridge:
+        summary = bridge.run(1.5, disturb)
+    for client in deaf:
+        with contextlib.suppress(Exception):
+            client.close()
+    assert (summary.ticks, summary.dropped, summary.overruns) == (1500, 0, 0)
+    report = audit(path)
+    assert (report.verdict, report.resimulation) == ("passive", "bit for bit")
+
+
+def test_the_button_of_the_page_stops_the_run_and_the_recording_says_who_did(
+    floor: Path, tmp_path: Path
+) -> None:
+    path, window = tmp_path / "run.mcap", Window(Address("127.0.0.1", 0))
+    scene = str(floor.with_name("floor.xml"))
+    with (
+        Bridge(scene, ScriptedDevice(pressed), LOOSE, recording=path, onlooker=window) as bridge,
+        browser(tmp_path) as tab,
+    ):
+        window.on_stop = partial(bridge.stop, "view")
+        page = tab()
+        page.open(window.url)
+        button = "[...document.querySelectorAll('button')].find(b => b.innerText == 'stop the run')"
+        page.wait_for(f"!!{button}")
+        presser = threading.Timer(1.0, page.value, [f"{button}.click()"])
+        presser.start()
+        summary = bridge.run(60.0)
+        presser.join()
+    assert summary.stopped_by == "view"
+    assert 0 < summary.ticks < 60_000
+    stop = read_recording(path).events[-1]
+    assert (stop["event"], stop["reason"]) == ("stop", "view")
+    assert audit(path).verdict == "passive"
+
+
+@pytest.mark.parametrize(
+    ("said", "times"),
+    [
+        (STOP, 1),
+        (STOP + STOP, 1),
+        (b'{"command": "stop", "force": 99}\n', 0),
+        (b'{"command": "stiffness", "value": 1e9}\n', 0),
+        (b"x" * 100_000 + b"\n" + STOP, 0),
+        (b"", 0),
+    ],
+)
+def test_a_run_obeys_one_command_once_and_nothing_else(said: bytes, times: int) -> None:
+    window = Window(Address("127.0.0.1", 0))
+    heard: list[bool] = []
+    window.on_stop = partial(heard.append, True)
+    process = types.SimpleNamespace(stdout=io.BytesIO(said))
+    window._process = process  # type: ignore[assignment] # of a process, only what it says
+    window._listen()
+    assert len(heard) == times
+
+
+def test_a_view_that_cannot_be_served_is_said_before_the_run(floor: Path, call: Called) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = str(taken.getsockname()[1])
+        code, _, err = call("run", floor.with_name("floor.xml"), "--fast", "--view", "--port", port)
+    assert code == 2
+    assert f"port {port} is in use" in err
+
+
+def test_without_the_extra_a_sentence_says_how_to_get_it(
+    floor: Path, call: Called, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
+    for command in (("view", floor), ("run", "peg_in_hole", "--view")):
+        code, _, err = call(*command)
+        assert code == 2
+        assert "hapticbridge[view]" in err
+
+
+def test_an_event_of_the_run_reaches_the_view(floor: Path) -> None:
+    recording = read_recording(floor)
+    show, ring = live(recording, 4096)
+    ring.cursors[1] = 0
+    # as the bridge tells it: what was set before tick 10
+    show.note(json.loads(json.dumps({"event": "input", "tick": 10, "writes": [["ctrl", 99, [1]]]})))
+    ring.append(recording.ticks[:10])
+    show.look()
+    assert not show.is_lost
+    ring.append(recording.ticks[10:20])
+    show.look()
+    assert show.is_lost  # the scene has no such control: applied, not passed over
