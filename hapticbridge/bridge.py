@@ -23,10 +23,12 @@ from hapticbridge.device import Device, device_for
 from hapticbridge.errors import DeviceError, HapticBridgeError, SafetyTrip, SceneError
 from hapticbridge.guard import (
     Limits,
+    guarding_for,
     limits_for,
     refuse_simulated_time,
     refuse_stretched_start,
     trip_reason,
+    wait_until_still,
 )
 from hapticbridge.inputs import Write, apply_writes, input_writes
 from hapticbridge.jit import direct
@@ -81,6 +83,10 @@ class Bridge:
         axes: 3 × 3 rotation from the device's frame to the scene's.
         absolute: Take the device's poses as poses in the scene instead of relative to its start.
         limits: Limits on the wrench, within the device's own; None takes these.
+        controller: Passivity controller: ``damper``, ``tank`` or ``off``. It acts only where the
+            device was given more than its damping burns and the scene gives up.
+        clutch: Number of the device's button, from 0, that lets it move without the handle.
+        dead_man: Number of the button that must be held for any force.
         live: Draw a status line on stderr, from the recorder's process.
 
     Raises:
@@ -105,6 +111,9 @@ class Bridge:
         axes: ArrayLike | None = None,
         absolute: bool = False,
         limits: Limits | None = None,
+        controller: str = "damper",
+        clutch: int | None = None,
+        dead_man: int | None = None,
         live: bool = False,
     ) -> None:
         self.scene = scene if isinstance(scene, Scene) else load_scene(scene)
@@ -122,6 +131,16 @@ class Bridge:
             self.method,
         )
         self._limits = limits_for(self.device.info, limits)
+        self._guarding = guarding_for(
+            self.device.info,
+            self._limits,
+            self.period,
+            scale=self._workspace.scale,
+            controller=controller,
+            clutch=clutch,
+            dead_man=dead_man,
+            is_absolute=self._workspace.is_absolute,
+        )
         refuse_unknowing(self.method, is_real=self.device.info.is_real, i_know=i_know)
         contact_stiffness_of(self.method, self.coupling, contact_stiffness)  # refused here already
         self._contact_stiffness = contact_stiffness
@@ -132,7 +151,7 @@ class Bridge:
         self._sample = np.zeros(1, SAMPLE_DTYPE)
         self._inputs: deque[list[Write]] = deque()
         self._tick = self._overruns = self._skipped = 0
-        self._stopped_by = ""
+        self._stopped_by = self._signal = ""
         self._is_open = False
 
     def __enter__(self) -> Bridge:
@@ -153,9 +172,11 @@ class Bridge:
     ) -> None:
         self._is_open = False
         reason = self._stopped_by if error is None else f"{type(error).__name__}: {error}"
+        named = {"signal": self._signal} if self._signal else {}
         self._event(
             "stop",
             reason=reason,
+            **named,
             overruns=self._overruns,
             skipped=self._skipped,
             dropped=self._stream.dropped,
@@ -186,20 +207,22 @@ class Bridge:
         model, data, substeps = self.scene.model, self.scene.data, range(self._substeps)
         stream, records, cursors = self._stream, self._stream.rows, self._stream.cursors
         sample, wrench = self._sample, row["wrench_on_device"][0]
+        outside = state["outside"]
         before, after, hand_over = self._before_step, self._after_step, self._publish
         read_device, write_device = self.device.read, self.device.write
         clock, wait, now = self.clock, self.clock.wait, self.clock.now
         inputs, step = self._inputs, self.method.step
         with stopping_on_signals(self._stop_on_signal):
-            clock.start(round(self.period * 1e9))
             try:
+                wait_until_still(self.device, sample, self.period)
+                clock.start(round(self.period * 1e9))
                 while self._tick != last and not self._stopped_by:
                     deadline, wake, skipped = wait()
                     if on_tick is not None:
                         on_tick(self._tick)
                     if inputs:
                         self._apply_inputs()
-                    news = read_device(sample)
+                    news = outside[0] = read_device(sample)
                     read_before, read = read, now()
                     elapsed = 1e-9 * (read - read_before)
                     for substep in substeps:
@@ -240,8 +263,8 @@ class Bridge:
             return f"zero force could not be sent: {error}"
         return ""
 
-    def _stop_on_signal(self) -> None:
-        self._stopped_by = "signal"
+    def _stop_on_signal(self, name: str) -> None:
+        self._stopped_by, self._signal = "signal", name
 
     def set_input(
         self,
@@ -351,6 +374,7 @@ class Bridge:
             limits=self._limits,
             workspace=self._workspace,
             contact_stiffness=self._contact_stiffness,
+            guarding=self._guarding,
         )
         self._binding = binding = Binding(scene.model, scene.data, self.parameters)
         refuse_stretched_start(binding.state, self._limits)

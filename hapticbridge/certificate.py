@@ -265,6 +265,20 @@ def is_certified(conditions: tuple[Condition, ...]) -> bool | None:
     return False if False in held else None if None in held or not held or is_late else True
 
 
+def assumed_damping(info: DeviceInfo) -> tuple[float, float]:
+    """Returns the damping in N s/m and N m s/rad that a device has, or is taken to have.
+
+    Unknown, or zero, it is ``UNKNOWN_DAMPING``, of a real device ``UNKNOWN_REAL_DAMPING``.
+    """
+    linear = info.damping or (UNKNOWN_REAL_DAMPING if info.is_real else UNKNOWN_DAMPING)
+    angular = info.rotational_damping or (
+        UNKNOWN_REAL_ROTATIONAL_DAMPING
+        if info.is_real and info.turns
+        else UNKNOWN_ROTATIONAL_DAMPING
+    )
+    return linear, angular
+
+
 def default_coupling(
     info: DeviceInfo,
     period: float,
@@ -296,13 +310,8 @@ def default_coupling(
     for name, value in (("scale", scale), ("force_scale", force_scale)):
         if not math.isfinite(value) or value <= 0:
             raise CouplingError(f"{name} is {value!r}; it must be finite and > 0")
-    damping = info.damping or (UNKNOWN_REAL_DAMPING if info.is_real else UNKNOWN_DAMPING)
+    damping, rotational = assumed_damping(info)
     damping /= scale * force_scale
-    rotational = info.rotational_damping or (
-        UNKNOWN_REAL_ROTATIONAL_DAMPING
-        if info.is_real and info.turns
-        else UNKNOWN_ROTATIONAL_DAMPING
-    )
     rotational *= scale / force_scale
     coupling = stiffest_coupling(damping, rotational, felt_period(info, period))
     checked_substeps(laws, CouplingError)

@@ -26,6 +26,10 @@ class TickFlag(IntFlag):
         STALE_SAMPLE: The device had nothing new since the previous tick.
         TRIP: The guard stopped the run in this tick; the wrench sent is zero. A tick that is not
             finite is not recorded at all; the event ``trip`` names it.
+        RESTARTED: The wrench rises from zero again from this tick on, after samples that were old
+            or a coupling that was re-seated.
+        RESEATED: The coupling was re-seated before this tick: the device's pose in it is that of
+            the handle in the tick before, from here on.
         MIDPOINT: The coupling was lossless in this tick: its torque follows the midpoint rule.
     """
 
@@ -40,6 +44,8 @@ class TickFlag(IntFlag):
     STALE_SAMPLE = 256
     TRIP = 512
     MIDPOINT = 1024
+    RESTARTED = 2048
+    RESEATED = 4096
 
 
 TICK_DTYPE = np.dtype(
@@ -74,7 +80,8 @@ TICK_DTYPE = np.dtype(
 """One record. Row k holds the sample read in tick k, the wrench computed from it, and the energies
 after the step. Positions in m, quaternions (w, x, y, z) with w >= 0, wrenches (force in N, torque
 in N m) in the world frame about the grip (``wrench_on_tool``) or in the device's frame
-(``wrench_on_device``), energies and cumulative works in J, ``injected_damping`` in N s/m."""
+(``wrench_on_device``), energies and cumulative works in J. ``injected_damping`` in N s/m is the
+largest that the passivity controller added on an axis of translation."""
 
 CLOCK_FIELDS = ("deadline_ns", "wake_ns", "read_ns", "write_ns")
 """Fields that depend on the clock, not on the input: two runs of one input may differ here."""

@@ -16,8 +16,16 @@ from hapticbridge.audit.device_port import (
     burnt_by_damping,
     kept_behind_a_law,
     passed_shares,
-    ramp_share,
 )
+from hapticbridge.audit.guarded import (
+    expected_handle,
+    expected_wrench,
+    is_first,
+    since_start,
+    wrench_sent_before,
+    wrench_share,
+)
+from hapticbridge.audit.turns import product_conjugate, rotate, steps, turn_between, turns
 from hapticbridge.kernel.state import RunParameters
 from hapticbridge.tick import TickFlag
 
@@ -28,50 +36,6 @@ SLACK_SHARE = 0.5
 ``certificate.needed_damping`` assumes."""
 
 
-def quaternion_product(a: Array, b: Array) -> Array:
-    """Returns a ⊗ b over arrays (…, 4), scalar first."""
-    scalar = a[..., :1] * b[..., :1] - np.sum(a[..., 1:] * b[..., 1:], axis=-1, keepdims=True)
-    vector = a[..., :1] * b[..., 1:] + b[..., :1] * a[..., 1:] + np.cross(a[..., 1:], b[..., 1:])
-    return np.concatenate([scalar, vector], axis=-1)
-
-
-def conjugate(q: Array) -> Array:
-    """Returns the inverse of unit quaternions (…, 4)."""
-    return np.asarray(q * np.array([1.0, -1.0, -1.0, -1.0]))
-
-
-def turn_between(a: Array, b: Array) -> Array:
-    """Returns the rotation vectors (…, 3) in the world frame that take a to b, in rad."""
-    q = quaternion_product(b, conjugate(a))
-    q = np.where(q[..., :1] < 0, -q, q)
-    sine = np.linalg.norm(q[..., 1:], axis=-1, keepdims=True)
-    angle = 2 * np.arctan2(sine, q[..., :1])
-    with np.errstate(invalid="ignore", divide="ignore"):
-        factor = np.where(sine > 0, angle / sine, 2.0)
-    return np.asarray(factor * q[..., 1:])
-
-
-def steps(values: Array, start: Array) -> Array:
-    """Returns v_k − v_{k−1} over rows, with v_{−1} = start."""
-    return np.diff(values, axis=0, prepend=start[None])
-
-
-def turns(values: Array, start: Array) -> Array:
-    """Returns the rotation vectors from each orientation's predecessor to it."""
-    return turn_between(np.concatenate([start[None], values[:-1]]), values)
-
-
-def product_conjugate(values: Array, start: Array) -> Array:
-    """Returns q_k ⊗ q_{k−1}⁻¹ over rows (n, 4), with q_{−1} = start."""
-    return quaternion_product(values, conjugate(np.concatenate([start[None], values[:-1]])))
-
-
-def rotate(q: Array, v: Array) -> Array:
-    """Returns R(q) v over rows, q (n, 4) and v (n, 3)."""
-    pure = np.concatenate([np.zeros((len(v), 1)), v], axis=1)
-    return quaternion_product(quaternion_product(q, pure), conjugate(q))[:, 1:]
-
-
 @dataclass(frozen=True, slots=True)
 class Balance:
     """What the recorded poses and wrenches say by themselves.
@@ -80,6 +44,7 @@ class Balance:
         wrench_on_tool: The coupling law at the recorded poses, (n, 6) in N and N m; the recorded
             wrench itself where the recorded poses alone do not tell it.
         wrench_on_device: What the guard should have sent for the recorded wrench, (n, 6).
+        injected_damping: What the passivity controller should have added, (n,) in N s/m.
         handle_position: Where the recorded device pose puts the handle, (n, 3) in m.
         handle_turn: By how much the recorded handle is turned from where it should be, (n,) in rad.
         coupling_work: Cumulative Σ f·δx + τ·δφ of the recorded wrench, (n,) in J; as recorded
@@ -96,6 +61,7 @@ class Balance:
 
     wrench_on_tool: Array
     wrench_on_device: Array
+    injected_damping: Array
     handle_position: Array
     handle_turn: Array
     coupling_work: Array
@@ -165,8 +131,7 @@ class Balance:
         coupling_work = ticks["coupling_work"] if parameters.laws > 1 else np.cumsum(work)
 
         device_start = np.array(parameters.device_start)
-        sent = np.concatenate([np.zeros((1, 6)), ticks["wrench_on_device"][:-1]])
-        sent[np.isin(ticks["tick"], resumed)] = 0.0
+        sent = wrench_sent_before(ticks, resumed)
         device_step = steps(ticks["device_position"], device_start[:3])
         device_turn = turns(ticks["device_quaternion"], device_start[3:])
         device_work = np.sum(sent[:, :3] * device_step, axis=1)
@@ -176,7 +141,8 @@ class Balance:
             given = np.sum(sent[:, :3] * _later(device_step, late), axis=1)
             given += np.sum(sent[:, 3:] * _later(device_turn, late), axis=1)
 
-        position, orientation = _handle(ticks, parameters)
+        position, orientation = expected_handle(ticks, parameters, handle_start)
+        on_device, injected = expected_wrench(ticks, parameters, resumed)
         stored = ticks["kinetic"] + ticks["potential"] - start_energy
         created = stored - coupling_work - ticks["actuator_work"] - ticks["external_work"]
         kept, lost = coupling_work, created  # without a law, all that the scene took up
@@ -191,6 +157,7 @@ class Balance:
                 work=works,
                 passed=passed_shares(ticks, parameters),
                 since_start=since_start(ticks, resumed),
+                share=wrench_share(ticks, parameters, resumed),
                 has_end=not late,
             )
         linear, angular = _slack_gains(parameters)
@@ -198,7 +165,8 @@ class Balance:
         slack += 0.5 * angular * np.sum(tool_turn**2, axis=1)
         return cls(
             wrench_on_tool=law,
-            wrench_on_device=_guarded(ticks, parameters, resumed),
+            wrench_on_device=on_device,
+            injected_damping=injected,
             handle_position=position,
             handle_turn=np.linalg.norm(
                 turn_between(orientation, ticks["handle_quaternion"]), axis=1
@@ -244,7 +212,7 @@ def _kicked(
         _later(steps(ticks["device_position"], start[:3]), late),
         _later(turns(ticks["device_quaternion"], start[3:]), late),
         np.diff(ticks["read_ns"], prepend=0) * 1e-9,
-        since_start(ticks, resumed) > 0,
+        ~is_first(ticks, resumed),
     )
     return np.asarray(given - burnt + parameters.force_scale / parameters.scale * taken)
 
@@ -252,37 +220,3 @@ def _kicked(
 def _later(moved: Array, late: int) -> Array:
     """Returns each row's motion ``late`` rows on; none where the recording has ended by then."""
     return np.concatenate([moved[late:], np.zeros_like(moved[:late])]) if late else moved
-
-
-def _handle(ticks: NDArray[np.void], parameters: RunParameters) -> tuple[Array, Array]:
-    """Maps the recorded device poses into the scene (h = h_0 + scale · A (p − p_0))."""
-    axes = np.array(parameters.axes).reshape(3, 3)
-    origin, target = np.array(parameters.device_origin), np.array(parameters.handle_origin)
-    moved = (ticks["device_position"] - origin[:3]) @ axes.T
-    # a rotation vector turns with the axes: log(A R Aᵀ) = A log(R)
-    vector = turn_between(np.broadcast_to(origin[3:], (len(ticks), 4)), ticks["device_quaternion"])
-    vector = vector @ axes.T
-    angle = np.linalg.norm(vector, axis=1, keepdims=True)
-    turn = np.concatenate([np.cos(angle / 2), np.sinc(angle / (2 * np.pi)) / 2 * vector], axis=1)
-    orientation = quaternion_product(turn, np.broadcast_to(target[3:], (len(ticks), 4)))
-    return target[:3] + parameters.scale * moved, orientation
-
-
-def since_start(ticks: NDArray[np.void], resumed: Array) -> Array:
-    """Returns how many ticks ago the force began to rise, at the start or after a pause."""
-    starts = np.concatenate([[0.0], np.sort(resumed)])
-    return np.asarray(ticks["tick"] - starts[np.searchsorted(starts, ticks["tick"], "right") - 1])
-
-
-def _guarded(ticks: NDArray[np.void], parameters: RunParameters, resumed: Array) -> Array:
-    """Scales, limits and ramps the recorded wrench on the tool as the guard does."""
-    axes = np.array(parameters.axes).reshape(3, 3)
-    on_tool = ticks["wrench_on_tool"]
-    force = -parameters.force_scale * on_tool[:, :3] @ axes
-    torque = -parameters.force_scale / parameters.scale * on_tool[:, 3:] @ axes
-    limited = []
-    for vector, limit in ((force, parameters.force_limit), (torque, parameters.torque_limit)):
-        norm = np.linalg.norm(vector, axis=1, keepdims=True)
-        limited.append(vector * np.where(norm > limit, limit / np.maximum(norm, 1e-300), 1.0))
-    ramp = ramp_share(parameters, since_start(ticks, resumed))
-    return np.concatenate(limited, axis=1) * ramp[:, None]

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.inputs import apply_writes
 from hapticbridge.kernel.state import COUPLING_ACTUATORS, Binding, RunParameters
-from hapticbridge.kernel.step import simulate
+from hapticbridge.kernel.step import simulate_recorded
 from hapticbridge.provenance import (
     MODEL_ATTACHMENT,
     STARTS,
@@ -172,17 +172,31 @@ def _simulated(recording: Recording, binding: Binding, data: mujoco.MjData) -> N
     )
     samples["buttons"] = ticks["buttons"]
     rows = np.zeros(len(ticks), TICK_DTYPE)
+    outside = ticks["flags"] & int(TickFlag.STALE_SAMPLE | TickFlag.RESEATED)
+    elapsed = _elapsed(ticks, recording.events)
     changes = [event for event in recording.events if event.get("event") in ("input", "resume")]
     done = 0
     for event in [*changes, None]:
         end = len(ticks) if event is None else _tick_of(event, done, len(ticks))
-        count = simulate(binding.state, samples[done:end], binding.row, rows[done:end])
+        part = slice(done, end)
+        count = simulate_recorded(
+            binding.state, samples[part], outside[part], elapsed[part], binding.row, rows[part]
+        )
         done += count
         if done < end:
             return rows[:done]
         if event is not None:
             _apply(event, binding, data)
     return rows
+
+
+def _elapsed(ticks: NDArray[np.void], events: list[dict[str, Any]]) -> NDArray[np.float64]:
+    """Returns the times between two readings in s, as the live loop counted them."""
+    resumed: list[Any] = [e.get("tick") for e in events if e.get("event") == "resume"]
+    read = ticks["read_ns"]
+    before = np.concatenate([np.zeros(1, np.int64), read[:-1]])
+    before[np.isin(ticks["tick"], resumed)] = 0
+    return np.asarray(1e-9 * (read - before))
 
 
 def _tick_of(event: dict[str, Any], done: int, count: int) -> int:

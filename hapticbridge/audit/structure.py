@@ -7,8 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.audit.balance import since_start
+from hapticbridge.audit.guarded import is_first, silence, since_start
+from hapticbridge.audit.turns import steps, turns
 from hapticbridge.kernel.state import RunParameters
+from hapticbridge.kernel.watch import STILL, STILL_TURN
 from hapticbridge.recording import Recording
 from hapticbridge.tick import CLOCK_FIELDS, TICK_DTYPE, TickFlag
 
@@ -128,6 +130,7 @@ def _flag_fault(
         TickFlag.DROPPED_BEFORE: np.zeros(len(ticks), bool),  # the ticks are contiguous
         TickFlag.RAMPING: since_start(ticks, resumed) < parameters.ramp_ticks,
         TickFlag.CONTACT: ticks["contacts"] > 0,
+        **_watch_flags(ticks, parameters, resumed),
     }
     for flag, is_due in expected.items():
         wrong = ((ticks["flags"] & int(flag)) != 0) != is_due
@@ -143,3 +146,29 @@ def _flag_fault(
             text = f"tick {tick} says that the device had nothing new, and its {field} differs"
             return Fault(text, tick, "flags")
     return None
+
+
+def _watch_flags(
+    ticks: NDArray[np.void], parameters: RunParameters, resumed: NDArray[np.float64]
+) -> dict[TickFlag, NDArray[np.bool_]]:
+    """Says where the handle must not have followed, and where the coupling was re-seated."""
+    guarding, buttons = parameters.guarding, ticks["buttons"]
+    is_released = (buttons & guarding.clutch) != 0
+    if guarding.dead_man:
+        is_released |= (buttons & guarding.dead_man) == 0
+    was_released = np.concatenate([[guarding.dead_man != 0], is_released[:-1]])
+    first = is_first(ticks, resumed)
+    elapsed = np.diff(ticks["read_ns"], prepend=0) * 1e-9
+    has_stalled = ~first & (elapsed > guarding.longest_stall)
+    start = np.array(parameters.device_start)
+    moved = np.linalg.norm(steps(ticks["device_position"], start[:3]), axis=1)
+    turned = np.linalg.norm(turns(ticks["device_quaternion"], start[3:]), axis=1)
+    has_strayed = first & guarding.reseats & ((moved > STILL) | (turned > STILL_TURN))
+    is_reseated = ~is_released & (was_released | has_stalled | has_strayed)
+    is_silent = silence(ticks, parameters) > 0
+    was_silent = np.concatenate([[False], is_silent[:-1]])
+    return {
+        TickFlag.CLUTCH: is_released,
+        TickFlag.RESEATED: is_reseated,
+        TickFlag.RESTARTED: is_reseated | (~is_released & was_silent & ~is_silent),
+    }

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.jit import compiled, compiled_for_threads
+from hapticbridge.kernel.account import keep_account
 from hapticbridge.kernel.direct import place_tool
 from hapticbridge.kernel.handle import (
     handle_pose,
@@ -26,9 +27,10 @@ from hapticbridge.kernel.meter import (
     add_coupling_work,
     judge_environment,
 )
-from hapticbridge.kernel.native import floats, ints, mj_fwd_position, mj_step
+from hapticbridge.kernel.native import floats, has_warned, ints, mj_fwd_position, mj_step
 from hapticbridge.kernel.ports import meter_ports, note_moved_mocap_bodies
 from hapticbridge.kernel.scheme import DIRECT, HELD, LOSSLESS
+from hapticbridge.kernel.watch import follow, refused
 from hapticbridge.kernel.wrench import render, wrench_of_step
 from hapticbridge.pose import (
     add,
@@ -113,7 +115,7 @@ def before_step(
             than was burnt, and an uneven time stamp must not count more.
 
     Returns:
-        ``OK`` or ``BAD_SAMPLE``; in the latter case nothing was changed.
+        ``OK``; else ``BAD_SAMPLE`` or why ``watch.refused`` it, and nothing was changed.
     """
     s, r = state[0], row[0]
     if substep == 0:
@@ -128,6 +130,10 @@ def before_step(
 
         moved = subtract(position, vector_of(s.device_position))
         turned = rotation_between(quaternion_of(s.device_quaternion), quaternion)
+        code = refused(state, moved, turned, elapsed)
+        if code != OK:
+            return code
+        keep_account(state, moved, turned, elapsed)
         w = s.wrench_on_device
         s.device_energy += dot((w[0], w[1], w[2]), moved) + dot((w[3], w[4], w[5]), turned)
         if s.tick > s.ramp_start:
@@ -138,7 +144,10 @@ def before_step(
         store_vector(s.device_position, position)
         store_quaternion(s.device_quaternion, quaternion)
 
-        handle, orientation = handle_pose(state, position, quaternion)
+        handle, orientation = vector_of(s.handle_position), quaternion_of(s.handle_quaternion)
+        buttons = sample[0].buttons
+        if follow(state, position, quaternion, moved, turned, buttons, elapsed):
+            handle, orientation = handle_pose(state, position, quaternion)
         store_vector(s.handle_step, subtract(handle, vector_of(s.handle_position)))
         store_vector(
             s.handle_turn, rotation_between(quaternion_of(s.handle_quaternion), orientation)
@@ -193,7 +202,7 @@ def _record(state: NDArray[np.void], row: NDArray[np.void]) -> None:
     r.coupling_work, r.actuator_work = s.coupling_work, s.actuator_work
     r.external_work = s.external_work
     r.environment_energy, r.device_energy = s.environment_energy, s.device_energy
-    r.injected_damping = 0.0
+    r.injected_damping = s.injected_damping
 
 
 @compiled
@@ -234,8 +243,10 @@ def after_step(state: NDArray[np.void], row: NDArray[np.void], substep: int) -> 
     s.flags = MIDPOINT if was_midpoint else 0
     square = dot(force, force) + dot(torque, torque)
     # MuJoCo ignores a control beyond its limit, so a wrench that is to be applied must stay below
-    if not math.isfinite(square + s.environment_energy) or (
-        s.scheme == HELD and square > LARGEST_CONTROL * LARGEST_CONTROL
+    if (
+        not math.isfinite(square + s.environment_energy)
+        or (s.scheme == HELD and square > LARGEST_CONTROL * LARGEST_CONTROL)
+        or has_warned(state)
     ):
         s.flags = TRIP
         for i in range(6):
@@ -252,6 +263,20 @@ def after_step(state: NDArray[np.void], row: NDArray[np.void], substep: int) -> 
     _record(state, row)
     s.tick += 1
     return OK
+
+
+@compiled
+def _tick(
+    state: NDArray[np.void], sample: NDArray[np.void], row: NDArray[np.void], elapsed: float
+) -> bool:
+    s = state[0]
+    for substep in range(s.substeps):
+        if before_step(state, sample, row, substep, elapsed) != OK:
+            return False
+        advance(state)
+        if after_step(state, row, substep) != OK:
+            return False
+    return True
 
 
 @compiled_for_threads
@@ -275,14 +300,35 @@ def simulate(
     Returns:
         How many ticks were completed; fewer than asked where a sample or a result was not finite.
     """
-    s = state[0]
     for k in range(samples.size):
-        for substep in range(s.substeps):
-            # when the device was asked decides no record, only what the live loop's meter says
-            if before_step(state, samples[k : k + 1], row, substep, s.period) != OK:
-                return k
-            advance(state)
-            if after_step(state, row, substep) != OK:
-                return k
+        if not _tick(state, samples[k : k + 1], row, state[0].period):
+            return k
+        rows[k] = row[0]
+    return int(samples.size)
+
+
+@compiled_for_threads
+def simulate_recorded(
+    state: NDArray[np.void],
+    samples: NDArray[np.void],
+    outside: NDArray[np.int64],
+    elapsed: NDArray[np.float64],
+    row: NDArray[np.void],
+    rows: NDArray[np.void],
+) -> int:
+    """As ``simulate``, of a run that was recorded: with what came from outside the scene.
+
+    Args:
+        state: The bound state.
+        samples: Device samples, one per tick.
+        outside: ``STALE_SAMPLE`` and ``RESEATED`` as the live loop had them, per tick.
+        elapsed: Time between two samples in s, per tick.
+        row: The bound record.
+        rows: Receives the records; as long as ``samples``.
+    """
+    for k in range(samples.size):
+        state[0].outside = outside[k]
+        if not _tick(state, samples[k : k + 1], row, elapsed[k]):
+            return k
         rows[k] = row[0]
     return int(samples.size)

@@ -1,0 +1,205 @@
+"""What the guard should have sent, and where the handle should have been, from records alone.
+
+The second computation of what ``kernel.watch``, ``kernel.account`` and ``kernel.wrench`` do tick by
+tick, over whole arrays.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticbridge.audit.turns import quaternion_product, steps, turn_between, turns
+from hapticbridge.kernel.account import TANK_START, THRESHOLD
+from hapticbridge.kernel.guarding import DAMPER, TANK
+from hapticbridge.kernel.state import RunParameters
+from hapticbridge.tick import TickFlag
+
+Array = NDArray[np.float64]
+
+
+def has_flag(ticks: NDArray[np.void], flag: TickFlag) -> NDArray[np.bool_]:
+    """Returns in which records a flag is set."""
+    return np.asarray((ticks["flags"] & int(flag)) != 0)
+
+
+def is_first(ticks: NDArray[np.void], resumed: Array) -> NDArray[np.bool_]:
+    """Returns which ticks are the first of a run, after a start or a pause without force."""
+    return np.asarray((ticks["tick"] == 0) | np.isin(ticks["tick"], resumed))
+
+
+def since_start(ticks: NDArray[np.void], resumed: Array) -> Array:
+    """Returns how many ticks ago the force began to rise: at the start, or when it did so again."""
+    restarts = ticks["tick"][has_flag(ticks, TickFlag.RESTARTED)]
+    starts = np.unique(np.concatenate([[0.0], resumed, restarts.astype(np.float64)]))
+    return np.asarray(ticks["tick"] - starts[np.searchsorted(starts, ticks["tick"], "right") - 1])
+
+
+def run_lengths(is_on: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Returns for each row how many rows up to it are on without a gap."""
+    index = np.arange(1, len(is_on) + 1)
+    return np.asarray(index - np.maximum.accumulate(np.where(is_on, 0, index)))
+
+
+def silence(ticks: NDArray[np.void], parameters: RunParameters) -> NDArray[np.int64]:
+    """Returns for how many ticks the wrench has been fading: no new sample, or no handle."""
+    is_silent = has_flag(ticks, TickFlag.CLUTCH)
+    if parameters.guarding.stale_ticks > 0:
+        stale = run_lengths(has_flag(ticks, TickFlag.STALE_SAMPLE))
+        is_silent = is_silent | (stale > parameters.guarding.stale_ticks)
+    return run_lengths(is_silent)
+
+
+def wrench_share(ticks: NDArray[np.void], parameters: RunParameters, resumed: Array) -> Array:
+    """Returns the share of the wrench that the guard lets through while it rises or fades, (n,)."""
+    rising = (since_start(ticks, resumed) + 1.0) / (parameters.ramp_ticks + 1.0)
+    fading = 1.0 - silence(ticks, parameters) / parameters.guarding.fade_ticks
+    return np.asarray(np.minimum(rising, 1.0) * np.maximum(fading, 0.0))
+
+
+def wrench_sent_before(ticks: NDArray[np.void], resumed: Array) -> Array:
+    """Returns the wrench that acted on each tick's motion of the device, (n, 6)."""
+    sent = np.concatenate([np.zeros((1, 6)), ticks["wrench_on_device"][:-1]])
+    sent[np.isin(ticks["tick"], resumed)] = 0.0
+    return sent
+
+
+def expected_handle(
+    ticks: NDArray[np.void], parameters: RunParameters, handle_start: Array
+) -> tuple[Array, Array]:
+    """Maps the recorded device poses into the scene: h = h_0 + scale · A (p − p_0).
+
+    p_0 and h_0 are those of the last tick in which the coupling was re-seated; while a clutch holds
+    it, the handle stays where it was.
+    """
+    count = len(ticks)
+    before = np.concatenate([handle_start[None], _poses(ticks, "handle")[:-1]])
+    device = _poses(ticks, "device")
+    origin = np.tile(np.array(parameters.device_origin), (count, 1))
+    target = np.tile(np.array(parameters.handle_origin), (count, 1))
+    seats = np.flatnonzero(has_flag(ticks, TickFlag.RESEATED))
+    last = np.searchsorted(seats, np.arange(count), "right") - 1
+    is_seated = last >= 0
+    if is_seated.any():
+        at = seats[last[is_seated]]
+        origin[is_seated], target[is_seated] = device[at], before[at]
+    axes = np.array(parameters.axes).reshape(3, 3)
+    moved = (device[:, :3] - origin[:, :3]) @ axes.T
+    # a rotation vector turns with the axes: log(A R Aᵀ) = A log(R)
+    vector = turn_between(origin[:, 3:], device[:, 3:]) @ axes.T
+    angle = np.linalg.norm(vector, axis=1, keepdims=True)
+    turn = np.concatenate([np.cos(angle / 2), np.sinc(angle / (2 * np.pi)) / 2 * vector], axis=1)
+    position = target[:, :3] + parameters.scale * moved
+    orientation = quaternion_product(turn, target[:, 3:])
+    is_held = has_flag(ticks, TickFlag.CLUTCH)[:, None]
+    return np.where(is_held, before[:, :3], position), np.where(is_held, before[:, 3:], orientation)
+
+
+def _poses(ticks: NDArray[np.void], body: str) -> Array:
+    return np.concatenate([ticks[f"{body}_position"], ticks[f"{body}_quaternion"]], axis=1)
+
+
+def expected_wrench(
+    ticks: NDArray[np.void], parameters: RunParameters, resumed: Array
+) -> tuple[Array, Array]:
+    """Returns what the guard should have sent, (n, 6), and the damping that it injected, (n,)."""
+    axes = np.array(parameters.axes).reshape(3, 3)
+    on_tool = ticks["wrench_on_tool"]
+    force = -parameters.force_scale * on_tool[:, :3] @ axes
+    torque = -parameters.force_scale / parameters.scale * on_tool[:, 3:] @ axes
+    wrench = np.concatenate([force, torque], axis=1)
+    share = wrench_share(ticks, parameters, resumed)
+    wrench, injected = _controlled(ticks, parameters, resumed, wrench, share)
+    guarding = parameters.guarding
+    starts = is_first(ticks, resumed) | has_flag(ticks, TickFlag.RESTARTED)
+    parts = (
+        (wrench[:, :3], parameters.force_limit, guarding.force_rise),
+        (wrench[:, 3:], parameters.torque_limit, guarding.torque_rise),
+    )
+    limited = []
+    for vector, limit, rise in parts:
+        norm = np.linalg.norm(vector, axis=1, keepdims=True)
+        short = vector * np.where(norm > limit, limit / np.maximum(norm, 1e-300), 1.0)
+        limited.append(_slewed(short, rise, starts))
+    return np.concatenate(limited, axis=1) * share[:, None], injected
+
+
+def _slewed(vector: Array, rise: float, starts: NDArray[np.bool_]) -> Array:
+    """Lets a vector change by at most ``rise`` from row to row, from zero at each start."""
+    if not np.isfinite(rise):
+        return vector
+    slewed = vector.copy()
+    before = np.concatenate([np.zeros((1, 3)), vector[:-1]])
+    before[starts] = 0.0
+    done = -1
+    for first in np.flatnonzero(np.linalg.norm(vector - before, axis=1) > rise).tolist():
+        for k in range(max(first, done + 1), len(vector)):
+            last = np.zeros(3) if starts[k] else slewed[k - 1]
+            change = vector[k] - last
+            length = float(np.linalg.norm(change))
+            if length <= rise:
+                break
+            slewed[k] = last + rise / length * change
+            done = k
+    return slewed
+
+
+def _capped_sum(values: Array, surplus: float) -> Array:
+    """Returns x_k = max(x_{k−1} + v_k, −surplus), x_{−1} = 0, along the first axis."""
+    total = np.cumsum(values, axis=0)
+    return np.asarray(total + np.maximum(np.maximum.accumulate(-surplus - total, axis=0), 0.0))
+
+
+def _controlled(
+    ticks: NDArray[np.void],
+    parameters: RunParameters,
+    resumed: Array,
+    wrench: Array,
+    share: Array,
+) -> tuple[Array, Array]:
+    guarding = parameters.guarding
+    nothing = np.zeros(len(ticks))
+    if guarding.controller not in (DAMPER, TANK):
+        return wrench, nothing
+    start = np.array(parameters.device_start)
+    moved = np.concatenate(
+        [
+            steps(ticks["device_position"], start[:3]),
+            turns(ticks["device_quaternion"], start[3:]),
+        ],
+        axis=1,
+    )
+    first = is_first(ticks, resumed)
+    elapsed = np.diff(ticks["read_ns"], prepend=0) * 1e-9
+    rate = np.where(first, 0.0, 1.0 / np.maximum(elapsed, parameters.period))
+    velocity = rate[:, None] * moved
+    credit = np.repeat([guarding.credit, guarding.rotational_credit], 3)
+    given = (wrench_sent_before(ticks, resumed) - credit * velocity) * moved
+    own = ticks["kinetic"] + ticks["potential"] - ticks["actuator_work"] - ticks["external_work"]
+    change = np.concatenate([[0.0], np.diff(own)])
+    change[0] = own[0] - _start_energy(ticks)
+    asked = np.linalg.norm(wrench[:, :3], axis=1)
+    sent = np.linalg.norm(ticks["wrench_on_device"][:, :3], axis=1)
+    passed = np.minimum(np.divide(sent, asked, out=share.copy(), where=asked > 0), 1.0)
+    gained = parameters.force_scale / parameters.scale * passed * change
+    total = given.sum(axis=1) + np.concatenate([[0.0], gained[:-1]])
+    account = _capped_sum(total, guarding.surplus)
+    if guarding.controller == TANK:
+        work = parameters.period * np.sum(wrench * velocity, axis=1)
+        level = np.maximum(TANK_START - account, 0.0)
+        factor = np.where(work > level, level / np.where(work > level, work, 1.0), 1.0)
+        return wrench * factor[:, None], nothing
+    debt = (account - THRESHOLD)[:, None]
+    owed = np.minimum(debt, _capped_sum(given, guarding.surplus))
+    most = np.repeat([guarding.most_damping, guarding.most_rotational_damping], 3)
+    square = parameters.period * velocity**2
+    damping = np.divide(owed, square, out=np.zeros_like(owed), where=(owed > 0) & (square > 0))
+    damping = np.minimum(damping, most)
+    return wrench - damping * velocity, damping[:, :3].max(axis=1)
+
+
+def _start_energy(ticks: NDArray[np.void]) -> float:
+    """Returns S_start from the first record: E_0 = S_0 − S_start − works of the first tick."""
+    row = ticks[0]
+    works = row["coupling_work"] + row["actuator_work"] + row["external_work"]
+    return float(row["kinetic"] + row["potential"] - works - row["environment_energy"])

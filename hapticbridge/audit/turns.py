@@ -1,0 +1,52 @@
+"""Rotations over whole arrays: quaternions (…, 4), scalar first, and rotation vectors (…, 3)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+def quaternion_product(a: Array, b: Array) -> Array:
+    """Returns a ⊗ b over arrays (…, 4), scalar first."""
+    scalar = a[..., :1] * b[..., :1] - np.sum(a[..., 1:] * b[..., 1:], axis=-1, keepdims=True)
+    vector = a[..., :1] * b[..., 1:] + b[..., :1] * a[..., 1:] + np.cross(a[..., 1:], b[..., 1:])
+    return np.concatenate([scalar, vector], axis=-1)
+
+
+def conjugate(q: Array) -> Array:
+    """Returns the inverse of unit quaternions (…, 4)."""
+    return np.asarray(q * np.array([1.0, -1.0, -1.0, -1.0]))
+
+
+def turn_between(a: Array, b: Array) -> Array:
+    """Returns the rotation vectors (…, 3) in the world frame that take a to b, in rad."""
+    q = quaternion_product(b, conjugate(a))
+    q = np.where(q[..., :1] < 0, -q, q)
+    sine = np.linalg.norm(q[..., 1:], axis=-1, keepdims=True)
+    angle = 2 * np.arctan2(sine, q[..., :1])
+    with np.errstate(invalid="ignore", divide="ignore"):
+        factor = np.where(sine > 0, angle / sine, 2.0)
+    return np.asarray(factor * q[..., 1:])
+
+
+def steps(values: Array, start: Array) -> Array:
+    """Returns v_k − v_{k−1} over rows, with v_{−1} = start."""
+    return np.diff(values, axis=0, prepend=start[None])
+
+
+def turns(values: Array, start: Array) -> Array:
+    """Returns the rotation vectors from each orientation's predecessor to it."""
+    return turn_between(np.concatenate([start[None], values[:-1]]), values)
+
+
+def product_conjugate(values: Array, start: Array) -> Array:
+    """Returns q_k ⊗ q_{k−1}⁻¹ over rows (n, 4), with q_{−1} = start."""
+    return quaternion_product(values, conjugate(np.concatenate([start[None], values[:-1]])))
+
+
+def rotate(q: Array, v: Array) -> Array:
+    """Returns R(q) v over rows, q (n, 4) and v (n, 3)."""
+    pure = np.concatenate([np.zeros((len(v), 1)), v], axis=1)
+    return quaternion_product(quaternion_product(q, pure), conjugate(q))[:, 1:]
