@@ -13,8 +13,12 @@ from hapticbridge.errors import HapticBridgeError
 
 SPIN_NS = 150_000
 """The end of each wait is spun instead of slept, in ns. A sleeping thread wakes some 50 to 100 µs
-late on an ordinary kernel; longer spins cost processor time and, under SCHED_FIFO, are throttled
-by the kernel for 50 ms in each second."""
+late on an ordinary kernel; longer spins cost processor time."""
+
+SPIN_SHARE = 0.75
+"""Largest share of a period that is spun, no unit: it counts above 5 kHz. Under SCHED_FIFO the
+kernel stops a thread for 50 ms in each second in which it did not sleep for 50 ms (5 %); with this,
+a tick may take another 20 % of the period before that happens. Less wakes later at such rates."""
 
 LOWEST_RATE, HIGHEST_RATE = 1.0, 1e6
 """In Hz. Below one tick a second nothing can be felt; above 1 MHz no step of MuJoCo fits between
@@ -71,11 +75,12 @@ class RealClock:
     is_lossless = False
 
     def __init__(self) -> None:
-        self._period = self._origin = self._deadline = 0
+        self._period = self._spin = self._origin = self._deadline = 0
 
     def start(self, period_ns: int) -> None:
         """Puts the last deadline to now (see ``Clock.start``)."""
         self._period = period_ns
+        self._spin = min(SPIN_NS, round(SPIN_SHARE * period_ns))
         self._origin = time.monotonic_ns() - self._deadline
 
     def wait(self) -> tuple[int, int, int]:
@@ -88,8 +93,8 @@ class RealClock:
             skipped = (now - deadline) // self._period
             deadline += skipped * self._period
         else:
-            if deadline - now > SPIN_NS:
-                time.sleep((deadline - now - SPIN_NS) * 1e-9)
+            if deadline - now > self._spin:
+                time.sleep((deadline - now - self._spin) * 1e-9)
             while now < deadline:
                 now = monotonic() - self._origin
         self._deadline = deadline

@@ -18,7 +18,7 @@ STOP_SIGNALS = tuple(
 
 @contextmanager
 def stopping_on_signals(stop: Callable[[str], None]) -> Iterator[None]:
-    """Calls ``stop`` with the signal's name; only the main thread may do so, others run as they are.
+    """Calls ``stop`` with the signal's name; only the main thread may, others run as they are.
 
     A signal that is ignored stays so: ``nohup`` sees to that for SIGHUP.
 

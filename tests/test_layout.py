@@ -16,9 +16,9 @@ ORDER = (
     ("rendering",),
     ("ledger", "inputs", "device"),
     ("guard", "recording", "certificate", "felt"),
-    ("provenance", "summary", "workspace"),
+    ("provenance", "summary", "workspace", "realtime"),
     ("bridge", "audit", "identify"),
-    ("report", "study", "check"),
+    ("report", "study", "check", "doctor"),
     ("cli",),
 )
 RANK = {name: rank for rank, names in enumerate(ORDER) for name in names}

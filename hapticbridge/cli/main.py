@@ -16,6 +16,7 @@ from rich.markup import escape
 from hapticbridge.cli.chart import ChartCommand
 from hapticbridge.cli.check import Check
 from hapticbridge.cli.devices import Devices
+from hapticbridge.cli.doctor import Doctor
 from hapticbridge.cli.identify import Identify
 from hapticbridge.cli.judge import Audit, Repair
 from hapticbridge.cli.run import Run
@@ -33,6 +34,7 @@ Command = (
     | Annotated[Check, tyro.conf.subcommand("check")]
     | Annotated[Stability, tyro.conf.subcommand("stability")]
     | Annotated[ChartCommand, tyro.conf.subcommand("chart")]
+    | Annotated[Doctor, tyro.conf.subcommand("doctor")]
     | Annotated[Repair, tyro.conf.subcommand("repair")]
     | Annotated[Zwidth, tyro.conf.subcommand("zwidth")]
     | Annotated[Bound, tyro.conf.subcommand("bound")]

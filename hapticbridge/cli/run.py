@@ -70,6 +70,9 @@ class Run:
     """Ticks per second."""
     substeps: int = 1
     """MuJoCo steps per tick; with more than one the mean of their wrenches is sent."""
+    realtime: bool = False
+    """Ask the system for real time while the loop runs, and say what it refuses and how to grant it
+    ('hapticbridge doctor' tells more); with a real device that is always asked for."""
     fast: bool = False
     """Simulated time: as fast as it goes, and the same in every run."""
     stiffness: float | None = None
@@ -130,6 +133,7 @@ class Run:
                 ramp=self.ramp,
             ),
             live=not self.as_json,
+            realtime=self.realtime or None,
         )
         if not self.as_json:
             announce(bridge, scales, self.substeps, is_method_asked=self.method is not None)

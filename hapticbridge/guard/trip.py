@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from hapticbridge.kernel.step import BAD_SAMPLE
-from hapticbridge.kernel.watch import BACKWARDS, GAVE_ENERGY, JUMPED, STRETCHED, TWISTED
+from hapticbridge.kernel.codes import BACKWARDS, BAD_SAMPLE, GAVE_ENERGY, JUMPED, STRETCHED, TWISTED
 
 _REASONS = {
     BAD_SAMPLE: "the device's pose is not finite or not a rotation",

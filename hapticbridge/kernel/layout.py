@@ -111,6 +111,8 @@ _COUNTS = (
     "has_actuators",
     "has_gravity_compensation",
     "has_tendons_or_flexes",
+    "nq",
+    "nsensor",
     "ramp_ticks",
 )
 
@@ -171,8 +173,11 @@ _RUNNING_COUNTS = (
     "mocap_has_moved",
     "active_contacts",
     "is_midpoint",
+    "was_midpoint",
+    "is_near",
     "is_held",
     "hold",
+    "has_positions",
     "equality_rows",
     "first_unstrict",
     "first_active",
@@ -190,6 +195,7 @@ _RUNNING = (
     "lossless_debt",
     "device_energy",
     "device_burnt",
+    "law_work",
     "throughput",
     "slack",
     "slack_share",
@@ -210,7 +216,10 @@ STATE_DTYPE = np.dtype(
     + [(f"{name}_position", "<f8", 3) for name in _POSES]
     + [(f"{name}_quaternion", "<f8", 4) for name in _POSES]
     + [("handle_step", "<f8", 3), ("handle_turn", "<f8", 3), ("twist", "<f8", 3)]
-    + [(name, "<f8", 6) for name in ("wrench_on_tool", "motion", "wrench_on_device")]
+    + [
+        (name, "<f8", 6)
+        for name in ("wrench_on_tool", "motion", "applied_half", "wrench_on_device")
+    ]
     + [(name, "<i8") for name in _RUNNING_COUNTS]
     + [(name, "<f8") for name in _RUNNING]
     + [(name, "<i8") for name in _GUARD_COUNTS + _GUARD_RUNNING_COUNTS]

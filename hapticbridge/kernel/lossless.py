@@ -35,9 +35,10 @@ from hapticbridge.kernel.balanced_velocity import (
     write_external,
     write_half_step,
 )
-from hapticbridge.kernel.midpoint import midpoint_torque, twist_in_tool
+from hapticbridge.kernel.handle import quaternion_of, vector_of
+from hapticbridge.kernel.midpoint import twist_in_tool
 from hapticbridge.kernel.native import floats, ints, mj_factor_m, mj_passive
-from hapticbridge.pose import Quaternion, Vector, conjugate, dot, rotated, scaled, subtract
+from hapticbridge.pose import Vector, scaled, subtract
 
 HOLD_TICKS = 5
 """Ticks without anything near before the tool is lossless again, no unit. In twelve random hands on
@@ -107,7 +108,8 @@ def _enter(state: NDArray[np.void], force: Vector, torque: Vector) -> None:
     u = v − (T/2) M⁻¹ [Jᵀf − c(q, u) + p] stands on both sides; two passes leave O(T³).
     """
     s = state[0]
-    mj_factor_m(s.model, s.data)
+    if not s.has_positions:
+        mj_factor_m(s.model, s.data)
     carry(state, scaled(0.5, force), scaled(0.5, torque))
     u, v, half = floats(s.qvel, s.nv), floats(s.velocity, s.nv), floats(s.half_step, s.nv)
     for i in range(s.nv):
@@ -127,55 +129,31 @@ def _enter(state: NDArray[np.void], force: Vector, torque: Vector) -> None:
 
 
 @compiled
-def finish_lossless(
-    state: NDArray[np.void],
-    force: Vector,
-    torque: Vector,
-    half: tuple[Vector, Vector],
-    near: bool,
-    tool: Quaternion,
-    moved: Vector,
-    turned: Vector,
-) -> Vector:
+def finish_lossless(state: NDArray[np.void]) -> None:
     """Ends a step: balances it at v, carries the rest of the wrench over, changes the form.
 
-    Args:
-        state: The bound state after ``refresh_energies``, with the tool's pose before the step.
-        force: The coupling's on the tool, in the world frame.
-        torque: Its torque by the implicit form's rule.
-        half: What ``implicit_half`` returned, in the lossless form.
-        near: What ``is_near`` returned.
-        tool: The tool's orientation after the step.
-        moved: How the grip moved.
-        turned: How it turned.
-
-    Returns:
-        The torque by the rule of the form that the step had.
+    Needs the poses and energies after the step, and what ``wrench_of_step`` noted: the wrench, its
+    work (``law_work``, not in its sum yet), what the actuators applied, and what was near.
     """
     s = state[0]
-    was_midpoint = s.is_midpoint != 0
-    if was_midpoint:
-        torque = midpoint_torque(state, tool, turned)
-    work = dot(force, moved) + dot(torque, turned)
-    if was_midpoint:
-        mj_factor_m(s.model, s.data)
-        # the torque is carried in the tool's frame, so that it turns with the tool
-        q = s.tool_quaternion
-        applied = rotated(tool, rotated(conjugate((q[0], q[1], q[2], q[3])), half[1]))
-        carry(state, subtract(force, half[0]), subtract(torque, applied))
-        settle(state, work)
+    force, torque = vector_of(s.wrench_on_tool), vector_of(s.wrench_on_tool[3:6])
+    if s.was_midpoint:
+        if not s.has_positions:
+            mj_factor_m(s.model, s.data)
+        rest = subtract(force, vector_of(s.applied_half))
+        carry(state, rest, subtract(torque, vector_of(s.applied_half[3:6])))
+        settle(state, s.law_work)
     elif not s.is_held:
         # free, but not yet or no longer lossless: that balances to first order only
         v, u = floats(s.velocity, s.nv), floats(s.qvel, s.nv)
         for i in range(s.nv):
             v[i] = u[i]
-        balance(state, work)
-    s.hold = HOLD_TICKS if near else max(s.hold - 1, 0)
-    if was_midpoint and near:
+        balance(state, s.law_work)
+    s.hold = HOLD_TICKS if s.is_near else max(s.hold - 1, 0)
+    if s.was_midpoint and s.is_near:
         _leave(state)
-    elif not was_midpoint and s.hold == 0:
+    elif not s.was_midpoint and s.hold == 0:
         _enter(state, force, torque)
-    twist = twist_in_tool(state, tool)
+    twist = twist_in_tool(state, quaternion_of(s.tool_quaternion))
     for i in range(3):
         s.twist[i] = twist[i]
-    return torque

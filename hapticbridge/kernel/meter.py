@@ -19,7 +19,7 @@ from hapticbridge.kernel.native import (
     mj_kinematics,
     mj_make_m,
 )
-from hapticbridge.pose import Vector, dot
+from hapticbridge.pose import dot
 
 ENERGY_TOLERANCE = 1e-9
 """An environment is strict while Σ E_k <= 1e-9 J + 1e-9 Σ|f·δx|: rounding of a sum of many small
@@ -27,19 +27,26 @@ works, not physics. Larger hides real creation, smaller reports rounding."""
 
 
 @compiled
+def refresh_poses(state: NDArray[np.void]) -> None:
+    """Brings the bodies' poses to the state after the step (``mj_step`` leaves those before)."""
+    s = state[0]
+    mj_kinematics(s.model, s.data)
+
+
+@compiled
 def refresh_energies(state: NDArray[np.void]) -> None:
-    """Brings positions and energies to the state after the step (``mj_step`` leaves them before).
+    """Brings the energies to the state after the step.
 
     Kinetic energy needs the inertia matrix, potential energy the positions and, where there are
-    any, tendon lengths.
+    any, tendon lengths. Where MuJoCo's position stage has run since the step, all that is there.
     """
     s = state[0]
-    if s.has_tendons_or_flexes:
-        mj_fwd_kinematics(s.model, s.data)
-    else:
-        mj_kinematics(s.model, s.data)
-    mj_com_pos(s.model, s.data)
-    mj_make_m(s.model, s.data)
+    if not s.has_positions:
+        if s.has_tendons_or_flexes:
+            mj_fwd_kinematics(s.model, s.data)
+        else:
+            mj_com_pos(s.model, s.data)
+        mj_make_m(s.model, s.data)
     mj_energy_pos(s.model, s.data)
     mj_energy_vel(s.model, s.data)
     energy = floats(s.energy, 2)
@@ -47,25 +54,15 @@ def refresh_energies(state: NDArray[np.void]) -> None:
 
 
 @compiled
-def refresh_grip(state: NDArray[np.void]) -> None:
-    """Brings the grip's pose alone to the state after the step, in the middle of a tick."""
-    s = state[0]
-    mj_kinematics(s.model, s.data)
-
-
-@compiled
-def add_coupling_work(
-    state: NDArray[np.void], force: Vector, torque: Vector, moved: Vector, turned: Vector
-) -> None:
+def add_coupling_work(state: NDArray[np.void], work: float) -> None:
     """Adds f·δx + τ·δφ to the coupling's port, for as long as that wrench acted."""
     s = state[0]
-    work = dot(force, moved) + dot(torque, turned)
     s.coupling_work += work
     s.throughput += abs(work)
 
 
 @compiled
-def judge_environment(state: NDArray[np.void], moved: Vector, turned: Vector) -> None:
+def judge_environment(state: NDArray[np.void]) -> None:
     """Closes the tick's balance and holds the environment against (14) and the slack.
 
     E_k = S_k − S_{k−1} − (f_k·δx_k + τ_k·δφ_k) − actuators − external
@@ -78,6 +75,8 @@ def judge_environment(state: NDArray[np.void], moved: Vector, turned: Vector) ->
     b ‖δp_k‖² over the time between two samples at least, and against what the scene gave up.
     """
     s = state[0]
+    m = s.motion
+    moved, turned = (m[0], m[1], m[2]), (m[3], m[4], m[5])
     s.slack += 0.5 * s.slack_stiffness * dot(moved, moved)
     s.slack += 0.5 * s.slack_rotational_stiffness * dot(turned, turned)
     stored = (s.kinetic + s.potential) - s.start_energy

@@ -62,6 +62,7 @@ class Binding:
         """Starts the ramp again at the next tick, after a pause in which zero was commanded."""
         self.state["ramp_start"] = self.state["tick"]
         self.state["wrench_on_device"] = self.state["slewed"] = 0.0
+        self.state["has_positions"] = 0  # whoever had the scene meanwhile may have changed it
 
     def _fill_parameters(self, model: mujoco.MjModel, parameters: RunParameters) -> None:
         state = self.state
@@ -237,7 +238,7 @@ def _bind_addresses(
     for name, array in owned.items():
         state[name] = array.ctypes.data
 
-    for name in ("nv", "nbody", "ngeom", "nmocap", "ntendon"):
+    for name in ("nq", "nv", "nbody", "ngeom", "nmocap", "ntendon", "nsensor"):
         state[name] = getattr(model, name)
     state["equality_capacity"] = equality_capacity
     for name, value in native.contact_layout().items():

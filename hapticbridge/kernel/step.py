@@ -1,8 +1,8 @@
 """The tick's arithmetic: before MuJoCo's step, and after it.
 
-The live loop calls ``before_step``, MuJoCo through its Python bindings, ``after_step`` and
-``publish.publish``; the re-simulation calls ``simulate``, which inlines the same functions around
-``advance``, MuJoCo by its C symbol.
+The live loop calls ``before_step``, MuJoCo through its Python bindings, ``answer_step``, and once
+the wrench is out ``close_tick`` and ``publish.publish``. The re-simulation calls ``simulate``,
+which inlines the same functions around ``advance``, MuJoCo by its C symbol.
 """
 
 from __future__ import annotations
@@ -14,6 +14,12 @@ from numpy.typing import NDArray
 
 from hapticbridge.jit import compiled, compiled_for_threads
 from hapticbridge.kernel.account import keep_account
+from hapticbridge.kernel.after import answer_step, close_tick
+from hapticbridge.kernel.ahead import take_handle_in
+from hapticbridge.kernel.codes import BAD_RESULT as BAD_RESULT  # noqa: PLC0414
+from hapticbridge.kernel.codes import BAD_SAMPLE as BAD_SAMPLE  # noqa: PLC0414
+from hapticbridge.kernel.codes import HALF_DONE as HALF_DONE  # noqa: PLC0414
+from hapticbridge.kernel.codes import OK as OK  # noqa: PLC0414
 from hapticbridge.kernel.direct import place_tool
 from hapticbridge.kernel.handle import (
     handle_pose,
@@ -23,21 +29,14 @@ from hapticbridge.kernel.handle import (
     vector_of,
 )
 from hapticbridge.kernel.lossless import apply_carried
-from hapticbridge.kernel.meter import (
-    add_coupling_work,
-    judge_environment,
-)
-from hapticbridge.kernel.native import floats, has_warned, ints, mj_fwd_position, mj_step
-from hapticbridge.kernel.ports import meter_ports, note_moved_mocap_bodies
+from hapticbridge.kernel.native import floats, mj_fwd_position, mj_step
+from hapticbridge.kernel.ports import note_moved_mocap_bodies
 from hapticbridge.kernel.scheme import DIRECT, HELD, LOSSLESS
 from hapticbridge.kernel.watch import follow, refused
-from hapticbridge.kernel.wrench import render, wrench_of_step
 from hapticbridge.pose import (
-    add,
     canonical,
     conjugate,
     dot,
-    norm,
     product,
     quaternion_exp,
     rotated,
@@ -45,16 +44,6 @@ from hapticbridge.pose import (
     scaled,
     subtract,
 )
-
-# flags as plain integers: the compiler cannot read an enumeration
-CONTACT, TRIP, MIDPOINT = 64, 512, 1024
-
-OK, BAD_SAMPLE, BAD_RESULT = 0, 1, 2
-"""What a kernel function returns: go on, the device's sample is not finite, the simulation's
-result is not finite."""
-
-LARGEST_CONTROL = 1e10
-"""mjMAXVAL, in N and N m. Beyond it the run has diverged anyway."""
 
 
 @compiled
@@ -115,7 +104,8 @@ def before_step(
             than was burnt, and an uneven time stamp must not count more.
 
     Returns:
-        ``OK``; else ``BAD_SAMPLE`` or why ``watch.refused`` it, and nothing was changed.
+        ``OK``, ``HALF_DONE`` where MuJoCo's step needs only its second half, ``BAD_SAMPLE`` or why
+        ``watch.refused`` it; in these cases nothing was changed.
     """
     s, r = state[0], row[0]
     if substep == 0:
@@ -165,6 +155,11 @@ def before_step(
         store_quaternion(r.handle_quaternion, orientation)
 
     _show_handle(state, substep)
+    if s.has_positions:
+        s.has_positions = 0
+        if not s.mocap_has_moved:
+            take_handle_in(state)
+            return HALF_DONE
     return OK
 
 
@@ -182,87 +177,16 @@ def advance(state: NDArray[np.void]) -> None:
 
 
 @compiled
-def _record(state: NDArray[np.void], row: NDArray[np.void]) -> None:
-    """Copies what the tick computed into its record."""
-    s, r = state[0], row[0]
-    r.flags = s.flags
-    r.contacts = s.active_contacts
-    # without islands MuJoCo counts its iterations as those of island 0
-    islands = max(ints(s.nisland, 1)[0], 1)
-    iterations = ints(s.solver_niter, min(islands, 20))
-    r.solver_iterations = 0
-    for i in range(iterations.size):
-        r.solver_iterations += iterations[i]
-    store_vector(r.tool_position, vector_of(s.tool_position))
-    store_quaternion(r.tool_quaternion, quaternion_of(s.tool_quaternion))
-    for i in range(6):
-        r.wrench_on_tool[i] = s.wrench_on_tool[i]
-        r.wrench_on_device[i] = s.wrench_on_device[i]
-    r.kinetic, r.potential = s.kinetic, s.potential
-    r.coupling_work, r.actuator_work = s.coupling_work, s.actuator_work
-    r.external_work = s.external_work
-    r.environment_energy, r.device_energy = s.environment_energy, s.device_energy
-    r.injected_damping = s.injected_damping
-
-
-@compiled
 def after_step(state: NDArray[np.void], row: NDArray[np.void], substep: int) -> int:
     """Meters the step that just ended; after the last substep, computes and records the wrench.
-
-    With several laws a tick the wrench is their mean: the handle moves uniformly within a tick, so
-    the mean does on it the work that the single ones did.
 
     Returns:
         ``OK`` or ``BAD_RESULT``; in the latter case the wrench on the device is zero.
     """
-    s = state[0]
-    if s.scheme != DIRECT:
-        meter_ports(state)
-    is_last = substep + 1 == s.substeps
-    if s.laws == 1 and not is_last:
-        return OK
-    was_midpoint = s.is_midpoint != 0
-    force, torque, moved, turned = wrench_of_step(state, substep, is_last)
-    add_coupling_work(state, force, torque, moved, turned)
-    if s.laws > 1:
-        share = 1.0 / s.laws
-        force, torque = scaled(share, force), scaled(share, torque)
-        if substep > 0:
-            w, m = s.wrench_on_tool, s.motion
-            force = add((w[0], w[1], w[2]), force)
-            torque = add((w[3], w[4], w[5]), torque)
-            moved = add((m[0], m[1], m[2]), moved)
-            turned = add((m[3], m[4], m[5]), turned)
-        store_vector(s.motion[0:3], moved)
-        store_vector(s.motion[3:6], turned)
-    store_vector(s.wrench_on_tool[0:3], force)
-    store_vector(s.wrench_on_tool[3:6], torque)
-    if not is_last:
-        return OK
-    judge_environment(state, moved, turned)
-    s.flags = MIDPOINT if was_midpoint else 0
-    square = dot(force, force) + dot(torque, torque)
-    # MuJoCo ignores a control beyond its limit, so a wrench that is to be applied must stay below
-    if (
-        not math.isfinite(square + s.environment_energy)
-        or (s.scheme == HELD and square > LARGEST_CONTROL * LARGEST_CONTROL)
-        or has_warned(state)
-    ):
-        s.flags = TRIP
-        for i in range(6):
-            s.wrench_on_device[i] = 0.0
-        return BAD_RESULT
-    render(state, force, torque)
-    if s.scheme != LOSSLESS:  # there a contact may be near without a force
-        s.active_contacts = ints(s.ncon, 1)[0]
-    if s.active_contacts > 0:
-        s.flags |= CONTACT
-    s.peak_force = max(s.peak_force, norm(force))
-    s.peak_torque = max(s.peak_torque, norm(torque))
-
-    _record(state, row)
-    s.tick += 1
-    return OK
+    code = answer_step(state, row, substep)
+    if code != OK or substep + 1 != state[0].substeps:
+        return code
+    return close_tick(state, row, False)
 
 
 @compiled

@@ -6,14 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.jit import compiled
+from hapticbridge.kernel.codes import BACKWARDS, GAVE_ENERGY, JUMPED, STRETCHED, TWISTED
 from hapticbridge.kernel.handle import quaternion_of, store_quaternion, store_vector, vector_of
 from hapticbridge.pose import Quaternion, Vector, norm, rotation_between, subtract
 
 CLUTCH, STALE_SAMPLE, RESTARTED, RESEATED = 128, 256, 2048, 4096
 """Of ``TickFlag``: the compiler cannot read an enumeration."""
-
-JUMPED, BACKWARDS, STRETCHED, TWISTED, GAVE_ENERGY = 3, 4, 5, 6, 7
-"""Why a tick is refused, beside ``step.BAD_SAMPLE`` and ``step.BAD_RESULT``."""
 
 STILL = 1e-4
 """In m. A device that moved by more between its start and the first tick is re-seated; less is what

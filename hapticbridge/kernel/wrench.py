@@ -15,9 +15,8 @@ from hapticbridge.kernel.handle import (
     store_vector,
     vector_of,
 )
-from hapticbridge.kernel.lossless import finish_lossless
-from hapticbridge.kernel.meter import refresh_energies, refresh_grip
-from hapticbridge.kernel.midpoint import implicit_half
+from hapticbridge.kernel.meter import refresh_poses
+from hapticbridge.kernel.midpoint import implicit_half, midpoint_torque
 from hapticbridge.kernel.native import floats
 from hapticbridge.kernel.nearness import is_near
 from hapticbridge.kernel.scheme import DIRECT, LOSSLESS, WELD
@@ -27,7 +26,9 @@ from hapticbridge.pose import (
     Vector,
     add,
     canonical,
+    conjugate,
     norm,
+    rotated,
     rotation_between,
     scaled,
     subtract,
@@ -79,13 +80,13 @@ def wrench_of_step(
 ) -> tuple[Vector, Vector, Vector, Vector]:
     """Returns the wrench on the tool and the tool's motion since the last time it was asked.
 
-    Brings the tool's pose and, at the end of the tick, the energies up to date on the way.
+    Brings the tool's pose up to date on the way; ``tick_end`` goes on from what is noted here.
     """
     s = state[0]
     applied = half = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
-    near = False
     if s.scheme == LOSSLESS:  # while everything is still as the step had it
-        near = is_near(state)
+        s.is_near = is_near(state)
+        s.was_midpoint = s.is_midpoint
         if s.is_midpoint:
             half = implicit_half(state)
     elif s.scheme == WELD:
@@ -93,25 +94,24 @@ def wrench_of_step(
     elif s.scheme == DIRECT:
         applied = balance_contacts(state)
     if s.scheme != DIRECT:
-        if is_last:
-            refresh_energies(state)
-        else:
-            refresh_grip(state)
+        refresh_poses(state)
     grip = s.grip_site_id
     position = vector_of(floats(s.site_xpos + 24 * grip, 3))
     orientation = canonical(quaternion_of(floats(s.site_xquat + 32 * grip, 4)))
+    before = quaternion_of(s.tool_quaternion)
     moved = subtract(position, vector_of(s.tool_position))
-    turned = rotation_between(quaternion_of(s.tool_quaternion), orientation)
+    turned = rotation_between(before, orientation)
     if s.has_law:
         handle = (vector_of(s.handle_position), quaternion_of(s.handle_quaternion))
         if not is_last:
             handle = _handle_in_scene(state)
         applied = _law(state, handle, (position, orientation), moved, turned)
-        if s.scheme == LOSSLESS:
-            torque = finish_lossless(
-                state, applied[0], applied[1], half, near, orientation, moved, turned
-            )
-            applied = applied[0], torque
+        if s.scheme == LOSSLESS and s.is_midpoint:
+            applied = applied[0], midpoint_torque(state, orientation, turned)
+            # the torque is carried in the tool's frame, so that it turns with the tool
+            half = half[0], rotated(orientation, rotated(conjugate(before), half[1]))
+            store_vector(s.applied_half[0:3], half[0])
+            store_vector(s.applied_half[3:6], half[1])
     store_vector(s.tool_position, position)
     store_quaternion(s.tool_quaternion, orientation)
     return applied[0], applied[1], moved, turned

@@ -1,0 +1,151 @@
+"""The measurement, the findings, and one verdict."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from hapticbridge.clock import period_of
+from hapticbridge.doctor import cyclictest
+from hapticbridge.doctor.machine import Finding, System, findings
+from hapticbridge.doctor.wakeups import Wakeups, bare_turn, clock_turn
+from hapticbridge.errors import HapticBridgeError
+from hapticbridge.realtime import Lateness, memory_at_rest, real_time
+
+LATE_SHARE = 0.25
+"""Share of the period by which a tick may be late, no unit. The coupling is chosen at 80 % of the
+bound, so the hold may last T/0.8 = 1.25 T before the condition b >= KT/2 + B' is broken."""
+
+FEW_MISSED = 1e-4
+"""Share of deadlines missed that is still called fair: one in 10 s at 1 kHz."""
+
+SHORTEST, LONGEST = 1.0, 3600.0
+"""Duration in s: percentiles of less say nothing, and the longest wait is an hour."""
+
+TURN = 1.0
+"""Length in s of one turn. The loops take turns, so that a disturbance meets all of them."""
+
+BASELINE = "cyclictest"
+
+
+@dataclass(frozen=True, slots=True)
+class Diagnosis:
+    """What the doctor found.
+
+    Attributes:
+        rate: In Hz.
+        lateness: Per loop: ``bridge``, ``bare sleep`` and, where it ran, ``cyclictest``.
+        findings: What was looked at.
+        verdict: ``fit``, ``fair`` or ``unfit``.
+        sentence: The verdict with its reason, and what to do.
+    """
+
+    rate: float
+    lateness: dict[str, Lateness]
+    findings: tuple[Finding, ...]
+    verdict: str
+    sentence: str
+
+
+def diagnose(
+    rate: float = 1000.0,
+    duration: float = 20.0,
+    system: System | None = None,
+    tell: Callable[[float, float], None] = lambda _done, _whole: None,
+) -> Diagnosis:
+    """Measures this machine.
+
+    Args:
+        rate: Ticks per second, as the bridge takes them.
+        duration: Of the whole measurement, in s, 1 to 3600; the loops share it.
+        system: Where the kernel tells of itself.
+        tell: Called with the time done and the whole time, in s.
+
+    Raises:
+        HapticBridgeError: Rate or duration are out of range.
+    """
+    if not (math.isfinite(duration) and SHORTEST <= duration <= LONGEST):
+        raise HapticBridgeError(
+            f"duration is {duration!r} s; it must be {SHORTEST:g} to {LONGEST:g}"
+        )
+    period_ns = round(period_of(rate) * 1e9)
+    bridge, bare, baseline = Wakeups("bridge"), Wakeups("bare sleep"), Wakeups(BASELINE)
+    loops = [bridge, bare] + ([baseline] if cyclictest.is_there() else [])
+    rounds = max(1, round(duration / (TURN * len(loops))))
+    ticks = max(1, round(duration / (rounds * len(loops)) * 1e9 / period_ns))
+    with memory_at_rest() as at_rest:
+        for turn in range(rounds):
+            bare.add(*bare_turn(period_ns, ticks))
+            with real_time() as granted:
+                bridge.add(*clock_turn(period_ns, ticks))
+            if baseline in loops:
+                late = cyclictest.run(period_ns, ticks)
+                if late is not None:
+                    # it keeps its deadlines and skips none: a whole period late is a missed one
+                    baseline.add(late, int((late // period_ns).sum()))
+            tell(duration * (turn + 1) / rounds, duration)
+    lateness = {loop.name: loop.lateness() for loop in loops if loop.late_ns}
+    found = findings(system or System(), at_rest + granted)
+    found += (_baseline(lateness),)
+    verdict, sentence = judged(lateness, found, rate)
+    return Diagnosis(rate, lateness, found, verdict, sentence)
+
+
+def _baseline(lateness: dict[str, Lateness]) -> Finding:
+    if BASELINE in lateness:
+        return Finding("baseline", None, "cyclictest ran in turns with the loop, as a program in C")
+    if cyclictest.is_there():
+        return Finding(
+            "baseline", None, "cyclictest is there, but could not run: it needs the same permission"
+        )
+    return Finding(
+        "baseline",
+        None,
+        "cyclictest is not installed, so there is no program in C to compare with",
+        cyclictest.INSTALL,
+    )
+
+
+def judged(
+    lateness: dict[str, Lateness], found: tuple[Finding, ...], rate: float
+) -> tuple[str, str]:
+    """Returns the verdict and its sentence.
+
+    Args:
+        lateness: Per loop, ``bridge`` and ``bare sleep`` at least.
+        found: What was found.
+        rate: In Hz.
+    """
+    mine, period = lateness["bridge"], 1.0 / rate
+    allowed = LATE_SHARE * period
+    missed = mine.missed / (mine.ticks + mine.missed)
+    # what was found first counts most; one remedy often mends two things
+    remedies = dict.fromkeys(f.remedy for f in found if f.is_good is False and f.remedy)
+    advice = "; ".join(list(remedies)[:2])
+    held = f"{rate:g} Hz"
+    numbers = f"99.9 % of ticks within {mine.p999 * 1e6:.0f} µs, {mine.missed} missed"
+    if mine.p999 <= allowed and mine.missed == 0:
+        rest = f"; better still: {advice}" if advice else "; nothing is to be done"
+        return "fit", f"fit for {held}: {numbers}{rest}"
+    if mine.p99 <= allowed and missed <= FEW_MISSED:
+        verdict, words = "fair", f"fair for {held}"
+    else:
+        verdict, words = "unfit", f"unfit for {held}"
+    return verdict, f"{words}: {numbers}; {_cause(lateness, allowed, advice)}"
+
+
+def _cause(lateness: dict[str, Lateness], allowed: float, advice: str) -> str:
+    """Says whose the delays are, and what to do."""
+    baseline = lateness.get(BASELINE)
+    if baseline is not None and baseline.worst > allowed:
+        stalls = (
+            f"the machine itself stalls (a program in C woke up to {baseline.worst * 1e6:.0f} µs "
+            "late too)"
+        )
+        return f"{stalls}: {advice or 'use another one, or a lower rate'}"
+    if advice:
+        return advice
+    if lateness["bare sleep"].worst > allowed:
+        return "a bare sleep loop was late too: use another machine, or a lower rate"
+    return "the other loops were on time: report this as a fault of hapticbridge"

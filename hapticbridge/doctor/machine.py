@@ -1,0 +1,217 @@
+"""What of the machine decides how late a loop wakes, one finding with one sentence each."""
+
+from __future__ import annotations
+
+import os
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+from hapticbridge.device.families import blind_spots, plugged_devices
+from hapticbridge.realtime import Grant
+from hapticbridge.realtime.remedies import CAPABILITIES, LASTING, SHELL
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One thing that was looked at.
+
+    Attributes:
+        name: What.
+        is_good: Whether it helps; False where it stands in the way; None where it cannot be seen
+            or decides nothing.
+        sentence: How it is, and what that means.
+        remedy: What to do; empty where there is nothing.
+    """
+
+    name: str
+    is_good: bool | None
+    sentence: str
+    remedy: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class System:
+    """Where the kernel tells of itself.
+
+    Attributes:
+        sys: Root of sysfs.
+        proc: Root of procfs.
+    """
+
+    sys: Path = Path("/sys")
+    proc: Path = Path("/proc")
+
+    def text(self, path: Path) -> str | None:
+        """Returns what a file of the kernel says, or None where it is not there or not to read."""
+        try:
+            return path.read_text(encoding="utf-8", errors="replace").strip()
+        except OSError:
+            return None
+
+
+def findings(system: System, grants: tuple[Grant, ...]) -> tuple[Finding, ...]:
+    """Looks at everything; whatever the system does not show becomes a finding too.
+
+    Args:
+        system: Where to look.
+        grants: What the system answered when the loop asked for real time.
+    """
+    return (
+        *(Finding(g.name, g.is_granted, g.sentence, g.remedy) for g in grants),
+        *_lasting_ways(grants),
+        _throttling(system),
+        _preemption(system),
+        _governor(system),
+        _cores(),
+        _host(system),
+        _usb(),
+    )
+
+
+def _lasting_ways(grants: tuple[Grant, ...]) -> tuple[Finding, ...]:
+    """How to get for good what was refused and a command grants to one shell."""
+    if all(grant.remedy != SHELL for grant in grants):
+        return ()
+    return (
+        Finding(
+            "for good",
+            None,
+            "that command lasts as long as its shell; permissions can be granted for good too",
+            f"{LASTING}; or to this interpreter alone: {CAPABILITIES}",
+        ),
+    )
+
+
+def _throttling(system: System) -> Finding:
+    """Real-time threads are stopped by the kernel once they filled their share of each second."""
+    name = "throttling"
+    budget = system.text(system.proc / "sys/kernel/sched_rt_runtime_us")
+    whole = system.text(system.proc / "sys/kernel/sched_rt_period_us")
+    if budget is None or whole is None:
+        return Finding(name, None, "the share of real-time threads is not visible here")
+    if int(budget) < 0:
+        return Finding(name, True, "real-time threads are never stopped by the kernel")
+    share = int(budget) / max(int(whole), 1)
+    return Finding(
+        name,
+        share >= 0.9,
+        f"a real-time thread is stopped once it was busy for {share:.0%} of a second; the loop "
+        "sleeps in each period, so it stays below",
+        "" if share >= 0.9 else "sudo sysctl kernel.sched_rt_runtime_us=950000",
+    )
+
+
+def _preemption(system: System) -> Finding:
+    """How soon the kernel lets go of a core for a thread that should run."""
+    name = "preemption"
+    if sys.platform != "linux":
+        return Finding(name, None, f"real time is only supported on Linux, this is {sys.platform}")
+    version = system.text(system.proc / "version") or ""
+    if system.text(system.sys / "kernel/realtime") == "1" or "PREEMPT_RT" in version:
+        return Finding(name, True, "the kernel is a real-time one (PREEMPT_RT)")
+    if "PREEMPT_DYNAMIC" in version:
+        return _dynamic_preemption(system)
+    if "PREEMPT" in version:
+        return Finding(name, True, "the kernel is preemptible (PREEMPT)")
+    if not version:
+        return Finding(name, None, "the kernel's preemption model is not visible here")
+    return Finding(
+        name,
+        False,
+        "the kernel finishes its own work before it lets the loop run (no PREEMPT in its version)",
+        "install a kernel with PREEMPT_RT (Debian: linux-image-rt-amd64), or one with "
+        "PREEMPT_DYNAMIC and 'preempt=full'",
+    )
+
+
+def _dynamic_preemption(system: System) -> Finding:
+    """A kernel whose model is chosen when it starts."""
+    chosen = _dynamic_model(system)
+    if chosen == "full":
+        return Finding("preemption", True, "the kernel is preemptible (PREEMPT_DYNAMIC: full)")
+    shown = chosen or "which model is in use, it does not show here"
+    return Finding(
+        "preemption",
+        None,
+        f"the kernel can be preemptible (PREEMPT_DYNAMIC: {shown})",
+        "add 'preempt=full' to the kernel's command line; a PREEMPT_RT kernel is better still",
+    )
+
+
+def _dynamic_model(system: System) -> str:
+    """Returns the model in use, in brackets in ``none voluntary (full)``; empty if not visible."""
+    text = system.text(system.sys / "kernel/debug/sched/preempt") or ""
+    if "(" in text:
+        return text.partition("(")[2].partition(")")[0]
+    line = system.text(system.proc / "cmdline") or ""
+    settings = [word.partition("=")[2] for word in line.split() if word.startswith("preempt=")]
+    return settings[-1] if settings else ""
+
+
+def _governor(system: System) -> Finding:
+    """A core that is clocked down needs time to speed up, and until then every tick is long."""
+    name = "frequency"
+    files = sorted(system.sys.glob("devices/system/cpu/cpu[0-9]*/cpufreq/scaling_governor"))
+    governors = {text for text in map(system.text, files) if text}
+    if not governors:
+        return Finding(
+            name, None, "the processor's frequency is not governed here (a virtual machine?)"
+        )
+    if governors == {"performance"}:
+        return Finding(name, True, "all cores run at full frequency (governor performance)")
+    return Finding(
+        name,
+        False,
+        f"cores are clocked down when idle (governor {', '.join(sorted(governors))}): ticks after "
+        "a pause are longer",
+        "sudo cpupower frequency-set -g performance",
+    )
+
+
+def _cores() -> Finding:
+    name = "cores"
+    count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    busy = os.getloadavg()[0] if hasattr(os, "getloadavg") else 0.0
+    if not count or count < 2:
+        return Finding(
+            name, False, "there is one core: loop and recorder share it", "give it two at least"
+        )
+    sentence = f"{count} cores, {busy:.1f} processes wanted to run in the last minute"
+    if busy > count:
+        return Finding(
+            name, False, f"{sentence}: more than there are cores", "end what else is running"
+        )
+    return Finding(name, True, sentence)
+
+
+def _host(system: System) -> Finding:
+    name = "host"
+    flags = system.text(system.proc / "cpuinfo")
+    if flags is None:
+        return Finding(name, None, "whether this is a virtual machine is not visible here")
+    if " hypervisor" in flags:
+        return Finding(
+            name,
+            None,
+            "this is a virtual machine: its host may stop it for tens of milliseconds, and nothing "
+            "in it can prevent or foresee that",
+            "run on the machine itself",
+        )
+    return Finding(name, True, "no virtual machine")
+
+
+def _usb() -> Finding:
+    """Whether the haptic devices that are plugged in may be opened."""
+    name = "usb"
+    unseen = blind_spots()
+    plugged = plugged_devices()
+    problems = [f"{device}: {device.problem}" for device in plugged if device.problem]
+    if problems:
+        return Finding(name, False, "; ".join(problems), "hapticbridge devices")
+    if unseen:
+        sentence, _, remedy = unseen[0].partition(": ")
+        return Finding(name, False, sentence, remedy.strip("'"))
+    if not plugged:
+        return Finding(name, None, "no haptic device is plugged in")
+    return Finding(name, True, f"may be opened: {', '.join(map(str, plugged))}")

@@ -1,0 +1,221 @@
+"""What the loop asks of the system while it runs, and gives back afterwards.
+
+An ordinary process is paused whenever the kernel finds something else to do, its pages may be taken
+away, and it is moved from core to core. Each of the requests here removes one such cause of a late
+tick. None is refused in silence: what was not granted is said, with the command that grants it.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import gc
+import os
+import sys
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from hapticbridge.clock import Clock, RealClock
+from hapticbridge.errors import HapticBridgeError
+from hapticbridge.realtime.remedies import PRIORITY, way_to_grant
+
+if sys.platform != "win32":
+    import resource
+
+_LOCK_PRESENT, _LOCK_FUTURE = 1, 2  # MCL_CURRENT, MCL_FUTURE
+_SET_TIMER_SLACK, _GET_TIMER_SLACK = 29, 30  # prctl
+TIMER_SLACK_NS = 1
+"""How much later than asked the kernel may wake the loop, in ns, so that it can wake several
+threads at once. Ordinary threads begin with 50 000: that alone is 5 % of a period of 1 ms."""
+
+ISOLATED = Path("/sys/devices/system/cpu/isolated")
+
+
+@dataclass(frozen=True, slots=True)
+class Grant:
+    """The answer to one request.
+
+    Attributes:
+        name: ``scheduling``, ``memory``, ``core``, ``timer`` or ``collector``.
+        is_granted: Whether it is so while the loop runs.
+        sentence: What is granted; or what is not, why, and what that means.
+        remedy: The command that grants it; empty where it is granted or cannot be.
+    """
+
+    name: str
+    is_granted: bool
+    sentence: str
+    remedy: str = ""
+
+
+def wants_real_time(asked: bool | None, clock: Clock, *, is_real: bool) -> bool:
+    """Tells whether a run asks for real time.
+
+    Args:
+        asked: What the user said; None: for a real device, in real time.
+        clock: What drives the loop.
+        is_real: Whether the device moves a motor in somebody's hand.
+
+    Raises:
+        HapticBridgeError: It was asked for where time is not real.
+    """
+    if asked and clock.name != RealClock.name:
+        raise HapticBridgeError(
+            f"real time is asked for, and a {clock.name} clock: they exclude each other"
+        )
+    return is_real and clock.name == RealClock.name if asked is None else asked
+
+
+@contextmanager
+def memory_at_rest() -> Iterator[tuple[Grant, ...]]:
+    """Locks the process's memory and stops the garbage collector; undone at the end.
+
+    It takes a third of a second, so it is to be done before a device is held.
+
+    Yields:
+        One answer per request.
+    """
+    with ExitStack() as restore:
+        yield _collector(restore), _memory(restore)
+
+
+@contextmanager
+def real_time(core: int | None = None) -> Iterator[tuple[Grant, ...]]:
+    """Asks for real time for the calling thread; gives everything back at the end.
+
+    Threads and processes that are started meanwhile do not inherit the priority.
+
+    Args:
+        core: Where to run; None takes an isolated core if there is one, else the last one allowed
+            (the first serves most interrupts).
+
+    Yields:
+        One answer per request.
+    """
+    with ExitStack() as restore:
+        # the priority comes last, so that no other request runs, or waits, under it
+        yield _timer(restore), _core(restore, core), _scheduling(restore)
+
+
+def warn_of_refusals(grants: tuple[Grant, ...]) -> None:
+    """Warns once of each request that was refused, with the command that grants it."""
+    for grant in grants:
+        if not grant.is_granted:
+            remedy = f"; to grant it: {grant.remedy}" if grant.remedy else ""
+            warnings.warn(f"real time: {grant.sentence}{remedy}", stacklevel=3)
+
+
+def shown_limit(limit: int, unit: int = 1) -> str:
+    """Returns a limit of ``resource.getrlimit`` as ``ulimit`` shows it."""
+    return "unlimited" if limit == resource.RLIM_INFINITY else str(limit // unit)
+
+
+def _scheduling(restore: ExitStack) -> Grant:
+    name = "scheduling"
+    if not hasattr(os, "sched_setscheduler"):
+        return Grant(name, False, f"{sys.platform} has no SCHED_FIFO; only Linux is supported")
+    policy, parameter = os.sched_getscheduler(0), os.sched_getparam(0)
+    limit = resource.getrlimit(resource.RLIMIT_RTPRIO)[0]
+    # what a limit allows is better than nothing: any real-time priority goes before all others
+    wanted = dict.fromkeys((PRIORITY, min(PRIORITY, limit)) if limit > 0 else (PRIORITY,))
+    for priority in wanted:
+        try:
+            os.sched_setscheduler(
+                0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(priority)
+            )
+        except OSError as error:
+            reason = error.strerror
+        else:
+            restore.callback(os.sched_setscheduler, 0, policy, parameter)
+            return Grant(name, True, f"SCHED_FIFO at priority {priority}")
+    return Grant(
+        name,
+        False,
+        f"SCHED_FIFO was refused ({reason}; the limit 'ulimit -r' is {shown_limit(limit)}): any "
+        "other busy process can make a tick late by milliseconds",
+        way_to_grant(),
+    )
+
+
+def _memory(restore: ExitStack) -> Grant:
+    name = "memory"
+    if sys.platform != "linux":
+        return Grant(name, False, f"memory is not locked on {sys.platform}; only Linux does it")
+    library = ctypes.CDLL(None, use_errno=True)
+    limit = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0]
+    is_unlimited = limit == resource.RLIM_INFINITY
+    # under a limit, locking what comes would make the allocation beyond it fail in mid-run
+    whole = _LOCK_PRESENT | _LOCK_FUTURE
+    for flags in (whole, _LOCK_PRESENT) if is_unlimited else (_LOCK_PRESENT,):
+        if library.mlockall(flags) == 0:
+            restore.callback(library.munlockall)
+            share = "all memory is" if flags == whole else "the memory in use is"
+            return Grant(name, True, f"{share} locked")
+    reason = os.strerror(ctypes.get_errno())
+    return Grant(
+        name,
+        False,
+        f"memory could not be locked ({reason}; the limit 'ulimit -l' is "
+        f"{shown_limit(limit, 1024)} kB): a page that the system took away makes a tick late",
+        way_to_grant(),
+    )
+
+
+def _timer(restore: ExitStack) -> Grant:
+    name = "timer"
+    if sys.platform != "linux":
+        return Grant(name, False, f"the timer's slack cannot be set on {sys.platform}")
+    library = ctypes.CDLL(None, use_errno=True)
+    before = library.prctl(_GET_TIMER_SLACK, 0, 0, 0, 0)
+    if before < 0 or library.prctl(_SET_TIMER_SLACK, TIMER_SLACK_NS, 0, 0, 0) != 0:
+        reason = os.strerror(ctypes.get_errno())
+        return Grant(
+            name, False, f"the timer's slack of 50 µs stays ({reason}): wake-ups are that late"
+        )
+    restore.callback(library.prctl, _SET_TIMER_SLACK, before, 0, 0, 0)
+    return Grant(name, True, f"timer slack {TIMER_SLACK_NS} ns instead of {before * 1e-3:g} µs")
+
+
+def _core(restore: ExitStack, core: int | None) -> Grant:
+    name = "core"
+    if not hasattr(os, "sched_setaffinity"):
+        return Grant(name, False, f"{sys.platform} pins no thread to a core; only Linux does")
+    allowed = os.sched_getaffinity(0)
+    isolated = _isolated_cores()
+    chosen = core if core is not None else min(isolated, default=max(allowed))
+    try:
+        os.sched_setaffinity(0, {chosen})
+    except (OSError, ValueError, OverflowError) as error:
+        return Grant(name, False, f"the loop could not be pinned to core {chosen} ({error})")
+    restore.callback(os.sched_setaffinity, 0, allowed)
+    kind = "isolated core" if chosen in isolated else "core"
+    return Grant(name, True, f"pinned to {kind} {chosen} of {len(allowed | isolated)}")
+
+
+def _isolated_cores() -> set[int]:
+    """Returns the cores that the kernel gives no work of its own (``isolcpus``)."""
+    try:
+        text = ISOLATED.read_text(encoding="utf-8").strip()
+    except OSError:
+        return set()
+    cores: set[int] = set()
+    for part in filter(None, text.split(",")):
+        first, _, last = part.partition("-")
+        cores.update(range(int(first), int(last or first) + 1))
+    return cores
+
+
+def _collector(restore: ExitStack) -> Grant:
+    """Stops Python's collector of reference cycles: it would stop the loop for milliseconds."""
+    was_enabled, had_frozen = gc.isenabled(), gc.get_freeze_count() > 0
+    gc.collect()
+    gc.freeze()
+    gc.disable()
+    undo: list[Callable[[], None]] = [gc.enable] if was_enabled else []
+    if not had_frozen:
+        undo.append(gc.unfreeze)
+    for call in undo:
+        restore.callback(call)
+    return Grant("collector", True, "the garbage collector is frozen")

@@ -1,0 +1,66 @@
+"""How late a loop woke, as the numbers that tell whether it holds its rate."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from hapticbridge.errors import HapticBridgeError
+
+
+@dataclass(frozen=True, slots=True)
+class Lateness:
+    """How late the ticks of one loop woke.
+
+    Attributes:
+        ticks: How many woke.
+        missed: Deadlines that passed without a tick.
+        median: In s, as all that follow.
+        p99: Later than this was one tick in a hundred.
+        p999: One in a thousand.
+        worst: The latest of all.
+    """
+
+    ticks: int
+    missed: int
+    median: float
+    p99: float
+    p999: float
+    worst: float
+
+    def sentence(self) -> str:
+        """Returns the numbers in µs, in one line."""
+        return (
+            f"p50 {self.median * 1e6:.0f}, p99 {self.p99 * 1e6:.0f}, p99.9 {self.p999 * 1e6:.0f}, "
+            f"max {self.worst * 1e6:.0f} µs, {self.missed} of {self.ticks + self.missed} missed"
+        )
+
+
+def lateness_of(late_ns: ArrayLike, missed: int) -> Lateness:
+    """Returns the percentiles of times from deadline to wake-up.
+
+    Args:
+        late_ns: In ns, at least one; 0 or less counts as on time.
+        missed: Deadlines that were skipped.
+
+    Raises:
+        HapticBridgeError: There is no time at all.
+    """
+    late = np.maximum(np.asarray(late_ns, dtype=np.float64).ravel(), 0.0) * 1e-9
+    if late.size == 0:
+        raise HapticBridgeError("no tick woke, so there is no lateness; run it for longer")
+    late.sort()
+    # no interpolation: a percentile is a lateness that was seen
+    median, p99, p999 = (
+        float(late[-(-late.size * thousandths // 1000) - 1]) for thousandths in (500, 990, 999)
+    )
+    return Lateness(
+        ticks=int(late.size),
+        missed=missed,
+        median=median,
+        p99=p99,
+        p999=p999,
+        worst=float(late[-1]),
+    )

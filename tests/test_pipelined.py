@@ -1,0 +1,272 @@
+"""What runs ahead of the sample changes no bit: the pipelined tick against the plain one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+from audit_cases import TAP, ScriptedDevice, tapped
+from bridge_runs import REST, fast, sway
+
+from hapticbridge.audit import audit
+from hapticbridge.bridge import Bridge
+from hapticbridge.errors import SafetyTrip
+from hapticbridge.guard import Limits
+from hapticbridge.kernel.ahead import can_split, is_sound
+from hapticbridge.kernel.scheme import COUPLED, DIRECT, WELD
+from hapticbridge.recording import read_recording
+from hapticbridge.rendering import METHODS
+from hapticbridge.tick import TICK_DTYPE
+
+TICKS = 400
+
+WORKSHOP = """
+<mujoco>
+  <option cone="elliptic"/>
+  <default><geom solref="0.002 1" solimp="0.9 0.95 0.001"/></default>
+  <worldbody>
+    <geom type="plane" size="1 1 0.1"/>
+    <body name="tool" pos="0 0 0.012" gravcomp="1"><freejoint/>
+      <geom type="sphere" size="0.01" mass="0.1"/><site name="grip"/></body>
+    <body name="lever" pos="0.03 0 0.02"><joint name="lever" type="hinge" axis="0 1 0"
+        stiffness="0.1" damping="0.001"/>
+      <geom type="capsule" size="0.004" fromto="0 0 0 0 0 0.05" mass="0.05"/></body>
+    <body name="load" pos="-0.1 0 0.05"><freejoint/>
+      <geom type="box" size="0.01 0.01 0.01" mass="0.05"/></body>
+    <body name="lift" mocap="true" pos="-0.1 0 0.03">
+      <geom type="box" size="0.02 0.02 0.008"/></body>
+  </worldbody>
+  <actuator><position name="servo" joint="lever" kp="0.5" kv="0.01"/></actuator>
+  <sensor>
+    <framepos objtype="site" objname="grip"/><framelinvel objtype="site" objname="grip"/>
+    <jointpos joint="lever"/><touch name="touch" site="grip"/>
+  </sensor>
+</mujoco>"""
+"""A tool, a servo, a spring, sensors, and a load on a platform that is moved."""
+
+Rows = tuple[Any, ...]
+
+
+def numbers_of(bridge: Bridge) -> Rows:
+    data = bridge.scene.data
+    kept = data.qpos.copy(), data.qvel.copy(), data.sensordata.copy(), data.time
+    return (bridge.latest_records(TICKS), *kept)
+
+
+def run(folder: Path, scene: Any, *, pipelined: bool, on_tick: Any = None, **options: Any) -> Rows:
+    device = options.pop("device", None) or ScriptedDevice(sway)
+    with fast(scene, device, pipelined=pipelined, **options) as bridge:
+        bridge.run(TICKS * bridge.period, on_tick and (lambda tick: on_tick(bridge, tick)))
+        return numbers_of(bridge)
+
+
+def check_equal(plain: Rows, ahead: Rows) -> None:
+    for name in TICK_DTYPE.names or ():
+        np.testing.assert_array_equal(plain[0][name], ahead[0][name], err_msg=name)
+    for one, other in zip(plain[1:], ahead[1:], strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize(
+    ("method", "substeps"), [*((method, 1) for method in METHODS), ("implicit", 3), ("explicit", 2)]
+)
+def test_a_pipelined_run_is_the_plain_one_to_the_bit(
+    tmp_path: Path, method: str, substeps: int
+) -> None:
+    (tmp_path / "tap.csv").write_text(TAP)
+    plain, ahead = (
+        run(
+            tmp_path,
+            "peg_in_hole",
+            device=f"trajectory:{tmp_path / 'tap.csv'}",
+            pipelined=pipelined,
+            method=method,
+            substeps=substeps,
+        )
+        for pipelined in (False, True)
+    )
+    assert plain[0]["contacts"].max() > 0
+    check_equal(plain, ahead)
+
+
+@pytest.mark.parametrize("method", ["lossless", "compensated"])
+def test_the_audit_simulates_a_pipelined_run_again_bit_for_bit(tmp_path: Path, method: str) -> None:
+    plain, ahead = (
+        tapped(tmp_path, f"{pipelined}.mcap", method=method, pipelined=pipelined)
+        for pipelined in (False, True)
+    )
+    assert read_recording(plain).ticks.tobytes() == read_recording(ahead).ticks.tobytes()
+    report = audit(ahead)
+    assert report.resimulation == "bit for bit"
+    assert report.verdict == "passive"
+
+
+@pytest.mark.parametrize("method", ["lossless", "implicit", "explicit"])
+def test_motors_springs_sensors_and_moved_bodies_change_no_bit(tmp_path: Path, method: str) -> None:
+    path = tmp_path / "workshop.xml"
+    path.write_text(WORKSHOP)
+
+    def act(bridge: Bridge, tick: int) -> None:
+        if tick % 50 == 10:
+            bridge.set_input(ctrl={"servo": 0.3 * np.sin(tick)})
+        if 100 <= tick < 200:
+            height = 0.03 + 2e-5 * (tick - 100)
+            bridge.set_input(mocap={"lift": (-0.1, 0, height)})
+        if tick == 250:
+            bridge.set_input(body_wrench={"load": (0.01, 0, 0, 0, 0, 1e-5)})
+
+    plain, ahead = (
+        run(tmp_path, path, pipelined=pipelined, method=method, on_tick=act)
+        for pipelined in (False, True)
+    )
+    assert plain[0]["external_work"][-1] != 0.0
+    assert plain[0]["actuator_work"][-1] != 0.0
+    check_equal(plain, ahead)
+
+
+class Calls:
+    """Counts calls of MuJoCo's functions, and notes their order beside others."""
+
+    def __init__(self) -> None:
+        self.names: list[str] = []
+
+    def count(self, name: str) -> int:
+        return self.names.count(name)
+
+
+@pytest.fixture
+def calls(monkeypatch: pytest.MonkeyPatch) -> Calls:
+    seen = Calls()
+
+    def noted(name: str, function: Callable[..., None]) -> Callable[..., None]:
+        def call(*arguments: Any) -> None:
+            seen.names.append(name)
+            function(*arguments)
+
+        return call
+
+    for name in ("mj_step", "mj_step2", "mj_fwdPosition"):
+        monkeypatch.setattr(mujoco, name, noted(name, getattr(mujoco, name)))
+    return seen
+
+
+def test_only_the_first_tick_is_a_whole_step(tmp_path: Path, calls: Calls) -> None:
+    run(tmp_path, "point_mass", pipelined=True)
+    assert calls.count("mj_step") == 1
+    assert calls.count("mj_step2") == TICKS - 1
+    assert calls.count("mj_fwdPosition") == TICKS
+
+
+@pytest.mark.parametrize("method", ["weld", "explicit:rk4"])
+def test_methods_whose_constraints_or_stages_need_the_sample_take_whole_steps(
+    tmp_path: Path, calls: Calls, method: str
+) -> None:
+    run(tmp_path, "point_mass", pipelined=True, method=method)
+    assert calls.count("mj_step2") == calls.count("mj_fwdPosition") == 0
+
+
+def test_a_tick_in_which_a_body_was_moved_is_a_whole_step(tmp_path: Path, calls: Calls) -> None:
+    path = tmp_path / "workshop.xml"
+    path.write_text(WORKSHOP)
+
+    def lift(bridge: Bridge, tick: int) -> None:
+        if tick in (50, 90):
+            bridge.set_input(mocap={"lift": (-0.1, 0, 0.03 + 1e-6 * tick)})
+
+    run(tmp_path, path, pipelined=True, on_tick=lift)
+    assert calls.count("mj_step") == 3
+
+
+def test_the_wrench_goes_out_before_the_next_positions_are_computed(
+    tmp_path: Path, calls: Calls, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    device = ScriptedDevice(sway)
+    write = device.write
+
+    def noted(wrench: Any) -> None:
+        calls.names.append("write")
+        write(wrench)
+
+    monkeypatch.setattr(device, "write", noted)
+    run(tmp_path, "point_mass", pipelined=True, device=device)
+    # the first tick is a whole step; the last words are zero force, at the end of run and bridge
+    ticks = ["mj_step", "write", "mj_fwdPosition"]
+    ticks += ["mj_step2", "write", "mj_fwdPosition"] * (TICKS - 1)
+    assert calls.names == [*ticks, "write", "write"]
+
+
+def test_a_scene_changed_between_two_runs_is_taken_as_it_is(tmp_path: Path) -> None:
+    ends = []
+    for pipelined in (False, True):
+        with fast("point_mass", ScriptedDevice(lambda _tick: REST), pipelined=pipelined) as bridge:
+            bridge.run(0.05)
+            bridge.scene.data.qpos[:3] += 1e-3
+            bridge.run(0.05)
+            ends.append(numbers_of(bridge))
+    assert ends[0][0]["wrench_on_tool"][60, 0] != 0.0
+    check_equal(*ends)
+
+
+def test_a_control_callback_is_called_once_a_tick(calls: Calls) -> None:
+    """MuJoCo calls it between the halves of a whole step; ``mj_step2`` alone would leave it out."""
+    count = 0
+
+    def control(_model: Any, _data: Any) -> None:
+        nonlocal count
+        count += 1
+
+    with fast("point_mass", ScriptedDevice(sway), pipelined=True) as bridge:
+        mujoco.set_mjcb_control(control)
+        try:
+            bridge.run(0.1)
+        finally:
+            mujoco.set_mjcb_control(None)
+    assert count == calls.count("mj_step") == 100
+
+
+def test_what_can_be_split(tmp_path: Path) -> None:
+    with fast("point_mass", method="implicit") as bridge:
+        model = bridge.scene.model
+        assert can_split(model, COUPLED)
+        assert not can_split(model, WELD)
+        assert not can_split(model, DIRECT)
+        model.opt.integrator = mujoco.mjtIntegrator.mjINT_RK4
+        assert not can_split(model, COUPLED)
+
+
+@pytest.mark.parametrize("value", [1e10, -1e11, np.inf, np.nan])
+def test_what_mujoco_would_reset_is_left_to_a_whole_step(value: float) -> None:
+    with fast("point_mass", method="implicit") as bridge:
+        state, data = bridge._binding.state, bridge.scene.data
+        assert is_sound(state)
+        data.qvel[1] = value
+        assert not is_sound(state)
+        data.qvel[1] = 0.99e10
+        assert is_sound(state)
+        data.qpos[2] = value
+        assert not is_sound(state)
+
+
+@pytest.mark.parametrize("pipelined", [False, True])
+def test_energies_that_are_not_finite_end_in_zero_force(tmp_path: Path, pipelined: bool) -> None:
+    device = ScriptedDevice(sway)
+    limits = Limits(force=10.0, torque=0.5, ramp=0.0)
+    with (
+        pytest.raises(SafetyTrip, match="no longer finite"),
+        fast("point_mass", device, pipelined=pipelined, limits=limits) as bridge,
+    ):
+
+        def spoil(tick: int) -> None:
+            if tick == 20:
+                bridge._binding.state["start_energy"] = np.nan
+
+        bridge.run(0.1, spoil)
+    writes = np.array(device.writes)
+    assert np.all(np.isfinite(writes))
+    assert np.any(writes[19] != 0.0)
+    assert np.all(writes[-1] == 0.0)
+    assert bridge.latest_records(100)["tick"][-1] == 19

@@ -1,0 +1,298 @@
+"""What is asked of the system: given back, never refused in silence. Nothing grows in a tick."""
+
+from __future__ import annotations
+
+import ctypes
+import gc
+import os
+import resource
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from audit_cases import ScriptedDevice
+from bridge_runs import fast, sway
+
+from hapticbridge.bridge import Bridge
+from hapticbridge.clock import RealClock, SimulatedClock
+from hapticbridge.errors import HapticBridgeError, SceneError
+from hapticbridge.realtime import (
+    Grant,
+    check_pace,
+    lateness_of,
+    memory_at_rest,
+    real_time,
+    wants_real_time,
+)
+from hapticbridge.realtime import grants as asked
+from hapticbridge.realtime.pace import BESIDE_THE_STEP, SPARE, rate_for
+from hapticbridge.realtime.remedies import CONTAINER, PRIORITY, SHELL
+from hapticbridge.recording import read_recording
+from hapticbridge.rendering import METHODS, prepare
+from hapticbridge.scene import load_scene
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="real time is Linux's")
+
+
+class Library:
+    """Stands in for the C library: locks no memory, but notes what was asked."""
+
+    def __init__(self, *refused: int) -> None:
+        self.refused = refused
+        self.asked: list[int] = []
+        self.slack = 50_000
+
+    def mlockall(self, flags: int) -> int:
+        self.asked.append(flags)
+        ctypes.set_errno(12)
+        return -1 if flags in self.refused else 0
+
+    def munlockall(self) -> int:
+        self.asked.append(0)
+        return 0
+
+    def prctl(self, option: int, value: int, *_rest: int) -> int:
+        if option == asked._GET_TIMER_SLACK:
+            return self.slack
+        self.slack = value
+        return 0
+
+
+@pytest.fixture
+def library(monkeypatch: pytest.MonkeyPatch) -> Library:
+    fake = Library()
+    monkeypatch.setattr(ctypes, "CDLL", lambda *_name, **_options: fake)
+    return fake
+
+
+@pytest.fixture
+def refusing(monkeypatch: pytest.MonkeyPatch, library: Library) -> Library:
+    """A system that grants nothing that it can refuse, to an ordinary user."""
+
+    def refuse(*_arguments: Any) -> None:
+        raise PermissionError(1, "Operation not permitted")
+
+    library.refused = 1, 3
+    monkeypatch.setattr(os, "sched_setscheduler", refuse)
+    monkeypatch.setattr(os, "geteuid", lambda: 1000)
+    return library
+
+
+def named(grants: tuple[Grant, ...], name: str) -> Grant:
+    return next(grant for grant in grants if grant.name == name)
+
+
+def facts() -> tuple[Any, ...]:
+    """Everything that is changed while the loop runs."""
+    library = ctypes.CDLL(None)
+    slack = library.prctl(30, 0, 0, 0, 0)
+    policy, priority = os.sched_getscheduler(0), os.sched_getparam(0).sched_priority
+    return policy, priority, os.sched_getaffinity(0), slack, gc.isenabled(), gc.get_freeze_count()
+
+
+def test_everything_is_given_back_also_after_an_error() -> None:
+    before = facts()
+    with pytest.raises(KeyError), real_time():
+        assert facts() != before
+        raise KeyError
+    assert facts() == before
+
+
+def test_the_collector_and_the_lock_are_given_back(library: Library) -> None:
+    before = facts()
+    with pytest.raises(KeyError), memory_at_rest() as grants:
+        assert all(grant.is_granted for grant in grants)
+        assert not gc.isenabled()
+        assert gc.get_freeze_count() > 0
+        assert library.asked[-1] != 0
+        raise KeyError
+    assert library.asked[-1] == 0
+    assert facts() == before
+
+
+def test_a_collector_that_the_user_stopped_or_froze_stays_so(library: Library) -> None:
+    gc.disable()
+    gc.freeze()
+    try:
+        with memory_at_rest():
+            pass
+        assert not gc.isenabled()
+        assert gc.get_freeze_count() > 0
+    finally:
+        gc.enable()
+        gc.unfreeze()
+
+
+def test_granted_is_what_the_system_says_too() -> None:
+    with real_time() as grants:
+        policy = os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK
+        assert named(grants, "scheduling").is_granted == (policy == os.SCHED_FIFO)
+        assert named(grants, "core").is_granted
+        assert len(os.sched_getaffinity(0)) == 1
+        assert named(grants, "timer").is_granted
+        # a real-time thread has no slack at all, and newer kernels say so
+        assert ctypes.CDLL(None).prctl(30, 0, 0, 0, 0) in (0, asked.TIMER_SLACK_NS)
+
+
+def test_processes_started_meanwhile_are_ordinary_ones() -> None:
+    with real_time():
+        ask = [sys.executable, "-S", "-c", "import os; print(os.sched_getscheduler(0))"]
+        policy = subprocess.run(ask, capture_output=True, text=True, check=True).stdout
+    assert int(policy) == os.SCHED_OTHER
+
+
+@pytest.mark.parametrize(("user", "remedy"), [(1000, SHELL), (0, CONTAINER)])
+def test_what_is_refused_is_said_with_the_command_that_grants_it(
+    refusing: Library, monkeypatch: pytest.MonkeyPatch, user: int, remedy: str
+) -> None:
+    monkeypatch.setattr(os, "geteuid", lambda: user)
+    with memory_at_rest() as memory, real_time() as grants:
+        for grant in (named(memory, "memory"), named(grants, "scheduling")):
+            assert not grant.is_granted
+            assert grant.remedy == remedy
+            assert "ulimit" in grant.sentence
+    assert "--rtprio=80" in SHELL
+    assert "--memlock" in SHELL
+
+
+@pytest.mark.parametrize("limit", [10, PRIORITY, 99])
+def test_a_lower_limit_on_priority_is_used(monkeypatch: pytest.MonkeyPatch, limit: int) -> None:
+    got: list[int] = []
+
+    def schedule(_process: int, policy: int, parameter: Any) -> None:
+        if policy & os.SCHED_FIFO and parameter.sched_priority > limit:
+            raise PermissionError(1, "Operation not permitted")
+        got.append(parameter.sched_priority)
+
+    monkeypatch.setattr(os, "sched_setscheduler", schedule)
+    monkeypatch.setattr(resource, "getrlimit", lambda _which: (limit, limit))
+    with real_time() as grants:
+        assert named(grants, "scheduling").is_granted
+        assert got == [min(limit, PRIORITY)]
+
+
+@pytest.mark.parametrize(("limit", "flags"), [(resource.RLIM_INFINITY, 3), (1 << 30, 1)])
+def test_memory_to_come_is_locked_only_where_no_limit_can_fail_it(
+    library: Library, monkeypatch: pytest.MonkeyPatch, limit: int, flags: int
+) -> None:
+    monkeypatch.setattr(resource, "getrlimit", lambda _which: (limit, limit))
+    with memory_at_rest():
+        pass
+    assert library.asked == [flags, 0]
+
+
+def test_an_isolated_core_is_taken_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    chosen: list[Any] = []
+    monkeypatch.setattr(asked, "ISOLATED", tmp_path / "isolated")
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _process: {0, 1, 2})
+    monkeypatch.setattr(os, "sched_setaffinity", lambda _process, cores: chosen.append(cores))
+    with real_time():
+        assert chosen == [{2}]
+    (tmp_path / "isolated").write_text("4,6-7\n")
+    chosen.clear()
+    with real_time() as grants:
+        assert chosen == [{4}]
+    assert "isolated core 4" in named(grants, "core").sentence
+
+
+def test_a_core_that_is_not_there_is_said() -> None:
+    with real_time(core=4095) as grants:
+        assert not named(grants, "core").is_granted
+        assert "4095" in named(grants, "core").sentence
+
+
+def test_who_wants_real_time() -> None:
+    real, simulated = RealClock(), SimulatedClock()
+    assert wants_real_time(None, real, is_real=True)
+    assert not wants_real_time(None, real, is_real=False)
+    assert not wants_real_time(None, simulated, is_real=False)
+    assert not wants_real_time(False, real, is_real=True)
+    assert wants_real_time(True, real, is_real=False)
+    with pytest.raises(HapticBridgeError, match="simulated clock"):
+        wants_real_time(True, simulated, is_real=False)
+
+
+def test_a_run_goes_on_without_the_permission_says_so_once_and_records_it(
+    refusing: Library, tmp_path: Path
+) -> None:
+    path = tmp_path / "run.mcap"
+    with Bridge("point_mass", ScriptedDevice(sway), realtime=True, recording=path) as bridge:
+        with pytest.warns(UserWarning, match="real time") as warned:
+            bridge.run(0.02)
+        bridge.run(0.02)
+    assert sum("SCHED_FIFO was refused" in str(item.message) for item in warned) == 1
+    assert sum("memory could not be locked" in str(item.message) for item in warned) == 1
+    events = [event for event in read_recording(path).events if event["event"] == "real_time"]
+    assert len(events) == 2
+    assert "refused" in str(events[0]["scheduling"])
+    assert "frozen" in str(events[0]["collector"])
+
+
+@pytest.mark.parametrize("pipelined", [False, True])
+def test_ten_thousand_ticks_allocate_nothing_that_stays(pipelined: bool) -> None:
+    """Python's own numbers come and go; a tick that keeps one more object would show 10 000."""
+    blocks = np.zeros(2, dtype=np.int64)
+
+    def count(tick: int) -> None:
+        if tick in (2000, 12_000):
+            blocks[tick // 12_000] = sys.getallocatedblocks()
+
+    with fast("peg_in_hole", "simulated", pipelined=pipelined) as bridge:
+        gc.collect()
+        gc.disable()
+        try:
+            bridge.run(12.001, count)
+        finally:
+            gc.enable()
+    assert blocks[0] > 0
+    assert blocks[1] - blocks[0] == 0
+
+
+def test_percentiles_are_latenesses_that_were_seen() -> None:
+    late = lateness_of(np.arange(1, 1001) * 1000, 7)
+    assert (late.ticks, late.missed) == (1000, 7)
+    assert late.median == pytest.approx(500e-6)
+    assert late.p99 == pytest.approx(990e-6)
+    assert late.p999 == pytest.approx(999e-6)
+    assert late.worst == pytest.approx(1e-3)
+    assert lateness_of([-50], 0).worst == 0.0
+    with pytest.raises(HapticBridgeError, match="no tick"):
+        lateness_of([], 0)
+
+
+def test_a_scene_too_slow_is_refused_for_a_real_device_and_warned_of_for_others() -> None:
+    """No step fits into a microsecond, every one of a point mass into a second."""
+    scene, method = load_scene("point_mass"), METHODS["implicit"]
+    with fast(scene, method="implicit") as bridge:
+        coupling = bridge.coupling
+    prepare(scene, coupling, 1e-3, 1, method)
+    start = scene.data.qpos.copy(), scene.data.time, scene.data.qacc_warmstart.copy()
+    with pytest.raises(SceneError, match=r"could hold about \S+ Hz"):
+        check_pace(scene, method, 1e-9, 1, is_real=True)
+    with pytest.warns(UserWarning, match=r"could hold about \S+ Hz"):
+        check_pace(scene, method, 1e-9, 1, is_real=False)
+    check_pace(scene, method, 1.0, 1, is_real=True)
+    for before, after in zip(
+        start, (scene.data.qpos, scene.data.time, scene.data.qacc_warmstart), strict=True
+    ):
+        np.testing.assert_array_equal(before, after)
+
+
+def test_the_rate_that_is_offered_leaves_a_fifth_of_the_period() -> None:
+    assert rate_for(1e-3) == pytest.approx(SPARE / (1e-3 + BESIDE_THE_STEP))
+    assert (1e-3 + BESIDE_THE_STEP) * rate_for(1e-3) == pytest.approx(0.8)
+
+
+def test_a_bridge_refuses_before_the_device_is_held(monkeypatch: pytest.MonkeyPatch) -> None:
+    device = ScriptedDevice(sway)
+    device.info = replace(device.info, is_real=True)
+    started: list[float] = []
+    monkeypatch.setattr(device, "start", started.append)
+    bridge = Bridge("point_mass", device, rate=1e6, realtime=False)
+    with pytest.raises(SceneError, match="could hold"):
+        bridge.__enter__()
+    assert not started
