@@ -65,6 +65,10 @@ from hapticbridge.summary import Summary
 from hapticbridge.tick import SAMPLE_DTYPE, TICK_DTYPE, TickFlag
 from hapticbridge.workspace import Workspace, run_parameters
 
+RECORDER_LOOK = 0.1
+"""In s, how often the loop looks whether the recorder still lives: 4 µs each time. A run that is to
+be recorded ends with its recorder."""
+
 _NO_FORCE = np.zeros(6)
 
 
@@ -260,7 +264,11 @@ class Bridge:
             mujoco.mj_fwdPosition,
         )
         is_ahead = self._is_pipelined and can_split(model, self.method.scheme)
+        next_look, looks = self._tick, max(round(RECORDER_LOOK / self.period), 1)
         while self._tick != last and not self._stopped_by:
+            if self._tick >= next_look:
+                stream.look()
+                next_look += looks
             deadline, wake, skipped = wait()
             if on_tick is not None:
                 on_tick(self._tick)

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.audit.balance import Balance
+from hapticbridge.audit.ending import how_it_ended
 from hapticbridge.audit.physics import physics_fault
 from hapticbridge.audit.replay import replay
 from hapticbridge.audit.structure import TOLERANCE, Fault, structure_fault
@@ -156,8 +157,8 @@ def audit(path: str | Path, *, strict: bool = False) -> AuditReport:
     report = _judged(facts, balance, strict=strict)
     if report.verdict == "passive" and report.unchecked and not outcome.has_run:
         report = _invalid(facts, Fault(outcome.agreement))
-    trips = [event.get("tick") for event in recording.events if event.get("event") == "trip"]
-    tripped = f"; the guard tripped at tick {trips[0]}" if trips else ""
+    ended = how_it_ended(recording)
+    tripped = f"; {ended}" if ended else ""
     unchecked = f"; {report.unchecked}" if report.unchecked else ""
     return replace(report, reason=report.reason + tripped + unchecked)
 
