@@ -19,17 +19,15 @@ class TickFlag(IntFlag):
         DROPPED_BEFORE: Records were lost between the previous record and this one (ring full).
         FORCE_LIMITED: Force or torque was scaled down to the limit.
         SLEW_LIMITED: The wrench changed faster than the slew limit allows.
-        RAMPING: The start ramp still scales the wrench.
+        RAMPING: The wrench still rises, after the start or after the coupling was re-seated.
         CONTROLLER_ACTIVE: The passivity controller injected damping.
         CONTACT: MuJoCo found at least one contact in the scene.
         CLUTCH: The device moves without the handle.
         STALE_SAMPLE: The device had nothing new since the previous tick.
         TRIP: The guard stopped the run in this tick; the wrench sent is zero. A tick that is not
             finite is not recorded at all; the event ``trip`` names it.
-        RESTARTED: The wrench rises from zero again from this tick on, after samples that were old
-            or a coupling that was re-seated.
-        RESEATED: The coupling was re-seated before this tick: the device's pose in it is that of
-            the handle in the tick before, from here on.
+        RESEATED: The handle was put to the tool before this tick, and the device's pose belongs to
+            it from here on; the wrench rises from zero again.
         MIDPOINT: The coupling was lossless in this tick: its torque follows the midpoint rule.
     """
 
@@ -44,8 +42,7 @@ class TickFlag(IntFlag):
     STALE_SAMPLE = 256
     TRIP = 512
     MIDPOINT = 1024
-    RESTARTED = 2048
-    RESEATED = 4096
+    RESEATED = 2048
 
 
 TICK_DTYPE = np.dtype(

@@ -21,6 +21,7 @@ from hapticbridge.audit.guarded import (
     expected_handle,
     expected_wrench,
     is_first,
+    since_news,
     since_start,
     wrench_sent_before,
     wrench_share,
@@ -141,7 +142,7 @@ class Balance:
             given = np.sum(sent[:, :3] * _later(device_step, late), axis=1)
             given += np.sum(sent[:, 3:] * _later(device_turn, late), axis=1)
 
-        position, orientation = expected_handle(ticks, parameters, handle_start)
+        position, orientation = expected_handle(ticks, parameters, handle_start, tool_start)
         on_device, injected = expected_wrench(ticks, parameters, resumed)
         stored = ticks["kinetic"] + ticks["potential"] - start_energy
         created = stored - coupling_work - ticks["actuator_work"] - ticks["external_work"]
@@ -211,7 +212,7 @@ def _kicked(
         parameters,
         _later(steps(ticks["device_position"], start[:3]), late),
         _later(turns(ticks["device_quaternion"], start[3:]), late),
-        np.diff(ticks["read_ns"], prepend=0) * 1e-9,
+        since_news(ticks, parameters),
         ~is_first(ticks, resumed),
     )
     return np.asarray(given - burnt + parameters.force_scale / parameters.scale * taken)

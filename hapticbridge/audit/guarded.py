@@ -30,7 +30,7 @@ def is_first(ticks: NDArray[np.void], resumed: Array) -> NDArray[np.bool_]:
 
 def since_start(ticks: NDArray[np.void], resumed: Array) -> Array:
     """Returns how many ticks ago the force began to rise: at the start, or when it did so again."""
-    restarts = ticks["tick"][has_flag(ticks, TickFlag.RESTARTED)]
+    restarts = ticks["tick"][has_flag(ticks, TickFlag.RESEATED)]
     starts = np.unique(np.concatenate([[0.0], resumed, restarts.astype(np.float64)]))
     return np.asarray(ticks["tick"] - starts[np.searchsorted(starts, ticks["tick"], "right") - 1])
 
@@ -50,9 +50,41 @@ def silence(ticks: NDArray[np.void], parameters: RunParameters) -> NDArray[np.in
     return run_lengths(is_silent)
 
 
+def since_news(ticks: NDArray[np.void], parameters: RunParameters) -> Array:
+    """Returns the time in s that each tick's motion of the device took, (n,).
+
+    That is since the last new sample; T at least between two readings. Where the device had nothing
+    new, the time is that which has passed so far.
+    """
+    elapsed = np.diff(ticks["read_ns"], prepend=0) * 1e-9
+    total = np.concatenate([[0.0], np.cumsum(np.maximum(elapsed, parameters.period))])
+    stale = run_lengths(has_flag(ticks, TickFlag.STALE_SAMPLE))
+    before = np.concatenate([[0], stale[:-1]])
+    index = np.arange(len(ticks))
+    return np.asarray(total[1:] - total[index - before])
+
+
+def _ramp_ticks(ticks: NDArray[np.void], parameters: RunParameters, resumed: Array) -> Array:
+    """Returns in how many ticks the wrench rises: slowly after a start, soon after a re-seating."""
+    first = is_first(ticks, resumed)
+    is_soon = has_flag(ticks, TickFlag.RESEATED) & ~first
+    index = np.arange(len(ticks))
+    last_first = np.maximum.accumulate(np.where(first, index, -1))
+    last_soon = np.maximum.accumulate(np.where(is_soon, index, -1))
+    return np.where(last_soon > last_first, parameters.guarding.fade_ticks, parameters.ramp_ticks)
+
+
+def is_ramping(
+    ticks: NDArray[np.void], parameters: RunParameters, resumed: Array
+) -> NDArray[np.bool_]:
+    """Returns in which ticks the wrench still rises."""
+    return np.asarray(since_start(ticks, resumed) < _ramp_ticks(ticks, parameters, resumed))
+
+
 def wrench_share(ticks: NDArray[np.void], parameters: RunParameters, resumed: Array) -> Array:
     """Returns the share of the wrench that the guard lets through while it rises or fades, (n,)."""
-    rising = (since_start(ticks, resumed) + 1.0) / (parameters.ramp_ticks + 1.0)
+    length = _ramp_ticks(ticks, parameters, resumed)
+    rising = (since_start(ticks, resumed) + 1.0) / (length + 1.0)
     fading = 1.0 - silence(ticks, parameters) / parameters.guarding.fade_ticks
     return np.asarray(np.minimum(rising, 1.0) * np.maximum(fading, 0.0))
 
@@ -65,7 +97,10 @@ def wrench_sent_before(ticks: NDArray[np.void], resumed: Array) -> Array:
 
 
 def expected_handle(
-    ticks: NDArray[np.void], parameters: RunParameters, handle_start: Array
+    ticks: NDArray[np.void],
+    parameters: RunParameters,
+    handle_start: Array,
+    tool_start: Array,
 ) -> tuple[Array, Array]:
     """Maps the recorded device poses into the scene: h = h_0 + scale · A (p − p_0).
 
@@ -82,7 +117,8 @@ def expected_handle(
     is_seated = last >= 0
     if is_seated.any():
         at = seats[last[is_seated]]
-        origin[is_seated], target[is_seated] = device[at], before[at]
+        tool = np.concatenate([tool_start[None], _poses(ticks, "tool")[:-1]])
+        origin[is_seated], target[is_seated] = device[at], tool[at]
     axes = np.array(parameters.axes).reshape(3, 3)
     moved = (device[:, :3] - origin[:, :3]) @ axes.T
     # a rotation vector turns with the axes: log(A R Aᵀ) = A log(R)
@@ -111,7 +147,7 @@ def expected_wrench(
     share = wrench_share(ticks, parameters, resumed)
     wrench, injected = _controlled(ticks, parameters, resumed, wrench, share)
     guarding = parameters.guarding
-    starts = is_first(ticks, resumed) | has_flag(ticks, TickFlag.RESTARTED)
+    starts = is_first(ticks, resumed) | has_flag(ticks, TickFlag.RESEATED)
     parts = (
         (wrench[:, :3], parameters.force_limit, guarding.force_rise),
         (wrench[:, 3:], parameters.torque_limit, guarding.torque_rise),
@@ -170,8 +206,7 @@ def _controlled(
         axis=1,
     )
     first = is_first(ticks, resumed)
-    elapsed = np.diff(ticks["read_ns"], prepend=0) * 1e-9
-    rate = np.where(first, 0.0, 1.0 / np.maximum(elapsed, parameters.period))
+    rate = np.where(first, 0.0, 1.0 / since_news(ticks, parameters))
     velocity = rate[:, None] * moved
     credit = np.repeat([guarding.credit, guarding.rotational_credit], 3)
     given = (wrench_sent_before(ticks, resumed) - credit * velocity) * moved

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.audit.guarded import is_first, silence, since_start
+from hapticbridge.audit.guarded import is_first, is_ramping, silence
 from hapticbridge.audit.turns import steps, turns
 from hapticbridge.kernel.state import RunParameters
 from hapticbridge.kernel.watch import STILL, STILL_TURN
@@ -128,7 +128,7 @@ def _flag_fault(
     """Holds those flags that other fields repeat against them."""
     expected = {
         TickFlag.DROPPED_BEFORE: np.zeros(len(ticks), bool),  # the ticks are contiguous
-        TickFlag.RAMPING: since_start(ticks, resumed) < parameters.ramp_ticks,
+        TickFlag.RAMPING: is_ramping(ticks, parameters, resumed),
         TickFlag.CONTACT: ticks["contacts"] > 0,
         **_watch_flags(ticks, parameters, resumed),
     }
@@ -164,11 +164,10 @@ def _watch_flags(
     moved = np.linalg.norm(steps(ticks["device_position"], start[:3]), axis=1)
     turned = np.linalg.norm(turns(ticks["device_quaternion"], start[3:]), axis=1)
     has_strayed = first & guarding.reseats & ((moved > STILL) | (turned > STILL_TURN))
-    is_reseated = ~is_released & (was_released | has_stalled | has_strayed)
     is_silent = silence(ticks, parameters) > 0
-    was_silent = np.concatenate([[False], is_silent[:-1]])
+    has_news = np.concatenate([[False], is_silent[:-1]]) & ~is_silent
+    is_reseated = ~is_released & (was_released | has_news | has_stalled | has_strayed)
     return {
         TickFlag.CLUTCH: is_released,
         TickFlag.RESEATED: is_reseated,
-        TickFlag.RESTARTED: is_reseated | (~is_released & was_silent & ~is_silent),
     }

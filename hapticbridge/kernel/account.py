@@ -26,7 +26,7 @@ seen it: 5 N at 2400 N/m hold 5 mJ. More lets a larger kick pass, less softens c
 
 
 @compiled
-def keep_account(state: NDArray[np.void], moved: Vector, turned: Vector, elapsed: float) -> None:
+def keep_account(state: NDArray[np.void], moved: Vector, turned: Vector, interval: float) -> None:
     """Adds what the last tick gave to the device, burnt there and took up in the scene.
 
         A_k = max(A_{k-1} + w_{k-1}·δp_k − b δp_k²/t + r c (S_{k-1} − S_{k-2} − W), −surplus)
@@ -45,7 +45,7 @@ def keep_account(state: NDArray[np.void], moved: Vector, turned: Vector, elapsed
         state: The bound state, as the tick before left it.
         moved: δp in m, in the device's frame.
         turned: Its rotation vector.
-        elapsed: t in s.
+        interval: t in s, since the device's last new sample.
     """
     s = state[0]
     stored = s.kinetic + s.potential - s.start_energy
@@ -53,7 +53,7 @@ def keep_account(state: NDArray[np.void], moved: Vector, turned: Vector, elapsed
     gained = (s.force_scale / s.scale) * s.passed * (own - s.own_before)
     s.own_before = own
     # before the first tick and in a pause nobody knows how long the device took to move
-    rate = 1.0 / max(elapsed, s.period) if s.tick > s.ramp_start else 0.0
+    rate = 1.0 / interval if s.tick > s.ramp_start else 0.0
     given = 0.0
     w, a = s.wrench_on_device, s.axis_account
     for i in range(3):

@@ -152,7 +152,14 @@ _GUARD_PARAMETERS = (
     "most_energy",
 )
 
-_GUARD_RUNNING_COUNTS = ("outside", "watch_flags", "is_released", "stale_run", "silent_ticks")
+_GUARD_RUNNING_COUNTS = (
+    "outside",
+    "watch_flags",
+    "is_released",
+    "stale_run",
+    "silent_ticks",
+    "rise_ticks",
+)
 
 _GUARD_RUNNING = (
     "since_news",

@@ -61,6 +61,7 @@ class Binding:
     def resume(self) -> None:
         """Starts the ramp again at the next tick, after a pause in which zero was commanded."""
         self.state["ramp_start"] = self.state["tick"]
+        self.state["rise_ticks"] = self.state["ramp_ticks"]
         self.state["wrench_on_device"] = self.state["slewed"] = 0.0
         self.state["has_positions"] = 0  # whoever had the scene meanwhile may have changed it
 
@@ -79,7 +80,7 @@ class Binding:
         for name in ("period", "substeps", "scale", "force_scale", "force_limit", "torque_limit"):
             state[name] = getattr(parameters, name)
         state["timestep"] = model.opt.timestep
-        state["ramp_ticks"] = parameters.ramp_ticks
+        state["ramp_ticks"] = state["rise_ticks"] = parameters.ramp_ticks
         coupling = parameters.coupling
         for name in ("stiffness", "damping", "rotational_stiffness", "rotational_damping"):
             state[name] = getattr(coupling, name)

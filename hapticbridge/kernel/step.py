@@ -123,12 +123,13 @@ def before_step(
         code = refused(state, moved, turned, elapsed)
         if code != OK:
             return code
-        keep_account(state, moved, turned, elapsed)
+        # old samples hide how the device moved: it took all the time since the last new one
+        interval = max(elapsed, s.period) + s.since_news
+        keep_account(state, moved, turned, interval)
         w = s.wrench_on_device
         s.device_energy += dot((w[0], w[1], w[2]), moved) + dot((w[3], w[4], w[5]), turned)
         if s.tick > s.ramp_start:
             # before the first tick and in a pause nobody knows how long the device took to move
-            interval = max(elapsed, s.period)
             s.device_burnt += s.device_damping / interval * dot(moved, moved)
             s.device_burnt += s.device_rotational_damping / interval * dot(turned, turned)
         store_vector(s.device_position, position)

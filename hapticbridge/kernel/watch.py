@@ -10,7 +10,7 @@ from hapticbridge.kernel.codes import BACKWARDS, GAVE_ENERGY, JUMPED, STRETCHED,
 from hapticbridge.kernel.handle import quaternion_of, store_quaternion, store_vector, vector_of
 from hapticbridge.pose import Quaternion, Vector, norm, rotation_between, subtract
 
-CLUTCH, STALE_SAMPLE, RESTARTED, RESEATED = 128, 256, 2048, 4096
+CLUTCH, STALE_SAMPLE, RESEATED = 128, 256, 2048
 """Of ``TickFlag``: the compiler cannot read an enumeration."""
 
 STILL = 1e-4
@@ -61,11 +61,11 @@ def follow(
 ) -> bool:
     """Decides whether the handle goes where the device went, and how much of the wrench is sent.
 
-    The handle stays where it is while a clutch button is held, or a dead-man button is not. When it
-    follows again, and after a stall, the coupling is re-seated: the pose of the device now is that
-    of the handle as it was, so the coupling is neither stretched nor moved by that, and the wrench
-    rises from zero as at the start. Without news for ``stale_ticks`` the wrench fades; the first
-    new sample after that lets it rise again.
+    The handle stays where it is while a clutch button is held, or a dead-man button is not, and the
+    wrench fades; it also fades without news for ``stale_ticks``. When that is over, and after a
+    stall, the coupling is re-seated: the handle is put to the tool, so that nothing is stretched,
+    the device's pose now belongs to it, and the wrench rises within ``fade_ticks``. A coupling that
+    was stretched while no force was felt would give back what nobody had put in.
 
     Args:
         state: The bound state.
@@ -97,14 +97,15 @@ def follow(
     has_stalled = elapsed > s.longest_stall and not is_first
     has_strayed = is_first and s.reseats and (norm(moved) > STILL or norm(turned) > STILL_TURN)
     is_asked = (s.outside & RESEATED) != 0  # a recorded run is simulated again
-    if was_released or has_stalled or has_strayed or is_asked:
+    has_news = was_silent and not is_silent
+    if was_released or has_news or has_stalled or has_strayed or is_asked:
         s.watch_flags |= RESEATED
         store_vector(s.device_origin[0:3], position)
         store_quaternion(s.device_origin[3:7], quaternion)
-        store_vector(s.handle_origin[0:3], vector_of(s.handle_position))
-        store_quaternion(s.handle_origin[3:7], quaternion_of(s.handle_quaternion))
-    if (s.watch_flags & RESEATED) != 0 or (was_silent and not is_silent):
-        s.watch_flags |= RESTARTED
+        store_vector(s.handle_origin[0:3], vector_of(s.tool_position))
+        store_quaternion(s.handle_origin[3:7], quaternion_of(s.tool_quaternion))
+        if not is_first:
+            s.rise_ticks = s.fade_ticks
         s.ramp_start = s.tick
         for i in range(6):
             s.slewed[i] = 0.0

@@ -162,9 +162,9 @@ def render(state: NDArray[np.void], force: Vector, torque: Vector) -> None:
     store_vector(s.slewed[3:6], torque_on_device)
     share = 1.0
     since_start = s.tick - s.ramp_start
-    if since_start < s.ramp_ticks:
+    if since_start < s.rise_ticks:
         s.flags |= RAMPING
-        share = (since_start + 1.0) / (s.ramp_ticks + 1.0)
+        share = (since_start + 1.0) / (s.rise_ticks + 1.0)
     if s.silent_ticks > 0:
         share *= max(0.0, 1.0 - s.silent_ticks / s.fade_ticks)
     if share != 1.0:

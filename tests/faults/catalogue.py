@@ -13,15 +13,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from faults.rig import CAUSE, PERIOD, PRESS, STALE, Outcome, Rig
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
+from faults.rig import CAUSE, PERIOD, PRESS, STALE, Outcome, Rig
 from hapticbridge.bridge import Bridge
-from hapticbridge.certificate import default_coupling
 from hapticbridge.coupling import Coupling
-from hapticbridge.device import SimulatedDevice
+from hapticbridge.device.hand import DEFAULT_HAND, Hand
 from hapticbridge.errors import DeviceError, DeviceLost
+from hapticbridge.passivity import WorstHand
 
 PUSHER = """<mujoco><compiler angle="radian"/>
 <option timestep="0.001" integrator="discrete" gravity="0 0 0" cone="elliptic"/>
@@ -223,19 +222,38 @@ def _motor(rig: Rig) -> None:
     )
 
 
-def _stiff(rig: Rig) -> None:
-    rig.coupling = stiffened(10.0)
+def stiff(factor: float, hand: Hand | WorstHand | None, controller: str = "damper") -> Any:
+    """Returns a fault: a wall too stiff for the device, which is knocked with 5 N for 5 ms.
+
+    Args:
+        factor: Stiffness over the largest that a device of 2 N s/m bears, 2b/T = 4000 N/m.
+        hand: Who holds it.
+        controller: Passivity controller.
+    """
+
+    def do(rig: Rig) -> None:
+        rig.scene = rig.folder / "heavy.xml"
+        rig.scene.write_text(HEAVY)
+        rig.points = ((0.0, 0.0), (9.0, 0.0))
+        rig.parameters = {"hand": hand}
+        rig.options = {"method": "implicit", "controller": controller}
+        rig.coupling = Coupling(factor * 4000.0, 0.0, 1.0, 5e-4)
+
+        def refuse(tick: int, wrench: NDArray[np.float64]) -> None:
+            if CAUSE <= tick < CAUSE + 5:
+                wrench[0] += 5.0
+
+        rig.device.refuse = refuse
+
+    return do
 
 
-def stiffened(factor: float) -> Coupling:
-    """Returns a coupling at a multiple of the stiffest that the bound lets a default device bear."""
-    usual = default_coupling(SimulatedDevice().info, PERIOD)
-    return Coupling(
-        stiffness=factor * 4000.0,
-        damping=usual.damping,
-        rotational_stiffness=usual.rotational_stiffness,
-        rotational_damping=usual.rotational_damping,
-    )
+HEAVY = """<mujoco><compiler angle="radian"/>
+<option timestep="0.001" integrator="discrete" gravity="0 0 0"/>
+<worldbody><body name="tool"><freejoint/>
+  <geom type="sphere" size="0.01" mass="1000"/><site name="grip"/></body></worldbody></mujoco>
+"""
+"""A tool of a ton: behind a coupling it is a wall."""
 
 
 def _quantised(rig: Rig) -> None:
@@ -253,20 +271,15 @@ def _wall_clock(rig: Rig) -> None:
     rig.around = around
 
 
-def _disk(rig: Rig) -> None:
-    """The file may not grow any more: 200 kB, as on a disk that is full."""
-
-    def around(stack: ExitStack) -> None:
-        limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-        stack.callback(resource.setrlimit, resource.RLIMIT_FSIZE, limits)
-        resource.setrlimit(resource.RLIMIT_FSIZE, (LARGEST_FILE, limits[1]))
-
-    rig.around = around
+def _fill_disk(bridge: Bridge) -> None:
+    """From here on the recorder's file may not grow, as on a disk that is full."""
+    recorder, path = bridge._stream.recorder, bridge._path
+    assert recorder is not None and path is not None
+    size = path.stat().st_size
+    resource.prlimit(recorder._process.pid, resource.RLIMIT_FSIZE, (size + 1000, size + 1000))
 
 
-LARGEST_FILE = 4_500_000
-
-NO_TRIPS = {name: np.inf for name in ("speed", "turn_speed", "stretch", "angle", "energy")}
+NO_TRIPS = dict.fromkeys(("speed", "turn_speed", "stretch", "angle", "energy"), np.inf)
 
 FAULTS = (
     Fault("pose that is no number", corrupting(_nan), "trip", "pose is not finite"),
@@ -288,11 +301,12 @@ FAULTS = (
     Fault("MuJoCo warns: bad velocity", acting(_bad_acceleration), "trip", "diverged"),
     Fault("scene diverges", acting(_diverge), "trip", "diverged"),
     Fault("motor drives the tool", _motor, "trip", "more energy", NO_TRIPS, cause=500, within=900),
-    Fault("stiffness 10 x the limit", _stiff, "bounded", "", {"controller": 0, **NO_TRIPS}),
+    Fault("10 x too stiff, free device", stiff(10, None), "trip", "more energy", within=999),
+    Fault("10 x too stiff, in a hand", stiff(10, DEFAULT_HAND), "goes on"),
     Fault("encoder steps of 50 µm", _quantised, "goes on"),
     Fault("error in the user's code", acting(_raise), "stops", "ZeroDivisionError"),
     Fault("recorder killed", acting(_kill_recorder), "stops", "recorder died", within=101),
-    Fault("disk full", _disk, "stops", "recorder died", cause=0, within=2400),
+    Fault("disk full", acting(_fill_disk), "stops", "recorder died", within=600),
     Fault("Ctrl-C", acting(_signal(signal.SIGINT)), "stops", "SIGINT"),
     Fault("SIGTERM", acting(_signal(signal.SIGTERM)), "stops", "SIGTERM"),
     Fault("SIGHUP", acting(_signal(signal.SIGHUP)), "stops", "SIGHUP"),

@@ -1,4 +1,4 @@
-"""A device in a hand that presses on a wall, a clock that can stall, and what is measured of them."""
+"""A device in a hand that presses on a wall, a clock that can stall, and what is measured."""
 
 from __future__ import annotations
 
@@ -107,6 +107,7 @@ class FaultyDevice:
 
     def write(self, wrench: NDArray[np.float64]) -> None:
         self.writes.append((self.tick, wrench.copy()))
+        wrench = wrench.copy()
         self.refuse(self.tick, wrench)
         self.hold(wrench)
 
@@ -175,9 +176,7 @@ class Rig:
                 bridge._guarding = replace(bridge._guarding, **self.guard)
                 with bridge:
                     try:
-                        bridge.run(
-                            self.duration, self.on_tick and (lambda k: self._act(bridge, k))
-                        )
+                        bridge.run(self.duration, self.on_tick and (lambda k: self._act(bridge, k)))
                     finally:
                         ticks_done = bridge._tick
         except (HapticBridgeError, ZeroDivisionError) as raised:
@@ -227,7 +226,7 @@ class Outcome:
         ticks_of = np.array([tick for tick, _ in device.writes])
         wrenches = np.array([wrench for _, wrench in device.writes])
         forces = np.linalg.norm(wrenches[:, :3], axis=1)
-        zero = ticks_of[(ticks_of >= cause) & (wrenches == 0).all(axis=1)]
+        zero = ticks_of[(ticks_of >= cause - 1) & (wrenches == 0).all(axis=1)]
         given = np.array(device.to_the_hand)
         before = min(cause, len(given) - 1)
         recording = read_recording(path)
@@ -236,7 +235,7 @@ class Outcome:
             is_finite=bool(np.isfinite(wrenches).all()),
             energy=float(given.max()),
             energy_after=float((given[before:] - given[before]).max()),
-            zero_after=int(zero[0]) - cause if zero.size else None,
+            zero_after=max(int(zero[0]) - cause, 0) if zero.size else None,
             last_is_zero=not wrenches[-1].any(),
             error=error,
             ticks=ticks,
