@@ -17,7 +17,7 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hapticbridge.certificate import condition_sentences, default_coupling
+from hapticbridge.certificate import condition_sentences, default_coupling, device_conditions
 from hapticbridge.clock import Clock, RealClock, period_of
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Device, device_for
@@ -159,6 +159,7 @@ class Bridge:
             self.device.info,
             self._limits,
             self.period,
+            needed=self._needed_damping(),
             scale=self._workspace.scale,
             controller=controller,
             clutch=clutch,
@@ -360,6 +361,17 @@ class Bridge:
                 body_wrench=body_wrench,
             )
         )
+
+    def _needed_damping(self) -> tuple[float, float]:
+        """Returns what the device must have in N s/m and N m s/rad; 0 where nothing asks for it."""
+        scales, method = (self._workspace.scale, self._workspace.force_scale), self.method
+        if not method.has_coupling:
+            return 0.0, 0.0
+        conditions = device_conditions(
+            self.device.info, self.used, self.period, *scales, self.laws, method
+        )
+        needed = {condition.axis: condition.needed for condition in conditions}
+        return needed.get("translation", 0.0), needed.get("rotation", 0.0)
 
     @property
     def used(self) -> Coupling:

@@ -6,11 +6,13 @@ tick, over whole arrays.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.audit.turns import quaternion_product, steps, turn_between, turns
-from hapticbridge.kernel.account import TANK_START, THRESHOLD
+from hapticbridge.kernel.account import BOUND, SWINGS, TANK_START, THRESHOLD
 from hapticbridge.kernel.guarding import DAMPER, TANK
 from hapticbridge.kernel.state import RunParameters
 from hapticbridge.tick import TickFlag
@@ -145,39 +147,56 @@ def expected_wrench(
     torque = -parameters.force_scale / parameters.scale * on_tool[:, 3:] @ axes
     wrench = np.concatenate([force, torque], axis=1)
     share = wrench_share(ticks, parameters, resumed)
-    wrench, injected = _controlled(ticks, parameters, resumed, wrench, share)
+    control = _controlled(ticks, parameters, resumed, wrench, share)
     guarding = parameters.guarding
     starts = is_first(ticks, resumed) | has_flag(ticks, TickFlag.RESEATED)
     parts = (
-        (wrench[:, :3], parameters.force_limit, guarding.force_rise),
-        (wrench[:, 3:], parameters.torque_limit, guarding.torque_rise),
+        (slice(0, 3), parameters.force_limit, guarding.force_rise),
+        (slice(3, 6), parameters.torque_limit, guarding.torque_rise),
     )
-    limited = []
-    for vector, limit, rise in parts:
-        norm = np.linalg.norm(vector, axis=1, keepdims=True)
-        short = vector * np.where(norm > limit, limit / np.maximum(norm, 1e-300), 1.0)
-        limited.append(_slewed(short, rise, starts))
-    return np.concatenate(limited, axis=1) * share[:, None], injected
+    sent = [
+        _chained(control.wrench[:, part], control.change[:, part], limit, rise, starts)
+        for part, limit, rise in parts
+    ]
+    return np.concatenate(sent, axis=1) * share[:, None], control.injected
 
 
-def _slewed(vector: Array, rise: float, starts: NDArray[np.bool_]) -> Array:
-    """Lets a vector change by at most ``rise`` from row to row, from zero at each start."""
-    if not np.isfinite(rise):
-        return vector
-    slewed = vector.copy()
-    before = np.concatenate([np.zeros((1, 3)), vector[:-1]])
+def _limited(vector: Array, limit: float) -> Array:
+    """Shortens what is longer than the limit."""
+    norm = np.linalg.norm(vector, axis=-1, keepdims=True)
+    return np.asarray(vector * np.where(norm > limit, limit / np.maximum(norm, 1e-300), 1.0))
+
+
+def _chained(
+    vector: Array, change: Array, limit: float, rise: float, starts: NDArray[np.bool_]
+) -> Array:
+    """Limits a vector where its change since the row before, as that was sent, is bounded.
+
+    Args:
+        vector: (n, 3).
+        change: Most change of each component, (n, 3); inf where there is no bound.
+        limit: Largest norm.
+        rise: Largest norm of the change.
+        starts: Rows before which it was zero.
+    """
+    sent = _limited(vector, limit)
+    before = np.concatenate([np.zeros((1, 3)), sent[:-1]])
     before[starts] = 0.0
+    is_bounded = np.isfinite(change).any(axis=1)
+    is_bounded |= np.linalg.norm(sent - before, axis=1) > rise
     done = -1
-    for first in np.flatnonzero(np.linalg.norm(vector - before, axis=1) > rise).tolist():
-        for k in range(max(first, done + 1), len(vector)):
-            last = np.zeros(3) if starts[k] else slewed[k - 1]
-            change = vector[k] - last
-            length = float(np.linalg.norm(change))
-            if length <= rise:
-                break
-            slewed[k] = last + rise / length * change
+    for first in np.flatnonzero(is_bounded).tolist():
+        for k in range(max(first, done + 1), len(sent)):
+            last = np.zeros(3) if starts[k] else sent[k - 1]
+            plain = sent[k].copy()
+            asked = np.clip(vector[k], last - change[k], last + change[k])
+            step = _limited(asked, limit) - last
+            length = float(np.linalg.norm(step))
+            sent[k] = last + (step if length <= rise else rise / length * step)
             done = k
-    return slewed
+            if np.array_equal(sent[k], plain):
+                break
+    return sent
 
 
 def _capped_sum(values: Array, surplus: float) -> Array:
@@ -186,17 +205,31 @@ def _capped_sum(values: Array, surplus: float) -> Array:
     return np.asarray(total + np.maximum(np.maximum.accumulate(-surplus - total, axis=0), 0.0))
 
 
+class _Control(NamedTuple):
+    """What the controller makes of the wrench.
+
+    Attributes:
+        wrench: With damping or the tank's share, (n, 6).
+        change: By how much each component may change from tick to tick, (n, 6); inf: at will.
+        injected: The damping added, (n,).
+    """
+
+    wrench: Array
+    change: Array
+    injected: Array
+
+
 def _controlled(
     ticks: NDArray[np.void],
     parameters: RunParameters,
     resumed: Array,
     wrench: Array,
     share: Array,
-) -> tuple[Array, Array]:
+) -> _Control:
     guarding = parameters.guarding
-    nothing = np.zeros(len(ticks))
+    nothing, free = np.zeros(len(ticks)), np.full((len(ticks), 6), np.inf)
     if guarding.controller not in (DAMPER, TANK):
-        return wrench, nothing
+        return _Control(wrench, free, nothing)
     start = np.array(parameters.device_start)
     moved = np.concatenate(
         [
@@ -223,14 +256,17 @@ def _controlled(
         work = parameters.period * np.sum(wrench * velocity, axis=1)
         level = np.maximum(TANK_START - account, 0.0)
         factor = np.where(work > level, level / np.where(work > level, work, 1.0), 1.0)
-        return wrench * factor[:, None], nothing
+        return _Control(wrench * factor[:, None], free, nothing)
     debt = (account - THRESHOLD)[:, None]
     owed = np.minimum(debt, _capped_sum(given, guarding.surplus))
     most = np.repeat([guarding.most_damping, guarding.most_rotational_damping], 3)
     square = parameters.period * velocity**2
     damping = np.divide(owed, square, out=np.zeros_like(owed), where=(owed > 0) & (square > 0))
     damping = np.minimum(damping, most)
-    return wrench - damping * velocity, damping[:, :3].max(axis=1)
+    reverses = np.diff(np.sign(velocity), axis=0, prepend=np.zeros((1, 6)))
+    swings = np.stack([run_lengths(np.abs(axis) == 2) for axis in reverses.T], axis=1)
+    change = np.where((owed > 0) & (swings >= SWINGS), BOUND * most * np.abs(velocity), np.inf)
+    return _Control(wrench - damping * velocity, change, damping[:, :3].max(axis=1))
 
 
 def _start_energy(ticks: NDArray[np.void]) -> float:

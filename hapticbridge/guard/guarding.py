@@ -19,6 +19,11 @@ SURPLUS = 0.05
 behind it about as much; what they give back must not be taken for activity. A larger one lets a
 larger kick pass before the controller acts."""
 
+UNCERTIFIED_CREDIT = 0.5
+"""Share of its damping that a device is taken to burn where it has less than the coupling needs,
+without unit. With all of it a swing is kept from growing and does not end; with half of it the
+other half ends it. With none of it the controller would brake free motion."""
+
 STALE_PERIODS = 10
 """Periods of the device without a new sample after which the wrench fades. Fewer make a device that
 loses single samples rattle, more hold the force of a pose that is long gone."""
@@ -60,6 +65,7 @@ def guarding_for(
     limits: Limits,
     period: float,
     *,
+    needed: tuple[float, float] = (0.0, 0.0),
     scale: float = 1.0,
     controller: str = "damper",
     clutch: int | None = None,
@@ -75,6 +81,9 @@ def guarding_for(
             takes (``certificate.assumed_damping``); where its mass is, the clip is b alone.
         limits: Of the run.
         period: T in s.
+        needed: Damping in N s/m and N m s/rad that the coupling needs
+            (``certificate.device_conditions``). A device that has it is taken to burn all that its
+            damping can: its account stays balanced, and the controller idle.
         scale: Handle motion per device motion.
         controller: One of ``CONTROLLERS``.
         clutch: Button that lets the device move without the handle.
@@ -103,12 +112,16 @@ def guarding_for(
     if info.is_prescribed:
         return common
     linear, angular = assumed_damping(info)
+    credit = [
+        own if own >= asked else UNCERTIFIED_CREDIT * own
+        for own, asked in zip((linear, angular), needed, strict=True)
+    ]
     own = period if info.rate is None else max(1.0 / info.rate, period)
     return replace(
         common,
         controller=CONTROLLERS[controller],
-        credit=linear,
-        rotational_credit=angular,
+        credit=credit[0],
+        rotational_credit=credit[1],
         most_damping=min(linear, math.inf if info.mass is None else info.mass / period),
         most_rotational_damping=min(
             angular,

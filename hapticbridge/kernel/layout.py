@@ -231,6 +231,7 @@ STATE_DTYPE = np.dtype(
     + [(name, "<f8") for name in _RUNNING]
     + [(name, "<i8") for name in _GUARD_COUNTS + _GUARD_RUNNING_COUNTS]
     + [(name, "<f8") for name in _GUARD_PARAMETERS + _GUARD_RUNNING]
+    + [("reversals", "<i8", 6)]
     + [(name, "<f8", 6) for name in ("axis_account", "device_velocity", "slewed")]
 )
 """Addresses, sizes, parameters, the previous tick's poses, and the energies so far. Poses are
