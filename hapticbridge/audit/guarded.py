@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.audit.turns import quaternion_product, steps, turn_between, turns
-from hapticbridge.kernel.account import BOUND, SWINGS, TANK_START, THRESHOLD
+from hapticbridge.kernel.account import BOUND, SWINGS, TANK_START, THRESHOLD, WINDOW
 from hapticbridge.kernel.guarding import DAMPER, TANK
 from hapticbridge.kernel.state import RunParameters
 from hapticbridge.tick import TickFlag
@@ -253,10 +253,8 @@ def _controlled(
     total = given.sum(axis=1) + np.concatenate([[0.0], gained[:-1]])
     account = _capped_sum(total, guarding.surplus)
     if guarding.controller == TANK:
-        work = parameters.period * np.sum(wrench * velocity, axis=1)
-        level = np.maximum(TANK_START - account, 0.0)
-        factor = np.where(work > level, level / np.where(work > level, work, 1.0), 1.0)
-        return _Control(wrench * factor[:, None], free, nothing)
+        share = _tank_share(parameters, wrench, velocity, account)
+        return _Control(wrench * share[:, None], free, nothing)
     debt = (account - THRESHOLD)[:, None]
     owed = np.minimum(debt, _capped_sum(given, guarding.surplus))
     most = np.repeat([guarding.most_damping, guarding.most_rotational_damping], 3)
@@ -264,9 +262,22 @@ def _controlled(
     damping = np.divide(owed, square, out=np.zeros_like(owed), where=(owed > 0) & (square > 0))
     damping = np.minimum(damping, most)
     reverses = np.diff(np.sign(velocity), axis=0, prepend=np.zeros((1, 6)))
-    swings = np.stack([run_lengths(np.abs(axis) == 2) for axis in reverses.T], axis=1)
-    change = np.where((owed > 0) & (swings >= SWINGS), BOUND * most * np.abs(velocity), np.inf)
-    return _Control(wrench - damping * velocity, change, damping[:, :3].max(axis=1))
+    count = np.cumsum(np.abs(reverses) == 2, axis=0)
+    count[WINDOW:] -= count[:-WINDOW].copy()
+    swings = count >= SWINGS
+    change = np.where((owed > 0) & swings, BOUND * most * np.abs(velocity), np.inf)
+    held = wrench - damping * velocity
+    # the tank comes last, and only where no axis is bounded
+    pays = (debt[:, 0] > 0) & ~swings.any(axis=1)
+    share = np.where(pays, _tank_share(parameters, held, velocity, account), 1.0)
+    return _Control(held * share[:, None], change, damping[:, :3].max(axis=1))
+
+
+def _tank_share(parameters: RunParameters, wrench: Array, velocity: Array, account: Array) -> Array:
+    """Returns the share of the wrench that the tank pays for, (n,)."""
+    work = parameters.period * np.sum(wrench * velocity, axis=1)
+    level = np.maximum(TANK_START - account, 0.0)
+    return np.where(work > level, level / np.where(work > level, work, 1.0), 1.0)
 
 
 def _start_energy(ticks: NDArray[np.void]) -> float:

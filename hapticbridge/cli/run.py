@@ -7,7 +7,7 @@ import math
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
@@ -19,7 +19,7 @@ from hapticbridge.clock import RealClock, SimulatedClock, period_of
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo, device_for
 from hapticbridge.errors import HapticBridgeError, RecordingError
-from hapticbridge.guard import Limits
+from hapticbridge.guard import USUAL_ENERGY, USUAL_STRETCH, Limits
 from hapticbridge.kernel.parameters import checked_substeps
 from hapticbridge.rendering import Method, default_method, method_named
 from hapticbridge.scene import load_scene, settings_from
@@ -98,6 +98,18 @@ class Run:
     """Largest torque on the device in N m; by default the device's own."""
     ramp: float = 0.5
     """Seconds over which the force rises at the start."""
+    controller: Literal["damper", "tank", "off"] = "damper"
+    """Passivity controller: what is done when the device was given more than its damping burns and
+    the scene gives up."""
+    clutch: int | None = None
+    """Button of the device, from 0: while it is held the device moves without the handle."""
+    dead_man: int | None = None
+    """Button of the device, from 0, that must be held for any force."""
+    stretch_limit: float = USUAL_STRETCH
+    """Largest distance between handle and tool in m; beyond it the run is stopped."""
+    energy_limit: float = USUAL_ENERGY
+    """Most energy in J that the device may be given beyond what the hand put in; inf for scenes
+    whose motors are meant to push the hand."""
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
     """Print the summary as JSON."""
 
@@ -131,7 +143,12 @@ class Run:
                     device.info.torque_limit if self.torque_limit is None else self.torque_limit
                 ),
                 ramp=self.ramp,
+                stretch=self.stretch_limit,
+                energy=self.energy_limit,
             ),
+            controller=self.controller,
+            clutch=self.clutch,
+            dead_man=self.dead_man,
             live=not self.as_json,
             realtime=self.realtime or None,
         )

@@ -3,6 +3,8 @@
 from hapticbridge.guard.guarding import CONTROLLERS as CONTROLLERS
 from hapticbridge.guard.guarding import guarding_for as guarding_for
 from hapticbridge.guard.limits import UNLIMITED as UNLIMITED
+from hapticbridge.guard.limits import USUAL_ENERGY as USUAL_ENERGY
+from hapticbridge.guard.limits import USUAL_STRETCH as USUAL_STRETCH
 from hapticbridge.guard.limits import Limits as Limits
 from hapticbridge.guard.limits import limits_for as limits_for
 from hapticbridge.guard.start import refuse_simulated_time as refuse_simulated_time

@@ -43,8 +43,9 @@ class Fault:
     Attributes:
         name: In a few words.
         do: Does it to a rig.
-        ends: What must come of it: ``trip``, ``zero`` (the force is taken away and comes back),
-            ``stops`` (the run ends with zero force) or ``goes on``.
+        ends: What must come of it: ``trip``, ``fades`` (the force is taken away and comes back),
+            ``re-seats`` (it begins again from zero), ``stops`` (the run ends with zero force) or
+            ``goes on``.
         says: What the audit of its recording must name; empty where the run is an ordinary one.
         without: What of the guard is switched off on the other side.
         cause: The tick at which it can be seen.
@@ -112,7 +113,7 @@ def _every(share: float) -> Callable[[Rig], None]:
 
 def _stall(rig: Rig) -> None:
     """The loop stands still for 0.2 s, in which the hand goes 20 mm deeper."""
-    rig.points = (*PRESS[:3], (1.5, 0.0804), (1.7, 0.1004 + 0.29), (1.9, 0.0804), (9.0, 0.0804))
+    rig.points = (*PRESS[:3], (1.5, 0.0804), (1.7, 0.1004), (1.9, 0.0804), (9.0, 0.0804))
     rig.device.corrupt = _passing(rig, CAUSE, 0.2)
 
 
@@ -281,13 +282,15 @@ def _fill_disk(bridge: Bridge) -> None:
 
 NO_TRIPS = dict.fromkeys(("speed", "turn_speed", "stretch", "angle", "energy"), np.inf)
 
+UNGUARDED = {"controller": 0, **NO_TRIPS}
+
 FAULTS = (
     Fault("pose that is no number", corrupting(_nan), "trip", "pose is not finite"),
     Fault("infinite quaternion", corrupting(_infinite), "trip", "pose is not finite"),
-    Fault("60 mm jump", corrupting(_jump), "trip", "jumped", NO_TRIPS),
+    Fault("60 mm jump", corrupting(_jump), "trip", "jumped", UNGUARDED),
     Fault("half a turn in a tick", corrupting(_half_turn), "trip", "jumped", NO_TRIPS),
     Fault("quaternion of the other sign", corrupting(_other_sign), "goes on"),
-    Fault("no news for 0.3 s", _frozen, "zero", "", {"stale_ticks": 0}, within=32),
+    Fault("no news for 0.3 s", _frozen, "fades", "", {"stale_ticks": 0}, within=32),
     Fault("half the sample rate", corrupting(lambda k, _s: STALE * (k % 2)), "goes on"),
     Fault("20 % of samples lost", _every(0.2), "goes on"),
     Fault("50 % of samples lost", _every(0.5), "goes on"),
@@ -301,12 +304,12 @@ FAULTS = (
     Fault("MuJoCo warns: bad velocity", acting(_bad_acceleration), "trip", "diverged"),
     Fault("scene diverges", acting(_diverge), "trip", "diverged"),
     Fault("motor drives the tool", _motor, "trip", "more energy", NO_TRIPS, cause=500, within=900),
-    Fault("10 x too stiff, free device", stiff(10, None), "trip", "more energy", within=999),
+    Fault("10 x too stiff, free", stiff(10, None), "goes on", "", UNGUARDED),
     Fault("10 x too stiff, in a hand", stiff(10, DEFAULT_HAND), "goes on"),
     Fault("encoder steps of 50 µm", _quantised, "goes on"),
     Fault("error in the user's code", acting(_raise), "stops", "ZeroDivisionError"),
     Fault("recorder killed", acting(_kill_recorder), "stops", "recorder died", within=101),
-    Fault("disk full", acting(_fill_disk), "stops", "recorder died", within=600),
+    Fault("disk full", acting(_fill_disk), "stops", "recorder died", within=999),
     Fault("Ctrl-C", acting(_signal(signal.SIGINT)), "stops", "SIGINT"),
     Fault("SIGTERM", acting(_signal(signal.SIGTERM)), "stops", "SIGTERM"),
     Fault("SIGHUP", acting(_signal(signal.SIGHUP)), "stops", "SIGHUP"),

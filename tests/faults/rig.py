@@ -219,6 +219,7 @@ class Outcome:
     events: list[str]
     flags: NDArray[np.int64]
     forces: NDArray[np.float64]
+    torques: NDArray[np.float64]
 
     @classmethod
     def of(cls, rig: Rig, path: Path, cause: int, error: str, ticks: int) -> Outcome:
@@ -244,6 +245,7 @@ class Outcome:
             events=[str(event["event"]) for event in recording.events],
             flags=recording.ticks["flags"],
             forces=forces,
+            torques=np.linalg.norm(wrenches[:, 3:], axis=1),
         )
 
     def has_flag(self, flag: TickFlag) -> bool:
