@@ -37,7 +37,7 @@ from hapticbridge.kernel.after import answer_step
 from hapticbridge.kernel.ahead import can_split
 from hapticbridge.kernel.codes import BAD_RESULT, HALF_DONE, OK, RING_FULL
 from hapticbridge.kernel.layout import STATE_DTYPE
-from hapticbridge.kernel.parameters import checked_substeps
+from hapticbridge.kernel.parameters import checked_substeps, refuse_substeps
 from hapticbridge.kernel.publish import finish_tick, publish
 from hapticbridge.kernel.state import Binding
 from hapticbridge.kernel.step import before_step
@@ -141,41 +141,48 @@ class Bridge:
         realtime: bool | None = None,
     ) -> None:
         self.scene = scene if isinstance(scene, Scene) else load_scene(scene)
-        self.device = device_for(self.scene, device) if isinstance(device, str) else device
         self.period = period_of(rate)
         self._substeps = checked_substeps(substeps)
         self.method = default_method(substeps) if method is None else method_named(method)
+        refuse_substeps(self.method.scheme, substeps)
         self._workspace = Workspace.of(scale, force_scale, axes, is_absolute=absolute)
-        self.coupling = coupling or default_coupling(
-            self.device.info,
-            self.period,
-            self._workspace.scale,
-            self._workspace.force_scale,
-            self.laws,
-            self.method,
-        )
-        self._limits = limits_for(self.device.info, limits)
-        self._guarding = guarding_for(
-            self.device.info,
-            self._limits,
-            self.period,
-            needed=self._needed_damping(),
-            scale=self._workspace.scale,
-            controller=controller,
-            clutch=clutch,
-            dead_man=dead_man,
-            is_absolute=self._workspace.is_absolute,
-        )
-        refuse_unknowing(self.method, is_real=self.device.info.is_real, i_know=i_know)
-        contact_stiffness_of(self.method, self.coupling, contact_stiffness)  # refused here already
-        self._contact_stiffness = contact_stiffness
         self._path = Path(recording) if recording is not None else None
         self._is_live = live
         self.clock = clock or RealClock()
         self._is_pipelined = self.clock.name == RealClock.name if pipelined is None else pipelined
-        refuse_simulated_time(self.device.info, self.clock)
-        self._is_realtime = wants_real_time(realtime, self.clock, is_real=self.device.info.is_real)
         self._grants: tuple[Grant, ...] = ()
+        with ExitStack() as refused:
+            if isinstance(device, str):
+                device = device_for(self.scene, device)
+                refused.callback(device.close)  # else nobody could, if it is refused
+            self.device = device
+            self.coupling = coupling or default_coupling(
+                device.info,
+                self.period,
+                self._workspace.scale,
+                self._workspace.force_scale,
+                self.laws,
+                self.method,
+            )
+            self._limits = limits_for(device.info, limits)
+            self._guarding = guarding_for(
+                device.info,
+                self._limits,
+                self.period,
+                needed=self._needed_damping(),
+                scale=self._workspace.scale,
+                controller=controller,
+                clutch=clutch,
+                dead_man=dead_man,
+                is_absolute=self._workspace.is_absolute,
+            )
+            refuse_unknowing(self.method, is_real=device.info.is_real, i_know=i_know)
+            # refused here already
+            contact_stiffness_of(self.method, self.coupling, contact_stiffness)
+            refuse_simulated_time(device.info, self.clock)
+            self._is_realtime = wants_real_time(realtime, self.clock, is_real=device.info.is_real)
+            refused.pop_all()
+        self._contact_stiffness = contact_stiffness
         self._sample = np.zeros(1, SAMPLE_DTYPE)
         self._inputs: deque[list[Write]] = deque()
         self._tick = self._overruns = self._skipped = 0
@@ -348,11 +355,7 @@ class Bridge:
         Raises:
             SceneError: A name does not exist or has the wrong count of numbers.
         """
-        if not self.method.meters_inputs:
-            raise SceneError(
-                f"method '{self.method.name}' cannot meter the work of inputs; use 'implicit'"
-            )
-        self._inputs.append(
+        self.repeat_input(
             input_writes(
                 self.scene.model,
                 ctrl=ctrl,
@@ -361,6 +364,14 @@ class Bridge:
                 body_wrench=body_wrench,
             )
         )
+
+    def repeat_input(self, writes: list[Write]) -> None:
+        """As ``set_input``, with the writes that a recording's event ``input`` holds."""
+        if not self.method.meters_inputs:
+            raise SceneError(
+                f"method '{self.method.name}' cannot meter the work of inputs; use 'implicit'"
+            )
+        self._inputs.append(writes)
 
     def _needed_damping(self) -> tuple[float, float]:
         """Returns what the device must have in N s/m and N m s/rad; 0 where nothing asks for it."""

@@ -279,6 +279,19 @@ def assumed_damping(info: DeviceInfo) -> tuple[float, float]:
     return linear, angular
 
 
+def damping_margin(conditions: tuple[Condition, ...]) -> float | None:
+    """Returns the least share of the device's damping that is left, 1 − needed / b.
+
+    Negative where more is needed than there is; None where no damping is known.
+    """
+    shares = [
+        1.0 - condition.needed / condition.available if condition.available else -math.inf
+        for condition in conditions
+        if condition.available is not None
+    ]
+    return min(shares, default=None)
+
+
 def default_coupling(
     info: DeviceInfo,
     period: float,

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from hapticbridge.audit import AuditReport
 from hapticbridge.device import DATA_SHEET_UNITS
 from hapticbridge.errors import RecordingError
-from hapticbridge.felt import coupling_sentences
+from hapticbridge.felt import coupling_sentences, was_always_held
 from hapticbridge.picture import inline_svg, new_figure, write_picture
 from hapticbridge.provenance import parameters_of
 from hapticbridge.recording import Recording
@@ -71,7 +71,7 @@ DEVICE_FACTS = {"name": "", "axes": ""} | DATA_SHEET_UNITS
 """What a page shows of the device's data sheet, with units."""
 
 
-def _decimated(
+def decimated(
     time: NDArray[np.float64], values: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Keeps the least and the greatest value of each bin, in their order."""
@@ -104,21 +104,25 @@ def draw_recording(recording: Recording) -> Figure:
     force_axes, position_axes, energy_axes = figure.subplots(3, 1, sharex=True)
     position_axes.plot([], [], color="grey", ls=":", lw=1, label="handle")
     for i, (axis, colour) in enumerate(zip(_AXES, _COLOURS, strict=True)):
-        force_axes.plot(*_decimated(time, ticks["wrench_on_tool"][:, i]), color=colour, label=axis)
+        force_axes.plot(*decimated(time, ticks["wrench_on_tool"][:, i]), color=colour, label=axis)
         start = ticks["tool_position"][0, i]
         tool = 1e3 * (ticks["tool_position"][:, i] - start)
         handle = 1e3 * (ticks["handle_position"][:, i] - start)
-        position_axes.plot(*_decimated(time, tool), color=colour, label=f"tool {axis}")
-        position_axes.plot(*_decimated(time, handle), color=colour, ls=":", lw=1)
+        position_axes.plot(*decimated(time, tool), color=colour, label=f"tool {axis}")
+        position_axes.plot(*decimated(time, handle), color=colour, ls=":", lw=1)
     for name, label in _ENERGIES:
-        energy_axes.plot(*_decimated(time, 1e3 * ticks[name]), label=label)
+        energy_axes.plot(*decimated(time, 1e3 * ticks[name]), label=label)
     force_axes.set_ylabel("force on the tool (N)")
     position_axes.set_ylabel("way from the start (mm)")
     energy_axes.set_ylabel("energy (mJ)")
     energy_axes.set_xlabel("time (s)")
     method = method_named(meta.get("method", ""))
     told = coupling_sentences(
-        parameters.coupling, method, parameters.period, parameters.substeps
+        parameters.coupling,
+        method,
+        parameters.period,
+        parameters.substeps,
+        is_always_held=was_always_held(ticks),
     ) or ("no coupling law",)
     title = f"{meta.get('scene', '')}: method {method.name}, {1 / parameters.period:g} Hz"
     # a control code would make a broken SVG

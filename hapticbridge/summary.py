@@ -34,10 +34,12 @@ class Summary:
         slack_share: Largest share of the slack that was used.
         method: How the tool was rendered.
         about: What that means, in a sentence.
-        hazard: What it may do on a real device, in a sentence; empty for ``implicit``.
+        hazard: What it may do on a real device, in a sentence; empty where the device condition is
+            all that is to be said.
         coupling: The coupling asked for: what should be felt.
         used: That of the law, whose damping B' the device condition counts.
-        rendered: What is felt away from contact, and what is used, in sentences.
+        rendered: What is felt away from contact, or everywhere if the tool was never let go, and
+            what is used, in sentences.
         felt: The coupling that the tool was truly held by, where no law says it (a weld: the
             stiffest axis, as measured at the start).
         fault: Tick and port (``environment`` or ``device``) of the first fault, or None. Behind a
@@ -129,7 +131,11 @@ class Summary:
             coupling=asked,
             used=parameters.coupling,
             rendered=coupling_sentences(
-                parameters.coupling, method, parameters.period, parameters.substeps
+                parameters.coupling,
+                method,
+                parameters.period,
+                parameters.substeps,
+                is_always_held=ticks > 0 and not state["lossless_ticks"][0],
             ),
             felt=parameters.felt,
             fault=ledger.fault,

@@ -6,7 +6,9 @@ a row of the shared-memory ring, and the payload of a message in the recording.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from enum import IntFlag
+from typing import NamedTuple
 
 import numpy as np
 
@@ -79,6 +81,64 @@ after the step. Positions in m, quaternions (w, x, y, z) with w >= 0, wrenches (
 in N m) in the world frame about the grip (``wrench_on_tool``) or in the device's frame
 (``wrench_on_device``), energies and cumulative works in J. ``injected_damping`` in N s/m is the
 largest that the passivity controller added on an axis of translation."""
+
+_POSITION, _QUATERNION = (("x", "y", "z"), "m"), (("w", "x", "y", "z"), "1")
+_WRENCH = ("fx", "fy", "fz", "tx", "ty", "tz"), "N"
+_PARTS: dict[str, tuple[tuple[str, ...], str]] = {
+    "device_position": _POSITION,
+    "device_quaternion": _QUATERNION,
+    "handle_position": _POSITION,
+    "handle_quaternion": _QUATERNION,
+    "tool_position": _POSITION,
+    "tool_quaternion": _QUATERNION,
+    "wrench_on_tool": _WRENCH,
+    "wrench_on_device": _WRENCH,
+}
+_UNITS = {
+    "deadline_ns": "ns",
+    "wake_ns": "ns",
+    "read_ns": "ns",
+    "write_ns": "ns",
+    "kinetic": "J",
+    "potential": "J",
+    "coupling_work": "J",
+    "actuator_work": "J",
+    "external_work": "J",
+    "environment_energy": "J",
+    "device_energy": "J",
+    "injected_damping": "N s/m",
+}
+
+
+class Column(NamedTuple):
+    """One number of a record, as tables and messages name it.
+
+    Attributes:
+        name: The field's, with ``_x`` and the like where the field is a vector.
+        field: Of ``TICK_DTYPE``.
+        part: Index in the field; None where the field is one number.
+        unit: SI, ``ns`` where the name says so, ``1`` for counts, bits and quaternions.
+    """
+
+    name: str
+    field: str
+    part: int | None
+    unit: str
+
+
+def _columns() -> Iterator[Column]:
+    for field in TICK_DTYPE.names or ():
+        if field not in _PARTS:
+            yield Column(field, field, None, _UNITS.get(field, "1"))
+            continue
+        parts, unit = _PARTS[field]
+        for index, part in enumerate(parts):
+            is_torque = part.startswith("t")
+            yield Column(f"{field}_{part}", field, index, "N m" if is_torque else unit)
+
+
+COLUMNS = tuple(_columns())
+"""Every number of a record in order."""
 
 CLOCK_FIELDS = ("deadline_ns", "wake_ns", "read_ns", "write_ns")
 """Fields that depend on the clock, not on the input: two runs of one input may differ here."""

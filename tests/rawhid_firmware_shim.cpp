@@ -20,9 +20,19 @@ static void analogWriteFrequency(int, float) {}
 static void analogWrite(int pin, int value) { pins[pin] = value; }
 static void digitalWrite(int pin, int value) { pins[pin] = value; }
 static int digitalRead(int) { return HIGH; }
-static void noInterrupts() {}
-static void interrupts() {}
-static unsigned micros() { return now_us; }
+// As on a Teensy 3: micros() switches interrupts on again, whatever they were before.
+static bool is_masked = false;
+static int sections = 0, broken_sections = 0;
+static void noInterrupts() { is_masked = true; }
+static void interrupts() {
+  sections++;
+  if (!is_masked) broken_sections++;
+  is_masked = false;
+}
+static unsigned micros() {
+  is_masked = false;
+  return now_us;
+}
 
 struct RawHidPort {
   int recv(void* buffer, int) {
@@ -67,6 +77,8 @@ int sketch_fetch(unsigned char* frame) {
 }
 void sketch_turn(int count) { encoder_count = count; }
 int sketch_pin(int pin) { return pins[pin]; }
+int sketch_sections() { return sections; }
+int sketch_broken_sections() { return broken_sections; }
 }
 #else
 #include "hb_protocol.h"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
-from concurrent.futures import Executor, Future
 from pathlib import Path
 from typing import Any
 
@@ -14,20 +13,9 @@ import sweep_functions as functions
 from hapticbridge.study.points import grid
 from hapticbridge.study.sweep import sweep
 from hapticbridge.study.table import Table
+from hapticbridge.study.workers import InThisProcess
 
 POINTS = grid(stiffness=[1000, 3000.0, 1e4 / 3], damping=np.linspace(0.1, 0.3, 3), tool="peg")
-
-
-class Inline(Executor):
-    """Works while it submits."""
-
-    def submit(self, task: Callable[..., Any], /, *args: Any, **named: Any) -> Future[Any]:
-        future: Future[Any] = Future()
-        try:
-            future.set_result(task(*args, **named))
-        except Exception as error:
-            future.set_exception(error)
-        return future
 
 
 def computed(scratch: Path) -> Counter[int]:
@@ -35,7 +23,7 @@ def computed(scratch: Path) -> Counter[int]:
 
 
 def serial(function: Callable[[Any], Any] = functions.bound, points: Any = POINTS) -> Table:
-    return sweep(function, points, executor=Inline())
+    return sweep(function, points, executor=InThisProcess())
 
 
 def parts(folder: Path) -> list[Path]:

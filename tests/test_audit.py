@@ -18,7 +18,8 @@ from scipy.spatial.transform import Rotation
 
 from hapticbridge.audit import audit
 from hapticbridge.audit.balance import Balance
-from hapticbridge.audit.turns import turn_between
+from hapticbridge.audit.differences import turn_between
+from hapticbridge.audit.reached import Reached
 from hapticbridge.bridge import Bridge
 from hapticbridge.clock import SimulatedClock
 from hapticbridge.coupling import Coupling
@@ -85,12 +86,16 @@ def test_shipped_scenes_are_passive_on_the_simulated_device(scene: str, tmp_path
 def test_balance_agrees_with_the_kernel_and_with_a_sum_by_hand(held: Recording) -> None:
     ticks = held.ticks
     starts = {name: meta_start(held.meta, name) for name in STARTS}
+    parameters = parameters_of(held.meta)
     balance = Balance.of(
         ticks,
-        parameters_of(held.meta),
-        np.array(starts["handle_start"]),
-        np.array(starts["tool_start"]),
-        starts["start_kinetic"][0] + starts["start_potential"][0],
+        parameters,
+        Reached.at_start(
+            parameters,
+            np.array(starts["handle_start"]),
+            np.array(starts["tool_start"]),
+            starts["start_kinetic"][0] + starts["start_potential"][0],
+        ),
         np.zeros(0),
     )
     # rounding of 200 summed works of 1e-3 J

@@ -14,6 +14,7 @@ from random_hands import random_motion
 from hapticbridge.audit import audit
 from hapticbridge.audit.balance import Balance
 from hapticbridge.audit.device_port import kept_behind_a_law
+from hapticbridge.audit.reached import Reached
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import SimulatedDevice
 from hapticbridge.guard import Limits
@@ -48,7 +49,7 @@ def test_the_balance_is_the_identity_behind_the_bound() -> None:
     e, de = h - x, d - moved
     force = k * e + b / T * de
     still = np.zeros((count, 3))
-    kept = kept_behind_a_law(
+    parts, held = kept_behind_a_law(
         RUN,
         stretch=(e, still),
         stretched=(de, still),
@@ -57,6 +58,8 @@ def test_the_balance_is_the_identity_behind_the_bound() -> None:
         since_start=np.arange(count, dtype=np.float64),
         share=np.ones(count),
     )
+
+    kept = np.cumsum(parts) + held
 
     def norm(v: np.ndarray, weight: float) -> np.ndarray:
         return np.asarray(weight * np.sum(v**2, axis=-1))
@@ -84,7 +87,7 @@ def kept(
     e = np.zeros((count, 3))
     e[:, 0] = stretch
     none = np.zeros((count, 3))
-    energy = kept_behind_a_law(
+    parts, held = kept_behind_a_law(
         run,
         stretch=(e, none),
         stretched=(none, none),
@@ -93,7 +96,7 @@ def kept(
         since_start=np.arange(count, dtype=np.float64),
         share=np.minimum(np.arange(1.0, count + 1) / (run.ramp_ticks + 1), 1.0),
     )
-    return [float(value) for value in energy]
+    return [float(value) for value in np.cumsum(parts) + held]
 
 
 def test_a_spring_that_is_limited_stores_force_times_length_beyond_the_limit() -> None:
@@ -139,9 +142,12 @@ def balance(path: Path, damping: float | None = None, rotational: float = 1.0) -
     return Balance.of(
         recording.ticks,
         parameters,
-        np.array(starts["handle_start"]),
-        np.array(starts["tool_start"]),
-        starts["start_kinetic"][0] + starts["start_potential"][0],
+        Reached.at_start(
+            parameters,
+            np.array(starts["handle_start"]),
+            np.array(starts["tool_start"]),
+            starts["start_kinetic"][0] + starts["start_potential"][0],
+        ),
         np.array(resumed, dtype=np.float64),
     )
 

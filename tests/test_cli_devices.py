@@ -2,15 +2,25 @@ from __future__ import annotations
 
 import json
 import os
+import socket
 from pathlib import Path
 
 import pytest
 from cli_cases import Called
+from emulated.hid_seam import HidSeam
+from emulated.pid_model import PidStick
 
 from hapticbridge.cli import devices as command
-from hapticbridge.device import hid_search, usb_bus, usb_search
+from hapticbridge.device import haply, hid_search, usb_bus, usb_search
+from hapticbridge.device.dhd_library import VARIABLE
 from hapticbridge.device.families import FAMILIES, RULES_FILE, plugged_devices, udev_rules
-from hapticbridge.device.plugged import Family, Plugged
+from hapticbridge.device.plugged import (
+    RULES_COMMAND,
+    Family,
+    Plugged,
+    access_problem,
+    permission_problem,
+)
 
 
 def plug(
@@ -105,9 +115,12 @@ def listed(problem: str | None, serial: str = "") -> Plugged:
         ([listed(None)], "next: hapticbridge run peg_in_hole --device rawhid\n"),
         ([listed(None, "A"), listed(None, "B")], "--device rawhid:serial=A\n"),
         (
-            [listed("no permission")],
-            "  not usable: no permission\nnext: hapticbridge devices",
+            [listed(permission_problem("/dev/hidraw0"))],
+            "whoever sits at the machine\nnext: hapticbridge devices",
         ),
+        # no rule would help, and one of two can be used
+        ([listed("no node"), listed(None, "B")], "next: hapticbridge run peg_in_hole --device"),
+        ([listed("no node")], "  not usable: no node\n"),
     ],
 )
 def test_it_says_what_to_do_next(
@@ -117,6 +130,7 @@ def test_it_says_what_to_do_next(
     code, out, _ = call("devices")
     assert code == 0
     assert words in out
+    assert ("udevadm" in out) is (RULES_COMMAND in (plugged[0].problem or ""))
     assert f"rawhid: {plugged[0]}".replace("\x1b", "�") in out
 
 
@@ -146,9 +160,44 @@ def test_a_usb_device_is_listed_by_the_kernels_word_where_libusb_is_missing(bus:
     assert "libusb cannot be loaded" in device.problem
 
 
-def test_the_bus_is_read_without_opening_anything(
-    bus: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_hid_device_is_listed_by_the_kernels_word_where_hidapi_is_missing(
+    call: Called, bus: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    plug(bus, "1-1", "16c0:0486", name="RawHID", serial="77", hidraw=True)
+    assert plugged_devices() == []  # where hidapi is there, it lists what has a node
+    monkeypatch.setattr(hid_search, "hid_api", lambda: None)
+    (device,) = plugged_devices()
+    assert (device.family, device.serial) == ("rawhid", "77")
+    code, _, err = call("run", "peg_in_hole", "--device", "rawhid")
+    assert code == 2
+    assert "hidapi cannot be loaded; 'pip install hidapi' brings it" in err
+
+
+@pytest.mark.parametrize(
+    ("is_there", "is_permitted", "words"),
+    [
+        (True, True, None),
+        (True, False, "no permission to open"),
+        (False, False, "there is no"),  # as root, who may open all that there is
+    ],
+)
+def test_a_node_that_is_not_there_yet_is_no_missing_permission(
+    is_there: bool,
+    is_permitted: bool,
+    words: str | None,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    node = tmp_path / "hidraw0"
+    if is_there:
+        node.touch()
+    monkeypatch.setattr(os, "access", lambda path, mode: is_permitted)
+    problem = access_problem(str(node))
+    assert (problem or "").startswith(words or "")
+    assert (problem is None) is (words is None)
+
+
+def test_the_bus_is_read_without_opening_anything(bus: Path) -> None:
     plug(bus, "1-1", "16c0:0486", name="RawHID", serial="77", hidraw=True)
     plug(bus, "1-22", "046d:c626")
     (bus / "1-3").mkdir()
@@ -158,12 +207,11 @@ def test_the_bus_is_read_without_opening_anything(
     assert (first.name, first.serial) == ("RawHID", "77")
     assert (first.has_hidraw, second.has_hidraw, second.name) == (True, False, "")
     assert str(second.node) == "/dev/bus/usb/001/004"
-    for answer in (True, False):
-        monkeypatch.setattr(os, "access", lambda path, mode, answer=answer: answer)
-        assert first.is_permitted is answer
 
 
-@pytest.mark.parametrize("family", FAMILIES, ids=lambda family: family.name)
+@pytest.mark.parametrize(
+    "family", [f for f in FAMILIES if f.find is None], ids=lambda family: family.name
+)
 def test_running_on_a_device_that_is_not_there_is_one_sentence_that_helps(
     call: Called, family: Family, bus: Path
 ) -> None:
@@ -172,3 +220,73 @@ def test_running_on_a_device_that_is_not_there_is_one_sentence_that_helps(
     assert err.count("\n") == 1
     assert err.startswith(f"error: no device '{family.name}' is plugged in (looked for ")
     assert "'hapticbridge devices' lists what is, and what permission is missing" in err
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("haply", "the Inverse Service does not run: nobody answers at localhost:"),
+        ("forcedimension", "the library '/no/such.so' cannot be loaded"),
+    ],
+)
+def test_what_stands_between_us_and_a_device_is_said_to_be_missing(
+    call: Called, monkeypatch: pytest.MonkeyPatch, bus: Path, name: str, words: str
+) -> None:
+    monkeypatch.setenv(VARIABLE, "/no/such.so")
+    with socket.socket() as unused:
+        unused.bind(("localhost", 0))  # nobody listens there
+        place = ("localhost", unused.getsockname()[1])
+        monkeypatch.setattr(haply, "PLACE", place)
+        monkeypatch.setattr(haply.medium, "__defaults__", (place,))
+        monkeypatch.setattr(haply.find, "__defaults__", (place,))
+        code, out, err = call("run", "peg_in_hole", "--device", name)
+        assert (code, out, err.count("\n")) == (2, "", 1)
+        assert err.startswith(f"error: {words}")
+        code, out, _ = call("devices")
+        assert code == 0
+        assert f"  {words}" in out
+        code, out, _ = call("devices", "--json")
+    told = {f["name"]: f["medium"] for f in json.loads(out)["supported"]}
+    assert told[name].startswith(words)
+    assert told["rawhid"] is None
+
+
+def test_a_class_gets_a_rule_for_each_product_that_is_plugged_in(
+    bus: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert "# pid: " in udev_rules()
+    assert "# none is plugged in: plug it in, and write these rules again" in udev_rules()
+    seam = HidSeam(PidStick(serial="A"), PidStick(serial="B"), PidStick())
+    seam.plugged[2].product = 0x4802
+    monkeypatch.setattr(hid_search, "hid_api", lambda: seam)
+    plugged = plugged_devices()
+    assert [(one.family, one.serial, one.product) for one in plugged] == [
+        ("pid", "A", 0x4801),
+        ("pid", "B", 0x4801),
+        ("pid", "P1", 0x4802),
+    ]
+    rules = [line for line in udev_rules().splitlines() if "*:1209:" in line]
+    assert rules == [
+        f'SUBSYSTEM=="hidraw", KERNELS=="*:1209:480{n}.*", TAG+="uaccess"' for n in (1, 2)
+    ]
+
+
+def test_how_often_a_device_is_asked_is_read_where_the_kernel_shows_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(hid_search, "CLASS", tmp_path / "class")
+    interface = tmp_path / "1-1:1.0"
+    hid = interface / "0003:1209:4801.0001"
+    hid.mkdir(parents=True)
+    (hid / "report_descriptor").write_bytes(b"\x05\x01")
+    (tmp_path / "class/hidraw3").mkdir(parents=True)
+    (tmp_path / "class/hidraw3/device").symlink_to(hid)
+    assert hid_search.polling("/dev/hidraw3") == (None, None)
+    for name, direction, interval in (("ep_81", "in", "8ms"), ("ep_01", "out", "125us")):
+        (interface / name).mkdir()
+        (interface / name / "direction").write_text(direction + "\n")
+        (interface / name / "interval").write_text(interval + "\n")
+    assert hid_search.polling("/dev/hidraw3") == pytest.approx((8e-3, 125e-6))
+    assert hid_search.report_descriptor("/dev/hidraw3", None) == b"\x05\x01"
+    assert hid_search.report_descriptor("/dev/hidraw4", None) == b""
+    assert hid_search.polling("/dev/hidraw4") == (None, None)

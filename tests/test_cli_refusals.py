@@ -41,6 +41,7 @@ BAD_RUNS: list[tuple[tuple[object, ...], str]] = [
     (("point_mass", "--force-scale", 0), "force_scale"),
     (("point_mass", "--ramp", -1), "ramp"),
     (("point_mass", "--ramp", 1e300), "ramp"),
+    (("point_mass", "--realtime"), "exclude each other"),
     (("point_mass", "--record", "no/such/folder/run.mcap"), "folder"),
 ]
 
@@ -103,10 +104,10 @@ def test_what_is_no_recording_is_refused_in_one_sentence(
 def test_file_without_permission_is_refused(
     call: Called, run_file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def refuse(self: Path) -> bytes:
+    def refuse(self: Path, *_mode: object, **_options: object) -> bytes:
         raise PermissionError(13, os.strerror(13))
 
-    monkeypatch.setattr(Path, "read_bytes", refuse)  # root may read everything
+    monkeypatch.setattr(Path, "open", refuse)  # root may read everything
     code, _, err = call("audit", run_file)
     assert code == 2
     assert "Permission denied" in one_sentence(err)

@@ -97,7 +97,7 @@ def test_bound_shows_every_alternative(capsys: pytest.CaptureFixture[str]) -> No
         r"B' = B, Tustin's damper none suffices 500 Hz",
         r"B' = B, one tick late, against a wall 2\.5 N s/m 166\.7 Hz",
         r"B' = B, one tick late, any environment none suffices -",
-        r"lossless line of that stiffness 2 N s/m every frequency",
+        r"transmission line of that stiffness 2 N s/m every frequency",
     ):
         assert re.search(row, told.words)
 

@@ -60,6 +60,15 @@ def test_a_wait_sleeps_and_spins_only_at_the_end(wall: Wall) -> None:
     assert wall.slept == [pytest.approx(850e-6, abs=1e-6)]
 
 
+def test_a_spin_leaves_a_quarter_of_a_short_period_to_sleep(wall: Wall) -> None:
+    """Else a real-time thread never sleeps, and the kernel stops it for 50 ms in each second."""
+    clock = RealClock()
+    clock.start(100_000)
+    for _ in range(3):
+        clock.wait()
+    assert wall.slept == [pytest.approx(25e-6, abs=1e-6)] * 3
+
+
 def test_missed_deadlines_are_skipped_and_counted_not_caught_up(wall: Wall) -> None:
     clock = RealClock()
     clock.start(PERIOD)

@@ -9,12 +9,17 @@ from typing import Any
 
 import numpy as np
 import pytest
+from emulated.dhd_stub import OMEGA3, SIGMA7, Stub
 from emulated.hid_device import HidDevice
 from emulated.hid_seam import HidSeam
+from emulated.pid_layouts import ODD
+from emulated.pid_model import PidStick
 from emulated.rawhid_model import RawHid
 from emulated.spacemouse_model import SpaceMouse
 from emulated.ticking import Ticking
+from emulated.timed import Timed
 from falcon_cases import Bench
+from haply_cases import Bench as HaplyBench
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -29,6 +34,7 @@ from hapticbridge.device import (
     SimulatedDevice,
     open_device,
 )
+from hapticbridge.device.pid import open_pid
 from hapticbridge.device.plugged import tell_nobody
 from hapticbridge.device.rawhid import open_rawhid
 from hapticbridge.device.spacemouse import open_spacemouse
@@ -77,6 +83,22 @@ def falcon(_: Path) -> Device:
     return device
 
 
+def haply(_: Path) -> Device:
+    def build() -> tuple[Device, Timed]:
+        bench = HaplyBench()
+        return bench.opened(), bench.time
+
+    return Ticking(build)
+
+
+def force_dimension(kind: int) -> Device:
+    def build() -> tuple[Device, Timed]:
+        stub = Stub(kind)
+        return stub.opened(), stub
+
+    return Ticking(build)
+
+
 DEVICES: dict[str, Callable[[Path], Device]] = {
     "simulated": lambda _: open_device("simulated"),
     "free": lambda _: open_device("simulated:hand=none,damping=0"),
@@ -93,6 +115,11 @@ DEVICES: dict[str, Callable[[Path], Device]] = {
         lambda: SpaceMouse(pushed, has_long_reports=True), open_spacemouse
     ),
     "falcon": falcon,
+    "haply": haply,
+    "omega.3": lambda _: force_dimension(OMEGA3),
+    "sigma.7": lambda _: force_dimension(SIGMA7),
+    "stick": lambda _: ticking(lambda: PidStick(SimulatedDevice()), open_pid),
+    "odd stick": lambda _: ticking(lambda: PidStick(SimulatedDevice(), ODD), open_pid),
 }
 
 
@@ -266,7 +293,13 @@ def test_options_reach_the_device_and_the_specification_goes_before_the_code(
 @pytest.mark.parametrize(
     ("spec", "options", "words"),
     [
-        ("falcn", {}, "unknown device 'falcn'; there are 'falcon', 'rawhid', 'simul"),
+        (
+            "falcn",
+            {},
+            "unknown device 'falcn'; there are 'falcon', 'forcedimension', 'haply', 'pid'",
+        ),
+        ("haply:colour=red", {}, "unknown option 'colour' of the haply device; there are 'd"),
+        ("forcedimension:colour=red", {}, "unknown option 'colour' of the forcedimension dev"),
         ("rawhid:colour=red", {}, "unknown option 'colour' of the rawhid device; there are 'd"),
         ("spacemouse", {"colour": 1}, "unknown option 'colour' of the spacemouse device"),
         ("spacemouse:speed=fast", {}, "speed = 'fast': must be a number"),

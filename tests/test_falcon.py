@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import array
 from pathlib import Path
 
 import numpy as np
@@ -82,6 +83,32 @@ def test_a_force_that_is_not_finite_is_no_force() -> None:
     device.start(PERIOD)
     looped(bench, device, 3, (np.nan, 1.0, 0.0))
     assert bench.model.motors == (0, 0, 0)
+
+
+@pytest.mark.parametrize("refused", [1, 20, 21])
+def test_no_force_is_sent_until_it_is_taken_and_a_force_once(refused: int) -> None:
+    bench = Bench()
+    device = bench.opened()
+    device.start(PERIOD)
+    device.write(np.array([0.0, 3.0, 0.0, 0.0, 0.0, 0.0]))
+    write, left, sent = bench.link.write, refused, 0
+
+    def full(packet: array.array[int], timeout_ms: int = 1) -> bool:
+        nonlocal left, sent
+        left, sent = left - 1, sent + 1
+        return left < 0 and write(packet, timeout_ms)
+
+    bench.link.write = full  # type: ignore[method-assign]
+    device.write(np.array([0.0, 2.0, 0.0, 0.0, 0.0, 0.0]))
+    assert sent == 1
+    left = refused
+    if refused <= 20:
+        device.write(np.zeros(6))
+        bench.time.until(bench.time.now + PERIOD)
+        assert bench.model.motors == (0, 0, 0)
+    else:
+        with pytest.raises(DeviceLost, match="does not take that it is to give no force"):
+            device.write(np.zeros(6))
 
 
 def test_buttons_are_reported_with_the_pose() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import array
 from pathlib import Path
 
 import numpy as np
@@ -149,3 +150,26 @@ def test_the_data_sheet_says_what_is_known_and_nothing_else() -> None:
     assert info.force_limit == 8.0
     # 0.05 mm per encoder step sideways, by the published constants
     assert info.resolution == pytest.approx(5e-5, rel=0.05)
+
+
+@pytest.mark.parametrize("lost", [1, 10_000])
+def test_one_lost_reply_is_measured_again_and_silence_is_not_borne(lost: int) -> None:
+    info = Bench().opened().info
+    bench = Bench()
+    write, packets = bench.link.write, 0
+
+    def lossy(packet: array.array[int], timeout_ms: int = 1) -> bool:
+        nonlocal packets
+        packets += 1
+        return 250 <= packets < 250 + lost or write(packet, timeout_ms)
+
+    bench.link.write = lossy  # type: ignore[method-assign]
+    if lost == 1:
+        found = bench.opened().info
+        assert packets > 500  # the second time whole
+        assert found.rate == pytest.approx(info.rate, rel=0.02)
+        assert found.delay == pytest.approx(info.delay, rel=0.05)
+    else:
+        with pytest.raises(DeviceLost, match="fell silent while its timing was measured"):
+            bench.opened()
+        assert bench.link.is_closed

@@ -60,7 +60,10 @@ def refused(device: SimulatedDevice | Wrapped, words: str, **options: Any) -> No
 @pytest.mark.parametrize("stiffness", [10.0, 135.0, 800.0])
 def test_a_hand_that_holds_still_is_felt_as_a_spring(stiffness: float) -> None:
     held = SimulatedDevice(resolution=1e-5, hand=Hand(stiffness=stiffness), path=STILL)
-    refused(held, f"axis x: a spring of {stiffness:.3g}")
+    with pytest.raises(IdentificationError, match="axis x: a spring of ") as error:
+        identify(held, SimulatedClock(), period=PERIOD, axes=("x",), duration=6.0)
+    told = float(str(error.value).split("a spring of ")[1].split()[0])
+    assert told == pytest.approx(stiffness, rel=0.02)
 
 
 def test_a_hand_that_moves_is_told_from_a_device() -> None:

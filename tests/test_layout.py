@@ -17,8 +17,9 @@ ORDER = (
     ("ledger", "inputs", "device"),
     ("guard", "recording", "certificate", "felt"),
     ("provenance", "summary", "workspace", "realtime"),
-    ("bridge", "audit", "identify"),
+    ("bridge", "audit", "identify", "compare", "export"),
     ("report", "study", "check", "doctor"),
+    ("whatif",),  # runs the bridge and asks the audit, which must not know of either
     ("cli",),
 )
 RANK = {name: rank for rank, names in enumerate(ORDER) for name in names}

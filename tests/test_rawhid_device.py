@@ -241,6 +241,9 @@ def test_a_device_that_must_be_homed_or_sends_nothing_does_not_start() -> None:
     model.status = 16
     with pytest.raises(DeviceError, match="does not know its pose yet: home or calibrate it"):
         device.start(PERIOD)
+    model.status = 8
+    with pytest.raises(DeviceError, match="reports a fault of its own"):
+        device.start(PERIOD)
     device, model, _ = opened()
     model.is_silent = True
     with pytest.raises(DeviceError, match="sends no state frames"):

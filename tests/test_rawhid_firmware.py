@@ -239,3 +239,11 @@ def test_the_sketch_pushes_the_way_it_is_told_and_its_interrupt_lets_go_if_the_l
     assert sketch.sketch_pin(PWM) > 0
     sketch.sketch_run(2_000, 0)
     assert sketch.sketch_pin(PWM) == 0
+
+
+def test_what_the_sketch_does_with_interrupts_off_keeps_them_off(sketch: ctypes.CDLL) -> None:
+    before = sketch.sketch_sections()
+    sketch.sketch_send(force_frame(1, WRENCH, 20))
+    sketch.sketch_run(1_010 * 3, 1)
+    assert sketch.sketch_sections() >= before + 4  # a force frame, three states
+    assert sketch.sketch_broken_sections() == 0

@@ -1,4 +1,4 @@
-"""What substeps buy and what they cost: the figures that the README prints."""
+"""What substeps buy, accuracy, and what they cost: device damping."""
 
 from __future__ import annotations
 

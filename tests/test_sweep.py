@@ -18,14 +18,14 @@ import pytest
 import sweep_functions as functions
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from sweep_runs import POINTS, Inline, computed, serial
+from sweep_runs import POINTS, computed, serial
 
 from hapticbridge.errors import StudyError
 from hapticbridge.study.points import grid, plain, point_key
 from hapticbridge.study.results import ResultFolder
 from hapticbridge.study.sweep import sweep
 from hapticbridge.study.table import Outcome
-from hapticbridge.study.workers import cores
+from hapticbridge.study.workers import InThisProcess, cores
 
 
 def test_the_table_holds_what_a_plain_loop_gives() -> None:
@@ -83,7 +83,7 @@ def test_every_executor_gives_the_same_bits(tmp_path: Path) -> None:
                 folder=tmp_path / form,
                 format=form,
                 chunk=2,
-                executor=Inline(),
+                executor=InThisProcess(),
             )
             assert kept.equals(expected)
 
@@ -123,26 +123,28 @@ def test_a_failed_point_records_why_and_stops_nothing(tmp_path: Path) -> None:
 
 def test_results_that_no_table_can_hold_are_failures_of_their_point(tmp_path: Path) -> None:
     for _ in range(2):
-        table = sweep(functions.oddities, grid(n=range(8)), folder=tmp_path, executor=Inline())
+        table = sweep(
+            functions.oddities, grid(n=range(8)), folder=tmp_path, executor=InThisProcess()
+        )
         assert table.failed.tolist() == [False, *[True] * 6, False]
         assert table.results == ("x", "extra", "late")
         np.testing.assert_equal(table["x"], [1.5, *[math.nan] * 6, 2.0])
         assert table["late"].tolist() == [""] * 7 + ["text"]
     assert "not a mapping" in table["error"][1]
     assert "name of another column" in table["error"][3]
-    short = sweep(functions.one_too_few, grid(n=range(3)), batched=True, executor=Inline())
+    short = sweep(functions.one_too_few, grid(n=range(3)), batched=True, executor=InThisProcess())
     assert all("returned 0 results for 1 points" in text for text in short["error"])
 
 
 def test_other_points_reuse_those_that_are_known(scratch: Path) -> None:
     reports: list[tuple[int, int]] = []
     more = grid(n=range(6, 15), gain=[0.1])
-    sweep(functions.counted, functions.COUNTED, folder=scratch / "parts", executor=Inline())
+    sweep(functions.counted, functions.COUNTED, folder=scratch / "parts", executor=InThisProcess())
     table = sweep(
         functions.counted,
         more,
         folder=scratch / "parts",
-        executor=Inline(),
+        executor=InThisProcess(),
         progress=lambda done, total: reports.append((done, total)),
     )
     assert set(computed(scratch).values()) == {1}

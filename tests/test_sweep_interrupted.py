@@ -17,14 +17,14 @@ from typing import Any
 
 import pytest
 import sweep_functions as functions
-from sweep_runs import Inline, computed, parts, serial
+from sweep_runs import computed, parts, serial
 
 from hapticbridge.signals import holding_interrupts
 from hapticbridge.study.points import Point, grid, point_key
 from hapticbridge.study.sweep import Chunk, _Shift, sweep
 from hapticbridge.study.table import Outcome
 from hapticbridge.study.task import WORKER_DIED
-from hapticbridge.study.workers import Workers
+from hapticbridge.study.workers import InThisProcess, Workers
 
 
 class Dead(BaseException):
@@ -35,7 +35,7 @@ class Fragile(Workers):
     """A pool that breaks, with all that is in flight, when a task raises Dead."""
 
     def __init__(self) -> None:
-        super().__init__(Inline(), depth=4)
+        super().__init__(InThisProcess(), depth=4)
         self.restarts = 0
         self.broken = False
         self.flying: list[tuple[Future[Any], Callable[..., Any], tuple[object, ...]]] = []
@@ -94,7 +94,9 @@ def test_a_sweep_that_was_killed_goes_on_and_computes_nothing_twice(
     assert 0 < kept < len(functions.COUNTED)
     name = json.loads((folder / "sweep.json").read_text())["function"]
     assert name == "sweep_functions.counted"
-    resumed = sweep(functions.counted, functions.COUNTED, folder=folder, executor=Inline(), chunk=1)
+    resumed = sweep(
+        functions.counted, functions.COUNTED, folder=folder, executor=InThisProcess(), chunk=1
+    )
     often = computed(scratch)
     # what was in flight is computed again, at most two tasks a worker; what was kept is not
     assert sum(often.values()) - len(functions.COUNTED) <= len(functions.COUNTED) - kept
@@ -168,7 +170,12 @@ def test_ctrl_c_keeps_what_is_done(scratch: Path) -> None:
     (scratch / "ctrl-c").touch()
     folder = scratch / "parts"
     again = functools.partial(
-        sweep, functions.counted, functions.COUNTED, folder=folder, executor=Inline(), chunk=2
+        sweep,
+        functions.counted,
+        functions.COUNTED,
+        folder=folder,
+        executor=InThisProcess(),
+        chunk=2,
     )
     with pytest.raises(KeyboardInterrupt):
         again()
@@ -181,7 +188,7 @@ def test_parts_that_were_cut_changed_or_come_from_elsewhere_are_computed_again(
     scratch: Path,
 ) -> None:
     folder, other = scratch / "mine", scratch / "other"
-    again = functools.partial(sweep, executor=Inline(), chunk=1)
+    again = functools.partial(sweep, executor=InThisProcess(), chunk=1)
     expected = again(functions.counted, functions.COUNTED, folder=folder)
     cut, changed, gone, *_ = parts(folder)
     cut.write_bytes(cut.read_bytes()[:-9])
@@ -202,7 +209,12 @@ def test_parts_that_were_cut_changed_or_come_from_elsewhere_are_computed_again(
 def test_what_a_killed_sweep_was_writing_is_removed_and_nothing_else(scratch: Path) -> None:
     folder = scratch / "parts"
     again = functools.partial(
-        sweep, functions.counted, functions.COUNTED, folder=folder, executor=Inline(), chunk=4
+        sweep,
+        functions.counted,
+        functions.COUNTED,
+        folder=folder,
+        executor=InThisProcess(),
+        chunk=4,
     )
     again()
     kept = sorted(folder.iterdir())

@@ -14,15 +14,16 @@ from typing import Any
 import numpy as np
 import pytest
 import sweep_functions as functions
-from sweep_runs import POINTS, Inline, serial
+from sweep_runs import POINTS, serial
 
 from hapticbridge.errors import StudyError
 from hapticbridge.study.points import grid
 from hapticbridge.study.sweep import sweep
+from hapticbridge.study.workers import InThisProcess
 
 
 def test_an_executor_of_somebody_else_that_breaks_is_one_sentence() -> None:
-    class Broken(Inline):
+    class Broken(InThisProcess):
         def submit(self, task: Callable[..., Any], /, *args: Any, **named: Any) -> Future[Any]:
             raise BrokenExecutor
 
@@ -35,21 +36,23 @@ def test_an_executor_of_somebody_else_that_breaks_is_one_sentence() -> None:
 
 
 def test_a_folder_of_another_function_or_version_is_refused(tmp_path: Path) -> None:
-    sweep(functions.bound, POINTS, folder=tmp_path, executor=Inline())
+    sweep(functions.bound, POINTS, folder=tmp_path, executor=InThisProcess())
     with pytest.raises(StudyError, match=r"holds a sweep of sweep_functions\.bound .* start anew"):
-        sweep(functions.bound_of_all, POINTS, batched=True, folder=tmp_path, executor=Inline())
+        sweep(
+            functions.bound_of_all, POINTS, batched=True, folder=tmp_path, executor=InThisProcess()
+        )
     one, two = (functools.partial(functions.plus, more=more) for more in (1, 1 + 2**-52))
     points = grid(n=[1])
-    sweep(one, points, folder=tmp_path / "plus", executor=Inline())
+    sweep(one, points, folder=tmp_path / "plus", executor=InThisProcess())
     with pytest.raises(StudyError, match=r"more=1\.0000000000000002"):
-        sweep(two, points, folder=tmp_path / "plus", executor=Inline())
+        sweep(two, points, folder=tmp_path / "plus", executor=InThisProcess())
     manifest = tmp_path / "sweep.json"
     manifest.write_text(manifest.read_text().replace('"hapticbridge": "', '"hapticbridge": "9'))
     with pytest.raises(StudyError, match="by hapticbridge 9"):
-        sweep(functions.bound, POINTS, folder=tmp_path, executor=Inline())
+        sweep(functions.bound, POINTS, folder=tmp_path, executor=InThisProcess())
     manifest.write_text("[]")
     with pytest.raises(StudyError, match="not the manifest"):
-        sweep(functions.bound, POINTS, folder=tmp_path, executor=Inline())
+        sweep(functions.bound, POINTS, folder=tmp_path, executor=InThisProcess())
 
 
 @pytest.mark.parametrize(
@@ -79,7 +82,11 @@ def test_a_folder_of_another_function_or_version_is_refused(tmp_path: Path) -> N
 def test_what_cannot_be_swept_is_refused_with_a_sentence(
     arguments: dict[str, Any], sentence: str
 ) -> None:
-    usual: dict[str, Any] = {"function": functions.bound, "points": POINTS, "executor": Inline()}
+    usual: dict[str, Any] = {
+        "function": functions.bound,
+        "points": POINTS,
+        "executor": InThisProcess(),
+    }
     with pytest.raises(StudyError, match=sentence):
         sweep(**(usual | arguments))
 
@@ -95,9 +102,9 @@ def test_a_folder_that_cannot_be_used_is_refused(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     for folder in (tmp_path / "file", tmp_path / "file" / "below"):
         with pytest.raises(StudyError, match="is not a folder"):
-            sweep(functions.bound, POINTS, folder=folder, executor=Inline())
+            sweep(functions.bound, POINTS, folder=folder, executor=InThisProcess())
     with pytest.raises(StudyError, match="cannot be made"):
-        sweep(functions.bound, POINTS, folder="/proc/nowhere", executor=Inline())
+        sweep(functions.bound, POINTS, folder="/proc/nowhere", executor=InThisProcess())
     with pytest.raises(StudyError, match="cannot be written"):
         serial().write(tmp_path / "no" / "where.csv")
     with pytest.raises(StudyError, match="no column 'x'"):
@@ -110,7 +117,7 @@ def test_what_is_not_installed_is_named_with_the_command_that_installs_it(
     for name in ("pyarrow", "pyarrow.parquet", "distributed"):
         monkeypatch.setitem(sys.modules, name, None)
     with pytest.raises(StudyError, match=r"pip install 'hapticbridge\[tables\]'"):
-        sweep(functions.bound, POINTS, folder=tmp_path, format="parquet", executor=Inline())
+        sweep(functions.bound, POINTS, folder=tmp_path, format="parquet", executor=InThisProcess())
     with pytest.raises(StudyError, match=r"pip install 'hapticbridge\[cluster\]'"):
         sweep(functions.bound, POINTS, scheduler="tcp://127.0.0.1:1")
 

@@ -11,6 +11,7 @@ import pytest
 from emulated.echo import EchoHid
 from emulated.hid_seam import HidSeam
 from emulated.spacemouse_model import SpaceMouse
+from emulated.usb_device import StallError
 
 from hapticbridge.device import hid_search, transport_hid
 from hapticbridge.device.hex_log import VARIABLE, HexLog
@@ -126,6 +127,12 @@ class Handle:
     def get_feature_report(self, report_num: int, max_length: int) -> Sequence[int]:
         return b""
 
+    def get_input_report(self, report_num: int, max_length: int) -> Sequence[int]:
+        return b""
+
+    def get_report_descriptor(self) -> Sequence[int]:
+        return b""
+
     def close(self) -> None:
         self.is_closed = True
 
@@ -141,6 +148,58 @@ def test_an_overlapped_write_does_not_wait_and_the_newest_report_wins() -> None:
     link.close()
     assert handle.sent == [b"\0", b"\x03"]
     assert handle.is_closed
+
+
+def test_of_each_kind_the_newest_report_is_sent_and_kinds_take_turns() -> None:
+    handle = Handle()
+    link = HidLink(handle, "slow", slots=2)
+    link.write(b"a0")
+    handle.entered.acquire()
+    for report, slot in ((b"a1", 0), (b"b1", 1), (b"a2", 0), (b"b2", 1)):
+        link.write(report, slot)
+    handle.gate.release(3)
+    link.close()
+    assert handle.sent == [b"a0", b"b2", b"a2"]
+
+
+def test_a_report_of_set_up_is_sent_before_the_call_returns_and_what_waited_is_dropped(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(transport_hid, "LONGEST_WRITE", 10.0)
+    handle = Handle()
+    link = HidLink(handle, "slow")
+    link.write(b"old")
+    handle.entered.acquire()
+    link.write(b"waits")
+
+    class Opened(threading.Event):
+        def wait(self, timeout: float | None = None) -> bool:
+            handle.gate.release(10)  # only now, when what waits has been dropped
+            return super().wait(timeout)
+
+    link._is_idle = Opened()
+    link.send(b"set-up")
+    assert handle.sent == [b"old", b"set-up"]
+    handle.result = -1
+    with pytest.raises(DeviceLost, match="slow did not take a report"):
+        link.send(b"set-up")
+    link.close()
+
+
+def test_requests_that_fail_have_an_empty_answer() -> None:
+    class Refusing(EchoHid):
+        def set_feature(self, report: bytes, now: float) -> None:
+            raise StallError
+
+    link, device, seam = linked()
+    requests = link.requests
+    assert requests.set_feature(b"\0feature!")
+    assert requests.feature(0, 9) == b"feature!"
+    assert requests.report_descriptor() == device.report_descriptor
+    assert requests.input_report(0, 65) == b""
+    assert not linked(Refusing())[0].requests.set_feature(b"\0x")
+    seam.unplug(device)
+    assert (requests.feature(0, 9), requests.report_descriptor()) == (b"", b"")
 
 
 def test_a_device_that_takes_no_report_any_more_is_lost(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -189,7 +248,7 @@ def test_the_log_holds_what_went_over_the_wire(
     link = HidLink.open(plugged, seam, is_overlapped=False, log=HexLog())
     link.write(b"\0" + b"\x12" * 64)
     link.take()
-    assert not (tmp_path / "wire.log").exists()
+    assert (tmp_path / "wire.log").read_text() == ""
     link.close()
     first, second = (tmp_path / "wire.log").read_text().splitlines()
     assert first.split(" ", 2)[1:] == [">", "00 " + " ".join(["12"] * 64)]
@@ -212,9 +271,14 @@ def test_a_log_that_is_full_keeps_the_newest_and_says_what_it_dropped(
 def test_a_log_that_cannot_be_written_says_so_and_one_that_is_off_keeps_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    log = HexLog(tmp_path / "no" / "wire.log")
-    log.add(">", b"\0")
     with pytest.raises(DeviceError, match=r"the log .* cannot be written: No such file"):
+        HexLog(tmp_path / "no" / "wire.log")
+    (tmp_path / "full").mkdir()
+    log = HexLog(tmp_path / "full" / "wire.log")
+    log.add(">", b"\0")
+    (tmp_path / "full" / "wire.log").unlink()
+    (tmp_path / "full" / "wire.log").mkdir()
+    with pytest.raises(DeviceError, match=r"the log .* cannot be written: Is a directory"):
         log.close()
     log.close()
     monkeypatch.delenv(VARIABLE, raising=False)
@@ -256,6 +320,7 @@ class Listing:
 def test_a_node_that_may_not_be_opened_is_listed_with_what_to_do(
     is_permitted: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    (tmp_path / "hidraw3").touch()
     node = str(tmp_path / "hidraw3")
     monkeypatch.setattr(hid_search, "hid_api", lambda: Listing(node))
     monkeypatch.setattr(os, "access", lambda path, mode: is_permitted)

@@ -19,7 +19,7 @@ from emulated.pyusb_backend import PyusbBackend
 
 from hapticbridge.device import SimulatedDevice
 from hapticbridge.device.falcon import FAMILY, FalconDevice, open_falcon
-from hapticbridge.device.falcon_boot import READ_FROM, WRITE_TO
+from hapticbridge.device.falcon_boot import READ_FROM, WRITE_TO, enter_run_mode
 from hapticbridge.device.falcon_packets import SIZE, encode
 from hapticbridge.device.hex_log import HexLog
 from hapticbridge.device.plugged import tell_nobody
@@ -203,6 +203,16 @@ def test_packets_come_whole_and_as_they_are(opened: Open) -> None:
     assert [len(p) for p in packets if len(p) > 2] == [18]
 
 
+def test_packets_that_nobody_takes_are_bounded(
+    opened: Open, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("hapticbridge.device.transport_usb.MOST_PACKETS", 3)
+    link = opened(Host(falcon()))
+    enter_run_mode(link)
+    time.sleep(0.1)  # the bridge reports its status every millisecond
+    assert 0 < len(link.take()) <= 3
+
+
 def test_an_unplugged_device_is_lost_for_reading_and_writing(opened: Open) -> None:
     model = falcon()
     host = Host(model)
@@ -239,10 +249,12 @@ def test_a_write_that_is_not_taken_in_time_is_no_loss_and_one_that_fails_is(open
 def test_closing_twice_is_allowed_and_puts_the_interpreter_back(opened: Open) -> None:
     before = 5e-3  # Python's own
     sys.setswitchinterval(before)
-    link = opened(Host(falcon()))
+    link, other = opened(Host(falcon())), opened(Host(falcon()))
     assert sys.getswitchinterval() <= 50e-6
     link.close()
     link.close()
+    assert sys.getswitchinterval() <= 50e-6  # the other's
+    other.close()
     assert sys.getswitchinterval() == pytest.approx(before)
     with pytest.raises(DeviceLost, match="is closed"):
         link.take()
@@ -252,7 +264,7 @@ def test_the_log_holds_every_byte_and_is_written_at_the_end(opened: Open, tmp_pa
     path = tmp_path / "bytes.txt"
     link = opened(Host(falcon()), path)
     link.write(question())
-    assert not path.exists()
+    assert path.read_text() == ""
     link.close()
     assert f"> {question().tobytes().hex(' ')}" in path.read_text()
 

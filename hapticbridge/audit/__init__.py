@@ -1,4 +1,4 @@
 """The verdict on a recording, from the recording alone. Never imports the bridge."""
 
-from hapticbridge.audit.verdict import AuditReport as AuditReport
+from hapticbridge.audit.report import AuditReport as AuditReport
 from hapticbridge.audit.verdict import audit as audit

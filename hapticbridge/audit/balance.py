@@ -2,7 +2,7 @@
 
 Written apart from the kernel on purpose. It uses other formulas where there are any (rotation
 vectors by matrices of quaternion products over whole arrays), so that one mistake does not hide
-the other.
+the other. A long recording is judged block by block: ``Reached`` is what one hands to the next.
 """
 
 from __future__ import annotations
@@ -17,18 +17,15 @@ from hapticbridge.audit.device_port import (
     kept_behind_a_law,
     passed_shares,
 )
-from hapticbridge.audit.guarded import (
-    expected_handle,
-    expected_wrench,
-    is_first,
-    since_news,
-    since_start,
-    wrench_sent_before,
-    wrench_share,
+from hapticbridge.audit.differences import (
+    steps,
+    summed,
+    turn_between,
+    turns,
 )
-from hapticbridge.audit.turns import product_conjugate, rotate, steps, turn_between, turns
+from hapticbridge.audit.law import Motion, wrench_by_law
+from hapticbridge.audit.reached import Reached
 from hapticbridge.kernel.state import RunParameters
-from hapticbridge.tick import TickFlag
 
 Array = NDArray[np.float64]
 
@@ -40,6 +37,8 @@ SLACK_SHARE = 0.5
 @dataclass(frozen=True, slots=True)
 class Balance:
     """What the recorded poses and wrenches say by themselves.
+
+    Cumulative is from the first tick of the recording on, however many ticks came before these.
 
     Attributes:
         wrench_on_tool: The coupling law at the recorded poses, (n, 6) in N and N m; the recorded
@@ -58,6 +57,7 @@ class Balance:
         kicked: What the device was given beyond what its damping burns and scene and coupling
             give up, (n,) in J; zero for an unknown damping, or several laws a tick. Behind a
             coupling law what the environment created is not in it: that is the other port's.
+        reached: What the balance of the next ticks begins with.
     """
 
     wrench_on_tool: Array
@@ -73,112 +73,121 @@ class Balance:
     slack: Array
     kicked: Array
 
+    reached: Reached
+
     @classmethod
     def of(
         cls,
         ticks: NDArray[np.void],
         parameters: RunParameters,
-        handle_start: Array,
-        tool_start: Array,
-        start_energy: float,
+        before: Reached,
         resumed: Array,
         late: int = 0,
+        following: NDArray[np.void] | None = None,
     ) -> Balance:
         """Computes everything from records.
 
         Args:
-            ticks: Records without gaps, ``TICK_DTYPE``.
+            ticks: Records without gaps, ``TICK_DTYPE``, at least one.
             parameters: The run's.
-            handle_start: Handle pose (7,) before the first tick.
-            tool_start: Tool pose (7,) before the first tick.
-            start_energy: Kinetic plus potential energy before the first tick, in J.
+            before: What the ticks before them left.
             resumed: Ticks at which the run went on after a pause without force.
             late: After how many ticks a wrench answers a sample: what was sent in row k acted on
                 the motion between rows k + late and k + late + 1.
+            following: The records after these, as many as ``late``, or fewer where they end.
         """
-        coupling, period = parameters.coupling, parameters.period
-        handle_step = steps(ticks["handle_position"], handle_start[:3])
-        tool_step = steps(ticks["tool_position"], tool_start[:3])
-        handle_turn = turns(ticks["handle_quaternion"], handle_start[3:])
-        tool_turn = turns(ticks["tool_quaternion"], tool_start[3:])
-        stretch = ticks["handle_position"] - ticks["tool_position"]
-        twist = turn_between(ticks["tool_quaternion"], ticks["handle_quaternion"])
-        force = coupling.stiffness * stretch + coupling.damping / period * (handle_step - tool_step)
-        torque = coupling.rotational_stiffness * twist + coupling.rotational_damping / period * (
-            handle_turn - tool_turn
-        )
-
-        is_midpoint = (ticks["flags"] & int(TickFlag.MIDPOINT)) != 0
-        if np.any(is_midpoint):
-            # the turn that takes the tool from the tick before to this one carries what was then
-            carried = product_conjugate(ticks["tool_quaternion"], tool_start[3:])
-            before = turn_between(tool_start[3:], handle_start[3:])
-            spring = 0.5 * (twist + rotate(carried, np.vstack([before[None], twist[:-1]])))
-            midway = 0.5 * (handle_turn + rotate(carried, handle_turn)) - tool_turn
-            rate = coupling.rotational_damping / period + 0.5 * coupling.rotational_stiffness
-            midpoint = coupling.rotational_stiffness * spring + rate * midway
-            torque = np.where(is_midpoint[:, None], midpoint, torque)
-
+        sums = before.sums
+        motion = Motion.of(ticks, before.handle, before.tool)
         recorded = ticks["wrench_on_tool"]
-        law = np.concatenate([force, torque], axis=1)
-        if not parameters.has_law or parameters.laws > 1:
-            law = recorded
+        law = recorded
+        if parameters.has_law and parameters.laws == 1:
+            law = wrench_by_law(ticks, parameters.coupling, parameters.period, motion)
         works = (
-            np.sum(recorded[:, :3] * tool_step, axis=1),
-            np.sum(recorded[:, 3:] * tool_turn, axis=1),
+            np.sum(recorded[:, :3] * motion.tool_step, axis=1),
+            np.sum(recorded[:, 3:] * motion.tool_turn, axis=1),
         )
         work = works[0] + works[1]
         # over several laws a tick the work is a sum that their mean does not tell
-        coupling_work = ticks["coupling_work"] if parameters.laws > 1 else np.cumsum(work)
+        coupling_work = (
+            ticks["coupling_work"] if parameters.laws > 1 else summed(work, sums["coupling_work"])
+        )
 
-        device_start = np.array(parameters.device_start)
-        sent = wrench_sent_before(ticks, resumed)
-        device_step = steps(ticks["device_position"], device_start[:3])
-        device_turn = turns(ticks["device_quaternion"], device_start[3:])
+        sent = np.concatenate([before.sent[None], ticks["wrench_on_device"][:-1]])
+        sent[np.isin(ticks["tick"], resumed)] = 0.0
+        device_step = steps(ticks["device_position"], before.device[:3])
+        device_turn = turns(ticks["device_quaternion"], before.device[3:])
         device_work = np.sum(sent[:, :3] * device_step, axis=1)
         device_work += np.sum(sent[:, 3:] * device_turn, axis=1)
-        given = device_work
-        if late:
-            given = np.sum(sent[:, :3] * _later(device_step, late), axis=1)
-            given += np.sum(sent[:, 3:] * _later(device_turn, late), axis=1)
+        device_energy = summed(device_work, sums["device_energy"])
+        later = _later(ticks, following, late) if late else (device_step, device_turn)
+        given = np.sum(sent[:, :3] * later[0], axis=1) + np.sum(sent[:, 3:] * later[1], axis=1)
 
-        position, orientation = expected_handle(ticks, parameters, handle_start, tool_start)
-        on_device, injected = expected_wrench(ticks, parameters, resumed)
-        stored = ticks["kinetic"] + ticks["potential"] - start_energy
+        expected, guarded = before.guarded.after(ticks, resumed)
+        seen = expected.seen
+        stored = ticks["kinetic"] + ticks["potential"] - before.start_energy
         created = stored - coupling_work - ticks["actuator_work"] - ticks["external_work"]
         kept, lost = coupling_work, created  # without a law, all that the scene took up
+        kept_sum = np.zeros(len(ticks))
         if parameters.has_law:
             # the slack pays for what the environment creates, but a ramp or a limit lets through
             # only a share of the slack: counted here, it would blame a device that bears its law
             lost = np.minimum(created, 0.0)
-            kept = kept_behind_a_law(
+            parts, held = kept_behind_a_law(
                 parameters,
-                stretch=(stretch, twist),
-                stretched=(handle_step - tool_step, handle_turn - tool_turn),
+                stretch=(motion.stretch, motion.twist),
+                stretched=motion.stretched,
                 work=works,
                 passed=passed_shares(ticks, parameters),
-                since_start=since_start(ticks, resumed),
-                share=wrench_share(ticks, parameters, resumed),
+                since_start=seen.since_start,
+                share=seen.share,
+                share_before=before.share,
                 has_end=not late,
             )
+            kept_sum = summed(parts, sums["kept"])
+            kept = kept_sum + held
+        burnt = np.zeros(len(ticks))
+        if parameters.device_damping is not None:
+            parts = burnt_by_damping(parameters, *later, seen.interval, ~seen.first)
+            burnt = summed(parts, sums["burnt"])
         linear, angular = _slack_gains(parameters)
-        slack = 0.5 * linear * np.sum(tool_step**2, axis=1)
-        slack += 0.5 * angular * np.sum(tool_turn**2, axis=1)
+        slack = 0.5 * linear * np.sum(motion.tool_step**2, axis=1)
+        slack += 0.5 * angular * np.sum(motion.tool_turn**2, axis=1)
+        totals = {
+            "coupling_work": coupling_work,
+            "throughput": summed(np.abs(work), sums["throughput"]),
+            "device_energy": device_energy,
+            "device_throughput": summed(np.abs(device_work), sums["device_throughput"]),
+            "slack": summed(slack, sums["slack"]),
+            "given": summed(given, sums["given"]),
+            "burnt": burnt,
+            "kept": kept_sum,
+        }
+        last = ticks[-1]
         return cls(
             wrench_on_tool=law,
-            wrench_on_device=on_device,
-            injected_damping=injected,
-            handle_position=position,
+            wrench_on_device=expected.wrench,
+            injected_damping=expected.injected,
+            handle_position=expected.position,
             handle_turn=np.linalg.norm(
-                turn_between(orientation, ticks["handle_quaternion"]), axis=1
+                turn_between(expected.orientation, ticks["handle_quaternion"]), axis=1
             ),
             coupling_work=coupling_work,
-            throughput=np.cumsum(np.abs(work)),
-            device_energy=np.cumsum(device_work),
-            device_throughput=np.cumsum(np.abs(device_work)),
+            throughput=totals["throughput"],
+            device_energy=device_energy,
+            device_throughput=totals["device_throughput"],
             environment_energy=created,
-            slack=np.cumsum(slack),
-            kicked=_kicked(ticks, parameters, np.cumsum(given), lost + kept, resumed, late),
+            slack=totals["slack"],
+            kicked=_kicked(parameters, totals["given"], burnt, lost + kept),
+            reached=Reached(
+                handle=np.concatenate([last["handle_position"], last["handle_quaternion"]]),
+                tool=np.concatenate([last["tool_position"], last["tool_quaternion"]]),
+                device=np.concatenate([last["device_position"], last["device_quaternion"]]),
+                sent=last["wrench_on_device"].copy(),
+                start_energy=before.start_energy,
+                share=float(seen.share[-1]),
+                guarded=guarded,
+                sums={name: float(total[-1]) for name, total in totals.items()},
+            ),
         )
 
 
@@ -196,28 +205,21 @@ def _slack_gains(parameters: RunParameters) -> tuple[float, float]:
     return share * linear, share * angular
 
 
-def _kicked(
-    ticks: NDArray[np.void],
-    parameters: RunParameters,
-    given: Array,
-    taken: Array,
-    resumed: Array,
-    late: int,
-) -> Array:
+def _kicked(parameters: RunParameters, given: Array, burnt: Array, taken: Array) -> Array:
     """Returns Σ w·δp − Σ b‖δp‖²/t + what scene and coupling took up, in the device's scale."""
     if parameters.device_damping is None or (parameters.has_law and parameters.laws > 1):
-        return np.zeros(len(ticks))
-    start = np.array(parameters.device_start)
-    burnt = burnt_by_damping(
-        parameters,
-        _later(steps(ticks["device_position"], start[:3]), late),
-        _later(turns(ticks["device_quaternion"], start[3:]), late),
-        since_news(ticks, parameters),
-        ~is_first(ticks, resumed),
-    )
+        return np.zeros(len(given))
     return np.asarray(given - burnt + parameters.force_scale / parameters.scale * taken)
 
 
-def _later(moved: Array, late: int) -> Array:
-    """Returns each row's motion ``late`` rows on; none where the recording has ended by then."""
-    return np.concatenate([moved[late:], np.zeros_like(moved[:late])]) if late else moved
+def _later(
+    ticks: NDArray[np.void], following: NDArray[np.void] | None, late: int
+) -> tuple[Array, Array]:
+    """Returns the device's steps and turns ``late`` rows on; none where the records end by then."""
+    rows = ticks if following is None else np.concatenate([ticks, following])
+    moved = []
+    for field, of in (("device_position", steps), ("device_quaternion", turns)):
+        change = of(rows[field], rows[field][0])[late : late + len(ticks)]
+        missing = np.zeros((len(ticks) - len(change), 3))
+        moved.append(np.concatenate([change, missing]))
+    return moved[0], moved[1]

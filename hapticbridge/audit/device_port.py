@@ -22,7 +22,7 @@ def burnt_by_damping(
     interval: Array,
     is_running: NDArray[np.bool_],
 ) -> Array:
-    """Returns Σ b‖δp‖²/t, the least that the device's damping burns, (n,) in J.
+    """Returns b‖δp‖²/t of each tick, the least that the device's damping burns, (n,) in J.
 
     t is the time between two samples, T at least: a damper that moves by δp within t burns no less
     than at constant speed, and a missed deadline makes t longer. Dry friction is not counted: an
@@ -39,7 +39,7 @@ def burnt_by_damping(
     burnt = (parameters.device_damping or 0.0) * np.sum(moved**2, axis=1)
     burnt += (parameters.device_rotational_damping or 0.0) * np.sum(turned**2, axis=1)
     time = np.maximum(interval, parameters.period)
-    return np.asarray(np.cumsum(np.where(is_running, burnt / time, 0.0)))
+    return np.asarray(np.where(is_running, burnt / time, 0.0))
 
 
 def passed_shares(ticks: NDArray[np.void], parameters: RunParameters) -> tuple[Array, Array]:
@@ -63,9 +63,10 @@ def kept_behind_a_law(
     passed: tuple[Array, Array],
     since_start: Array,
     share: Array,
+    share_before: float = 0.0,
     has_end: bool = True,
-) -> Array:
-    """Returns what coupling and tool took up of what the handle gave, (n,) in J of the scene.
+) -> tuple[Array, Array]:
+    """Returns what coupling and tool took up of what the handle gave, in J of the scene.
 
         Σ c_k w_k + r_k V(e_k) − Σ max(0, r_k − r_{k−1}) (V(e_k) + ½‖δe_k‖²_{B/T})
 
@@ -83,9 +84,13 @@ def kept_behind_a_law(
         passed: c, the share of force and of torque that the guard let through, (n,) each.
         since_start: Ticks since the force began to rise, (n,).
         share: r, the share of the wrench that is let through while it rises or fades, (n,).
+        share_before: r of the tick before the first of these.
         has_end: Whether r_k V(e_k) is counted. It stands for what a device at e_k could still be
             given; where the device is no longer there, because the sample is old, only what it was
             given by then counts.
+
+    Returns:
+        What is summed over the ticks, each tick's part of it, and r V(e); (n,) each.
 
     References:
         Brown & Colgate 1997, eq. (6); here summed over time instead of frequency by frequency.
@@ -97,18 +102,18 @@ def kept_behind_a_law(
     )
     stiffness = (coupling.stiffness, coupling.rotational_stiffness)
     damping = (coupling.damping, coupling.rotational_damping)
-    rise = np.where(since_start == 0, share, np.diff(share, prepend=0.0))
-    kept = np.zeros(len(share))
+    rise = np.where(since_start == 0, share, np.diff(share, prepend=share_before))
+    summed, held = np.zeros(len(share)), np.zeros(len(share))
     for k, b, limit, e, de, w, c in zip(
         stiffness, damping, limits, stretch, stretched, work, passed, strict=True
     ):
         spring = _spring_energy(k, np.linalg.norm(e, axis=1), limit)
         found = spring + 0.5 * b / parameters.period * np.sum(de**2, axis=1)
         taken = np.where(since_start > 0, c * w, 0.0)
-        kept += np.cumsum(taken) - np.cumsum(rise * found)
+        summed += taken - rise * found
         if has_end:
-            kept += share * spring
-    return kept
+            held += share * spring
+    return summed, held
 
 
 def _spring_energy(stiffness: float, length: Array, limit: float) -> Array:

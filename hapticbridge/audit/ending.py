@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from hapticbridge.recording import Recording
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 
-def how_it_ended(recording: Recording) -> str:
+def how_it_ended(events: Sequence[Mapping[str, Any]]) -> str:
     """Returns a clause that names the event which ended the run; empty for an ordinary end.
 
     Args:
-        recording: Of the run.
+        events: The recording's.
     """
-    events = recording.events
     clauses = []
     for event in events:
         name, reason = event.get("event"), event.get("reason")

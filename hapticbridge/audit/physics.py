@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.audit.balance import Balance
-from hapticbridge.audit.guarded import has_flag
 from hapticbridge.audit.structure import TOLERANCE, Fault
+from hapticbridge.audit.watched import has_flag
 from hapticbridge.tick import TickFlag
 
 CONTROLLED_TOLERANCE = 1e-5
@@ -16,12 +16,13 @@ small velocity, which takes five digits of a sum's rounding. The re-simulation t
 
 
 def physics_fault(ticks: NDArray[np.void], balance: Balance) -> Fault | None:
-    """Returns the earliest disagreement between the records and their second computation.
+    """Returns the earliest disagreement between records and their second computation.
 
     Args:
         ticks: Records without gaps, ``TICK_DTYPE``.
         balance: What their poses and wrenches say by themselves.
     """
+    start = int(ticks["tick"][0])
     vectors = (
         ("handle_position", balance.handle_position, "m", "device pose and scale"),
         ("wrench_on_tool", balance.wrench_on_tool, "N or N m", "coupling law and poses"),
@@ -34,10 +35,11 @@ def physics_fault(ticks: NDArray[np.void], balance: Balance) -> Fault | None:
         if name == "wrench_on_device":
             is_active = has_flag(ticks, TickFlag.CONTROLLER_ACTIVE)
             allowed = np.where(is_active, allowed * CONTROLLED_TOLERANCE / TOLERANCE, allowed)
-        faults.append(_first(name, difference, allowed, unit, by))
+        faults.append(_first(name, start, difference, allowed, unit, by))
     faults.append(
         _first(
             "handle_quaternion",
+            start,
             balance.handle_turn,
             np.full(len(ticks), TOLERANCE),
             "rad",
@@ -53,26 +55,40 @@ def physics_fault(ticks: NDArray[np.void], balance: Balance) -> Fault | None:
         difference = np.abs(ticks[name] - joules)
         scale = throughput + np.abs(ticks["potential"])
         faults.append(
-            _first(name, difference, TOLERANCE * (1 + scale), "J", "recorded poses and wrenches")
+            _first(
+                name,
+                start,
+                difference,
+                TOLERANCE * (1 + scale),
+                "J",
+                "recorded poses and wrenches",
+            )
         )
     is_off = (ticks["flags"] & int(TickFlag.CONTROLLER_ACTIVE)) == 0
     damping = np.where(is_off, np.abs(ticks["injected_damping"]), 0.0)
-    faults.append(_first("injected_damping", damping, np.zeros(len(ticks)), "N s/m", "flags"))
+    faults.append(
+        _first("injected_damping", start, damping, np.zeros(len(ticks)), "N s/m", "flags")
+    )
     wrong = np.abs(ticks["injected_damping"] - balance.injected_damping)
     allowed = CONTROLLED_TOLERANCE * (1 + np.abs(balance.injected_damping))
-    faults.append(_first("injected_damping", wrong, allowed, "N s/m", "poses and energies"))
+    faults.append(_first("injected_damping", start, wrong, allowed, "N s/m", "poses and energies"))
     found = [fault for fault in faults if fault is not None]
     return min(found, key=lambda fault: fault.tick or 0) if found else None
 
 
 def _first(
-    name: str, difference: NDArray[np.float64], allowed: NDArray[np.float64], unit: str, by: str
+    name: str,
+    start: int,
+    difference: NDArray[np.float64],
+    allowed: NDArray[np.float64],
+    unit: str,
+    by: str,
 ) -> Fault | None:
     wrong = ~(difference <= allowed)  # also where a sum overflowed to NaN
     if not wrong.any():
         return None
-    tick = int(np.argmax(wrong))
-    amount = float(difference[tick])
+    at = int(np.argmax(wrong))
+    tick, amount = start + at, float(difference[at])
     return Fault(
         f"{name} of tick {tick} is {amount:.3g} {unit} off what {by} give",
         tick,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections import deque
 from dataclasses import dataclass
 from typing import Any
 
@@ -25,7 +26,7 @@ from hapticbridge.provenance import (
     start_of,
     versions,
 )
-from hapticbridge.recording import Recording
+from hapticbridge.recording import RecordingFile
 from hapticbridge.rendering import check_prepared, method_named
 from hapticbridge.tick import CLOCK_FIELDS, SAMPLE_DTYPE, TICK_DTYPE, TickFlag
 
@@ -41,6 +42,8 @@ NOT_RUN = "not re-simulated"
 
 _OUTSIDE = int(TickFlag.OVERRUN | TickFlag.DROPPED_BEFORE | TickFlag.STALE_SAMPLE)
 """Flags that the clock, the recorder and the device set, not the simulation."""
+
+_COMPARED = tuple(name for name in TICK_DTYPE.names or () if name not in CLOCK_FIELDS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,27 +74,144 @@ class Replay:
         return self.tick is not None
 
 
-def replay(recording: Recording, parameters: RunParameters) -> Replay:
-    """Simulates the recorded device motion again and compares all fields but the clock's.
+class Resimulation:
+    """Simulates the recorded device motion again, block by block.
+
+    What differs is kept as it comes; ``outcome`` tells. All fields are compared but the clock's.
+
+    Args:
+        recording: What is simulated again.
+        parameters: Of the recorded run.
 
     Raises:
         RecordingError: The attachments contradict the metadata, so the file was changed.
     """
-    reason = _obstacle(recording)
-    if reason:
-        return Replay(f"{NOT_RUN}: {reason}")
-    model = _model(recording, parameters)
-    data = mujoco.MjData(model)
-    # an error inside the C symbol would end the process, so MuJoCo takes its first step in Python
-    restore_state(model, data, recording.attachments[STATE_ATTACHMENT])
-    method_named(recording.meta.get("method", "")).step(model, data)
-    restore_state(model, data, recording.attachments[STATE_ATTACHMENT])
-    binding = Binding(model, data, parameters)
-    _check_start(recording, binding.state)
-    return _compared(recording, _simulated(recording, binding, data))
+
+    def __init__(self, recording: RecordingFile, parameters: RunParameters) -> None:
+        self._is_same_processor = _is_same_processor(recording)
+        self._first: tuple[int, str, float] | None = None
+        self._off = dict.fromkeys(_COMPARED, 0.0)
+        self._largest = dict.fromkeys(_COMPARED, 0.0)
+        self._done, self._is_over = 0, False
+        self._changes = deque(e for e in recording.events if e.get("event") in ("input", "resume"))
+        self._changed = self._read_ns = 0
+        self._resumed: list[Any] = [
+            event.get("tick") for event in recording.events if event.get("event") == "resume"
+        ]
+        self._obstacle = _obstacle(recording)
+        if self._obstacle:
+            return
+        model = _model(recording, parameters)
+        self._data = data = mujoco.MjData(model)
+        # an error inside the C symbol would end the process, so MuJoCo takes its first step in
+        # Python
+        restore_state(model, data, recording.attachments[STATE_ATTACHMENT])
+        method_named(recording.meta.get("method", "")).step(model, data)
+        restore_state(model, data, recording.attachments[STATE_ATTACHMENT])
+        self._binding = Binding(model, data, parameters)
+        _check_start(recording, self._binding.state)
+
+    def add(self, ticks: NDArray[np.void]) -> None:
+        """Simulates the next records, ``TICK_DTYPE``, at least one.
+
+        Raises:
+            RecordingError: An event among them is damaged.
+        """
+        if self._obstacle or self._is_over:
+            return
+        samples = np.zeros(len(ticks), SAMPLE_DTYPE)
+        samples["position"], samples["quaternion"] = (
+            ticks["device_position"],
+            ticks["device_quaternion"],
+        )
+        samples["buttons"] = ticks["buttons"]
+        rows = np.zeros(len(ticks), TICK_DTYPE)
+        outside = ticks["flags"] & int(TickFlag.STALE_SAMPLE | TickFlag.RESEATED)
+        elapsed = self._elapsed(ticks)
+        done = 0
+        while done < len(ticks) and not self._is_over:
+            end = len(ticks)
+            if self._changes:
+                end = min(self._due(self._changes[0]) - self._done, end)
+            state, row, part = self._binding.state, self._binding.row, slice(done, end)
+            count = simulate_recorded(
+                state, samples[part], outside[part], elapsed[part], row, rows[part]
+            )
+            self._is_over = count < end - done
+            done += count
+            if self._changes and done == end < len(ticks):
+                self._apply(self._changes.popleft())
+        self._compare(ticks[:done], rows[:done])
+        self._done += done
+
+    def outcome(self) -> Replay:
+        """Says how the records agree with what was simulated, when there are no more.
+
+        Raises:
+            RecordingError: An event after the last of them is damaged.
+        """
+        if self._obstacle:
+            return Replay(f"{NOT_RUN}: {self._obstacle}")
+        while self._changes and not self._is_over:
+            self._due(self._changes[0])
+            self._apply(self._changes.popleft())
+        off = max(self._off[name] / max(self._largest[name], 1.0) for name in _COMPARED)
+        if self._is_over and self._first is None:
+            return Replay("disagrees", self._done, "tool_position", float("nan"))
+        if self._first is None:
+            return Replay("bit for bit")
+        if not self._is_over and not self._is_same_processor and off <= FOREIGN_TOLERANCE:
+            return Replay("within 1e-9 (other processor)")
+        return Replay("disagrees", *self._first)
+
+    def _elapsed(self, ticks: NDArray[np.void]) -> NDArray[np.float64]:
+        """Returns the times between two readings in s, as the live loop counted them."""
+        read = ticks["read_ns"]
+        before = np.concatenate([[self._read_ns], read[:-1]])
+        before[np.isin(ticks["tick"], self._resumed)] = 0
+        self._read_ns = int(read[-1])
+        return np.asarray(1e-9 * (read - before))
+
+    def _due(self, event: dict[str, Any]) -> int:
+        tick = event.get("tick")
+        if not isinstance(tick, int) or tick < self._changed:
+            raise RecordingError(f"event '{event['event']}' names tick {tick!r}, out of order")
+        return tick
+
+    def _apply(self, event: dict[str, Any]) -> None:
+        self._changed = int(event["tick"])
+        if event["event"] == "resume":
+            self._binding.resume()
+            return
+        try:
+            apply_writes(self._data, event.get("writes", []))
+        except (HapticBridgeError, TypeError, ValueError) as error:
+            raise RecordingError(
+                f"event 'input' at tick {event.get('tick')} is damaged: {error}"
+            ) from None
+
+    def _compare(self, recorded_rows: NDArray[np.void], again: NDArray[np.void]) -> None:
+        if not len(again):
+            return
+        first: tuple[int, str, float] | None = None
+        for name in _COMPARED:
+            recorded, simulated = recorded_rows[name], again[name]
+            if name == "flags":
+                recorded, simulated = recorded & ~_OUTSIDE, simulated & ~_OUTSIDE
+            self._largest[name] = max(self._largest[name], float(np.abs(simulated).max()))
+            unequal = (recorded != simulated).reshape(len(again), -1).any(axis=1)
+            if not unequal.any():
+                continue
+            difference = np.abs(recorded - simulated).reshape(len(again), -1).max(axis=1)
+            self._off[name] = max(self._off[name], float(difference.max()))
+            at = int(np.argmax(unequal))
+            if first is None or at < first[0]:
+                first = (at, name, float(difference[at]))
+        if first is not None and self._first is None:
+            self._first = (self._done + first[0], *first[1:])
 
 
-def _obstacle(recording: Recording) -> str:
+def _obstacle(recording: RecordingFile) -> str:
     try:
         recorded = dict(json.loads(recording.meta.get("versions", "")))
     except (ValueError, TypeError, RecursionError):
@@ -104,7 +224,7 @@ def _obstacle(recording: Recording) -> str:
     return f"the file has no attachment '{missing[0]}'" if missing else ""
 
 
-def _model(recording: Recording, parameters: RunParameters) -> mujoco.MjModel:
+def _model(recording: RecordingFile, parameters: RunParameters) -> mujoco.MjModel:
     content = recording.attachments[MODEL_ATTACHMENT]
     if hashlib.sha256(content).hexdigest() != recording.meta.get("scene_sha256"):
         raise RecordingError("the attached model is not the one of scene_sha256")
@@ -143,7 +263,7 @@ def _model(recording: Recording, parameters: RunParameters) -> mujoco.MjModel:
     return model
 
 
-def _check_start(recording: Recording, state: NDArray[np.void]) -> None:
+def _check_start(recording: RecordingFile, state: NDArray[np.void]) -> None:
     """Refuses metadata that do not repeat the start of the attached scene."""
     for name in STARTS:
         recorded = meta_start(recording.meta, name)
@@ -156,91 +276,8 @@ def _check_start(recording: Recording, state: NDArray[np.void]) -> None:
             )
 
 
-def _is_same_processor(recording: Recording) -> bool:
+def _is_same_processor(recording: RecordingFile) -> bool:
     try:
         return bool(json.loads(recording.meta["host"])["processor"] == processor())
     except (KeyError, TypeError, ValueError, RecursionError):
         return True
-
-
-def _simulated(recording: Recording, binding: Binding, data: mujoco.MjData) -> NDArray[np.void]:
-    ticks = recording.ticks
-    samples = np.zeros(len(ticks), SAMPLE_DTYPE)
-    samples["position"], samples["quaternion"] = (
-        ticks["device_position"],
-        ticks["device_quaternion"],
-    )
-    samples["buttons"] = ticks["buttons"]
-    rows = np.zeros(len(ticks), TICK_DTYPE)
-    outside = ticks["flags"] & int(TickFlag.STALE_SAMPLE | TickFlag.RESEATED)
-    elapsed = _elapsed(ticks, recording.events)
-    changes = [event for event in recording.events if event.get("event") in ("input", "resume")]
-    done = 0
-    for event in [*changes, None]:
-        end = len(ticks) if event is None else _tick_of(event, done, len(ticks))
-        part = slice(done, end)
-        count = simulate_recorded(
-            binding.state, samples[part], outside[part], elapsed[part], binding.row, rows[part]
-        )
-        done += count
-        if done < end:
-            return rows[:done]
-        if event is not None:
-            _apply(event, binding, data)
-    return rows
-
-
-def _elapsed(ticks: NDArray[np.void], events: list[dict[str, Any]]) -> NDArray[np.float64]:
-    """Returns the times between two readings in s, as the live loop counted them."""
-    resumed: list[Any] = [e.get("tick") for e in events if e.get("event") == "resume"]
-    read = ticks["read_ns"]
-    before = np.concatenate([np.zeros(1, np.int64), read[:-1]])
-    before[np.isin(ticks["tick"], resumed)] = 0
-    return np.asarray(1e-9 * (read - before))
-
-
-def _tick_of(event: dict[str, Any], done: int, count: int) -> int:
-    tick = event.get("tick")
-    if not isinstance(tick, int) or tick < done:
-        raise RecordingError(f"event '{event['event']}' names tick {tick!r}, out of order")
-    return min(tick, count)
-
-
-def _apply(event: dict[str, Any], binding: Binding, data: mujoco.MjData) -> None:
-    if event["event"] == "resume":
-        binding.resume()
-        return
-    try:
-        apply_writes(data, event.get("writes", []))
-    except (HapticBridgeError, TypeError, ValueError) as error:
-        raise RecordingError(
-            f"event 'input' at tick {event.get('tick')} is damaged: {error}"
-        ) from None
-
-
-def _compared(recording: Recording, again: NDArray[np.void]) -> Replay:
-    ticks = recording.ticks[: len(again)]
-    first: tuple[int, str, float] | None = None
-    largest = 0.0
-    for name in TICK_DTYPE.names or ():
-        if name in CLOCK_FIELDS:
-            continue
-        recorded, simulated = ticks[name], again[name]
-        if name == "flags":
-            recorded, simulated = recorded & ~_OUTSIDE, simulated & ~_OUTSIDE
-        unequal = (recorded != simulated).reshape(len(again), -1).any(axis=1)
-        if not unequal.any():
-            continue
-        difference = np.abs(recorded - simulated).reshape(len(again), -1).max(axis=1)
-        largest = max(largest, float(difference.max() / max(np.abs(simulated).max(), 1.0)))
-        tick = int(np.argmax(unequal))
-        if first is None or tick < first[0]:
-            first = (tick, name, float(difference[tick]))
-    if len(again) < len(recording.ticks) and first is None:
-        first = (len(again), "tool_position", float("nan"))
-        largest = float("inf")
-    if first is None:
-        return Replay("bit for bit")
-    if not _is_same_processor(recording) and largest <= FOREIGN_TOLERANCE:
-        return Replay("within 1e-9 (other processor)")
-    return Replay("disagrees", *first)

@@ -45,6 +45,8 @@ class Devices:
         for family in FAMILIES:
             out.print(f"{family.name}: {plain(family.about)}")
             out.print(f"  axes {family.axes}; force {family.force}; rate {family.rate}")
+            if family.medium is not None:
+                out.print(f"  {plain(family.medium())}")
         out.print("[bold]plugged in[/bold]")
         for device in plugged:
             out.print(f"{device.family}: {plain(str(device))} at {plain(device.path)}")
@@ -54,19 +56,20 @@ class Devices:
             out.print("none; 'simulated' and 'trajectory:FILE' need none")
         for sentence in unseen:
             out.print(f"[yellow]warning:[/yellow] {plain(sentence)}")
-        if any(device.problem for device in plugged):
+        usable = [device for device in plugged if device.problem is None]
+        if any(RULES_COMMAND in (device.problem or "") for device in plugged):
             out.print(
                 f"next: {RULES_COMMAND} | sudo tee {RULES_FILE}, "
                 "then sudo udevadm control --reload && sudo udevadm trigger"
             )
-        elif plugged:
-            out.print(f"next: hapticbridge run peg_in_hole --device {_specification(plugged)}")
+        elif usable:
+            specification = _specification(usable[0], plugged)
+            out.print(f"next: hapticbridge run peg_in_hole --device {specification}")
         return 0
 
 
-def _specification(plugged: list[Plugged]) -> str:
-    """Returns what to type for the first device; its serial where there are more like it."""
-    first = plugged[0]
+def _specification(first: Plugged, plugged: list[Plugged]) -> str:
+    """Returns what to type for a device; its serial where there are more like it."""
     is_only = sum(device.family == first.family for device in plugged) == 1
     return first.family if is_only else f"{first.family}:serial={first.serial or first.path}"
 
@@ -82,6 +85,7 @@ def _facts(plugged: list[Plugged], unseen: list[str]) -> dict[str, Any]:
                 "force": family.force,
                 "rate": family.rate,
                 "options": list(family.options),
+                "medium": None if family.medium is None else family.medium(),
                 "ids": [{"id": str(usb_id), "model": usb_id.model} for usb_id in family.ids],
             }
             for family in FAMILIES

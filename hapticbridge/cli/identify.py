@@ -11,19 +11,30 @@ from typing import Annotated
 import tyro
 from rich.table import Table
 
-from hapticbridge.cli.terminal import err, out, plain, print_json, progress, quantity, tell
+from hapticbridge.cli.terminal import (
+    out,
+    plain,
+    print_json,
+    progress,
+    quantity,
+    tell,
+    write_figure,
+)
+from hapticbridge.cli.zwidth import next_command
 from hapticbridge.clock import RealClock, SimulatedClock, period_of
 from hapticbridge.device import AXES, open_device
 from hapticbridge.device.profile import Profile, own_folder
 from hapticbridge.errors import HapticBridgeError, choices
+from hapticbridge.felt import coupling_sentences
 from hapticbridge.identify import Identification, identify
 from hapticbridge.identify.fit import CONFIDENCE, Estimate
 from hapticbridge.identify.identification import DURATION, FORCE_SHARE, TRAVEL
 from hapticbridge.identify.measured_profile import measured_profile
 from hapticbridge.identify.picture import draw_identification
 from hapticbridge.passivity import ZWidth, z_width
-from hapticbridge.picture import check_ending, write_picture
-from hapticbridge.study.theory import draw_z_width
+from hapticbridge.picture import check_ending
+from hapticbridge.rendering import default_method
+from hapticbridge.study.theory import draw_z_width, recommended
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,6 +102,7 @@ class Identify:
             serial=device.info.serial,
             date=date.today().isoformat(),
             duration=self.duration,
+            workspace=getattr(device, "workspace", None),
         )
         path = self._write(profile, is_real=device.info.is_real)
         if self.as_json:
@@ -104,8 +116,7 @@ class Identify:
             (self.zwidth, draw_z_width(z) if self.zwidth and z else None),
         ):
             if target is not None and figure is not None:
-                write_picture(figure, target)
-                err.print(f"wrote {plain(str(target))}")
+                write_figure(figure, target)
         return 0
 
     def _check(self) -> None:
@@ -193,9 +204,12 @@ def _print(result: Identification, z: ZWidth | None) -> None:
         return
     out.print(
         f"with the lower ends (b = {z.device_damping:.4g} N s/m) the largest safe stiffness is "
-        f"{z.limit[0]:.4g} N/m at B = 0; use K = {z.corner.stiffness:.4g} N/m, "
-        f"B = {z.corner.damping:.3g} N s/m ({z.corner_limited_by})"
+        f"{z.limit[0]:.4g} N/m at B' = 0 ({z.corner_limited_by})"
     )
+    (told,) = coupling_sentences(z.corner, default_method(), z.period, 1)
+    felt = recommended(z)
+    out.print(f"use {told}")
+    out.print(f"next: {plain(next_command(felt.stiffness, felt.damping, 1.0 / z.period))}")
 
 
 def _told(estimate: Estimate) -> str:
@@ -214,6 +228,6 @@ def _facts(result: Identification, z: ZWidth | None, path: Path | None) -> dict[
         "largest_stiffness": None if z is None else float(z.limit[0]),
         "coupling": None
         if z is None
-        else {"stiffness": z.corner.stiffness, "damping": z.corner.damping},
+        else {"stiffness": recommended(z).stiffness, "damping": recommended(z).damping},
         "profile": None if path is None else str(path),
     }

@@ -11,11 +11,22 @@ from typing import Annotated
 import tyro
 
 from hapticbridge.audit import AuditReport, audit
-from hapticbridge.cli.terminal import err, out, plain, print_error, quantity
+from hapticbridge.cli.judge_many import print_audits, print_unreadable
+from hapticbridge.cli.judge_what_if import print_what_if
+from hapticbridge.cli.terminal import err, out, plain, progress, quantity
 from hapticbridge.errors import RecordingError
 from hapticbridge.picture import check_ending
 from hapticbridge.recording import read_recording, repair
 from hapticbridge.report import plot_recording, write_report
+from hapticbridge.study.audits import (
+    audit_all,
+    check_table_name,
+    find_recordings,
+    reports_of,
+    worst_exit_code,
+    write_audits,
+)
+from hapticbridge.whatif import changes_from, draw_what_if, what_if
 
 _USUAL_EVENTS = ("start", "stop", "input")
 _COLOURS = {"passive": "green", "active": "red", "invalid": "magenta"}
@@ -25,14 +36,19 @@ _COLOURS = {"passive": "green", "active": "red", "invalid": "magenta"}
 class Audit:
     """Judge recorded runs offline: passive, active or invalid, and why.
 
-    Exit code 0 if all are passive and no device lacks damping, 1 if not, 2 if a file is no
-    recording. Example:
+    Several recordings, a folder (searched through and through) or a pattern give a table, sorted by
+    the margin: the least share left, of the slack and of the device's damping; negative beyond the
+    limit. What is no recording is named and passed over. Exit code 0 if all are passive and no
+    device lacks damping, 1 if not, 2 if a file is no recording; with --what-if it is that of the
+    changed runs. Examples:
 
         hapticbridge audit run.mcap --plot run.png
+        hapticbridge audit runs/ --jobs 4 --table runs.parquet
+        hapticbridge audit run.mcap --what-if stiffness=3000 --what-if rate=500
     """
 
     files: tyro.conf.Positional[tuple[Path, ...]]
-    """Recordings (.mcap)."""
+    """Recordings (.mcap), folders of them, or patterns such as 'runs/**/a*.mcap'."""
     strict: bool = False
     """Accept only passivity itself, not the slack that the device's damping leaves."""
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
@@ -41,34 +57,79 @@ class Audit:
     """Draw force, position and energies into this picture (.png, .svg or .pdf; one file only)."""
     report: Path | None = None
     """Write a self-contained HTML page (one file only)."""
+    table: Path | None = None
+    """Write a row per recording to this file: .parquet (extra 'tables'), .csv or .json."""
+    jobs: int | None = None
+    """Processes for many recordings; by default as many as there are cores, 1: none but this."""
+    scheduler: str | None = None
+    """Address of a dask.distributed scheduler to audit on (extra 'cluster'); its workers must see
+    the files under the same names."""
+
+    what_if: Annotated[
+        tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="NAME=VALUE")
+    ] = ()
+    """Simulate the recorded hand again with this changed, as often as wanted: stiffness, damping,
+    rotational_stiffness, rotational_damping, method, rate, substeps, scale, force_scale,
+    contact_stiffness, or a parameter of the scene. Twice: with the recorded motion, and, where the
+    device is known, with a model hand. With --plot both are drawn (one file only)."""
 
     def execute(self) -> int:
         """Audits; returns the exit code."""
         if not self.files:
             raise RecordingError("audit needs at least one recording")
-        if len(self.files) > 1 and (self.plot or self.report):
-            raise RecordingError("--plot and --report take one recording at a time")
         if self.plot is not None:
             check_ending(self.plot)
-        reports, unreadable = [], 0
-        for file in self.files:
-            try:
-                with err.status(f"auditing {plain(str(file))} …"):
-                    report = audit(file, strict=self.strict)
-            except RecordingError as error:
-                if len(self.files) == 1:
-                    raise
-                print_error(error)  # one bad file must not hide what the others are
-                unreadable = 2
-                continue
-            reports.append(report)
-            if not self.as_json:
-                _print_report(report)
+        if self.table is not None:
+            check_table_name(self.table)
+        files = find_recordings(self.files)
+        if files != list(self.files) or len(files) > 1 or self.table is not None:
+            return self._audit_many(files)
+        if self.what_if:
+            return self._ask(files[0])
+        with err.status(f"auditing {plain(str(files[0]))} …"):
+            report = audit(files[0], strict=self.strict)
         if self.as_json:
-            out.print_json(json.dumps([json.loads(report.to_json()) for report in reports]))
+            out.print_json(json.dumps([json.loads(report.to_json())]))
+        else:
+            _print_report(report)
         if self.plot is not None or self.report is not None:
-            self._draw(reports[0])
-        return max(unreadable, *(report.exit_code for report in reports), 0)
+            self._draw(report)
+        return report.exit_code
+
+    def _audit_many(self, files: list[Path]) -> int:
+        if self.plot or self.report or self.what_if:
+            raise RecordingError("--plot, --report and --what-if take one recording at a time")
+        with progress("auditing") as show:
+            table = audit_all(
+                files,
+                strict=self.strict,
+                jobs=self.jobs,
+                scheduler=self.scheduler,
+                progress=show,
+            )
+        if self.as_json:
+            out.print_json(json.dumps(reports_of(table)))
+            print_unreadable(table)
+        else:
+            print_audits(table)
+        if self.table is not None:
+            write_audits(table, self.table)
+            err.print(f"wrote {plain(str(self.table))}")
+        return worst_exit_code(table)
+
+    def _ask(self, file: Path) -> int:
+        if self.report or self.strict:
+            raise RecordingError("--what-if goes with --plot and --json, not --report or --strict")
+        with progress("what if") as show:
+            found = what_if(file, changes_from(self.what_if), progress=show)
+        if self.as_json:
+            out.print_json(found.to_json())
+        else:
+            print_what_if(found)
+        if self.plot is not None:
+            draw_what_if(found, self.plot)
+            err.print(f"wrote {plain(str(self.plot))}")
+        return found.exit_code
 
     def _draw(self, report: AuditReport) -> None:
         recording = read_recording(report.path)

@@ -13,8 +13,10 @@ import mujoco
 import tyro
 from rich.markup import escape
 
+from hapticbridge.cli.bound import Bound
 from hapticbridge.cli.chart import ChartCommand
 from hapticbridge.cli.check import Check
+from hapticbridge.cli.data import Compare, Export
 from hapticbridge.cli.devices import Devices
 from hapticbridge.cli.doctor import Doctor
 from hapticbridge.cli.identify import Identify
@@ -23,7 +25,7 @@ from hapticbridge.cli.run import Run
 from hapticbridge.cli.scenes import Scenes
 from hapticbridge.cli.stability import Stability
 from hapticbridge.cli.terminal import err, out, print_error
-from hapticbridge.cli.theory import Bound, Zwidth
+from hapticbridge.cli.zwidth import Zwidth
 from hapticbridge.errors import HapticBridgeError, SafetyTrip
 
 Command = (
@@ -35,6 +37,8 @@ Command = (
     | Annotated[Stability, tyro.conf.subcommand("stability")]
     | Annotated[ChartCommand, tyro.conf.subcommand("chart")]
     | Annotated[Doctor, tyro.conf.subcommand("doctor")]
+    | Annotated[Export, tyro.conf.subcommand("export")]
+    | Annotated[Compare, tyro.conf.subcommand("compare")]
     | Annotated[Repair, tyro.conf.subcommand("repair")]
     | Annotated[Zwidth, tyro.conf.subcommand("zwidth")]
     | Annotated[Bound, tyro.conf.subcommand("bound")]

@@ -17,12 +17,12 @@ from hapticbridge.cli.run_words import announce, announce_measured, print_summar
 from hapticbridge.cli.terminal import err, out, tell
 from hapticbridge.clock import RealClock, SimulatedClock, period_of
 from hapticbridge.coupling import Coupling
-from hapticbridge.device import DeviceInfo, device_for
+from hapticbridge.device import Device, DeviceInfo, device_for
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.guard import USUAL_ENERGY, USUAL_STRETCH, Limits
 from hapticbridge.kernel.parameters import checked_substeps
 from hapticbridge.rendering import Method, default_method, method_named
-from hapticbridge.scene import load_scene, settings_from
+from hapticbridge.scene import Scene, load_scene, settings_from
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +79,7 @@ class Run:
     """Coupling stiffness K in N/m; by default the stiffest that is safe on the device."""
     damping: float | None = None
     """Coupling damping B in N s/m that is to be felt; of it 'lossless' uses B' = B - KT/2 and
-    'compensated' B - KT, 0 at least, and the device needs KT/2 + B'."""
+    'compensated' B - KT, 0 at least, and the device needs KT/2 + B'. The others use it as it is."""
     rotational_stiffness: float | None = None
     """Rotational coupling stiffness in N m/rad."""
     rotational_damping: float | None = None
@@ -120,7 +120,13 @@ class Run:
         if self.record is not None and self.record.exists() and not self.overwrite:
             raise RecordingError(f"'{self.record}' exists; choose another file or add --overwrite")
         scene = load_scene(self.scene, self.grip, **settings_from(self.settings))
-        device = device_for(scene, self.device, tell)
+        with ExitStack() as stack:
+            device = device_for(scene, self.device, tell)
+            stack.callback(device.close)  # what is refused from here on must not leave it claimed
+            return self._feel(scene, device, stack)
+
+    def _feel(self, scene: Scene, device: Device, stack: ExitStack) -> int:
+        """Runs the bridge on a device that is open; returns the exit code."""
         scales = self.scale, self.scale if self.force_scale is None else self.force_scale
         bridge = Bridge(
             scene,
@@ -154,12 +160,12 @@ class Run:
         )
         if not self.as_json:
             announce(bridge, scales, self.substeps, is_method_asked=self.method is not None)
-        with ExitStack() as stack:
-            with err.status("preparing (the first run on a machine compiles for about 20 s) …"):
-                stack.enter_context(bridge)
-            if not self.as_json:
-                announce_measured(bridge)
-            summary = bridge.run(self.duration)
+        with err.status("preparing (the first run on a machine compiles for about 20 s) …"):
+            stack.enter_context(bridge)
+        if not self.as_json:
+            announce_measured(bridge)
+        summary = bridge.run(self.duration)
+        stack.close()
         if self.as_json:
             values = asdict(summary) | {"verdict": summary.verdict}
             out.print_json(json.dumps(values | {"recording": str(self.record or "") or None}))

@@ -12,7 +12,7 @@ from hapticbridge.bridge import Bridge
 from hapticbridge.certificate import device_conditions
 from hapticbridge.cli.terminal import err, out, quantity
 from hapticbridge.coupling import Coupling
-from hapticbridge.felt import coupling_sentences
+from hapticbridge.felt import coupling_sentences, is_always_held
 from hapticbridge.rendering import default_method, method_named
 from hapticbridge.summary import Summary
 
@@ -31,7 +31,10 @@ def announce(
     coupling, method = bridge.coupling, bridge.method
     scene, device = escape(bridge.scene.name), escape(bridge.device.info.name)
     err.print(f"[bold]{scene}[/bold] on {device}, {1 / bridge.period:g} Hz, method {method.name}")
-    for sentence in coupling_sentences(bridge.used, method, bridge.period, substeps):
+    held = is_always_held(bridge.scene.model, bridge.scene.grip)
+    for sentence in coupling_sentences(
+        bridge.used, method, bridge.period, substeps, is_always_held=held
+    ):
         err.print(f"  {sentence}")
     if not method.has_law:
         err.print(
@@ -56,9 +59,8 @@ def announce(
     ):
         err.print(
             f"[yellow]warning:[/yellow] asked for B = {coupling.damping:g} N s/m, B_r = "
-            f"{coupling.rotational_damping:g} N m s/rad, felt is B = {least.damping:g}, B_r = "
-            f"{least.rotational_damping:g}: method {method.name} cannot show less damping at this "
-            "stiffness and rate; lower the stiffness or raise the rate"
+            f"{coupling.rotational_damping:g} N m s/rad: less than method {method.name} can show "
+            "at this stiffness and rate; lower the stiffness or raise the rate"
         )
     if not method.has_law:
         return  # told when the scene is prepared and the weld measured: ``announce_measured``

@@ -6,12 +6,15 @@ import json
 import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
+from matplotlib.figure import Figure
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from hapticbridge.jsonable import jsonable
+from hapticbridge.picture import write_picture
 
 out = Console(highlight=False, soft_wrap=True)
 """Results, on stdout."""
@@ -59,6 +62,13 @@ def progress(words: str) -> Iterator[Callable[..., None]]:
             bar.update(task, completed=done, total=total, description=told)
 
         yield show
+
+
+def write_figure(figure: Figure, path: Path) -> None:
+    """Writes a picture and says so on stderr."""
+    with err.status("drawing …"):
+        write_picture(figure, path)
+    err.print(f"wrote {plain(str(path))}")
 
 
 def print_json(facts: object) -> None:

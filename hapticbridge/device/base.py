@@ -177,8 +177,8 @@ class DeviceInfo:
         """Reads what ``to_json`` wrote.
 
         Raises:
-            DeviceError: The text is not a JSON object with exactly these keys, or a value is
-                invalid.
+            DeviceError: The text is not a JSON object with these keys (``serial`` may be missing),
+                or a value is invalid.
         """
         try:
             values = json.loads(text)
@@ -192,7 +192,8 @@ class DeviceInfo:
                 f"device data holds {choices(unknown)}, which it does not know; "
                 f"it knows {choices(names)}"
             )
-        if missing := names - values.keys():
+        needed = {f.name for f in dataclasses.fields(cls) if f.default is dataclasses.MISSING}
+        if missing := needed - values.keys():
             raise DeviceError(f"device data lacks {choices(missing)}")
         return cls(**values)
 

@@ -35,7 +35,7 @@ from hapticbridge.device.falcon_motion import (
     resolution,
 )
 from hapticbridge.device.falcon_packets import SIZE, ReplyStream, Request
-from hapticbridge.device.falcon_start import LONGEST_PERIOD, SILENCE, bring_up, home, silent
+from hapticbridge.device.falcon_start import LONGEST_PERIOD, SILENCE, bring_up, home, insist, silent
 from hapticbridge.device.falcon_timing import measured_timing
 from hapticbridge.device.hex_log import HexLog
 from hapticbridge.device.plugged import Family, Tell, UsbId, chosen, tell_nobody
@@ -59,9 +59,7 @@ class FalconDevice:
         link: To the Falcon.
         name: What errors call it.
         firmware: File with its program, for one that has none; None: it must have it.
-        mass: Apparent mass at the grip in kg, > 0, or None.
-        damping: b at the grip in N s/m, >= 0, or None.
-        friction: Coulomb friction in N, >= 0, or None.
+        mass, damping, friction: At the grip in kg, N s/m and N, or None.
         tell: Told what the user should know or do.
 
     Raises:
@@ -184,15 +182,18 @@ class FalconDevice:
     def write(self, wrench: NDArray[np.float64]) -> None:
         """Sends a force, and with it the next question; the torque is left out.
 
+        What is not taken in time is left out; but no force at all is sent until it is taken.
+
         Args:
             wrench: Shape (6,), in the device's frame.
 
         Raises:
-            DeviceLost: It is gone.
+            DeviceLost: It is gone, or does not take that it is to give no force.
         """
         self._command(self._motion, wrench, self._bytes)
         self._asked_before, self._asked = self._asked, self._link.now()
-        self._link.write(self._packet)
+        if not self._link.write(self._packet) and not wrench.any():
+            insist(self._link, self._packet, self._name)
 
     def close(self) -> None:
         """Commands zero force, puts the lights out and lets the device go."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import array
+
 from hapticbridge.device.falcon_boot import (
     Link,
     ask,
@@ -20,6 +22,10 @@ SILENCE = 0.05
 LONGEST_PERIOD = 0.02
 """In s. It is asked once a tick; slower, two lost replies would already count as silence."""
 
+ZERO_TRIES = 20
+"""How often a packet without force is sent again that was not taken, for 1 ms each: no watchdog of
+a Falcon is known, so the force before it would stay."""
+
 HOMING_TIME = 60.0
 """In s: how long the user has to move the grip through its range."""
 
@@ -29,6 +35,21 @@ _ALL = 7  # a bit per encoder
 def silent(name: str) -> DeviceLost:
     """Returns the error that a Falcon has fallen silent."""
     return DeviceLost(f"{name}: gave no usable reply for {1e3 * SILENCE:g} ms")
+
+
+def insist(link: Link, packet: array.array[int], name: str) -> None:
+    """Sends a packet without force that was not taken until it is.
+
+    Args:
+        link: To the Falcon.
+        packet: Of no force.
+        name: What errors call it.
+
+    Raises:
+        DeviceLost: It is gone, or takes none in ``ZERO_TRIES``.
+    """
+    if not any(link.write(packet) for _ in range(ZERO_TRIES)):
+        raise DeviceLost(f"{name}: does not take that it is to give no force")
 
 
 def bring_up(link: Link, stream: ReplyStream, name: str, firmware: str | None, tell: Tell) -> None:

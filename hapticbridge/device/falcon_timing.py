@@ -22,6 +22,10 @@ SHARE = 0.95
 """Share of replies that came back within the delay, no unit. The longest are the host's own stalls,
 which the loop counts as missed deadlines."""
 
+TRIES = 3
+"""How often the timing is measured before a Falcon counts as silent: a reply can be lost on the
+serial line, and a busy host can stall for as long as one is waited for."""
+
 _ANSWER_TIME = 0.05  # s, longer is silence
 
 
@@ -47,10 +51,15 @@ def measured_timing(link: Link, stream: ReplyStream, name: str) -> tuple[float, 
     Raises:
         DeviceLost: It fell silent.
     """
-    return _rate(link, stream, name), _delay(link, stream, name)
+    for _ in range(TRIES):
+        rate = _rate(link, stream)
+        if rate is not None and (delay := _delay(link, stream)) is not None:
+            return rate, delay
+    raise DeviceLost(f"{name}: fell silent while its timing was measured")
 
 
-def _rate(link: Link, stream: ReplyStream, name: str) -> float:
+def _rate(link: Link, stream: ReplyStream) -> float | None:
+    """Measures the rate in Hz; None where a reply did not come."""
     for _ in range(UNDER_WAY):
         send_question(link)
     begin = last = link.now()
@@ -58,24 +67,25 @@ def _rate(link: Link, stream: ReplyStream, name: str) -> float:
     while last - begin < TIME:
         found = answers(link, stream, _ANSWER_TIME)
         if not found:
-            raise DeviceLost(f"{name}: fell silent while its rate was measured")
+            return None
         last = link.now()
         if deliveries == 0:
             begin = last  # time counts from the first delivery
         deliveries += 1
         for _ in range(found):
             send_question(link)
-    while answers(link, stream, 2 * PACE):
-        pass  # the last ones, which nobody waited for
+    for _ in range(UNDER_WAY):
+        answers(link, stream, 2 * PACE)  # the last ones, which nobody waited for
     return (deliveries - 1) / (last - begin)
 
 
-def _delay(link: Link, stream: ReplyStream, name: str) -> float:
+def _delay(link: Link, stream: ReplyStream) -> float | None:
+    """Measures the delay in s; None likewise."""
     times = []
     end = link.now() + TIME
     while (begin := link.now()) < end:
         if not ask(link, stream, 0, _ANSWER_TIME):
-            raise DeviceLost(f"{name}: fell silent while its delay was measured")
+            return None
         times.append(link.now() - begin)
         while (left := begin + PACE - link.now()) > 0:
             link.wait(left)

@@ -6,11 +6,14 @@ from collections.abc import Sequence
 
 from hapticbridge.device import hid_search, usb_search
 from hapticbridge.device.falcon import FAMILY as FALCON
-from hapticbridge.device.plugged import Family, Plugged
+from hapticbridge.device.forcedimension import FAMILY as FORCE_DIMENSION
+from hapticbridge.device.haply import FAMILY as HAPLY
+from hapticbridge.device.pid import FAMILY as PID
+from hapticbridge.device.plugged import Family, Plugged, UsbId
 from hapticbridge.device.rawhid import FAMILY as RAWHID
 from hapticbridge.device.spacemouse import FAMILY as SPACEMOUSE
 
-FAMILIES: tuple[Family, ...] = (FALCON, SPACEMOUSE, RAWHID)
+FAMILIES: tuple[Family, ...] = (FALCON, SPACEMOUSE, RAWHID, PID, HAPLY, FORCE_DIMENSION)
 """In the order in which they are listed."""
 
 RULES_FILE = "/etc/udev/rules.d/70-hapticbridge.rules"
@@ -30,6 +33,8 @@ def plugged_devices() -> list[Plugged]:
 
 def plugged_of(family: Family) -> list[Plugged]:
     """Lists a family's devices that are plugged in, with what keeps each from being opened."""
+    if family.find is not None:
+        return family.find()
     if family.transport == "hid":
         return hid_search.find(family)
     return usb_search.find(family)
@@ -51,7 +56,8 @@ def udev_rules(families: Sequence[Family] = FAMILIES) -> str:
     """Returns the udev rules that let whoever sits at the machine open these devices.
 
     A HID device is matched by its kernel name, ``BUS:VENDOR:PRODUCT.NUMBER``, which it has over
-    Bluetooth too, where there is no USB parent to look at.
+    Bluetooth too, where there is no USB parent to look at. A rule cannot ask a device what it can
+    do, so a family that is a class gets a rule for each of its devices that is plugged in.
     """
     lines = [
         "# Lets whoever sits at the machine open haptic devices. Written by",
@@ -61,8 +67,13 @@ def udev_rules(families: Sequence[Family] = FAMILIES) -> str:
         "#   sudo udevadm control --reload && sudo udevadm trigger",
     ]
     for family in families:
+        if not family.ids and family.recognises is None:
+            continue  # no node to open: a program of the maker's has it
         lines += ["", f"# {family.name}: {family.about}"]
-        for usb_id in family.ids:
+        ids = family.ids if family.recognises is None else _ids_plugged_in(family)
+        if not ids:
+            lines.append("# none is plugged in: plug it in, and write these rules again")
+        for usb_id in ids:
             vendor, product = f"{usb_id.vendor:04x}", f"{usb_id.product:04x}"
             if family.transport == "hid":
                 kernels = f"*:{vendor}:{product}.*".upper()
@@ -74,3 +85,9 @@ def udev_rules(families: Sequence[Family] = FAMILIES) -> str:
                 )
             lines += [f"# {usb_id.model}", f'{match}, TAG+="uaccess"']
     return "\n".join(lines) + "\n"
+
+
+def _ids_plugged_in(family: Family) -> tuple[UsbId, ...]:
+    """Returns the products of a family that are plugged in, each once."""
+    found = {(one.vendor, one.product): one.name for one in plugged_of(family)}
+    return tuple(UsbId(*numbers, name) for numbers, name in sorted(found.items()))

@@ -5,7 +5,10 @@ from __future__ import annotations
 import os
 import time
 from collections import deque
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import TextIO
 
 from hapticbridge.errors import DeviceError
 
@@ -25,6 +28,9 @@ class HexLog:
 
     Args:
         path: File to write; None takes ``HAPTICBRIDGE_LOG_USB``, and keeps nothing without it.
+
+    Raises:
+        DeviceError: The file cannot be written; said before the device is opened, not after a run.
     """
 
     def __init__(self, path: str | Path | None = None) -> None:
@@ -33,6 +39,9 @@ class HexLog:
         self._lines: deque[tuple[int, str, bytes]] = deque(maxlen=MOST_LINES)
         self._count = 0
         self._origin = time.monotonic_ns()
+        if self._path is not None:
+            with _appending(self._path):
+                pass
 
     @property
     def is_on(self) -> bool:
@@ -61,12 +70,20 @@ class HexLog:
         path, self._path = self._path, None
         dropped = self._count - len(self._lines)
         try:
-            with path.open("a", encoding="ascii") as file:
+            with _appending(path) as file:
                 if dropped:
                     file.write(f"# {dropped} transfers before these were not kept\n")
                 for when, direction, data in self._lines:
                     file.write(f"{1e-9 * (when - self._origin):.6f} {direction} {data.hex(' ')}\n")
-        except OSError as error:
-            raise DeviceError(f"the log '{path}' cannot be written: {error.strerror}") from None
         finally:
             self._lines.clear()
+
+
+@contextmanager
+def _appending(path: Path) -> Iterator[TextIO]:
+    try:
+        with path.open("a", encoding="ascii") as file:
+            yield file
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or str(error)
+        raise DeviceError(f"the log '{path}' cannot be written: {reason}") from None

@@ -3,13 +3,29 @@
 from __future__ import annotations
 
 import importlib
-import os
+import re
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any, Protocol, cast
 
-from hapticbridge.device.plugged import Family, Plugged, permission_problem
-from hapticbridge.device.usb_bus import on_the_bus
+from hapticbridge.device.plugged import Family, Plugged, access_problem
+from hapticbridge.device.usb_bus import members, on_the_bus
+
+NO_NODE = (
+    "the kernel gives it no hidraw node; load its driver (for 046d: 'sudo modprobe hid_logitech') "
+    "and plug it in again"
+)
+NO_HIDAPI = "hidapi cannot be loaded; 'pip install hidapi' brings it"
+
+CLASS = Path("/sys/class/hidraw")
+"""Where Linux shows HID devices to everybody; absent on other systems."""
+
+CONTROLLERS = frozenset({(0x01, 0x04), (0x01, 0x05), (0x0F, 0x01)})
+"""Usage page and usage of joysticks, game pads and physical interface devices: what a family that
+has no list of products looks at more closely. Others (keyboards!) are not opened to be asked."""
+
+_INTERVAL, _UNITS = re.compile(r"(\d+)(ms|us)"), {"ms": 1e-3, "us": 1e-6}
 
 
 class HidHandle(Protocol):
@@ -32,6 +48,12 @@ class HidHandle(Protocol):
 
     def get_feature_report(self, report_num: int, max_length: int) -> Sequence[int]:
         """Asks for a feature report."""
+
+    def get_input_report(self, report_num: int, max_length: int) -> Sequence[int]:
+        """Asks for an input report."""
+
+    def get_report_descriptor(self) -> Sequence[int]:
+        """Returns the device's report descriptor."""
 
     def close(self) -> None:
         """Closes the device."""
@@ -68,54 +90,93 @@ def find(family: Family, api: HidApi | None = None) -> list[Plugged]:
     Args:
         family: What to look for.
         api: hidapi or what stands for it; None takes the real one. Only then the USB bus is asked
-            too, for devices that the kernel gave no hidraw node.
+            too, for devices without a hidraw node, and for all of them where hidapi is missing.
 
     Returns:
-        One entry per device, none where hidapi is missing.
+        One entry per device.
     """
     module = hid_api() if api is None else api
     found: dict[str, Plugged] = {}
     for entry in module.enumerate() if module is not None else ():
         vendor, product = int(entry["vendor_id"]), int(entry["product_id"])
-        model = family.model(vendor, product)
         usage = entry.get("usage_page"), entry.get("usage")
-        if model is None or family.usage not in (None, usage):
-            continue
         raw = entry["path"]
         path = raw.decode(errors="replace") if isinstance(raw, bytes) else str(raw)
-        is_closed = api is None and path.startswith("/") and not os.access(path, os.R_OK | os.W_OK)
         # hidapi names one node once per top-level collection
-        found.setdefault(
-            path,
-            Plugged(
-                family=family.name,
-                name=entry.get("product_string") or model,
-                serial=entry.get("serial_number") or "",
-                path=path,
-                vendor=vendor,
-                product=product,
-                transport="hid",
-                problem=permission_problem(path) if is_closed else None,
-            ),
-        )
-    return [*found.values(), *(_without_node(family) if api is None else [])]
-
-
-def _without_node(family: Family) -> list[Plugged]:
-    """Lists the family's devices on the USB bus that have no hidraw node at all."""
-    return [
-        Plugged(
+        if path in found or family.usage not in (None, usage):
+            continue
+        if family.recognises is None:
+            model = family.model(vendor, product)
+        elif usage in CONTROLLERS and family.recognises(report_descriptor(path, module)):
+            model = family.about
+        else:
+            model = None
+        if model is None:
+            continue
+        is_node = api is None and path.startswith("/")
+        found[path] = Plugged(
             family=family.name,
-            name=device.name or model,
-            serial=device.serial,
-            path=str(device.node),
-            vendor=device.vendor,
-            product=device.product,
+            name=entry.get("product_string") or model,
+            serial=entry.get("serial_number") or "",
+            path=path,
+            vendor=vendor,
+            product=product,
             transport="hid",
-            problem="the kernel gives it no hidraw node; load its driver (for 046d: "
-            "'sudo modprobe hid_logitech') and plug it in again",
+            problem=access_problem(path) if is_node else None,
         )
-        for device in on_the_bus()
-        if not device.has_hidraw
-        and (model := family.model(device.vendor, device.product)) is not None
-    ]
+    if api is not None:
+        return list(found.values())
+    unlisted = (d for d in on_the_bus() if module is None or not d.has_hidraw)
+    problem = NO_NODE if module is not None else NO_HIDAPI
+    return [*found.values(), *members(family, unlisted, lambda _: problem)]
+
+
+def report_descriptor(path: str, api: HidApi | None) -> bytes:
+    """Returns a device's report descriptor, empty where nobody tells.
+
+    Linux shows it to everybody in sysfs, so nothing is opened there.
+    """
+    try:
+        return (CLASS / Path(path).name / "device/report_descriptor").read_bytes()
+    except OSError:
+        pass
+    if api is None:
+        return b""
+    handle = api.device()
+    try:
+        handle.open_path(path.encode())
+    except (OSError, ValueError):
+        return b""
+    try:
+        return descriptor_of(handle)
+    finally:
+        handle.close()
+
+
+def descriptor_of(handle: HidHandle) -> bytes:
+    """Returns the report descriptor of an open device, empty where hidapi does not tell."""
+    try:
+        return bytes(handle.get_report_descriptor())
+    except (OSError, ValueError, AttributeError):  # hidapi before 0.14 has no such call
+        return b""
+
+
+def polling(path: str) -> tuple[float | None, float | None]:
+    """Returns how often the host asks a device for a report and offers it one, in s each.
+
+    Args:
+        path: A hidraw node.
+
+    Returns:
+        None where the kernel does not say, and for a device without that endpoint.
+    """
+    found: dict[str, float] = {}
+    try:
+        for endpoint in sorted((CLASS / Path(path).name / "device/..").glob("ep_*")):
+            direction = (endpoint / "direction").read_text().strip()
+            interval = (endpoint / "interval").read_text().strip()
+            if (told := _INTERVAL.fullmatch(interval)) is not None:
+                found[direction] = int(told[1]) * _UNITS[told[2]]
+    except (OSError, ValueError):
+        pass  # it was just unplugged
+    return found.get("in"), found.get("out")

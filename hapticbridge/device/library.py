@@ -42,7 +42,8 @@ def open_device(spec: str, *, tell: Tell = tell_nobody, **options: object) -> De
       recording. All after the colon is the file's name, commas and colons too.
     - a device that is plugged in, by its family's name (``hapticbridge devices`` lists them), with
       options that the family has: ``spacemouse:speed=0.1,turn=1,dead_band=0.05``,
-      ``rawhid:serial=12345,damping=2``, ``falcon:firmware=FILE``. ``serial`` picks one of several,
+      ``rawhid:serial=12345,damping=2``, ``falcon:firmware=FILE``, ``pid:newtons=4,travel=0.08``,
+      ``haply:serial=049D``, ``forcedimension:library=FILE``. ``serial`` picks one of several,
       ``log=FILE`` keeps what went over the wire. What its driver does not know comes from the
       profile of the unit or its kind, or from that of ``profile=NAME`` (or a file, or ``none``).
 
@@ -63,16 +64,22 @@ def open_device(spec: str, *, tell: Tell = tell_nobody, **options: object) -> De
     """
     name, _, rest = spec.partition(":")
     if (family := family_named(name)) is not None:
-        valid = (*family.options, "profile")
+        valid = tuple(dict.fromkeys((*family.options, "profile")))
         refuse_unknown(name, options, valid)
         asked = {**options, **parsed(name, rest, valid)}
-        wanted = asked.pop("profile", None)
+        wanted = asked.get("profile")
+        if "profile" not in family.options:
+            asked.pop("profile", None)
         chosen = None if wanted in (None, "none") else profile_named(str(wanted))
         device = family.open(asked, tell)
-        if wanted is None:
-            chosen = profile_of(name, device.info.serial)
-        if chosen is not None:
-            device.info = chosen.fill(device.info)
+        try:
+            if wanted is None:
+                chosen = profile_of(name, device.info.serial)
+            if chosen is not None:
+                device.info = chosen.fill(device.info)
+        except BaseException:
+            device.close()
+            raise
         return device
     if name not in _OPENERS:
         names = choices([*_OPENERS, *(family.name for family in FAMILIES)])

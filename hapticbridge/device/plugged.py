@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 from hapticbridge.device.base import Device
@@ -45,8 +47,9 @@ class Family:
     Attributes:
         name: What ``open_device`` knows it by.
         about: What it is, in a few words.
-        ids: Every product of the family.
-        transport: ``hid`` (hidapi) or ``usb`` (pyusb).
+        ids: Every product of the family, none where it is a class.
+        transport: ``hid`` (hidapi), ``usb`` (pyusb), ``service`` (a program of the maker's that
+            runs beside us) or ``library`` (one of the maker's that is loaded).
         axes: Which axes it has, in words, because it may differ from unit to unit.
         force: What force it can show, in words.
         rate: How often it reports, in words.
@@ -54,18 +57,27 @@ class Family:
         open: Finds the device and opens it; takes the options and whom to tell.
         usage: Usage page and usage of the HID collection that speaks the protocol, where a product
             has several; None where any will do.
+        find: Lists what is plugged in, where neither hidapi nor pyusb can tell.
+        medium: Says in a sentence whether the service or library is there, likewise.
+        sought: What is looked for, in words, where numbers on the USB bus do not say it.
+        recognises: Tells from a HID report descriptor whether a device is one of them, for a family
+            that is a class and has no list of products; None for all others.
     """
 
     name: str
     about: str
     ids: tuple[UsbId, ...]
-    transport: Literal["hid", "usb"]
+    transport: Literal["hid", "usb", "service", "library"]
     axes: str
     force: str
     rate: str
     options: tuple[str, ...]
     open: Callable[[Mapping[str, object], Tell], Device]
     usage: tuple[int, int] | None = None
+    find: Callable[[], list[Plugged]] | None = None
+    medium: Callable[[], str] | None = None
+    sought: str = ""
+    recognises: Callable[[bytes], bool] | None = None
 
     def model(self, vendor: int, product: int) -> str | None:
         """Returns the model that has these numbers, or None if it is none of the family."""
@@ -84,9 +96,9 @@ class Plugged:
         name: What the device calls itself, else the model's name; printable, and so is the serial.
         serial: Its serial number, empty where it has none or does not tell.
         path: Where it is opened: a device node.
-        vendor: Its numbers.
+        vendor: Its numbers on the USB bus; 0 where whoever lists it does not tell.
         product: Likewise.
-        transport: ``hid`` or ``usb``.
+        transport: As the family's.
         problem: Why it cannot be opened, and what to do, in one sentence; None where it can.
     """
 
@@ -104,8 +116,9 @@ class Plugged:
             object.__setattr__(self, field, printable(getattr(self, field)))
 
     def __str__(self) -> str:
-        serial = f", serial {self.serial}" if self.serial else ""
-        return f"{self.name} ({self.vendor:04x}:{self.product:04x}{serial})"
+        numbers = f"{self.vendor:04x}:{self.product:04x}" if self.vendor else ""
+        facts = ", ".join(filter(None, (numbers, f"serial {self.serial}" if self.serial else "")))
+        return f"{self.name} ({facts})" if facts else self.name
 
 
 def printable(text: str) -> str:
@@ -119,6 +132,15 @@ def permission_problem(path: str) -> str:
         f"no permission to open {path}; '{RULES_COMMAND}' prints the rule that grants it to "
         "whoever sits at the machine"
     )
+
+
+def access_problem(path: str) -> str | None:
+    """Says why this user cannot open a node that the kernel has told of; None where nothing."""
+    if os.access(path, os.R_OK | os.W_OK):
+        return None
+    if not Path(path).exists():
+        return f"there is no {path} yet, or none in this container; try again in a second"
+    return permission_problem(path)
 
 
 def chosen(family: Family, plugged: Sequence[Plugged], serial: object = None) -> Plugged:
@@ -135,8 +157,12 @@ def chosen(family: Family, plugged: Sequence[Plugged], serial: object = None) ->
     """
     if not plugged:
         vendors = ", ".join(sorted({f"{usb_id.vendor:04x}" for usb_id in family.ids}))
-        is_one = len(family.ids) == 1
-        looked = str(family.ids[0]) if is_one else f"{len(family.ids)} products of {vendors}"
+        looked = f"{len(family.ids)} products of {vendors}"
+        if len(family.ids) == 1:
+            looked = str(family.ids[0])
+        elif family.recognises is not None:
+            looked = "any product, by what it says it can do"
+        looked = family.sought or looked
         raise DeviceError(
             f"no device '{family.name}' is plugged in (looked for {looked}); 'hapticbridge "
             "devices' lists what is, and what permission is missing"

@@ -90,7 +90,8 @@ class RawHidDevice:
             The pose before the first tick, shape (1,), ``SAMPLE_DTYPE``.
 
         Raises:
-            DeviceError: The period is not, the device sends nothing, or it must be homed first.
+            DeviceError: The period is not, the device sends nothing, must be homed first, or
+                reports a fault.
         """
         self._period = checked_period(period)
         watchdog = max(SHORTEST_WATCHDOG, WATCHDOG_PERIODS * period)
@@ -108,6 +109,7 @@ class RawHidDevice:
                 f"{self._name} does not know its pose yet: home or calibrate it, as its builder "
                 "says, and start again"
             )
+        self._refuse_fault(states.newest)
         self._fill(states.newest)
         return self._sample.copy()
 
@@ -141,8 +143,7 @@ class RawHidDevice:
             sample[0] = self._sample[0]
             return int(TickFlag.STALE_SAMPLE)
         self._silent_ticks = 0
-        if states.newest.status & (Status.FAULT | Status.NOT_READY):
-            raise DeviceError(f"{self._name} reports a fault of its own and gives no force")
+        self._refuse_fault(states.newest)
         self._fill(states.newest)
         sample[0] = self._sample[0]
         return 0
@@ -189,6 +190,10 @@ class RawHidDevice:
         """How many force frames the device had not obeyed yet when it sent its newest state."""
         state = self.states.newest
         return 0 if state is None else (self._sequence - state.echo) & 0xFFFF
+
+    def _refuse_fault(self, state: State) -> None:
+        if state.status & (Status.FAULT | Status.NOT_READY):
+            raise DeviceError(f"{self._name} reports a fault of its own and gives no force")
 
     def _fill(self, state: State) -> None:
         """Makes a sample of a state; axes that the device lacks stay where they are."""

@@ -9,7 +9,7 @@ from hapticbridge.errors import DeviceError, choices
 FILES = ("path",)
 """Options that take all that comes after them: the file's name, commas too."""
 
-TEXTS = ("hand", "serial", "firmware", "log", "profile")
+TEXTS = ("hand", "serial", "firmware", "log", "profile", "reverse", "service", "library")
 """Options that are text up to the next comma; a serial number may have leading zeros."""
 
 WHOLE = ("delay",)

@@ -8,6 +8,7 @@ from collections import deque
 from typing import Protocol
 
 from hapticbridge.device.hex_log import HexLog
+from hapticbridge.device.hid_requests import HidRequests
 from hapticbridge.device.hid_search import HidApi, HidHandle, hid_api
 from hapticbridge.device.plugged import Plugged
 from hapticbridge.errors import DeviceError, DeviceLost
@@ -56,6 +57,10 @@ class HidLink:
         name: What errors call it.
         is_overlapped: Whether reports are sent by a thread. Without it ``write`` is hidapi's own.
         log: Keeps what goes over the wire.
+        slots: How many kinds of report there are of which each newest one is to be sent, >= 1.
+
+    Attributes:
+        requests: Asks the device and sets its features, waiting for the answer.
     """
 
     def __init__(
@@ -65,13 +70,16 @@ class HidLink:
         *,
         is_overlapped: bool = True,
         log: HexLog | None = None,
+        slots: int = 1,
     ) -> None:
         self._handle = handle
         self._name = name
         self._log = log or HexLog("")
+        self.requests = HidRequests(handle, self._log)
         self._is_open = True
         self._lost = ""
-        self._outgoing: deque[bytes] = deque(maxlen=1)  # the newest wins
+        # in each the newest wins, and they take turns
+        self._outgoing: list[deque[bytes]] = [deque(maxlen=1) for _ in range(slots)]
         self._wake, self._is_idle = threading.Event(), threading.Event()
         self._is_idle.set()
         self._busy_since = 0.0
@@ -89,6 +97,7 @@ class HidLink:
         *,
         is_overlapped: bool = True,
         log: HexLog | None = None,
+        slots: int = 1,
     ) -> HidLink:
         """Opens a device that was found.
 
@@ -105,7 +114,7 @@ class HidLink:
             raise DeviceError(
                 f"{plugged} at {plugged.path} cannot be opened; it may be in use or just unplugged"
             ) from None
-        return cls(handle, str(plugged), is_overlapped=is_overlapped, log=log)
+        return cls(handle, str(plugged), is_overlapped=is_overlapped, log=log, slots=slots)
 
     def take(self) -> list[bytes]:
         """Returns the reports that have come since the last call, oldest first, without waiting.
@@ -134,11 +143,12 @@ class HidLink:
         """
         return self._read(timeout_ms)
 
-    def write(self, report: bytes) -> None:
-        """Sends a report; overlapped, it replaces one that has not been sent yet.
+    def write(self, report: bytes, slot: int = 0) -> None:
+        """Sends a report; overlapped, it replaces one of its slot that has not been sent yet.
 
         Args:
             report: Its number first, 0 where the device's reports have none.
+            slot: Which kind of report it is.
 
         Raises:
             DeviceLost: The device is gone, or took no report for ``LONGEST_WRITE``.
@@ -152,8 +162,19 @@ class HidLink:
         if not self._is_idle.is_set() and time.monotonic() - self._busy_since > LONGEST_WRITE:
             self._lost = f"{self._name} takes no reports any more"
             raise DeviceLost(self._lost)
-        self._outgoing.append(report)
+        self._outgoing[slot].append(report)
         self._wake.set()
+
+    def send(self, report: bytes) -> None:
+        """Sends a report before it returns, and drops what still waits to be sent: for set-up.
+
+        Raises:
+            DeviceLost: The device is gone, or takes no reports.
+        """
+        for waiting in self._outgoing:
+            waiting.clear()
+        if self._lost or not self._is_idle.wait(LONGEST_WRITE) or not self._is_sent(report):
+            raise DeviceLost(self._lost or f"{self._name} did not take a report")
 
     def close(self) -> None:
         """Sends what is still to be sent, for at most ``LONGEST_WRITE``, and lets the device go."""
@@ -192,12 +213,21 @@ class HidLink:
         while True:
             self._wake.wait()
             self._wake.clear()
-            while self._outgoing:
-                self._busy_since = time.monotonic()
-                self._is_idle.clear()
-                if not self._is_sent(self._outgoing.popleft()):
-                    self._lost = f"{self._name} is gone: it took no report"
-                    return
-                self._is_idle.set()
+            while any(self._outgoing):
+                for waiting in self._outgoing:
+                    if not self._is_newest_sent(waiting):
+                        self._lost = f"{self._name} is gone: it took no report"
+                        return
             if not self._is_open:
                 return
+
+    def _is_newest_sent(self, waiting: deque[bytes]) -> bool:
+        """Sends what waits in a slot, if anything; returns whether that went well."""
+        self._busy_since = time.monotonic()
+        self._is_idle.clear()
+        try:
+            return self._is_sent(waiting.popleft())
+        except IndexError:
+            return True  # nothing waits here, or it was just dropped
+        finally:
+            self._is_idle.set()

@@ -22,6 +22,10 @@ from hapticbridge.errors import DeviceError, DeviceLost
 PACKET = 64
 """Bytes per bulk packet on full speed. Reads ask for one packet each, so that they end with it."""
 
+MOST_PACKETS = 1024
+"""Packets kept for ``take``, the newest. An FTDI bridge sends one a millisecond though nobody asks,
+and between two runs nobody takes them: without a bound they would be 0.4 GB after an hour."""
+
 READ_MS = 100
 """Longest wait of the reader thread for one packet, in ms: how long ``close`` may have to wait."""
 
@@ -60,12 +64,11 @@ class UsbLink:
         self._device, self._name = device, name
         self._read_from, self._write_to = read_from, write_to
         self._log = log or HexLog("")
-        self._packets: deque[bytes] = deque()
+        self._packets: deque[bytes] = deque(maxlen=MOST_PACKETS)
         self._arrived = threading.Event()
         self._lost = ""
         self._is_open = True
-        self._switch_interval = sys.getswitchinterval()
-        sys.setswitchinterval(min(SWITCH_INTERVAL, self._switch_interval))
+        _prompt_threads(+1)
         self._reader = threading.Thread(target=self._read_always, name="usb", daemon=True)
         self._reader.start()
         atexit.register(self.close)  # a thread inside libusb must not outlive the interpreter
@@ -177,7 +180,7 @@ class UsbLink:
         self._reader.join(2e-3 * READ_MS)
         if not self._reader.is_alive():  # else it is still inside libusb with what this would free
             usb.util.dispose_resources(self._device)
-        sys.setswitchinterval(self._switch_interval)
+        _prompt_threads(-1)
         self._log.close()
 
     def _require(self) -> None:
@@ -209,6 +212,18 @@ class UsbLink:
                 self._log.add("<", packet)
             self._packets.append(packet)
             self._arrived.set()
+
+
+_prompt = {"links": 0, "usual": 0.0}
+
+
+def _prompt_threads(change: int) -> None:
+    """Makes threads change promptly while any link is open, and as before after the last one."""
+    if _prompt["links"] == 0:
+        _prompt["usual"] = sys.getswitchinterval()
+    _prompt["links"] += change
+    usual = _prompt["usual"]
+    sys.setswitchinterval(min(SWITCH_INTERVAL, usual) if _prompt["links"] else usual)
 
 
 def _claim(device: Any) -> None:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-import os
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
+
+from hapticbridge.device.plugged import Family, Plugged
 
 BUS = Path("/sys/bus/usb/devices")
 """Where Linux lists what is plugged in; absent on a machine without USB and on other systems."""
@@ -32,11 +34,6 @@ class OnTheBus:
     serial: str
     node: Path
     has_hidraw: bool
-
-    @property
-    def is_permitted(self) -> bool:
-        """Whether this user may read and write the node."""
-        return os.access(self.node, os.R_OK | os.W_OK)
 
 
 def on_the_bus(bus: Path | None = None) -> list[OnTheBus]:
@@ -75,6 +72,32 @@ def on_the_bus(bus: Path | None = None) -> list[OnTheBus]:
             )
         )
     return found
+
+
+def members(
+    family: Family, devices: Iterable[OnTheBus], problem: Callable[[OnTheBus], str | None]
+) -> list[Plugged]:
+    """Returns those of a family, as they are listed.
+
+    Args:
+        family: Which.
+        devices: What is on the bus.
+        problem: Says why a device cannot be opened; None where it can.
+    """
+    return [
+        Plugged(
+            family=family.name,
+            name=device.name or model,
+            serial=device.serial,
+            path=str(device.node),
+            vendor=device.vendor,
+            product=device.product,
+            transport=family.transport,
+            problem=problem(device),
+        )
+        for device in devices
+        if (model := family.model(device.vendor, device.product)) is not None
+    ]
 
 
 def _text(path: Path) -> str:

@@ -11,8 +11,8 @@ import usb.backend.libusb1
 import usb.core
 import usb.util
 
-from hapticbridge.device.plugged import Family, Plugged, permission_problem
-from hapticbridge.device.usb_bus import NODES, OnTheBus, on_the_bus
+from hapticbridge.device.plugged import Family, Plugged, access_problem, permission_problem
+from hapticbridge.device.usb_bus import NODES, OnTheBus, members, on_the_bus
 
 
 def libusb() -> Any:
@@ -45,31 +45,15 @@ def find(family: Family, backend: Any = None) -> list[Plugged]:
     Returns:
         One entry per device, in the order of their places on the bus.
     """
-    listed = [] if backend is not None else _told_by_kernel(family)
+    listed = [] if backend is not None else members(family, on_the_bus(), _problem)
     source = libusb() if backend is None and not listed else backend
     return listed if source is None else [_described(family, d) for d in devices_of(family, source)]
 
 
-def _told_by_kernel(family: Family) -> list[Plugged]:
-    def problem(device: OnTheBus) -> str | None:
-        if libusb() is None:
-            return "libusb cannot be loaded; reinstall the package 'libusb-package'"
-        return None if device.is_permitted else permission_problem(str(device.node))
-
-    return [
-        Plugged(
-            family=family.name,
-            name=device.name or model,
-            serial=device.serial,
-            path=str(device.node),
-            vendor=device.vendor,
-            product=device.product,
-            transport="usb",
-            problem=problem(device),
-        )
-        for device in on_the_bus()
-        if (model := family.model(device.vendor, device.product)) is not None
-    ]
+def _problem(device: OnTheBus) -> str | None:
+    if libusb() is None:
+        return "libusb cannot be loaded; reinstall the package 'libusb-package'"
+    return access_problem(str(device.node))
 
 
 def devices_of(family: Family, backend: Any) -> list[Any]:

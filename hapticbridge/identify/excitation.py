@@ -29,8 +29,9 @@ GROWTH, SHRINKING = 0.7, 0.5
 while it moves more. Faster overshoots the travel, slower wastes the run."""
 
 ENOUGH, TOO_MUCH = 0.4, 0.6
-"""Shares of the travel between which the signal is left as it is; the largest deflection overshoots
-them by about as much again, on a heavy device of little damping."""
+"""Shares of the travel between which the signal is left as it is. The largest deflection is 1.4
+times the travel then, and twice it on a light device that breaks away from its friction (largest of
+300 runs: 2.14). Larger shares overshoot more, smaller ones move too few steps of an encoder."""
 
 _RESCUE = 0.05
 """Time in s in which the signal shrinks while the axis is beyond the travel, as a light one is that

@@ -28,7 +28,7 @@ from hapticbridge.tick import SAMPLE_DTYPE, TickFlag
 
 Array = NDArray[np.float64]
 
-RUNAWAY = 2.5
+RUNAWAY = 3.0
 """Multiple of the allowed travel at which a run is given up: the device is not doing what the force
 says, so no force is better than more of it."""
 

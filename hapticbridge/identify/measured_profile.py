@@ -16,7 +16,13 @@ _FIELDS = {
 
 
 def measured_profile(
-    result: Identification, *, device: str, serial: str, date: str, duration: float
+    result: Identification,
+    *,
+    device: str,
+    serial: str,
+    date: str,
+    duration: float,
+    workspace: tuple[float, float, float] | None = None,
 ) -> Profile:
     """Returns a profile of the unit: of each kind of axis the values that promise least.
 
@@ -26,6 +32,8 @@ def measured_profile(
         serial: Of the unit; may be empty.
         date: When, as the file should say it.
         duration: Seconds per axis, likewise.
+        workspace: In m, of a device whose metres are the user's word: what was measured holds only
+            with it.
     """
     info = result.info
     source = f"identified on {date}: {duration:g} s per axis ({', '.join(result.fits)}), unheld"
@@ -44,6 +52,8 @@ def measured_profile(
     quantities["delay"] = _quantity(max(late, key=lambda delay: delay.most), source)
     for name in ("force_limit", "torque_limit", "speed_limit"):
         quantities[name] = Quantity(float(getattr(info, name)), "the driver's, not measured")
+    if workspace is not None:
+        quantities["workspace"] = Quantity(workspace, "stated or assumed when it was identified")
     return Profile(
         name=f"{info.name} {serial}".strip(),
         device=device,

@@ -64,6 +64,7 @@ def answer_step(state: NDArray[np.void], row: NDArray[np.void], substep: int) ->
         add_coupling_work(state, s.law_work)
         return OK
     s.flags = MIDPOINT if s.was_midpoint else 0
+    s.lossless_ticks += s.was_midpoint
     square = dot(force, force) + dot(torque, torque)
     # MuJoCo ignores a control beyond its limit, so a wrench that is to be applied must stay below
     if (

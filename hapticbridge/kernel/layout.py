@@ -183,6 +183,7 @@ _RUNNING_COUNTS = (
     "was_midpoint",
     "is_near",
     "is_held",
+    "lossless_ticks",
     "hold",
     "has_positions",
     "equality_rows",

@@ -32,6 +32,20 @@ def checked_substeps(substeps: int, error: type[HapticBridgeError] = HapticBridg
     return Arguments(error).whole("substeps", substeps, least=1, most=MOST_SUBSTEPS)
 
 
+def refuse_substeps(scheme: int, substeps: int) -> None:
+    """Refuses more than one MuJoCo step per tick for a scheme that takes but one.
+
+    Raises:
+        HapticBridgeError: Says why the scheme takes but one.
+    """
+    reasons = {
+        DIRECT: "a tool without mass has no motion to divide",
+        LOSSLESS: "a lossless coupling carries half of a tick's wrench over to the next",
+    }
+    if substeps != 1 and scheme in reasons:
+        raise HapticBridgeError(f"substeps is {substeps!r}; {reasons[scheme]}, so it must be 1")
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunParameters:
     """Everything beside scene and device motion that decides what a run computes.
@@ -40,7 +54,7 @@ class RunParameters:
         grip: Name of the site on the tool.
         period: T in s.
         substeps: MuJoCo steps per tick, >= 1.
-        coupling: K and B.
+        coupling: K and B' of the law, which is not what is felt (``rendering.Method.used``).
         scale: Handle motion per device motion, without unit.
         force_scale: Force on the device per force on the tool, without unit. Power is equal on both
             sides where it equals ``scale``; torques return by force_scale / scale.
@@ -103,16 +117,7 @@ class RunParameters:
                 f"contact stiffness is {stiffness!r} N/m; it must be finite and > 0 for a tool "
                 "without mass, and has no meaning for another"
             )
-        if self.scheme == DIRECT and self.substeps != 1:
-            raise HapticBridgeError(
-                f"substeps is {self.substeps!r}; a tool without mass has no motion to divide, so "
-                "it must be 1"
-            )
-        if self.scheme == LOSSLESS and self.substeps != 1:
-            raise HapticBridgeError(
-                f"substeps is {self.substeps!r}; a lossless coupling carries half of a tick's "
-                "wrench over to the next, so it must be 1"
-            )
+        refuse_substeps(self.scheme, self.substeps)
         if self.ramp_ticks < 0:
             raise HapticBridgeError(f"ramp_ticks is {self.ramp_ticks}; it must be >= 0")
         for name in ("device_origin", "handle_origin", "device_start"):

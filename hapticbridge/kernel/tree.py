@@ -92,10 +92,12 @@ def has_passive_forces(model: mujoco.MjModel) -> bool:
 
 def _touches(model: mujoco.MjModel, equality: int, bodies: NDArray[np.bool_]) -> bool:
     """Tells whether an equality constraint holds the tree; what cannot be told counts as yes."""
-    kind, ids = model.eq_objtype[equality], (model.eq_obj1id[equality], model.eq_obj2id[equality])
-    owner = {
-        _OBJECTS.mjOBJ_BODY: lambda i: i,
-        _OBJECTS.mjOBJ_SITE: lambda i: model.site_bodyid[i],
-        _OBJECTS.mjOBJ_JOINT: lambda i: model.jnt_bodyid[i],
-    }.get(_OBJECTS(kind))
-    return owner is None or any(bool(bodies[owner(i)]) for i in ids if i >= 0)
+    ids = np.array([model.eq_obj1id[equality], model.eq_obj2id[equality]])
+    ids = ids[ids >= 0]
+    if model.eq_type[equality] == mujoco.mjtEq.mjEQ_JOINT:  # of joints the object's type says none
+        return bool(bodies[model.jnt_bodyid[ids]].any())
+    if model.eq_objtype[equality] == _OBJECTS.mjOBJ_BODY:
+        return bool(bodies[ids].any())
+    if model.eq_objtype[equality] == _OBJECTS.mjOBJ_SITE:
+        return bool(bodies[model.site_bodyid[ids]].any())
+    return True

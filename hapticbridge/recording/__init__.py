@@ -2,6 +2,8 @@
 
 from hapticbridge.recording.format import Attachment as Attachment
 from hapticbridge.recording.reader import Recording as Recording
+from hapticbridge.recording.reader import RecordingFile as RecordingFile
+from hapticbridge.recording.reader import open_recording as open_recording
 from hapticbridge.recording.reader import read_recording as read_recording
 from hapticbridge.recording.recorder import Recorder as Recorder
 from hapticbridge.recording.recovery import repair as repair

@@ -18,6 +18,8 @@ import zstandard
 from mcap.opcode import Opcode
 from mcap.writer import MCAP0_MAGIC
 
+from hapticbridge.recording.file_bytes import FileBytes
+
 MAGIC = MCAP0_MAGIC
 """How an MCAP file starts and ends."""
 
@@ -59,7 +61,7 @@ class Fields:
         stop: Where it ends.
     """
 
-    def __init__(self, data: bytes, start: int, stop: int) -> None:
+    def __init__(self, data: bytes | FileBytes, start: int, stop: int) -> None:
         self._data, self._position, self._stop = data, start, stop
 
     @property
@@ -104,25 +106,26 @@ _Item: TypeAlias = Block | tuple[int, Fields]
 
 
 class Container:
-    """An MCAP file in memory.
+    """An MCAP file.
 
     Args:
-        data: The file's bytes, which start with the MCAP magic.
+        data: The file, which starts with the MCAP magic.
 
     Attributes:
         is_cut: The end of the file is missing.
         problems: What is damaged, one sentence each; complete after ``records`` is exhausted.
     """
 
-    def __init__(self, data: bytes) -> None:
+    def __init__(self, data: FileBytes) -> None:
         self._data = data
         self.problems: list[str] = []
         self._summary, self._end = 0, len(data)
         footer = len(data) - len(MAGIC) - _FOOTER_SIZE
         self.is_cut = not (
             footer >= len(MAGIC)
-            and data.endswith(MAGIC)
-            and _RECORD.unpack_from(data, footer) == (Opcode.FOOTER, _FOOTER.size)
+            and data[-len(MAGIC) :] == MAGIC
+            and _RECORD.unpack(data[footer : footer + _RECORD.size])
+            == (Opcode.FOOTER, _FOOTER.size)
         )
         self._chunks: list[int] = []
         if not self.is_cut:
@@ -130,11 +133,12 @@ class Container:
             self._read_footer(footer)
 
     def _read_footer(self, footer: int) -> None:
-        start, _, crc = _FOOTER.unpack_from(self._data, footer + _RECORD.size)
+        start, _, crc = _FOOTER.unpack(self._data[footer + _RECORD.size : footer + _FOOTER_SIZE])
         if start == 0 and crc == 0:
             return
-        covered = memoryview(self._data)[start : self._end + _FOOTER_SIZE - 4]
-        if not len(MAGIC) <= start <= footer or (crc and zlib.crc32(covered) != crc):
+        if not len(MAGIC) <= start <= footer or (
+            crc and self._data.checksum(start, self._end + _FOOTER_SIZE - 4) != crc
+        ):
             self.problems.append("the index at the end of the file is damaged (checksum)")
         if len(MAGIC) <= start <= footer:
             self._summary = start
@@ -179,7 +183,7 @@ class Container:
 
     def _check_attachment(self, body: int, stop: int) -> None:
         crc = int.from_bytes(self._data[max(body, stop - 4) : stop], "little")
-        if crc and zlib.crc32(memoryview(self._data)[body : stop - 4]) != crc:
+        if crc and self._data.checksum(body, stop - 4) != crc:
             start = body - _RECORD.size
             self.problems.append(
                 f"the attachment at byte {start} is damaged: its checksum does not match"
@@ -208,8 +212,7 @@ class Container:
         for opcode, body, stop in self._walk(len(MAGIC), self._end, self._chunks):
             if opcode == Opcode.DATA_END:
                 crc = Fields(self._data, body, stop).number(4) if stop - body >= 4 else 0
-                covered = memoryview(self._data)[: body - _RECORD.size]
-                if crc and zlib.crc32(covered) != crc:
+                if crc and self._data.checksum(0, body - _RECORD.size) != crc:
                     self.problems.append("the data section's checksum does not match")
                 return
             yield opcode, body, stop
@@ -220,9 +223,10 @@ class Container:
         """Yields (opcode, start of body, end of body); after a fault goes on at ``resume``."""
         position = start
         while position < end:
-            stop, opcode = end + 1, self._data[position]
-            if position + _RECORD.size <= end:
-                _, length = _RECORD.unpack_from(self._data, position)
+            head = self._data[position : min(position + _RECORD.size, end)]
+            stop, opcode = end + 1, head[0]
+            if len(head) == _RECORD.size:
+                _, length = _RECORD.unpack(head)
                 stop = position + _RECORD.size + length
             if stop <= end and opcode >= Opcode.HEADER:
                 if Opcode.DATA_END < opcode < 0x80:
@@ -234,7 +238,7 @@ class Container:
                 continue
             following = next((offset for offset in resume if position < offset < end), None)
             # a machine that lost power may leave zeros behind the last whole record
-            is_cut_here = self.is_cut and (opcode != 0 or not any(self._data[position:]))
+            is_cut_here = self.is_cut and (opcode != 0 or self._data.is_zero_from(position))
             if not is_cut_here:
                 until = "the file's end" if following is None else f"byte {following}"
                 self.problems.append(f"nothing can be read from byte {position} to {until}")

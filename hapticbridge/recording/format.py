@@ -125,7 +125,15 @@ class Digest:
     two different contents are hashed as the same bytes.
     """
 
-    def __init__(self, metadata: Mapping[str, str], attachments: Iterable[Attachment]) -> None:
+    def __init__(
+        self, metadata: Mapping[str, str] | None = None, attachments: Iterable[Attachment] = ()
+    ) -> None:
+        self._ticks = hashlib.sha256()
+        self._events = hashlib.sha256()
+        self.describe(metadata or {}, attachments)
+
+    def describe(self, metadata: Mapping[str, str], attachments: Iterable[Attachment]) -> None:
+        """Sets metadata and attachments: a reader knows them only at the end of a damaged file."""
         self._metadata = hashlib.sha256()
         for key in sorted(metadata):
             _add(self._metadata, key.encode())
@@ -135,8 +143,6 @@ class Digest:
             _add(self._attachments, attachment.name.encode())
             _add(self._attachments, attachment.media_type.encode())
             _add(self._attachments, attachment.data)
-        self._ticks = hashlib.sha256()
-        self._events = hashlib.sha256()
 
     def add_ticks(self, rows: NDArray[np.void]) -> None:
         """Adds records, shape (n,), ``TICK_DTYPE``."""

@@ -1,4 +1,4 @@
-"""Reads a recording, whole, cut or damaged.
+"""Reads a recording, whole, cut or damaged; all at once, or its ticks block by block.
 
 Reading is vectorised: a run of messages on ``/tick`` inside a chunk is one structured view, so
 ten minutes at 1 kHz (600 000 records) take about a second.
@@ -6,8 +6,8 @@ ten minutes at 1 kHz (600 000 records) take about a second.
 
 from __future__ import annotations
 
-import json
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,33 +18,25 @@ from numpy.typing import NDArray
 from hapticbridge.errors import RecordingError
 from hapticbridge.recording import format as layout
 from hapticbridge.recording.container import MAGIC, Block, Container, DamageError, Fields
+from hapticbridge.recording.contents import Contents
+from hapticbridge.recording.file_bytes import FileBytes
 from hapticbridge.recording.format import Attachment
 from hapticbridge.tick import TICK_DTYPE
 
-_MESSAGE_DTYPE = np.dtype(
-    [
-        ("opcode", "u1"),
-        ("length", "<u8"),
-        ("channel", "<u2"),
-        ("sequence", "<u4"),
-        ("log_time", "<u8"),
-        ("publish_time", "<u8"),
-        ("payload", layout.PAYLOAD_DTYPE),
-    ]
-)
-_RECORD_HEAD = 9
-_MESSAGE_HEAD = _MESSAGE_DTYPE.fields["payload"][1]  # type: ignore[index]
-_TICK_LENGTH = _MESSAGE_DTYPE.itemsize - _RECORD_HEAD
-_CDR = int.from_bytes(layout.CDR_HEADER, "little")
+BLOCK = 1 << 14
+"""Records that are read at once where a recording is not read whole: 16 s at 1 kHz, 6.5 MB. Larger
+blocks take more memory, smaller ones more time."""
 
 
-@dataclass(frozen=True)
-class Recording:
-    """What a recording holds.
+@dataclass(frozen=True, kw_only=True)
+class RecordingFile:
+    """What a recording holds beside its ticks, which are read from the file when asked for.
 
     Attributes:
         path: The file.
-        ticks: Its records in order, shape (n,), ``TICK_DTYPE``.
+        count: How many records it holds.
+        last_tick: Number of the last record's tick; -1 without records.
+        flags: All flags that any record has.
         events: Its events in order; each has ``event`` and ``time_ns`` (since the run's start).
         meta: Metadata as text; empty if it was damaged.
         attachments: Attached files by name.
@@ -57,7 +49,9 @@ class Recording:
     """
 
     path: Path
-    ticks: NDArray[np.void]
+    count: int
+    last_tick: int
+    flags: int
     events: list[dict[str, Any]]
     meta: dict[str, str]
     attachments: dict[str, bytes]
@@ -66,128 +60,41 @@ class Recording:
     computed_digest: str
     problems: tuple[str, ...]
 
+    def blocks(self, size: int | None = None) -> Iterator[NDArray[np.void]]:
+        """Yields the records in order, ``TICK_DTYPE``, in blocks of one size; the last is shorter.
 
-@dataclass
-class _Contents:
-    """Gathers what the blocks hold."""
+        A block is the caller's to keep.
 
-    problems: list[str]
-    runs: list[NDArray[np.void]] = field(default_factory=list)
-    events: list[tuple[bytes, dict[str, Any]]] = field(default_factory=list)
-    attachments: list[Attachment] = field(default_factory=list)
-    meta: dict[str, str] | None = None
-    digest: str | None = None
-    schemas: dict[int, tuple[str, str, bytes]] = field(default_factory=dict)
-    topics: dict[int, str] = field(default_factory=dict)
-    refusal: str | None = None
+        Args:
+            size: Records, >= 1; ``BLOCK`` by default.
 
-    def add_metadata(self, fields: Fields) -> None:
-        name, entries = fields.text(), fields.mapping()
-        if name == layout.METADATA_NAME:
-            if self.meta is not None:
-                raise DamageError(f"there is a second metadata record '{name}'")
-            self.meta = entries
-        elif name == layout.DIGEST_NAME:
-            if self.digest is not None:
-                raise DamageError(f"there is a second metadata record '{name}'")
-            self.digest = entries.get(layout.DIGEST_KEY, "")
+        Raises:
+            RecordingError: The file cannot be read, or is not what it was when it was opened.
+        """
+        size = size or BLOCK
+        runs: list[NDArray[np.void]] = []
+        found = 0
+        for _ in _passes(self.path, runs.append):
+            while sum(run.size for run in runs) >= size:
+                block, runs[:] = _cut(runs, size)
+                found += size
+                yield block
+        if runs:
+            found += sum(run.size for run in runs)
+            yield _joined(runs)
+        if found != self.count:
+            raise RecordingError(f"the recording {self.path} was changed while it was read")
 
-    def add_attachment(self, fields: Fields) -> None:
-        fields.raw(16)
-        name, media_type = fields.text(), fields.text()
-        data = fields.raw(fields.number(8))
-        if any(name == attachment.name for attachment in self.attachments):
-            raise DamageError(f"there is a second attachment '{name}'")
-        self.attachments.append(Attachment(name, media_type, data))
 
-    def add_block(self, block: Block) -> None:
-        data, position = block.data, 0
-        while position < len(data):
-            body = position + _RECORD_HEAD
-            stop = body + int.from_bytes(data[position + 1 : body], "little")
-            if stop > len(data) or body > len(data):
-                self.problems.append(f"{block.label} ends inside a record")
-                return
-            fields = Fields(data, body, stop)
-            try:
-                if data[position] == Opcode.MESSAGE:
-                    channel = fields.number(2)
-                    topic = self.topics.get(channel)
-                    if topic == layout.TICK_TOPIC:
-                        stop = self._add_ticks(data, position, channel)
-                    elif topic == layout.EVENT_TOPIC:
-                        fields.raw(20)
-                        self._add_event(data[position + _MESSAGE_HEAD : stop])
-                elif data[position] == Opcode.SCHEMA:
-                    self._add_schema(fields)
-                elif data[position] == Opcode.CHANNEL:
-                    self._add_channel(fields)
-            except DamageError as error:
-                self.problems.append(f"{block.label} holds a damaged record: {error}")
-            position = stop
+@dataclass(frozen=True, kw_only=True)
+class Recording(RecordingFile):
+    """What a recording holds, all of it in memory.
 
-    def _add_schema(self, fields: Fields) -> None:
-        schema_id = fields.number(2)
-        name, encoding = fields.text(), fields.text()
-        self.schemas[schema_id] = (name, encoding, fields.raw(fields.number(4)))
+    Attributes:
+        ticks: Its records in order, shape (n,), ``TICK_DTYPE``.
+    """
 
-    def _add_channel(self, fields: Fields) -> None:
-        channel, schema_id = fields.number(2), fields.number(2)
-        topic, encoding = fields.text(), fields.text()
-        if topic == layout.EVENT_TOPIC and encoding == layout.EVENT_ENCODING:
-            self.topics[channel] = topic
-        if topic == layout.TICK_TOPIC and channel not in self.topics:
-            name, schema_encoding, text = self.schemas.get(schema_id, ("", "", b""))
-            if (name, schema_encoding) != (layout.TICK_SCHEMA_NAME, layout.TICK_SCHEMA_ENCODING):
-                self.refusal = (
-                    f"its topic {topic} has the schema '{name}', not '{layout.TICK_SCHEMA_NAME}'"
-                )
-            elif text != layout.tick_schema() or encoding != layout.TICK_ENCODING:
-                self.refusal = (
-                    f"its schema {name} has other fields than this version of hapticbridge writes"
-                )
-            else:
-                self.topics[channel] = topic
-
-    def _add_ticks(self, data: bytes, position: int, channel: int) -> int:
-        """Adds the run of records that starts here; returns where it ends."""
-        size, count = _MESSAGE_DTYPE.itemsize, 16
-        start = position
-        while True:
-            count = min(count, (len(data) - position) // size)
-            rows = np.frombuffer(data, _MESSAGE_DTYPE, count, position)
-            matches = (
-                (rows["opcode"] == Opcode.MESSAGE)
-                & (rows["length"] == _TICK_LENGTH)
-                & (rows["channel"] == channel)
-                & (rows["payload"]["cdr"].view("<u4") == _CDR)
-            )
-            run = count if matches.all() else int(matches.argmin())
-            self.runs.append(rows["payload"]["record"][:run])
-            position += run * size
-            if run < count or count == 0:
-                break
-            count *= 2  # small windows first: events may sit between every few records
-        if position == start:
-            raise DamageError(f"a message on {layout.TICK_TOPIC} is not one record")
-        return position
-
-    def _add_event(self, payload: bytes) -> None:
-        try:
-            event = json.loads(payload)
-        except (ValueError, RecursionError) as error:
-            raise DamageError("an event is not JSON") from error
-        if not isinstance(event, dict):
-            raise DamageError("an event is not a JSON object")
-        self.events.append((payload, event))
-
-    def ticks(self) -> NDArray[np.void]:
-        gathered = np.empty(sum(run.size for run in self.runs), TICK_DTYPE)
-        position = 0
-        for run in self.runs:
-            gathered[position : position + run.size] = run
-            position += run.size
-        return gathered
+    ticks: NDArray[np.void]
 
 
 def read_recording(path: str | Path) -> Recording:
@@ -209,58 +116,124 @@ def read_recording(path: str | Path) -> Recording:
     return read_with_attachments(Path(path))[0]
 
 
+def open_recording(path: str | Path) -> RecordingFile:
+    """As ``read_recording``, but for the ticks: memory does not grow with the recording's length.
+
+    The file is read through once, for its digest, its events and what is damaged. Events are kept;
+    a run with an input in every tick has as many of them.
+
+    Raises:
+        RecordingError: As for ``read_recording``.
+    """
+    facts, _ = _described(Path(path), [])
+    return RecordingFile(**facts)
+
+
 def read_with_attachments(path: Path) -> tuple[Recording, list[Attachment]]:
     """As ``read_recording``, with the attachments as they stand in the file, in their order."""
-    container = Container(_load(path))
-    contents = _Contents(container.problems)
-    contents.add_block(container.summary())
-    for item in container.records():
-        if isinstance(item, Block):
-            contents.add_block(item)
-            continue
-        opcode, fields = item
-        add = contents.add_metadata if opcode == Opcode.METADATA else contents.add_attachment
-        try:
-            add(fields)
-        except DamageError as error:
-            kind = "a metadata record" if opcode == Opcode.METADATA else "an attachment"
-            contents.problems.append(f"{kind} is damaged: {error}")
-    if layout.TICK_TOPIC not in contents.topics.values():
+    runs: list[NDArray[np.void]] = []
+    facts, attachments = _described(path, runs, keeps=True)
+    return Recording(**facts, ticks=_joined(runs)), attachments
+
+
+def _described(
+    path: Path, runs: list[NDArray[np.void]], *, keeps: bool = False
+) -> tuple[dict[str, Any], list[Attachment]]:
+    """Reads a file through; returns the fields of ``RecordingFile``, and the attachments.
+
+    Args:
+        path: The file.
+        runs: Gets the records, run by run.
+        keeps: Whether it does.
+    """
+    digest = layout.Digest()
+    count, last, flags = 0, -1, 0
+
+    def take(run: NDArray[np.void]) -> None:
+        nonlocal count, last, flags
+        digest.add_ticks(run)
+        count += run.size
+        last = int(run["tick"][-1]) if run.size else last
+        flags |= int(np.bitwise_or.reduce(run["flags"]))
+        if keeps:
+            runs.append(run)
+
+    *_, (container, contents) = _passes(path, take)
+    if not contents.has_ticks:
         # a file that was cut inside its first chunk has no schema yet, but says what it is
         if contents.refusal or contents.meta is None or not container.is_cut:
             reason = contents.refusal or f"it has no topic {layout.TICK_TOPIC}"
             raise RecordingError(f"{path} is not a recording that can be read: {reason}")
     elif contents.meta is None:
         contents.problems.append(f"the metadata record '{layout.METADATA_NAME}' is missing")
-    meta, ticks = contents.meta or {}, contents.ticks()
-    digest = layout.Digest(meta, contents.attachments)
-    digest.add_ticks(ticks)
+    meta = contents.meta or {}
+    digest.describe(meta, contents.attachments)
     for payload, _ in contents.events:
         digest.add_event(payload)
-    recording = Recording(
-        path=path,
-        ticks=ticks,
-        events=[event for _, event in contents.events],
-        meta=meta,
-        attachments={item.name: item.data for item in contents.attachments},
-        is_cut=container.is_cut,
-        digest=contents.digest,
-        computed_digest=digest.hexdigest(),
-        problems=tuple(dict.fromkeys(contents.problems)),
-    )
-    return recording, contents.attachments
+    facts = {
+        "path": path,
+        "count": count,
+        "last_tick": last,
+        "flags": flags,
+        "events": [event for _, event in contents.events],
+        "meta": meta,
+        "attachments": {item.name: item.data for item in contents.attachments},
+        "is_cut": container.is_cut,
+        "digest": contents.digest,
+        "computed_digest": digest.hexdigest(),
+        "problems": tuple(dict.fromkeys(contents.problems)),
+    }
+    return facts, contents.attachments
 
 
-def _load(path: Path) -> bytes:
+def _passes(
+    path: Path, take: Callable[[NDArray[np.void]], None]
+) -> Iterator[tuple[Container, Contents]]:
+    """Reads a file through, and yields the same two after every part of it."""
+    with FileBytes(path) as data:
+        if data[: len(MAGIC)] != MAGIC:
+            what = "it is empty" if not len(data) else "it does not start with the MCAP magic"
+            raise RecordingError(f"{path} is not an MCAP file: {what}")
+        container = Container(data)
+        contents = Contents(container.problems, take)
+        contents.add_block(container.summary())
+        for item in container.records():
+            if isinstance(item, Block):
+                contents.add_block(item)
+            else:
+                _add_described(contents, *item)
+            yield container, contents
+        yield container, contents
+
+
+def _add_described(contents: Contents, opcode: int, fields: Fields) -> None:
+    is_meta = opcode == Opcode.METADATA
     try:
-        if path.exists() and not path.is_file():
-            kind = "a folder" if path.is_dir() else "not a regular file"
-            raise RecordingError(f"cannot read the recording {path}: it is {kind}")
-        data = path.read_bytes()
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise RecordingError(f"cannot read the recording {path}: {reason}") from error
-    if not data.startswith(MAGIC):
-        what = "it is empty" if not data else "it does not start with the MCAP magic"
-        raise RecordingError(f"{path} is not an MCAP file: {what}")
-    return data
+        (contents.add_metadata if is_meta else contents.add_attachment)(fields)
+    except DamageError as error:
+        kind = "a metadata record" if is_meta else "an attachment"
+        contents.problems.append(f"{kind} is damaged: {error}")
+
+
+def _joined(runs: list[NDArray[np.void]]) -> NDArray[np.void]:
+    """Returns runs as one array."""
+    gathered = np.empty(sum(run.size for run in runs), TICK_DTYPE)
+    position = 0
+    for run in runs:
+        gathered[position : position + run.size] = run
+        position += run.size
+    return gathered
+
+
+def _cut(
+    runs: list[NDArray[np.void]], size: int
+) -> tuple[NDArray[np.void], list[NDArray[np.void]]]:
+    """Returns the first ``size`` records of runs as one array, and the runs that are left."""
+    left, head = size, []
+    for index, run in enumerate(runs):
+        head.append(run[:left])
+        left -= head[-1].size
+        if not left:
+            rest = [run[head[-1].size :], *runs[index + 1 :]]
+            return _joined(head), [each for each in rest if each.size]
+    raise AssertionError("fewer records than asked for")

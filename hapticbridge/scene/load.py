@@ -127,9 +127,10 @@ class Scene:
         """
         if distance == self._reach:
             return
-        self.model.geom_gap += distance - self._reach
-        self.model.pair_gap += distance - self._reach
-        self._reach = distance
+        more, self._reach = distance - self._reach, distance
+        self.model.geom_gap += more
+        self.model.pair_gap += more
+        self.model.flex_gap += more
 
     def set_coupling(self, coupling: Coupling) -> None:
         """Sets the gains of the coupling's actuators; needs no compilation."""

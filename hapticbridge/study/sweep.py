@@ -42,6 +42,7 @@ def sweep(
     chunk: int | None = None,
     executor: Executor | None = None,
     scheduler: str | None = None,
+    jobs: int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Table:
     """Applies a function to every point and returns a table of what it returned.
@@ -78,6 +79,7 @@ def sweep(
             the cores that this process may use.
         scheduler: Address of a running dask.distributed cluster (needs the extra ``cluster``),
             instead of an executor.
+        jobs: Processes at most where neither is given, >= 1; by default as many as there are cores.
         progress: Called with the points done and all points, at the start and after every task.
 
     Returns:
@@ -92,8 +94,11 @@ def sweep(
     check_format(format)
     if executor is not None and scheduler is not None:
         raise StudyError("executor and scheduler were both given; give one of them")
-    if chunk is not None and (isinstance(chunk, bool) or not isinstance(chunk, int) or chunk < 1):
-        raise StudyError(f"chunk is {chunk!r:.60}; it must be a whole number >= 1")
+    for word, count in (("chunk", chunk), ("jobs", jobs)):
+        if count is not None and (
+            isinstance(count, bool) or not isinstance(count, int) or count < 1
+        ):
+            raise StudyError(f"{word} is {count!r:.60}; it must be a whole number >= 1")
     parameters = tuple(next(iter(wanted.values())))
     done: dict[str, Outcome] = {}
     kept = None
@@ -113,7 +118,7 @@ def sweep(
     missing = {key: point for key, point in wanted.items() if key not in done}
     if missing:
         chunks = deque(_cut(missing, chunk or _usual_chunk(len(missing))))
-        with hired(function, executor, scheduler, len(chunks)) as workers:
+        with hired(function, executor, scheduler, len(chunks), jobs) as workers:
             _Shift(workers, function, batched, keep).work(chunks)
     table = table_of(list(wanted.values()), [done[key] for key in wanted])
     if kept is not None:

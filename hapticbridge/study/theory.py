@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from textwrap import wrap
 
@@ -118,7 +119,7 @@ def alternatives(felt: Coupling, period: float, filter_time: float) -> tuple[Alt
         way("B' = B, one tick late, against a wall", delay=1),
         anywhere,
         Alternative(
-            "lossless line of that stiffness",
+            "transmission line of that stiffness",
             float(line.max()),
             None,
             (frequency, line),
@@ -173,11 +174,12 @@ def recommended(z: ZWidth) -> Coupling:
     return default_method().rendered(z.corner, z.period)
 
 
-def draw_z_width(z: ZWidth) -> Figure:
+def draw_z_width(z: ZWidth, measured: Sequence[tuple[float, float, float]] | None = None) -> Figure:
     """Draws the couplings that a device can show: region, limiting lines, corner to use.
 
     Args:
         z: From ``z_width``.
+        measured: Limits that were found by trying: B in N s/m, K and its half-width in N/m.
     """
     figure = new_figure(8, 5.5)
     axes = figure.subplots()
@@ -209,6 +211,11 @@ def draw_z_width(z: ZWidth) -> Figure:
     )
     region = float(z.limit.max())
     highest = max(float(line.stiffness.max()) for line in z.lines)
+    if measured:
+        damping, stiffness, half_width = zip(*measured, strict=True)
+        label = "measured: below it a push died down, above it did not"
+        axes.errorbar(damping, stiffness, half_width, fmt="D", color="#c64600", ms=6, label=label)
+        region = max(region, max(stiffness) / HIGHEST_SHOWN)
     axes.set_ylim(0, min(1.08 * highest, HIGHEST_SHOWN * region))
     axes.set_xlim(0, z.damping[-1])
     axes.set_xlabel("damping that the coupling uses, B' (N s/m)")

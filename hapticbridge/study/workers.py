@@ -48,6 +48,19 @@ def cores() -> int:
     return os.cpu_count() or 1
 
 
+class InThisProcess(Executor):
+    """Works while it submits: for few tasks, where a process would take longer to start."""
+
+    def submit(self, task: Callable[..., Any], /, *arguments: Any, **named: Any) -> Future[Any]:
+        """Does the task; what it raises is the future's."""
+        future: Future[Any] = Future()
+        try:
+            future.set_result(task(*arguments, **named))
+        except Exception as error:
+            future.set_exception(error)
+        return future
+
+
 class Workers:
     """An executor that somebody else owns.
 
@@ -104,9 +117,9 @@ class ProcessWorkers(Workers):
         StudyError: The processes cannot start, or cannot import the function.
     """
 
-    def __init__(self, function: Callable[[Any], Any], tasks: int) -> None:
+    def __init__(self, function: Callable[[Any], Any], tasks: int, jobs: int | None = None) -> None:
         self._function = function
-        self._count = max(1, min(cores(), tasks))
+        self._count = max(1, min(jobs or cores(), tasks))
         # one task waits behind each that runs, so that no process is ever without work
         super().__init__(self._pool(), depth=2 * self._count)
         self._probe()
@@ -206,7 +219,11 @@ class ClusterWorkers(Workers):
 
 @contextlib.contextmanager
 def hired(
-    function: Callable[[Any], Any], executor: Executor | None, scheduler: str | None, tasks: int
+    function: Callable[[Any], Any],
+    executor: Executor | None,
+    scheduler: str | None,
+    tasks: int,
+    jobs: int | None = None,
 ) -> Iterator[Workers]:
     """Opens the workers of a sweep and closes those that it opened.
 
@@ -218,7 +235,7 @@ def hired(
     elif scheduler is not None:
         workers = ClusterWorkers(scheduler)
     else:
-        workers = ProcessWorkers(function, tasks)
+        workers = ProcessWorkers(function, tasks, jobs)
     try:
         yield workers
     finally:

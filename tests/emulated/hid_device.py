@@ -57,6 +57,10 @@ class HidDevice(UsbDevice):
         """Returns a feature report, None where there is none of this number."""
         return None
 
+    def input_report(self, number: int, now: float) -> bytes | None:
+        """Returns an input report that the host asks for, None where there is none."""
+        return None
+
     # -- reports towards the host ----------------------------------------------------------------
 
     def push(self, report: bytes) -> None:
@@ -98,6 +102,11 @@ class HidDevice(UsbDevice):
             self.set_feature(data, now)
         elif key == (_CLASS_TO_HOST, _GET_REPORT) and kind == FEATURE_REPORT:
             answer = self.feature(number, now)
+            if answer is None:
+                raise StallError
+            return answer
+        elif key == (_CLASS_TO_HOST, _GET_REPORT) and kind == INPUT_REPORT:
+            answer = self.input_report(number, now)
             if answer is None:
                 raise StallError
             return answer

@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from typing import Any
 
 from emulated.hid_device import HidDevice
+from emulated.timed import Timed
+from emulated.usb_device import StallError
 from hapticbridge.device.hid_search import HidHandle
 
 
@@ -88,11 +90,23 @@ class _Handle:
         return len(data)
 
     def send_feature_report(self, data: bytes) -> int:
-        self._there("").set_feature(data, self._seam.now)
+        try:
+            self._there("").set_feature(data, self._seam.now)
+        except StallError:
+            return -1
         return len(data)
 
     def get_feature_report(self, report_num: int, max_length: int) -> Sequence[int]:
         return list((self._there("").feature(report_num, self._seam.now) or b"")[:max_length])
+
+    def get_input_report(self, report_num: int, max_length: int) -> Sequence[int]:
+        answer = self._there("").input_report(report_num, self._seam.now)
+        if answer is None:
+            raise OSError("read error")
+        return list(answer[:max_length])
+
+    def get_report_descriptor(self) -> Sequence[int]:
+        return list(self._there("").report_descriptor)
 
     def close(self) -> None:
         self._device = None
@@ -125,7 +139,7 @@ class DrivingClock:
     name = "simulated"
     is_lossless = True
 
-    def __init__(self, seam: HidSeam) -> None:
+    def __init__(self, seam: Timed) -> None:
         self._seam = seam
         self._period = self._now = self._origin = 0
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from emulated.hid_seam import HidSeam
+from emulated.timed import Timed
 from hapticbridge.device import Device
 
 
@@ -20,7 +20,7 @@ class Ticking:
         build: Makes the driver and what its device is plugged into.
     """
 
-    def __init__(self, build: Callable[[], tuple[Device, HidSeam]]) -> None:
+    def __init__(self, build: Callable[[], tuple[Device, Timed]]) -> None:
         self._build = build
         self._device, self._seam = build()
         self._is_used = False

@@ -34,6 +34,9 @@ LIMIT = 300.0
 LOOP = 10.0
 """In s of virtual time: how long the closed loops run."""
 
+STICK_LOOP = 4.0
+"""Likewise, for a stick: until its peg has touched the hole."""
+
 REPEATS, REPEATED_LOOP = 3, 1.0
 """How many runs must be the same to the bit, and how long each is, in s of virtual time."""
 
@@ -135,7 +138,8 @@ def _in_the_guest(folder: Path, command: Sequence[str], *, is_virtual: bool) -> 
 
 
 def _checks_in_virtual_time(folder: Path) -> list[Claim]:
-    run = _in_the_guest(folder, _pytest("/run/job/report.xml"), is_virtual=True)
+    command = _pytest("/run/job/report.xml", "*check_*.py")
+    run = _in_the_guest(folder, command, is_virtual=True)
     return claims_of(folder / "report.xml", run.output)
 
 
@@ -146,21 +150,21 @@ def _round_trips(folder: Path) -> list[Claim]:
 
 
 def _recorded(folder: Path, device: str, seconds: float) -> tuple[GuestRun, Path]:
-    """Runs ``hapticbridge run peg_in_hole`` on an emulated device in virtual time."""
+    """Runs ``hapticbridge run`` on an emulated device in virtual time."""
     folder.mkdir(exist_ok=True)
     program = ["-m", "usb_tiers.closed_loop"]
     command = [sys.executable, *program, device, f"{seconds:g}", "/run/job/run.mcap"]
     return _in_the_guest(folder, command, is_virtual=True), folder / "run.mcap"
 
 
-def _closed_loop(device: str) -> Callable[[Path], list[Claim]]:
+def _closed_loop(device: str, seconds: float = LOOP) -> Callable[[Path], list[Claim]]:
     def run(folder: Path) -> list[Claim]:
-        ended, file = _recorded(folder, device, LOOP)
-        name = f"peg_in_hole on {device} for {LOOP:g} s of virtual time is audited passive"
+        ended, file = _recorded(folder, device, seconds)
+        name = f"a peg's insertion on {device} for {seconds:g} s of virtual time is audited passive"
         if ended.status != 0:
             return [Claim(name, is_true=False, note=ended.output)]
         report = hb.audit(file)
-        is_whole = report.ticks == round(1000 * LOOP) and not report.is_cut
+        is_whole = report.ticks == round(1000 * seconds) and not report.is_cut
         note = f"{report.ticks} ticks, {report.verdict} ({report.environment})"
         return [Claim(name, is_whole and report.verdict == "passive", note)]
 
@@ -181,6 +185,7 @@ def _the_same_every_time(folder: Path) -> list[Claim]:
 JOBS = (
     Job("C: closed loop on a Falcon", _kernel_missing, _closed_loop("falcon")),
     Job("C: closed loop on raw HID", _kernel_missing, _closed_loop("rawhid")),
+    Job("C: closed loop on a stick", _kernel_missing, _closed_loop("pid", STICK_LOOP)),
     Job("C: checks in User-Mode Linux, virtual time", _kernel_missing, _checks_in_virtual_time),
     Job("C: 1 kHz loop, repeated", _kernel_missing, _the_same_every_time),
     Job("B: checks under umockdev", _umockdev_missing, _under_umockdev),

@@ -7,7 +7,7 @@ import os
 import struct
 
 from emulated.front_end import FrontEnd
-from emulated.hid_device import FEATURE_REPORT, OUTPUT_REPORT, HidDevice
+from emulated.hid_device import FEATURE_REPORT, INPUT_REPORT, OUTPUT_REPORT, HidDevice
 from emulated.usb_device import StallError
 
 _DESTROY, _OPEN, _CLOSE, _OUTPUT = 1, 4, 5, 6
@@ -22,7 +22,7 @@ _GET_REPORT, _GET_REPORT_REPLY, _CREATE, _INPUT, _SET_REPORT, _SET_REPORT_REPLY 
 _EVENT_SIZE = 4380
 _DATA_MAX = 4096
 _BUS_USB = 3
-_KINDS = {0: FEATURE_REPORT, 1: OUTPUT_REPORT}
+_KINDS = {0: FEATURE_REPORT, 1: OUTPUT_REPORT, 2: INPUT_REPORT}
 """Kinds of report in uhid's numbering."""
 
 
@@ -95,6 +95,8 @@ class Uhid(FrontEnd):
         answer = None
         if _KINDS.get(kind) == FEATURE_REPORT:
             answer = self._device.feature(number, now)
+        elif _KINDS.get(kind) == INPUT_REPORT:
+            answer = self._device.input_report(number, now)
         data = b"" if answer is None else self._blank + answer
         head = struct.pack(
             "<IIHH", _GET_REPORT_REPLY, token, errno.EIO if answer is None else 0, len(data)

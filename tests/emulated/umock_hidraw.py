@@ -8,6 +8,7 @@ import os
 import socket
 import struct
 from collections import deque
+from collections.abc import Callable
 from pathlib import Path
 
 from emulated.hid_device import FEATURE_REPORT, OUTPUT_REPORT, HidDevice
@@ -75,7 +76,9 @@ class HidrawClient(Client):
             kind = FEATURE_REPORT if number == 6 else OUTPUT_REPORT
             self._done(self._set_report(kind, self._memory(address, size), now))
         elif number == 7:
-            self._get_feature(address, size, now)
+            self._get_report(self._device.feature, address, size, now)
+        elif number == 10:
+            self._get_report(self._device.input_report, address, size, now)
         else:
             self._done(-errno.ENOTTY)
 
@@ -95,8 +98,10 @@ class HidrawClient(Client):
             return -errno.EPIPE
         return len(report)
 
-    def _get_feature(self, address: int, size: int, now: float) -> None:
-        answer = self._device.feature(self._memory(address, 1)[0], now)
+    def _get_report(
+        self, report: Callable[[int, float], bytes | None], address: int, size: int, now: float
+    ) -> None:
+        answer = report(self._memory(address, 1)[0], now)
         if answer is None:
             self._done(-errno.EPIPE)
             return

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from emulated.falcon_model import FalconModel
 from emulated.handle import Handle
+from emulated.pid_layouts import ODD, USUAL
+from emulated.pid_model import PidStick
+from emulated.planar_hand import planar_hand
 from emulated.rawhid_model import Claims, RawHid
 
 from hapticbridge.device import SimulatedDevice
@@ -17,6 +20,11 @@ RESOLUTION = 50e-6
 
 FALCON = f"falcon:mass={MASS},damping={DAMPING},friction={FRICTION}"
 """The Falcon does not know its own mechanics; whoever opens it says them."""
+
+NEWTONS, TRAVEL = 4.0, 0.12
+"""N at full scale and m from stop to stop: nobody can ask a stick for them."""
+
+STICK = f"pid:newtons={NEWTONS},travel={TRAVEL},mass={MASS},damping={DAMPING},friction={FRICTION}"
 
 PROGRAM = bytes(range(256)) * 31
 """Stands for the maker's program: about its size, and every byte value in it."""
@@ -53,3 +61,16 @@ def free_rawhid(serial: str = "R1") -> RawHid:
     """Returns a home-made device that nobody holds, without friction."""
     claims = Claims(mass=MASS, damping=DAMPING)
     return RawHid(SimulatedDevice(mass=MASS, damping=DAMPING, hand=None), claims, serial=serial)
+
+
+def stick(serial: str = "P1") -> PidStick:
+    """Returns a force-feedback stick in a hand that pushes a peg into its hole, in its plane."""
+    path = planar_hand("planar_peg")
+    mechanics = SimulatedDevice(mass=MASS, damping=DAMPING, friction=FRICTION, path=path)
+    return PidStick(mechanics, newtons=NEWTONS, travel=TRAVEL, serial=serial)
+
+
+def free_stick(*, is_odd: bool = False) -> PidStick:
+    """Returns a stick that nobody holds, without friction; ``is_odd``: of the other reports."""
+    mechanics = SimulatedDevice(mass=MASS, damping=DAMPING, hand=None)
+    return PidStick(mechanics, ODD if is_odd else USUAL, newtons=NEWTONS, travel=TRAVEL)

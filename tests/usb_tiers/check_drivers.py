@@ -22,21 +22,25 @@ from usb_tiers.benches import (
     DAMPING,
     FALCON,
     MASS,
+    NEWTONS,
     PROGRAM,
+    STICK,
     falcon,
     free_falcon,
     free_rawhid,
+    free_stick,
     rawhid,
+    stick,
     unloaded_falcon,
 )
 from usb_tiers.conftest import IS_TIME_VIRTUAL, Plug
-from usb_tiers.waiting import wait_for
+from usb_tiers.waiting import usable_devices, wait_for
 
 PERIOD = 1e-3
 
 
 def _opened(specification: str, count: int = 1) -> Device:
-    wait_for(lambda: len(plugged_devices()) >= count)
+    wait_for(lambda: len(usable_devices()) >= count)
     device = hb.open_device(specification)
     device.start(PERIOD)
     return device
@@ -93,6 +97,32 @@ def test_a_written_force_moves_a_home_made_device_likewise(plug_hid: Plug) -> No
     _require_pushed(moved, 0.2, 0.5)
 
 
+@pytest.mark.parametrize("is_odd", [False, True], ids=["usual", "odd"])
+def test_a_written_force_moves_a_force_feedback_stick_likewise(
+    plug_hid: Plug, is_odd: bool
+) -> None:
+    model = plug_hid(lambda: free_stick(is_odd=is_odd))
+    device = _opened(STICK)
+    start = _held(device, 0.01, (0.0, 0.0, 0.0))
+    moved = _held(device, 0.2, (0.5, 0.0, 0.0)) - start
+    assert model.call("force") == pytest.approx((0.5, 0.0), abs=2e-3 * NEWTONS)
+    device.close()
+    assert model.call("force") == (0.0, 0.0)
+    _require_pushed(moved, 0.2, 0.5)
+
+
+def test_a_stick_lets_go_of_a_host_that_says_nothing_any_more(plug_hid: Plug) -> None:
+    model = plug_hid(free_stick)
+    device = _opened(STICK)
+    _held(device, 0.05, (0.5, 0.0, 0.0))
+    assert model.call("force") != (0.0, 0.0)
+    life = max(effect.duration for effect in model.get("effects").values())
+    assert life <= 0.4
+    time.sleep(1.1 * life)
+    assert model.call("force") == (0.0, 0.0)
+    device.close()
+
+
 def test_a_falcon_takes_its_program_and_then_speaks(plug_usb: Plug, tmp_path: Path) -> None:
     model = plug_usb(unloaded_falcon)
     file = tmp_path / "program.bin"
@@ -143,7 +173,7 @@ def test_a_stalled_endpoint_ends_a_run_in_words(plug_usb: Plug) -> None:
 def test_two_home_made_devices_at_once_are_told_apart(plug_hid: Plug) -> None:
     for serial in ("left", "right"):
         plug_hid(lambda serial=serial: free_rawhid(serial))  # type: ignore[misc]
-    wait_for(lambda: len(plugged_devices()) == 2)
+    wait_for(lambda: len(usable_devices()) == 2)
     with pytest.raises(DeviceError, match=r"left.*right|right.*left"):
         hb.open_device("rawhid")
     left, right = (_opened(f"rawhid:serial={serial}", 2) for serial in ("left", "right"))
@@ -171,7 +201,7 @@ def _deflected(now: float) -> tuple[float, ...]:
 
 def _pulled_out_of_a_run(model: EmulatorProcess, specification: str, file: Path) -> None:
     """Pulls a device out half a second after its run's start; no row may be lost before that."""
-    wait_for(plugged_devices)
+    wait_for(usable_devices)
     times: list[float] = []
 
     def on_tick(tick: int) -> None:
@@ -212,4 +242,14 @@ def test_a_home_made_device_pulled_out_of_a_run_loses_no_row_and_can_come_back(
     wait_for(lambda: not plugged_devices())
     plug_hid(rawhid)
     again = _opened("rawhid")
+    again.close()
+
+
+def test_a_stick_pulled_out_of_a_run_loses_no_row_and_can_come_back(
+    plug_hid: Plug, tmp_path: Path, no_spin: None
+) -> None:
+    _pulled_out_of_a_run(plug_hid(stick), STICK, tmp_path / "run.mcap")
+    wait_for(lambda: not plugged_devices())
+    plug_hid(stick)
+    again = _opened(STICK)
     again.close()

@@ -1,4 +1,4 @@
-"""Runs ``hapticbridge run peg_in_hole`` on an emulated device: closed_loop.py DEVICE SECONDS FILE.
+"""Runs ``hapticbridge run`` on an emulated device: closed_loop.py DEVICE SECONDS FILE.
 
 The whole way is there: scene, loop, driver, library, kernel, and a device in a hand, which pushes
 the peg into its hole.
@@ -15,25 +15,31 @@ from emulated.usbip import Usbip
 
 import hapticbridge.clock
 from hapticbridge.cli import main
-from hapticbridge.device.families import plugged_devices
-from usb_tiers.benches import FALCON, falcon, rawhid
-from usb_tiers.waiting import wait_for
+from usb_tiers.benches import FALCON, STICK, falcon, rawhid, stick
+from usb_tiers.waiting import usable_devices, wait_for
 
-DEVICES: dict[str, tuple[Callable[[], UsbDevice], str]] = {
-    "falcon": (falcon, FALCON),
-    "rawhid": (rawhid, "rawhid"),
+DEVICES: dict[str, tuple[Callable[[], UsbDevice], str, tuple[str, ...]]] = {
+    "falcon": (falcon, FALCON, ("peg_in_hole",)),
+    "rawhid": (rawhid, "rawhid", ("peg_in_hole",)),
+    # a scene in x and z for a stick in x and y
+    "pid": (
+        stick,
+        STICK,
+        ("planar_peg", "--axes", *"100", *("0", "0", "-1"), *"010"),
+    ),
 }
+"""What is plugged in, as what it is opened, and the scene to run."""
 
 
 def run(device: str, seconds: str, file: str) -> int:
     """Plugs the model in and runs the command; returns its exit code."""
-    make, specification = DEVICES[device]
+    make, specification, scene = DEVICES[device]
     # where time stands still while a program runs, a spin would hardly end
     hapticbridge.clock.SPIN_NS = 0
     with EmulatorProcess(make, Usbip):
-        wait_for(plugged_devices)
+        wait_for(usable_devices)
         options = ["--device", specification, "--duration", seconds, "--record", file]
-        return main(["run", "peg_in_hole", *options])
+        return main(["run", *scene, *options])
 
 
 if __name__ == "__main__":

@@ -6,6 +6,9 @@ import time
 from collections.abc import Callable
 from typing import TypeVar
 
+from hapticbridge.device.families import plugged_devices
+from hapticbridge.device.plugged import Plugged
+
 _Found = TypeVar("_Found")
 
 
@@ -21,3 +24,8 @@ def wait_for(look: Callable[[], _Found], seconds: float = 10.0) -> _Found:
             raise TimeoutError(f"not within {seconds:g} s")
         time.sleep(0.01)
     return found
+
+
+def usable_devices() -> list[Plugged]:
+    """Lists what can be opened: the kernel tells of a device before its node is there."""
+    return [device for device in plugged_devices() if device.problem is None]

@@ -103,12 +103,24 @@ void motion_read(HbMotion& motion) {
 
 // ========================================================================= the protocol: leave it
 
-HbDevice device(my_sheet());
+HbDevice device(my_sheet());  // loop()'s alone
+HbCommand command;            // control_tick()'s copy of what it was commanded
 IntervalTimer control;
 
 // In an interrupt, so that a loop() that hangs cannot leave a force on the motor: then no force
-// frame is taken either, and the watchdog of the last one runs out here.
-void control_tick() { motor_write(device.wrench(micros())); }
+// frame is taken either, and the watchdog of the last one runs out here. A processor that has
+// stopped altogether keeps its PWM: if your driver has an enable input, let a hardware watchdog
+// hold it.
+void control_tick() { motor_write(command.wrench(micros())); }
+
+// Hands the command to control_tick(). Only this is done with interrupts off, and takes a
+// microsecond: checking a frame takes some 40 on a Teensy 3.2, and the encoder would lose edges.
+// No call to micros() in between: on a Teensy 3 that switches interrupts on again.
+void pass_on() {
+  noInterrupts();
+  command = device.command();
+  interrupts();
+}
 
 void setup() {
   motor_setup();
@@ -127,20 +139,17 @@ void send_state(uint32_t now_us) {
   memset(&motion, 0, sizeof motion);
   motion_read(motion);
   uint8_t frame[HB_FRAME_BYTES];
-  noInterrupts();  // control_tick() uses the same device
   device.state(motion, now_us, frame);
-  interrupts();
+  pass_on();  // a fault takes the force away
   RawHID.send(frame, 0);
 }
 
 void loop() {
   uint8_t frame[HB_FRAME_BYTES];
   while (RawHID.recv(frame, 0) > 0) {
-    noInterrupts();
     device.receive(frame, micros());
-    const bool has_answer = device.answer(frame);
-    interrupts();
-    if (has_answer) RawHID.send(frame, 100);
+    pass_on();
+    if (device.answer(frame)) RawHID.send(frame, 100);
   }
   send_state(micros());
 }

@@ -65,20 +65,27 @@ uint16_t hb_crc16(const uint8_t* data, size_t count) {
   return crc;
 }
 
+HbCommand::HbCommand()
+    : received_us(0), watchdog_us(0), is_enabled(false), has_expired(false), is_unfit(false) {
+  memset(&commanded, 0, sizeof commanded);
+}
+
+HbWrench HbCommand::wrench(uint32_t now_us) {
+  // unsigned, so right across the clock's wrap; once expired it stays so until the next force frame
+  if (!has_expired && (uint32_t)(now_us - received_us) >= watchdog_us) has_expired = true;
+  if (is_enabled && !has_expired && !is_unfit) return commanded;
+  HbWrench none;
+  memset(&none, 0, sizeof none);
+  return none;
+}
+
 HbDevice::HbDevice(const HbSheet& sheet)
     : sheet_(sheet),
-      received_us_(0),
-      watchdog_us_(0),
       sequence_(0),
       echo_(0),
       asked_sequence_(0),
       asked_page_(-1),
-      is_enabled_(false),
-      has_expired_(false),
-      is_damaged_(false),
-      is_unfit_(false) {
-  memset(&wrench_, 0, sizeof wrench_);
-}
+      is_damaged_(false) {}
 
 bool HbDevice::receive(const uint8_t frame[HB_FRAME_BYTES], uint32_t now_us) {
   if (frame[0] != MAGIC || get16(frame + CRC_AT) != hb_crc16(frame, CRC_AT)) {
@@ -96,14 +103,14 @@ bool HbDevice::receive(const uint8_t frame[HB_FRAME_BYTES], uint32_t now_us) {
     uint16_t watchdog_ms = get16(frame + 6);
     if (watchdog_ms > HB_LONGEST_WATCHDOG_MS) watchdog_ms = HB_LONGEST_WATCHDOG_MS;
     for (int i = 0; i < 3; i++) {
-      wrench_.force[i] = get_float(frame + 8 + 4 * i);
-      wrench_.torque[i] = get_float(frame + 20 + 4 * i);
+      command_.commanded.force[i] = get_float(frame + 8 + 4 * i);
+      command_.commanded.torque[i] = get_float(frame + 20 + 4 * i);
     }
     echo_ = get16(frame + 4);
-    is_enabled_ = (frame[3] & ENABLE) != 0;
-    watchdog_us_ = 1000u * watchdog_ms;
-    received_us_ = now_us;
-    has_expired_ = false;
+    command_.is_enabled = (frame[3] & ENABLE) != 0;
+    command_.watchdog_us = 1000u * watchdog_ms;
+    command_.received_us = now_us;
+    command_.has_expired = false;
   } else {
     return false;
   }
@@ -143,11 +150,11 @@ bool HbDevice::answer(uint8_t frame[HB_FRAME_BYTES]) {
 }
 
 void HbDevice::state(const HbMotion& motion, uint32_t now_us, uint8_t frame[HB_FRAME_BYTES]) {
-  is_unfit_ = (motion.status & (HB_FAULT | HB_NOT_READY)) != 0;
-  wrench(now_us);  // brings has_expired_ up to now
+  command_.is_unfit = (motion.status & (HB_FAULT | HB_NOT_READY)) != 0;
+  wrench(now_us);  // brings command_.has_expired up to now
   uint8_t status = motion.status & (HB_SATURATED | HB_FAULT | HB_NOT_READY);
-  if (is_enabled_) status |= HB_ENABLED;
-  if (has_expired_) status |= HB_WATCHDOG;
+  if (command_.is_enabled) status |= HB_ENABLED;
+  if (command_.has_expired) status |= HB_WATCHDOG;
   if (is_damaged_) status |= HB_DAMAGED;
   begin(frame, STATE, status, ++sequence_);
   put16(frame + 6, motion.buttons);
@@ -160,13 +167,4 @@ void HbDevice::state(const HbMotion& motion, uint32_t now_us, uint8_t frame[HB_F
   }
   put16(frame + 60, echo_);
   seal(frame);
-}
-
-HbWrench HbDevice::wrench(uint32_t now_us) {
-  // unsigned, so right across the clock's wrap; once expired it stays so until the next force frame
-  if (!has_expired_ && (uint32_t)(now_us - received_us_) >= watchdog_us_) has_expired_ = true;
-  if (is_enabled_ && !has_expired_ && !is_unfit_) return wrench_;
-  HbWrench none;
-  memset(&none, 0, sizeof none);
-  return none;
 }

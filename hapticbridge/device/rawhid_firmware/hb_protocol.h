@@ -7,6 +7,9 @@
 //   device.state(motion, now_us, frame);        // once per period: where it is
 //   HbWrench wrench = device.wrench(now_us);    // what the motors are to give now, often
 //
+// An HbDevice belongs to one thread. What drives the motors in an interrupt works on a copy of
+// device.command(), so that interrupts are off for as long as that copy takes and no longer.
+//
 // Licence: Apache-2.0, as the rest of hapticbridge.
 #ifndef HB_PROTOCOL_H
 #define HB_PROTOCOL_H
@@ -68,6 +71,24 @@ struct HbWrench {
   float torque[3];  // N m
 };
 
+// What the host has commanded, and until when: all that an interrupt needs.
+struct HbCommand {
+  HbWrench commanded;
+  uint32_t received_us;
+  uint32_t watchdog_us;
+  bool is_enabled;
+  bool has_expired;
+  bool is_unfit;  // the device's last state said HB_FAULT or HB_NOT_READY
+
+  // Nothing is commanded.
+  HbCommand();
+
+  // Returns what the motors are to give now: nothing unless the newest force frame enabled them and
+  // is younger than the watchdog that it named. Call it often, best from a timer's interrupt, so
+  // that a main loop that hangs cannot leave a force on the motors.
+  HbWrench wrench(uint32_t now_us);
+};
+
 // CRC-16/CCITT-FALSE: polynomial 0x1021, start 0xFFFF, no reflection. "123456789" gives 0x29B1.
 uint16_t hb_crc16(const uint8_t* data, size_t count);
 
@@ -86,24 +107,20 @@ class HbDevice {
   // wrench() gives nothing.
   void state(const HbMotion& motion, uint32_t now_us, uint8_t frame[HB_FRAME_BYTES]);
 
-  // Returns what the motors are to give now: nothing unless the newest force frame enabled them and
-  // is younger than the watchdog that it named. Call it often, best from a timer's interrupt, so
-  // that a main loop that hangs cannot leave a force on the motors.
-  HbWrench wrench(uint32_t now_us);
+  // What the host has commanded. It changes with receive() and with state().
+  const HbCommand& command() const { return command_; }
+
+  // Returns what the motors are to give now, see HbCommand.
+  HbWrench wrench(uint32_t now_us) { return command_.wrench(now_us); }
 
  private:
   HbSheet sheet_;
-  HbWrench wrench_;
-  uint32_t received_us_;
-  uint32_t watchdog_us_;
+  HbCommand command_;
   uint16_t sequence_;
   uint16_t echo_;
   uint16_t asked_sequence_;
   int16_t asked_page_;
-  bool is_enabled_;
-  bool has_expired_;
   bool is_damaged_;
-  bool is_unfit_;
 };
 
 #endif

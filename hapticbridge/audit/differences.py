@@ -1,4 +1,4 @@
-"""Rotations over whole arrays: quaternions (…, 4), scalar first, and rotation vectors (…, 3)."""
+"""From tick to tick, over whole arrays: steps, turns, sums, and the time since the force rose."""
 
 from __future__ import annotations
 
@@ -31,19 +31,28 @@ def turn_between(a: Array, b: Array) -> Array:
     return np.asarray(factor * q[..., 1:])
 
 
-def steps(values: Array, start: Array) -> Array:
-    """Returns v_k − v_{k−1} over rows, with v_{−1} = start."""
-    return np.diff(values, axis=0, prepend=start[None])
+def steps(values: Array, before: Array) -> Array:
+    """Returns v_k − v_{k−1} over rows, with v_{−1} = before."""
+    return np.diff(values, axis=0, prepend=before[None])
 
 
-def turns(values: Array, start: Array) -> Array:
+def turns(values: Array, before: Array) -> Array:
     """Returns the rotation vectors from each orientation's predecessor to it."""
-    return turn_between(np.concatenate([start[None], values[:-1]]), values)
+    return turn_between(np.concatenate([before[None], values[:-1]]), values)
 
 
-def product_conjugate(values: Array, start: Array) -> Array:
-    """Returns q_k ⊗ q_{k−1}⁻¹ over rows (n, 4), with q_{−1} = start."""
-    return quaternion_product(values, conjugate(np.concatenate([start[None], values[:-1]])))
+def product_conjugate(values: Array, before: Array) -> Array:
+    """Returns q_k ⊗ q_{k−1}⁻¹ over rows (n, 4), with q_{−1} = before."""
+    return quaternion_product(values, conjugate(np.concatenate([before[None], values[:-1]])))
+
+
+def summed(values: Array, before: float) -> Array:
+    """Returns the sums up to each of the values, of what was before too.
+
+    They are added one after the other, so that sums over blocks are those over the whole, to the
+    bit.
+    """
+    return np.cumsum(np.concatenate([[before], values]))[1:]
 
 
 def rotate(q: Array, v: Array) -> Array:

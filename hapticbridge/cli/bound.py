@@ -1,4 +1,4 @@
-"""``hapticbridge zwidth`` and ``hapticbridge bound``."""
+"""``hapticbridge bound``."""
 
 from __future__ import annotations
 
@@ -8,142 +8,21 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
-from matplotlib.figure import Figure
 from rich.table import Table
 
-from hapticbridge.cli.terminal import err, out, plain, print_json
+from hapticbridge.cli.terminal import out, plain, print_json, write_figure
+from hapticbridge.cli.zwidth import DEFAULT_RATE, next_command
 from hapticbridge.clock import period_of
 from hapticbridge.coupling import Coupling
-from hapticbridge.felt import coupling_sentences
-from hapticbridge.passivity import ZWidth, z_width
 from hapticbridge.passivity.compensation import largest_felt_damping, law_damping
 from hapticbridge.passivity.grid import scalar
-from hapticbridge.picture import check_ending, write_picture
+from hapticbridge.picture import check_ending
 from hapticbridge.rendering import default_method
 from hapticbridge.study.theory import (
     Alternative,
     alternatives,
     draw_alternatives,
-    draw_z_width,
-    recommended,
 )
-
-DEFAULT_RATE = 1000.0
-"""Hz; what 'hapticbridge run' takes by itself, so that it need not be told."""
-
-
-def _next_command(stiffness: float, damping: float, rate: float) -> str:
-    command = f"hapticbridge run SCENE --stiffness {stiffness:.6g} --damping {damping:.6g}"
-    return command if rate == DEFAULT_RATE else f"{command} --rate {rate:.6g}"
-
-
-def _write(figure: Figure, path: Path) -> None:
-    with err.status("drawing …"):
-        write_picture(figure, path)
-    err.print(f"wrote {plain(str(path))}")
-
-
-@dataclass(frozen=True, slots=True)
-class Zwidth:
-    """Which stiffness and damping a device can show at a rate, and which to use.
-
-    Every line that limits it is named, with the command that uses the coupling. Example:
-        hapticbridge zwidth --damping 2 --mass 0.1 --friction 0.05 --resolution 1e-5 --plot out.png
-    """
-
-    damping: float
-    """Physical damping b of the device in N s/m."""
-    mass: float | None = None
-    """Mass of the device in kg; with it the line of a device that nobody holds is drawn too."""
-    friction: float | None = None
-    """Coulomb friction of the device in N."""
-    resolution: float = 0.0
-    """Step of the device's position in m; 0 where it is exact."""
-    rate: float = DEFAULT_RATE
-    """Ticks per second."""
-    delay: int = 0
-    """Whole ticks from position to force, beyond the hold."""
-    filter_time: float = 0.0
-    """Time constant in s of a first-order low-pass behind the coupling's damper."""
-    plot: Path | None = None
-    """Draw the region into this picture (.png, .svg or .pdf)."""
-    as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
-    """Print the lines, the limit and the corner as JSON."""
-
-    def execute(self) -> int:
-        """Computes and prints; returns the exit code."""
-        if self.plot is not None:
-            check_ending(self.plot)
-        period = period_of(self.rate)
-        with err.status("computing …"):
-            z = z_width(
-                self.damping,
-                period,
-                mass=self.mass,
-                friction=self.friction,
-                resolution=self.resolution,
-                delay=self.delay,
-                filter_time=self.filter_time,
-            )
-        # the run command has no low-pass to offer, and without it this corner is not passive
-        felt = recommended(z)
-        command = _next_command(felt.stiffness, felt.damping, self.rate)
-        told = None if z.filter_time else command
-        if self.as_json:
-            print_json(_z_width_facts(z, told))
-        else:
-            _print_z_width(z, told)
-        if self.plot is not None:
-            _write(draw_z_width(z), self.plot)
-        return 0
-
-
-def _z_width_facts(z: ZWidth, command: str | None) -> dict[str, object]:
-    return {
-        "lines": [
-            {
-                "name": line.name,
-                "reason": line.reason,
-                "required": line.is_required,
-                "largest_damping": line.largest_damping,
-                "stiffness": line.stiffness.tolist(),
-            }
-            for line in z.lines
-        ],
-        "damping": z.damping.tolist(),
-        "limit": z.limit.tolist(),
-        "limited_by": list(z.limited_by),
-        "corner": {
-            "stiffness": z.corner.stiffness,
-            "damping": z.corner.damping,
-            "felt_damping": recommended(z).damping,
-            "method": default_method().name,
-            "limited_by": z.corner_limited_by,
-        },
-        "notes": list(z.notes),
-        "next": command,
-    }
-
-
-def _print_z_width(z: ZWidth, command: str | None) -> None:
-    table = Table("line", "K at B' = 0", "B' at K = 0", "because", box=None, pad_edge=False)
-    for line in z.lines:
-        stiffness = f"{line.stiffness[0]:.5g} N/m"
-        reason = line.reason if line.is_required else f"not kept: {line.reason}"
-        table.add_row(line.name, stiffness, f"{line.largest_damping:.4g} N s/m", reason)
-    out.print(table)
-    reason = next(line.reason for line in z.lines if line.name == z.corner_limited_by)
-    out.print(f"limited by: {z.corner_limited_by} ({reason})")
-    for note in z.notes:
-        out.print(f"note: {note}")
-    (told,) = coupling_sentences(z.corner, default_method(), z.period, 1)
-    out.print(f"use {told}: 80 % of the limit at a quarter of its damping")
-    if command is None:
-        out.print(
-            "'hapticbridge run' has no low-pass: leave --filter-time out for a run's coupling"
-        )
-    else:
-        out.print(f"next: {plain(command)}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -189,7 +68,7 @@ class Bound:
             self._print(ways, period)
         if self.plot is not None:
             title = f"K = {self.stiffness:g} N/m, B = {self.damping:g} N s/m at {self.rate:g} Hz"
-            _write(draw_alternatives(ways, title, b), self.plot)
+            write_figure(draw_alternatives(ways, title, b), self.plot)
         return 0 if holds else 1
 
     def _facts(self, ways: tuple[Alternative, ...], period: float) -> dict[str, object]:
@@ -242,7 +121,7 @@ class Bound:
             out.print(f"device damping {b:g} >= {needed:.4g} N s/m: passive in any hand")
             out.print(f"it bears any K up to {2 * b / period:.4g} N/m with any B up to {b:g} N s/m")
             shown = max(self.damping, least)
-            out.print(f"next: {plain(_next_command(self.stiffness, shown, self.rate))}")
+            out.print(f"next: {plain(next_command(self.stiffness, shown, self.rate))}")
             return
         out.print(f"device damping {b:g} < {needed:.4g} N s/m: [red]not passive in any hand[/]")
         self._print_remedies(b, needed, period)

@@ -1,0 +1,119 @@
+"""Was the environment passive, and the device's port: the verdict on energies, block by block."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticbridge.audit.balance import Balance
+from hapticbridge.audit.structure import TOLERANCE
+
+_RECORDED = ("kinetic", "potential", "actuator_work", "external_work")
+
+
+@dataclass(frozen=True, slots=True)
+class _Excess:
+    """When a limit was first exceeded, and by how many joules."""
+
+    tick: int
+    joules: float
+
+
+@dataclass(slots=True)
+class Judgement:
+    """Gathers what decides the verdict while a recording passes by.
+
+    Attributes:
+        is_watched: Whether the device's port is judged by what happened. A device that meets its
+            condition needs no watch behind a coupling law: that is the proof.
+        energies: Energies after the newest tick, in J.
+        slack_share: Largest share of the slack that was used.
+    """
+
+    is_watched: bool
+    energies: dict[str, float] = field(default_factory=dict)
+    slack_share: float = 0.0
+    _unstrict: _Excess | None = None
+    _active: _Excess | None = None
+    _kicked: _Excess | None = None
+
+    def add(self, ticks: NDArray[np.void], balance: Balance) -> None:
+        """Adds records, at least one, and their balance."""
+        created = balance.environment_energy
+        rounding = TOLERANCE * (1 + balance.throughput)
+        unstrict = created > rounding
+        allowed = balance.slack + rounding
+        self.slack_share = max(
+            self.slack_share, float(np.max(np.where(unstrict, created / allowed, 0.0)))
+        )
+        start = int(ticks["tick"][0])
+        self._unstrict = self._unstrict or _first(unstrict, created, start)
+        self._active = self._active or _first(created > allowed, created - balance.slack, start)
+        if self.is_watched:
+            kicked = balance.kicked > rounding
+            self._kicked = self._kicked or _first(kicked, balance.kicked, start)
+        last = ticks[-1]
+        self.energies = {name: float(last[name]) for name in _RECORDED} | {
+            "coupling_work": float(balance.coupling_work[-1]),
+            "environment_energy": float(created[-1]),
+            "device_energy": float(balance.device_energy[-1]),
+            "slack": float(balance.slack[-1]),
+        }
+
+    def findings(self, *, strict: bool) -> dict[str, Any]:
+        """Returns the fields of ``AuditReport`` that say what the energies mean.
+
+        Args:
+            strict: Accept only (14) itself.
+        """
+        unstrict, active, kicked = self._unstrict, self._active, self._kicked
+        if kicked is not None and not (active is not None and active.tick <= kicked.tick):
+            return {
+                "verdict": "active",
+                "environment": "within slack" if unstrict else "strict",
+                "reason": f"from tick {kicked.tick} the device is given {kicked.joules:.3g} J more "
+                "than its damping burns and scene and coupling give up",
+                "tick": kicked.tick,
+                "port": "device",
+                "joules": kicked.joules,
+                "slack_share": self.slack_share,
+            }
+        if unstrict is None:
+            lost = -self.energies["environment_energy"]
+            return {
+                "verdict": "passive",
+                "environment": "strict",
+                "reason": f"the environment never gave out more than it got ({lost:.3g} J "
+                "dissipated)",
+            }
+        if active is None and not strict:
+            return {
+                "verdict": "passive",
+                "environment": "within slack",
+                "reason": "energy was created at times, within the slack that the coupling leaves "
+                f"({self.slack_share:.0%} of it used)",
+                "slack_share": self.slack_share,
+            }
+        excess = active or unstrict
+        limit = "its slack" if active else "(14), asked for strictly"
+        return {
+            "verdict": "active",
+            "environment": "active" if active else "within slack",
+            "reason": f"from tick {excess.tick} the environment exceeds {limit} by "
+            f"{excess.joules:.3g} J",
+            "tick": excess.tick,
+            "port": "environment",
+            "joules": excess.joules,
+            "slack_share": self.slack_share,
+        }
+
+
+def _first(is_beyond: NDArray[np.bool_], joules: NDArray[np.float64], start: int) -> _Excess | None:
+    """Returns the first of these ticks that is beyond a limit; ``start`` is the first one."""
+    if not is_beyond.any():
+        return None
+    at = int(np.argmax(is_beyond))
+    return _Excess(start + at, float(joules[at]))

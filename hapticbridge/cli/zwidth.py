@@ -1,0 +1,242 @@
+"""``hapticbridge zwidth``."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.table import Table
+
+from hapticbridge.cli.terminal import (
+    err,
+    out,
+    plain,
+    print_json,
+    progress,
+    tell,
+    write_figure,
+)
+from hapticbridge.clock import RealClock, SimulatedClock, period_of
+from hapticbridge.device import AXES, Device, DeviceInfo, open_device
+from hapticbridge.device.lateness import delay_ticks
+from hapticbridge.errors import HapticBridgeError, choices
+from hapticbridge.felt import coupling_sentences
+from hapticbridge.identify.measured_width import MeasuredWidth, measure_width, measured_points
+from hapticbridge.passivity import ZWidth, z_width
+from hapticbridge.picture import check_ending
+from hapticbridge.rendering import default_method
+from hapticbridge.study.theory import draw_z_width, recommended
+
+DEFAULT_RATE = 1000.0
+"""Hz; what 'hapticbridge run' takes by itself, so that it need not be told."""
+
+
+def next_command(stiffness: float, damping: float, rate: float) -> str:
+    """Returns the command that runs a scene with this coupling."""
+    command = f"hapticbridge run SCENE --stiffness {stiffness:.6g} --damping {damping:.6g}"
+    return command if rate == DEFAULT_RATE else f"{command} --rate {rate:.6g}"
+
+
+@dataclass(frozen=True, slots=True)
+class Zwidth:
+    """Which stiffness and damping a device can show at a rate, and which to use.
+
+    Every line that limits it is named, with the command that uses the coupling. With --measure the
+    limits are also tried on a device, and drawn beside the lines. Examples:
+
+        hapticbridge zwidth --damping 2 --mass 0.1 --friction 0.05 --resolution 1e-5 --plot out.png
+        hapticbridge zwidth --measure simulated:hand=none --plot out.png
+    """
+
+    damping: float | None = None
+    """Physical damping b of the device in N s/m; with --measure by default what is known of it."""
+    measure: str | None = None
+    """Try walls of rising stiffness on this device, as 'run --device' takes it, until its swing no
+    longer dies down. Hold it as in use, or not at all; it is pushed with up to half its force."""
+    axis: str = "x"
+    """Which axis --measure shakes: x, y or z."""
+    mass: float | None = None
+    """Mass of the device in kg; with it the line of a device that nobody holds is drawn too."""
+    friction: float | None = None
+    """Coulomb friction of the device in N."""
+    resolution: float | None = None
+    """Step of the device's position in m; by default exact."""
+    rate: float = DEFAULT_RATE
+    """Ticks per second."""
+    delay: int = 0
+    """Whole ticks from position to force, beyond the hold."""
+    filter_time: float = 0.0
+    """Time constant in s of a first-order low-pass behind the coupling's damper."""
+    plot: Path | None = None
+    """Draw the region into this picture (.png, .svg or .pdf)."""
+    as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
+    """Print the lines, the limit and the corner as JSON."""
+
+    def execute(self) -> int:
+        """Computes and prints; returns the exit code."""
+        if self.plot is not None:
+            check_ending(self.plot)
+        period = period_of(self.rate)
+        device = None if self.measure is None else self._opened(self.measure)
+        try:
+            with err.status("computing …"):
+                z = self._computed(period, None if device is None else device.info)
+            measured = None
+            if device is not None:
+                clock = RealClock() if device.info.is_real else SimulatedClock()
+                with progress("measuring") as show:
+                    measured = measure_width(device, clock, z, axis=self.axis, progress=show)
+        finally:
+            if device is not None:
+                device.close()
+        # the run command has no low-pass to offer, and without it this corner is not passive
+        felt = recommended(z)
+        command = next_command(felt.stiffness, felt.damping, self.rate)
+        told = None if z.filter_time else command
+        if self.as_json:
+            print_json(_z_width_facts(z, told) | _measured_facts(measured))
+        else:
+            _print_z_width(z, told)
+            if measured is not None:
+                _print_measured(measured)
+        if self.plot is not None:
+            points = None if measured is None else measured_points(measured)
+            write_figure(draw_z_width(z, points), self.plot)
+        return 0
+
+    def _opened(self, spec: str) -> Device:
+        if self.filter_time or self.delay:
+            raise HapticBridgeError(
+                "--measure tries walls without low-pass or further delay: leave --filter-time and "
+                "--delay out"
+            )
+        device = open_device(spec, tell=tell)
+        here = [axis for axis in AXES[:3] if axis in device.info.axes]
+        if device.info.is_prescribed or self.axis not in here:
+            device.close()
+            raise HapticBridgeError(
+                f"--axis {self.axis}: the device moves by force along "
+                f"{choices([] if device.info.is_prescribed else here)}"
+            )
+        return device
+
+    def _computed(self, period: float, info: DeviceInfo | None) -> ZWidth:
+        """Computes the lines from what was given, else from what is known of the device."""
+        given = {
+            name: getattr(self, name) for name in ("damping", "mass", "friction", "resolution")
+        }
+        delay = self.delay
+        if info is not None:
+            given = {
+                name: getattr(info, name) if value is None else value
+                for name, value in given.items()
+            }
+            delay = delay_ticks(info, period) or 0
+        if given["damping"] is None:
+            missing = "the device's is unknown" if info else "it is missing"
+            raise HapticBridgeError(
+                f"zwidth needs --damping, and {missing}; 'hapticbridge identify' measures it"
+            )
+        return z_width(
+            given["damping"],
+            period,
+            mass=given["mass"],
+            friction=given["friction"],
+            resolution=given["resolution"] or 0.0,
+            delay=delay,
+            filter_time=self.filter_time,
+        )
+
+
+def _z_width_facts(z: ZWidth, command: str | None) -> dict[str, object]:
+    return {
+        "lines": [
+            {
+                "name": line.name,
+                "reason": line.reason,
+                "required": line.is_required,
+                "largest_damping": line.largest_damping,
+                "stiffness": line.stiffness.tolist(),
+            }
+            for line in z.lines
+        ],
+        "damping": z.damping.tolist(),
+        "limit": z.limit.tolist(),
+        "limited_by": list(z.limited_by),
+        "corner": {
+            "stiffness": z.corner.stiffness,
+            "damping": z.corner.damping,
+            "felt_damping": recommended(z).damping,
+            "method": default_method().name,
+            "limited_by": z.corner_limited_by,
+        },
+        "notes": list(z.notes),
+        "next": command,
+    }
+
+
+def _print_z_width(z: ZWidth, command: str | None) -> None:
+    table = Table("line", "K at B' = 0", "B' at K = 0", "because", box=None, pad_edge=False)
+    for line in z.lines:
+        stiffness = f"{line.stiffness[0]:.5g} N/m"
+        reason = line.reason if line.is_required else f"not kept: {line.reason}"
+        table.add_row(line.name, stiffness, f"{line.largest_damping:.4g} N s/m", reason)
+    out.print(table)
+    reason = next(line.reason for line in z.lines if line.name == z.corner_limited_by)
+    out.print(f"limited by: {z.corner_limited_by} ({reason})")
+    for note in z.notes:
+        out.print(f"note: {note}")
+    (told,) = coupling_sentences(z.corner, default_method(), z.period, 1)
+    out.print(f"use {told}: 80 % of the limit at a quarter of its damping")
+    if command is None:
+        out.print(
+            "'hapticbridge run' has no low-pass: leave --filter-time out for a run's coupling"
+        )
+    else:
+        out.print(f"next: {plain(command)}")
+
+
+def _measured_facts(measured: MeasuredWidth | None) -> dict[str, object]:
+    if measured is None:
+        return {}
+    return {
+        "measured": [
+            {
+                "damping": limit.damping,
+                "borne": limit.borne,
+                "not_borne": limit.not_borne,
+                "predicted": predicted,
+                "trials": [asdict(trial) for trial in limit.trials],
+            }
+            for limit, predicted in zip(measured.limits, measured.predicted, strict=True)
+        ]
+    }
+
+
+def _print_measured(measured: MeasuredWidth) -> None:
+    """Prints what was borne beside what theory says."""
+    headings = ["B'", "borne to K", "not borne from K", "safe for any hand"]
+    table = Table(*headings, "without a hand", box=None, pad_edge=False)
+    unheld = measured.unheld or (None,) * len(measured.limits)
+    for limit, safe, free in zip(measured.limits, measured.predicted, unheld, strict=True):
+        table.add_row(
+            f"{limit.damping:.3g} N s/m",
+            f"{limit.borne:.4g} N/m",
+            "not found" if limit.not_borne is None else f"{limit.not_borne:.4g} N/m",
+            f"{safe:.4g} N/m",
+            "mass unknown" if free is None else f"{free:.4g} N/m",
+        )
+    out.print("measured on the device, as it was held:")
+    out.print(table)
+    low = [
+        limit.damping
+        for limit, safe in zip(measured.limits, measured.predicted, strict=True)
+        if limit.not_borne is not None and limit.not_borne < safe
+    ]
+    if low:
+        out.print(
+            f"[yellow]at B' = {low[0]:.3g} N s/m it bears less than theory allows:[/yellow] its "
+            "damping is less than was given, or it answers later; run 'hapticbridge identify'"
+        )

@@ -1,0 +1,206 @@
+"""Where two recorded runs part: first tick, field and size."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticbridge.compare.comparison import Comparison, Difference
+from hapticbridge.errors import RecordingError
+from hapticbridge.provenance import meta_float
+from hapticbridge.recording import RecordingFile, open_recording
+from hapticbridge.tick import CLOCK_FIELDS, COLUMNS, TICK_DTYPE, Column, TickFlag
+
+DECISIVE = (
+    "scene_sha256",
+    "scene_parameters",
+    "grip",
+    "method",
+    "period_s",
+    "substeps",
+    "stiffness",
+    "damping",
+    "rotational_stiffness",
+    "rotational_damping",
+    "felt",
+    "contact_stiffness",
+    "scale",
+    "force_scale",
+    "axes",
+    "force_limit",
+    "torque_limit",
+    "ramp_ticks",
+    "device",
+    "device_start",
+    "device_origin",
+    "handle_origin",
+    "handle_start",
+    "tool_start",
+    "start_kinetic",
+    "start_potential",
+)
+"""Metadata that decide what a run computes."""
+
+_BESIDE = ("versions", "host", "clock")
+"""Metadata that may explain why two runs differ, but make no difference by themselves."""
+
+_UNHELD = int(TickFlag.OVERRUN | TickFlag.DROPPED_BEFORE)
+"""Flags that clock and recorder set; like times, they differ between any two real runs."""
+
+SHORTEST, LONGEST = 1e-9, 1e3
+"""Periods in s that are compared: ticks are matched by whole ns, in 64 bits."""
+
+COMPARED = tuple(column for column in COLUMNS if column.field not in CLOCK_FIELDS)
+"""What is compared: every number of a record but its times."""
+
+
+def compare(first: str | Path, second: str | Path) -> Comparison:
+    """Compares two recordings tick by tick, bit by bit, without holding either in memory.
+
+    Ticks are matched by the time at which they were due, number times period: two runs at
+    different rates are compared where their ticks coincide (1 kHz and 500 Hz: at every second tick
+    of the first), and gaps shift nothing. Times of the clock and the flags ``OVERRUN`` and
+    ``DROPPED_BEFORE`` are left out, because they differ between any two real runs.
+
+    Args:
+        first: A recording.
+        second: Another one.
+
+    Raises:
+        RecordingError: One of them cannot be read, or does not say its period.
+    """
+    files = open_recording(first), open_recording(second)
+    periods = _period(files[0]), _period(files[1])
+    found = _Found(periods)
+    found.add_all(files)
+    return Comparison(
+        paths=(files[0].path, files[1].path),
+        ticks=(files[0].count, files[1].count),
+        periods=periods,
+        compared=found.compared,
+        alone=(found.shared[0] - found.compared, found.shared[1] - found.compared),
+        first=found.first,
+        largest=tuple(found.largest.values()),
+        decisive=_meta_differences(files, DECISIVE),
+        beside=_meta_differences(files, _BESIDE),
+        events=_event_differences(files),
+        notes=tuple(note for file in files for note in _notes(file)),
+    )
+
+
+class _Found:
+    """Gathers differences while pairs of ticks pass by."""
+
+    def __init__(self, periods: tuple[float, float]) -> None:
+        self._periods = periods
+        self._steps = round(periods[0] * 1e9), round(periods[1] * 1e9)
+        self.compared = 0
+        self.shared = [0, 0]
+        self.first: Difference | None = None
+        self.largest: dict[str, Difference] = {}
+
+    def add_all(self, files: tuple[RecordingFile, RecordingFile]) -> None:
+        """Compares all records that were due at the same time, block by block."""
+        streams = self._due(files, 0), self._due(files, 1)
+        nothing = np.zeros(0, TICK_DTYPE), np.zeros(0, np.int64)
+        waiting = [nothing, nothing]
+        while True:
+            for side in (0, 1):
+                if not waiting[side][0].size:
+                    waiting[side] = next(streams[side], nothing)
+            (a, due_a), (b, due_b) = waiting
+            if not (a.size and b.size):
+                break
+            # no further than both are known; what is behind waits for the other's next block
+            until = min(due_a.max(), due_b.max())
+            _, mine, other = np.intersect1d(due_a, due_b, return_indices=True)
+            if mine.size:
+                self.add(a[mine], b[other])
+            waiting = [(rows[due > until], due[due > until]) for rows, due in waiting]
+        for stream in streams:  # what is behind the end of the shorter run is counted
+            for _ in stream:
+                pass
+
+    def _due(
+        self, files: tuple[RecordingFile, RecordingFile], side: int
+    ) -> Iterator[tuple[NDArray[np.void], NDArray[np.int64]]]:
+        """Yields the records of one file with the times in ns at which they were due."""
+        for ticks in files[side].blocks():
+            due = ticks["tick"] * self._steps[side]
+            self.shared[side] += int(np.count_nonzero(due % self._steps[1 - side] == 0))
+            yield ticks, due
+
+    def add(self, a: NDArray[np.void], b: NDArray[np.void]) -> None:
+        """Compares records of the same times."""
+        self.compared += len(a)
+        earliest: tuple[int, Difference] | None = None
+        for column in COMPARED:
+            x, y = _numbers(a, column), _numbers(b, column)
+            unequal = x.view(np.int64) != y.view(np.int64)
+            if not unequal.any():
+                continue
+            with np.errstate(invalid="ignore", over="ignore"):
+                size = np.abs(x.astype(np.float64) - y.astype(np.float64))
+            size = np.where(unequal, np.where(np.isfinite(size), size, np.inf), -1.0)
+            at = int(np.argmax(unequal))
+            if earliest is None or at < earliest[0]:
+                earliest = at, self._difference(column, a, b, at)
+            worst = self._difference(column, a, b, int(np.argmax(size)))
+            known = self.largest.get(column.name)
+            if known is None or worst.size > known.size:
+                self.largest[column.name] = worst
+        if self.first is None and earliest is not None:
+            self.first = earliest[1]
+
+    def _difference(
+        self, column: Column, a: NDArray[np.void], b: NDArray[np.void], at: int
+    ) -> Difference:
+        ticks = int(a["tick"][at]), int(b["tick"][at])
+        values = _numbers(a, column)[at].item(), _numbers(b, column)[at].item()
+        time = ticks[0] * self._periods[0]
+        return Difference(time, ticks, column.name, column.unit, values)
+
+
+def _numbers(ticks: NDArray[np.void], column: Column) -> NDArray[np.int64 | np.float64]:
+    field = ticks[column.field]
+    if column.field == "flags":
+        field = field & ~_UNHELD
+    return np.ascontiguousarray(field if column.part is None else field[:, column.part])
+
+
+def _period(file: RecordingFile) -> float:
+    period = meta_float(file.meta, "period_s")
+    if not SHORTEST <= period <= LONGEST:
+        raise RecordingError(
+            f"{file.path}: metadata 'period_s' is {period:g}; it must be from {SHORTEST:g} to "
+            f"{LONGEST:g} s"
+        )
+    return period
+
+
+def _meta_differences(
+    files: tuple[RecordingFile, RecordingFile], names: tuple[str, ...]
+) -> dict[str, tuple[str | None, str | None]]:
+    pairs = {name: (files[0].meta.get(name), files[1].meta.get(name)) for name in names}
+    return {name: pair for name, pair in pairs.items() if pair[0] != pair[1]}
+
+
+def _event_differences(
+    files: tuple[RecordingFile, RecordingFile],
+) -> dict[str, tuple[int, int]]:
+    lists = [[str(event.get("event", "unnamed")) for event in file.events] for file in files]
+    names = dict.fromkeys(lists[0] + lists[1])
+    counts = {name: (lists[0].count(name), lists[1].count(name)) for name in names}
+    return {name: pair for name, pair in counts.items() if pair[0] != pair[1]}
+
+
+def _notes(file: RecordingFile) -> Iterator[str]:
+    if file.is_cut:
+        yield f"{file.path} is cut; what it holds is compared"
+    elif file.digest != file.computed_digest:
+        yield f"{file.path} does not match its digest: it was changed"
+    if file.problems:
+        yield f"{file.path} is damaged: {'; '.join(file.problems)}"

@@ -1,0 +1,182 @@
+"""Force Dimension's own library (DHD), loaded at run time: none of it is part of this project.
+
+Signatures, types and codes as the SDK's header ``dhdc.h`` and its public Python bindings have them.
+Every call ends with the device's number. Getters and setters return a negative number where they
+failed, 0, or a positive one as a warning. Each talks to the device before it returns: how long
+that may take is up to the library, and cannot be bounded from here.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import ctypes.util
+import math
+import os
+import sys
+from collections.abc import Callable
+from ctypes import POINTER, c_byte, c_char_p, c_double, c_int, c_ubyte, c_uint, c_ushort
+from typing import Any
+
+from hapticbridge.errors import DeviceError
+
+VARIABLE = "HAPTICBRIDGE_DHD"
+"""Environment variable that names the library's file where the option ``library`` does not."""
+
+FRESH, TIMEGUARD, SATURATED = 0, 1, 2
+"""Codes: done; a getter had no newer sample; a motor is at its end."""
+
+MOST_WATCHDOG = 255
+"""Largest watchdog, in steps of ``WATCHDOG_STEP``: its argument is a byte."""
+
+WATCHDOG_STEP = 125e-6
+"""In s."""
+
+TIMING, SHARE = 0.1, 0.95
+"""Time in s for which exchanges are measured, and the share of them that keeps the delay."""
+
+_NUMBERS = POINTER(c_double)
+
+FUNCTIONS: dict[str, tuple[Any, tuple[Any, ...]]] = {
+    "dhdGetDeviceCount": (c_int, ()),
+    "dhdOpenID": (c_int, (c_byte,)),
+    "dhdClose": (c_int, (c_byte,)),
+    "dhdGetSystemType": (c_int, (c_byte,)),
+    "dhdGetSerialNumber": (c_int, (POINTER(c_ushort), c_byte)),
+    "dhdGetMaxForce": (c_double, (c_byte,)),
+    "dhdGetMaxTorque": (c_double, (c_byte,)),
+    "dhdGetEffectorMass": (c_int, (_NUMBERS, c_byte)),
+    "dhdSetGravityCompensation": (c_int, (c_int, c_byte)),
+    "dhdEnableExpertMode": (c_int, ()),
+    "dhdDisableExpertMode": (c_int, ()),
+    "dhdSetWatchdog": (c_int, (c_ubyte, c_byte)),
+    "dhdEnableForce": (c_int, (c_ubyte, c_byte)),
+    "dhdGetPosition": (c_int, (_NUMBERS,) * 3 + (c_byte,)),
+    "dhdGetPositionAndOrientationFrame": (c_int, (_NUMBERS,) * 4 + (c_byte,)),
+    "dhdGetButtonMask": (c_uint, (c_byte,)),
+    "dhdSetForce": (c_int, (c_double,) * 3 + (c_byte,)),
+    "dhdSetForceAndTorque": (c_int, (c_double,) * 6 + (c_byte,)),
+    "dhdGetTime": (c_double, ()),
+    "dhdErrorGetLastStr": (c_char_p, ()),
+}
+"""What is called, with the type of the result and those of the arguments."""
+
+NAMES = {
+    "linux": ("libdrd.so.3", "libdrd.so", "libdhd.so.3", "libdhd.so"),
+    "darwin": ("libdrd.dylib", "libdhd.dylib"),
+    "win32": ("drd64.dll", "dhd64.dll"),
+}
+"""Usual names of its files, by ``sys.platform``. DRD holds all of DHD."""
+
+
+class Dhd:
+    """The library, loaded, with every function that is used bound to its signature.
+
+    Args:
+        path: Its file.
+
+    Raises:
+        DeviceError: It cannot be loaded, or lacks a function.
+    """
+
+    def __init__(self, path: str) -> None:
+        try:
+            library = ctypes.CDLL(path)
+        except OSError as error:
+            reason = " ".join(str(error).split())
+            raise DeviceError(f"the library '{path}' cannot be loaded: {reason}") from None
+        self.path = path
+        self._functions: dict[str, Any] = {}
+        for name, (result, arguments) in FUNCTIONS.items():
+            try:
+                function = getattr(library, name)
+            except AttributeError:
+                raise DeviceError(
+                    f"'{path}' has no {name}: it is not Force Dimension's library, or is older "
+                    "than 3.3"
+                ) from None
+            function.restype, function.argtypes = result, arguments
+            self._functions[name] = function
+
+    def __getitem__(self, name: str) -> Any:
+        """Returns a function of ``FUNCTIONS``."""
+        return self._functions[name]
+
+    def now(self) -> float:
+        """Returns the time in s of the library's own clock."""
+        return float(self["dhdGetTime"]())
+
+    def last_error(self) -> str:
+        """Returns what the library says of its last error."""
+        text = self["dhdErrorGetLastStr"]()
+        return text.decode(errors="replace") if text else "it does not say why"
+
+    def require(self, name: str, *arguments: Any, what: str) -> int:
+        """Calls a function; returns its code, 0 or a warning.
+
+        Args:
+            name: Of ``FUNCTIONS``.
+            *arguments: The function's.
+            what: What could not be done if it fails, for the message.
+
+        Raises:
+            DeviceError: It failed; says what the library says.
+        """
+        code = int(self[name](*arguments))
+        if code < 0:
+            raise DeviceError(f"{what}: {self.last_error()}")
+        return code
+
+    def has_watchdog(self, device: int, steps: int) -> bool:
+        """Sets a device's watchdog; returns False where it has none.
+
+        Args:
+            device: Its number.
+            steps: Of ``WATCHDOG_STEP``, 1 to ``MOST_WATCHDOG``. A force that is this old ends.
+        """
+        self["dhdEnableExpertMode"]()
+        code = int(self["dhdSetWatchdog"](steps, device))
+        self["dhdDisableExpertMode"]()
+        return code >= 0
+
+    def timing(self, exchange: Callable[[], object]) -> tuple[float, float]:
+        """Returns how often an exchange can be made, in Hz, and the time in s that most kept.
+
+        Args:
+            exchange: Reads a sample and writes a force; made for ``TIMING``.
+        """
+        times = []
+        begin = last = self.now()
+        while last - begin < TIMING:
+            exchange()
+            now = self.now()
+            times.append(now - last)
+            last = now
+        times.sort()
+        return len(times) / (last - begin), times[math.ceil(SHARE * len(times)) - 1]
+
+
+def located(library: object = None) -> str:
+    """Returns the library's file.
+
+    Args:
+        library: What the user named; None: the environment variable, else the usual names.
+
+    Raises:
+        DeviceError: None is found; says where to get it and how to name it.
+    """
+    named = library or os.environ.get(VARIABLE)
+    if named:
+        return str(named)
+    for name in ("drd", "dhd"):
+        if (found := ctypes.util.find_library(name)) is not None:
+            return found
+    for name in NAMES.get(sys.platform, ()):
+        try:
+            ctypes.CDLL(name)
+        except OSError:
+            continue
+        return name
+    raise DeviceError(
+        "Force Dimension's library (DHD) was not found: install the SDK of forcedimension.com and "
+        f"name its file with library=FILE or {VARIABLE}"
+    )

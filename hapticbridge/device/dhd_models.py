@@ -1,0 +1,107 @@
+"""What Force Dimension's library calls its devices, and what is known of each beforehand."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from hapticbridge.errors import DeviceError
+from hapticbridge.pose import Quaternion, canonical
+
+ROTATION_ERROR = 1e-3
+"""Of R Rᵀ, without unit: more is no rotation, whatever rounded it."""
+
+_NOTHING_RECORDED = 0.5  # N m, of torques that are recorded and have no motor: the usual limit
+
+
+@dataclass(frozen=True, slots=True)
+class Model:
+    """A kind of device.
+
+    Attributes:
+        name: The maker's.
+        turns: Whether its wrist has motors.
+        force: Largest force in N, where the library sets no limit; None where none was found.
+        torque: Largest torque in N m, likewise.
+    """
+
+    name: str
+    turns: bool = False
+    force: float | None = None
+    torque: float | None = None
+
+
+MODELS = {
+    33: Model("omega.3", force=12.0),
+    34: Model("omega.6", force=12.0),
+    36: Model("omega.6 left", force=12.0),
+    35: Model("omega.7", force=12.0),
+    37: Model("omega.7 left", force=12.0),
+    60: Model("Novint Falcon", force=8.0),
+    63: Model("delta.3", force=20.0),
+    104: Model("sigma.7", turns=True, force=12.0, torque=0.4),
+    105: Model("sigma.7 left", turns=True, force=12.0, torque=0.4),
+    108: Model("lambda.7", turns=True, force=12.0),
+    109: Model("lambda.7 left", turns=True, force=12.0),
+    203: Model("lambda.3"),
+    206: Model("sigma.3"),
+}
+"""By ``dhdGetSystemType``: numbers of the SDK's header. Forces and torques are what CHAI3D lets
+programs ask of each; the maker's own figures are as large or larger."""
+
+
+def limits_of(
+    model: Model, told: Sequence[float], asked: Mapping[str, float]
+) -> tuple[float, float]:
+    """Returns the largest force in N and torque in N m that a device may be sent.
+
+    The lower holds of what the library says and of what was asked, or is known of the model.
+
+    Args:
+        model: The device's.
+        told: What the library says of each; it is negative where it sets no limit.
+        asked: Numbers of the data sheet that the user named.
+
+    Raises:
+        DeviceError: Nobody knows.
+    """
+    limits = {"force": 0.0, "torque": _NOTHING_RECORDED}
+    usual = {"force": model.force, "torque": model.torque}
+    for name, said in zip(limits, told, strict=True):
+        if name == "torque" and not model.turns:
+            continue
+        ends = [asked.get(f"{name}_limit", usual[name]), said if said > 0.0 else None]
+        known = [end for end in ends if end is not None]
+        if not known:
+            raise DeviceError(
+                f"neither the library nor this project knows the largest {name} of {model.name}; "
+                f"name it with {name}_limit="
+            )
+        limits[name] = min(known)
+    return limits["force"], limits["torque"]
+
+
+def quaternion_of(frame: Sequence[float], name: str) -> Quaternion:
+    """Returns the unit quaternion (w, x, y, z) of a rotation matrix.
+
+    Args:
+        frame: Nine numbers, row by row.
+        name: What errors call the device.
+
+    Raises:
+        DeviceError: The matrix is no rotation, or a number in it is not finite.
+    """
+    flat = np.array(frame)
+    matrix = flat.reshape(3, 3)
+    is_finite = bool(np.isfinite(matrix).all())
+    if not is_finite or not (
+        np.abs(matrix @ matrix.T - np.eye(3)).max() < ROTATION_ERROR and np.linalg.det(matrix) > 0
+    ):
+        raise DeviceError(f"{name} reports an orientation that is no rotation")
+    quaternion = np.empty(4)
+    mujoco.mju_mat2Quat(quaternion, flat)
+    w, x, y, z = (quaternion / np.linalg.norm(quaternion)).tolist()
+    return canonical((w, x, y, z))

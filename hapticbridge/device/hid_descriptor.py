@@ -1,0 +1,217 @@
+"""A HID device's own description of its reports: which bits of which report mean what.
+
+A report descriptor is a program for a small machine: items set the state (size, count, range,
+usage) of the fields that the next main item makes. What is read here is what finding fields by
+usage needs; designators, strings and delimiters are skipped.
+
+References:
+    USB-IF, Device Class Definition for Human Interface Devices 1.11, sections 5 and 6.2.2.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+from hapticbridge.errors import DeviceError
+
+INPUT, OUTPUT, FEATURE = 8, 9, 11
+"""Kinds of report, as the main items that describe them are numbered."""
+
+LONGEST_DESCRIPTOR = 4096
+"""In bytes: what Linux reads of one (HID_MAX_DESCRIPTOR_SIZE)."""
+
+LONGEST_REPORT_BITS = 8 * 16384
+"""What Linux takes for a report (HID_MAX_BUFFER_SIZE)."""
+
+MOST_USAGES = 1024
+"""Usages kept per field. A keyboard has 256; a range of 65536 means 'any', and names nothing."""
+
+_MAIN, _GLOBAL, _LOCAL, _LONG = 0, 1, 2, 0xFE
+_COLLECTION, _END_COLLECTION = 10, 12
+_VARIABLE, _CONSTANT = 2, 1
+(_PAGE, _LOGICAL_LEAST, _LOGICAL_MOST, _PHYSICAL_LEAST, _PHYSICAL_MOST, _EXPONENT, _UNIT, _SIZE,
+ _REPORT, _COUNT, _PUSH, _POP) = range(12)  # fmt: skip
+_USAGE, _USAGE_LEAST, _USAGE_MOST = range(3)
+
+Number = tuple[int, int]
+"""An item's data: its value without sign, and how many bytes it took."""
+
+
+@dataclass(frozen=True, slots=True)
+class Field:
+    """What one main item describes: ``count`` elements of ``size`` bits, one after another.
+
+    Attributes:
+        kind: ``INPUT``, ``OUTPUT`` or ``FEATURE``.
+        report: Number of the report, 0 where the device does not number them.
+        offset: First bit within the report, its number not counted.
+        size: Bits per element.
+        count: How many elements.
+        is_variable: Whether each element has a usage and a value of its own. If not it is an array:
+            an element's value says which usage is meant, ``minimum`` the first, in their order.
+        usages: 32 bits each, the page above; the last one goes for all further elements. None
+            where it is padding.
+        collections: Usages of the collections around it, outermost first.
+        minimum: Least logical value.
+        maximum: Most.
+        physical: Least and most physical value; the logical ones where the device gives none.
+        unit: Of the physical values, coded as the standard has it; 0: none.
+        exponent: Power of ten of that unit.
+    """
+
+    kind: int
+    report: int
+    offset: int
+    size: int
+    count: int
+    is_variable: bool
+    usages: tuple[int, ...]
+    collections: tuple[int, ...]
+    minimum: int
+    maximum: int
+    physical: tuple[int, int]
+    unit: int
+    exponent: int
+
+
+@dataclass(slots=True)
+class _State:
+    """What items have set so far."""
+
+    globals: dict[int, Number] = field(default_factory=dict)
+    pushed: list[dict[int, Number]] = field(default_factory=list)
+    usages: list[Number] = field(default_factory=list)
+    least: Number | None = None
+    collections: list[int] = field(default_factory=list)
+    lengths: dict[tuple[int, int], int] = field(default_factory=dict)
+
+    def value(self, item: int, *, is_signed: bool = False) -> int:
+        number = self.globals.get(item, (0, 0))
+        return _signed(number) if is_signed else number[0]
+
+    def full_usages(self) -> list[int]:
+        """Returns the usages since the last main item; short ones are of the page that holds."""
+        page = self.value(_PAGE) << 16
+        return [value if size == 4 else page | value for value, size in self.usages]
+
+    def limits(self, least: int, most: int) -> tuple[int, int]:
+        """Returns a range; the upper end has a sign only where the lower one is negative."""
+        low = self.value(least, is_signed=True)
+        return low, self.value(most, is_signed=low < 0)
+
+
+def fields_of(descriptor: bytes) -> tuple[Field, ...]:
+    """Returns the fields that a report descriptor describes; padding is one without usages.
+
+    Args:
+        descriptor: As the device sent it.
+
+    Raises:
+        DeviceError: It is no report descriptor, and why.
+    """
+    if not 0 < len(descriptor) <= LONGEST_DESCRIPTOR:
+        raise DeviceError(
+            f"a report descriptor of {len(descriptor)} bytes: it must have 1 to "
+            f"{LONGEST_DESCRIPTOR}"
+        )
+    state, fields = _State(), []
+    for kind, tag, number in _items(descriptor):
+        if kind == _GLOBAL:
+            _set_global(state, tag, number)
+        elif kind == _LOCAL:
+            _set_local(state, tag, number)
+        elif kind == _MAIN:
+            if tag in (INPUT, OUTPUT, FEATURE):
+                fields += _fields(state, tag, number[0])
+            elif tag == _COLLECTION:
+                state.collections.append(next(iter(state.full_usages()), 0))
+            elif tag == _END_COLLECTION:
+                if not state.collections:
+                    raise DeviceError("a report descriptor that ends a collection it never began")
+                state.collections.pop()
+            state.usages, state.least = [], None
+    return tuple(fields)
+
+
+def _items(descriptor: bytes) -> Iterator[tuple[int, int, Number]]:
+    """Yields kind, tag and data of each short item; long ones mean nothing to anybody."""
+    place = 0
+    while place < len(descriptor):
+        prefix = descriptor[place]
+        if prefix == _LONG:
+            length = 2 + (descriptor[place + 1] if place + 1 < len(descriptor) else 0)
+        else:
+            length = (0, 1, 2, 4)[prefix & 3]
+        data = descriptor[place + 1 : place + 1 + length]
+        if len(data) < length:
+            raise DeviceError(f"a report descriptor that ends within the item at byte {place}")
+        place += 1 + length
+        if prefix != _LONG:
+            yield prefix >> 2 & 3, prefix >> 4, (int.from_bytes(data, "little"), length)
+
+
+def _signed(number: Number) -> int:
+    value, size = number
+    return value - (1 << 8 * size) if size and value >> (8 * size - 1) else value
+
+
+def _set_global(state: _State, tag: int, number: Number) -> None:
+    if tag == _PUSH:
+        state.pushed.append(dict(state.globals))
+    elif tag == _POP:
+        if not state.pushed:
+            raise DeviceError("a report descriptor that restores a state it never kept")
+        state.globals = state.pushed.pop()
+    else:
+        state.globals[tag] = number
+
+
+def _set_local(state: _State, tag: int, number: Number) -> None:
+    if tag == _USAGE:
+        state.usages.append(number)
+    elif tag == _USAGE_LEAST:
+        state.least = number
+    elif tag == _USAGE_MOST and state.least is not None:
+        least, size = state.least
+        room = MOST_USAGES - len(state.usages)
+        last = min(number[0], least + room - 1)
+        state.usages += [(usage, max(size, number[1])) for usage in range(least, last + 1)]
+        state.least = None
+    del state.usages[MOST_USAGES:]
+
+
+def _fields(state: _State, kind: int, flags: int) -> list[Field]:
+    """Returns the field that a main item makes, none where it is empty, and moves on."""
+    size, count, report = state.value(_SIZE), state.value(_COUNT), state.value(_REPORT)
+    if report > 255:
+        raise DeviceError(f"a report descriptor with a report number of {report}")
+    offset = state.lengths.get((kind, report), 0)
+    if offset + size * count > LONGEST_REPORT_BITS:
+        raise DeviceError(f"a report descriptor with a report of {offset + size * count} bits")
+    state.lengths[kind, report] = offset + size * count
+    usages = () if flags & _CONSTANT else tuple(state.full_usages())
+    if not size or not count:
+        return []
+    logical = state.limits(_LOGICAL_LEAST, _LOGICAL_MOST)
+    physical = state.limits(_PHYSICAL_LEAST, _PHYSICAL_MOST)
+    exponent = _signed((state.value(_EXPONENT), 1)) if state.value(_EXPONENT) < 256 else 0
+    if 8 <= exponent <= 15:
+        exponent -= 16  # four bits with a sign, unless the device sent eight
+    return [
+        Field(
+            kind=kind,
+            report=report,
+            offset=offset,
+            size=size,
+            count=count,
+            is_variable=bool(flags & _VARIABLE),
+            usages=usages,
+            collections=tuple(state.collections),
+            minimum=logical[0],
+            maximum=logical[1],
+            physical=physical if physical[0] < physical[1] else logical,
+            unit=state.value(_UNIT),
+            exponent=exponent,
+        )
+    ]

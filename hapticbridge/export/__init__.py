@@ -1,0 +1,6 @@
+"""A recording as a table for other programs: Parquet, CSV or HDF5."""
+
+from hapticbridge.export.export import FORMATS as FORMATS
+from hapticbridge.export.export import Exported as Exported
+from hapticbridge.export.export import export as export
+from hapticbridge.export.export import target_for as target_for

@@ -1,0 +1,51 @@
+"""What a format does: takes the description of a recording, then its ticks block by block."""
+
+from __future__ import annotations
+
+import importlib
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticbridge.errors import RecordingError
+from hapticbridge.recording import RecordingFile
+from hapticbridge.tick import Column
+
+
+class Sink(Protocol):
+    """A table that is being written.
+
+    Args:
+        path: The file to write.
+        recording: Where metadata and events come from.
+    """
+
+    def __init__(self, path: Path, recording: RecordingFile) -> None: ...
+
+    def add(self, ticks: NDArray[np.void]) -> None:
+        """Appends records, ``TICK_DTYPE``."""
+
+    def close(self) -> None:
+        """Finishes the file."""
+
+
+def column_values(ticks: NDArray[np.void], column: Column) -> NDArray[Any]:
+    """Returns one column of records, contiguous, int64 or float64, to the bit."""
+    field = ticks[column.field]
+    return np.ascontiguousarray(field if column.part is None else field[:, column.part])
+
+
+def needed(module: str, package: str, form: str, extra: str) -> Any:
+    """Returns a module of an optional package.
+
+    Raises:
+        RecordingError: It is not installed.
+    """
+    try:
+        return importlib.import_module(module)
+    except ImportError:
+        raise RecordingError(
+            f"{form} needs {package}, which is not installed: pip install 'hapticbridge[{extra}]'"
+        ) from None

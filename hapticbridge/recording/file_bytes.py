@@ -1,0 +1,90 @@
+"""A file's bytes by their places, read when they are asked for."""
+
+from __future__ import annotations
+
+import threading
+import zlib
+from pathlib import Path
+from types import TracebackType
+
+from hapticbridge.errors import RecordingError
+
+WINDOW = 1 << 20
+"""Bytes that are read at once where a long stretch is only looked through: larger takes more
+memory, smaller more calls."""
+
+
+class FileBytes:
+    """A file as a sequence of bytes that is never in memory as a whole.
+
+    It is not mapped into memory: a bridge that records to the same file anew would cut it, and to
+    touch a mapped page behind the end ends the process. Slices may be read from several threads.
+
+    Args:
+        path: A regular file.
+
+    Raises:
+        RecordingError: It cannot be read.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._lock = threading.Lock()
+        try:
+            if path.exists() and not path.is_file():
+                kind = "a folder" if path.is_dir() else "not a regular file"
+                raise RecordingError(f"cannot read the recording {path}: it is {kind}")
+            self._size = path.stat().st_size
+            self._file = path.open("rb", buffering=0)
+        except (OSError, ValueError) as error:
+            raise self._refusal(error) from error
+
+    def __enter__(self) -> FileBytes:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self._file.close()
+
+    def __len__(self) -> int:
+        return self._size
+
+    def __getitem__(self, places: slice) -> bytes:
+        """Returns the bytes of a slice without a step.
+
+        Raises:
+            RecordingError: They cannot be read, or the file became shorter meanwhile.
+        """
+        start, stop, _ = places.indices(self._size)
+        wanted = max(stop - start, 0)
+        pieces = bytearray()
+        try:
+            with self._lock:
+                self._file.seek(start)
+                # a read may return less than was asked for
+                while len(pieces) < wanted and (piece := self._file.read(wanted - len(pieces))):
+                    pieces += piece
+        except OSError as error:
+            raise self._refusal(error) from error
+        if len(pieces) < wanted:
+            raise RecordingError(f"the recording {self._path} became shorter while it was read")
+        return bytes(pieces)
+
+    def checksum(self, start: int, stop: int) -> int:
+        """Returns the CRC-32 of a stretch."""
+        crc = 0
+        for at in range(start, stop, WINDOW):
+            crc = zlib.crc32(self[at : min(at + WINDOW, stop)], crc)
+        return crc
+
+    def is_zero_from(self, start: int) -> bool:
+        """Tells whether nothing but zeros stands behind a place."""
+        return not any(any(self[at : at + WINDOW]) for at in range(start, self._size, WINDOW))
+
+    def _refusal(self, error: Exception) -> RecordingError:
+        reason = getattr(error, "strerror", None) or error
+        return RecordingError(f"cannot read the recording {self._path}: {reason}")

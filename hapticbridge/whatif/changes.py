@@ -1,0 +1,139 @@
+"""What may be changed, by name, and what it was."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, fields, replace
+
+from hapticbridge.coupling import Coupling
+from hapticbridge.errors import RecordingError, choices
+from hapticbridge.rendering import METHODS, Method, method_named
+
+UNITS = {
+    "stiffness": "N/m",
+    "damping": "N s/m",
+    "rotational_stiffness": "N m/rad",
+    "rotational_damping": "N m s/rad",
+    "method": "",
+    "rate": "Hz",
+    "substeps": "",
+    "scale": "",
+    "force_scale": "",
+    "contact_stiffness": "N/m",
+}
+"""What may be changed beside the scene's own parameters, with units."""
+
+_GAINS = tuple(field.name for field in fields(Coupling))
+
+Value = float | int | str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Settings:
+    """What decides a run beside scene, device and limits.
+
+    Attributes:
+        coupling: K and B as asked for: what should be felt.
+        method: How the tool is rendered.
+        rate: Ticks per second.
+        substeps: MuJoCo steps per tick.
+        scale: Handle motion per device motion.
+        force_scale: Force on the device per force on the tool.
+        contact_stiffness: K_c in N/m of method ``direct``; None takes the coupling's.
+        scene: Values of the scene's parameters, by name.
+    """
+
+    coupling: Coupling
+    method: Method
+    rate: float
+    substeps: int
+    scale: float
+    force_scale: float
+    contact_stiffness: float | None
+    scene: Mapping[str, float]
+
+    def value(self, name: str) -> Value | None:
+        """Returns what a name of ``UNITS`` or of the scene stands for."""
+        if name in _GAINS:
+            return float(getattr(self.coupling, name))
+        if name == "method":
+            return self.method.name
+        if name in UNITS:
+            value: Value | None = getattr(self, name)
+            return value
+        return self.scene[name]
+
+    def changed(self, changes: Mapping[str, Value]) -> Settings:
+        """Returns the settings with changes in the place of what was.
+
+        ``scale`` alone changes the scale of the force with it, where both were one: power stays
+        equal on both sides. A contact stiffness goes with the method that knows one.
+
+        Raises:
+            RecordingError: A name is unknown, or its value cannot be one.
+            CouplingError: A gain is out of range.
+        """
+        known = {*UNITS, *self.scene}
+        if unknown := [name for name in changes if name not in known]:
+            raise RecordingError(
+                f"'{unknown[0]:.60}' cannot be changed; what can: {choices(UNITS)}; of the scene: "
+                f"{choices(self.scene)}"
+            )
+        given = {name: _checked(name, value) for name, value in changes.items()}
+        method = method_named(str(given.get("method", self.method.name)))
+        gains = {name: float(given[name]) for name in _GAINS if name in given}
+        scale = float(given.get("scale", self.scale))
+        is_equal = self.scale == self.force_scale
+        contact = given.get("contact_stiffness", self.contact_stiffness)
+        if method.has_coupling and "contact_stiffness" not in given:
+            contact = None
+        return Settings(
+            coupling=replace(self.coupling, **gains),
+            method=method,
+            rate=float(given.get("rate", self.rate)),
+            substeps=int(given.get("substeps", self.substeps)),
+            scale=scale,
+            force_scale=float(given.get("force_scale", scale if is_equal else self.force_scale)),
+            contact_stiffness=None if contact is None else float(contact),
+            scene={name: float(given.get(name, was)) for name, was in self.scene.items()},
+        )
+
+
+def changes_from(words: Iterable[str]) -> dict[str, Value]:
+    """Returns changes from words such as ``stiffness=3000`` and ``method=explicit``.
+
+    Raises:
+        RecordingError: A word is not a name and a value, or a name comes twice.
+    """
+    changes: dict[str, Value] = {}
+    for word in words:
+        name, sign, text = (part.strip() for part in word.partition("="))
+        if not (name and sign and text):
+            raise RecordingError(
+                f"cannot change '{word:.80}'; write a name and a value, such as stiffness=3000; "
+                f"names: {choices(UNITS)}, and the scene's parameters"
+            )
+        if name in changes:
+            raise RecordingError(f"'{name}' is changed twice; change it once")
+        changes[name] = text
+    return changes
+
+
+def _checked(name: str, value: Value) -> Value:
+    """Returns a value of the kind that its name asks for; the range is the run's to check."""
+    if name == "method":
+        if value not in METHODS:
+            raise RecordingError(f"method is {value!r:.60}; choose one of {choices(METHODS)}")
+        return value
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        number = math.nan
+    if not math.isfinite(number):
+        raise RecordingError(f"{name} is {value!r:.60}; it must be a finite number")
+    if name == "substeps":
+        if not number.is_integer():
+            raise RecordingError(f"substeps is {value!r:.60}; it must be a whole number")
+        return int(number)
+    return number

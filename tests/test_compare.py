@@ -1,0 +1,186 @@
+"""Two recorded runs: alike in every bit, or where they part, by how much and perhaps why."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from audit_cases import recorded, rewritten, tapped
+from cli_cases import Called
+from numpy.typing import NDArray
+
+from hapticbridge.compare import compare
+from hapticbridge.errors import RecordingError
+from hapticbridge.recording import read_recording, reader
+from hapticbridge.tick import TickFlag
+
+
+@pytest.fixture(scope="module")
+def tap(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tapped(tmp_path_factory.mktemp("compare"))
+
+
+Change = Callable[[NDArray[np.void]], None]
+
+
+def changed(path: Path, folder: Path, change: Change, **parts: Any) -> Path:
+    recording = read_recording(path)
+    rows = recording.ticks.copy()
+    change(rows)
+    return rewritten(recording, folder / "changed.mcap", ticks=rows, **parts)
+
+
+def test_a_run_that_is_repeated_is_the_same_run(tap: Path, tmp_path: Path, call: Called) -> None:
+    again = tapped(tmp_path, "again.mcap")
+    found = compare(tap, again)
+    assert found.is_same
+    assert found.compared == len(read_recording(tap).ticks)
+    code, out, _ = call("compare", tap, again)
+    assert code == 0
+    assert "equal in every bit" in out
+
+
+@pytest.mark.parametrize("block", [16, 1000])
+def test_the_first_difference_is_told_and_the_largest(
+    block: int, tap: Path, tmp_path: Path, call: Called, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def change(rows: NDArray[np.void]) -> None:
+        rows["tool_position"][50, 1] += 2.5e-6
+        rows["tool_position"][60:70, 1] -= 3e-3
+        rows["kinetic"][55] += 0.5
+
+    monkeypatch.setattr(reader, "BLOCK", block)
+    other = changed(tap, tmp_path, change)
+    found = compare(tap, other)
+    assert found.first is not None
+    assert (found.first.column, found.first.ticks) == ("tool_position_y", (50, 50))
+    assert found.first.size == pytest.approx(2.5e-6, rel=1e-6)
+    largest = {each.column: each for each in found.largest}
+    assert set(largest) == {"tool_position_y", "kinetic"}
+    assert largest["tool_position_y"].size == pytest.approx(3e-3)
+    assert 60 <= largest["tool_position_y"].ticks[0] < 70
+    assert largest["kinetic"].ticks == (55, 55)
+    assert largest["kinetic"].size == pytest.approx(0.5)
+    code, out, _ = call("compare", tap, other)
+    assert code == 1
+    assert "part at tick 50 (0.05 s) in tool_position_y, by 2.5 µm" in out
+    assert "500 mJ at tick 55" in out
+
+
+def test_a_difference_in_the_last_bit_is_one(tap: Path, tmp_path: Path) -> None:
+    def change(rows: NDArray[np.void]) -> None:
+        rows["device_energy"][100] = np.nextafter(rows["device_energy"][100], 1)
+
+    found = compare(tap, changed(tap, tmp_path, change))
+    assert found.first is not None
+    assert found.first.column == "device_energy"
+    assert 0 < found.first.size < 1e-17
+
+
+def test_clock_and_recorder_make_no_difference(tap: Path, tmp_path: Path) -> None:
+    def change(rows: NDArray[np.void]) -> None:
+        rows["wake_ns"] += 17
+        rows["flags"][5] |= int(TickFlag.OVERRUN)
+
+    assert compare(tap, changed(tap, tmp_path, change)).is_same
+
+    def stale(rows: NDArray[np.void]) -> None:
+        rows["flags"][5] |= int(TickFlag.STALE_SAMPLE)
+
+    assert not compare(tap, changed(tap, tmp_path, stale)).is_same
+
+
+def test_a_gap_shifts_nothing(tap: Path, tmp_path: Path) -> None:
+    recording = read_recording(tap)
+    rows = np.delete(recording.ticks, slice(40, 45))
+    found = compare(tap, rewritten(recording, tmp_path / "gap.mcap", ticks=rows))
+    assert found.first is None
+    assert found.alone == (5, 0)
+    assert not found.is_same
+
+
+def test_a_longer_run_is_another_run_and_the_common_part_is_compared(
+    tap: Path, tmp_path: Path, call: Called, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(reader, "BLOCK", 32)
+    recording = read_recording(tap)
+    count = len(recording.ticks)
+    short = rewritten(recording, tmp_path / "short.mcap", ticks=recording.ticks[:-70])
+    found = compare(tap, short)
+    assert (found.first, found.alone, found.compared) == (None, (70, 0), count - 70)
+    code, out, _ = call("compare", short, tap)
+    assert code == 1
+    assert f"{count - 70} common ticks are equal" in out
+    assert "70 of the second" in out
+
+
+def test_runs_at_two_rates_are_compared_where_their_ticks_coincide(
+    tmp_path: Path, call: Called
+) -> None:
+    """A hand at rest: both runs are at rest too, and part in nothing but the rate."""
+    paths = [tmp_path / f"{rate}.mcap" for rate in (1000, 400)]
+    for path, rate in zip(paths, (1000, 400), strict=True):
+        hand = tmp_path / "still.csv"
+        hand.write_text("t,x,y,z\n0,0,0,0\n0.1,0,0,0\n")
+        recorded(path, "point_mass", f"trajectory:{hand}", duration=0.1, rate=rate)
+    found = compare(*paths)
+    # 1 ms and 2.5 ms: every 5 ms
+    assert (found.ticks, found.compared, found.alone) == ((100, 40), 20, (0, 0))
+    assert "period_s" in found.decisive
+    names = {each.column for each in found.largest}
+    assert "tick" in names  # numbered differently
+    assert "handle_position_x" not in names
+    code, out, _ = call("compare", *paths)
+    assert code == 1
+    assert "rates 1000 Hz and 400 Hz: compared at their 20 common ticks" in out
+
+
+def test_what_decided_the_run_is_listed_where_it_differs(
+    tap: Path, tmp_path: Path, call: Called
+) -> None:
+    meta = {"stiffness": "17.0", "started": "1970-01-01", "versions": "{}"}
+    other = changed(tap, tmp_path, lambda rows: None, meta=meta)
+    found = compare(tap, other)
+    assert set(found.decisive) == {"stiffness"}
+    assert set(found.beside) == {"versions"}
+    assert not found.is_same
+    code, out, _ = call("compare", tap, other, "--json")
+    told = json.loads(out)
+    assert code == 1
+    assert told["decisive"]["stiffness"][1] == "17.0"
+    assert (told["first"], told["is_same"]) == (None, False)
+    versions = {"versions": "{}", "started": "1970-01-01"}
+    other = changed(tap, tmp_path, lambda rows: None, meta=versions)
+    assert compare(tap, other).is_same  # they may explain a difference, and are none
+
+
+def test_a_number_that_is_none_on_one_side_is_infinitely_far(tap: Path, tmp_path: Path) -> None:
+    def change(rows: NDArray[np.void]) -> None:
+        rows["potential"][9] = np.nan
+
+    found = compare(tap, changed(tap, tmp_path, change))
+    assert found.first is not None
+    assert found.first.size == np.inf
+    assert json.loads(found.to_json())["first"]["size"] is None
+
+
+def test_damage_is_told_and_what_is_no_recording_refused(
+    tap: Path, tmp_path: Path, call: Called
+) -> None:
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(tap.read_bytes()[:-100])
+    code, _, err = call("compare", tap, cut)
+    assert "is cut" in err
+    assert code == 0  # every tick is there
+    (tmp_path / "foreign.mcap").write_bytes(b"nothing")
+    code, _, err = call("compare", tap, tmp_path / "foreign.mcap")
+    assert (code, "not an MCAP file" in err) == (2, True)
+    recording = read_recording(tap)
+    for period in ("0", "nan", "1e9"):
+        other = rewritten(recording, tmp_path / "period.mcap", meta={"period_s": period})
+        with pytest.raises(RecordingError, match="period_s"):
+            compare(tap, other)

@@ -1,0 +1,312 @@
+"""The doctor: what it finds on machines of every kind, what it measures, and what it concludes."""
+
+from __future__ import annotations
+
+import json
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hapticbridge.cli.main import main
+from hapticbridge.device.plugged import Plugged
+from hapticbridge.doctor import cyclictest, diagnosis, machine
+from hapticbridge.doctor.diagnosis import diagnose, judged
+from hapticbridge.doctor.machine import Finding, System, findings
+from hapticbridge.doctor.wakeups import bare_turn
+from hapticbridge.errors import HapticBridgeError
+from hapticbridge.realtime import Grant, Lateness, real_time
+from hapticbridge.realtime.remedies import CONTAINER, SHELL
+
+GRANTED = (Grant("scheduling", True, "SCHED_FIFO at priority 80"),)
+
+DEBIAN = "Linux version 6.12.0 (gcc) #1 SMP {} Debian 6.12.0-1"
+
+
+def system_with(folder: Path, files: dict[str, str]) -> System:
+    for name, text in files.items():
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text + "\n")
+    return System(sys=folder / "sys", proc=folder / "proc")
+
+
+def found(
+    folder: Path, files: dict[str, str], grants: tuple[Grant, ...] = GRANTED
+) -> dict[str, Finding]:
+    return {item.name: item for item in findings(system_with(folder, files), grants)}
+
+
+def test_a_container_that_shows_nothing_of_its_machine_is_no_error(tmp_path: Path) -> None:
+    seen = found(tmp_path, {})
+    for name in ("throttling", "preemption", "frequency", "host"):
+        assert seen[name].is_good is None
+        assert seen[name].sentence
+
+
+@pytest.mark.parametrize(
+    ("governors", "is_good"),
+    [(["performance", "performance"], True), (["performance", "powersave"], False)],
+)
+def test_one_core_that_is_clocked_down_is_found(
+    tmp_path: Path, governors: list[str], is_good: bool
+) -> None:
+    place = "sys/devices/system/cpu/cpu{}/cpufreq/scaling_governor"
+    files = {place.format(core): governor for core, governor in enumerate(governors)}
+    seen = found(tmp_path, files)["frequency"]
+    assert seen.is_good is is_good
+    assert ("cpupower" in seen.remedy) != is_good
+
+
+@pytest.mark.parametrize(
+    ("files", "is_good", "word"),
+    [
+        ({"sys/kernel/realtime": "1"}, True, "PREEMPT_RT"),
+        ({"proc/version": DEBIAN.format("PREEMPT_RT")}, True, "PREEMPT_RT"),
+        ({"proc/version": DEBIAN.format("PREEMPT")}, True, "PREEMPT"),
+        ({"proc/version": DEBIAN.format("")}, False, "no PREEMPT"),
+        ({"proc/version": DEBIAN.format("PREEMPT_DYNAMIC")}, None, "does not show"),
+        (
+            {
+                "proc/version": DEBIAN.format("PREEMPT_DYNAMIC"),
+                "sys/kernel/debug/sched/preempt": "none (voluntary) full",
+            },
+            None,
+            "voluntary",
+        ),
+        (
+            {
+                "proc/version": DEBIAN.format("PREEMPT_DYNAMIC"),
+                "proc/cmdline": "root=/dev/sda1 preempt=full quiet",
+            },
+            True,
+            "full",
+        ),
+    ],
+)
+def test_the_preemption_model_is_read(
+    tmp_path: Path, files: dict[str, str], is_good: bool | None, word: str
+) -> None:
+    seen = found(tmp_path, files)["preemption"]
+    assert seen.is_good is is_good
+    assert word in seen.sentence
+    assert bool(seen.remedy) != bool(is_good)
+
+
+@pytest.mark.parametrize(("budget", "is_good"), [("-1", True), ("950000", True), ("100000", False)])
+def test_the_share_of_real_time_threads_is_read(tmp_path: Path, budget: str, is_good: bool) -> None:
+    place = "proc/sys/kernel/sched_rt_{}_us"
+    files = {place.format("runtime"): budget, place.format("period"): "1000000"}
+    assert found(tmp_path, files)["throttling"].is_good is is_good
+
+
+@pytest.mark.parametrize(("flags", "is_good"), [("fpu vme", True), ("fpu hypervisor", None)])
+def test_a_virtual_machine_is_told(tmp_path: Path, flags: str, is_good: bool | None) -> None:
+    seen = found(tmp_path, {"proc/cpuinfo": f"flags\t\t: {flags}"})["host"]
+    assert seen.is_good is is_good
+    assert ("this is a virtual machine" in seen.sentence) != bool(is_good)
+
+
+def test_what_one_shell_may_is_also_said_for_good(tmp_path: Path) -> None:
+    def refused(remedy: str) -> tuple[Grant, ...]:
+        return (Grant("scheduling", False, "SCHED_FIFO was refused", remedy),)
+
+    seen = found(tmp_path, {}, refused(SHELL))
+    assert seen["scheduling"].remedy == SHELL
+    for words in ("limits.d", "rtprio", "memlock", "setcap", "log in again"):
+        assert words in seen["for good"].remedy
+    assert "for good" not in found(tmp_path, {}, refused(CONTAINER))
+    assert "for good" not in found(tmp_path, {})
+
+
+def test_devices_that_may_not_be_opened_are_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    device = Plugged(
+        family="falcon",
+        name="Falcon",
+        serial="",
+        path="/dev/bus/usb/001/004",
+        vendor=0x0403,
+        product=0xCB48,
+        transport="usb",
+        problem=None,
+    )
+    monkeypatch.setattr(machine, "blind_spots", list)
+    monkeypatch.setattr(machine, "plugged_devices", list)
+    assert found(tmp_path, {})["usb"].is_good is None
+    monkeypatch.setattr(machine, "plugged_devices", lambda: [device])
+    assert found(tmp_path, {})["usb"].is_good is True
+    locked = replace(device, problem="no permission to open /dev/bus/usb/001/004")
+    monkeypatch.setattr(machine, "plugged_devices", lambda: [device, locked])
+    seen = found(tmp_path, {})["usb"]
+    assert seen.is_good is False
+    assert "no permission" in seen.sentence
+    monkeypatch.setattr(machine, "plugged_devices", list)
+    monkeypatch.setattr(machine, "blind_spots", lambda: ["hidapi cannot be loaded: 'pip install'"])
+    assert found(tmp_path, {})["usb"].remedy == "pip install"
+
+
+def test_a_bare_loop_counts_what_it_slept_too_long(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Time stands still but for sleeps: 5 µs too long each, and once three periods."""
+    now, sleeps = 10**9, 0
+
+    def sleep(seconds: float) -> None:
+        nonlocal now, sleeps
+        sleeps += 1
+        now += round(seconds * 1e9) + (3_000_000 if sleeps == 4 else 5_000)
+
+    monkeypatch.setattr(time, "monotonic_ns", lambda: now)
+    monkeypatch.setattr(time, "sleep", sleep)
+    late, missed = bare_turn(1_000_000, 10)
+    assert missed == 2
+    assert late.size + missed == 10
+    assert late[3] == 3_000_000
+    assert late[4] == 0  # the deadline that was due just then
+    assert np.all(np.delete(late, [3, 4]) == 5_000)
+
+
+CYCLICTEST = """# /dev/cpu_dma_latency set to 0us
+# Histogram
+000000 000000
+000017 000003
+000250 000001
+# Total: 000000004
+# Min Latencies: 00017
+# Avg Latencies: 00075
+# Max Latencies: 61000
+# Histogram Overflows: 00002
+# Histogram Overflow at cycle number:
+# Thread 0: 00001 00007
+"""
+
+
+def test_the_histogram_of_cyclictest_is_read_with_its_overflows() -> None:
+    late = cyclictest.parsed(CYCLICTEST)
+    assert late is not None
+    assert sorted(late.tolist()) == [17_000] * 3 + [250_000] + [61_000_000] * 2
+    assert cyclictest.parsed("FATAL: could not set scheduling") is None
+
+
+def lateness(p99: float, p999: float, worst: float, missed: int = 0) -> Lateness:
+    return Lateness(100_000 - missed, missed, 1e-7, p99, p999, worst)
+
+
+@pytest.mark.parametrize(
+    ("mine", "verdict"),
+    [
+        (lateness(1e-5, 2.4e-4, 9e-4), "fit"),
+        (lateness(1e-5, 2.6e-4, 9e-4), "fair"),
+        (lateness(1e-5, 1e-5, 9e-3, missed=10), "fair"),
+        (lateness(1e-5, 1e-5, 9e-3, missed=11), "unfit"),
+        (lateness(2.6e-4, 2.6e-4, 9e-4), "unfit"),
+    ],
+)
+def test_the_verdict_allows_what_the_default_coupling_allows(mine: Lateness, verdict: str) -> None:
+    """At 1 kHz a quarter of the period: 80 % of the bound bear T/0.8; one missed in 10 000."""
+    loops = {"bridge": mine, "bare sleep": lateness(1e-4, 1e-4, 1e-4)}
+    said, sentence = judged(loops, (), 1000.0)
+    assert said == verdict
+    assert sentence.startswith(f"{verdict} for 1000 Hz")
+
+
+def test_the_verdict_says_whose_delays_they_are_and_what_to_do() -> None:
+    late, good = lateness(5e-4, 5e-4, 5e-3), lateness(1e-5, 1e-5, 1e-5)
+    mend = Finding("scheduling", False, "refused", "sudo prlimit")
+    again = Finding("memory", False, "refused", "sudo prlimit")
+    alone = {"bridge": late, "bare sleep": good}
+    assert "fault of hapticbridge" in judged(alone, (), 1000.0)[1]
+    assert judged(alone, (mend, again), 1000.0)[1].count("sudo prlimit") == 1
+    assert "bare sleep loop" in judged(alone | {"bare sleep": late}, (), 1000.0)[1]
+    assert "machine itself stalls" in judged(alone | {"cyclictest": late}, (mend,), 1000.0)[1]
+    assert "nothing is to be done" in judged(alone | {"bridge": good}, (), 1000.0)[1]
+
+
+@pytest.fixture
+def quick(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, int, int]]:
+    """Turns that take no time: the bridge's loop is 10 µs late, the bare one 60 µs."""
+    turns: list[tuple[str, int, int]] = []
+
+    def turn(name: str, late: int) -> Any:
+        def wait(period_ns: int, ticks: int) -> tuple[Any, int]:
+            turns.append((name, period_ns, ticks))
+            return np.full(ticks, late, dtype=np.int64), 0
+
+        return wait
+
+    monkeypatch.setattr(diagnosis, "clock_turn", turn("bridge", 10_000))
+    monkeypatch.setattr(diagnosis, "bare_turn", turn("bare", 60_000))
+    monkeypatch.setattr(cyclictest, "is_there", lambda: False)
+    monkeypatch.setattr(diagnosis, "memory_at_rest", real_time)
+    return turns
+
+
+def test_the_loops_take_turns_and_share_the_time(quick: list[tuple[str, int, int]]) -> None:
+    done: list[float] = []
+    result = diagnose(2000.0, 6.0, tell=lambda at, _whole: done.append(at))
+    assert [name for name, _, _ in quick] == ["bare", "bridge"] * 3
+    assert {(period, ticks) for _, period, ticks in quick} == {(500_000, 2000)}
+    assert done == [2.0, 4.0, 6.0]
+    assert result.lateness["bridge"].ticks == 6000
+    assert result.lateness["bridge"].p999 == pytest.approx(1e-5)
+    assert result.verdict == "fit"
+
+
+@pytest.mark.parametrize("output", [CYCLICTEST, None])
+def test_cyclictest_takes_its_turns_where_it_is_and_may(
+    quick: list[tuple[str, int, int]], monkeypatch: pytest.MonkeyPatch, output: str | None
+) -> None:
+    monkeypatch.setattr(cyclictest, "is_there", lambda: True)
+    monkeypatch.setattr(cyclictest, "run", lambda *_: output and cyclictest.parsed(output))
+    result = diagnose(1000.0, 6.0)
+    assert ("cyclictest" in result.lateness) == (output is not None)
+    said = {finding.name: finding.sentence for finding in result.findings}["baseline"]
+    assert ("could not run" in said) == (output is None)
+    if output is not None:
+        assert result.lateness["cyclictest"].missed == 2 * 2 * 61
+
+
+@pytest.mark.parametrize(
+    ("arguments", "word"),
+    [
+        ((1000.0, 0.5), "duration"),
+        ((1000.0, float("nan")), "duration"),
+        ((0.0, 5.0), "rate"),
+        ((2e6, 5.0), "rate"),
+    ],
+)
+def test_bad_numbers_are_refused(arguments: tuple[float, float], word: str) -> None:
+    with pytest.raises(HapticBridgeError, match=word):
+        diagnose(*arguments)
+
+
+def test_the_command_prints_a_table_and_one_verdict(
+    quick: list[tuple[str, int, int]], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["doctor", "--duration", "2"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[1].split()[:5] == ["bridge", "10", "10", "10", "10"]
+    assert lines[2].split()[:6] == ["bare", "sleep", "60", "60", "60", "60"]
+    assert lines[-1].startswith("fit for 1000 Hz: 99.9 % of ticks within 10 µs, 0 missed")
+
+
+def test_the_command_speaks_json_and_exits_1_where_the_machine_is_unfit(
+    quick: list[tuple[str, int, int]],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    late = np.full(1000, 900_000, dtype=np.int64)
+    monkeypatch.setattr(diagnosis, "clock_turn", lambda *_: (late, 0))
+    assert main(["doctor", "--duration", "2", "--json"]) == 1
+    facts = json.loads(capsys.readouterr().out)
+    assert facts["verdict"] == "unfit"
+    assert facts["lateness"]["bridge"]["p99"] == pytest.approx(9e-4)
+    assert {finding["name"] for finding in facts["findings"]} >= {"scheduling", "usb", "frequency"}
+
+
+def test_the_command_refuses_bad_numbers_in_a_sentence(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["doctor", "--duration", "0"]) == 2
+    assert "duration is 0.0 s" in capsys.readouterr().err

@@ -1,0 +1,196 @@
+"""A recording as a table: every double comes back to the bit, with units, metadata and events."""
+
+from __future__ import annotations
+
+import csv
+import importlib
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from cli_cases import Called
+from recording_cases import EPOCH, META, random_rows, write
+
+from hapticbridge.errors import RecordingError
+from hapticbridge.export import export
+from hapticbridge.export.csv_file import sidecar_of
+from hapticbridge.recording import reader
+from hapticbridge.tick import TICK_DTYPE
+
+pq: Any = importlib.import_module("pyarrow.parquet")
+
+COUNT = 150
+
+UNITS = {
+    "tick": "1",
+    "deadline_ns": "ns",
+    "device_position_x": "m",
+    "tool_quaternion_w": "1",
+    "wrench_on_tool_fz": "N",
+    "wrench_on_device_tx": "N m",
+    "device_energy": "J",
+    "injected_damping": "N s/m",
+}
+"""Written down once more, by hand."""
+
+Columns = dict[str, np.ndarray]
+
+
+def from_parquet(path: Path) -> tuple[Columns, dict[str, str], dict[str, str], list[Any]]:
+    table = pq.read_table(path)
+    units = {field.name: field.metadata[b"unit"].decode() for field in table.schema}
+    about = {key.decode(): value for key, value in table.schema.metadata.items()}
+    meta, events = (json.loads(about[f"hapticbridge.{name}"]) for name in ("meta", "events"))
+    return {name: table[name].to_numpy() for name in table.column_names}, units, meta, events
+
+
+def from_csv(path: Path) -> tuple[Columns, dict[str, str], dict[str, str], list[Any]]:
+    about = json.loads(sidecar_of(path).read_text(encoding="utf-8"))
+    with path.open(newline="") as file:
+        header, *rows = csv.reader(file)
+    columns = {
+        name: np.array([int(v) if v.lstrip("-").isdigit() else float(v) for v in values])
+        for name, values in zip(header, zip(*rows, strict=True), strict=True)
+    }
+    return columns, about["units"], about["meta"], about["events"]
+
+
+def from_hdf5(path: Path) -> tuple[Columns, dict[str, str], dict[str, str], list[Any]]:
+    h5py = pytest.importorskip("h5py")
+    with h5py.File(path) as file:
+        ticks, meta = file["ticks"], file["meta"]
+        return (
+            {name: ticks[name][:] for name in ticks},
+            {name: ticks[name].attrs["unit"] for name in ticks},
+            {key: meta[key].asstr()[()] for key in meta},
+            [json.loads(text) for text in file["events"].asstr()[:]],
+        )
+
+
+FORMATS = [("parquet", from_parquet), ("csv", from_csv), ("hdf5", from_hdf5)]
+
+
+def rows_to_keep() -> np.ndarray:
+    """Arbitrary bits; in one column two NaNs that differ in their payload, and both zeros."""
+    rows = random_rows(COUNT)
+    bits = [0x7FF8000000000001, 0x7FF8000000000002, -(2**63), 0]
+    rows["kinetic"][:4] = np.array(bits, dtype=np.int64).view(np.float64)
+    return rows
+
+
+@pytest.fixture
+def recording(tmp_path: Path) -> Path:
+    write(tmp_path / "run.mcap", rows_to_keep())
+    return tmp_path / "run.mcap"
+
+
+@pytest.mark.parametrize(("form", "read"), FORMATS)
+def test_every_number_comes_back_to_the_bit(
+    form: str,
+    read: Callable[[Path], tuple[Columns, dict[str, str], dict[str, str], list[Any]]],
+    recording: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    if form == "hdf5":
+        pytest.importorskip("h5py")
+    monkeypatch.setattr(reader, "BLOCK", 64)  # in three parts
+    done = export(recording, form)
+    columns, units, meta, events = read(done.files[0])
+    assert not done.damage
+    rows, position = rows_to_keep(), 0
+    names = list(columns)
+    if form == "hdf5":  # in the order of the alphabet
+        names = list(from_parquet(export(recording, "parquet").files[0])[0])
+    for field in TICK_DTYPE.names or ():
+        values = rows[field].reshape(COUNT, -1)
+        for index in range(values.shape[1]):
+            name, got = names[position], columns[names[position]]
+            assert name.startswith(field)
+            assert got.dtype == values.dtype
+            expected = values[:, index]
+            if form == "csv":  # text knows one NaN
+                got, expected = (np.where(np.isnan(v), np.nan, v) for v in (got, expected))
+            np.testing.assert_array_equal(got.view(np.int64), expected.view(np.int64))
+            position += 1
+    assert position == len(columns) == TICK_DTYPE.itemsize // 8
+    assert {name: units[name] for name in UNITS} == UNITS
+    assert meta == META | {"epoch_ns": str(EPOCH)}
+    assert [event["event"] for event in events] == ["start", "mark", "mark"]
+
+
+@pytest.mark.parametrize(
+    ("form", "module", "extra"), [("parquet", "pyarrow", "tables"), ("hdf5", "h5py", "hdf5")]
+)
+def test_a_missing_package_is_one_sentence(
+    form: str,
+    module: str,
+    extra: str,
+    recording: Path,
+    call: Called,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    found = importlib.import_module
+
+    def without(name: str) -> Any:
+        if name.split(".", maxsplit=1)[0] == module:
+            raise ImportError(name)
+        return found(name)
+
+    monkeypatch.setattr(importlib, "import_module", without)
+    code, out, err = call("export", recording, "--to", form)
+    assert (code, out) == (2, "")
+    assert f"pip install 'hapticbridge[{extra}]'" in " ".join(err.split())
+    assert [path.name for path in recording.parent.iterdir()] == ["run.mcap"]  # no half file
+
+
+def test_a_file_that_exists_is_kept_unless_it_may_be_replaced(
+    recording: Path, call: Called
+) -> None:
+    target = recording.with_name("out.csv")
+    sidecar_of(target).write_text("mine")
+    code, _, err = call("export", recording, "--to", "csv", "--out", target)
+    assert code == 2
+    assert "exists" in err
+    assert sidecar_of(target).read_text() == "mine"
+    assert not target.exists()
+    code, out, _ = call("export", recording, "--to", "csv", "--out", target, "--overwrite")
+    assert code == 0
+    assert f"{COUNT} ticks, 3 events" in out
+    assert len(target.read_text().splitlines()) == COUNT + 1
+
+
+def test_what_cannot_be_written_or_read_is_said(recording: Path, tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match=r"the folder .* does not exist"):
+        export(recording, "parquet", tmp_path / "no" / "out.parquet")
+    with pytest.raises(RecordingError, match=r"'xls' is unknown.*'csv', 'hdf5', 'parquet'"):
+        export(recording, "xls")
+    (tmp_path / "foreign.mcap").write_bytes(b"nothing")
+    with pytest.raises(RecordingError, match="not an MCAP file"):
+        export(tmp_path / "foreign.mcap", "csv")
+    assert not (tmp_path / "foreign.csv").exists()
+
+
+def test_a_cut_recording_is_exported_as_far_as_it_goes(tmp_path: Path, call: Called) -> None:
+    path = tmp_path / "cut.mcap"
+    write(path, random_rows(1000))
+    data = path.read_bytes()
+    path.write_bytes(data[: int(0.7 * len(data))])
+    code, out, err = call("export", path, "--to", "parquet", "--json")
+    assert code == 0
+    assert "cut" in err
+    told = json.loads(out)
+    assert (told["is_cut"], told["damage"]) == (True, [])
+    columns = from_parquet(Path(told["files"][0]))[0]
+    assert 0 < len(columns["tick"]) == told["ticks"] < 1000
+
+
+def test_a_changed_recording_is_exported_with_a_warning(recording: Path, call: Called) -> None:
+    data = bytearray(recording.read_bytes())
+    data[len(data) // 2] ^= 0xFF
+    recording.write_bytes(data)
+    code, _, err = call("export", recording, "--to", "csv")
+    assert code == 1
+    assert "damaged" in err

@@ -1,0 +1,231 @@
+"""A recorded hand through a changed bridge: the same run where nothing is changed, and what a model
+hand does that wants what the recorded one wanted."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from audit_cases import TAP, recorded, rewritten
+from cli_cases import Called
+
+from hapticbridge.bridge import Bridge
+from hapticbridge.device import DeviceInfo, Hand
+from hapticbridge.errors import HapticBridgeError, RecordingError
+from hapticbridge.provenance import SOURCE_PREFIX
+from hapticbridge.recording import read_recording
+from hapticbridge.tick import TICK_DTYPE
+from hapticbridge.whatif import WhatIf, WhatIfRun, changes_from, what_if
+from hapticbridge.whatif.intent import intended
+
+DURATION = 0.4
+
+
+@pytest.fixture(scope="module")
+def wall(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A hand that presses a wall and is pressed back."""
+    path = tmp_path_factory.mktemp("what_if") / "wall.mcap"
+    motion = path.with_name("hand.csv")
+    motion.write_text("t,x,y,z\n0,0,0,0\n0.05,0,0,0\n0.2,0.02,0,0\n0.4,0.02,0.003,0\n")
+    recorded(path, "virtual_wall", f"simulated:path={motion}", duration=DURATION)
+    return path
+
+
+@pytest.fixture(scope="module")
+def softer(wall: Path) -> WhatIf:
+    return what_if(wall, {"stiffness": 600, "damping": 0.6})
+
+
+def run_of(found: WhatIf, name: str) -> WhatIfRun:
+    return next(run for run in found.runs if run.name == name)
+
+
+@pytest.mark.parametrize("options", [{}, {"scale": 2.0, "substeps": 2, "rate": 500}])
+def test_nothing_changed_is_the_recorded_run_again(options: dict[str, Any], tmp_path: Path) -> None:
+    """Inputs, a pause, a scene parameter and a ramp are repeated too."""
+    path = tmp_path / "run.mcap"
+    motion = tmp_path / "tap.csv"
+    motion.write_text(TAP)
+
+    def push(bridge: Bridge, tick: int) -> None:
+        if tick in (20, 40):
+            bridge.set_input(body_wrench={"peg": [0.05, 0, 0, 0, 0, 0]})
+
+    recorded(path, "peg_in_hole", f"simulated:path={motion}", duration=0.1, on_tick=push, **options)
+    found = what_if(path, {})
+    recorded_run, prescribed = found.runs[0].ticks, found.runs[1].ticks
+    assert len(prescribed) == len(recorded_run)
+    for name in ("handle_position", "tool_position", "wrench_on_device", "environment_energy"):
+        # the damping asked for is the law's plus K T/2, and back: rounding
+        np.testing.assert_allclose(prescribed[name], recorded_run[name], rtol=0, atol=1e-9)
+    assert np.ptp(recorded_run["wrench_on_device"]) > 1e-3
+    assert found.runs[1].report.resimulation == "bit for bit"
+
+
+def test_a_prescribed_motion_is_the_recorded_one(softer: WhatIf) -> None:
+    prescribed, before = run_of(softer, "prescribed"), softer.runs[0]
+    np.testing.assert_array_equal(
+        prescribed.ticks["device_position"], before.ticks["device_position"]
+    )
+    # pressed in as far, a quarter as stiff; K e is nearly all of the force
+    ratio = prescribed.peaks["force on device"] / before.peaks["force on device"]
+    assert ratio == pytest.approx(0.25, abs=0.03)
+    assert prescribed.report.certified is None
+
+
+def test_the_model_hand_gives_way_as_a_spring_against_a_spring_does(softer: WhatIf) -> None:
+    """At the end all but rests: the scene's hand, 1000 N/m towards 20 mm, and a wall at 10 mm."""
+    closed, before = run_of(softer, "closed loop"), softer.runs[0]
+    deep = [float(run.ticks["device_position"][-1, 0]) for run in (before, closed)]
+    force = [float(run.ticks["wrench_on_tool"][-1, 0]) for run in (before, closed)]
+    for run, stiffness in zip((0, 1), (2400.0, 600.0), strict=True):
+        # k_h (p − x) = K (x − wall)
+        assert deep[run] == pytest.approx(
+            (1000 * 0.02 + stiffness * 0.01) / (1000 + stiffness), rel=0.02
+        )
+        assert force[run] == pytest.approx(1000 * (0.02 - deep[run]), rel=0.05)
+    assert deep[1] - deep[0] > 1e-3
+
+
+def test_the_model_hand_follows_the_recording_where_nothing_changed(softer: WhatIf) -> None:
+    travel = np.ptp(softer.runs[0].ticks["device_position"], axis=0).max()
+    assert travel > 5e-3
+    assert 0 < softer.hand_error < 0.02 * travel
+    assert any("off the recorded motion" in note for note in softer.notes)
+
+
+def test_what_the_hand_wanted_is_found_where_it_is_known() -> None:
+    """A device of 0.1 kg and 2 N s/m in a hand, in closed form: x = sin ωt gives p and w = 0."""
+    period, omega, size = 1e-3, 2 * np.pi * 1.0, 0.01
+    time = period * np.arange(2000)
+    ticks = np.zeros(len(time), TICK_DTYPE)
+    ticks["device_position"][:, 0] = size * (1 - np.cos(omega * time))
+    ticks["device_quaternion"][:, 0] = 1.0
+    info = DeviceInfo.from_json(
+        json.dumps(
+            dict.fromkeys(DeviceInfo.__dataclass_fields__)
+            | {"name": "d", "axes": ["x", "y", "z"], "mass": 0.1, "damping": 2.0, "serial": ""}
+            | {"force_limit": 10, "torque_limit": 0, "speed_limit": 1}
+            | {"is_prescribed": False, "is_real": False, "delay": 0.0}
+        )
+    )
+    hand = Hand()
+    table = intended(info, hand, ticks, period, (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0))
+    # b_h p' + k_h p = (m + m_h) x'' + (b + b_h) x' + k_h x, solved for one frequency
+    s = 1j * omega
+    law = (0.65 * s**2 + 8.5 * s + 135.0) / (6.5 * s + 135.0)
+    expected = size * (1 - np.real(law * np.exp(s * time)))
+    settled = slice(400, 1900)  # the filter starts at rest, and smoothing ends at the edges
+    np.testing.assert_allclose(table[settled, 1], expected[settled], atol=0.01 * size)
+    assert np.abs(table[:, 2:4]).max() == 0.0
+
+
+def test_a_changed_method_rate_or_scene_is_run(wall: Path) -> None:
+    found = what_if(wall, {"method": "explicit", "rate": 500, "mass": 0.05})
+    assert [name for name, *_ in found.changes] == ["method", "rate", "mass"]
+    assert found.changes[1][2:] == (1000.0, 500.0)
+    closed = found.runs[2]
+    meta = [len(run.ticks) for run in found.runs]
+    assert meta == [400, 200, 200]
+    assert closed.period == 0.002
+    assert closed.report.certified is False  # K T/2 has doubled
+    assert found.exit_code == 1
+    assert any("linear between its samples" in note for note in found.notes)
+
+
+def test_without_a_device_that_answers_there_is_no_closed_loop(wall: Path, tmp_path: Path) -> None:
+    recording = read_recording(wall)
+    info = DeviceInfo.from_json(recording.meta["device"])
+    unknown = {"device": replace(info, mass=None).to_json()}
+    found = what_if(rewritten(recording, tmp_path / "a.mcap", meta=unknown), {"rate": 2000})
+    assert [run.name for run in found.runs] == ["recorded", "prescribed"]
+    assert any("no closed loop: the device's mass unknown" in note for note in found.notes)
+    assert np.isnan(found.hand_error)
+    assert json.loads(found.to_json())["hand_error"] is None
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["stifness=3"], "'stifness' cannot be changed; what can: .*'stiffness'.*'mass'"),
+        (["stiffness"], "write a name and a value"),
+        (["stiffness=1", "stiffness=2"], "changed twice"),
+        (["stiffness=nan"], "finite number"),
+        (["stiffness=-1"], "stiffness"),
+        (["method=magic"], "choose one of .*'explicit'"),
+        (["substeps=1.5"], "whole number"),
+        (["rate=0"], "rate"),
+        (["mass=99"], "mass.* from"),
+        (["contact_stiffness=5"], "only 'direct' takes it"),
+    ],
+)
+def test_what_cannot_be_asked_is_refused_in_a_sentence(
+    words: list[str], told: str, wall: Path
+) -> None:
+    with pytest.raises(HapticBridgeError, match=told):
+        what_if(wall, changes_from(words))
+
+
+def test_a_recording_that_is_not_what_it_says_is_not_simulated(wall: Path, tmp_path: Path) -> None:
+    recording = read_recording(wall)
+    rows = recording.ticks.copy()
+    rows["kinetic"][50] += 1.0
+    with pytest.raises(RecordingError, match="what is invalid cannot be simulated again"):
+        what_if(rewritten(recording, tmp_path / "a.mcap", ticks=rows), {})
+    bare = {n: d for n, d in recording.attachments.items() if not n.startswith(SOURCE_PREFIX)}
+    alone = replace(recording, attachments=bare)
+    with pytest.raises(RecordingError, match="carries no scene"):
+        what_if(rewritten(alone, tmp_path / "b.mcap"), {})
+    evil = {f"{SOURCE_PREFIX}../../evil.xml": b"<mujoco/>"}
+    with pytest.raises(RecordingError, match="outside the scene's folder"):
+        what_if(rewritten(recording, tmp_path / "c.mcap", attachments=evil), {})
+
+
+def test_a_scene_that_a_program_changed_is_told(wall: Path, tmp_path: Path) -> None:
+    recording = read_recording(wall)
+    name = next(n for n in recording.attachments if n.startswith(SOURCE_PREFIX))
+    heavier = recording.attachments[name].replace(b'mass="0.05"', b'mass="0.06"')
+    assert heavier != recording.attachments[name]
+    kept = {n: d for n, d in recording.attachments.items() if not n.endswith(".toml")}
+    other = rewritten(
+        replace(recording, attachments=kept | {name: heavier}),
+        tmp_path / "a.mcap",
+        meta={"scene_parameters": "{}"},
+    )
+    assert any("does not give the recorded model" in note for note in what_if(other, {}).notes)
+    assert not any("does not give" in note for note in what_if(wall, {}).notes)
+
+
+def test_the_command_shows_runs_side_by_side_and_draws_them(
+    wall: Path, tmp_path: Path, call: Called
+) -> None:
+    picture = tmp_path / "what_if.png"
+    command = ("audit", wall, "--what-if", "stiffness=5000", "--plot", picture)
+    code, out, err = call(*command)
+    assert code == 1  # 2 N s/m do not bear it
+    assert "stiffness: 2400 -> 5000 N/m" in out
+    assert out.index("recorded") < out.index("prescribed") < out.index("closed loop")
+    assert "off the recorded motion" in err
+    assert picture.stat().st_size > 10_000
+    code, out, _ = call("audit", wall, "--what-if", "stiffness=1000", "--json")
+    told = json.loads(out)
+    assert code == 0
+    assert [run["name"] for run in told["runs"]] == ["recorded", "prescribed", "closed loop"]
+    assert told["changes"] == [
+        {"name": "stiffness", "unit": "N/m", "before": 2400.0, "after": 1000.0}
+    ]
+    code, _, err = call("audit", wall, "--what-if", "nothing=1")
+    assert (code, "what can" in err) == (2, True)
+
+
+def test_motions_are_told_apart_by_rate(wall: Path) -> None:
+    """At twice the rate every second sample is a recorded one, and those between are midway."""
+    found = what_if(wall, {"rate": 2000})
+    before, after = (run.ticks["device_position"] for run in found.runs[:2])
+    np.testing.assert_allclose(after[::2], before, rtol=0, atol=1e-15)
+    middle = 0.5 * (before[1:] + before[:-1])
+    np.testing.assert_allclose(after[1:-1:2], middle, rtol=0, atol=1e-12)
