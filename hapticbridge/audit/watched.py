@@ -105,10 +105,11 @@ class Watch:
         elapsed = np.maximum(raw, period)
         is_stale = has_flag(ticks, TickFlag.STALE_SAMPLE)
         stale = run_lengths(is_stale, self.stale)
-        total = np.concatenate([[0.0], np.cumsum(elapsed)])
-        earlier = np.minimum(np.concatenate([[self.stale], stale[:-1]]), index)
-        interval = total[1:] - total[index - earlier]
-        interval += np.where(earlier == index, self.since_news, 0.0)
+        interval = elapsed.copy()
+        interval[0] += self.since_news
+        # one after the other, so that the sums do not depend on where a block ends
+        for k in (1 + np.flatnonzero(is_stale[:-1])).tolist():
+            interval[k] += interval[k - 1]
 
         is_released = (ticks["buttons"] & guarding.clutch) != 0
         if guarding.dead_man:
