@@ -17,7 +17,7 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hapticbridge.certificate import condition_sentences, default_coupling, device_conditions
+from hapticbridge.certificate import condition_sentences, default_coupling, needed_on_axes
 from hapticbridge.clock import Clock, RealClock, period_of
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Device, device_for
@@ -169,7 +169,15 @@ class Bridge:
                 device.info,
                 self._limits,
                 self.period,
-                needed=self._needed_damping(),
+                needed=needed_on_axes(
+                    device.info,
+                    self.used,
+                    self.period,
+                    self._workspace.scale,
+                    self._workspace.force_scale,
+                    self.laws,
+                    self.method,
+                ),
                 scale=self._workspace.scale,
                 controller=controller,
                 clutch=clutch,
@@ -225,7 +233,7 @@ class Bridge:
 
         Args:
             duration: Time to run in s; None runs until the device's motion ends, or for ever
-                (Ctrl-C and SIGTERM stop cleanly).
+                (Ctrl-C, SIGTERM, SIGHUP and Ctrl-Z stop cleanly).
             on_tick: Called with the tick's number before it, for scripted inputs.
 
         Returns:
@@ -372,17 +380,6 @@ class Bridge:
                 f"method '{self.method.name}' cannot meter the work of inputs; use 'implicit'"
             )
         self._inputs.append(writes)
-
-    def _needed_damping(self) -> tuple[float, float]:
-        """Returns what the device must have in N s/m and N m s/rad; 0 where nothing asks for it."""
-        scales, method = (self._workspace.scale, self._workspace.force_scale), self.method
-        if not method.has_coupling:
-            return 0.0, 0.0
-        conditions = device_conditions(
-            self.device.info, self.used, self.period, *scales, self.laws, method
-        )
-        needed = {condition.axis: condition.needed for condition in conditions}
-        return needed.get("translation", 0.0), needed.get("rotation", 0.0)
 
     @property
     def used(self) -> Coupling:

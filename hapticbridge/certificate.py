@@ -181,6 +181,26 @@ def device_conditions(
     return tuple(conditions)
 
 
+def needed_on_axes(
+    info: DeviceInfo,
+    coupling: Coupling,
+    period: float,
+    scale: float,
+    force_scale: float,
+    laws: int,
+    method: Method,
+) -> tuple[float, float]:
+    """Returns the damping that a coupling needs in N s/m and N m s/rad; 0 where nothing asks.
+
+    See ``device_conditions`` for the arguments.
+    """
+    if not method.has_coupling:
+        return 0.0, 0.0
+    conditions = device_conditions(info, coupling, period, scale, force_scale, laws, method)
+    needed = {condition.axis: condition.needed for condition in conditions}
+    return needed.get("translation", 0.0), needed.get("rotation", 0.0)
+
+
 def _needed_on(
     info: DeviceInfo,
     coupling: Coupling,
