@@ -251,7 +251,7 @@ class Bridge:
             if self._is_realtime:
                 self._note_grants(stack.enter_context(real_time()))
             try:
-                wait_until_still(self.device, self._sample, self.period)
+                wait_until_still(self.device, self._sample, self.period, self.clock)
                 self.clock.start(round(self.period * 1e9))
                 reason = self._loop(last, on_tick)
             except DeviceError as error:

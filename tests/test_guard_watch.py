@@ -15,9 +15,11 @@ import numpy as np
 import pytest
 from audit_cases import ScriptedDevice, verdict_of
 from bridge_runs import fast
+from cli_cases import Called
 from faults.rig import Outcome, Rig
 from numpy.typing import NDArray
 
+from hapticbridge.clock import RealClock, SimulatedClock
 from hapticbridge.device.last_word import LastWord
 from hapticbridge.errors import DeviceError, HapticBridgeError
 from hapticbridge.guard import UNLIMITED, Limits, guarding_for, wait_until_still
@@ -138,12 +140,15 @@ class Moving:
 def test_force_waits_until_the_device_is_still(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(start_module, "STILL_TIME", 0.02)
     device: Any = Moving(still_after=30)
-    wait_until_still(device, np.zeros(1, SAMPLE_DTYPE), 1e-3)
+    wait_until_still(device, np.zeros(1, SAMPLE_DTYPE), 1e-3, RealClock())
     assert device.count > 30
+    unread: Any = Moving(still_after=30)
+    wait_until_still(unread, np.zeros(1, SAMPLE_DTYPE), 1e-3, SimulatedClock())
+    assert unread.count == 0
     monkeypatch.setattr(start_module, "PATIENCE", 0.05)
     restless: Any = Moving(still_after=10**6)
     with pytest.raises(DeviceError, match="hold it still"):
-        wait_until_still(restless, np.zeros(1, SAMPLE_DTYPE), 1e-3)
+        wait_until_still(restless, np.zeros(1, SAMPLE_DTYPE), 1e-3, RealClock())
 
 
 @pytest.mark.parametrize(
@@ -182,6 +187,7 @@ def test_a_guard_reads_back_as_it_was_written() -> None:
 
 KILLED = """
 import sys, time
+from hapticbridge.clock import RealClock, SimulatedClock
 from hapticbridge.device.last_word import LastWord
 word = LastWord(sys.argv[1], b"\\0zero")
 print("ready", flush=True)
@@ -210,3 +216,14 @@ def test_a_killed_process_still_says_zero_and_one_that_closed_does_not(tmp_path:
     word.close()
     word.close()
     assert quiet.read_bytes() == b""
+
+
+def test_the_command_line_knows_the_guard(call: Called) -> None:
+    short = ("run", "point_mass", "--fast", "--duration", "0.05")
+    code, _, error = call(*short, "--clutch", "99")
+    assert (code, error.count("\n")) == (2, 1)
+    assert "clutch button is 99" in error
+    code, _, error = call(*short, "--energy-limit", "nan")
+    assert (code, error.count("\n")) == (2, 1)
+    code, *_ = call(*short, "--controller", "tank", "--dead-man", "0", "--stretch-limit", "0.1")
+    assert code == 0

@@ -19,20 +19,22 @@ STILL_DISTANCE = 1e-3
 """In m, moved within ``STILL_TIME``: 1 cm/s, what a hand that holds still stays below."""
 
 
-def wait_until_still(device: Device, sample: NDArray[np.void], period: float) -> None:
+def wait_until_still(device: Device, sample: NDArray[np.void], period: float, clock: Clock) -> None:
     """Waits until a device with motors is still; returns at once for any other.
 
     Args:
         device: Started, under zero force.
         sample: Shape (1,), ``SAMPLE_DTYPE``; receives the newest one.
         period: T in s, at which it is read.
+        clock: The run's. Only real time is waited for; a clock that somebody drives also drives
+            what the device does, which must not begin before the run.
 
     Raises:
         DeviceError: It moves on.
     """
-    if not device.info.is_real or device.info.is_prescribed:
+    if not device.info.is_real or device.info.is_prescribed or type(clock) is not RealClock:
         return
-    clock = RealClock()  # one of its own: the run's time begins with its first tick
+    clock = RealClock()  # another: the run's time begins with its first tick
     clock.start(round(1e9 * period))
     anchor = np.zeros(1, SAMPLE_DTYPE)
     since = begun = None
