@@ -99,8 +99,9 @@ class Bridge:
         axes: 3 × 3 rotation from the device's frame to the scene's.
         absolute: Take the device's poses as poses in the scene instead of relative to its start.
         limits: Limits on the wrench, within the device's own; None takes these.
-        controller: Passivity controller: ``damper``, ``tank`` or ``off``. It acts only where the
-            device was given more than its damping burns and the scene gives up.
+        controller: Passivity controller: ``damper``, ``tank`` or ``off``. It acts where the device
+            was given more than its damping burns and the scene gives up. None: ``damper`` where the
+            device condition does not hold, else ``off``.
         clutch: Number of the device's button, from 0, that lets it move without the handle.
         dead_man: Number of the button that must be held for any force.
         live: Draw a status line on stderr, from the recorder's process.
@@ -133,7 +134,7 @@ class Bridge:
         axes: ArrayLike | None = None,
         absolute: bool = False,
         limits: Limits | None = None,
-        controller: str = "damper",
+        controller: str | None = None,
         clutch: int | None = None,
         dead_man: int | None = None,
         live: bool = False,

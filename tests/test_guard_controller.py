@@ -14,6 +14,7 @@ from hapticbridge.audit.guarded import _capped_sum
 from hapticbridge.device import SimulatedDevice
 from hapticbridge.guard import guarding_for, limits_for
 from hapticbridge.kernel.account import keep_account
+from hapticbridge.kernel.guarding import DAMPER, OFF
 from hapticbridge.kernel.layout import STATE_DTYPE
 from hapticbridge.passivity import WorstHand
 from hapticbridge.recording import read_recording
@@ -78,6 +79,7 @@ def test_a_device_with_too_little_damping_is_credited_with_half_of_it() -> None:
     assert (enough.credit, enough.rotational_credit) == (2.0, 2e-3)
     short = guarding_for(info, limits, T, needed=(2.1, 1e-3))
     assert (short.credit, short.rotational_credit) == (1.0, 2e-3)
+    assert (enough.controller, short.controller) == (OFF, DAMPER)
     light = guarding_for(SimulatedDevice(mass=1e-3).info, limits, T)
     assert light.most_damping == pytest.approx(1.0)  # m/T, below b
 

@@ -98,9 +98,9 @@ class Run:
     """Largest torque on the device in N m; by default the device's own."""
     ramp: float = 0.5
     """Seconds over which the force rises at the start."""
-    controller: Literal["damper", "tank", "off"] = "damper"
+    controller: Literal["damper", "tank", "off"] | None = None
     """Passivity controller: what is done when the device was given more than its damping burns and
-    the scene gives up."""
+    the scene gives up; by default 'damper' where the device condition does not hold, else 'off'."""
     clutch: int | None = None
     """Button of the device, from 0: while it is held the device moves without the handle."""
     dead_man: int | None = None

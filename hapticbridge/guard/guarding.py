@@ -67,7 +67,7 @@ def guarding_for(
     *,
     needed: tuple[float, float] = (0.0, 0.0),
     scale: float = 1.0,
-    controller: str = "damper",
+    controller: str | None = None,
     clutch: int | None = None,
     dead_man: int | None = None,
     is_absolute: bool = False,
@@ -85,7 +85,10 @@ def guarding_for(
             (``certificate.device_conditions``). A device that has it is taken to burn all that its
             damping can: its account stays balanced, and the controller idle.
         scale: Handle motion per device motion.
-        controller: One of ``CONTROLLERS``.
+        controller: One of ``CONTROLLERS``; None: ``damper`` where the device has less damping than
+            the coupling needs, else ``off``. A device that has it needs none, and a spring that was
+            turned far beyond the torque limit gives back more than the surplus covers: there the
+            account would blame an honest run.
         clutch: Button that lets the device move without the handle.
         dead_man: Button that must be held for any force.
         is_absolute: Whether the device's pose is one in the scene; it is then not re-seated before
@@ -94,7 +97,7 @@ def guarding_for(
     Raises:
         DeviceError: The controller's name or a button is not valid.
     """
-    if controller not in CONTROLLERS:
+    if controller is not None and controller not in CONTROLLERS:
         raise DeviceError(f"unknown controller {controller!r}; there are {choices(CONTROLLERS)}")
     buttons = button_mask(clutch, "clutch"), button_mask(dead_man, "dead-man")
     if buttons[0] and buttons[0] == buttons[1]:
@@ -116,10 +119,11 @@ def guarding_for(
         own if own >= asked else UNCERTIFIED_CREDIT * own
         for own, asked in zip((linear, angular), needed, strict=True)
     ]
+    is_borne = linear >= needed[0] and angular >= needed[1]
     own = period if info.rate is None else max(1.0 / info.rate, period)
     return replace(
         common,
-        controller=CONTROLLERS[controller],
+        controller=CONTROLLERS[controller or ("off" if is_borne else "damper")],
         credit=credit[0],
         rotational_credit=credit[1],
         most_damping=min(linear, math.inf if info.mass is None else info.mass / period),

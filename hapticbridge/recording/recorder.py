@@ -163,7 +163,10 @@ class Recorder:
             return RecordingError(str(answer["error"]))
         status = self._process.returncode
         how = f"killed by signal {-status}" if status < 0 else f"ended with status {status}"
-        return RecordingError(f"the recorder's process was {how}")
+        return RecordingError(
+            f"the recorder's process was {how}; what it wrote is readable up to the last whole "
+            "chunk, and 'hapticbridge repair' makes a whole file of it"
+        )
 
     def _reap(self) -> None:
         self._is_closed = True

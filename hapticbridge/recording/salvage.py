@@ -37,7 +37,7 @@ def salvage(path: Path, rows: NDArray[np.void], events: Sequence[Mapping[str, ob
         last = int(ticks["tick"][-1]) if ticks.size else -1
         rest = rows[rows["tick"] > last]
         if rest.size and int(rest["tick"][0]) != last + 1:
-            return "what it wrote is readable up to the last whole chunk; 'repair' makes it whole"
+            return "the records behind that are lost"
         epoch = recording.meta.get(layout.EPOCH_KEY, "0")
         writer = RecordingWriter(beside, recording.meta, attachments, int(epoch))
         writer.write_ticks(ticks)
@@ -52,9 +52,9 @@ def salvage(path: Path, rows: NDArray[np.void], events: Sequence[Mapping[str, ob
     except (RecordingError, OSError, ValueError):
         with contextlib.suppress(OSError):
             beside.unlink(missing_ok=True)
-        return "what it wrote is readable up to the last whole chunk, if 'repair' can read it"
+        return "the records behind that could not be written"
     total = ticks.size + rest.size
-    return f"the bridge made the recording whole, with all {total} records"
+    return f"the bridge has done so: all {total} records are there"
 
 
 def _key(event: Mapping[str, object]) -> tuple[object, ...]:
