@@ -30,12 +30,43 @@ def test_it_prints_draws_and_saves_what_it_measured(
     assert found.quantities["rotational_damping"].value == pytest.approx(2e-3, rel=0.01)
 
 
+def test_a_profile_that_cannot_be_written_costs_no_measurement(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "file").write_text("", encoding="utf-8")
+    place = str(tmp_path / "file" / "p.toml")
+    assert main(["identify", FREE, "--axes", "x", "--duration", "5", "--save", place]) == 2
+    told = capsys.readouterr()
+    assert "resolution 20 µm" in told.out
+    assert "cannot write" in told.err and "Traceback" not in told.err
+
+
 def test_as_json_it_tells_the_same(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["identify", FREE, "--axes", "y", "--duration", "5", "--json"]) == 0
     facts = json.loads(capsys.readouterr().out)
     assert facts["axes"]["y"]["damping"]["value"] == pytest.approx(1.5, rel=0.02)
     assert facts["largest_stiffness"] == pytest.approx(3000, rel=0.03)
     assert facts["profile"] is None
+
+
+@pytest.mark.parametrize(
+    ("device", "axis", "told"),
+    [
+        (FREE, "rx", "none of x, y, z was measured"),
+        ("simulated:hand=none,damping=0", "x", "damping may be zero"),
+    ],
+)
+def test_a_z_width_that_is_not_known_is_not_drawn_and_it_says_why(
+    device: str, axis: str, told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Without x, y or z it once said that the damping may be zero, and drew nothing, silently."""
+    width = tmp_path / "width.png"
+    words = ["identify", device, "--axes", axis, "--duration", "2", "--zwidth", str(width)]
+    assert main(words) == 0
+    captured = capsys.readouterr()
+    assert told in captured.out and told in " ".join(captured.err.split())
+    assert "not measured: " in captured.out
+    assert not width.exists()
 
 
 @pytest.mark.parametrize(
@@ -47,6 +78,7 @@ def test_as_json_it_tells_the_same(capsys: pytest.CaptureFixture[str]) -> None:
         ([FREE, "--duration", "0.5"], "--duration is 0.5 s; it must be 2 to 600"),
         ([FREE, "--force-share", "1.5"], "--force-share is 1.5; it must be 0.001 to 1"),
         ([FREE, "--plot", "fit.txt"], "does not end like a picture"),
+        ([FREE, "--plot", "a.png", "--zwidth", "a.png"], "--plot and --zwidth both name 'a.png'"),
         (["no-such-device"], "unknown device 'no-such-device'"),
     ],
 )

@@ -9,7 +9,7 @@ from scipy.integrate import solve_ivp
 
 from hapticbridge.clock import SimulatedClock
 from hapticbridge.device import SimulatedDevice
-from hapticbridge.identify import Identification, fit_axis, identify
+from hapticbridge.identify import Estimate, Identification, fit_axis, identify
 from hapticbridge.identify.identification import step_of
 from hapticbridge.tick import TickFlag
 
@@ -113,6 +113,50 @@ def test_half_a_period_of_delay_is_found_although_no_tick_is_that_long() -> None
     assert fit.delay.value == pytest.approx(0.5 * PERIOD, abs=0.03 * PERIOD)
 
 
+class Pulled(SimulatedDevice):
+    """Something else than the motor pulls at x: a weight of 1 N, or a cable of k N/m."""
+
+    def __init__(self, weight: float, spring: float, **numbers: float) -> None:
+        super().__init__(hand=None, **numbers)  # type: ignore[arg-type]
+        self.weight, self.spring, self.x = weight, spring, 0.0
+
+    def read(self, sample: NDArray[np.void]) -> int:
+        flag = super().read(sample)
+        self.x = float(sample["position"][0, 0])
+        return flag
+
+    def write(self, wrench: NDArray[np.float64]) -> None:
+        pulled = wrench.copy()
+        pulled[0] += self.weight - self.spring * self.x
+        super().write(pulled)
+
+
+@pytest.mark.parametrize(("weight", "spring"), [(1.0, 0.0), (-1.0, 0.0), (0.0, 0.9)])
+@pytest.mark.parametrize("mass", [0.06, 0.25])
+def test_a_weight_or_a_weak_cable_is_neither_refused_nor_taken_for_mass(
+    weight: float, spring: float, mass: float
+) -> None:
+    """A weight was once taken for a saturated motor, and a cable made the mass too small."""
+    device = Pulled(weight, spring, mass=mass, damping=0.6)
+    result = identify(device, SimulatedClock(), period=PERIOD, axes=("x",), duration=5.0)
+    fit = result.fits["x"]
+    assert fit.mass.least <= mass <= fit.mass.most
+    assert fit.mass.half_width < 0.02 * mass
+    # a spring that is felt a tick late takes kT/2 of the damping
+    assert fit.damping.value == pytest.approx(0.6, abs=2 * spring * PERIOD + 0.005)
+    assert fit.spring.value == pytest.approx(spring, rel=0.1, abs=0.1)
+
+
+@pytest.mark.parametrize("period", [2.5e-4, 1e-3, 2e-3, 4e-3])
+@pytest.mark.parametrize("mass", [0.1, 0.3])
+def test_no_damping_is_not_taken_for_a_little(mass: float, period: float) -> None:
+    device = SimulatedDevice(hand=None, mass=mass, damping=0.0)
+    result = identify(device, SimulatedClock(), period=period, axes=("x",), duration=4.0)
+    damping = result.fits["x"].damping
+    assert damping.least <= 0.0 <= damping.most
+    assert damping.half_width < 0.02
+
+
 def test_samples_that_do_not_come_are_left_out_and_not_taken_for_rest() -> None:
     true = known(3) | {"delay": 0}
 
@@ -158,3 +202,16 @@ def test_the_step_of_a_position_is_exact(step: float) -> None:
 def test_a_position_without_steps_has_none() -> None:
     assert step_of(np.sin(np.linspace(0.0, 30.0, 4000))) == 0.0
     assert step_of(np.array([np.nan, 1.0, 1.0])) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("estimate", "told"),
+    [
+        (Estimate(4.6e-10, 6e-4), "0 ± 0.0006"),
+        (Estimate(-2e-10, 6e-4), "0 ± 0.0006"),
+        (Estimate(1.98765, 0.008), "1.988 ± 0.008"),
+        (Estimate(0.25, 0.0), "0.25 ± 0"),
+    ],
+)
+def test_an_estimate_tells_no_digits_that_mean_nothing(estimate: Estimate, told: str) -> None:
+    assert estimate.told() == told

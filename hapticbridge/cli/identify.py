@@ -27,7 +27,7 @@ from hapticbridge.device.profile import Profile, own_folder
 from hapticbridge.errors import HapticBridgeError, choices
 from hapticbridge.felt import coupling_sentences
 from hapticbridge.identify import Identification, identify
-from hapticbridge.identify.fit import CONFIDENCE, Estimate
+from hapticbridge.identify.fit import CONFIDENCE
 from hapticbridge.identify.identification import DURATION, FORCE_SHARE, TRAVEL
 from hapticbridge.identify.measured_profile import measured_profile
 from hapticbridge.identify.picture import draw_identification
@@ -76,6 +76,8 @@ class Identify:
             if path is not None:
                 check_ending(path)
         self._check()
+        if self.plot is not None and self.plot == self.zwidth:
+            raise HapticBridgeError(f"--plot and --zwidth both name '{self.plot}'")
         device = open_device(self.device, tell=tell)
         try:
             axes = self._axes(device.info.axes)
@@ -104,19 +106,23 @@ class Identify:
             duration=self.duration,
             workspace=getattr(device, "workspace", None),
         )
-        path = self._write(profile, is_real=device.info.is_real)
+        path = self._place(profile, is_real=device.info.is_real)
+        # first, so that a file that cannot be written costs nothing that was measured
         if self.as_json:
             print_json(_facts(result, z, path))
         else:
             _print(result, z)
-            if path is not None:
-                out.print(f"wrote {plain(str(path))}")
+        if path is not None:
+            _write(profile, path)
+            tell(f"wrote {path}")
         for target, figure in (
             (self.plot, draw_identification(result) if self.plot else None),
             (self.zwidth, draw_z_width(z) if self.zwidth and z else None),
         ):
             if target is not None and figure is not None:
                 write_figure(figure, target)
+        if self.zwidth is not None and z is None:
+            tell(f"'{self.zwidth}' is not drawn: {_why_none(result)}")
         return 0
 
     def _check(self) -> None:
@@ -139,18 +145,19 @@ class Identify:
                 raise HapticBridgeError(f"--axes {axis}: the device has {choices(present)}")
         return tuple(axis for axis in AXES if axis in (self.axes or present))
 
-    def _write(self, profile: Profile, *, is_real: bool) -> Path | None:
-        path = self.save
-        if path is None:
-            if not is_real:
-                return None
-            path = own_folder() / f"{'-'.join(filter(None, (profile.device, profile.serial)))}.toml"
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_text(profile.to_toml(), encoding="utf-8")
-        except OSError as error:
-            raise HapticBridgeError(f"cannot write '{path}': {error.strerror}") from None
-        return path
+    def _place(self, profile: Profile, *, is_real: bool) -> Path | None:
+        """Returns where the profile goes; None where it is not kept."""
+        if self.save is not None or not is_real:
+            return self.save
+        return own_folder() / f"{'-'.join(filter(None, (profile.device, profile.serial)))}.toml"
+
+
+def _write(profile: Profile, path: Path) -> None:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(profile.to_toml(), encoding="utf-8")
+    except OSError as error:
+        raise HapticBridgeError(f"cannot write '{path}': {error.strerror}") from None
 
 
 def _z_width(result: Identification) -> ZWidth | None:
@@ -184,9 +191,9 @@ def _print(result: Identification, z: ZWidth | None) -> None:
             if (len(axis) == 2) == turns:
                 table.add_row(
                     axis,
-                    _told(fit.mass),
-                    _told(fit.damping),
-                    _told(fit.friction),
+                    fit.mass.told(),
+                    fit.damping.told(),
+                    fit.friction.told(),
                     f"{1e3 * fit.delay.value:.2f} ± {1e3 * fit.delay.half_width:.2f}",
                 )
         if table.row_count:
@@ -199,8 +206,10 @@ def _print(result: Identification, z: ZWidth | None) -> None:
         step = quantity(result.resolution, "m") if result.resolution else "none seen"
         out.print(f"resolution {step}")
     out.print(f"± holds the true value with {CONFIDENCE:.0%}")
+    if left := [axis for axis in result.info.axes if axis not in result.fits]:
+        out.print(f"not measured: {', '.join(left)}; a profile takes axes of a kind for alike")
     if z is None:
-        out.print("damping may be zero: no coupling is safe for any hand")
+        out.print(_why_none(result))
         return
     out.print(
         f"with the lower ends (b = {z.device_damping:.4g} N s/m) the largest safe stiffness is "
@@ -212,8 +221,10 @@ def _print(result: Identification, z: ZWidth | None) -> None:
     out.print(f"next: {plain(next_command(felt.stiffness, felt.damping, 1.0 / z.period))}")
 
 
-def _told(estimate: Estimate) -> str:
-    return f"{estimate.value:.4g} ± {estimate.half_width:.1g}"
+def _why_none(result: Identification) -> str:
+    if result.of_all("damping", turns=False) is None:
+        return "none of x, y, z was measured: the stiffness that the device can show is not known"
+    return "damping may be zero: no coupling is safe for any hand"
 
 
 def _facts(result: Identification, z: ZWidth | None, path: Path | None) -> dict[str, object]:

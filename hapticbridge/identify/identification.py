@@ -150,7 +150,8 @@ def identify(
         fits=fits,
         resolution=_resolution(info, runs),
         period=float(intervals.mean()),
-        period_spread=float(intervals.std()),
+        # in whole nanoseconds, as the clock counts: a steady one has no spread, not 1e-19 s
+        period_spread=1e-9 * float(np.rint(1e9 * intervals).std()),
         period_most=float(np.quantile(intervals, 0.999)),
     )
 

@@ -13,6 +13,9 @@ from hapticbridge.picture import new_figure
 
 _COLOURS = {"x": "#a51d2d", "y": "#1b7837", "z": "#1a5fb4"}
 
+_WIDTHS = {"x": 5.0, "y": 3.0, "z": 1.2}
+"""In points: axes that are alike lie on each other, and all shall be seen."""
+
 
 def draw_identification(result: Identification) -> Figure:
     """Draws, for each axis, the force that neither its mass nor a constant takes, over the speed.
@@ -52,7 +55,7 @@ def _draw_axis(panel: Axes, result: Identification, axis: str, fit: AxisFit) -> 
     area = found.columns[:, 3]
     speed = found.columns[:, 1] / area
     rest = found.right / area - fit.mass.value * found.columns[:, 0] / area - fit.offset.value
-    panel.plot(speed, rest, ".", color=colour, ms=3, alpha=0.5)
+    panel.plot(speed, rest, ".", color=colour, ms=3, zorder=3)
     most = float(np.abs(speed).max())
     line = np.linspace(-most, most, 400)
     force = fit.damping.value * line + fit.friction.value * np.sign(line)
@@ -61,7 +64,8 @@ def _draw_axis(panel: Axes, result: Identification, axis: str, fit: AxisFit) -> 
         line,
         force,
         color=colour,
-        lw=1.5,
-        label=f"{axis}: b = {fit.damping.value:.3g} ± {fit.damping.half_width:.1g} {units[0]}, "
-        f"f_c = {fit.friction.value:.2g} ± {fit.friction.half_width:.1g} {units[1]}",
+        lw=_WIDTHS[axis[-1]],
+        alpha=0.45,
+        label=f"{axis}: b = {fit.damping.told()} {units[0]}, "
+        f"f_c = {fit.friction.told()} {units[1]}",
     )

@@ -25,9 +25,14 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-_BUMP = Polynomial([0.0, 4.0, -4.0]) ** 4
-"""φ over a window of unit length, 1 in its middle: smooth enough that φ'' and its own first
-derivative vanish at the ends, so that a sum over samples is as good as an integral."""
+_BUMP = Polynomial([0.0, 4.0, -4.0]) ** 6
+"""φ over a window of unit length, 1 in its middle. The error that a window's ends make in a sum of
+φ'' x over samples looks like damping: with the 4th power it was 0.06 % of force over speed at 40
+samples a window and 1.5 % at 16, with the 6th 0.003 % and 0.17 %. Higher powers use less of a
+window."""
+
+LEAST_SAMPLES = 24
+"""Periods that a window spans at least: the error above is below 0.03 % then."""
 
 OVERLAP = 4
 """Windows begin every 1/OVERLAP of their length, without unit. More use the samples better, by
@@ -50,8 +55,8 @@ class Windows:
         right: ∫φ F(t − d), in N s, shape (n,).
         begin: First sample of each window, shape (n,).
         position: ∫φ x, in m s, shape (n,): the column of a spring.
-        excess: ∫φ e(t − d), in N s, where e is what F exceeds half of its largest value by, shape
-            (n,): the column of a motor that gives less than it is told.
+        excess: ∫φ e(t − d), in N s, where e is what F exceeds half of its largest distance from its
+            median by, shape (n,): the column of a motor that gives less than it is told.
     """
 
     columns: Array
@@ -70,11 +75,11 @@ def windows(
         position: x in m (or an angle in rad) at the samples, shape (n,).
         force: F in N (or N m), held from each sample to the next, shape (n,).
         period: T in s.
-        length: Of a window, in s; at least 16 periods.
+        length: Of a window, in s; at least ``LEAST_SAMPLES`` periods.
         resolution: Step of the position in m, 0 where it is exact.
         delay: d in s, from a write until the force acts, 0 or more.
     """
-    count = max(round(length / period), 16)
+    count = max(round(length / period), LEAST_SAMPLES)
     length = count * period
     nodes = np.arange(count + 1) / count
     trapezoid = np.full(count + 1, period)
@@ -91,8 +96,10 @@ def windows(
     step = max(count // OVERLAP, 1)
     begin = np.arange(held, len(position) - count, step)
     x = np.lib.stride_tricks.sliding_window_view(position, count + 1)[begin]
-    half = 0.5 * float(np.abs(force).max())
-    excess = np.sign(force) * np.maximum(np.abs(force) - half, 0.0)
+    # a force that bears a weight is always large: its excess would be the force itself
+    swing = force - np.median(force)
+    half = 0.5 * float(np.abs(swing).max())
+    excess = np.sign(swing) * np.maximum(np.abs(swing) - half, 0.0)
     f, e = (
         np.lib.stride_tricks.sliding_window_view(values, count + held)[begin - held]
         for values in (force, excess)

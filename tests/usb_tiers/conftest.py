@@ -23,7 +23,7 @@ from emulated.usbip import Usbip
 
 from usb_tiers.waiting import wait_for
 
-TIER = os.environ["HAPTICBRIDGE_TIER"]
+TIER = os.environ.get("HAPTICBRIDGE_TIER", "")  # empty where pytest only passes by
 _FRONT_ENDS: dict[str, dict[str, Callable[[Any], FrontEnd]]] = {
     "umock": {"umock": Umock},
     "uml": {"usbip": Usbip, "uhid": Uhid},
@@ -54,7 +54,7 @@ def plug_usb() -> Iterator[Plug]:
     yield from _plugging(Umock if TIER == "umock" else Usbip)
 
 
-@pytest.fixture(params=_FRONT_ENDS[TIER])
+@pytest.fixture(params=_FRONT_ENDS.get(TIER, {}))
 def plug_hid(request: pytest.FixtureRequest) -> Iterator[Plug]:
     """Plugs in a HID device, in each way that the tier has."""
     yield from _plugging(_FRONT_ENDS[TIER][request.param])
