@@ -17,23 +17,25 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hapticbridge.certificate import condition_sentences, default_coupling
+from hapticbridge.certificate import condition_sentences, default_coupling, needed_on_axes
 from hapticbridge.clock import Clock, RealClock, period_of
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Device, device_for
 from hapticbridge.errors import DeviceError, HapticBridgeError, SafetyTrip, SceneError
 from hapticbridge.guard import (
     Limits,
+    guarding_for,
     limits_for,
     refuse_simulated_time,
     refuse_stretched_start,
     trip_reason,
+    wait_until_still,
 )
 from hapticbridge.inputs import Write, apply_writes, input_writes
 from hapticbridge.jit import direct
 from hapticbridge.kernel.after import answer_step
 from hapticbridge.kernel.ahead import can_split
-from hapticbridge.kernel.codes import BAD_RESULT, BAD_SAMPLE, HALF_DONE, OK, RING_FULL
+from hapticbridge.kernel.codes import BAD_RESULT, HALF_DONE, OK, RING_FULL
 from hapticbridge.kernel.layout import STATE_DTYPE
 from hapticbridge.kernel.parameters import checked_substeps, refuse_substeps
 from hapticbridge.kernel.publish import finish_tick, publish
@@ -62,6 +64,10 @@ from hapticbridge.signals import stopping_on_signals
 from hapticbridge.summary import Summary
 from hapticbridge.tick import SAMPLE_DTYPE, TICK_DTYPE, TickFlag
 from hapticbridge.workspace import Workspace, run_parameters
+
+RECORDER_LOOK = 0.1
+"""In s, how often the loop looks whether the recorder still lives: 4 µs each time. A run that is to
+be recorded ends with its recorder."""
 
 _NO_FORCE = np.zeros(6)
 
@@ -93,6 +99,11 @@ class Bridge:
         axes: 3 × 3 rotation from the device's frame to the scene's.
         absolute: Take the device's poses as poses in the scene instead of relative to its start.
         limits: Limits on the wrench, within the device's own; None takes these.
+        controller: Passivity controller: ``damper``, ``tank`` or ``off``. It acts where the device
+            was given more than its damping burns and the scene gives up. None: ``damper`` where the
+            device condition does not hold, else ``off``.
+        clutch: Number of the device's button, from 0, that lets it move without the handle.
+        dead_man: Number of the button that must be held for any force.
         live: Draw a status line on stderr, from the recorder's process.
         onlooker: Who looks at the run from another process, as ``view.Window`` does; it is started
             when the bridge is entered and closed when it is left.
@@ -125,6 +136,9 @@ class Bridge:
         axes: ArrayLike | None = None,
         absolute: bool = False,
         limits: Limits | None = None,
+        controller: str | None = None,
+        clutch: int | None = None,
+        dead_man: int | None = None,
         live: bool = False,
         onlooker: Onlooker | None = None,
         pipelined: bool | None = None,
@@ -155,6 +169,25 @@ class Bridge:
                 self.method,
             )
             self._limits = limits_for(device.info, limits)
+            self._guarding = guarding_for(
+                device.info,
+                self._limits,
+                self.period,
+                needed=needed_on_axes(
+                    device.info,
+                    self.used,
+                    self.period,
+                    self._workspace.scale,
+                    self._workspace.force_scale,
+                    self.laws,
+                    self.method,
+                ),
+                scale=self._workspace.scale,
+                controller=controller,
+                clutch=clutch,
+                dead_man=dead_man,
+                is_absolute=self._workspace.is_absolute,
+            )
             refuse_unknowing(self.method, is_real=device.info.is_real, i_know=i_know)
             # refused here already
             contact_stiffness_of(self.method, self.coupling, contact_stiffness)
@@ -165,7 +198,7 @@ class Bridge:
         self._sample = np.zeros(1, SAMPLE_DTYPE)
         self._inputs: deque[list[Write]] = deque()
         self._tick = self._overruns = self._skipped = 0
-        self._stopped_by = ""
+        self._stopped_by = self._signal = ""
         self._is_open = False
 
     def __enter__(self) -> Bridge:
@@ -186,9 +219,11 @@ class Bridge:
     ) -> None:
         self._is_open = False
         reason = self._stopped_by if error is None else f"{type(error).__name__}: {error}"
+        named = {"signal": self._signal} if self._signal else {}
         self._event(
             "stop",
             reason=reason,
+            **named,
             overruns=self._overruns,
             skipped=self._skipped,
             dropped=self._stream.dropped,
@@ -202,7 +237,7 @@ class Bridge:
 
         Args:
             duration: Time to run in s; None runs until the device's motion ends, or for ever
-                (Ctrl-C and SIGTERM stop cleanly).
+                (Ctrl-C, SIGTERM, SIGHUP and Ctrl-Z stop cleanly).
             on_tick: Called with the tick's number before it, for scripted inputs.
 
         Returns:
@@ -219,8 +254,9 @@ class Bridge:
             stack.enter_context(stopping_on_signals(self._stop_on_signal))
             if self._is_realtime:
                 self._note_grants(stack.enter_context(real_time()))
-            self.clock.start(round(self.period * 1e9))
             try:
+                wait_until_still(self.device, self._sample, self.period, self.clock)
+                self.clock.start(round(self.period * 1e9))
                 reason = self._loop(last, on_tick)
             except DeviceError as error:
                 reason = f"tick {self._tick}: {error}"
@@ -237,6 +273,7 @@ class Bridge:
         model, data, substeps = self.scene.model, self.scene.data, range(self._substeps)
         stream, records, cursors = self._stream, self._stream.rows, self._stream.cursors
         sample, wrench = self._sample, state["wrench_on_device"][0]
+        outside = state["outside"]
         before, answer, finish = self._before_step, self._answer_step, self._finish_tick
         read_device, write_device = self.device.read, self.device.write
         wait, now, hand_over = self.clock.wait, self.clock.now, self._publish
@@ -247,18 +284,22 @@ class Bridge:
             mujoco.mj_fwdPosition,
         )
         is_ahead = self._is_pipelined and can_split(model, self.method.scheme)
+        next_look, looks = self._tick, max(round(RECORDER_LOOK / self.period), 1)
         while self._tick != last and not self._stopped_by:
+            if self._tick >= next_look:
+                stream.look()
+                next_look += looks
             deadline, wake, skipped = wait()
             if on_tick is not None:
                 on_tick(self._tick)
             if inputs:
                 self._apply_inputs()
-            news = read_device(sample)
+            news = outside[0] = read_device(sample)
             read_before, read = read, now()
             elapsed = 1e-9 * (read - read_before)
             for substep in substeps:
                 code = before(state, sample, row, substep, elapsed)
-                if code == BAD_SAMPLE:
+                if code not in (OK, HALF_DONE):
                     return trip_reason(code, self._tick)
                 step = second_half if code == HALF_DONE else whole_step
                 step(model, data)
@@ -305,8 +346,8 @@ class Bridge:
         answers = {grant.name: grant.sentence for grant in self._grants + grants}
         self._event("real_time", **answers)
 
-    def _stop_on_signal(self) -> None:
-        self._stopped_by = "signal"
+    def _stop_on_signal(self, name: str) -> None:
+        self._stopped_by, self._signal = "signal", name
 
     def set_input(
         self,
@@ -429,6 +470,7 @@ class Bridge:
             limits=self._limits,
             workspace=self._workspace,
             contact_stiffness=self._contact_stiffness,
+            guarding=self._guarding,
         )
         self._binding = binding = Binding(scene.model, scene.data, self.parameters)
         refuse_stretched_start(binding.state, self._limits)

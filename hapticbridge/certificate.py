@@ -181,6 +181,26 @@ def device_conditions(
     return tuple(conditions)
 
 
+def needed_on_axes(
+    info: DeviceInfo,
+    coupling: Coupling,
+    period: float,
+    scale: float,
+    force_scale: float,
+    laws: int,
+    method: Method,
+) -> tuple[float, float]:
+    """Returns the damping that a coupling needs in N s/m and N m s/rad; 0 where nothing asks.
+
+    See ``device_conditions`` for the arguments.
+    """
+    if not method.has_coupling:
+        return 0.0, 0.0
+    conditions = device_conditions(info, coupling, period, scale, force_scale, laws, method)
+    needed = {condition.axis: condition.needed for condition in conditions}
+    return needed.get("translation", 0.0), needed.get("rotation", 0.0)
+
+
 def _needed_on(
     info: DeviceInfo,
     coupling: Coupling,
@@ -265,6 +285,20 @@ def is_certified(conditions: tuple[Condition, ...]) -> bool | None:
     return False if False in held else None if None in held or not held or is_late else True
 
 
+def assumed_damping(info: DeviceInfo) -> tuple[float, float]:
+    """Returns the damping in N s/m and N m s/rad that a device has, or is taken to have.
+
+    Unknown, or zero, it is ``UNKNOWN_DAMPING``, of a real device ``UNKNOWN_REAL_DAMPING``.
+    """
+    linear = info.damping or (UNKNOWN_REAL_DAMPING if info.is_real else UNKNOWN_DAMPING)
+    angular = info.rotational_damping or (
+        UNKNOWN_REAL_ROTATIONAL_DAMPING
+        if info.is_real and info.turns
+        else UNKNOWN_ROTATIONAL_DAMPING
+    )
+    return linear, angular
+
+
 def damping_margin(conditions: tuple[Condition, ...]) -> float | None:
     """Returns the least share of the device's damping that is left, 1 − needed / b.
 
@@ -309,13 +343,8 @@ def default_coupling(
     for name, value in (("scale", scale), ("force_scale", force_scale)):
         if not math.isfinite(value) or value <= 0:
             raise CouplingError(f"{name} is {value!r}; it must be finite and > 0")
-    damping = info.damping or (UNKNOWN_REAL_DAMPING if info.is_real else UNKNOWN_DAMPING)
+    damping, rotational = assumed_damping(info)
     damping /= scale * force_scale
-    rotational = info.rotational_damping or (
-        UNKNOWN_REAL_ROTATIONAL_DAMPING
-        if info.is_real and info.turns
-        else UNKNOWN_ROTATIONAL_DAMPING
-    )
     rotational *= scale / force_scale
     coupling = stiffest_coupling(damping, rotational, felt_period(info, period))
     checked_substeps(laws, CouplingError)

@@ -6,6 +6,7 @@ nanoseconds of running: zero at the first start, and a later start goes on where
 
 from __future__ import annotations
 
+import sys
 import time
 from typing import Protocol
 
@@ -64,6 +65,17 @@ class Clock(Protocol):
         """Returns the time in ns of running."""
 
 
+def running_ns() -> int:
+    """Returns monotonic time in ns that also passes while the machine is suspended.
+
+    Linux's CLOCK_MONOTONIC stands still then: the loop would go on as if no time had passed, with
+    the force of a pose that is long gone. Setting the time of day moves neither.
+    """
+    if sys.platform == "linux":
+        return time.clock_gettime_ns(time.CLOCK_BOOTTIME)
+    return time.monotonic_ns()
+
+
 class RealClock:
     """Wall time: monotonic, absolute deadlines, overruns skipped and counted, never caught up.
 
@@ -81,13 +93,12 @@ class RealClock:
         """Puts the last deadline to now (see ``Clock.start``)."""
         self._period = period_ns
         self._spin = min(SPIN_NS, round(SPIN_SHARE * period_ns))
-        self._origin = time.monotonic_ns() - self._deadline
+        self._origin = running_ns() - self._deadline
 
     def wait(self) -> tuple[int, int, int]:
         """Sleeps to shortly before the deadline, then spins (see ``Clock.wait``)."""
         deadline = self._deadline + self._period
-        monotonic = time.monotonic_ns
-        now = monotonic() - self._origin
+        now = running_ns() - self._origin
         skipped = 0
         if now >= deadline + self._period:
             skipped = (now - deadline) // self._period
@@ -96,13 +107,13 @@ class RealClock:
             if deadline - now > self._spin:
                 time.sleep((deadline - now - self._spin) * 1e-9)
             while now < deadline:
-                now = monotonic() - self._origin
+                now = running_ns() - self._origin
         self._deadline = deadline
         return deadline, now, skipped
 
     def now(self) -> int:
         """Returns ns of running."""
-        return time.monotonic_ns() - self._origin
+        return running_ns() - self._origin
 
 
 class SimulatedClock:

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import HapticBridgeError, RecordingError
+from hapticbridge.kernel.guarding import UNGUARDED, Guarding
 from hapticbridge.kernel.scheme import WELD
 from hapticbridge.kernel.state import Binding, RunParameters
 from hapticbridge.recording import Attachment
@@ -140,6 +141,7 @@ def describe_run(
         "period_s": repr(parameters.period),
         "substeps": str(parameters.substeps),
         "ramp_ticks": str(parameters.ramp_ticks),
+        "guard": parameters.guarding.to_json(),
         "method": method,
         "felt": json.dumps(felt and [getattr(felt, name) for name in _GAINS]),
         "discretization": method_named(method).discretization,
@@ -254,6 +256,7 @@ def parameters_of(meta: Mapping[str, str]) -> RunParameters:
             contact_stiffness=meta_float(meta, "contact_stiffness"),
             device_damping=burning,
             device_rotational_damping=rotational,
+            guarding=Guarding.from_json(meta["guard"]) if "guard" in meta else UNGUARDED,
         )
     except RecordingError:
         raise

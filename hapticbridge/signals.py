@@ -1,4 +1,4 @@
-"""SIGINT and SIGTERM as a wish to stop while a loop runs, or held back for a moment."""
+"""Signals as a wish to stop while a loop runs, or held back for a moment."""
 
 from __future__ import annotations
 
@@ -8,24 +8,32 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+STOP_SIGNALS = tuple(
+    getattr(signal, name)
+    for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGTSTP")
+    if hasattr(signal, name)
+)
+"""What ends a run. Ctrl-Z (SIGTSTP) among them: a process that is suspended leaves the force on."""
 
 
 @contextmanager
-def stopping_on_signals(stop: Callable[[], None]) -> Iterator[None]:
-    """Calls ``stop`` instead of raising; only the main thread may do so, others run as they are.
+def stopping_on_signals(stop: Callable[[str], None]) -> Iterator[None]:
+    """Calls ``stop`` with the signal's name; only the main thread may, others run as they are.
+
+    A signal that is ignored stays so: ``nohup`` sees to that for SIGHUP.
 
     A ``KeyboardInterrupt`` in the middle of a tick could fall between a computed wrench and its
     being sent; a wish that is looked at once a tick cannot.
     """
 
-    def handle(_number: int, _frame: FrameType | None) -> None:
-        stop()
+    def handle(number: int, _frame: FrameType | None) -> None:
+        stop(signal.Signals(number).name)
 
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    previous = {number: signal.signal(number, handle) for number in STOP_SIGNALS}
+    heeded = [number for number in STOP_SIGNALS if signal.getsignal(number) != signal.SIG_IGN]
+    previous = {number: signal.signal(number, handle) for number in heeded}
     try:
         yield
     finally:

@@ -21,13 +21,15 @@ class TickFlag(IntFlag):
         DROPPED_BEFORE: Records were lost between the previous record and this one (ring full).
         FORCE_LIMITED: Force or torque was scaled down to the limit.
         SLEW_LIMITED: The wrench changed faster than the slew limit allows.
-        RAMPING: The start ramp still scales the wrench.
+        RAMPING: The wrench still rises, after the start or after the coupling was re-seated.
         CONTROLLER_ACTIVE: The passivity controller injected damping.
         CONTACT: MuJoCo found at least one contact in the scene.
         CLUTCH: The device moves without the handle.
         STALE_SAMPLE: The device had nothing new since the previous tick.
         TRIP: The guard stopped the run in this tick; the wrench sent is zero. A tick that is not
             finite is not recorded at all; the event ``trip`` names it.
+        RESEATED: The handle was put to the tool before this tick, and the device's pose belongs to
+            it from here on; the wrench rises from zero again.
         MIDPOINT: The coupling was lossless in this tick: its torque follows the midpoint rule.
     """
 
@@ -42,6 +44,7 @@ class TickFlag(IntFlag):
     STALE_SAMPLE = 256
     TRIP = 512
     MIDPOINT = 1024
+    RESEATED = 2048
 
 
 TICK_DTYPE = np.dtype(
@@ -76,7 +79,8 @@ TICK_DTYPE = np.dtype(
 """One record. Row k holds the sample read in tick k, the wrench computed from it, and the energies
 after the step. Positions in m, quaternions (w, x, y, z) with w >= 0, wrenches (force in N, torque
 in N m) in the world frame about the grip (``wrench_on_tool``) or in the device's frame
-(``wrench_on_device``), energies and cumulative works in J, ``injected_damping`` in N s/m."""
+(``wrench_on_device``), energies and cumulative works in J. ``injected_damping`` in N s/m is the
+largest that the passivity controller added on an axis of translation."""
 
 _POSITION, _QUATERNION = (("x", "y", "z"), "m"), (("w", "x", "y", "z"), "1")
 _WRENCH = ("fx", "fy", "fz", "tx", "ty", "tz"), "N"

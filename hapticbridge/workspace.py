@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo
 from hapticbridge.guard import UNLIMITED, Limits
+from hapticbridge.kernel.guarding import UNGUARDED, Guarding
 from hapticbridge.kernel.parameters import (
     RunParameters,
     checked_substeps,
@@ -88,6 +89,7 @@ def run_parameters(
     limits: Limits = UNLIMITED,
     workspace: Workspace = SAME_FRAME,
     contact_stiffness: float | None = None,
+    guarding: Guarding = UNGUARDED,
 ) -> RunParameters:
     """Returns the parameters of a run that starts now.
 
@@ -103,6 +105,7 @@ def run_parameters(
         limits: On the wrench that is sent.
         workspace: The map from the device's frame to the scene's.
         contact_stiffness: K_c in N/m of a tool without mass; None takes the coupling's stiffness.
+        guarding: What the guard does within a tick.
 
     Raises:
         HapticBridgeError: A value is out of range.
@@ -128,4 +131,5 @@ def run_parameters(
         contact_stiffness=contact_stiffness_of(method, coupling, contact_stiffness),
         device_damping=burning,
         device_rotational_damping=rotational,
+        guarding=guarding,
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from hapticbridge.clock import SimulatedClock
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import AXES, Device, DeviceInfo
 from hapticbridge.guard import Limits
+from hapticbridge.kernel.guarding import UNGUARDED
 from hapticbridge.provenance import MODEL_ATTACHMENT
 from hapticbridge.recording import Attachment, Recording, RecordingWriter
 from hapticbridge.scene import Scene
@@ -56,8 +58,15 @@ def recorded(
 ) -> Summary:
     """Runs a bridge in simulated time into a file."""
     options.setdefault("clock", SimulatedClock())
-    options.setdefault("limits", Limits(force=10.0, torque=0.5, ramp=0.05))
-    with Bridge(scene, device, coupling, recording=path, **options) as bridge:
+    options.setdefault(
+        "limits", Limits(force=10.0, torque=0.5, ramp=0.05, angle=math.inf, energy=math.inf)
+    )
+    options.setdefault("controller", "off")  # what is audited is what a method does by itself
+    is_guarded = options.pop("is_guarded", True)
+    bridge = Bridge(scene, device, coupling, recording=path, **options)
+    if not is_guarded:  # what happens where nobody stops it
+        bridge._guarding = UNGUARDED
+    with bridge:
         return bridge.run(duration, on_tick and (lambda tick: on_tick(bridge, tick)))
 
 

@@ -12,6 +12,7 @@ import hapticbridge as hb
 from hapticbridge.audit import AuditReport
 from hapticbridge.device import SimulatedDevice, TrajectoryDevice
 from hapticbridge.guard import Limits
+from hapticbridge.kernel.guarding import UNGUARDED
 from hapticbridge.scene import Scene
 
 NEVER = 1e9
@@ -61,6 +62,7 @@ def recorded_and_audited(
         limits=Limits(force=info.force_limit, torque=info.torque_limit, ramp=0.0),
         recording=path,
     )
+    bridge._guarding = UNGUARDED  # maps show what happens where nobody stops it
     # where the guard trips, the file holds what was before
     with bridge, suppress(hb.SafetyTrip):
         bridge.run(ticks * period, displace)

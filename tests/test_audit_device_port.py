@@ -56,6 +56,7 @@ def test_the_balance_is_the_identity_behind_the_bound() -> None:
         work=(np.sum(force * moved, axis=1), np.zeros(count)),
         passed=(np.ones(count), np.ones(count)),
         since_start=np.arange(count, dtype=np.float64),
+        share=np.ones(count),
     )
 
     kept = np.cumsum(parts) + held
@@ -93,6 +94,7 @@ def kept(
         work=(np.full(count, work), np.zeros(count)),
         passed=(np.full(count, passed), np.ones(count)),
         since_start=np.arange(count, dtype=np.float64),
+        share=np.minimum(np.arange(1.0, count + 1) / (run.ramp_ticks + 1), 1.0),
     )
     return [float(value) for value in np.cumsum(parts) + held]
 

@@ -6,7 +6,8 @@ import time
 
 import pytest
 
-from hapticbridge.clock import RealClock, SimulatedClock
+from hapticbridge import clock as clock_module
+from hapticbridge.clock import RealClock, SimulatedClock, running_ns
 
 PERIOD = 1_000_000
 
@@ -18,7 +19,7 @@ class Wall:
         self.ns = 5_000_000_000
         self.slept: list[float] = []
 
-    def monotonic_ns(self) -> int:
+    def running_ns(self) -> int:
         self.ns += 100  # reading takes time, so that a spin ends
         return self.ns
 
@@ -30,7 +31,7 @@ class Wall:
 @pytest.fixture
 def wall(monkeypatch: pytest.MonkeyPatch) -> Wall:
     clock = Wall()
-    monkeypatch.setattr(time, "monotonic_ns", clock.monotonic_ns)
+    monkeypatch.setattr(clock_module, "running_ns", clock.running_ns)
     monkeypatch.setattr(time, "sleep", clock.sleep)
     return clock
 
@@ -97,3 +98,14 @@ def test_time_stands_still_between_runs(wall: Wall) -> None:
     wall.ns += 10_000_000_000
     clock.start(PERIOD)
     assert clock.wait()[0] == 2 * PERIOD
+
+
+@pytest.mark.skipif(not hasattr(time, "CLOCK_BOOTTIME"), reason="only Linux tells")
+def test_real_time_passes_while_the_machine_is_suspended(monkeypatch: pytest.MonkeyPatch) -> None:
+    suspended = 7_000_000_000
+
+    def told(which: int) -> int:
+        return suspended if which == time.CLOCK_BOOTTIME else 0
+
+    monkeypatch.setattr(time, "clock_gettime_ns", told)
+    assert running_ns() == suspended

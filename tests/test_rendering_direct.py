@@ -93,6 +93,7 @@ def test_geometry_decides_for_a_massless_tool_and_not_behind_a_coupling(
     scene, path = tmp_path / "slot.xml", tmp_path / "run.mcap"
     scene.write_text(SLOT.format(half=0.5 * share * limit))
     options: dict[str, Any] = {"contact_stiffness": stiffness} if method == "direct" else {}
+    options["is_guarded"] = False
     coupling = Coupling(stiffness, 0.5, 2.0, 5e-4)
     summary = recorded(
         path, scene, Rotor(damping), coupling, duration=0.3, method=method, limits=FREE, **options

@@ -108,7 +108,7 @@ def test_meter_and_audit_name_the_tick_at_which_energy_was_created(
     for method in (name, "implicit"):
         path = tmp_path / f"{method.replace(':', '_')}.mcap"
         device = ScriptedDevice(swing, strength=200.0)
-        summary = recorded(path, scene, device, loose, duration=0.2, method=method, limits=FREE)
+        summary = recorded(path, scene, device, loose, duration=0.15, method=method, limits=FREE)
         reports[method] = audit(path)
         found = (reports[method].tick, reports[method].port)
         assert found == (summary.fault or (None, ""))

@@ -16,11 +16,8 @@ from hapticbridge.audit.device_port import (
     burnt_by_damping,
     kept_behind_a_law,
     passed_shares,
-    ramp_share,
 )
 from hapticbridge.audit.differences import (
-    quaternion_product,
-    since_start,
     steps,
     summed,
     turn_between,
@@ -47,6 +44,7 @@ class Balance:
         wrench_on_tool: The coupling law at the recorded poses, (n, 6) in N and N m; the recorded
             wrench itself where the recorded poses alone do not tell it.
         wrench_on_device: What the guard should have sent for the recorded wrench, (n, 6).
+        injected_damping: What the passivity controller should have added, (n,) in N s/m.
         handle_position: Where the recorded device pose puts the handle, (n, 3) in m.
         handle_turn: By how much the recorded handle is turned from where it should be, (n,) in rad.
         coupling_work: Cumulative Σ f·δx + τ·δφ of the recorded wrench, (n,) in J; as recorded
@@ -64,6 +62,7 @@ class Balance:
 
     wrench_on_tool: Array
     wrench_on_device: Array
+    injected_damping: Array
     handle_position: Array
     handle_turn: Array
     coupling_work: Array
@@ -123,11 +122,12 @@ class Balance:
         later = _later(ticks, following, late) if late else (device_step, device_turn)
         given = np.sum(sent[:, :3] * later[0], axis=1) + np.sum(sent[:, 3:] * later[1], axis=1)
 
-        position, orientation = _handle(ticks, parameters)
+        expected, guarded = before.guarded.after(ticks, resumed)
+        seen = expected.seen
         stored = ticks["kinetic"] + ticks["potential"] - before.start_energy
         created = stored - coupling_work - ticks["actuator_work"] - ticks["external_work"]
         kept, lost = coupling_work, created  # without a law, all that the scene took up
-        kept_sum, running = np.zeros(len(ticks)), since_start(ticks, resumed)
+        kept_sum = np.zeros(len(ticks))
         if parameters.has_law:
             # the slack pays for what the environment creates, but a ramp or a limit lets through
             # only a share of the slack: counted here, it would blame a device that bears its law
@@ -138,7 +138,8 @@ class Balance:
                 stretched=motion.stretched,
                 work=works,
                 passed=passed_shares(ticks, parameters),
-                since_start=running,
+                since_start=seen.since_start,
+                share=seen.share,
                 share_before=before.share,
                 has_end=not late,
             )
@@ -146,8 +147,7 @@ class Balance:
             kept = kept_sum + held
         burnt = np.zeros(len(ticks))
         if parameters.device_damping is not None:
-            interval = np.diff(ticks["read_ns"], prepend=before.read_ns) * 1e-9
-            parts = burnt_by_damping(parameters, *later, interval, running > 0)
+            parts = burnt_by_damping(parameters, *later, seen.interval, ~seen.first)
             burnt = summed(parts, sums["burnt"])
         linear, angular = _slack_gains(parameters)
         slack = 0.5 * linear * np.sum(motion.tool_step**2, axis=1)
@@ -165,10 +165,11 @@ class Balance:
         last = ticks[-1]
         return cls(
             wrench_on_tool=law,
-            wrench_on_device=_guarded(ticks, parameters, running),
-            handle_position=position,
+            wrench_on_device=expected.wrench,
+            injected_damping=expected.injected,
+            handle_position=expected.position,
             handle_turn=np.linalg.norm(
-                turn_between(orientation, ticks["handle_quaternion"]), axis=1
+                turn_between(expected.orientation, ticks["handle_quaternion"]), axis=1
             ),
             coupling_work=coupling_work,
             throughput=totals["throughput"],
@@ -182,9 +183,9 @@ class Balance:
                 tool=np.concatenate([last["tool_position"], last["tool_quaternion"]]),
                 device=np.concatenate([last["device_position"], last["device_quaternion"]]),
                 sent=last["wrench_on_device"].copy(),
-                read_ns=int(last["read_ns"]),
                 start_energy=before.start_energy,
-                share=float(ramp_share(parameters, running[-1:])[0]),
+                share=float(seen.share[-1]),
+                guarded=guarded,
                 sums={name: float(total[-1]) for name, total in totals.items()},
             ),
         )
@@ -222,31 +223,3 @@ def _later(
         missing = np.zeros((len(ticks) - len(change), 3))
         moved.append(np.concatenate([change, missing]))
     return moved[0], moved[1]
-
-
-def _handle(ticks: NDArray[np.void], parameters: RunParameters) -> tuple[Array, Array]:
-    """Maps the recorded device poses into the scene (h = h_0 + scale · A (p − p_0))."""
-    axes = np.array(parameters.axes).reshape(3, 3)
-    origin, target = np.array(parameters.device_origin), np.array(parameters.handle_origin)
-    moved = (ticks["device_position"] - origin[:3]) @ axes.T
-    # a rotation vector turns with the axes: log(A R Aᵀ) = A log(R)
-    vector = turn_between(np.broadcast_to(origin[3:], (len(ticks), 4)), ticks["device_quaternion"])
-    vector = vector @ axes.T
-    angle = np.linalg.norm(vector, axis=1, keepdims=True)
-    turn = np.concatenate([np.cos(angle / 2), np.sinc(angle / (2 * np.pi)) / 2 * vector], axis=1)
-    orientation = quaternion_product(turn, np.broadcast_to(target[3:], (len(ticks), 4)))
-    return target[:3] + parameters.scale * moved, orientation
-
-
-def _guarded(ticks: NDArray[np.void], parameters: RunParameters, running: Array) -> Array:
-    """Scales, limits and ramps the recorded wrench on the tool as the guard does."""
-    axes = np.array(parameters.axes).reshape(3, 3)
-    on_tool = ticks["wrench_on_tool"]
-    force = -parameters.force_scale * on_tool[:, :3] @ axes
-    torque = -parameters.force_scale / parameters.scale * on_tool[:, 3:] @ axes
-    limited = []
-    for vector, limit in ((force, parameters.force_limit), (torque, parameters.torque_limit)):
-        norm = np.linalg.norm(vector, axis=1, keepdims=True)
-        limited.append(vector * np.where(norm > limit, limit / np.maximum(norm, 1e-300), 1.0))
-    ramp = ramp_share(parameters, running)
-    return np.concatenate(limited, axis=1) * ramp[:, None]

@@ -42,11 +42,6 @@ def burnt_by_damping(
     return np.asarray(np.where(is_running, burnt / time, 0.0))
 
 
-def ramp_share(parameters: RunParameters, since_start: Array) -> Array:
-    """Returns the share of the wrench that the guard lets through while it rises, (n,)."""
-    return np.asarray(np.minimum((since_start + 1.0) / (parameters.ramp_ticks + 1.0), 1.0))
-
-
 def passed_shares(ticks: NDArray[np.void], parameters: RunParameters) -> tuple[Array, Array]:
     """Returns the share of force and of torque that the guard let through, (n,) each."""
     scales = (parameters.force_scale, parameters.force_scale / parameters.scale)
@@ -54,7 +49,8 @@ def passed_shares(ticks: NDArray[np.void], parameters: RunParameters) -> tuple[A
     for part, scale in zip((slice(0, 3), slice(3, 6)), scales, strict=True):
         full = scale * np.linalg.norm(ticks["wrench_on_tool"][:, part], axis=1)
         sent = np.linalg.norm(ticks["wrench_on_device"][:, part], axis=1)
-        shares.append(np.divide(sent, full, out=np.ones_like(full), where=full > 0))
+        passed = np.divide(sent, full, out=np.ones_like(full), where=full > 0)
+        shares.append(np.minimum(passed, 1.0))  # injected damping may add to the wrench
     return shares[0], shares[1]
 
 
@@ -66,6 +62,7 @@ def kept_behind_a_law(
     work: tuple[Array, Array],
     passed: tuple[Array, Array],
     since_start: Array,
+    share: Array,
     share_before: float = 0.0,
     has_end: bool = True,
 ) -> tuple[Array, Array]:
@@ -86,6 +83,7 @@ def kept_behind_a_law(
         work: Of force and of torque on the tool in each tick, (n,) each in J.
         passed: c, the share of force and of torque that the guard let through, (n,) each.
         since_start: Ticks since the force began to rise, (n,).
+        share: r, the share of the wrench that is let through while it rises or fades, (n,).
         share_before: r of the tick before the first of these.
         has_end: Whether r_k V(e_k) is counted. It stands for what a device at e_k could still be
             given; where the device is no longer there, because the sample is old, only what it was
@@ -104,7 +102,6 @@ def kept_behind_a_law(
     )
     stiffness = (coupling.stiffness, coupling.rotational_stiffness)
     damping = (coupling.damping, coupling.rotational_damping)
-    share = ramp_share(parameters, since_start)
     rise = np.where(since_start == 0, share, np.diff(share, prepend=share_before))
     summed, held = np.zeros(len(share)), np.zeros(len(share))
     for k, b, limit, e, de, w, c in zip(

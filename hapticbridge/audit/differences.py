@@ -59,9 +59,3 @@ def rotate(q: Array, v: Array) -> Array:
     """Returns R(q) v over rows, q (n, 4) and v (n, 3)."""
     pure = np.concatenate([np.zeros((len(v), 1)), v], axis=1)
     return quaternion_product(quaternion_product(q, pure), conjugate(q))[:, 1:]
-
-
-def since_start(ticks: NDArray[np.void], resumed: Array) -> Array:
-    """Returns how many ticks ago the force began to rise, at the start or after a pause."""
-    starts = np.concatenate([[0.0], np.sort(resumed)])
-    return np.asarray(ticks["tick"] - starts[np.searchsorted(starts, ticks["tick"], "right") - 1])

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticbridge.audit.guarded import Guarded
 from hapticbridge.kernel.state import RunParameters
 
 Array = NDArray[np.float64]
@@ -33,9 +34,9 @@ class Reached:
         tool: Tool pose (7,).
         device: Device pose (7,).
         sent: Wrench that was sent to the device, (6,).
-        read_ns: When the device was read, in ns.
         start_energy: Kinetic plus potential energy before the first tick, in J.
         share: Of the wrench that the ramp let through.
+        guarded: Where the guard has got to.
         sums: The cumulative energies so far, in J.
     """
 
@@ -43,10 +44,10 @@ class Reached:
     tool: Array
     device: Array
     sent: Array
-    read_ns: int
     start_energy: float
     share: float
     sums: dict[str, float]
+    guarded: Guarded
 
     @classmethod
     def at_start(
@@ -61,6 +62,6 @@ class Reached:
             start_energy: Kinetic plus potential energy before the first tick, in J.
         """
         device = np.array(parameters.device_start)
-        return cls(
-            handle, tool, device, np.zeros(6), 0, start_energy, 0.0, dict.fromkeys(SUMS, 0.0)
-        )
+        guarded = Guarded.at_start(parameters, handle, tool, start_energy)
+        sums = dict.fromkeys(SUMS, 0.0)
+        return cls(handle, tool, device, np.zeros(6), start_energy, 0.0, sums, guarded)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.inputs import apply_writes
 from hapticbridge.kernel.state import COUPLING_ACTUATORS, Binding, RunParameters
-from hapticbridge.kernel.step import simulate
+from hapticbridge.kernel.step import simulate_recorded
 from hapticbridge.provenance import (
     MODEL_ATTACHMENT,
     STARTS,
@@ -28,7 +28,7 @@ from hapticbridge.provenance import (
 )
 from hapticbridge.recording import RecordingFile
 from hapticbridge.rendering import check_prepared, method_named
-from hapticbridge.tick import SAMPLE_DTYPE, TICK_DTYPE
+from hapticbridge.tick import SAMPLE_DTYPE, TICK_DTYPE, TickFlag
 
 DECISIVE = ("hapticbridge", "mujoco", "numba")
 """Packages whose versions must match for a run to be repeated to the bit."""
@@ -62,9 +62,10 @@ class Rerun:
 
     def __init__(self, recording: RecordingFile, parameters: RunParameters) -> None:
         self._changes: deque[Mapping[str, Any]] = deque()
+        self._resumed: list[Any] = []
         for event in recording.events:
             self.note(event)
-        self._changed = 0
+        self._changed = self._read_ns = 0
         self.done, self.is_over = 0, False
         self.model = model = _model(recording, parameters)
         self.data = data = mujoco.MjData(model)
@@ -79,7 +80,14 @@ class Rerun:
     def warm_up(self) -> None:
         """Compiles what ``add`` needs, so that the first call takes no longer than others."""
         binding = self._binding
-        simulate(binding.state, np.zeros(0, SAMPLE_DTYPE), binding.row, np.zeros(0, TICK_DTYPE))
+        simulate_recorded(
+            binding.state,
+            np.zeros(0, SAMPLE_DTYPE),
+            np.zeros(0, TICK_DTYPE)["flags"],
+            np.zeros(0),
+            binding.row,
+            np.zeros(0, TICK_DTYPE),
+        )
 
     @property
     def slack(self) -> float:
@@ -90,12 +98,14 @@ class Rerun:
         """Takes an event of a run that still goes on; those that change nothing are passed over."""
         if event.get("event") in CHANGES:
             self._changes.append(event)
+        if event.get("event") == "resume":
+            self._resumed.append(event.get("tick"))
 
     def add(self, ticks: NDArray[np.void]) -> NDArray[np.void]:
         """Simulates the next ticks.
 
         Args:
-            ticks: Their records, ``TICK_DTYPE``, at least one; only the device's samples are used.
+            ticks: Their records, ``TICK_DTYPE``, at least one; only what came from outside is used.
 
         Returns:
             Records as simulated; fewer where it ``is_over``.
@@ -109,14 +119,18 @@ class Rerun:
             ticks["device_quaternion"],
         )
         samples["buttons"] = ticks["buttons"]
+        outside = ticks["flags"] & int(TickFlag.STALE_SAMPLE | TickFlag.RESEATED)
+        elapsed = self._elapsed(ticks)
         rows = np.zeros(len(ticks), TICK_DTYPE)
         done = 0
         while done < len(ticks) and not self.is_over:
             end = len(ticks)
             if self._changes:
                 end = min(self._due(self._changes[0]) - self.done, end)
-            binding = self._binding
-            count = simulate(binding.state, samples[done:end], binding.row, rows[done:end])
+            state, row, part = self._binding.state, self._binding.row, slice(done, end)
+            count = simulate_recorded(
+                state, samples[part], outside[part], elapsed[part], row, rows[part]
+            )
             self.is_over = count < end - done
             done += count
             if self._changes and done == end < len(ticks):
@@ -133,6 +147,14 @@ class Rerun:
         while self._changes and not self.is_over:
             self._due(self._changes[0])
             self._apply(self._changes.popleft())
+
+    def _elapsed(self, ticks: NDArray[np.void]) -> NDArray[np.float64]:
+        """Returns the times between two readings in s, as the live loop counted them."""
+        read = ticks["read_ns"]
+        before = np.concatenate([[self._read_ns], read[:-1]])
+        before[np.isin(ticks["tick"], self._resumed)] = 0
+        self._read_ns = int(read[-1])
+        return np.asarray(1e-9 * (read - before))
 
     def _due(self, event: Mapping[str, Any]) -> int:
         tick = event.get("tick")

@@ -9,7 +9,7 @@ from itertools import chain
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.audit.differences import since_start
+from hapticbridge.audit.watched import Seen, Watch
 from hapticbridge.kernel.state import RunParameters
 from hapticbridge.recording import RecordingFile
 from hapticbridge.tick import CLOCK_FIELDS, TICK_DTYPE, TickFlag
@@ -71,12 +71,13 @@ def structure_fault(
     """
     found: dict[int, Fault] = {}
     before: NDArray[np.void] = np.zeros(0, TICK_DTYPE)
-    count = 0
+    count, watch = 0, Watch.at_start(parameters)
     for ticks in blocks:
+        seen, watch = watch.after(ticks, resumed)
         checks = chain(
             _number_faults(ticks, count),
             _time_faults(ticks, before, count, parameters),
-            _flag_faults(ticks, before, parameters, resumed),
+            _flag_faults(ticks, before, seen),
         )
         for rank, fault in enumerate(checks):
             if fault is not None:
@@ -150,17 +151,14 @@ def _wrong_deadline(
 
 
 def _flag_faults(
-    ticks: NDArray[np.void],
-    before: NDArray[np.void],
-    parameters: RunParameters,
-    resumed: NDArray[np.float64],
+    ticks: NDArray[np.void], before: NDArray[np.void], seen: Seen
 ) -> Iterator[Fault | None]:
     """Holds those flags that other fields repeat against them."""
     numbers = ticks["tick"]
     expected = {
         TickFlag.DROPPED_BEFORE: np.zeros(len(ticks), bool),  # the ticks are contiguous
-        TickFlag.RAMPING: since_start(ticks, resumed) < parameters.ramp_ticks,
         TickFlag.CONTACT: ticks["contacts"] > 0,
+        **seen.flags,
     }
     for flag, is_due in expected.items():
         wrong = ((ticks["flags"] & int(flag)) != 0) != is_due

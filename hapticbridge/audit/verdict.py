@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.audit.balance import Balance
+from hapticbridge.audit.ending import how_it_ended
 from hapticbridge.audit.judgement import Judgement
 from hapticbridge.audit.physics import physics_fault
 from hapticbridge.audit.reached import Reached
@@ -100,8 +101,8 @@ def audit(path: str | Path, *, strict: bool = False) -> AuditReport:
     report = AuditReport(**facts, **passed.judgement.findings(strict=strict))
     if report.verdict == "passive" and report.unchecked and not outcome.has_run:
         report = _invalid(facts, Fault(outcome.agreement))
-    trips = [event.get("tick") for event in recording.events if event.get("event") == "trip"]
-    tripped = f"; the guard tripped at tick {trips[0]}" if trips else ""
+    ended = how_it_ended(recording.events)
+    tripped = f"; {ended}" if ended else ""
     unchecked = f"; {report.unchecked}" if report.unchecked else ""
     return replace(report, reason=report.reason + tripped + unchecked)
 

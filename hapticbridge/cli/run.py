@@ -8,7 +8,7 @@ from contextlib import ExitStack
 from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
@@ -21,7 +21,7 @@ from hapticbridge.clock import RealClock, SimulatedClock, period_of
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Device, DeviceInfo, device_for
 from hapticbridge.errors import HapticBridgeError, RecordingError
-from hapticbridge.guard import Limits
+from hapticbridge.guard import USUAL_ENERGY, USUAL_STRETCH, Limits
 from hapticbridge.kernel.parameters import checked_substeps
 from hapticbridge.rendering import Method, default_method, method_named
 from hapticbridge.scene import Scene, load_scene, settings_from
@@ -108,6 +108,18 @@ class Run:
     printed."""
     port: int = 8080
     """Port to serve the view on; 0: any that is free."""
+    controller: Literal["damper", "tank", "off"] | None = None
+    """Passivity controller: what is done when the device was given more than its damping burns and
+    the scene gives up; by default 'damper' where the device condition does not hold, else 'off'."""
+    clutch: int | None = None
+    """Button of the device, from 0: while it is held the device moves without the handle."""
+    dead_man: int | None = None
+    """Button of the device, from 0, that must be held for any force."""
+    stretch_limit: float = USUAL_STRETCH
+    """Largest distance between handle and tool in m; beyond it the run is stopped."""
+    energy_limit: float = USUAL_ENERGY
+    """Most energy in J that the device may be given beyond what the hand put in; inf for scenes
+    whose motors are meant to push the hand."""
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
     """Print the summary as JSON."""
 
@@ -148,7 +160,12 @@ class Run:
                     device.info.torque_limit if self.torque_limit is None else self.torque_limit
                 ),
                 ramp=self.ramp,
+                stretch=self.stretch_limit,
+                energy=self.energy_limit,
             ),
+            controller=self.controller,
+            clutch=self.clutch,
+            dead_man=self.dead_man,
             live=not self.as_json,
             onlooker=window,
             realtime=self.realtime or None,

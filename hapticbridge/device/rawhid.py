@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Mapping
 from dataclasses import replace
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 from hapticbridge.device.base import AXES, checked_period
 from hapticbridge.device.hex_log import HexLog
 from hapticbridge.device.hid_search import HidApi, find
+from hapticbridge.device.last_word import LastWord
 from hapticbridge.device.plugged import Family, Tell, UsbId, chosen
 from hapticbridge.device.rawhid_frame import (
     LARGEST,
@@ -58,6 +60,7 @@ class RawHidDevice:
 
     Attributes:
         info: Its data sheet.
+        last_word: Says zero to it should this process die; None where no other process can.
         states: The newest state, and how many were lost or damaged on the way.
 
     Raises:
@@ -75,6 +78,7 @@ class RawHidDevice:
         self._period, self._silent_ticks = 0.0, 0
         self._watchdog_ms = LONGEST_WATCHDOG_MS
         self._is_open, self._has_begun = True, False
+        self.last_word: LastWord | None = None
 
     def start(self, period: float) -> NDArray[np.void]:
         """Waits for a state frame that is newer than this call.
@@ -170,6 +174,8 @@ class RawHidDevice:
             pass  # its own watchdog does it
         finally:
             self._link.close()
+            if self.last_word is not None:
+                self.last_word.close()
 
     @property
     def velocity(self) -> NDArray[np.float64]:
@@ -230,6 +236,10 @@ def open_rawhid(
         link.close()
         raise
     device.info = replace(device.info, serial=plugged.serial)
+    if api is None and plugged.path.startswith("/dev/hidraw"):
+        zero = b"\0" + force_frame(0, _NO_WRENCH, 1, is_enabled=False)
+        with contextlib.suppress(OSError):  # its own watchdog is there in any case
+            device.last_word = LastWord(plugged.path, zero)
     return device
 
 

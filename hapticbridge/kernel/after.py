@@ -22,7 +22,7 @@ from hapticbridge.kernel.handle import (
 )
 from hapticbridge.kernel.lossless import finish_lossless
 from hapticbridge.kernel.meter import add_coupling_work, judge_environment, refresh_energies
-from hapticbridge.kernel.native import ints
+from hapticbridge.kernel.native import has_warned, ints
 from hapticbridge.kernel.ports import meter_ports
 from hapticbridge.kernel.scheme import DIRECT, HELD, LOSSLESS
 from hapticbridge.kernel.wrench import render, wrench_of_step
@@ -67,8 +67,10 @@ def answer_step(state: NDArray[np.void], row: NDArray[np.void], substep: int) ->
     s.lossless_ticks += s.was_midpoint
     square = dot(force, force) + dot(torque, torque)
     # MuJoCo ignores a control beyond its limit, so a wrench that is to be applied must stay below
-    if not math.isfinite(square) or (
-        s.scheme == HELD and square > LARGEST_CONTROL * LARGEST_CONTROL
+    if (
+        not math.isfinite(square)
+        or (s.scheme == HELD and square > LARGEST_CONTROL * LARGEST_CONTROL)
+        or has_warned(state)
     ):
         return _refuse(state)
     render(state, force, torque)
@@ -146,4 +148,4 @@ def _record(state: NDArray[np.void], row: NDArray[np.void]) -> None:
     r.coupling_work, r.actuator_work = s.coupling_work, s.actuator_work
     r.external_work = s.external_work
     r.environment_energy, r.device_energy = s.environment_energy, s.device_energy
-    r.injected_damping = 0.0
+    r.injected_damping = s.injected_damping

@@ -45,6 +45,7 @@ _POINTERS = (
     "efc_pos",
     "efc_force",
     "contact",
+    "warnings",
     "passive_gravcomp_dofs",
     "geom_bodyid",
     "body_mocap",
@@ -133,6 +134,43 @@ _PARAMETERS = (
     "torque_limit",
 )
 
+_GUARD_COUNTS = ("controller", "stale_ticks", "fade_ticks", "clutch", "dead_man", "reseats")
+
+_GUARD_PARAMETERS = (
+    "credit",
+    "rotational_credit",
+    "most_damping",
+    "most_rotational_damping",
+    "surplus",
+    "force_rise",
+    "torque_rise",
+    "longest_stall",
+    "most_speed",
+    "most_turn_speed",
+    "most_stretch",
+    "most_angle",
+    "most_energy",
+)
+
+_GUARD_RUNNING_COUNTS = (
+    "outside",
+    "watch_flags",
+    "is_released",
+    "stale_run",
+    "silent_ticks",
+    "rise_ticks",
+)
+
+_GUARD_RUNNING = (
+    "since_news",
+    "account",
+    "own_before",
+    "passed",
+    "given",
+    "kicked",
+    "injected_damping",
+)
+
 _POSES = ("device", "handle", "tool")
 
 _RUNNING_COUNTS = (
@@ -192,6 +230,10 @@ STATE_DTYPE = np.dtype(
     ]
     + [(name, "<i8") for name in _RUNNING_COUNTS]
     + [(name, "<f8") for name in _RUNNING]
+    + [(name, "<i8") for name in _GUARD_COUNTS + _GUARD_RUNNING_COUNTS]
+    + [(name, "<f8") for name in _GUARD_PARAMETERS + _GUARD_RUNNING]
+    + [("reversals", "<i8", 6)]
+    + [(name, "<f8", 6) for name in ("axis_account", "device_velocity", "slewed")]
 )
 """Addresses, sizes, parameters, the previous tick's poses, and the energies so far. Poses are
 (x, y, z, qw, qx, qy, qz); ``axes`` is the row-major rotation from the device's frame to the

@@ -109,6 +109,32 @@ def pointer_at(address: int) -> int:
     return int(numba.carray(_as_pointer(address), 1, np.int64)[0])
 
 
+_DIVERGED = tuple(
+    int(kind)
+    for kind in (
+        mujoco.mjtWarning.mjWARN_BADQPOS,
+        mujoco.mjtWarning.mjWARN_BADQVEL,
+        mujoco.mjtWarning.mjWARN_BADQACC,
+        mujoco.mjtWarning.mjWARN_BADCTRL,
+    )
+)
+_FIRST_DIVERGED, _LAST_DIVERGED = min(_DIVERGED), max(_DIVERGED)
+
+
+@compiled
+def has_warned(state: NDArray[np.void]) -> bool:
+    """Returns whether MuJoCo found a position, velocity, acceleration or control that is no number.
+
+    It also counts what is larger than mjMAXVAL = 1e10, which is still finite but no motion.
+    """
+    # mjWarningStat: two integers, of which the second counts
+    counts = ints(state[0].warnings, 2 * _LAST_DIVERGED + 2)
+    total = 0
+    for kind in range(_FIRST_DIVERGED, _LAST_DIVERGED + 1):
+        total += counts[2 * kind + 1]
+    return total > 0
+
+
 _SCALARS: dict[str, Any] = {
     "int": ctypes.c_int,
     "mjtNum": ctypes.c_double,

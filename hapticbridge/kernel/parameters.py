@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from hapticbridge.arguments import Arguments
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import HapticBridgeError
+from hapticbridge.kernel.guarding import UNGUARDED, Guarding
 from hapticbridge.kernel.scheme import COUPLED, DIRECT, HELD, LOSSLESS, WELD
 
 SLACK_SHARE = 0.5
@@ -71,6 +72,7 @@ class RunParameters:
         device_damping: b of the device in N s/m, None where unknown, in rotation too, or where the
             motion is prescribed. What the device was given is held against what this burns.
         device_rotational_damping: In N m s/rad, None likewise, or where nothing turns.
+        guarding: What the guard does within a tick.
 
     Raises:
         HapticBridgeError: A value is out of range.
@@ -94,6 +96,7 @@ class RunParameters:
     contact_stiffness: float = 0.0
     device_damping: float | None = None
     device_rotational_damping: float | None = None
+    guarding: Guarding = UNGUARDED
 
     def __post_init__(self) -> None:
         checked_substeps(self.substeps)

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
+
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.kernel import native
 from hapticbridge.kernel.direct import balance_contacts, tool_map
+from hapticbridge.kernel.guarding import Guarding
 from hapticbridge.kernel.handle import handle_pose
 from hapticbridge.kernel.layout import STATE_DTYPE
 from hapticbridge.kernel.meter import refresh_energies
@@ -28,6 +31,8 @@ COUPLING_ACTUATORS = tuple(
     f"coupling_{kind}_{axis}" for kind in ("force", "torque") for axis in ("x", "y", "z")
 )
 """Names of the six actuators that couple the grip to the handle, in the order of a wrench."""
+
+_TRIPS = ("speed", "turn_speed", "stretch", "angle", "energy")
 
 
 class Binding:
@@ -56,7 +61,8 @@ class Binding:
     def resume(self) -> None:
         """Starts the ramp again at the next tick, after a pause in which zero was commanded."""
         self.state["ramp_start"] = self.state["tick"]
-        self.state["wrench_on_device"] = 0.0
+        self.state["rise_ticks"] = self.state["ramp_ticks"]
+        self.state["wrench_on_device"] = self.state["slewed"] = 0.0
         self.state["has_positions"] = 0  # whoever had the scene meanwhile may have changed it
 
     def _fill_parameters(self, model: mujoco.MjModel, parameters: RunParameters) -> None:
@@ -74,7 +80,7 @@ class Binding:
         for name in ("period", "substeps", "scale", "force_scale", "force_limit", "torque_limit"):
             state[name] = getattr(parameters, name)
         state["timestep"] = model.opt.timestep
-        state["ramp_ticks"] = parameters.ramp_ticks
+        state["ramp_ticks"] = state["rise_ticks"] = parameters.ramp_ticks
         coupling = parameters.coupling
         for name in ("stiffness", "damping", "rotational_stiffness", "rotational_damping"):
             state[name] = getattr(coupling, name)
@@ -90,6 +96,7 @@ class Binding:
             self._bind_massless(model)
         if parameters.scheme == LOSSLESS:
             self._bind_lossless(model)
+        self._fill_guard(parameters.guarding)
         state["axes"] = parameters.axes
         quaternion = np.zeros(4)
         mujoco.mju_mat2Quat(quaternion, np.asarray(parameters.axes, dtype=np.float64))
@@ -98,6 +105,15 @@ class Binding:
             parameters.device_origin,
             parameters.handle_origin,
         )
+
+    def _fill_guard(self, guarding: Guarding) -> None:
+        for name in _TRIPS:
+            self.state[f"most_{name}"] = getattr(guarding, name)
+        for field in fields(guarding):
+            if field.name not in _TRIPS:
+                self.state[field.name] = getattr(guarding, field.name)
+        # a device that must be held to move the handle has not been, before the first tick
+        self.state["is_released"] = guarding.dead_man != 0
 
     def _bind_massless(self, model: mujoco.MjModel) -> None:
         grip = int(self.state["grip_site_id"][0])
@@ -197,6 +213,7 @@ def _bind_addresses(
     )
     for name in struct_fields.split():
         state[name] = native.field_address(data, name)
+    state["warnings"] = native.field_address(data, "warning")
 
     # actgravcomp hands a joint's gravity compensation to its actuators; the rest is passive
     passive = np.ascontiguousarray(

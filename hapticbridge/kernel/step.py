@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.jit import compiled, compiled_for_threads
+from hapticbridge.kernel.account import keep_account
 from hapticbridge.kernel.after import answer_step, close_tick
 from hapticbridge.kernel.ahead import take_handle_in
 from hapticbridge.kernel.codes import BAD_RESULT as BAD_RESULT  # noqa: PLC0414
@@ -31,6 +32,7 @@ from hapticbridge.kernel.lossless import apply_carried
 from hapticbridge.kernel.native import floats, mj_fwd_position, mj_step
 from hapticbridge.kernel.ports import note_moved_mocap_bodies
 from hapticbridge.kernel.scheme import DIRECT, HELD, LOSSLESS
+from hapticbridge.kernel.watch import follow, refused
 from hapticbridge.pose import (
     canonical,
     conjugate,
@@ -102,8 +104,8 @@ def before_step(
             than was burnt, and an uneven time stamp must not count more.
 
     Returns:
-        ``OK``, ``HALF_DONE`` where MuJoCo's step needs only its second half, or ``BAD_SAMPLE``; in
-        the latter case nothing was changed.
+        ``OK``, ``HALF_DONE`` where MuJoCo's step needs only its second half, ``BAD_SAMPLE`` or why
+        ``watch.refused`` it; in these cases nothing was changed.
     """
     s, r = state[0], row[0]
     if substep == 0:
@@ -118,17 +120,25 @@ def before_step(
 
         moved = subtract(position, vector_of(s.device_position))
         turned = rotation_between(quaternion_of(s.device_quaternion), quaternion)
+        code = refused(state, moved, turned, elapsed)
+        if code != OK:
+            return code
+        # old samples hide how the device moved: it took all the time since the last new one
+        interval = max(elapsed, s.period) + s.since_news
+        keep_account(state, moved, turned, interval)
         w = s.wrench_on_device
         s.device_energy += dot((w[0], w[1], w[2]), moved) + dot((w[3], w[4], w[5]), turned)
         if s.tick > s.ramp_start:
             # before the first tick and in a pause nobody knows how long the device took to move
-            interval = max(elapsed, s.period)
             s.device_burnt += s.device_damping / interval * dot(moved, moved)
             s.device_burnt += s.device_rotational_damping / interval * dot(turned, turned)
         store_vector(s.device_position, position)
         store_quaternion(s.device_quaternion, quaternion)
 
-        handle, orientation = handle_pose(state, position, quaternion)
+        handle, orientation = vector_of(s.handle_position), quaternion_of(s.handle_quaternion)
+        buttons = sample[0].buttons
+        if follow(state, position, quaternion, moved, turned, buttons, elapsed):
+            handle, orientation = handle_pose(state, position, quaternion)
         store_vector(s.handle_step, subtract(handle, vector_of(s.handle_position)))
         store_vector(
             s.handle_turn, rotation_between(quaternion_of(s.handle_quaternion), orientation)
@@ -180,6 +190,20 @@ def after_step(state: NDArray[np.void], row: NDArray[np.void], substep: int) -> 
     return close_tick(state, row, False)
 
 
+@compiled
+def _tick(
+    state: NDArray[np.void], sample: NDArray[np.void], row: NDArray[np.void], elapsed: float
+) -> bool:
+    s = state[0]
+    for substep in range(s.substeps):
+        if before_step(state, sample, row, substep, elapsed) != OK:
+            return False
+        advance(state)
+        if after_step(state, row, substep) != OK:
+            return False
+    return True
+
+
 @compiled_for_threads
 def simulate(
     state: NDArray[np.void],
@@ -201,14 +225,35 @@ def simulate(
     Returns:
         How many ticks were completed; fewer than asked where a sample or a result was not finite.
     """
-    s = state[0]
     for k in range(samples.size):
-        for substep in range(s.substeps):
-            # when the device was asked decides no record, only what the live loop's meter says
-            if before_step(state, samples[k : k + 1], row, substep, s.period) != OK:
-                return k
-            advance(state)
-            if after_step(state, row, substep) != OK:
-                return k
+        if not _tick(state, samples[k : k + 1], row, state[0].period):
+            return k
+        rows[k] = row[0]
+    return int(samples.size)
+
+
+@compiled_for_threads
+def simulate_recorded(
+    state: NDArray[np.void],
+    samples: NDArray[np.void],
+    outside: NDArray[np.int64],
+    elapsed: NDArray[np.float64],
+    row: NDArray[np.void],
+    rows: NDArray[np.void],
+) -> int:
+    """As ``simulate``, of a run that was recorded: with what came from outside the scene.
+
+    Args:
+        state: The bound state.
+        samples: Device samples, one per tick.
+        outside: ``STALE_SAMPLE`` and ``RESEATED`` as the live loop had them, per tick.
+        elapsed: Time between two samples in s, per tick.
+        row: The bound record.
+        rows: Receives the records; as long as ``samples``.
+    """
+    for k in range(samples.size):
+        state[0].outside = outside[k]
+        if not _tick(state, samples[k : k + 1], row, elapsed[k]):
+            return k
         rows[k] = row[0]
     return int(samples.size)

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.jit import compiled
+from hapticbridge.kernel.account import control
 from hapticbridge.kernel.direct import balance_contacts
 from hapticbridge.kernel.handle import (
     device_from_scene,
@@ -33,7 +34,8 @@ from hapticbridge.pose import (
     subtract,
 )
 
-FORCE_LIMITED, RAMPING = 4, 16  # TickFlag: the compiler cannot read an enumeration
+# TickFlag: the compiler cannot read an enumeration
+FORCE_LIMITED, SLEW_LIMITED, RAMPING = 4, 8, 16
 
 
 @compiled
@@ -124,19 +126,49 @@ def _limited(v: Vector, limit: float) -> tuple[Vector, bool]:
 
 
 @compiled
+def _slewed(v: Vector, before: Vector, rise: float) -> tuple[Vector, bool]:
+    change = subtract(v, before)
+    length = norm(change)
+    if length > rise:
+        return add(before, scaled(rise / length, change)), True
+    return v, False
+
+
+@compiled
 def render(state: NDArray[np.void], force: Vector, torque: Vector) -> None:
-    """Turns the wrench on the tool into the one on the device: scale, limit by norm, start ramp."""
+    """Turns the wrench on the tool into the one on the device.
+
+    In this order: scale, passivity controller, limit by norm, slew limit, and what fades or starts
+    the wrench as a whole.
+    """
     s = state[0]
+    s.flags |= s.watch_flags
     on_device = scaled(-s.force_scale, device_from_scene(s.axes, force))
     torque_on_device = scaled(-s.force_scale / s.scale, device_from_scene(s.axes, torque))
+    asked = norm(on_device)
+    on_device, torque_on_device = control(state, on_device, torque_on_device)
     on_device, is_limited = _limited(on_device, s.force_limit)
     torque_on_device, is_torque_limited = _limited(torque_on_device, s.torque_limit)
     if is_limited or is_torque_limited:
         s.flags |= FORCE_LIMITED
+    last = s.slewed
+    on_device, is_slewed = _slewed(on_device, (last[0], last[1], last[2]), s.force_rise)
+    torque_on_device, is_torque_slewed = _slewed(
+        torque_on_device, (last[3], last[4], last[5]), s.torque_rise
+    )
+    if is_slewed or is_torque_slewed:
+        s.flags |= SLEW_LIMITED
+    store_vector(s.slewed[0:3], on_device)
+    store_vector(s.slewed[3:6], torque_on_device)
+    share = 1.0
     since_start = s.tick - s.ramp_start
-    if since_start < s.ramp_ticks:
+    if since_start < s.rise_ticks:
         s.flags |= RAMPING
-        ramp = (since_start + 1.0) / (s.ramp_ticks + 1.0)
-        on_device, torque_on_device = scaled(ramp, on_device), scaled(ramp, torque_on_device)
+        share = (since_start + 1.0) / (s.rise_ticks + 1.0)
+    if s.silent_ticks > 0:
+        share *= max(0.0, 1.0 - s.silent_ticks / s.fade_ticks)
+    if share != 1.0:
+        on_device, torque_on_device = scaled(share, on_device), scaled(share, torque_on_device)
+    s.passed = min(norm(on_device) / asked, 1.0) if asked > 0.0 else share
     store_vector(s.wrench_on_device[0:3], on_device)
     store_vector(s.wrench_on_device[3:6], torque_on_device)

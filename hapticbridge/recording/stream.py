@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import time
+from collections import deque
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,7 @@ from hapticbridge.errors import RecordingError
 from hapticbridge.recording.format import Attachment
 from hapticbridge.recording.recorder import Recorder
 from hapticbridge.recording.ring import TAIL, Ring
+from hapticbridge.recording.salvage import salvage
 from hapticbridge.tick import TickFlag
 
 RING_SECONDS, MOST_RECORDS = 8.0, 1 << 16
@@ -25,6 +27,11 @@ NOBODY_READS = 1 << 62
 
 RING_POLL = 1e-3
 """How often a run in simulated time looks whether the recorder made room, in s."""
+
+KEPT_EVENTS = 4096
+"""Events that can be written again should the recorder die; more cost memory alone."""
+
+_ENDED = "the recorder ended in mid-run; the recording stops there"
 
 
 class Onlooker(Protocol):
@@ -94,6 +101,7 @@ class RecordStream:
             self.cursors[TAIL] = NOBODY_READS
         self.recorder: Recorder | None = None
         self.lost = self.dropped = 0
+        self._events: deque[dict[str, Any]] = deque(maxlen=KEPT_EVENTS)
 
     @property
     def is_read(self) -> bool:
@@ -127,7 +135,7 @@ class RecordStream:
             RecordingError: The recorder's process ended.
         """
         if self.recorder is None or not self.recorder.is_alive():
-            raise RecordingError("the recorder ended in mid-run; the recording stops there")
+            raise RecordingError(_ENDED)
         if self._is_lossless and may_wait:
             time.sleep(RING_POLL)
             return True
@@ -146,9 +154,19 @@ class RecordStream:
         """
         told = {"event": event, "tick": tick, **details}
         if self.recorder is not None:
+            self._events.append(told | {"time_ns": time_ns})
             self.recorder.event(told, time_ns)
         if self._onlooker is not None:
             self._onlooker.event(told)
+
+    def look(self) -> None:
+        """Looks whether the recorder still lives; takes some microseconds.
+
+        Raises:
+            RecordingError: It does not.
+        """
+        if self.recorder is not None and not self.recorder.is_alive():
+            raise RecordingError(_ENDED)
 
     def latest(self, count: int) -> NDArray[np.void]:
         """Returns copies of the newest records, oldest first."""
@@ -162,8 +180,20 @@ class RecordStream:
         """
         try:
             if self.recorder is not None:
-                self.recorder.close()
+                self._close_recorder(self.recorder)
         finally:
             if self._onlooker is not None:
                 self._onlooker.close()
             self._ring.close()
+
+    def _close_recorder(self, recorder: Recorder) -> None:
+        try:
+            recorder.close()
+        except RecordingError as error:
+            if self._path is None or not self._path.exists() or not self._ring.rows.size:
+                raise
+            last = self._events[-1]["time_ns"] if self._events else 0
+            died = {"event": "recorder_died", "reason": str(error), "time_ns": last}
+            rows = self._ring.latest(self._ring.capacity)
+            outcome = salvage(self._path, rows, [*self._events, died])
+            raise RecordingError(f"{error}; {outcome}") from None

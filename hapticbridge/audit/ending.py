@@ -1,0 +1,38 @@
+"""How a recorded run ended, where it was not as it was asked to."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+
+def how_it_ended(events: Sequence[Mapping[str, Any]]) -> str:
+    """Returns a clause that names the event which ended the run; empty for an ordinary end.
+
+    Args:
+        events: The recording's.
+    """
+    clauses = []
+    for event in events:
+        name, reason = event.get("event"), event.get("reason")
+        if name == "trip":
+            clauses.append(f"the guard tripped at tick {event.get('tick')}: {_short(reason)}")
+        elif name == "bridge_died":
+            clauses.append(f"the bridge died after tick {event.get('tick')}")
+        elif name == "recorder_died":
+            clauses.append("the recorder died in mid-run")
+        elif name == "stop" and event.get("signal"):
+            clauses.append(f"stopped by {event['signal']} at tick {event.get('tick')}")
+        elif name == "stop" and reason not in ("duration", "signal", "caller", None, ""):
+            clauses.append(f"stopped by {_short(reason)}")
+    has_trip = any(event.get("event") == "trip" for event in events)
+    if has_trip:  # what is raised then is the same in other words
+        clauses = [clause for clause in clauses if not clause.startswith("stopped by")]
+    return "; ".join(clauses)
+
+
+def _short(reason: object) -> str:
+    """Returns the text of a reason without the tick that it begins with, as a file may hold it."""
+    text = str(reason)
+    head, mark, rest = text.partition(": ")
+    return rest[:200] if mark and head.startswith("tick ") else text[:200]

@@ -1,0 +1,152 @@
+"""When the handle must have followed the device, from records alone, block by block.
+
+The second computation of what ``kernel.watch`` does tick by tick, over whole arrays.
+"""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticbridge.audit.differences import steps, turns
+from hapticbridge.kernel.state import RunParameters
+from hapticbridge.kernel.watch import STILL, STILL_TURN
+from hapticbridge.tick import TickFlag
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+
+def has_flag(ticks: NDArray[np.void], flag: TickFlag) -> Flags:
+    """Returns in which records a flag is set."""
+    return np.asarray((ticks["flags"] & int(flag)) != 0)
+
+
+def run_lengths(is_on: Flags, before: int) -> NDArray[np.int64]:
+    """Returns for each row how many rows up to it are on without a gap.
+
+    Args:
+        is_on: Of these rows.
+        before: How many before the first of them.
+    """
+    index = np.arange(1, len(is_on) + 1)
+    return np.asarray(index - np.maximum.accumulate(np.where(is_on, -before, index)))
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """What the watch saw in some ticks.
+
+    Attributes:
+        first: Which are the first of a run, after a start or a pause without force.
+        interval: Time in s since the device's last new sample, T at least between two readings.
+        since_start: Ticks since the wrench began to rise.
+        ramp: In how many ticks it rises: slowly after a start, soon after a re-seating.
+        silence: For how many ticks it has been fading.
+        flags: Where the flags must be set that records repeat.
+        share: Of the wrench that is let through while it rises or fades.
+    """
+
+    first: Flags
+    interval: Array
+    since_start: Array
+    ramp: Array
+    silence: NDArray[np.int64]
+    flags: dict[TickFlag, Flags]
+    share: Array
+
+
+@dataclass(slots=True)
+class Watch:
+    """Where the watch has got to.
+
+    Attributes:
+        parameters: The run's.
+        device: Device pose (7,) in the tick before.
+        read_ns: When the device was read then.
+        stale: How many ticks in a row had nothing new.
+        silent: For how many ticks the wrench has been fading.
+        since_news: Time in s of those without news.
+        is_released: Whether the handle did not follow.
+        start: The tick at which the wrench began to rise.
+        is_soon: Whether it then rose soon.
+    """
+
+    parameters: RunParameters
+    device: Array
+    read_ns: int = 0
+    stale: int = 0
+    silent: int = 0
+    since_news: float = 0.0
+    is_released: bool = False
+    start: int = 0
+    is_soon: bool = False
+
+    @classmethod
+    def at_start(cls, parameters: RunParameters) -> Watch:
+        """Returns what the first tick begins with."""
+        is_released = parameters.guarding.dead_man != 0
+        return cls(parameters, np.array(parameters.device_start), is_released=is_released)
+
+    def after(self, ticks: NDArray[np.void], resumed: Array) -> tuple[Seen, Watch]:
+        """Looks at the next records, ``TICK_DTYPE``, at least one.
+
+        Args:
+            ticks: The records.
+            resumed: Ticks at which the run went on after a pause without force.
+        """
+        guarding, period = self.parameters.guarding, self.parameters.period
+        index = np.arange(len(ticks))
+        first = (ticks["tick"] == 0) | np.isin(ticks["tick"], resumed)
+        raw = np.diff(ticks["read_ns"], prepend=self.read_ns) * 1e-9
+        elapsed = np.maximum(raw, period)
+        is_stale = has_flag(ticks, TickFlag.STALE_SAMPLE)
+        stale = run_lengths(is_stale, self.stale)
+        interval = elapsed.copy()
+        interval[0] += self.since_news
+        # one after the other, so that the sums do not depend on where a block ends
+        for k in (1 + np.flatnonzero(is_stale[:-1])).tolist():
+            interval[k] += interval[k - 1]
+
+        is_released = (ticks["buttons"] & guarding.clutch) != 0
+        if guarding.dead_man:
+            is_released |= (ticks["buttons"] & guarding.dead_man) == 0
+        is_silent = is_released.copy()
+        if guarding.stale_ticks > 0:
+            is_silent |= stale > guarding.stale_ticks
+        silence = run_lengths(is_silent, self.silent)
+
+        was_released = np.concatenate([[self.is_released], is_released[:-1]])
+        has_news = np.concatenate([[self.silent > 0], is_silent[:-1]]) & ~is_silent
+        has_stalled = ~first & (raw > guarding.longest_stall)
+        moved = np.linalg.norm(steps(ticks["device_position"], self.device[:3]), axis=1)
+        turned = np.linalg.norm(turns(ticks["device_quaternion"], self.device[3:]), axis=1)
+        has_strayed = first & guarding.reseats & ((moved > STILL) | (turned > STILL_TURN))
+        is_seated = ~is_released & (was_released | has_news | has_stalled | has_strayed)
+
+        begins = first | is_seated
+        last = np.maximum.accumulate(np.where(begins, index, -1))
+        start = np.where(last >= 0, ticks["tick"][last], self.start)
+        is_soon = np.where(last >= 0, (is_seated & ~first)[last], self.is_soon)
+        since_start = (ticks["tick"] - start).astype(np.float64)
+        ramp = np.where(is_soon, guarding.fade_ticks, self.parameters.ramp_ticks)
+        rising = np.minimum((since_start + 1.0) / (ramp + 1.0), 1.0)
+        fading = np.maximum(1.0 - silence / guarding.fade_ticks, 0.0)
+        flags = {
+            TickFlag.CLUTCH: is_released,
+            TickFlag.RESEATED: is_seated,
+            TickFlag.RAMPING: since_start < ramp,
+        }
+        seen = Seen(first, interval, since_start, ramp, silence, flags, rising * fading)
+        then = copy.copy(self)
+        row = ticks[-1]
+        then.device = np.concatenate([row["device_position"], row["device_quaternion"]])
+        then.read_ns = int(row["read_ns"])
+        then.stale, then.silent = int(stale[-1]), int(silence[-1])
+        then.since_news = float(interval[-1]) if is_stale[-1] else 0.0
+        then.is_released = bool(is_released[-1])
+        then.start, then.is_soon = int(start[-1]), bool(is_soon[-1])
+        return seen, then

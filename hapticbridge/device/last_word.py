@@ -1,0 +1,74 @@
+"""A process of its own that says zero to a device when the bridge can no longer.
+
+A bridge that is killed (SIGKILL), or whose interpreter crashes, runs no line of its own any more. A
+child that holds a second handle to the same device node sees its end of a pipe close, and then
+writes the report it was given. It is possible where two processes may hold one device: hidraw. USB
+interfaces belong to the one that claimed them; there the device's own watchdog is all there is.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import subprocess
+import sys
+from typing import IO, cast
+
+_CHILD = """
+import os, signal, sys, time
+for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGTSTP"):
+    signal.signal(getattr(signal, name), signal.SIG_IGN)
+device, report = int(sys.argv[1]), bytes.fromhex(sys.argv[2])
+os.write(1, b"r")
+if not os.read(0, 1):
+    for _ in range(3):
+        try:
+            os.write(device, report)
+        except OSError:
+            pass
+        time.sleep(0.002)
+"""
+# three times, because a report of the dead bridge may still be on its way behind the first
+
+PATIENCE = 5.0
+"""In s: how long the child may take to end; it needs a millisecond."""
+
+
+class LastWord:
+    """Holds a report that is written to a device node if this process ends without ``close``.
+
+    Args:
+        path: The device node; opened once more, for writing.
+        report: What is written, the report's number first.
+
+    Raises:
+        OSError: The node cannot be opened again, or no process started.
+    """
+
+    def __init__(self, path: str, report: bytes) -> None:
+        node = os.open(path, os.O_WRONLY | os.O_NOCTTY)
+        try:
+            self._process = subprocess.Popen(
+                [sys.executable, "-I", "-S", "-c", _CHILD, str(node), report.hex()],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                pass_fds=(node,),
+                start_new_session=True,  # Ctrl-C ends the bridge, which then says close
+                bufsize=0,
+            )
+        finally:
+            os.close(node)
+        cast(IO[bytes], self._process.stdout).read(1)  # from here on it heeds the pipe
+
+    def close(self) -> None:
+        """Tells the child that nothing needs to be said; may be called more than once."""
+        process = self._process
+        if process.stdin is None or process.stdin.closed:
+            return
+        with contextlib.suppress(OSError):
+            process.stdin.write(b"x")
+        process.stdin.close()
+        if process.stdout is not None:
+            process.stdout.close()
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(PATIENCE)

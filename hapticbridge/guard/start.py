@@ -1,0 +1,92 @@
+"""What must hold before force is enabled."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticbridge.clock import Clock, RealClock, SimulatedClock
+from hapticbridge.device import Device, DeviceInfo
+from hapticbridge.errors import DeviceError
+from hapticbridge.guard.limits import Limits
+from hapticbridge.tick import SAMPLE_DTYPE
+
+STILL_TIME, PATIENCE = 0.1, 5.0
+"""In s: how long a real device must be still before force is enabled, and how long that is waited
+for. A hand that reaches for a device stays for longer than the first."""
+
+STILL_DISTANCE = 1e-3
+"""In m, moved within ``STILL_TIME``: 1 cm/s, what a hand that holds still stays below."""
+
+
+def wait_until_still(device: Device, sample: NDArray[np.void], period: float, clock: Clock) -> None:
+    """Waits until a device with motors is still; returns at once for any other.
+
+    Args:
+        device: Started, under zero force.
+        sample: Shape (1,), ``SAMPLE_DTYPE``; receives the newest one.
+        period: T in s, at which it is read.
+        clock: The run's. Only real time is waited for; a clock that somebody drives also drives
+            what the device does, which must not begin before the run.
+
+    Raises:
+        DeviceError: It moves on.
+    """
+    if not device.info.is_real or device.info.is_prescribed or type(clock) is not RealClock:
+        return
+    clock = RealClock()  # another: the run's time begins with its first tick
+    clock.start(round(1e9 * period))
+    anchor = np.zeros(1, SAMPLE_DTYPE)
+    since = begun = None
+    while True:
+        clock.wait()
+        device.read(sample)
+        now = clock.now()
+        begun = now if begun is None else begun
+        moved = float(np.linalg.norm(sample["position"][0] - anchor["position"][0]))
+        if since is None or not moved <= STILL_DISTANCE:
+            anchor[0], since = sample[0], now
+        elif now - since >= 1e9 * STILL_TIME:
+            return
+        if now - begun > 1e9 * PATIENCE:
+            raise DeviceError(
+                f"the device '{device.info.name}' has moved for {PATIENCE:g} s; hold it still, "
+                "then start again: force is enabled only at rest"
+            )
+
+
+def refuse_simulated_time(info: DeviceInfo, clock: Clock) -> None:
+    """Refuses a clock that runs ahead of a device that lives in real time.
+
+    That is a device with motors, and one that follows a hand without end, some time after it.
+
+    Raises:
+        DeviceError: It is so.
+    """
+    follows = info.is_prescribed and info.delay != 0.0 and info.duration is None
+    if (info.is_real or follows) and isinstance(clock, SimulatedClock):
+        raise DeviceError(
+            f"the device '{info.name}' moves in real time, so the loop cannot run as fast as it "
+            "goes; leave out --fast (in code: the SimulatedClock)"
+        )
+
+
+def refuse_stretched_start(state: NDArray[np.void], limits: Limits) -> None:
+    """Refuses a start at which the coupling would already pull with more than the force limit.
+
+    Args:
+        state: The kernel's state (``STATE_DTYPE``, one element) before the first tick.
+        limits: Of the run.
+
+    Raises:
+        DeviceError: Says how far the handle is from the grip, and where the grip is.
+    """
+    s = state[0]
+    distance = float(np.linalg.norm(s["handle_position"] - s["tool_position"]))
+    force = float(s["stiffness"]) * distance
+    if force > limits.force:
+        raise DeviceError(
+            f"the device's absolute pose puts the handle {1e3 * distance:.3g} mm from the grip, "
+            f"{force:.3g} N at the start; the limit is {limits.force:g} N: start nearer to "
+            f"{np.round(s['tool_position'], 4).tolist()} m or use relative poses"
+        )

@@ -1,0 +1,28 @@
+"""Why the guard stopped a run, in words."""
+
+from __future__ import annotations
+
+from hapticbridge.kernel.codes import BACKWARDS, BAD_SAMPLE, GAVE_ENERGY, JUMPED, STRETCHED, TWISTED
+
+_REASONS = {
+    BAD_SAMPLE: "the device's pose is not finite or not a rotation",
+    JUMPED: "the device's pose jumped farther than the device can move",
+    BACKWARDS: "time ran backwards",
+    STRETCHED: "the tool is farther from the handle than the stretch limit",
+    TWISTED: "the tool is turned from the handle by more than the angle limit",
+    GAVE_ENERGY: "the device was given more energy beyond what the hand put in than the limit",
+}
+_DIVERGED = (
+    "the simulation is no longer finite (force, pose or energy); the scene diverged, so lower the "
+    "stiffness or the period"
+)
+
+
+def trip_reason(code: int, tick: int) -> str:
+    """Says why the kernel refused a tick.
+
+    Args:
+        code: What ``before_step`` or ``after_step`` returned, not ``OK``.
+        tick: The tick's number.
+    """
+    return f"tick {tick}: {_REASONS.get(code, _DIVERGED)}"

@@ -1,0 +1,112 @@
+"""Before a sample is used: is it possible, is it new, and does the handle follow the device."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticbridge.jit import compiled
+from hapticbridge.kernel.codes import BACKWARDS, GAVE_ENERGY, JUMPED, STRETCHED, TWISTED
+from hapticbridge.kernel.handle import quaternion_of, store_quaternion, store_vector, vector_of
+from hapticbridge.pose import Quaternion, Vector, norm, rotation_between, subtract
+
+CLUTCH, STALE_SAMPLE, RESEATED = 128, 256, 2048
+"""Of ``TickFlag``: the compiler cannot read an enumeration."""
+
+STILL = 1e-4
+"""In m. A device that moved by more between its start and the first tick is re-seated; less is what
+a hand that holds still does, and leaves a coupling of 2400 N/m with 0.24 N."""
+
+STILL_TURN = 0.02
+"""In rad, likewise: 0.05 N m behind 2.4 N m/rad."""
+
+
+@compiled
+def refused(state: NDArray[np.void], moved: Vector, turned: Vector, elapsed: float) -> int:
+    """Says why a tick must not be, or 0. Nothing is changed.
+
+    Args:
+        state: The bound state, as the tick before left it.
+        moved: By how much the new sample is from the last one, in m.
+        turned: Likewise as a rotation vector.
+        elapsed: Time between the two readings in s.
+    """
+    s = state[0]
+    is_first = s.tick == s.ramp_start
+    if elapsed < 0.0 and not is_first:
+        return BACKWARDS
+    # the device moves on while its samples are old, and between a start and the first tick
+    time = max(elapsed, s.period) + s.since_news
+    is_fast = norm(moved) > s.most_speed * time or norm(turned) > s.most_turn_speed * time
+    if is_fast and not is_first:
+        return JUMPED
+    stretch = subtract(vector_of(s.handle_position), vector_of(s.tool_position))
+    if norm(stretch) > s.most_stretch:
+        return STRETCHED
+    twist = rotation_between(quaternion_of(s.tool_quaternion), quaternion_of(s.handle_quaternion))
+    if norm(twist) > s.most_angle:
+        return TWISTED
+    return GAVE_ENERGY if s.kicked > s.most_energy else 0
+
+
+@compiled
+def follow(
+    state: NDArray[np.void],
+    position: Vector,
+    quaternion: Quaternion,
+    moved: Vector,
+    turned: Vector,
+    buttons: int,
+    elapsed: float,
+) -> bool:
+    """Decides whether the handle goes where the device went, and how much of the wrench is sent.
+
+    The handle stays where it is while a clutch button is held, or a dead-man button is not, and the
+    wrench fades; it also fades without news for ``stale_ticks``. When that is over, and after a
+    stall, the coupling is re-seated: the handle is put to the tool, so that nothing is stretched,
+    the device's pose now belongs to it, and the wrench rises within ``fade_ticks``. A coupling that
+    was stretched while no force was felt would give back what nobody had put in.
+
+    Args:
+        state: The bound state.
+        position: Of the device, new, in m.
+        quaternion: Likewise.
+        moved: Since the last sample, in m.
+        turned: Likewise as a rotation vector.
+        buttons: Bits.
+        elapsed: Time since the last sample in s.
+
+    Returns:
+        Whether the handle follows the device.
+    """
+    s = state[0]
+    s.watch_flags = 0
+    is_stale = (s.outside & STALE_SAMPLE) != 0
+    was_silent = s.silent_ticks > 0
+    s.stale_run = s.stale_run + 1 if is_stale else 0
+    s.since_news = s.since_news + max(elapsed, s.period) if is_stale else 0.0
+    was_released = s.is_released != 0
+    is_released = (buttons & s.clutch) != 0 or (s.dead_man != 0 and (buttons & s.dead_man) == 0)
+    s.is_released = is_released
+    is_silent = is_released or (s.stale_ticks > 0 and s.stale_run > s.stale_ticks)
+    s.silent_ticks = s.silent_ticks + 1 if is_silent else 0
+    if is_released:
+        s.watch_flags = CLUTCH
+        return False
+    is_first = s.tick == s.ramp_start
+    has_stalled = elapsed > s.longest_stall and not is_first
+    has_strayed = is_first and s.reseats and (norm(moved) > STILL or norm(turned) > STILL_TURN)
+    is_asked = (s.outside & RESEATED) != 0  # a recorded run is simulated again
+    has_news = was_silent and not is_silent
+    if was_released or has_news or has_stalled or has_strayed or is_asked:
+        s.watch_flags |= RESEATED
+        store_vector(s.device_origin[0:3], position)
+        store_quaternion(s.device_origin[3:7], quaternion)
+        store_vector(s.handle_origin[0:3], vector_of(s.tool_position))
+        store_quaternion(s.handle_origin[3:7], quaternion_of(s.tool_quaternion))
+        if not is_first:
+            s.rise_ticks = s.fade_ticks
+        s.ramp_start = s.tick
+        for i in range(6):
+            s.slewed[i] = 0.0
+    return True

@@ -1,0 +1,319 @@
+"""The faults: each a function that does one to a rig, with what must come of it."""
+
+from __future__ import annotations
+
+import os
+import resource
+import signal
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faults.rig import CAUSE, PERIOD, PRESS, STALE, Outcome, Rig
+from hapticbridge.bridge import Bridge
+from hapticbridge.coupling import Coupling
+from hapticbridge.device.hand import DEFAULT_HAND, Hand
+from hapticbridge.errors import DeviceError, DeviceLost
+from hapticbridge.passivity import WorstHand
+
+PUSHER = """<mujoco><compiler angle="radian"/>
+<option timestep="0.001" integrator="discrete" gravity="0 0 0" cone="elliptic"/>
+<default><geom solref="0.002 1" solimp="0.9 0.95 0.001"/></default>
+<worldbody>
+  <body name="tool"><joint name="rail" type="slide" axis="1 0 0"/>
+    <geom type="sphere" size="0.01" mass="0.05"/><site name="grip"/></body>
+  <body name="ram" pos="0.06 0 0"><joint name="ram" type="slide" axis="1 0 0" damping="20"/>
+    <geom type="box" size="0.01 0.03 0.03" mass="0.5"/></body>
+</worldbody>
+<actuator><motor name="ram" joint="ram" ctrlrange="-40 40"/></actuator></mujoco>
+"""
+"""A ram on a motor in front of the tool: with 40 N it drives the tool through wherever it is."""
+
+
+@dataclass(frozen=True)
+class Fault:
+    """A fault and its bars.
+
+    Attributes:
+        name: In a few words.
+        do: Does it to a rig.
+        ends: What must come of it: ``trip``, ``fades`` (the force is taken away and comes back),
+            ``re-seats`` (it begins again from zero), ``stops`` (the run ends with zero force) or
+            ``goes on``.
+        says: What the audit of its recording must name; empty where the run is an ordinary one.
+        without: What of the guard is switched off on the other side.
+        cause: The tick at which it can be seen.
+        within: Ticks from there to zero force.
+    """
+
+    name: str
+    do: Callable[[Rig], None]
+    ends: str
+    says: str = ""
+    without: dict[str, Any] | None = None
+    cause: int = CAUSE
+    within: int = 2
+
+    def run(self, folder: Path, *, is_guarded: bool = True) -> Outcome:
+        rig = Rig(folder)
+        self.do(rig)
+        if not is_guarded:
+            rig.guard |= self.without or {}
+        return rig.run(self.cause)
+
+
+def corrupting(change: Callable[[int, NDArray[np.void]], int | None]) -> Callable[[Rig], None]:
+    """Returns a fault that changes the samples from the cause on."""
+
+    def do(rig: Rig) -> None:
+        def corrupt(tick: int, sample: NDArray[np.void]) -> int:
+            return 0 if tick < CAUSE else change(tick - CAUSE, sample) or 0
+
+        rig.device.corrupt = corrupt
+
+    return do
+
+
+def _nan(_since: int, sample: NDArray[np.void]) -> None:
+    sample["position"][0, 0] = np.nan
+
+
+def _infinite(_since: int, sample: NDArray[np.void]) -> None:
+    sample["quaternion"][0, 1] = np.inf
+
+
+def _jump(_since: int, sample: NDArray[np.void]) -> None:
+    sample["position"][0, 0] += 0.06
+
+
+def _half_turn(_since: int, sample: NDArray[np.void]) -> None:
+    sample["quaternion"][0] = (0.0, 0.0, 1.0, 0.0)
+
+
+def _other_sign(_since: int, sample: NDArray[np.void]) -> None:
+    sample["quaternion"][0] *= -1.0
+
+
+def _frozen(rig: Rig) -> None:
+    """For 0.3 s nothing new comes, while the hand goes back by 20 mm."""
+    rig.points = (*PRESS[:3], (1.5, 0.0804), (1.7, 0.0604), (9.0, 0.0604))
+    corrupting(lambda since, _sample: STALE if since < 300 else 0)(rig)
+
+
+def _every(share: float) -> Callable[[Rig], None]:
+    chosen = np.random.default_rng(3).random(4000) < share
+    return corrupting(lambda since, _sample: STALE if chosen[since] else 0)
+
+
+def _stall(rig: Rig) -> None:
+    """The loop stands still for 0.2 s, in which the hand goes 20 mm deeper."""
+    rig.points = (*PRESS[:3], (1.5, 0.0804), (1.7, 0.1004), (1.9, 0.0804), (9.0, 0.0804))
+    rig.device.corrupt = _passing(rig, CAUSE, 0.2)
+
+
+def _passing(rig: Rig, at: int, seconds: float) -> Callable[[int, NDArray[np.void]], int]:
+    """The loop learns at a tick that time has passed, and the device moved on."""
+
+    def corrupt(tick: int, sample: NDArray[np.void]) -> int:
+        if tick == at:
+            rig.clock.block(seconds)
+            for _ in range(round(seconds / PERIOD)):
+                rig.device.move_on()
+            sample[0] = rig.device.true[0]
+        return 0
+
+    return corrupt
+
+
+def _read_blocks(rig: Rig) -> None:
+    rig.device.corrupt = _passing(rig, CAUSE, 1.0)
+
+
+def _write_blocks(rig: Rig) -> None:
+    def refuse(tick: int, _wrench: NDArray[np.float64]) -> None:
+        if tick == CAUSE - 1:
+            rig.clock.block(1.0)
+            for _ in range(1000):
+                rig.device.move_on()
+
+    rig.device.refuse = refuse
+
+
+def _backwards(rig: Rig) -> None:
+    def corrupt(tick: int, _sample: NDArray[np.void]) -> int:
+        if tick == CAUSE:
+            rig.clock.set_back(0.5)
+        return 0
+
+    rig.device.corrupt = corrupt
+
+
+def _read_fails(rig: Rig) -> None:
+    def corrupt(tick: int, _sample: NDArray[np.void]) -> int:
+        if tick == CAUSE:
+            raise DeviceError("the device reports a fault of its own (code 8)")
+        return 0
+
+    rig.device.corrupt = corrupt
+
+
+def _write_fails(rig: Rig) -> None:
+    def refuse(tick: int, wrench: NDArray[np.float64]) -> None:
+        if tick >= CAUSE:
+            rig.device.hold(np.zeros(6))  # unplugged: no current
+            raise DeviceLost("the device is gone")
+        del wrench
+
+    rig.device.refuse = refuse
+
+
+def _write_is_cut(rig: Rig) -> None:
+    def refuse(tick: int, wrench: NDArray[np.float64]) -> None:
+        if tick == CAUSE and wrench.any():
+            rig.device.hold(np.concatenate([wrench[:2], np.zeros(4)]))
+            raise DeviceLost("the device took 16 of 48 bytes")
+
+    rig.device.refuse = refuse
+
+
+def acting(act: Callable[[Bridge], None], at: int = CAUSE) -> Callable[[Rig], None]:
+    """Returns a fault that does something to the bridge before a tick."""
+
+    def do(rig: Rig) -> None:
+        rig.on_tick = lambda bridge, tick: act(bridge) if tick == at else None
+
+    return do
+
+
+def _bad_acceleration(bridge: Bridge) -> None:
+    bridge.scene.data.qvel[:] = 2e10
+
+
+def _diverge(bridge: Bridge) -> None:
+    bridge.scene.data.qvel[:] = np.nan
+
+
+def _raise(_bridge: Bridge) -> None:
+    raise ZeroDivisionError
+
+
+def _signal(number: int) -> Callable[[Bridge], None]:
+    return lambda _bridge: os.kill(os.getpid(), number)
+
+
+def _kill_recorder(bridge: Bridge) -> None:
+    recorder = bridge._stream.recorder
+    assert recorder is not None
+    os.kill(recorder._process.pid, signal.SIGKILL)
+    recorder._process.wait()
+
+
+def _motor(rig: Rig) -> None:
+    rig.scene = rig.folder / "pusher.xml"
+    rig.scene.write_text(PUSHER)
+    rig.points = ((0.0, 0.0), (9.0, 0.0))
+    rig.on_tick = lambda bridge, tick: (
+        bridge.set_input(ctrl={"ram": -40.0}) if tick == CAUSE - 1000 else None
+    )
+
+
+def stiff(factor: float, hand: Hand | WorstHand | None, controller: str = "damper") -> Any:
+    """Returns a fault: a wall too stiff for the device, which is knocked with 5 N for 5 ms.
+
+    Args:
+        factor: Stiffness over the largest that a device of 2 N s/m bears, 2b/T = 4000 N/m.
+        hand: Who holds it.
+        controller: Passivity controller.
+    """
+
+    def do(rig: Rig) -> None:
+        rig.scene = rig.folder / "heavy.xml"
+        rig.scene.write_text(HEAVY)
+        rig.points = ((0.0, 0.0), (9.0, 0.0))
+        rig.parameters = {"hand": hand}
+        rig.options = {"method": "implicit", "controller": controller}
+        rig.coupling = Coupling(factor * 4000.0, 0.0, 1.0, 5e-4)
+
+        def refuse(tick: int, wrench: NDArray[np.float64]) -> None:
+            if CAUSE <= tick < CAUSE + 5:
+                wrench[0] += 5.0
+
+        rig.device.refuse = refuse
+
+    return do
+
+
+HEAVY = """<mujoco><compiler angle="radian"/>
+<option timestep="0.001" integrator="discrete" gravity="0 0 0"/>
+<worldbody><body name="tool"><freejoint/>
+  <geom type="sphere" size="0.01" mass="1000"/><site name="grip"/></body></worldbody></mujoco>
+"""
+"""A tool of a ton: behind a coupling it is a wall."""
+
+
+def _quantised(rig: Rig) -> None:
+    rig.parameters = {"resolution": 5e-5}
+
+
+def _wall_clock(rig: Rig) -> None:
+    """Somebody sets the time of day; the loop must not look at it."""
+
+    def around(stack: ExitStack) -> None:
+        real = time.time
+        stack.callback(setattr, time, "time", real)
+        time.time = lambda: real() - 3600.0
+
+    rig.around = around
+
+
+def _fill_disk(bridge: Bridge) -> None:
+    """From here on the recorder's file may not grow, as on a disk that is full."""
+    recorder, path = bridge._stream.recorder, bridge._path
+    assert recorder is not None and path is not None
+    size = path.stat().st_size
+    resource.prlimit(recorder._process.pid, resource.RLIMIT_FSIZE, (size + 1000, size + 1000))
+
+
+NO_TRIPS = dict.fromkeys(("speed", "turn_speed", "stretch", "angle", "energy"), np.inf)
+
+UNGUARDED = {"controller": 0, **NO_TRIPS}
+
+FAULTS = (
+    Fault("pose that is no number", corrupting(_nan), "trip", "pose is not finite"),
+    Fault("infinite quaternion", corrupting(_infinite), "trip", "pose is not finite"),
+    Fault("60 mm jump", corrupting(_jump), "trip", "jumped", UNGUARDED),
+    Fault("half a turn in a tick", corrupting(_half_turn), "trip", "jumped", NO_TRIPS),
+    Fault("quaternion of the other sign", corrupting(_other_sign), "goes on"),
+    Fault("no news for 0.3 s", _frozen, "fades", "", {"stale_ticks": 0}, within=32),
+    Fault("half the sample rate", corrupting(lambda k, _s: STALE * (k % 2)), "goes on"),
+    Fault("20 % of samples lost", _every(0.2), "goes on"),
+    Fault("50 % of samples lost", _every(0.5), "goes on"),
+    Fault("stall of 0.2 s, 20 mm deeper", _stall, "re-seats", "", {"longest_stall": np.inf}),
+    Fault("time runs backwards", _backwards, "trip", "time ran backwards"),
+    Fault("read fails", _read_fails, "trip", "fault of its own"),
+    Fault("read blocks for 1 s", _read_blocks, "re-seats", "", {"longest_stall": np.inf}),
+    Fault("write fails", _write_fails, "trip", "is gone"),
+    Fault("write blocks for 1 s", _write_blocks, "re-seats", "", {"longest_stall": np.inf}),
+    Fault("write is cut short", _write_is_cut, "trip", "16 of 48 bytes"),
+    Fault("MuJoCo warns: bad velocity", acting(_bad_acceleration), "trip", "diverged"),
+    Fault("scene diverges", acting(_diverge), "trip", "diverged"),
+    Fault("motor drives the tool", _motor, "trip", "more energy", NO_TRIPS, cause=500, within=900),
+    Fault("10 x too stiff, free", stiff(10, None), "goes on", "", UNGUARDED),
+    Fault("10 x too stiff, in a hand", stiff(10, DEFAULT_HAND), "goes on"),
+    Fault("encoder steps of 50 µm", _quantised, "goes on"),
+    Fault("error in the user's code", acting(_raise), "stops", "ZeroDivisionError"),
+    Fault("recorder killed", acting(_kill_recorder), "stops", "recorder died", within=101),
+    Fault("disk full", acting(_fill_disk), "stops", "recorder died", within=999),
+    Fault("Ctrl-C", acting(_signal(signal.SIGINT)), "stops", "SIGINT"),
+    Fault("SIGTERM", acting(_signal(signal.SIGTERM)), "stops", "SIGTERM"),
+    Fault("SIGHUP", acting(_signal(signal.SIGHUP)), "stops", "SIGHUP"),
+    Fault("Ctrl-Z", acting(_signal(signal.SIGTSTP)), "stops", "SIGTSTP"),
+    Fault("time of day set back", _wall_clock, "goes on"),
+)
+"""In the order of the table."""

@@ -1,0 +1,252 @@
+"""A device in a hand that presses on a wall, a clock that can stall, and what is measured."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticbridge.audit import AuditReport, audit
+from hapticbridge.bridge import Bridge
+from hapticbridge.clock import SimulatedClock
+from hapticbridge.coupling import Coupling
+from hapticbridge.device import SimulatedDevice
+from hapticbridge.device.motion import Motion
+from hapticbridge.errors import HapticBridgeError
+from hapticbridge.guard import Limits
+from hapticbridge.recording import read_recording
+from hapticbridge.tick import SAMPLE_DTYPE, TickFlag
+
+PERIOD = 1e-3
+CAUSE = 1500
+"""The tick at which a fault happens: the hand has pressed with 9 N for some tenths of a second."""
+
+STALE = int(TickFlag.STALE_SAMPLE)
+
+PRESS = ((0.0, 0.0), (0.2, 0.0), (0.9, 0.0804), (9.0, 0.0804))
+"""Time in s and where the hand wants to be along x in m: the wall is at 10 mm, and 135 N/m over the
+rest of the way are 9 N."""
+
+
+def motion_of(points: tuple[tuple[float, float], ...]) -> Motion:
+    times, along = zip(*points, strict=True)
+    return Motion(times, [(x, 0.0, 0.0) for x in along])
+
+
+class FaultClock(SimulatedClock):
+    """Simulated time in which a tick may take long, and which may be set back."""
+
+    is_lossless = True
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._deadline = self._offset = 0
+
+    def block(self, seconds: float) -> None:
+        self._now += round(1e9 * seconds)
+
+    def set_back(self, seconds: float) -> None:
+        self._offset -= round(1e9 * seconds)
+
+    def wait(self) -> tuple[int, int, int]:
+        deadline = self._deadline + self._period
+        skipped = max((self._now - deadline) // self._period, 0)
+        self._deadline = deadline + skipped * self._period
+        self._now = max(self._now, self._deadline)
+        return self._deadline, self.now(), skipped
+
+    def now(self) -> int:
+        return self._now + self._offset
+
+
+class FaultyDevice:
+    """A simulated device whose samples and writes go through a fault; meters what it is given.
+
+    Attributes:
+        writes: Every wrench that arrived, by tick.
+        to_the_hand: Σ w·δp − b δp²/T so far in J, by tick, from true poses and accepted wrenches.
+    """
+
+    def __init__(self, inner: SimulatedDevice) -> None:
+        self.inner, self.info = inner, inner.info
+        self.corrupt: Callable[[int, NDArray[np.void]], int] = lambda _tick, _sample: 0
+        self.refuse: Callable[[int, NDArray[np.float64]], None] = lambda _tick, _wrench: None
+        self.tick = -1
+        self.writes: list[tuple[int, NDArray[np.float64]]] = []
+        self.to_the_hand: list[float] = [0.0]
+        self.true = np.zeros(1, SAMPLE_DTYPE)
+        self._held = np.zeros(6)
+        self.is_closed = False
+
+    def start(self, period: float) -> NDArray[np.void]:
+        self.true = self.inner.start(period)
+        return self.true.copy()
+
+    def move_on(self) -> None:
+        """Lets one period of the device's own time pass."""
+        before = self.true["position"][0].copy()
+        self.inner.read(self.true)
+        moved = self.true["position"][0] - before
+        burnt = (self.info.damping or 0.0) / PERIOD * float(moved @ moved)
+        self.to_the_hand.append(self.to_the_hand[-1] + float(self._held[:3] @ moved) - burnt)
+
+    def read(self, sample: NDArray[np.void]) -> int:
+        self.tick += 1
+        self.move_on()
+        last = sample[0].copy()
+        sample[0] = self.true[0]
+        code = self.corrupt(self.tick, sample)
+        if code == STALE:
+            sample[0] = last
+        return code
+
+    def write(self, wrench: NDArray[np.float64]) -> None:
+        self.writes.append((self.tick, wrench.copy()))
+        wrench = wrench.copy()
+        self.refuse(self.tick, wrench)
+        self.hold(wrench)
+
+    def hold(self, wrench: NDArray[np.float64]) -> None:
+        """Lets the motors hold a wrench."""
+        self._held = wrench.copy()
+        self.inner.write(wrench)
+
+    def close(self) -> None:
+        self.is_closed = True
+
+
+@dataclass
+class Rig:
+    """What a fault is done to, before it runs.
+
+    Attributes:
+        folder: Where the recording goes.
+        scene: Name or path.
+        points: The hand's path along x.
+        parameters: Of the simulated device.
+        coupling: None: the default.
+        options: Of the bridge.
+        duration: In s.
+        guard: Changes to what the guard does, for the other side of a test.
+        on_tick: Called before each tick with the bridge.
+    """
+
+    folder: Path
+    scene: str | Path = "virtual_wall"
+    points: tuple[tuple[float, float], ...] = PRESS
+    parameters: dict[str, Any] = field(default_factory=dict)
+    coupling: Coupling | None = None
+    options: dict[str, Any] = field(default_factory=dict)
+    duration: float = 2.5
+    guard: dict[str, Any] = field(default_factory=dict)
+    on_tick: Callable[[Bridge, int], None] | None = None
+    around: Callable[[ExitStack], None] | None = None
+    clock: FaultClock = field(default_factory=FaultClock)
+    _device: FaultyDevice | None = None
+
+    @property
+    def device(self) -> FaultyDevice:
+        if self._device is None:
+            path = None if self.parameters.get("hand", 1) is None else motion_of(self.points)
+            self._device = FaultyDevice(SimulatedDevice(path=path, **self.parameters))
+        return self._device
+
+    def run(self, cause: int) -> Outcome:
+        """Runs it and reports."""
+        path, error = self.folder / "run.mcap", ""
+        options = {"limits": Limits(force=10.0, torque=0.5, ramp=0.2)} | self.options
+        ticks_done = 0
+        try:
+            with ExitStack() as stack:
+                if self.around is not None:
+                    self.around(stack)
+                bridge = Bridge(
+                    self.scene,
+                    self.device,
+                    self.coupling,
+                    recording=path,
+                    clock=self.clock,
+                    **options,
+                )
+                bridge._guarding = replace(bridge._guarding, **self.guard)
+                with bridge:
+                    try:
+                        bridge.run(self.duration, self.on_tick and (lambda k: self._act(bridge, k)))
+                    finally:
+                        ticks_done = bridge._tick
+        except (HapticBridgeError, ZeroDivisionError) as raised:
+            error = f"{type(raised).__name__}: {raised}"
+        return Outcome.of(self, path, cause, error, ticks_done)
+
+    def _act(self, bridge: Bridge, tick: int) -> None:
+        if self.on_tick is not None:
+            self.on_tick(bridge, tick)
+
+
+@dataclass
+class Outcome:
+    """What came of a fault.
+
+    Attributes:
+        largest_force: Of all that was written, in N.
+        is_finite: Whether all of it was.
+        energy: Largest energy given to the hand beyond what it had put in, in J.
+        energy_after: The same, counted from the cause on.
+        zero_after: Ticks from the cause to the first zero wrench; None where none came.
+        last_is_zero: Whether the last write was zero.
+        error: What was raised, or nothing.
+        ticks: Ticks that were done, and ``rows`` records of them in the file.
+        report: The audit's; None where there is no file.
+        events: Names of the recording's events.
+        flags: Of each record.
+    """
+
+    largest_force: float
+    is_finite: bool
+    energy: float
+    energy_after: float
+    zero_after: int | None
+    last_is_zero: bool
+    error: str
+    ticks: int
+    rows: int
+    report: AuditReport
+    events: list[str]
+    flags: NDArray[np.int64]
+    forces: NDArray[np.float64]
+    torques: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, rig: Rig, path: Path, cause: int, error: str, ticks: int) -> Outcome:
+        device = rig.device
+        ticks_of = np.array([tick for tick, _ in device.writes])
+        wrenches = np.array([wrench for _, wrench in device.writes])
+        forces = np.linalg.norm(wrenches[:, :3], axis=1)
+        zero = ticks_of[(ticks_of >= cause - 1) & (wrenches == 0).all(axis=1)]
+        given = np.array(device.to_the_hand)
+        before = min(cause, len(given) - 1)
+        recording = read_recording(path)
+        return cls(
+            largest_force=float(np.max(forces)),
+            is_finite=bool(np.isfinite(wrenches).all()),
+            energy=float(given.max()),
+            energy_after=float((given[before:] - given[before]).max()),
+            zero_after=max(int(zero[0]) - cause, 0) if zero.size else None,
+            last_is_zero=not wrenches[-1].any(),
+            error=error,
+            ticks=ticks,
+            rows=len(recording.ticks),
+            report=audit(path),
+            events=[str(event["event"]) for event in recording.events],
+            flags=recording.ticks["flags"],
+            forces=forces,
+            torques=np.linalg.norm(wrenches[:, 3:], axis=1),
+        )
+
+    def has_flag(self, flag: TickFlag) -> bool:
+        return bool((self.flags & int(flag)).any())

@@ -1,0 +1,111 @@
+"""Every fault against the simulated device: what must hold, and that the guard is what holds it."""
+
+from __future__ import annotations
+
+import os
+import signal
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from audit_cases import ScriptedDevice
+from bridge_runs import fast, sway
+
+from faults.catalogue import FAULTS, Fault
+from faults.rig import CAUSE, Outcome
+from hapticbridge.audit import audit
+from hapticbridge.recording import read_recording
+from hapticbridge.tick import TickFlag
+
+LIMIT, MOST_ENERGY = 10.0, 0.05
+"""In N, of the rig, and in J, beyond what the hand put in."""
+
+pytestmark = pytest.mark.filterwarnings("ignore:.*Nan, Inf or huge value")
+
+
+def ids(fault: Fault) -> str:
+    return fault.name.replace(" ", "_")
+
+
+def at_cause(outcome: Outcome) -> float:
+    return float(outcome.forces[CAUSE])
+
+
+@pytest.mark.parametrize("fault", FAULTS, ids=ids)
+def test_a_fault_hurts_nobody_and_its_recording_is_whole(fault: Fault, tmp_path: Path) -> None:
+    outcome = fault.run(tmp_path)
+    assert outcome.is_finite
+    assert outcome.largest_force <= LIMIT * (1 + 1e-12)
+    assert outcome.energy <= MOST_ENERGY
+    assert outcome.last_is_zero
+    assert outcome.rows == outcome.ticks
+    assert outcome.report.verdict != "invalid", outcome.report.reason
+    assert outcome.report.resimulation == "bit for bit"
+    assert fault.says in outcome.report.reason
+    if fault.ends in ("trip", "stops", "fades"):
+        assert outcome.zero_after is not None
+        assert outcome.zero_after <= fault.within
+    if fault.ends == "trip":
+        assert outcome.error.startswith("SafetyTrip")
+        assert outcome.events[-2:] == ["trip", "stop"]
+    elif fault.ends in ("fades", "re-seats", "goes on"):
+        assert not outcome.error
+        assert outcome.has_flag(TickFlag.RESEATED) == (fault.ends != "goes on")
+    if fault.ends == "re-seats":
+        assert at_cause(outcome) < 0.1 * LIMIT
+
+
+@pytest.mark.parametrize("fault", [fault for fault in FAULTS if fault.without], ids=ids)
+def test_without_its_guard_the_fault_does_harm(fault: Fault, tmp_path: Path) -> None:
+    outcome = fault.run(tmp_path, is_guarded=False)
+    if fault.ends == "re-seats":
+        assert at_cause(outcome) > 0.5 * LIMIT
+    elif "turn" in fault.name:
+        torques = outcome.torques
+        assert torques[CAUSE : CAUSE + 5].max() > 0.3
+    else:
+        assert outcome.energy > MOST_ENERGY
+
+
+def test_a_signal_at_any_tick_ends_a_run_with_zero_force() -> None:
+    generator = np.random.default_rng(11)
+    device = ScriptedDevice(sway)
+    with fast("point_mass", device) as bridge:
+        for count in range(50):
+            number = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)[count % 3]
+            begun, wanted = bridge._tick, int(generator.integers(1, 40))
+            writes = len(device.writes)
+
+            def act(k: int, at: int = begun + wanted, number: int = number) -> None:
+                if k == at:
+                    os.kill(os.getpid(), number)
+
+            summary = bridge.run(0.05, act)
+            assert (summary.stopped_by, summary.ticks) == ("signal", begun + wanted + 1)
+            assert len(device.writes) == writes + wanted + 2
+            assert device.writes[-2].any()
+            assert not device.writes[-1].any()
+
+
+def test_a_signal_that_is_ignored_stays_ignored() -> None:
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)  # as nohup leaves it
+    try:
+        with fast("point_mass", ScriptedDevice(sway)) as bridge:
+            summary = bridge.run(
+                0.02, lambda k: os.kill(os.getpid(), signal.SIGHUP) if k == 5 else None
+            )
+    finally:
+        signal.signal(signal.SIGHUP, before)
+    assert summary.stopped_by == "duration"
+
+
+def test_a_killed_recorders_last_records_are_written_by_the_bridge(tmp_path: Path) -> None:
+    fault: Any = next(fault for fault in FAULTS if fault.name == "recorder killed")
+    outcome = fault.run(tmp_path)
+    recording = read_recording(tmp_path / "run.mcap")
+    assert not recording.is_cut
+    assert recording.ticks["tick"].tolist() == list(range(outcome.ticks))
+    assert "recorder_died" in outcome.events
+    assert not list(tmp_path.glob("*.salvaged"))
+    assert audit(tmp_path / "run.mcap").verdict == "passive"

@@ -1,0 +1,126 @@
+"""The energy account of both ports and the controller that keeps it balanced."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from audit_cases import recorded, tapped, verdict_of
+from faults.catalogue import NO_TRIPS, stiff
+from faults.rig import CAUSE, Outcome, Rig
+
+from hapticbridge.audit.guarded import _capped_sum
+from hapticbridge.device import SimulatedDevice
+from hapticbridge.guard import guarding_for, limits_for
+from hapticbridge.kernel.account import keep_account
+from hapticbridge.kernel.guarding import DAMPER, OFF
+from hapticbridge.kernel.layout import STATE_DTYPE
+from hapticbridge.passivity import WorstHand
+from hapticbridge.recording import read_recording
+from hapticbridge.tick import CLOCK_FIELDS, TICK_DTYPE, TickFlag
+
+T = 1e-3
+WORST = WorstHand(2.0, np.pi / T, T)
+ACTIVE = int(TickFlag.CONTROLLER_ACTIVE)
+
+
+def knocked(folder: Path, factor: float, hand: WorstHand | None, controller: str) -> Outcome:
+    rig = Rig(folder)
+    stiff(factor, hand, controller)(rig)
+    rig.guard |= NO_TRIPS
+    return rig.run(CAUSE)
+
+
+def largest(outcome: Outcome, after: int) -> float:
+    return float(outcome.forces[CAUSE + after : CAUSE + after + 40].max())
+
+
+@pytest.mark.parametrize("hand", [None, WORST], ids=["free", "worst hand"])
+def test_a_wall_of_one_and_a_half_times_the_limit_swings_without_and_decays_with(
+    tmp_path: Path, hand: WorstHand | None
+) -> None:
+    without = knocked(tmp_path, 1.5, hand, "off")
+    assert largest(without, 950) > 0.7 * largest(without, 50) > 1.0
+    with_it = knocked(tmp_path, 1.5, hand, "damper")
+    assert largest(with_it, 950) < 0.1
+    assert not (without.flags & ACTIVE).any()
+    # what it did is computed again by two other routes
+    assert with_it.report.verdict != "invalid", with_it.report.reason
+    assert with_it.report.resimulation == "bit for bit"
+    ticks = read_recording(tmp_path / "run.mcap").ticks
+    assert 0.5 < ticks["injected_damping"].max() <= 2.0  # min(b, m/T)
+
+
+@pytest.mark.parametrize("controller", ["damper", "tank"])
+def test_at_ten_times_the_limit_a_free_device_is_calmed(tmp_path: Path, controller: str) -> None:
+    outcome = knocked(tmp_path, 10.0, None, controller)
+    assert largest(outcome, 950) < 0.1
+    assert outcome.energy < 0.02
+    assert outcome.report.verdict != "invalid", outcome.report.reason
+
+
+@pytest.mark.parametrize("scene", ["peg_in_hole", "hammer"])
+def test_on_a_certified_device_the_controller_is_idle(tmp_path: Path, scene: str) -> None:
+    rows = []
+    for controller in ("damper", "off"):
+        path = tmp_path / f"{controller}.mcap"
+        summary = recorded(path, scene, duration=2.0, controller=controller)
+        assert summary.is_certified
+        rows.append(read_recording(path).ticks)
+    for name in set(TICK_DTYPE.names or ()) - set(CLOCK_FIELDS):
+        np.testing.assert_array_equal(rows[0][name], rows[1][name], err_msg=name)
+
+
+def test_a_device_with_too_little_damping_is_credited_with_half_of_it() -> None:
+    info = SimulatedDevice().info
+    limits = limits_for(info, None)
+    enough = guarding_for(info, limits, T, needed=(2.0, 2e-3))
+    assert (enough.credit, enough.rotational_credit) == (2.0, 2e-3)
+    short = guarding_for(info, limits, T, needed=(2.1, 1e-3))
+    assert (short.credit, short.rotational_credit) == (1.0, 2e-3)
+    assert (enough.controller, short.controller) == (OFF, DAMPER)
+    light = guarding_for(SimulatedDevice(mass=1e-3).info, limits, T)
+    assert light.most_damping == pytest.approx(1.0)  # m/T, below b
+
+
+def test_an_hour_of_dissipation_pays_for_no_more_than_the_surplus() -> None:
+    state = np.zeros(1, STATE_DTYPE)
+    state["period"], state["scale"], state["force_scale"], state["tick"] = T, 1.0, 1.0, 1
+    state["surplus"] = 0.05
+    nothing = (0.0, 0.0, 0.0)
+    state["wrench_on_device"][0, 0] = -2.0
+    for _ in range(1000):
+        keep_account(state, (1e-3, 0.0, 0.0), nothing, T)  # the hand pushes in 2 mJ each time
+    assert state["account"][0] == -0.05
+    assert state["given"][0] == pytest.approx(-2.0)
+    for _ in range(30):
+        keep_account(state, (-1e-3, 0.0, 0.0), nothing, T)
+    assert state["account"][0] == pytest.approx(0.01)
+
+
+def test_the_audits_capped_sum_is_the_recursion() -> None:
+    values = np.random.default_rng(4).normal(0.0, 0.02, (500, 2))
+    total, expected = np.zeros(2), []
+    for row in values:
+        total = np.maximum(total + row, -0.05)
+        expected.append(total)
+    np.testing.assert_allclose(_capped_sum(values, 0.05), expected, atol=1e-15)
+
+
+def test_a_changed_injected_damping_does_not_pass_the_audit(tmp_path: Path) -> None:
+    knocked(tmp_path, 1.5, None, "damper")
+    recording = read_recording(tmp_path / "run.mcap")
+    ticks = recording.ticks.copy()
+    at = int(np.argmax(ticks["injected_damping"]))
+    ticks["injected_damping"][at] *= 1.01
+    report = verdict_of(recording, tmp_path, ticks=ticks)
+    assert (report.verdict, report.port, report.tick) == ("invalid", "injected_damping", at)
+
+
+def test_a_recording_from_before_the_guard_is_judged_as_it_was(tmp_path: Path) -> None:
+    recording = read_recording(tapped(tmp_path))
+    meta = {name: value for name, value in recording.meta.items() if name != "guard"}
+    recording.meta.clear()
+    recording.meta.update(meta)
+    assert verdict_of(recording, tmp_path).verdict == "passive"

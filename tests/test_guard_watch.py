@@ -1,0 +1,229 @@
+"""Clutch, dead-man, slew, start: the handle follows the device only when it should."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from audit_cases import ScriptedDevice, verdict_of
+from bridge_runs import fast
+from cli_cases import Called
+from faults.rig import Outcome, Rig
+from numpy.typing import NDArray
+
+from hapticbridge.clock import RealClock, SimulatedClock
+from hapticbridge.device.last_word import LastWord
+from hapticbridge.errors import DeviceError, HapticBridgeError
+from hapticbridge.guard import UNLIMITED, Limits, guarding_for, wait_until_still
+from hapticbridge.guard import start as start_module
+from hapticbridge.kernel.guarding import UNGUARDED, Guarding
+from hapticbridge.recording import read_recording
+from hapticbridge.tick import SAMPLE_DTYPE, TickFlag
+
+LIMIT = 10.0
+CLUTCH, RESEATED = int(TickFlag.CLUTCH), int(TickFlag.RESEATED)
+DOWN, UP = 1200, 1500
+
+
+def pressed(button: int, is_down: Callable[[int], bool]) -> Callable[[int, Any], int]:
+    def press(tick: int, sample: NDArray[np.void]) -> int:
+        sample["buttons"] = (1 << button) if is_down(tick) else 0
+        return 0
+
+    return press
+
+
+def run(folder: Path, is_down: Callable[[int], bool], **options: Any) -> Outcome:
+    rig = Rig(folder, options=options)
+    rig.device.corrupt = pressed(3, is_down)
+    return rig.run(DOWN)
+
+
+def test_a_clutch_moves_the_device_without_the_handle_and_comes_back_without_a_step(
+    tmp_path: Path,
+) -> None:
+    outcome = run(tmp_path, lambda k: DOWN <= k < UP, clutch=3)
+    ticks = read_recording(tmp_path / "run.mcap").ticks
+    held = slice(DOWN, UP)
+    assert outcome.forces[DOWN - 1] > 5.0  # pressed on the wall
+    assert (ticks["handle_position"][held] == ticks["handle_position"][DOWN - 1]).all()
+    assert np.ptp(ticks["device_position"][held, 0]) > 0.01  # the hand pushes it on
+    assert not outcome.forces[DOWN + 25 : UP].any()
+    assert outcome.forces[UP] < 0.01 * LIMIT
+    assert np.abs(np.diff(outcome.forces[UP - 1 : UP + 400])).max() < 0.1 * LIMIT
+    assert np.flatnonzero(ticks["flags"] & CLUTCH).tolist() == list(range(DOWN, UP))
+    assert np.flatnonzero(ticks["flags"] & RESEATED).tolist() == [UP]
+    assert outcome.energy < 0.05
+    assert (outcome.report.verdict, outcome.report.resimulation) == ("passive", "bit for bit")
+
+
+def test_without_a_clutch_the_button_is_a_button(tmp_path: Path) -> None:
+    outcome = run(tmp_path, lambda k: DOWN <= k < UP)
+    assert not outcome.has_flag(TickFlag.CLUTCH)
+    assert outcome.forces[UP] > 5.0
+
+
+def test_a_dead_man_must_be_held_for_any_force(tmp_path: Path) -> None:
+    outcome = run(tmp_path, lambda k: 300 <= k < DOWN, dead_man=3)
+    assert not outcome.forces[:300].any()
+    assert outcome.forces[DOWN - 1] > 5.0
+    assert not outcome.forces[DOWN + 25 :].any()
+    assert outcome.report.resimulation == "bit for bit"
+    assert outcome.report.verdict == "passive"
+
+
+@pytest.mark.parametrize("flag", [CLUTCH, RESEATED])
+def test_a_changed_flag_does_not_pass_the_audit(tmp_path: Path, flag: int) -> None:
+    run(tmp_path, lambda k: DOWN <= k < UP, clutch=3)
+    recording = read_recording(tmp_path / "run.mcap")
+    ticks = recording.ticks.copy()
+    ticks["flags"][UP] ^= flag
+    report = verdict_of(recording, tmp_path, ticks=ticks)
+    assert report.verdict == "invalid"
+    assert "flag" in report.reason
+
+
+@pytest.mark.parametrize(("rise", "most"), [(2e-3, 5.0), (0.0, 10.0), (5e-3, 2.0)])
+def test_the_force_changes_no_faster_than_it_may(rise: float, most: float) -> None:
+    # a hand that goes 10 mm in 2 ms, which a device of 5 m/s can do: 24 N
+    device = ScriptedDevice(lambda k: (0.0 if k < 50 else 0.005 * min(k - 49, 2), 0, 0, 1, 0, 0, 0))
+    limits = Limits(force=10.0, torque=0.5, ramp=0.0, rise=rise)
+    with fast("virtual_wall", device, limits=limits) as bridge:
+        bridge.run(0.06)
+        flags = bridge.latest_records(60)["flags"]
+    steps = np.linalg.norm(np.diff(device.writes[:60], axis=0)[:, :3], axis=1)
+    assert steps.max() == pytest.approx(most)
+    assert bool((flags & int(TickFlag.SLEW_LIMITED)).any()) == (rise > 0)
+
+
+def test_a_device_that_moved_before_the_first_tick_finds_the_coupling_unstretched() -> None:
+    away = [0.0] + [0.05] * 20
+    device = ScriptedDevice(lambda k: (away[min(k, 20)], 0, 0, 1, 0, 0, 0))
+    device.start(1e-3)
+    device._tick = 5
+    start = device.start
+
+    def started(period: float) -> NDArray[np.void]:
+        sample = start(period)
+        device._tick = 1  # by the first tick it is 50 mm away
+        return sample
+
+    device.start = started  # type: ignore[method-assign]
+    with fast("point_mass", device) as bridge:
+        bridge.run(0.01)
+        rows = bridge.latest_records(10)
+    assert rows["flags"][0] & RESEATED
+    assert np.abs(rows["wrench_on_tool"][:, :3]).max() < 1e-9
+
+
+class Moving:
+    """A device with motors that moves for a while."""
+
+    def __init__(self, still_after: int) -> None:
+        self.info = replace(ScriptedDevice(lambda _k: (0,) * 7).info, is_real=True)
+        self.count, self._still_after = 0, still_after
+
+    def read(self, sample: NDArray[np.void]) -> int:
+        self.count += 1
+        sample["position"][0, 0] = 1e-3 * min(self.count, self._still_after)
+        return 0
+
+
+def test_force_waits_until_the_device_is_still(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(start_module, "STILL_TIME", 0.02)
+    device: Any = Moving(still_after=30)
+    wait_until_still(device, np.zeros(1, SAMPLE_DTYPE), 1e-3, RealClock())
+    assert device.count > 30
+    unread: Any = Moving(still_after=30)
+    wait_until_still(unread, np.zeros(1, SAMPLE_DTYPE), 1e-3, SimulatedClock())
+    assert unread.count == 0
+    monkeypatch.setattr(start_module, "PATIENCE", 0.05)
+    restless: Any = Moving(still_after=10**6)
+    with pytest.raises(DeviceError, match="hold it still"):
+        wait_until_still(restless, np.zeros(1, SAMPLE_DTYPE), 1e-3, RealClock())
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"controller": "magic"}, "there are 'damper', 'off', 'tank'"),
+        ({"clutch": -1}, "clutch button is -1"),
+        ({"dead_man": 99}, "dead-man button is 99"),
+        ({"clutch": 1, "dead_man": 1}, "exclude each other"),
+    ],
+)
+def test_what_the_guard_is_not_is_refused(options: dict[str, Any], message: str) -> None:
+    info = ScriptedDevice(lambda _k: (0,) * 7).info
+    with pytest.raises(DeviceError, match=message):
+        guarding_for(info, Limits(force=10.0, torque=0.5), 1e-3, **options)
+
+
+@pytest.mark.parametrize(
+    "change", [{"rise": -1.0}, {"stretch": 0.0}, {"angle": 4.0}, {"energy": float("nan")}]
+)
+def test_limits_that_cannot_be_are_refused(change: dict[str, float]) -> None:
+    with pytest.raises(DeviceError, match="it must be"):
+        Limits(force=1.0, torque=1.0, **change)
+
+
+def test_a_guard_reads_back_as_it_was_written() -> None:
+    info = ScriptedDevice(lambda _k: (0,) * 7).info
+    guarding = guarding_for(info, Limits(force=10.0, torque=0.5), 1e-3, clutch=2)
+    assert Guarding.from_json(guarding.to_json()) == guarding
+    assert Guarding.from_json(UNGUARDED.to_json()) == UNGUARDED
+    for text in ("", "{}", "[1]", guarding.to_json().replace("0.05", '"x"')):
+        with pytest.raises(HapticBridgeError, match="guard"):
+            Guarding.from_json(text)
+    assert not UNLIMITED.rise
+
+
+KILLED = """
+import sys, time
+from hapticbridge.clock import RealClock, SimulatedClock
+from hapticbridge.device.last_word import LastWord
+word = LastWord(sys.argv[1], b"\\0zero")
+print("ready", flush=True)
+time.sleep(60)
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs POSIX processes")
+def test_a_killed_process_still_says_zero_and_one_that_closed_does_not(tmp_path: Path) -> None:
+    node, quiet = tmp_path / "hidraw", tmp_path / "closed"
+    node.touch()
+    quiet.touch()
+    process = subprocess.Popen(
+        [sys.executable, "-c", KILLED, str(node)], stdout=subprocess.PIPE, text=True
+    )
+    assert process.stdout is not None
+    assert process.stdout.readline() == "ready\n"
+    assert node.read_bytes() == b""
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    limit = time.monotonic() + 20.0
+    while node.read_bytes() != 3 * b"\0zero":
+        assert time.monotonic() < limit, "nobody said zero"
+    process.stdout.close()
+    word = LastWord(str(quiet), b"\0zero")
+    word.close()
+    word.close()
+    assert quiet.read_bytes() == b""
+
+
+def test_the_command_line_knows_the_guard(call: Called) -> None:
+    short = ("run", "point_mass", "--fast", "--duration", "0.05")
+    code, _, error = call(*short, "--clutch", "99")
+    assert (code, error.count("\n")) == (2, 1)
+    assert "clutch button is 99" in error
+    code, _, error = call(*short, "--energy-limit", "nan")
+    assert (code, error.count("\n")) == (2, 1)
+    code, *_ = call(*short, "--controller", "tank", "--dead-man", "0", "--stretch-limit", "0.1")
+    assert code == 0
