@@ -14,6 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.audit.differences import quaternion_product, steps, turn_between, turns
+from hapticbridge.audit.interventions import Interventions
+from hapticbridge.audit.law import poses_before
 from hapticbridge.audit.watched import Seen, Watch, has_flag
 from hapticbridge.kernel.account import BOUND, SWINGS, TANK_START, THRESHOLD, WINDOW
 from hapticbridge.kernel.guarding import DAMPER, TANK
@@ -87,24 +89,26 @@ class Guarded:
         watch = Watch.at_start(parameters)
         return cls(parameters, watch, handle, tool, origin, target, start_energy)
 
-    def after(self, ticks: NDArray[np.void], resumed: Array) -> tuple[Expected, Guarded]:
+    def after(
+        self, ticks: NDArray[np.void], outside: Interventions
+    ) -> tuple[Expected, Guarded]:
         """Says what the next records, ``TICK_DTYPE``, at least one, should hold.
 
         Args:
             ticks: The records.
-            resumed: Ticks at which the run went on after a pause without force.
+            outside: What was done to the run while it went on.
         """
         then = copy.copy(self)
-        seen, then.watch = self.watch.after(ticks, resumed)
+        seen, then.watch = self.watch.after(ticks, outside)
         device = self.watch.device
-        position, orientation = then._follow(ticks)
+        position, orientation = then._follow(ticks, outside)
         parameters = self.parameters
         axes = np.array(parameters.axes).reshape(3, 3)
         on_tool = ticks["wrench_on_tool"]
         force = -parameters.force_scale * on_tool[:, :3] @ axes
         torque = -parameters.force_scale / parameters.scale * on_tool[:, 3:] @ axes
         asked = np.concatenate([force, torque], axis=1)
-        control = then._control(ticks, asked, seen, device, resumed)
+        control = then._control(ticks, asked, seen, device, outside.resumed)
         guarding = parameters.guarding
         starts = seen.first | has_flag(ticks, TickFlag.RESEATED)
         parts = (
@@ -129,7 +133,9 @@ class Guarded:
         wrench = full * seen.share[:, None]
         return Expected(position, orientation, wrench, control.injected, seen), then
 
-    def _follow(self, ticks: NDArray[np.void]) -> tuple[Array, Array]:
+    def _follow(
+        self, ticks: NDArray[np.void], outside: Interventions
+    ) -> tuple[Array, Array]:
         """Maps the recorded device poses into the scene: h = h_0 + scale · A (p − p_0).
 
         p_0 and h_0 are the device's pose and the tool's where the coupling was last re-seated;
@@ -137,8 +143,8 @@ class Guarded:
         """
         parameters, count = self.parameters, len(ticks)
         handle, tool, device = (_poses(ticks, name) for name in ("handle", "tool", "device"))
-        before = np.concatenate([self.handle[None], handle[:-1]])
-        tool_before = np.concatenate([self.tool[None], tool[:-1]])
+        before = poses_before(ticks, "handle", self.handle, outside)
+        tool_before = poses_before(ticks, "tool", self.tool, outside)
         is_seated = has_flag(ticks, TickFlag.RESEATED)
         at = np.maximum.accumulate(np.where(is_seated, np.arange(count), -1))
         origin = np.where(at[:, None] >= 0, device[at], self.origin)
