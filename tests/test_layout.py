@@ -18,7 +18,7 @@ ORDER = (
     ("guard", "recording", "certificate", "felt"),
     ("provenance", "summary", "workspace", "realtime"),
     ("commands",),
-    ("bridge", "audit", "identify", "compare", "export"),
+    ("arrangement", "opened", "commanded", "bridge", "audit", "identify", "compare", "export"),
     ("report", "film", "view", "study", "check", "doctor"),
     ("whatif",),  # runs the bridge and asks the audit, which must not know of either
     ("cli",),
