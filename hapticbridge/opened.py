@@ -110,7 +110,9 @@ class Opened(Arrangement):
             self._stream.start(self._description(), attachments(scene))
             self._event("start")
 
-    def _bind(self, coupling: Coupling, felt: Coupling | None) -> None:
+    def _bind(
+        self, coupling: Coupling, felt: Coupling | None, start_elastic: float = 0.0
+    ) -> None:
         """Lets a run begin in the state in which the scene is."""
         scene = self.scene
         self.parameters = parameters = run_parameters(
@@ -126,6 +128,7 @@ class Opened(Arrangement):
             workspace=self._workspace,
             contact_stiffness=self._contact_stiffness,
             guarding=self._guarding,
+            start_elastic=start_elastic,
         )
         start = start_state(scene.model, scene.data).tobytes()
         self._binding = binding = Binding(scene.model, scene.data, parameters)

@@ -22,6 +22,7 @@ from hapticbridge.provenance import (
     MODEL_ATTACHMENT,
     STARTS,
     STATE_ATTACHMENT,
+    elastic_energy,
     meta_start,
     processor,
     restore_state,
@@ -78,6 +79,8 @@ class Rerun:
         restore_state(model, data, start)
         method.step(model, data)
         restore_state(model, data, start)
+        if parameters.start_elastic:
+            _check_elastic(parameters.start_elastic, elastic_energy(data))
         self._binding = Binding(model, data, parameters)
         self._commands = Repeater(self._binding, model, data, method, parameters, start)
         _check_start(recording, self._binding.state)
@@ -247,6 +250,15 @@ def _check_start(recording: RecordingFile, state: NDArray[np.void]) -> None:
             raise RecordingError(
                 f"metadata '{name}' is {recorded}, the attached scene starts with {present}"
             )
+
+
+def _check_elastic(claimed: float, present: float) -> None:
+    """Refuses a start that is said to store more than the attached scene's constraints do."""
+    if not abs(claimed - present) <= FOREIGN_TOLERANCE * (1.0 + present):
+        raise RecordingError(
+            f"metadata 'start_elastic' is {claimed!r} J, the attached scene's constraints store "
+            f"{present!r} J at most"
+        )
 
 
 def is_same_processor(recording: RecordingFile) -> bool:

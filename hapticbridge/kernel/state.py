@@ -245,7 +245,8 @@ class Binding:
             balance_contacts(state)
         else:
             refresh_energies(state)
-        state["start_energy"] = state["kinetic"] + state["potential"]
+        state["start_energy"] = state["kinetic"] + state["potential"] + parameters.start_elastic
+        state["own_before"] = -parameters.start_elastic
         if parameters.scheme == LOSSLESS:
             start_twist(state)
 
