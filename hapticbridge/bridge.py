@@ -3,8 +3,8 @@
     device ──sample──▶ handle ──▶ scene stepped by MuJoCo ──▶ wrench, energies ──▶ device, recording
 
 ``Bridge._loop`` is the loop; the arithmetic before and after MuJoCo's step is in ``kernel.step``.
-What a bridge is made of is in ``arrangement``, what is open while it runs in ``opened``, and what can be
-asked of it meanwhile in ``commanded``.
+What a bridge is made of is in ``arrangement``, what is open while it runs in ``opened``, and what
+can be asked of it meanwhile in ``commanded``.
 """
 
 from __future__ import annotations

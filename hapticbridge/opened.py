@@ -110,9 +110,7 @@ class Opened(Arrangement):
             self._stream.start(self._description(), attachments(scene))
             self._event("start")
 
-    def _bind(
-        self, coupling: Coupling, felt: Coupling | None, start_elastic: float = 0.0
-    ) -> None:
+    def _bind(self, coupling: Coupling, felt: Coupling | None, start_elastic: float = 0.0) -> None:
         """Lets a run begin in the state in which the scene is."""
         scene = self.scene
         self.parameters = parameters = run_parameters(

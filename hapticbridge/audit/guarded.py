@@ -89,9 +89,7 @@ class Guarded:
         watch = Watch.at_start(parameters)
         return cls(parameters, watch, handle, tool, origin, target, start_energy)
 
-    def after(
-        self, ticks: NDArray[np.void], outside: Interventions
-    ) -> tuple[Expected, Guarded]:
+    def after(self, ticks: NDArray[np.void], outside: Interventions) -> tuple[Expected, Guarded]:
         """Says what the next records, ``TICK_DTYPE``, at least one, should hold.
 
         Args:
@@ -133,9 +131,7 @@ class Guarded:
         wrench = full * seen.share[:, None]
         return Expected(position, orientation, wrench, control.injected, seen), then
 
-    def _follow(
-        self, ticks: NDArray[np.void], outside: Interventions
-    ) -> tuple[Array, Array]:
+    def _follow(self, ticks: NDArray[np.void], outside: Interventions) -> tuple[Array, Array]:
         """Maps the recorded device poses into the scene: h = h_0 + scale · A (p − p_0).
 
         p_0 and h_0 are the device's pose and the tool's where the coupling was last re-seated;

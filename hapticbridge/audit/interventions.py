@@ -111,7 +111,7 @@ class Interventions:
         between two of them asks for more.
         """
         parameters = self.parameters
-        if len(self.couplings) < 2:  # noqa: PLR2004 - the run's own
+        if len(self.couplings) < 2:
             return parameters
         needs = [
             needed_on_axes(

@@ -82,9 +82,7 @@ class Motion:
         return self.handle_step - self.tool_step, self.handle_turn - self.tool_turn
 
 
-def wrench_by_law(
-    ticks: NDArray[np.void], gains: Array, period: float, motion: Motion
-) -> Array:
+def wrench_by_law(ticks: NDArray[np.void], gains: Array, period: float, motion: Motion) -> Array:
     """Returns the wrench on the tool that the coupling gives, (n, 6) in N and N m.
 
     Args:

@@ -80,9 +80,7 @@ def audit(path: str | Path, *, strict: bool = False) -> AuditReport:
         return _invalid(facts, Fault(str(error)))
     facts["duration"] = recording.count * parameters.period
     facts["unchecked"] = _unchecked(parameters, method)
-    fault = file_fault(recording) or structure_fault(
-        recording.blocks(), parameters, outside
-    )
+    fault = file_fault(recording) or structure_fault(recording.blocks(), parameters, outside)
     if fault:
         return _invalid(facts, fault)
     passed = _Passed(recording, parameters, is_watched=facts["certified"] is not True)

@@ -73,9 +73,7 @@ class CommandQueue:
                 self._last_pause + PAUSE_INTERVAL - now if is_pause else 0.0,
             )
             if early > 0:
-                raise CommandError(
-                    f"the last command is too recent; ask again in {early:.2f} s"
-                )
+                raise CommandError(f"the last command is too recent; ask again in {early:.2f} s")
             if len(self.waiting) >= MOST_WAITING:
                 raise CommandError("the loop takes no commands; it stands still")
             self._last = now
@@ -87,6 +85,8 @@ class CommandQueue:
         if isinstance(command, Couple):
             self.allowance.check(command.stiffness, command.damping)
         elif isinstance(command, Reset) and not self.allowance.method.has_coupling:
-            raise CommandError("a tool without mass is where the hand is; there is nothing to reset")
+            raise CommandError(
+                "a tool without mass is where the hand is; there is nothing to reset"
+            )
         elif isinstance(command, Record) and not self._can_record:
             raise CommandError("this run cannot start a recorder")

@@ -251,9 +251,7 @@ class Binding:
             start_twist(state)
 
 
-def _gains_of(
-    model: mujoco.MjModel, first: int, parameters: RunParameters
-) -> tuple[float, ...]:
+def _gains_of(model: mujoco.MjModel, first: int, parameters: RunParameters) -> tuple[float, ...]:
     """Returns the whole gains of the coupling's actuators: of those that push, then that turn."""
     if parameters.scheme == LOSSLESS:  # the model may have half of them
         coupling = parameters.coupling

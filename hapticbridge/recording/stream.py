@@ -121,6 +121,7 @@ class RecordStream:
             self.recorder.wait_until_ready()
         if self._onlooker is not None:
             self._onlooker.start(str(self._ring.name), metadata, attachments)
+        self.tell({"event": "recording", "path": None if self._path is None else str(self._path)})
 
     @property
     def is_recording(self) -> bool:
