@@ -1,4 +1,4 @@
-"""What a run is asked for while it goes on: inputs of its scene, commands, a recorder in mid-run."""
+"""What a run is asked for while it goes on: inputs of its scene, commands, a recorder."""
 
 from __future__ import annotations
 
@@ -33,6 +33,8 @@ class Commanded(Opened):
 
     def __enter__(self) -> Self:
         super().__enter__()
+        if self._onlooker is not None:
+            self._commands.warm_up()
         self._operator = Operator(self._commands, self._event)
         self._operator.begin(self._repeater, self._guarding.fade_ticks)
         return self
@@ -150,7 +152,7 @@ class Commanded(Opened):
         self._event("start")
 
     def _next_path(self) -> Path:
-        """Returns the first file that does not exist: NAME.mcap, NAME-2.mcap, NAME-3.mcap …"""
+        """Returns the first of NAME.mcap, NAME-2.mcap, NAME-3.mcap … that does not exist."""
         base = self._path or Path(f"{self.scene.name}.mcap")
         stem, _, number = base.stem.rpartition("-")
         if not (stem and number.isdecimal()):

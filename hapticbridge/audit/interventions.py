@@ -107,7 +107,7 @@ class Interventions:
     def worst(self, info: DeviceInfo, method: Method) -> RunParameters:
         """Returns the run's parameters with the coupling that asks most of the device.
 
-        In translation and in rotation each; the condition is linear in the coupling, so that none
+        In translation and in rotation each; what is asked is convex in the coupling, so that none
         between two of them asks for more.
         """
         parameters = self.parameters

@@ -5,11 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
 
 from hapticbridge.certificate import assumed_damping, needed_on_axes
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo
-from hapticbridge.errors import CommandError
+from hapticbridge.device.lateness import delay_ticks
+from hapticbridge.errors import CommandError, CouplingError
 from hapticbridge.guard import Limits
 from hapticbridge.rendering import Method
 
@@ -19,8 +24,13 @@ stretch limit gives one. Softer, a hand no longer feels where the tool is."""
 
 _HALVINGS = 60
 
+_POINTS, _HIGHEST = 40, 1e3
+"""Of the table of needs: points, and the largest ratio B'/(K T)."""
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True)
 class Allowance:
     """What of stiffness and damping the device allows, in translation.
 
@@ -62,14 +72,39 @@ class Allowance:
         """Returns the coupling of the law for one that is to be felt."""
         return self.method.used(felt, self.period / self.substeps)
 
+    @cached_property
+    def _table(self) -> tuple[Array, Array]:
+        """Ratios B'/K in s, and what a device needs for K = 1 N/m at each, in N s/m.
+
+        The need is convex and homogeneous in K and B', so that a line between two points of it lies
+        above: what is read off in between is never too little.
+        """
+        laws, known = self.method.laws(self.substeps), replace(self.info, damping=self.damping)
+        is_linear = laws == 1 and not delay_ticks(known, self.period)
+        inner = () if is_linear else np.geomspace(0.02, 50.0, _POINTS)
+        ratios = self.period * np.array([0.0, *inner, _HIGHEST])
+        needs = []
+        for ratio in ratios.tolist():
+            asked = replace(self.start, stiffness=1.0, damping=ratio)
+            scales = self.scale, self.force_scale
+            try:
+                need = needed_on_axes(known, asked, self.period, *scales, laws, self.method)[0]
+            except CouplingError:  # a delay that no damping makes up for
+                need = math.inf
+            needs.append(need)
+        return ratios, np.array(needs)
+
     def needed(self, stiffness: float, damping: float) -> float:
-        """Returns the damping b in N s/m that a device needs for what is asked."""
-        laws = self.method.laws(self.substeps)
-        known = replace(self.info, damping=self.damping)
+        """Returns the damping b in N s/m that a device needs for what is asked.
+
+        In some microseconds, once it was asked before: a refusal must not take the loop's time.
+        """
         used = self.used(self.felt(stiffness, damping))
-        return needed_on_axes(
-            known, used, self.period, self.scale, self.force_scale, laws, self.method
-        )[0]
+        ratios, needs = self._table
+        ratio = min(used.damping / used.stiffness, float(ratios[-1]))
+        more = used.damping - ratio * used.stiffness  # B' beyond the table adds to the need
+        per_damping = float(needs[-1] / ratios[-1])
+        return used.stiffness * float(np.interp(ratio, ratios, needs)) + per_damping * more
 
     def most_stiffness(self, damping: float) -> float:
         """Returns the largest K in N/m that goes with a B in N s/m; 0 where none does."""
@@ -81,8 +116,9 @@ class Allowance:
         most = 4.0 * self.damping / (self.scale * self.force_scale)
         return _largest(most, lambda damping: self.needed(stiffness, damping), self.damping)
 
+    @cached_property
     def least_stiffness(self) -> float:
-        """Returns the least K in N/m: softer, the run would be stopped before the force is full.
+        """The least K in N/m: softer, the run would be stopped before the force is full.
 
         K >= F/(s_f s_h stretch limit): the guard stops a run whose coupling is too long.
         """
@@ -111,18 +147,17 @@ class Allowance:
             raise CommandError(
                 f"method '{self.method.name}' has no coupling law that could be changed in mid-run"
             )
-        least = self.least_stiffness()
+        least = self.least_stiffness
         if stiffness < least * (1.0 - 1e-9):
             raise CommandError(
                 f"stiffness is {stiffness:g} N/m; below {least:.4g} N/m the coupling is longer "
                 "than the run allows before the force is full"
             )
-        if not self.needed(stiffness, damping) <= self.damping * (1.0 + 1e-9):
+        needed = self.needed(stiffness, damping)
+        if not needed <= self.damping * (1.0 + 1e-9):
             raise CommandError(
                 f"stiffness {stiffness:g} N/m with damping {damping:g} N s/m needs a device of "
-                f"{self.needed(stiffness, damping):.4g} N s/m, and this one has "
-                f"{self.damping:.4g}: at most {self.most_stiffness(damping):.4g} N/m with that "
-                f"damping, {self.most_damping(stiffness):.4g} N s/m with that stiffness"
+                f"{needed:.4g} N s/m, and this one has {self.damping:.4g}"
             )
 
 

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import json
-import math
 from dataclasses import asdict, dataclass, fields
 from typing import Any
 
-from hapticbridge.arguments import shown
+from hapticbridge.arguments import Arguments, shown
 from hapticbridge.errors import CommandError, choices
 
 LONGEST_LINE = 200
 """Bytes of a line; the longest command has some 90."""
+
+_ARGUMENTS = Arguments(CommandError)
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,13 +31,8 @@ class Couple:
     damping: float
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            value = getattr(self, field.name)
-            is_number = isinstance(value, int | float) and not isinstance(value, bool)
-            if not is_number or not math.isfinite(value) or value < 0:
-                raise CommandError(f"{field.name} is {shown(value)}; it must be finite and >= 0")
-        if self.stiffness == 0:
-            raise CommandError("stiffness is 0 N/m; it must be > 0")
+        _ARGUMENTS.number("stiffness", self.stiffness, "N/m", least=0.0, is_open=True)
+        _ARGUMENTS.number("damping", self.damping, "N s/m", least=0.0)
 
 
 @dataclass(frozen=True, slots=True)

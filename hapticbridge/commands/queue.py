@@ -12,8 +12,8 @@ from hapticbridge.commands.command import Command, Couple, Record, Reset
 from hapticbridge.errors import CommandError
 
 MOST_WAITING = 8
-"""Commands that may wait for the loop, which takes one a tick; a loop that leaves more undone stands
-still."""
+"""Commands that may wait for the loop, which takes one a tick; a loop that leaves more undone
+stands still."""
 
 INTERVAL = 0.05
 """In s, least time between two commands. A slider that is dragged needs no more than 20 a second to
@@ -52,6 +52,11 @@ class CommandQueue:
         self._can_record, self._now = can_record, now
         self._offering = threading.Lock()  # never the loop's
         self._last = self._last_pause = -float("inf")
+
+    def warm_up(self) -> None:
+        """Computes what takes long, so that no command is the first one."""
+        if self.allowance.method.has_law:
+            self.allowance.needed(self.allowance.least_stiffness, 0.0)
 
     def offer(self, command: Command, by: str) -> None:
         """Hands a command over, or refuses it.

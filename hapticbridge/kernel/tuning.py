@@ -14,9 +14,9 @@ work, and the environment's own balance (14) does not see the gains. W is booked
 ``tuning_work``, and neither as the environment's nor as the device's.
 
 Two things bound it. Gains move in a straight line over ``tuning_ticks`` ticks, so W_k per tick is
-at most ½ (K_goal − K)/n ‖p‖², and every coupling in between needs no more damping than the two
-ends, because the condition is linear in K and B. And the guard's energy limit counts all that the
-device was given beyond what the hand put in: W is in it, so it never exceeds that limit.
+at most ½ (K_goal − K)/n ‖p‖²; and every coupling in between needs no more damping than one of the
+ends, because the need is convex in K and B. And the guard's energy limit counts all that the device
+was given beyond what the hand put in: W is in it, so it never exceeds that limit.
 """
 
 from __future__ import annotations

@@ -134,7 +134,7 @@ class Controls:
     def _add_sliders(self, gui: viser.GuiApi) -> None:
         allowance = self._allowance
         stiffness, damping = self._coupling
-        least = allowance.least_stiffness()
+        least = allowance.least_stiffness
         most = allowance.most_stiffness(damping), allowance.most_damping(stiffness)
         self._stiffness = gui.add_slider(
             "stiffness K (N/m)",
