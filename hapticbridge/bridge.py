@@ -157,6 +157,7 @@ class Bridge:
         self._grants: tuple[Grant, ...] = ()
         with ExitStack() as refused:
             if isinstance(device, str):
+                refuse_simulated_time(device, self.clock)
                 device = device_for(self.scene, device)
                 refused.callback(device.close)  # else nobody could, if it is refused
             self.device = device

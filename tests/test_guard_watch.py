@@ -125,16 +125,24 @@ def test_a_device_that_moved_before_the_first_tick_finds_the_coupling_unstretche
 
 
 class Moving:
-    """A device with motors that moves for a while."""
+    """A device with motors that moves for a while, and says where only after it was written to."""
 
     def __init__(self, still_after: int) -> None:
         self.info = replace(ScriptedDevice(lambda _k: (0,) * 7).info, is_real=True)
         self.count, self._still_after = 0, still_after
+        self._is_asked = True
+        self.forces: list[NDArray[np.float64]] = []
 
     def read(self, sample: NDArray[np.void]) -> int:
+        assert self._is_asked, "nobody asked since the last answer"
+        self._is_asked = False
         self.count += 1
-        sample["position"][0, 0] = 1e-3 * min(self.count, self._still_after)
+        sample["position"][0, 0] = 2e-3 * min(self.count, self._still_after)
         return 0
+
+    def write(self, wrench: NDArray[np.float64]) -> None:
+        self._is_asked = True
+        self.forces.append(wrench.copy())
 
 
 def test_force_waits_until_the_device_is_still(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -142,6 +150,7 @@ def test_force_waits_until_the_device_is_still(monkeypatch: pytest.MonkeyPatch) 
     device: Any = Moving(still_after=30)
     wait_until_still(device, np.zeros(1, SAMPLE_DTYPE), 1e-3, RealClock())
     assert device.count > 30
+    assert not np.any(device.forces)
     unread: Any = Moving(still_after=30)
     wait_until_still(unread, np.zeros(1, SAMPLE_DTYPE), 1e-3, SimulatedClock())
     assert unread.count == 0

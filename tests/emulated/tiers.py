@@ -87,7 +87,7 @@ def _pytest(report: str, files: str = "check_*.py", only: str = "test") -> list[
     """Returns the command that runs checks, apart from the project's own tests."""
     paths = sorted(str(path) for path in CHECKS.glob(files))
     plain = ["--rootdir", str(CHECKS), "-c", os.devnull, "-p", "no:cacheprovider"]
-    form = ["--tb=short", "-q", f"--junitxml={report}", "-o", "junit_family=xunit1"]
+    form = ["--tb=short", "-v", f"--junitxml={report}", "-o", "junit_family=xunit1"]
     return [sys.executable, "-m", "pytest", *plain, *form, "-k", only, *paths]
 
 
