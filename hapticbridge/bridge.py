@@ -257,6 +257,8 @@ class Bridge:
                 self._note_grants(stack.enter_context(real_time()))
             try:
                 wait_until_still(self.device, self._sample, self.period, self.clock)
+                if not self._tick and self._workspace.is_absolute:  # a hand moves while it waits
+                    refuse_stretched_start(self._binding.state, self._sample, self._limits)
                 self.clock.start(round(self.period * 1e9))
                 reason = self._loop(last, on_tick)
             except DeviceError as error:
@@ -474,7 +476,7 @@ class Bridge:
             guarding=self._guarding,
         )
         self._binding = binding = Binding(scene.model, scene.data, self.parameters)
-        refuse_stretched_start(binding.state, self._limits)
+        refuse_stretched_start(binding.state, self._sample, self._limits)
         if self._stream.is_read:
             meta = describe_run(
                 scene, self.parameters, binding, method=method.name, device=info, clock=clock.name

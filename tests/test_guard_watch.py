@@ -19,9 +19,10 @@ from cli_cases import Called
 from faults.rig import Outcome, Rig
 from numpy.typing import NDArray
 
+from hapticbridge.bridge import Bridge
 from hapticbridge.clock import RealClock, SimulatedClock
 from hapticbridge.device.last_word import LastWord
-from hapticbridge.errors import DeviceError, HapticBridgeError
+from hapticbridge.errors import DeviceError, HapticBridgeError, SafetyTrip
 from hapticbridge.guard import UNLIMITED, Limits, guarding_for, wait_until_still
 from hapticbridge.guard import start as start_module
 from hapticbridge.kernel.guarding import UNGUARDED, Guarding
@@ -160,6 +161,23 @@ def test_force_waits_until_the_device_is_still(monkeypatch: pytest.MonkeyPatch) 
         wait_until_still(restless, np.zeros(1, SAMPLE_DTYPE), 1e-3, RealClock())
 
 
+@pytest.mark.parametrize(("strays_to", "is_refused"), [(0.004, False), (0.05, True)])
+def test_an_absolute_device_that_strayed_while_rest_was_waited_for_is_refused(
+    monkeypatch: pytest.MonkeyPatch, strays_to: float, is_refused: bool
+) -> None:
+    """At 2400 N/m the device's 10 N are reached 4.17 mm from the grip."""
+    monkeypatch.setattr(start_module, "STILL_TIME", 0.005)
+    device = ScriptedDevice(lambda tick: (strays_to if tick else 0.0, 0, 0, 1, 0, 0, 0))
+    device.info = replace(device.info, is_real=True)
+    with Bridge("point_mass", device, absolute=True, realtime=False) as bridge:
+        if not is_refused:
+            bridge.run(0.01)
+            return
+        with pytest.raises(SafetyTrip, match="absolute pose puts the handle 50 mm from the grip"):
+            bridge.run(0.01)
+    assert not np.any(device.writes)
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -196,6 +214,7 @@ def test_a_guard_reads_back_as_it_was_written() -> None:
 
 KILLED = """
 import sys, time
+from hapticbridge.bridge import Bridge
 from hapticbridge.clock import RealClock, SimulatedClock
 from hapticbridge.device.last_word import LastWord
 word = LastWord(sys.argv[1], b"\\0zero")

@@ -10,6 +10,8 @@ from hapticbridge.device import Device, DeviceInfo
 from hapticbridge.device.families import family_named
 from hapticbridge.errors import DeviceError
 from hapticbridge.guard.limits import Limits
+from hapticbridge.kernel.handle import handle_pose
+from hapticbridge.pose import canonical
 from hapticbridge.tick import SAMPLE_DTYPE
 
 STILL_TIME, PATIENCE = 0.1, 5.0
@@ -89,18 +91,24 @@ def refuse_simulated_time(device: DeviceInfo | str, clock: Clock) -> None:
         )
 
 
-def refuse_stretched_start(state: NDArray[np.void], limits: Limits) -> None:
+def refuse_stretched_start(
+    state: NDArray[np.void], sample: NDArray[np.void], limits: Limits
+) -> None:
     """Refuses a start at which the coupling would already pull with more than the force limit.
 
     Args:
         state: The kernel's state (``STATE_DTYPE``, one element) before the first tick.
+        sample: Where the device is, shape (1,), ``SAMPLE_DTYPE``.
         limits: Of the run.
 
     Raises:
         DeviceError: Says how far the handle is from the grip, and where the grip is.
     """
     s = state[0]
-    distance = float(np.linalg.norm(s["handle_position"] - s["tool_position"]))
+    x, y, z = sample["position"][0].tolist()
+    quaternion = canonical(tuple(sample["quaternion"][0].tolist()))
+    handle, _ = handle_pose(state, (x, y, z), quaternion)
+    distance = float(np.linalg.norm(np.subtract(handle, s["tool_position"])))
     force = float(s["stiffness"]) * distance
     if force > limits.force:
         raise DeviceError(
