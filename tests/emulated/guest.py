@@ -21,8 +21,8 @@ import platformdirs
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 _MEMORY_MIB = 2048
-"""Taken from this machine as the guest uses it. A run locks its memory, 0.7 GB with every library
-that it has mapped; in a guest of 1 GiB what is left beside that is too little to compile in."""
+"""Taken from this machine as the guest uses it. 1 GiB holds what the checks need, but not the
+compiler beside it, where the host has not compiled ahead."""
 
 PATIENCE = 150.0
 """In s of this machine's time: a guest that prints nothing for so long is stopped, where it is to
