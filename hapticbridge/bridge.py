@@ -17,7 +17,7 @@ import numpy as np
 
 from hapticbridge.commanded import Commanded
 from hapticbridge.errors import DeviceError, HapticBridgeError, SafetyTrip
-from hapticbridge.guard import trip_reason, wait_until_still
+from hapticbridge.guard import trip_reason
 from hapticbridge.kernel.ahead import can_split
 from hapticbridge.kernel.codes import BAD_RESULT, HALF_DONE, OK, RING_FULL
 from hapticbridge.realtime import Grant, real_time, warn_of_refusals
@@ -62,7 +62,7 @@ class Bridge(Commanded):
             if self._is_realtime:
                 self._note_grants(stack.enter_context(real_time()))
             try:
-                wait_until_still(self.device, self._sample, self.period, self.clock)
+                self._come_to_rest()
                 while True:
                     self.clock.start(round(self.period * 1e9))
                     reason = self._loop(last, on_tick)

@@ -16,7 +16,7 @@ from hapticbridge.clock import RealClock
 from hapticbridge.commands import Repeater
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import DeviceError, HapticBridgeError, SceneError
-from hapticbridge.guard import refuse_stretched_start
+from hapticbridge.guard import refuse_stretched_start, wait_until_still
 from hapticbridge.inputs import Write, input_writes
 from hapticbridge.jit import direct
 from hapticbridge.kernel.after import answer_step
@@ -105,7 +105,7 @@ class Opened(Arrangement):
         # last, because from here on the device is held, and its pose counts
         self._sample[:] = self.device.start(self.period)
         self._bind(self.coupling, felt)
-        refuse_stretched_start(self._binding.state, self._limits)
+        refuse_stretched_start(self._binding.state, self._sample, self._limits)
         if self._stream.is_read:
             self._stream.start(self._description(), attachments(scene))
             self._event("start")
@@ -142,6 +142,16 @@ class Opened(Arrangement):
             device=self.device.info,
             clock=self.clock.name,
         )
+
+    def _come_to_rest(self) -> None:
+        """Waits until a real device is still, before force is enabled.
+
+        Raises:
+            DeviceError: It moves on, or a hand has meanwhile moved an absolute one too far.
+        """
+        wait_until_still(self.device, self._sample, self.period, self.clock)
+        if not self._tick and self._workspace.is_absolute:
+            refuse_stretched_start(self._binding.state, self._sample, self._limits)
 
     def _compile(self) -> None:
         """Gets the machine code of the tick ready, so that the first one is not late."""

@@ -24,6 +24,9 @@ from hapticbridge.view.address import Address
 BY = "view"
 """Who gave a command of the page, as the recording says."""
 
+GOODBYE = 2.0
+"""In s: how long the process may take to end when it is told to; the run is over by then."""
+
 _BOOTSTRAP = """
 import sys
 sys.path.insert(0, sys.argv[1])
@@ -116,7 +119,11 @@ class Window:
         self._outbox.put(None)
         if self._process is not None:
             self._process.terminate()
-            self._process.wait()
+            try:
+                self._process.wait(GOODBYE)
+            except subprocess.TimeoutExpired:  # it stands still, or a debugger holds it
+                self._process.kill()
+                self._process.wait()
             for stream in (self._process.stdin, self._process.stdout):
                 with contextlib.suppress(OSError):
                     cast(IO[bytes], stream).close()
