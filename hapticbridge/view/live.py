@@ -165,9 +165,11 @@ def _calm() -> None:
 def _follow(
     show: Show, page: Page, controls: Controls, inbox: queue.SimpleQueue[dict[str, Any] | None]
 ) -> None:
-    plotted = 0.0
+    plotted, due = 0.0, time.monotonic()
     while True:
         began = time.monotonic()
+        # from the last due time on, so that a late picture does not make all later ones late
+        due = max(due + FRAME, began)
         # events first: one that changes a tick must be known before that tick is simulated
         while not inbox.empty():
             event = inbox.get()
@@ -190,7 +192,7 @@ def _follow(
         if curves is not None and began - plotted >= REPLOT:
             plotted = began
             page.plot(*curves)
-        time.sleep(max(0.0, FRAME - (time.monotonic() - began)))
+        time.sleep(max(0.0, due - time.monotonic()))
 
 
 def run() -> None:
