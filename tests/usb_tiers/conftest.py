@@ -72,3 +72,4 @@ def _patience(monkeypatch: pytest.MonkeyPatch) -> None:
     if not IS_TIME_VIRTUAL:
         monkeypatch.setattr("hapticbridge.device.falcon.driver.SILENCE", 5.0)
         monkeypatch.setattr("hapticbridge.device.rawhid.driver.LONGEST_SILENCE", 5.0)
+        monkeypatch.setattr("hapticbridge.device.transport.hid.LONGEST_WRITE", 5.0)
