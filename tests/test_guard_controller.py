@@ -10,7 +10,7 @@ from audit_cases import recorded, tapped, verdict_of
 from faults.catalogue import NO_TRIPS, stiff
 from faults.rig import CAUSE, Outcome, Rig
 
-from hapticbridge.audit.guarded import _capped_sum
+from hapticbridge.audit.controlled import capped_sum
 from hapticbridge.device import SimulatedDevice
 from hapticbridge.guard import guarding_for, limits_for
 from hapticbridge.kernel.account import keep_account
@@ -105,7 +105,7 @@ def test_the_audits_capped_sum_is_the_recursion() -> None:
     for row in values:
         total = np.maximum(total + row, -0.05)
         expected.append(total)
-    np.testing.assert_allclose(_capped_sum(values, 0.05), expected, atol=1e-15)
+    np.testing.assert_allclose(capped_sum(values, 0.05), expected, atol=1e-15)
 
 
 def test_a_changed_injected_damping_does_not_pass_the_audit(tmp_path: Path) -> None:
