@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import signal
 import subprocess
 import sys
@@ -16,6 +17,7 @@ import pytest
 from audit_cases import ScriptedDevice, verdict_of
 from bridge_runs import fast
 from cli_cases import Called
+from faults.catalogue import FAULTS
 from faults.rig import Outcome, Rig
 from numpy.typing import NDArray
 
@@ -78,6 +80,30 @@ def test_a_dead_man_must_be_held_for_any_force(tmp_path: Path) -> None:
     assert not outcome.forces[DOWN + 25 :].any()
     assert outcome.report.resimulation == "bit for bit"
     assert outcome.report.verdict == "passive"
+
+
+def test_beyond_its_reach_a_device_moves_without_handle_and_force(tmp_path: Path) -> None:
+    fault = next(fault for fault in FAULTS if fault.name == "edge of the workspace")
+    rows = {}
+    for reach in (0.0125, 1.0):
+        rig = Rig(tmp_path)
+        fault.do(rig)
+        rig.options["limits"] = replace(rig.options["limits"], reach=reach)
+        rig.run(fault.cause)
+        rows[reach] = read_recording(tmp_path / "run.mcap").ticks
+    ticks, free = rows[0.0125], rows[1.0]
+    is_out = np.linalg.norm(ticks["device_position"], axis=1) > 0.0125
+    assert is_out.any()
+    assert ((ticks["flags"] & CLUTCH) != 0).tolist() == is_out.tolist()
+    begun = int(np.argmax(is_out))
+    out = begun + np.arange(np.argmin(is_out[begun:]))  # the first time that it is there
+    assert not ticks["wrench_on_device"][out[0] + 25 : out[-1]].any()
+    assert np.ptp(ticks["handle_position"][out], axis=0).max() == 0.0
+    assert ticks["flags"][out[-1] + 1] & RESEATED
+    assert np.linalg.norm(ticks["wrench_on_device"][out[-1] + 1, :3]) < 0.01 * LIMIT
+    # without an edge the same hand presses on
+    assert not (free["flags"] & CLUTCH).any()
+    assert np.linalg.norm(free["wrench_on_device"][out, :3], axis=1).max() > 5.0
 
 
 @pytest.mark.parametrize("flag", [CLUTCH, RESEATED])
@@ -167,7 +193,8 @@ def test_what_the_guard_is_not_is_refused(options: dict[str, Any], message: str)
 
 
 @pytest.mark.parametrize(
-    "change", [{"rise": -1.0}, {"stretch": 0.0}, {"angle": 4.0}, {"energy": float("nan")}]
+    "change",
+    [{"rise": -1.0}, {"stretch": 0.0}, {"angle": 4.0}, {"energy": float("nan")}, {"reach": 0.0}],
 )
 def test_limits_that_cannot_be_are_refused(change: dict[str, float]) -> None:
     with pytest.raises(DeviceError, match="it must be"):
@@ -179,6 +206,8 @@ def test_a_guard_reads_back_as_it_was_written() -> None:
     guarding = guarding_for(info, Limits(force=10.0, torque=0.5), 1e-3, clutch=2)
     assert Guarding.from_json(guarding.to_json()) == guarding
     assert Guarding.from_json(UNGUARDED.to_json()) == UNGUARDED
+    older = {k: v for k, v in json.loads(guarding.to_json()).items() if k != "reach"}
+    assert Guarding.from_json(json.dumps(older)) == guarding
     for text in ("", "{}", "[1]", guarding.to_json().replace("0.05", '"x"')):
         with pytest.raises(HapticBridgeError, match="guard"):
             Guarding.from_json(text)
@@ -189,7 +218,7 @@ KILLED = """
 import sys, time
 from hapticbridge.clock import RealClock, SimulatedClock
 from hapticbridge.device.last_word import LastWord
-word = LastWord(sys.argv[1], b"\\0zero")
+word = LastWord(sys.argv[1], b"\\0zero", b"\\1off")
 print("ready", flush=True)
 time.sleep(60)
 """
@@ -209,7 +238,7 @@ def test_a_killed_process_still_says_zero_and_one_that_closed_does_not(tmp_path:
     process.send_signal(signal.SIGKILL)
     process.wait()
     limit = time.monotonic() + 20.0
-    while node.read_bytes() != 3 * b"\0zero":
+    while node.read_bytes() != 3 * b"\0zero\1off":
         assert time.monotonic() < limit, "nobody said zero"
     process.stdout.close()
     word = LastWord(str(quiet), b"\0zero")

@@ -117,6 +117,9 @@ class Run:
     """Button of the device, from 0, that must be held for any force."""
     stretch_limit: float = USUAL_STRETCH
     """Largest distance between handle and tool in m; beyond it the run is stopped."""
+    reach_limit: float = math.inf
+    """Farthest in m that the device may be from the middle of its workspace; beyond it moves
+    without the handle and without force. Choose it short of the device's own stops."""
     energy_limit: float = USUAL_ENERGY
     """Most energy in J that the device may be given beyond what the hand put in; inf for scenes
     whose motors are meant to push the hand."""
@@ -162,6 +165,7 @@ class Run:
                 ramp=self.ramp,
                 stretch=self.stretch_limit,
                 energy=self.energy_limit,
+                reach=self.reach_limit,
             ),
             controller=self.controller,
             clutch=self.clutch,

@@ -111,6 +111,7 @@ def guarding_for(
         dead_man=buttons[1],
         stretch=limits.stretch * scale,
         angle=limits.angle,
+        reach=limits.reach,
     )
     if info.is_prescribed:
         return common

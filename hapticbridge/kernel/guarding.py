@@ -15,6 +15,9 @@ OFF, DAMPER, TANK = 0, 1, 2
 MOST_BUTTONS = 32
 """Buttons that a mask may name; no handle has more."""
 
+LATER = frozenset({"reach"})
+"""What came after the first recordings with a guard, which do without."""
+
 _POSITIVE = ("force_rise", "torque_rise", "longest_stall")
 _TRIPS = ("speed", "turn_speed", "stretch", "angle", "energy")
 _NOT_NEGATIVE = (
@@ -50,6 +53,8 @@ class Guarding:
         stretch: Length of the coupling in m above which it is stopped.
         angle: Angle between handle and tool in rad, likewise.
         energy: Energy in J given to the device beyond what the hand put in, likewise.
+        reach: Distance in m of the device from the origin of its frame beyond which it moves
+            without the handle and without force.
 
     Raises:
         HapticBridgeError: A value is out of range.
@@ -74,6 +79,7 @@ class Guarding:
     stretch: float = math.inf
     angle: float = math.inf
     energy: float = math.inf
+    reach: float = math.inf
 
     def __post_init__(self) -> None:
         if self.controller not in (OFF, DAMPER, TANK):
@@ -82,7 +88,7 @@ class Guarding:
             value = getattr(self, name)
             if not _is_number(value) or not 0 <= value < math.inf:
                 raise HapticBridgeError(f"guard: {name} is {value!r}; it must be finite and >= 0")
-        for name in (*_POSITIVE, *_TRIPS):
+        for name in (*_POSITIVE, *_TRIPS, "reach"):
             value = getattr(self, name)
             if not _is_number(value) or not value > 0:
                 raise HapticBridgeError(f"guard: {name} is {value!r}; it must be > 0")
@@ -107,7 +113,8 @@ class Guarding:
             values = dict(json.loads(text))
         except (ValueError, TypeError, RecursionError):
             values = {}
-        if values.keys() != {field.name for field in fields(cls)}:
+        names = {field.name for field in fields(cls)}
+        if not names - LATER <= values.keys() <= names:
             raise HapticBridgeError(f"metadata 'guard' is {text!r:.80}; it does not name a guard")
         numbers: dict[str, Any] = {k: math.inf if v is None else v for k, v in values.items()}
         return cls(**numbers)
