@@ -180,7 +180,7 @@ def test_force_waits_until_the_device_is_still(monkeypatch: pytest.MonkeyPatch) 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"controller": "magic"}, "there are 'damper', 'off', 'tank'"),
+        ({"controller": "magic"}, "there are 'damper', 'environment', 'off', 'tank'"),
         ({"clutch": -1}, "clutch button is -1"),
         ({"dead_man": 99}, "dead-man button is 99"),
         ({"clutch": 1, "dead_man": 1}, "exclude each other"),

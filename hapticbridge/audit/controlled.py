@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from hapticbridge.audit.differences import steps, turns
 from hapticbridge.audit.watched import Seen
 from hapticbridge.kernel.account import BOUND, SWINGS, TANK_START, THRESHOLD, WINDOW
-from hapticbridge.kernel.guarding import DAMPER, TANK
+from hapticbridge.kernel.guarding import DAMPER, ENVIRONMENT, TANK
 from hapticbridge.kernel.state import RunParameters
 
 Array = NDArray[np.float64]
@@ -47,6 +47,7 @@ class Account:
         account: In J.
         axes: Accounts (6,) of the axes, in J.
         velocity: Of the device in the tick before, (6,).
+        excess: What the environment had created beyond the slack then, in J.
         reversed: Where the motion of each axis was reversed in the last ticks, (n, 6).
     """
 
@@ -57,6 +58,7 @@ class Account:
     account: float = 0.0
     axes: Array = field(default_factory=lambda: np.zeros(6))
     velocity: Array = field(default_factory=lambda: np.zeros(6))
+    excess: float = 0.0
     reversed: NDArray[np.bool_] = field(default_factory=lambda: np.zeros((WINDOW, 6), bool))
 
     def after(
@@ -66,6 +68,7 @@ class Account:
         seen: Seen,
         device: Array,
         resumed: Array,
+        excess: Array,
     ) -> tuple[Controlled, Account]:
         """Says what the controller makes of the wrenches of the next records, at least one.
 
@@ -75,11 +78,14 @@ class Account:
             seen: What the watch saw.
             device: Device pose (7,) in the tick before.
             resumed: Ticks at which the run went on after a pause without force.
+            excess: What the environment has created beyond the slack, (n,) in J.
         """
         then = copy.copy(self)
         parameters, guarding = self.parameters, self.parameters.guarding
         nothing, free = np.zeros(len(ticks)), np.full((len(ticks), 6), np.inf)
-        if guarding.controller not in (DAMPER, TANK):
+        acts = guarding.controller in (DAMPER, TANK)
+        acts |= guarding.controller == ENVIRONMENT and parameters.has_law
+        if not acts:
             return Controlled(wrench, free, nothing), then
         position, quaternion = ticks["device_position"], ticks["device_quaternion"]
         moved = np.concatenate([steps(position, device[:3]), turns(quaternion, device[3:])], axis=1)
@@ -103,6 +109,9 @@ class Account:
             share = _tank_share(parameters, wrench, velocity, account)
             return Controlled(wrench * share[:, None], free, nothing), then
         debt = account - THRESHOLD
+        if guarding.controller == ENVIRONMENT:
+            debt = np.concatenate([[self.excess], excess[:-1]]) - THRESHOLD
+            then.excess = float(excess[-1])
         owed = np.minimum(debt[:, None], axes)
         most = np.repeat([guarding.most_damping, guarding.most_rotational_damping], 3)
         square, zero = parameters.period * velocity**2, np.zeros_like(owed)
@@ -110,6 +119,8 @@ class Account:
         damping = np.minimum(damping, most)
         change = np.where((owed > 0) & swings, BOUND * most * np.abs(velocity), np.inf)
         held = wrench - damping * velocity
+        if guarding.controller == ENVIRONMENT:
+            return Controlled(held, change, damping[:, :3].max(axis=1)), then
         # the tank comes last, and only where no axis is bounded
         pays = (debt > 0) & ~swings.any(axis=1)
         share = np.where(pays, _tank_share(parameters, held, velocity, account), 1.0)

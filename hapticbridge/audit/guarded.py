@@ -75,12 +75,15 @@ class Guarded:
         account = Account(parameters, start_energy)
         return cls(parameters, watch, handle, tool, origin, target, account)
 
-    def after(self, ticks: NDArray[np.void], resumed: Array) -> tuple[Expected, Guarded]:
+    def after(
+        self, ticks: NDArray[np.void], resumed: Array, excess: Array
+    ) -> tuple[Expected, Guarded]:
         """Says what the next records, ``TICK_DTYPE``, at least one, should hold.
 
         Args:
             ticks: The records.
             resumed: Ticks at which the run went on after a pause without force.
+            excess: What the environment has created beyond the slack, (n,) in J.
         """
         then = copy.copy(self)
         seen, then.watch = self.watch.after(ticks, resumed)
@@ -92,7 +95,7 @@ class Guarded:
         force = -parameters.force_scale * on_tool[:, :3] @ axes
         torque = -parameters.force_scale / parameters.scale * on_tool[:, 3:] @ axes
         asked = np.concatenate([force, torque], axis=1)
-        control, then.account = self.account.after(ticks, asked, seen, device, resumed)
+        control, then.account = self.account.after(ticks, asked, seen, device, resumed, excess)
         guarding = parameters.guarding
         starts = seen.first | has_flag(ticks, TickFlag.RESEATED)
         parts = (

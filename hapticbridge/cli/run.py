@@ -108,9 +108,10 @@ class Run:
     printed."""
     port: int = 8080
     """Port to serve the view on; 0: any that is free."""
-    controller: Literal["damper", "tank", "off"] | None = None
+    controller: Literal["damper", "environment", "tank", "off"] | None = None
     """Passivity controller: what is done when the device was given more than its damping burns and
-    the scene gives up; by default 'damper' where the device condition does not hold, else 'off'."""
+    the scene gives up, or, 'environment', when the scene created more than the coupling's slack; by
+    default 'damper' where the device condition does not hold, else 'environment'."""
     clutch: int | None = None
     """Button of the device, from 0: while it is held the device moves without the handle."""
     dead_man: int | None = None

@@ -9,8 +9,9 @@ from typing import Any
 
 from hapticbridge.errors import HapticBridgeError
 
-OFF, DAMPER, TANK = 0, 1, 2
-"""Passivity controllers: none, damping against the motion, or a tank that scales the wrench."""
+OFF, DAMPER, TANK, ENVIRONMENT = 0, 1, 2, 3
+"""Passivity controllers: none; damping against the motion, for what both ports owe; a tank that
+scales the wrench; damping for what the environment's port owes alone."""
 
 MOST_BUTTONS = 32
 """Buttons that a mask may name; no handle has more."""
@@ -34,7 +35,7 @@ class Guarding:
     """What the guard does within a tick; everything is off by default.
 
     Attributes:
-        controller: ``OFF``, ``DAMPER`` or ``TANK``.
+        controller: ``OFF``, ``DAMPER``, ``TANK`` or ``ENVIRONMENT``.
         credit: Damping in N s/m that the energy account takes the device to burn.
         rotational_credit: Likewise in N m s/rad.
         most_damping: Largest damping in N s/m that the controller adds on an axis.
@@ -82,8 +83,8 @@ class Guarding:
     reach: float = math.inf
 
     def __post_init__(self) -> None:
-        if self.controller not in (OFF, DAMPER, TANK):
-            raise HapticBridgeError(f"controller is {self.controller!r}; it must be 0, 1 or 2")
+        if self.controller not in (OFF, DAMPER, TANK, ENVIRONMENT):
+            raise HapticBridgeError(f"controller is {self.controller!r}; it must be 0 to 3")
         for name in _NOT_NEGATIVE:
             value = getattr(self, name)
             if not _is_number(value) or not 0 <= value < math.inf:
