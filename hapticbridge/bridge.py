@@ -168,10 +168,11 @@ class Bridge(Opened):
         """Starts the ramp; between two runs zero was commanded and the device may have moved."""
         if not self._is_open:
             raise HapticBridgeError("the bridge is not open; use 'with Bridge(...) as bridge:'")
-        self._stopped_by = ""
+        before, self._stopped_by = self._stopped_by, ""
         if self._tick:
             self._binding.resume()
-            self._event("resume")
+            self._event("resume", reason=before, **self._named_signal())
+        self._signal = ""
 
     def _take_changes(self) -> None:
         """Takes in what others want changed: between two ticks, and noted with its tick."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import signal
 import subprocess
 import sys
@@ -17,13 +18,14 @@ import pytest
 from audit_cases import ScriptedDevice, verdict_of
 from bridge_runs import fast
 from cli_cases import Called
-from faults.catalogue import FAULTS
+from faults.catalogue import FAULTS, PUSHER
 from faults.rig import Outcome, Rig
 from numpy.typing import NDArray
 
+from hapticbridge.audit import audit
 from hapticbridge.clock import RealClock, SimulatedClock
 from hapticbridge.device.last_word import LastWord
-from hapticbridge.errors import DeviceError, HapticBridgeError
+from hapticbridge.errors import DeviceError, HapticBridgeError, SafetyTrip
 from hapticbridge.guard import UNLIMITED, Limits, guarding_for, wait_until_still
 from hapticbridge.guard import start as start_module
 from hapticbridge.kernel.guarding import UNGUARDED, Guarding
@@ -80,6 +82,53 @@ def test_a_dead_man_must_be_held_for_any_force(tmp_path: Path) -> None:
     assert not outcome.forces[DOWN + 25 :].any()
     assert outcome.report.resimulation == "bit for bit"
     assert outcome.report.verdict == "passive"
+
+
+@pytest.mark.parametrize("scale", [1.0, 2.0])
+def test_a_coupling_that_is_stretched_too_far_stops_the_run(tmp_path: Path, scale: float) -> None:
+    """The tool stays at the wall; the limit counts the device's motion, whatever the scale."""
+    outcomes = {}
+    for stretch in (3e-3, 0.2):
+        limits = Limits(force=10.0, torque=0.5, ramp=0.2, stretch=stretch)
+        rig = Rig(tmp_path, options={"limits": limits, "scale": scale})
+        outcomes[stretch] = rig.run(DOWN)
+        ticks = read_recording(tmp_path / "run.mcap").ticks
+        distance = np.linalg.norm(ticks["handle_position"] - ticks["tool_position"], axis=1)
+        limit = scale * stretch
+        assert (distance[:-1] <= limit).all()
+        assert (distance[-1] > limit) == (stretch == 3e-3)  # seen a tick later
+    stopped = outcomes[3e-3]
+    assert "farther from the handle than the stretch limit" in stopped.error
+    assert "stretch limit" in stopped.report.reason
+    assert stopped.last_is_zero
+    assert stopped.report.resimulation == "bit for bit"
+    assert not outcomes[0.2].error
+
+
+@pytest.mark.parametrize("angle", [2.8, math.inf])
+def test_a_coupling_that_is_turned_too_far_stops_the_run(tmp_path: Path, angle: float) -> None:
+    """A tool on a rail cannot turn; at half a turn the torque would change sides."""
+    scene = tmp_path / "rail.xml"
+    scene.write_text(PUSHER)
+    device = ScriptedDevice(lambda k: (0, 0, 0, np.cos(2e-3 * k), 0, 0, np.sin(2e-3 * k)))
+    path, error = tmp_path / "run.mcap", ""
+    limits = Limits(force=10.0, torque=0.5, ramp=0.0, angle=angle, energy=math.inf)
+    with fast(scene, device, limits=limits, recording=path) as bridge:
+        try:
+            bridge.run(0.9)
+        except SafetyTrip as trip:
+            error = str(trip)
+    ticks = read_recording(path).ticks
+    torque = ticks["wrench_on_tool"][:, 5]
+    if angle == math.inf:
+        assert not error
+        assert torque.min() < -1.0 < 1.0 < torque.max()
+        return
+    assert "turned from the handle by more than the angle limit" in error
+    assert len(ticks) == pytest.approx(angle / 4e-3, abs=2)
+    assert (torque[1:] > 0).all()
+    assert not device.writes[-1].any()
+    assert "angle limit" in audit(path).reason
 
 
 def test_beyond_its_reach_a_device_moves_without_handle_and_force(tmp_path: Path) -> None:

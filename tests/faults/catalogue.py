@@ -200,8 +200,12 @@ def acting(act: Callable[[Bridge], None], at: int = CAUSE) -> Callable[[Rig], No
     return do
 
 
-def _bad_acceleration(bridge: Bridge) -> None:
+def _bad_velocity(bridge: Bridge) -> None:
     bridge.scene.data.qvel[:] = 2e10
+
+
+def _bad_acceleration(bridge: Bridge) -> None:
+    bridge.scene.data.qfrc_applied[:] = 1e11
 
 
 def _diverge(bridge: Bridge) -> None:
@@ -311,6 +315,27 @@ def _full_tmpfs(rig: Rig) -> None:
     rig.recording = disk / "run.mcap"
 
 
+def _full_ring(rig: Rig) -> None:
+    """The recorder stands still for 1 s behind a ring of 0.2 s."""
+
+    def around(stack: ExitStack) -> None:
+        stack.enter_context(patch("hapticbridge.recording.stream.RING_SECONDS", 0.2))
+
+    def act(bridge: Bridge, tick: int) -> None:
+        recorder, cursors = bridge._stream.recorder, bridge._stream.cursors
+        assert recorder is not None
+        if CAUSE <= tick < CAUSE + 1000:
+            if tick == CAUSE:
+                os.kill(recorder._process.pid, signal.SIGSTOP)
+            return
+        os.kill(recorder._process.pid, signal.SIGCONT)
+        while tick % 50 == 0 and cursors[TAIL] < cursors[HEAD]:
+            time.sleep(1e-3)  # the recorder keeps up, as it does in real time
+
+    rig.around, rig.on_tick, rig.duration = around, act, 3.0
+    rig.clock.is_lossless = False
+
+
 def can_mount() -> bool:
     """Tells whether this process may mount a file system, as root in its own namespace may."""
     with tempfile.TemporaryDirectory() as folder:
@@ -388,6 +413,9 @@ NO_TRIPS = dict.fromkeys(("speed", "turn_speed", "stretch", "angle", "energy"), 
 
 UNGUARDED = {"controller": 0, **NO_TRIPS}
 
+RING_FULL = Fault("ring full for 1 s", _full_ring, "goes on")
+"""The one that loses records, after its cause; they are counted."""
+
 DISK_FULL = Fault("disk full", _full_tmpfs, "stops", "the disk is full", within=600)
 
 FAULTS = (
@@ -407,7 +435,8 @@ FAULTS = (
     Fault("write fails", _write_fails, "trip", "is gone"),
     Fault("write blocks for 1 s", _write_blocks, "re-seats", "", {"longest_stall": np.inf}),
     Fault("write is cut short", _write_is_cut, "trip", "16 of 48 bytes"),
-    Fault("MuJoCo warns: bad velocity", acting(_bad_acceleration), "trip", "diverged"),
+    Fault("MuJoCo warns: bad velocity", acting(_bad_velocity), "trip", "diverged"),
+    Fault("MuJoCo warns: bad acceleration", acting(_bad_acceleration), "trip", "diverged"),
     Fault("scene diverges", acting(_diverge), "trip", "diverged"),
     Fault("motor drives the tool", _motor, "trip", "more energy", NO_TRIPS, cause=500, within=900),
     Fault("10 x too stiff, free", stiff(10, None), "goes on", "", UNGUARDED),
@@ -418,6 +447,7 @@ FAULTS = (
     Fault("recorder killed", acting(_kill_recorder), "stops", "recorder died", within=101),
     Fault("recording may not grow", acting(_fill_disk), "stops", "recorder died", within=999),
     *([DISK_FULL] if can_mount() else []),
+    RING_FULL,
     Fault("viewer killed", _watched(signal.SIGKILL), "goes on"),
     Fault("viewer hangs", _watched(signal.SIGSTOP), "goes on"),
     Fault("machine suspended for 5 s", _suspended, "stops", "suspend of the machine"),

@@ -204,6 +204,7 @@ class Outcome:
         ticks: Ticks that were done, and ``rows`` records of them in the file.
         report: The audit's; None where there is no file.
         events: Names of the recording's events.
+        dropped: Records that were lost, as the event ``stop`` says.
         flags: Of each record.
     """
 
@@ -218,6 +219,7 @@ class Outcome:
     rows: int
     report: AuditReport
     events: list[str]
+    dropped: int
     flags: NDArray[np.int64]
     forces: NDArray[np.float64]
     torques: NDArray[np.float64]
@@ -244,6 +246,7 @@ class Outcome:
             rows=len(recording.ticks),
             report=audit(path),
             events=[str(event["event"]) for event in recording.events],
+            dropped=sum(int(str(event.get("dropped", 0))) for event in recording.events),
             flags=recording.ticks["flags"],
             forces=forces,
             torques=np.linalg.norm(wrenches[:, 3:], axis=1),
