@@ -76,6 +76,16 @@ def running_ns() -> int:
     return time.monotonic_ns()
 
 
+def slept_ns() -> int:
+    """Returns for how long the machine has been suspended since it was booted, in ns; 0 elsewhere.
+
+    Between its two readings some microseconds may pass.
+    """
+    if sys.platform == "linux":
+        return running_ns() - time.monotonic_ns()
+    return 0
+
+
 class RealClock:
     """Wall time: monotonic, absolute deadlines, overruns skipped and counted, never caught up.
 

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import errno
 import io
 import json
+import resource
 import shutil
+import sys
 import tempfile
 from pathlib import Path
 
@@ -20,6 +23,7 @@ from recording_cases import EPOCH, FILES, META, chunk_ends, random_rows, same, w
 from hapticbridge.errors import RecordingError
 from hapticbridge.recording import Attachment, RecordingWriter, read_recording, repair
 from hapticbridge.recording import format as layout
+from hapticbridge.recording.output import RESERVE
 from hapticbridge.tick import TICK_DTYPE
 
 
@@ -229,6 +233,31 @@ def test_writer_refuses_what_it_cannot_write(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match="must be text, not 3"):
         RecordingWriter(tmp_path / "run.mcap", {"a": 3}, (), EPOCH)  # type: ignore[dict-item]
     assert not (tmp_path / "run.mcap").exists()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="room can be claimed on Linux alone")
+def test_room_for_the_end_is_claimed_ahead_and_given_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "run.mcap"
+    writer = RecordingWriter(path, META, FILES, EPOCH)
+    writer.write_ticks(np.zeros(1000, TICK_DTYPE))
+    assert path.stat().st_blocks * 512 > RESERVE > 20 * path.stat().st_size
+    assert not writer.is_full
+    # from here on the file may not grow by more than it has claimed, as on a full disk
+    monkeypatch.setattr(writer._output, "_allocate", lambda *_: errno.ENOSPC)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (path.stat().st_size + RESERVE, limits[1]))
+    try:
+        writer.write_ticks(random_rows(2000))
+        assert writer.is_full
+        writer.close()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    # what is not used is given back: on ext4 by the length alone, elsewhere as a hole
+    assert path.stat().st_blocks * 512 < path.stat().st_size + 2**16
+    recording = read_recording(path)
+    assert (len(recording.ticks), recording.is_cut) == (3000, False)
 
 
 def test_a_file_that_is_being_recorded_to_is_not_taken_over(tmp_path: Path) -> None:

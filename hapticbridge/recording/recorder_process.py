@@ -2,8 +2,8 @@
 
 Started by ``hapticbridge.recording.recorder``, which tells it what to do through its standard
 input: one line of JSON, the attachments' bytes, then one line per event, and ``{"close": true}``.
-It answers on standard output with ``ready``, ``closed`` or ``error``. If the input ends before it
-was told to close, the bridge died.
+It answers on standard output with ``ready``, ``full``, ``closed`` or ``error``. If the input ends
+before it was told to close, the bridge died.
 """
 
 from __future__ import annotations
@@ -57,12 +57,14 @@ class _Session:
             self._live = LiveLine(sys.stderr)
         self._last_time = 0
         self._last_tick = -1
+        self._has_told = False
 
     def run(self, inbox: SimpleQueue[dict[str, Any] | None]) -> None:
         """Records until the bridge says close, or is gone."""
         end = None
         while end is None:
             count = self._drain_once()
+            self._tell_if_full()
             end = self._handle(inbox)
             # a process that the bridge forked may hold the pipe open after the bridge's death
             if end is None and os.getppid() != self._parent:
@@ -90,6 +92,13 @@ class _Session:
         if self._live is not None:
             self._live.update(rows)
         return int(rows.size)
+
+    def _tell_if_full(self) -> None:
+        """Says once that the disk is full; there is room for what comes until the bridge ends."""
+        if self._writer is not None and self._writer.is_full and not self._has_told:
+            self._has_told = True
+            self._write_event({"event": "disk_full", "tick": self._last_tick}, self._last_time)
+            _answer(full=True)
 
     def _handle(self, inbox: SimpleQueue[dict[str, Any] | None]) -> str | None:
         """Writes the events that arrived; returns how the run ended, if it did."""

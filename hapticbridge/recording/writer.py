@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import errno
-import os
-import stat
-import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import BinaryIO, cast
@@ -17,55 +14,9 @@ from numpy.typing import NDArray
 from hapticbridge.errors import RecordingError
 from hapticbridge.recording import format as layout
 from hapticbridge.recording.format import Attachment
-
-if sys.platform != "win32":
-    import fcntl
+from hapticbridge.recording.output import Output
 
 __all__ = ["Attachment", "RecordingWriter"]
-
-
-class _Output:
-    """A file that hands each write to the operating system whole and at once.
-
-    The MCAP library writes a finished chunk in one call; a buffer in between would keep its end
-    until the next one, and a kill would lose it.
-    """
-
-    def __init__(self, path: Path, mode: str) -> None:
-        # not truncated before it is locked: another bridge may be recording to the same file
-        flags = os.O_WRONLY | os.O_CREAT | getattr(os, "O_BINARY", 0)
-        flags |= os.O_EXCL if "x" in mode else 0
-        self._file = os.fdopen(os.open(path, flags, 0o666), "wb", buffering=0)
-        try:
-            if sys.platform != "win32":
-                fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            if stat.S_ISREG(os.fstat(self._file.fileno()).st_mode):
-                self._file.truncate(0)
-        except BlockingIOError as error:
-            self._file.close()
-            raise OSError(errno.EBUSY, "another bridge is recording to it") from error
-        self._position = 0
-
-    def write(self, data: bytes) -> int:
-        view = memoryview(data)
-        while view:
-            written = self._file.write(view)
-            view = view[written:]
-        self._position += len(data)
-        return len(data)
-
-    def tell(self) -> int:
-        return self._position
-
-    def flush(self) -> None:
-        """Nothing is held back."""
-
-    def sync(self) -> None:
-        if stat.S_ISREG(os.fstat(self._file.fileno()).st_mode):
-            os.fsync(self._file.fileno())
-
-    def close(self) -> None:
-        self._file.close()
 
 
 class RecordingWriter:
@@ -102,7 +53,7 @@ class RecordingWriter:
         self._sequence = 0
         self._is_closed = False
         try:
-            self._output = _Output(self.path, "xb" if exclusive else "wb")
+            self._output = Output(self.path, is_new=exclusive)
         except OSError as error:
             raise self._refusal(error) from error
         try:
@@ -136,6 +87,11 @@ class RecordingWriter:
         self._events = self._mcap.register_channel(
             layout.EVENT_TOPIC, layout.EVENT_ENCODING, event_schema
         )
+
+    @property
+    def is_full(self) -> bool:
+        """Whether the disk is: what is still written goes into room that was claimed before."""
+        return self._output.is_full
 
     def write_ticks(self, rows: NDArray[np.void]) -> None:
         """Appends records.
