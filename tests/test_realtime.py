@@ -8,6 +8,7 @@ import os
 import resource
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -34,6 +35,8 @@ from hapticbridge.realtime.remedies import CONTAINER, PRIORITY, SHELL
 from hapticbridge.recording import read_recording
 from hapticbridge.rendering import METHODS, prepare
 from hapticbridge.scene import load_scene
+from hapticbridge.view.address import Address
+from hapticbridge.view.window import Window
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="real time is Linux's")
 
@@ -232,16 +235,54 @@ def test_a_run_goes_on_without_the_permission_says_so_once_and_records_it(
     assert "frozen" in str(events[0]["collector"])
 
 
-@pytest.mark.parametrize("pipelined", [False, True])
-def test_ten_thousand_ticks_allocate_nothing_that_stays(pipelined: bool) -> None:
+class Heap(ctypes.Structure):
+    """What ``mallinfo2`` of the C library tells, in bytes where it is not a count."""
+
+    _fields_ = (
+        *((name, ctypes.c_size_t) for name in ("arena", "ordblks", "smblks", "hblks", "hblkhd")),
+        *((name, ctypes.c_size_t) for name in ("usmblks", "fsmblks", "uordblks")),
+        *((name, ctypes.c_size_t) for name in ("fordblks", "keepcost")),
+    )
+
+
+def heap_reader() -> Callable[[], int]:
+    """Returns what tells how many bytes MuJoCo and the kernel hold: Python counts only its own."""
+    tell = getattr(ctypes.CDLL(None), "mallinfo2", None)
+    if tell is None:
+        return lambda: 0
+    tell.restype = Heap
+
+    def held() -> int:
+        heap = tell()
+        return int(heap.hblkhd + heap.uordblks)
+
+    return held
+
+
+@pytest.mark.parametrize(("pipelined", "controller"), [(False, "tank"), (True, "damper")])
+@pytest.mark.parametrize("watched", ["by nobody", "by the recorder", "by recorder and viewer"])
+def test_ten_thousand_ticks_allocate_nothing_that_stays(
+    tmp_path: Path, pipelined: bool, controller: str, watched: str
+) -> None:
     """Python's own numbers come and go; a tick that keeps one more object would show 10 000."""
-    blocks = np.zeros(2, dtype=np.int64)
+    watchers: dict[str, Any] = {}
+    if "recorder" in watched:
+        watchers["recording"] = tmp_path / "run.mcap"
+    if "viewer" in watched:
+        pytest.importorskip("viser", reason="needs the extra 'view'")
+        watchers["onlooker"] = Window(Address("127.0.0.1", 0))
+    blocks, held = np.zeros(2, dtype=np.int64), np.zeros(2, dtype=np.int64)
+    read_heap = heap_reader()
 
     def count(tick: int) -> None:
         if tick in (2000, 12_000):
+            held[tick // 12_000] = read_heap()
             blocks[tick // 12_000] = sys.getallocatedblocks()
 
-    with fast("peg_in_hole", "simulated", pipelined=pipelined) as bridge:
+    with fast(
+        "peg_in_hole", "simulated", pipelined=pipelined, controller=controller, clutch=0, **watchers
+    ) as bridge:
+        read_heap()
         gc.collect()
         gc.disable()
         try:
@@ -250,6 +291,7 @@ def test_ten_thousand_ticks_allocate_nothing_that_stays(pipelined: bool) -> None
             gc.enable()
     assert blocks[0] > 0
     assert blocks[1] - blocks[0] == 0
+    assert abs(held[1] - held[0]) < 10_000
 
 
 def test_percentiles_are_latenesses_that_were_seen() -> None:
