@@ -228,7 +228,7 @@ class SimulatedDevice:
         Args:
             wrench: Shape (6,): force in N, torque in N m, in the device's frame.
         """
-        self._written[:] = wrench
+        self._written[:] = wrench.data
 
     def displace(self, offset: NDArray[np.float64]) -> None:
         """Moves the device before its first sample, as a knock would: for runs that must decay.

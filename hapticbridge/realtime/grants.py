@@ -99,6 +99,11 @@ def real_time(core: int | None = None) -> Iterator[tuple[Grant, ...]]:
         yield _timer(restore), _core(restore, core), _scheduling(restore)
 
 
+def current_priority() -> int:
+    """Returns the calling thread's priority under SCHED_FIFO, 1 to 99; 0 where it has none."""
+    return os.sched_getparam(0).sched_priority if hasattr(os, "sched_getparam") else 0
+
+
 def warn_of_refusals(grants: tuple[Grant, ...]) -> None:
     """Warns once of each request that was refused, with the command that grants it."""
     for grant in grants:
@@ -182,9 +187,8 @@ def _core(restore: ExitStack, core: int | None) -> Grant:
     name = "core"
     if not hasattr(os, "sched_setaffinity"):
         return Grant(name, False, f"{sys.platform} pins no thread to a core; only Linux does")
-    allowed = os.sched_getaffinity(0)
-    isolated = _isolated_cores()
-    chosen = core if core is not None else min(isolated, default=max(allowed))
+    allowed, isolated = os.sched_getaffinity(0), _isolated_cores()
+    chosen = loop_core() if core is None else core
     try:
         os.sched_setaffinity(0, {chosen})
     except (OSError, ValueError, OverflowError) as error:
@@ -192,6 +196,11 @@ def _core(restore: ExitStack, core: int | None) -> Grant:
     restore.callback(os.sched_setaffinity, 0, allowed)
     kind = "isolated core" if chosen in isolated else "core"
     return Grant(name, True, f"pinned to {kind} {chosen} of {len(allowed | isolated)}")
+
+
+def loop_core() -> int:
+    """Returns the core on which a loop is put unless it is told another; only on Linux."""
+    return min(_isolated_cores(), default=max(os.sched_getaffinity(0)))
 
 
 def _isolated_cores() -> set[int]:
