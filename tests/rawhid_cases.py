@@ -7,7 +7,7 @@ from emulated.rawhid_model import Claims, RawHid
 
 from hapticbridge.device import SimulatedDevice
 from hapticbridge.device.plugged import tell_nobody
-from hapticbridge.device.rawhid import RawHidDevice, open_rawhid
+from hapticbridge.device.rawhid.driver import RawHidDevice, open_rawhid
 
 PERIOD = 1e-3
 

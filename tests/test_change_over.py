@@ -11,8 +11,8 @@ from kernel_runs import Array
 from lossless_runs import T, bound, tapping
 
 from hapticbridge.coupling import Coupling
-from hapticbridge.device.motion import pose_at
-from hapticbridge.device.motion_csv import read_motion
+from hapticbridge.device.trajectory.motion import pose_at
+from hapticbridge.device.trajectory.motion_csv import read_motion
 from hapticbridge.kernel.step import OK, after_step, before_step, simulate
 from hapticbridge.ledger import Ledger
 from hapticbridge.scene import load_scene, scene_path

@@ -11,9 +11,9 @@ from emulated.hid_seam import HidSeam
 from emulated.pid_model import PidStick
 
 from hapticbridge.cli import devices as command
-from hapticbridge.device import haply, hid_search, usb_bus, usb_search
-from hapticbridge.device.dhd_library import VARIABLE
 from hapticbridge.device.families import FAMILIES, RULES_FILE, plugged_devices, udev_rules
+from hapticbridge.device.forcedimension.library import VARIABLE
+from hapticbridge.device.haply import finding as haply
 from hapticbridge.device.plugged import (
     RULES_COMMAND,
     Family,
@@ -21,6 +21,7 @@ from hapticbridge.device.plugged import (
     access_problem,
     permission_problem,
 )
+from hapticbridge.device.transport import hid_search, usb_bus, usb_search
 
 
 def plug(

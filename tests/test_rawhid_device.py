@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from hapticbridge.device import SimulatedDevice
 from hapticbridge.device.base import AXES
 from hapticbridge.device.plugged import tell_nobody
-from hapticbridge.device.rawhid import LONGEST_SILENCE, RawHidDevice, open_rawhid
+from hapticbridge.device.rawhid.driver import LONGEST_SILENCE, RawHidDevice, open_rawhid
 from hapticbridge.errors import DeviceError, DeviceLost
 from hapticbridge.tick import SAMPLE_DTYPE, TickFlag
 
