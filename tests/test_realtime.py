@@ -30,6 +30,7 @@ from hapticbridge.realtime import (
     wants_real_time,
 )
 from hapticbridge.realtime import grants as asked
+from hapticbridge.realtime import pace
 from hapticbridge.realtime.pace import BESIDE_THE_STEP, SPARE, rate_for
 from hapticbridge.realtime.remedies import CONTAINER, PRIORITY, SHELL
 from hapticbridge.recording import read_recording
@@ -176,6 +177,8 @@ def test_a_lower_limit_on_priority_is_used(monkeypatch: pytest.MonkeyPatch, limi
     with real_time() as grants:
         assert named(grants, "scheduling").is_granted
         assert got == [min(limit, PRIORITY)]
+        said = named(grants, "scheduling").sentence
+        assert ("the limit 'ulimit -r' allows no more" in said) == (limit < PRIORITY)
 
 
 @pytest.mark.parametrize(("limit", "flags"), [(resource.RLIM_INFINITY, 3), (1 << 30, 1)])
@@ -183,9 +186,10 @@ def test_memory_to_come_is_locked_only_where_no_limit_can_fail_it(
     library: Library, monkeypatch: pytest.MonkeyPatch, limit: int, flags: int
 ) -> None:
     monkeypatch.setattr(resource, "getrlimit", lambda _which: (limit, limit))
-    with memory_at_rest():
+    with memory_at_rest() as grants:
         pass
     assert library.asked == [flags, 0]
+    assert ("not what is added later" in named(grants, "memory").sentence) == (flags == 1)
 
 
 def test_an_isolated_core_is_taken_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -322,6 +326,15 @@ def test_a_scene_too_slow_is_refused_for_a_real_device_and_warned_of_for_others(
         start, (scene.data.qpos, scene.data.time, scene.data.qacc_warmstart), strict=True
     ):
         np.testing.assert_array_equal(before, after)
+
+
+@pytest.mark.parametrize(("needed", "held"), [(6e-3, "130 Hz"), (1.04e-3, "770 Hz")])
+def test_the_rate_that_is_offered_is_a_plain_number(
+    monkeypatch: pytest.MonkeyPatch, needed: float, held: str
+) -> None:
+    monkeypatch.setattr(pace, "step_time", lambda *_: needed)
+    with pytest.raises(SceneError, match=f"needs .* ms .* could hold about {held}: "):
+        check_pace(load_scene("point_mass"), METHODS["implicit"], 1e-3, 1, is_real=True)
 
 
 def test_the_rate_that_is_offered_leaves_a_fifth_of_the_period() -> None:

@@ -134,7 +134,10 @@ def _scheduling(restore: ExitStack) -> Grant:
             reason = error.strerror
         else:
             restore.callback(os.sched_setscheduler, 0, policy, parameter)
-            return Grant(name, True, f"SCHED_FIFO at priority {priority}")
+            less = f", not {PRIORITY}: the limit 'ulimit -r' allows no more"
+            return Grant(
+                name, True, f"SCHED_FIFO at priority {priority}{less * (priority < PRIORITY)}"
+            )
     return Grant(
         name,
         False,
@@ -156,8 +159,12 @@ def _memory(restore: ExitStack) -> Grant:
     for flags in (whole, _LOCK_PRESENT) if is_unlimited else (_LOCK_PRESENT,):
         if library.mlockall(flags) == 0:
             restore.callback(library.munlockall)
-            share = "all memory is" if flags == whole else "the memory in use is"
-            return Grant(name, True, f"{share} locked")
+            shown = "all memory is locked"
+            if flags != whole:
+                shown = "the memory in use is locked, not what is added later"
+            if not is_unlimited:
+                shown += f": the limit 'ulimit -l' of {shown_limit(limit, 1024)} kB could fail it"
+            return Grant(name, True, shown)
     reason = os.strerror(ctypes.get_errno())
     return Grant(
         name,
