@@ -26,11 +26,11 @@ from hapticbridge.realtime import (
     check_pace,
     lateness_of,
     memory_at_rest,
+    pace,
     real_time,
     wants_real_time,
 )
 from hapticbridge.realtime import grants as asked
-from hapticbridge.realtime import pace
 from hapticbridge.realtime.pace import BESIDE_THE_STEP, SPARE, rate_for
 from hapticbridge.realtime.remedies import CONTAINER, PRIORITY, SHELL
 from hapticbridge.recording import read_recording
