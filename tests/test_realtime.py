@@ -181,10 +181,13 @@ def test_a_lower_limit_on_priority_is_used(monkeypatch: pytest.MonkeyPatch, limi
         assert ("the limit 'ulimit -r' allows no more" in said) == (limit < PRIORITY)
 
 
-@pytest.mark.parametrize(("limit", "flags"), [(resource.RLIM_INFINITY, 3), (1 << 30, 1)])
+@pytest.mark.parametrize(
+    ("limit", "flags"), [(resource.RLIM_INFINITY, 3), (1 << 50, 1), (1 << 23, 3)]
+)
 def test_memory_to_come_is_locked_only_where_no_limit_can_fail_it(
     library: Library, monkeypatch: pytest.MonkeyPatch, limit: int, flags: int
 ) -> None:
+    """This process has more than 8 MB already: if it may lock that, the limit does not bind it."""
     monkeypatch.setattr(resource, "getrlimit", lambda _which: (limit, limit))
     with memory_at_rest() as grants:
         pass

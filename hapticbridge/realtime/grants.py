@@ -153,16 +153,17 @@ def _memory(restore: ExitStack) -> Grant:
         return Grant(name, False, f"memory is not locked on {sys.platform}; only Linux does it")
     library = ctypes.CDLL(None, use_errno=True)
     limit = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0]
-    is_unlimited = limit == resource.RLIM_INFINITY
-    # under a limit, locking what comes would make the allocation beyond it fail in mid-run
+    # under a limit, locking what comes would make the allocation beyond it fail in mid-run; what is
+    # larger already can only be locked by a process that no limit binds (CAP_IPC_LOCK)
+    is_bound = limit != resource.RLIM_INFINITY and _mapped() <= limit
     whole = _LOCK_PRESENT | _LOCK_FUTURE
-    for flags in (whole, _LOCK_PRESENT) if is_unlimited else (_LOCK_PRESENT,):
+    for flags in (_LOCK_PRESENT,) if is_bound else (whole, _LOCK_PRESENT):
         if library.mlockall(flags) == 0:
             restore.callback(library.munlockall)
             shown = "all memory is locked"
             if flags != whole:
                 shown = "the memory in use is locked, not what is added later"
-            if not is_unlimited:
+            if is_bound:
                 shown += f": the limit 'ulimit -l' of {shown_limit(limit, 1024)} kB could fail it"
             return Grant(name, True, shown)
     reason = os.strerror(ctypes.get_errno())
@@ -173,6 +174,12 @@ def _memory(restore: ExitStack) -> Grant:
         f"{shown_limit(limit, 1024)} kB): a page that the system took away makes a tick late",
         way_to_grant(),
     )
+
+
+def _mapped() -> int:
+    """Returns the size in bytes of what the process has mapped, which is what would be locked."""
+    pages = Path("/proc/self/statm").read_text(encoding="utf-8").split()[0]
+    return int(pages) * resource.getpagesize()
 
 
 def _timer(restore: ExitStack) -> Grant:
