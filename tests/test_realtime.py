@@ -236,7 +236,9 @@ def test_a_run_goes_on_without_the_permission_says_so_once_and_records_it(
         bridge.run(0.02)
     assert sum("SCHED_FIFO was refused" in str(item.message) for item in warned) == 1
     assert sum("memory could not be locked" in str(item.message) for item in warned) == 1
-    events = [event for event in read_recording(path).events if event["event"] == "real_time"]
+    noted = read_recording(path).events
+    assert [event["time_ns"] for event in noted[:2]] == [0, 0]  # before time began
+    events = [event for event in noted if event["event"] == "real_time"]
     assert len(events) == 2
     assert "refused" in str(events[0]["scheduling"])
     assert "frozen" in str(events[0]["collector"])
