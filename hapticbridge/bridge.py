@@ -15,7 +15,7 @@ import mujoco
 import numpy as np
 
 from hapticbridge.errors import DeviceError, HapticBridgeError, SafetyTrip
-from hapticbridge.guard import trip_reason, wait_until_still
+from hapticbridge.guard import trip_reason
 from hapticbridge.inputs import apply_writes
 from hapticbridge.kernel.ahead import can_split
 from hapticbridge.kernel.codes import BAD_RESULT, HALF_DONE, OK, RING_FULL
@@ -62,7 +62,7 @@ class Bridge(Opened):
             if self._is_realtime:
                 self._note_grants(stack.enter_context(real_time()))
             try:
-                wait_until_still(self.device, self._sample, self.period, self.clock)
+                self._come_to_rest()
                 self.clock.start(round(self.period * 1e9))
                 reason = self._loop(last, on_tick)
             except DeviceError as error:
