@@ -13,10 +13,11 @@ import tyro
 from hapticbridge.audit import AuditReport, audit
 from hapticbridge.cli.judge_many import print_audits, print_unreadable
 from hapticbridge.cli.judge_what_if import print_what_if
-from hapticbridge.cli.terminal import err, out, plain, progress, quantity
+from hapticbridge.cli.terminal import err, out, plain, progress
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.film import Shot, still
 from hapticbridge.picture import check_ending
+from hapticbridge.quantity import quantity
 from hapticbridge.recording import Recording, read_recording, repair
 from hapticbridge.report import plot_recording, telling_time, write_report
 from hapticbridge.study.audits import (
