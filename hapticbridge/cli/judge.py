@@ -75,8 +75,9 @@ class Audit:
     ] = ()
     """Simulate the recorded hand again with this changed, as often as wanted: stiffness, damping,
     rotational_stiffness, rotational_damping, method, rate, substeps, scale, force_scale,
-    contact_stiffness, or a parameter of the scene. Twice: with the recorded motion, and, where the
-    device is known, with a model hand. With --plot both are drawn (one file only)."""
+    contact_stiffness, controller, or a parameter of the scene. Twice: with the recorded motion,
+    and, where the device is known, with a model hand. With --plot both are drawn (one file
+    only)."""
 
     def execute(self) -> int:
         """Audits; returns the exit code."""
