@@ -46,10 +46,8 @@ def swung(path: Path, controller: str | None, duration: float = 0.1) -> Path:
     scene = path.with_suffix(".xml")
     scene.write_text(LIGHTLY_HELD)
     device = SimulatedDevice(mass=0.2, damping=0.1, hand=report_runs.LIGHT_HAND)
-    limits = Limits(force=10.0, torque=0.5, ramp=0.05, energy=math.inf)
-    recorded(
-        path, str(scene), device, TOO_STIFF, duration=1.0, limits=limits, controller=controller
-    )
+    options: dict[str, Any] = {"duration": duration, "controller": controller}
+    recorded(path, str(scene), device, TOO_STIFF, **options)
     return path
 
 
