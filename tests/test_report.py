@@ -6,6 +6,7 @@ import io
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -91,6 +92,37 @@ def test_the_same_run_without_its_cause_is_given_another_one(made: Made, tmp_pat
     cause = likely_cause(evidence, report)
     assert cause is not None
     assert cause.kind == "rate"
+
+
+def cause_of(recording: Recording, report: AuditReport, **parts: Any) -> tuple[str, str]:
+    cause = likely_cause(evidence_of(Recording(**{**vars(recording), **parts})), report)
+    assert cause is not None
+    return cause.kind, cause.evidence
+
+
+def test_missed_deadlines_are_the_cause_where_the_device_bears_the_coupling(made: Made) -> None:
+    recording, report = made(report_runs.active_by_rate)
+    assert report.tick is not None
+    sheet = recording.meta["device"].replace('"damping": 2.0', '"damping": 20.0')
+    assert sheet != recording.meta["device"]
+    meta, ticks = recording.meta | {"device": sheet}, recording.ticks.copy()
+    assert cause_of(recording, report, meta=meta)[0] == "unknown"
+    ticks["flags"][[report.tick - 500, report.tick + 1]] |= int(TickFlag.OVERRUN)
+    assert cause_of(recording, report, meta=meta, ticks=ticks)[0] == "unknown"  # not before it
+    ticks["flags"][report.tick - 100 : report.tick - 97] |= int(TickFlag.OVERRUN)
+    kind, told = cause_of(recording, report, meta=meta, ticks=ticks)
+    assert (kind, told[:24]) == ("rate", "3 deadlines were missed ")
+
+
+def test_bodies_that_were_moved_are_the_cause_before_any_contact(made: Made) -> None:
+    recording, report = made(report_runs.active_by_contact)
+    assert report.tick is not None
+    moved = {"event": "input", "tick": report.tick - 5, "writes": [["mocap_pos", 0, [0, 0, 1]]]}
+    kind, told = cause_of(recording, report, events=[*recording.events, moved])
+    assert kind == "inputs"
+    assert "moved 1 times" in told
+    later = moved | {"tick": report.tick + 1}
+    assert cause_of(recording, report, events=[*recording.events, later])[0] == "contact setting"
 
 
 def test_a_passive_run_has_no_moment_and_no_cause(run_file: Path, tmp_path: Path) -> None:
