@@ -115,6 +115,7 @@ class Watch:
         is_released = (ticks["buttons"] & (guarding.clutch | CLUTCHED)) != 0
         if guarding.dead_man:
             is_released |= (ticks["buttons"] & guarding.dead_man) == 0
+        is_released |= np.linalg.norm(ticks["device_position"], axis=1) > guarding.reach
         is_silent = is_released | ((ticks["buttons"] & FORCE_OFF) != 0)
         if guarding.stale_ticks > 0:
             is_silent |= stale > guarding.stale_ticks
