@@ -10,7 +10,8 @@ from typing import Any
 import msgspec
 import viser
 import zstandard
-from websockets.sync.client import ClientConnection, connect
+from websockets.sync.client import connect
+from websockets.sync.connection import Connection
 from websockets.typing import Subprotocol
 
 PATIENCE = 60.0
@@ -25,7 +26,7 @@ class Hand:
         elements: Of the page, by their labels: uuid and what they were made with.
     """
 
-    def __init__(self, socket: ClientConnection) -> None:
+    def __init__(self, socket: Connection) -> None:
         self.socket = socket
         self.elements: dict[str, dict[str, Any]] = {}
 
