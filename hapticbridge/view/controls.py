@@ -36,6 +36,7 @@ STILL = 0.5
 """In s: for so long after the last touch a slider is not put anywhere; it may be in a hand."""
 
 _DIGITS = 1e-3  # N s/m
+_ROUNDING = 1.0 + 1e-9  # a bound of 2 that was found as 1.9999999999 is one of 2
 
 
 def allowance_of(metadata: Mapping[str, str]) -> Allowance:
@@ -116,13 +117,13 @@ class Controls:
         self._touched = 0.0
         gui = server.gui
         with gui.add_folder("control"):
+            stop = gui.add_button("stop the run", color="red")
             if allowance.method.has_law:
                 self._add_sliders(gui)
             force = gui.add_checkbox("force", initial_value=True)
             clutch = gui.add_checkbox("clutch (the hand moves alone)", initial_value=False)
             reset = gui.add_button("back to the start")
             self._record = gui.add_button("start recording")
-            stop = gui.add_button("stop the run", color="red")
             self.answer = gui.add_markdown("")
         self._force, self._clutch, self._is_recording = force, clutch, False
         force.on_update(lambda _: ask(Switch(force=force.value)))
@@ -224,8 +225,8 @@ def _up(value: float) -> float:
 
 
 def _down(value: float) -> float:
-    return float(value // 1.0)
+    return float(value * _ROUNDING // 1.0)
 
 
 def _floor(value: float) -> float:
-    return round(value // _DIGITS * _DIGITS, 3)
+    return round(value * _ROUNDING // _DIGITS * _DIGITS, 3)

@@ -207,14 +207,14 @@ def run() -> None:
         show = Show(Ring.attach(job["ring"]), facts, lag)
         address = Address(job["host"], job["port"], job["token"])
         server = serve(address)
+        outlet = Outlet(answers.fileno())
+        if not address.is_loopback:
+            server.gui.add_markdown(SHARED)
+        controls = Controls(server, allowance_of(facts.meta), outlet.ask)
         page = Page(server, show.model, show.parameters, dict(facts.meta), show.reference)
     except HapticBridgeError as error:
         print(json.dumps({"error": str(error)}), file=answers, flush=True)
         return
-    outlet = Outlet(answers.fileno())
-    controls = Controls(server, allowance_of(facts.meta), outlet.ask)
-    if not address.is_loopback:
-        server.gui.add_markdown(SHARED)
     print(json.dumps({"url": address.url(server.get_port())}), file=answers, flush=True)
     inbox: queue.SimpleQueue[dict[str, Any] | None] = queue.SimpleQueue()
     threading.Thread(target=_listen, args=(stream, inbox), daemon=True).start()
