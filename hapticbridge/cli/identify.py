@@ -27,7 +27,7 @@ from hapticbridge.device.profile import Profile, own_folder
 from hapticbridge.errors import HapticBridgeError, choices
 from hapticbridge.felt import coupling_sentences
 from hapticbridge.identify import Identification, identify
-from hapticbridge.identify.fit import CONFIDENCE
+from hapticbridge.identify.estimate import CONFIDENCE
 from hapticbridge.identify.identification import DURATION, FORCE_SHARE, TRAVEL
 from hapticbridge.identify.measured_profile import measured_profile
 from hapticbridge.identify.picture import draw_identification

@@ -12,8 +12,11 @@ from numpy.typing import NDArray
 from hapticbridge.clock import Clock
 from hapticbridge.device import Device, DeviceInfo
 from hapticbridge.errors import IdentificationError
+from hapticbridge.identify.axis_fit import AxisFit
+from hapticbridge.identify.estimate import Estimate
+from hapticbridge.identify.excitation import stretch
 from hapticbridge.identify.experiment import Allowance, AxisRun, move_axis
-from hapticbridge.identify.fit import AxisFit, Estimate, fit_axis
+from hapticbridge.identify.fit import fit_axis
 
 Array = NDArray[np.float64]
 
@@ -92,7 +95,7 @@ def identify(
     *,
     period: float,
     axes: tuple[str, ...] | None = None,
-    duration: float = DURATION,
+    duration: float | None = None,
     travel: tuple[float, float] = TRAVEL,
     force_share: float = FORCE_SHARE,
     progress: Callable[[str, float], None] | None = None,
@@ -107,7 +110,7 @@ def identify(
         clock: Not started yet.
         period: T in s of the loop.
         axes: Which; None: all that the device has.
-        duration: Seconds per axis.
+        duration: Seconds per axis; None: ``duration_at`` the period.
         travel: To each side, in m and rad.
         force_share: Share of the device's limits that may be used.
         progress: Called with the axis and the share of its run that is done.
@@ -128,6 +131,7 @@ def identify(
         # a turn is not faster than the rim of a 50 mm handle at the device's speed
         speed=(info.speed_limit, info.speed_limit / 0.025),
     )
+    duration = duration_at(period) if duration is None else duration
     device.start(period)
     clock.start(round(period * 1e9))
     runs, fits = {}, {}
@@ -154,6 +158,15 @@ def identify(
         period_spread=1e-9 * float(np.rint(1e9 * intervals).std()),
         period_most=float(np.quantile(intervals, 0.999)),
     )
+
+
+def duration_at(period: float) -> float:
+    """Returns how many seconds an axis takes unless somebody says otherwise: 12, more below 333 Hz.
+
+    Args:
+        period: T in s.
+    """
+    return DURATION * stretch(period)
 
 
 def _bound(progress: Callable[[str, float], None], axis: str) -> Callable[[float], None]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from hapticbridge.device.profile import Profile, Quantity
-from hapticbridge.identify.fit import Estimate
+from hapticbridge.identify.estimate import Estimate
 from hapticbridge.identify.identification import Identification
 
 _FIELDS = {

@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from hapticbridge.identify.fit import AxisFit
+from hapticbridge.identify.axis_fit import AxisFit
 from hapticbridge.identify.identification import Identification
 from hapticbridge.identify.weak_form import windows
 from hapticbridge.picture import new_figure
