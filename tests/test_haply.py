@@ -14,7 +14,7 @@ from haply_cases import PERIOD, Bench
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hapticbridge.device import SimulatedDevice, haply, haply_device, open_device
+from hapticbridge.device import SimulatedDevice, haply, open_device, silence
 from hapticbridge.device import haply_messages as messages
 from hapticbridge.device import transport_websocket as transport
 from hapticbridge.device.haply_device import FORCE_LIMIT, MOST_UNDER_WAY, HaplyDevice
@@ -335,7 +335,7 @@ def test_a_force_that_is_not_finite_and_a_slow_loop_are_refused() -> None:
 def test_over_real_sockets_it_runs_and_the_wire_is_logged(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(haply_device, "SILENCE", 5.0)  # a busy machine stalls for longer than 50 ms
+    monkeypatch.setattr(silence, "SILENCE", 5.0)  # a busy machine stalls for longer than 50 ms
     service = HaplyService({"049D": SimulatedDevice(damping=50.0)}, resolution=1e-6)
     sample = np.zeros(1, SAMPLE_DTYPE)
     log = tmp_path / "wire.log"

@@ -30,9 +30,8 @@ below 333 Hz stretch them (``stretch``)."""
 LEAST_WINDOWS = 60
 """Five in each of ``BLOCKS``: fewer say nothing of how much they differ."""
 
-MOST_NOISE = 0.002
-"""Largest share that noise may have in the columns of mass and of damping (squares). Least squares
-make a number too small by that share."""
+MOST_NOISE = 0.03
+"""Largest ``noise_share`` that is worth a result; below, the intervals of M and b grow by it."""
 
 DELAY_ERROR = 1e-5
 """Half-width in s that is added to every delay, for the same reason: a hundredth of a tick."""
@@ -126,12 +125,13 @@ def _fitted(
 
     applied = float(np.sqrt(np.mean((found.right / area) ** 2)))
     sums = SUM_ERROR * applied / float(np.sqrt(np.mean((speeds / area) ** 2)))
+    shift = METHOD_ERROR + found.noise_share
     mass, damping, friction, offset = (float(value) for value in values[:_DELAY])
     return AxisFit(
-        mass=Estimate(mass, float(error[_MASS]) + METHOD_ERROR * abs(mass)),
+        mass=Estimate(mass, float(error[_MASS]) + shift * abs(mass)),
         damping=Estimate(
             damping,
-            float(error[_DAMPING]) + METHOD_ERROR * abs(damping) + sums,
+            float(error[_DAMPING]) + shift * abs(damping) + sums,
             0.0 if drag.is_seen else _unseen(unbent, found, damping - float(error[_DAMPING])),
         ),
         friction=Estimate(friction, float(error[_FRICTION]) + METHOD_ERROR * applied),

@@ -61,6 +61,7 @@ def measured_profile(
         axes=info.axes,
         about="",
         quantities=quantities,
+        models=(info.name,),
     )
 
 

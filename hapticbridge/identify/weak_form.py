@@ -69,8 +69,8 @@ class Windows:
         begin: First sample of each window, shape (n,).
         position: ∫φ x, in m s, shape (n,): the column of a spring.
         drag: ∫φ x' |x'|, in m²/s, shape (n,): the column of a drag that grows with speed squared.
-        noise_share: Of the squares of the columns of M and b, whichever is more, what the noise of
-            the position makes.
+        noise_share: Of the squares of the columns of M and b, whichever is more, what the noise and
+            the rounding of the position make: by so much least squares make a number too small.
         excess: ∫φ e(t − d), in N s, where e is what F exceeds half of its largest distance from its
             median by, shape (n,): the column of a motor that gives less than it is told.
     """
@@ -147,11 +147,15 @@ def windows(
     )
     bump = _BUMP(nodes) * trapezoid
     absolute = position[begin] * area + x @ bump
-    share = 0.0
-    if noise > 0.0:
-        for column, weights in ((columns[:, 0], of_mass), (columns[:, 1], of_damping)):
-            square = float(np.mean(column**2)) if len(begin) else 0.0
-            share = max(share, noise**2 * float(weights @ weights) / max(square, 1e-300))
+    square = noise**2 + resolution**2 / 12.0
+    share = (
+        max(
+            square * float(weights @ weights) / max(float(np.mean(column**2)), 1e-300)
+            for column, weights in ((columns[:, 0], of_mass), (columns[:, 1], of_damping))
+        )
+        if len(begin)
+        else 0.0
+    )
     # speed over a span between samples, which lies in the span's middle
     span = max(count // _SPANS, 1)
     speed = (x[:, span:] - x[:, :-span]) / (span * period)
