@@ -10,7 +10,7 @@ from scipy.integrate import solve_ivp
 from hapticbridge.clock import SimulatedClock
 from hapticbridge.device import SimulatedDevice
 from hapticbridge.identify import Estimate, Identification, fit_axis, identify
-from hapticbridge.identify.identification import step_of
+from hapticbridge.identify.resolution import step_of
 from hapticbridge.tick import TickFlag
 
 PERIOD = 1e-3

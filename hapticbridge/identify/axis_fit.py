@@ -23,13 +23,14 @@ class AxisFit:
         offset: Constant force c in N (N m): weight, or an offset of the motor.
         delay: From a write until it shows in a sample, beyond the hold, in s.
         spring: Stiffness k in N/m (N m/rad) that would explain the rest: a hand, a cable.
-        drag: Drag b_2 in N s²/m² (N m s²/rad²), a resistance b_2 v |v| beside b v, as of air or oil.
-            It is part of the law where its interval leaves zero out.
+        drag: Drag b_2 in N s²/m² (N m s²/rad²): a resistance b_2 v |v| beside b v, as of oil. It is
+            part of the law where its interval leaves zero out.
         drag_speed: Speed v in m/s (rad/s) at which ``damping`` is taken, as (b v + b_2 v |v|)/v, so
             that it is the least at any speed that was seen: 0, or the largest where b_2 < 0.
         lost_gain: Share of the force above half of the largest that did not act, without unit: 0
             for a good motor, 1 for one that saturates there.
-        unexplained: RMS of the force that the law does not explain, in N (N m).
+        unexplained: RMS of the force that neither the law nor the noise and rounding of the
+            position explain, in N (N m).
         force: RMS of the force that was applied, in N (N m).
         window: Length of the windows used, in s.
         count: How many there were.

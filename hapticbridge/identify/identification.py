@@ -1,8 +1,12 @@
-"""Everything that a minute of small motions tells of a device, or why it tells nothing."""
+"""Everything that a minute of small motions tells of a device, or why it tells nothing.
+
+What no motion tells: who damps. A hand, a glove or a cable that only damps, without stiffness and
+without moving by itself, adds its damping to b in the equation of motion, where nothing sets the
+two apart. Such a b is too large, which is the unsafe side; ``UNHELD`` says so wherever b is told.
+"""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -17,8 +21,14 @@ from hapticbridge.identify.estimate import Estimate
 from hapticbridge.identify.excitation import stretch
 from hapticbridge.identify.experiment import Allowance, AxisRun, move_axis
 from hapticbridge.identify.fit import fit_axis
+from hapticbridge.identify.resolution import step_of
 
 Array = NDArray[np.float64]
+
+UNHELD = (
+    "that nobody held it is the user's word: a hand that only damps cannot be told from the device"
+)
+"""Goes with every b that was measured."""
 
 DURATION = 12.0
 """Seconds per axis: eight swings of the slowest tone. The half-widths fall with its square root."""
@@ -46,9 +56,6 @@ PRECISION = 0.2
 
 MOST_STALE = 0.5
 """Share of ticks without a new sample beyond which the loop runs too fast for the device."""
-
-MOST_STEPS = 2_000_000
-"""Step of resolution below travel/MOST_STEPS is none: rounding of a double, or of a float."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -219,29 +226,3 @@ def _resolution(info: DeviceInfo, runs: dict[str, AxisRun]) -> float | None:
         return None
     # joint encoders make no even steps in space; a driver then knows better
     return max(found) or info.resolution or 0.0
-
-
-def step_of(position: Array) -> float:
-    """Returns the step of a reported position, 0 where it has none.
-
-    All differences between positions that occur must be multiples of it. It is found as the
-    smallest difference, and made exact by all of them: Σ n d / Σ n² over the differences d = n Δ.
-
-    Args:
-        position: In m, NaN where there is none.
-    """
-    values = np.unique(position[np.isfinite(position)])
-    if len(values) < 3:
-        return 0.0
-    gaps = np.diff(values)
-    span = float(values[-1] - values[0])
-    gaps = gaps[gaps > span / MOST_STEPS]  # equal numbers, reached by different roundings
-    if not gaps.size:
-        return 0.0
-    step = float(gaps.min())
-    counts = np.rint(gaps / step)
-    if np.abs(gaps / step - counts).max() > 0.02 or len(gaps) < 3:
-        return 0.0
-    step = float(counts @ gaps / (counts @ counts))
-    total = round(span / step)
-    return span / total if math.isclose(span / total, step, rel_tol=1e-3) else 0.0

@@ -21,7 +21,7 @@ def draw_identification(result: Identification) -> Figure:
     """Draws, for each axis, the force that neither its mass nor a constant takes, over the speed.
 
     Each point is one window: F − M x'' − c against x'. A device that obeys the law lies on the
-    line b x' + f_c sign(x').
+    line b x' + b_2 x' |x'| + f_c sign(x'); b_2 is there where it was seen.
 
     Args:
         result: What ``identify`` returned.
@@ -39,8 +39,10 @@ def draw_identification(result: Identification) -> Figure:
         panel.set_ylabel("torque F − M x'' − c (N m)" if turns else "force F − M x'' − c (N)")
         panel.grid(alpha=0.3)
         panel.legend(fontsize="small", loc="upper left")
+    bends = any(fit.drag.is_seen for fit in result.fits.values())
+    law = f"b v + {'b_2 v |v| + ' if bends else ''}f_c sign(v)"
     figure.suptitle(
-        f"What resists {result.info.name}: points measured, lines b v + f_c sign(v)",
+        f"What resists {result.info.name}: points measured, lines {law}",
         fontsize="medium",
         parse_math=False,
     )
@@ -58,7 +60,7 @@ def _draw_axis(panel: Axes, result: Identification, axis: str, fit: AxisFit) -> 
     panel.plot(speed, rest, ".", color=colour, ms=3, zorder=3)
     most = float(np.abs(speed).max())
     line = np.linspace(-most, most, 400)
-    force = fit.damping.value * line + fit.friction.value * np.sign(line)
+    force = fit.resistance(line)
     units = ("N m s/rad", "N m") if turns else ("N s/m", "N")
     panel.plot(
         line,

@@ -17,6 +17,7 @@ order in T, telescopes to nothing because x and x' are continuous: what is left 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -55,8 +56,8 @@ _SURE = 2.0
 """Times the RMS of the difference of two means by which it must differ from zero."""
 
 LEAST_STEPS = 6
-"""Steps of resolution that a window must cross. Below, the rounding of the position is no longer
-small beside the motion."""
+"""Steps of resolution (of noise: √12 times its RMS, as if it were the rounding to such steps) that
+a window must cross. Below, the rounding of the position is no longer small beside the motion."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,10 +70,11 @@ class Windows:
         begin: First sample of each window, shape (n,).
         position: ∫φ x, in m s, shape (n,): the column of a spring.
         drag: ∫φ x' |x'|, in m²/s, shape (n,): the column of a drag that grows with speed squared.
-        noise_share: Of the squares of the columns of M and b, whichever is more, what the noise and
-            the rounding of the position make: by so much least squares make a number too small.
         excess: ∫φ e(t − d), in N s, where e is what F exceeds half of its largest distance from its
             median by, shape (n,): the column of a motor that gives less than it is told.
+        noise_share: Of the squares of the columns of M and b, whichever is more, what the noise and
+            the rounding of the position make: by so much least squares make a number too small.
+        mass_noise: RMS of what they make of the column of M, in m/s.
     """
 
     columns: Array
@@ -80,8 +82,9 @@ class Windows:
     begin: NDArray[np.int64]
     position: Array
     drag: Array
-    noise_share: float
     excess: Array
+    noise_share: float
+    mass_noise: float
 
 
 def windows(
@@ -129,7 +132,8 @@ def windows(
         np.lib.stride_tricks.sliding_window_view(values, count + held)[begin - held]
         for values in (force, excess)
     )
-    direction = _direction(x, resolution, noise)
+    trembling = math.sqrt(noise**2 + resolution**2 / 12.0)
+    direction = _direction(x, trembling)
     moves = direction != 0.0
     x, f, e = x[moves], f[moves], e[moves]
     begin, direction = begin[moves], direction[moves]
@@ -147,21 +151,16 @@ def windows(
     )
     bump = _BUMP(nodes) * trapezoid
     absolute = position[begin] * area + x @ bump
-    square = noise**2 + resolution**2 / 12.0
-    share = (
-        max(
-            square * float(weights @ weights) / max(float(np.mean(column**2)), 1e-300)
-            for column, weights in ((columns[:, 0], of_mass), (columns[:, 1], of_damping))
-        )
-        if len(begin)
-        else 0.0
-    )
+    # what noise and rounding make of the two columns, RMS
+    made = trembling * np.linalg.norm([of_mass, of_damping], axis=1)
+    squares = np.mean(columns[:, :2] ** 2, axis=0) if len(begin) else np.ones(2)
+    share = float(np.max(made**2 / np.maximum(squares, 1e-300)))
     # speed over a span between samples, which lies in the span's middle
     span = max(count // _SPANS, 1)
     speed = (x[:, span:] - x[:, :-span]) / (span * period)
     middle = (np.arange(count + 1 - span) + 0.5 * span) / count
     drag = (speed * np.abs(speed)) @ (_BUMP(middle) * period)
-    return Windows(columns, f @ weight, begin, absolute, drag, share, e @ weight)
+    return Windows(columns, f @ weight, begin, absolute, drag, e @ weight, share, float(made[0]))
 
 
 def noise_of(position: Array, resolution: float) -> float:
@@ -182,23 +181,16 @@ def noise_of(position: Array, resolution: float) -> float:
     return noise if noise > _ROUNDING * resolution + 1e-9 else 0.0
 
 
-def _direction(x: Array, resolution: float, noise: float) -> Array:
+def _direction(x: Array, trembling: float) -> Array:
     """Returns ±1 where a window keeps moving one way, 0 where it does not.
 
-    Every step must go that way; where noise makes steps back, the mean of each part must, by more
-    than noise would move it.
+    The mean of each of its parts must go that way, by more than noise and rounding would move it:
+    single steps may go back, as they do where joints with encoders make a position in space.
     """
-    steps = np.diff(x, axis=1)
-    edges = np.linspace(0, steps.shape[1], _PARTS + 1).astype(np.int64)
-    is_long = np.abs(x[:, -1] - x[:, 0]) >= LEAST_STEPS * max(resolution, np.sqrt(12.0) * noise)
-    if noise > 0.0:
-        lengths = np.diff(edges)
-        means = np.add.reduceat(x[:, :-1], edges[:-1], axis=1) / lengths
-        margin = _SURE * noise * np.sqrt(2.0 / lengths.min())
-        up = (np.diff(means, axis=1) > margin).all(axis=1)
-        down = (np.diff(means, axis=1) < -margin).all(axis=1)
-    else:
-        travelled = np.add.reduceat(steps, edges[:-1], axis=1)
-        up = (steps >= 0.0).all(axis=1) & (travelled > 0.0).all(axis=1)
-        down = (steps <= 0.0).all(axis=1) & (travelled < 0.0).all(axis=1)
+    edges = np.linspace(0, x.shape[1], _PARTS + 1).astype(np.int64)
+    lengths = np.diff(edges)
+    steps = np.diff(np.add.reduceat(x, edges[:-1], axis=1) / lengths, axis=1)
+    margin = _SURE * trembling * np.sqrt(2.0 / lengths.min())
+    is_long = np.abs(x[:, -1] - x[:, 0]) >= LEAST_STEPS * np.sqrt(12.0) * trembling
+    up, down = (steps > margin).all(axis=1), (steps < -margin).all(axis=1)
     return np.where(is_long, up.astype(np.float64) - down.astype(np.float64), 0.0)
