@@ -33,8 +33,8 @@ LEAST_WINDOWS = 60
 """Five in each of ``BLOCKS``: fewer say nothing of how much they differ."""
 
 MOST_NOISE = 0.005
-"""Largest ``noise_share`` that is worth a result. Below, all intervals grow by what it takes from the
-applied force. With 0.03, one good motor in thirty was taken for a saturated one."""
+"""Largest ``noise_share`` that is worth a result. Below, all intervals grow by what it takes from
+the applied force. With 0.03, one good motor in thirty was taken for a saturated one."""
 
 DELAY_ERROR = 1e-5
 """Half-width in s that is added to every delay, for the same reason: a hundredth of a tick."""

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 
 from hapticbridge.identify.axis_fit import AxisFit
 from hapticbridge.identify.identification import Identification
-from hapticbridge.identify.weak_form import windows
+from hapticbridge.identify.weak_form import noise_of, windows
 from hapticbridge.picture import new_figure
 
 _COLOURS = {"x": "#a51d2d", "y": "#1b7837", "z": "#1a5fb4"}
@@ -53,7 +53,8 @@ def _draw_axis(panel: Axes, result: Identification, axis: str, fit: AxisFit) -> 
     run, colour = result.runs[axis], _COLOURS[axis[-1]]
     turns = len(axis) == 2
     step = 0.0 if turns else result.resolution or 0.0
-    found = windows(run.position, run.force, run.period, fit.window, step, fit.delay.value)
+    noise = noise_of(run.position, step)
+    found = windows(run.position, run.force, run.period, fit.window, step, fit.delay.value, noise)
     area = found.columns[:, 3]
     speed = found.columns[:, 1] / area
     rest = found.right / area - fit.mass.value * found.columns[:, 0] / area - fit.offset.value
