@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from hapticbridge.coupling import Coupling
-from hapticbridge.device.motion import Motion
+from hapticbridge.device.trajectory.motion import Motion
 from hapticbridge.errors import StudyError
 from hapticbridge.mechanics import exact_mass_response
 from hapticbridge.study.engines import Body, Engine, Shape, Simulation, Task, open_engine

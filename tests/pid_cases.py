@@ -9,7 +9,7 @@ from emulated.pid_layouts import ODD, USUAL, Report
 from emulated.pid_model import PidStick
 
 from hapticbridge.device import SimulatedDevice
-from hapticbridge.device.pid import PidDevice, open_pid
+from hapticbridge.device.pid.driver import PidDevice, open_pid
 from hapticbridge.device.plugged import tell_nobody
 
 PERIOD = 1e-3

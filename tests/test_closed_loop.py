@@ -15,7 +15,7 @@ from hapticbridge.certificate import default_coupling, device_conditions, is_cer
 from hapticbridge.clock import SimulatedClock
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Hand, Motion, SimulatedDevice, random_hand
-from hapticbridge.device.hand import HAND_RANGES
+from hapticbridge.device.simulated.hand import HAND_RANGES
 from hapticbridge.errors import DeviceError, StudyError
 from hapticbridge.guard import Limits
 from hapticbridge.passivity import SampledLoop, WorstHand, minimum_damping

@@ -34,10 +34,10 @@ from hapticbridge.device import (
     SimulatedDevice,
     open_device,
 )
-from hapticbridge.device.pid import open_pid
+from hapticbridge.device.pid.driver import open_pid
 from hapticbridge.device.plugged import tell_nobody
-from hapticbridge.device.rawhid import open_rawhid
-from hapticbridge.device.spacemouse import open_spacemouse
+from hapticbridge.device.rawhid.finding import open_rawhid
+from hapticbridge.device.spacemouse.driver import open_spacemouse
 from hapticbridge.errors import DeviceError
 from hapticbridge.tick import SAMPLE_DTYPE, TICK_DTYPE
 

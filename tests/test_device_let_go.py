@@ -7,7 +7,8 @@ from dataclasses import replace
 import pytest
 from cli_cases import Called
 
-from hapticbridge import bridge
+from hapticbridge import arrangement
+from hapticbridge.bridge import Bridge
 from hapticbridge.cli import run
 from hapticbridge.device import SimulatedDevice, library
 from hapticbridge.device.families import FAMILIES
@@ -40,14 +41,14 @@ def test_a_bridge_that_is_refused_lets_go_of_what_it_opened_and_of_nothing_else(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     opened, own = Counted(), Counted()
-    monkeypatch.setattr(bridge, "device_for", lambda *_: opened)
+    monkeypatch.setattr(arrangement, "device_for", lambda *_: opened)
     limits = Limits(force=1e6, torque=1.0)
     with pytest.raises(DeviceError, match="force limit"):
-        bridge.Bridge("point_mass", "falcon", limits=limits)
+        Bridge("point_mass", "falcon", limits=limits)
     with pytest.raises(DeviceError, match="force limit"):
-        bridge.Bridge("point_mass", own, limits=limits)
+        Bridge("point_mass", own, limits=limits)
     assert (opened.closed, own.closed) == (1, 0)
-    assert bridge.Bridge("point_mass", "falcon").device is opened
+    assert Bridge("point_mass", "falcon").device is opened
     assert opened.closed == 1
 
 

@@ -13,7 +13,7 @@ from scipy.integrate import quad, solve_ivp
 from scipy.spatial.transform import Rotation
 
 from hapticbridge.device import Hand, Motion, SimulatedDevice
-from hapticbridge.device.motion import lissajous
+from hapticbridge.device.trajectory.motion import lissajous
 from hapticbridge.errors import DeviceError
 from hapticbridge.tick import SAMPLE_DTYPE
 

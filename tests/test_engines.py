@@ -23,7 +23,7 @@ from engine_tasks import (
 from scipy.spatial.transform import Rotation
 
 from hapticbridge.coupling import Coupling
-from hapticbridge.device.motion import Motion
+from hapticbridge.device.trajectory.motion import Motion
 from hapticbridge.errors import StudyError
 from hapticbridge.mechanics import drive_mass, integrate_rotation
 from hapticbridge.mechanics.coupled_mass import CoupledScheme

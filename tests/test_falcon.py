@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from hapticbridge.audit import audit
 from hapticbridge.bridge import Bridge
 from hapticbridge.device import SimulatedDevice, device_for
-from hapticbridge.device.falcon import FalconDevice
+from hapticbridge.device.falcon.driver import FalconDevice
 from hapticbridge.errors import DeviceError, DeviceLost, SafetyTrip
 from hapticbridge.recording import read_recording
 from hapticbridge.scene import load_scene

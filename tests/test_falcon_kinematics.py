@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from hapticbridge.device.falcon_kinematics import (
+from hapticbridge.device.falcon.kinematics import (
     FARTHEST,
     LARGEST_RADIUS,
     LEG_ANGLES,
@@ -21,7 +21,7 @@ from hapticbridge.device.falcon_kinematics import (
     forward,
     inverse,
 )
-from hapticbridge.device.falcon_statics import jacobian, thigh_torques
+from hapticbridge.device.falcon.statics import jacobian, thigh_torques
 
 COMPILES = settings(deadline=None)
 """The first example of a law may have to compile what it is about."""

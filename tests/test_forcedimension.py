@@ -13,11 +13,13 @@ import numpy as np
 import pytest
 from emulated.dhd_stub import CALL, OMEGA3, OMEGA6, SIGMA7, Stub
 
-from hapticbridge.device import forcedimension, open_device, usb_search
-from hapticbridge.device.dhd_library import VARIABLE, Dhd
-from hapticbridge.device.dhd_models import MODELS, quaternion_of
-from hapticbridge.device.forcedimension_device import ForceDimensionDevice
+from hapticbridge.device import open_device
+from hapticbridge.device.forcedimension import finding as forcedimension
+from hapticbridge.device.forcedimension.driver import ForceDimensionDevice
+from hapticbridge.device.forcedimension.library import VARIABLE, Dhd
+from hapticbridge.device.forcedimension.models import MODELS, quaternion_of
 from hapticbridge.device.plugged import Plugged
+from hapticbridge.device.transport import usb_search
 from hapticbridge.errors import DeviceError, DeviceLost
 from hapticbridge.pose import quaternion_log
 from hapticbridge.tick import SAMPLE_DTYPE, TickFlag
@@ -289,7 +291,7 @@ def test_the_library_is_named_by_option_variable_or_found(
     monkeypatch.setattr(ctypes.util, "find_library", lambda name: stub.file)
     assert stub.file in forcedimension.medium()
     monkeypatch.setattr(ctypes.util, "find_library", lambda name: None)
-    monkeypatch.setattr("hapticbridge.device.dhd_library.NAMES", {})
+    monkeypatch.setattr("hapticbridge.device.forcedimension.library.NAMES", {})
     assert "was not found: install the SDK of forcedimension.com" in forcedimension.medium()
     with pytest.raises(DeviceError, match="name its file with library=FILE"):
         open_device("forcedimension")

@@ -14,10 +14,11 @@ from haply_cases import PERIOD, Bench
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hapticbridge.device import SimulatedDevice, haply, open_device, silence
-from hapticbridge.device import haply_messages as messages
-from hapticbridge.device import transport_websocket as transport
-from hapticbridge.device.haply_device import FORCE_LIMIT, MOST_UNDER_WAY, HaplyDevice
+from hapticbridge.device import SimulatedDevice, open_device, silence
+from hapticbridge.device.haply import finding as haply
+from hapticbridge.device.haply import messages
+from hapticbridge.device.haply.driver import FORCE_LIMIT, MOST_UNDER_WAY, HaplyDevice
+from hapticbridge.device.transport import websocket as transport
 from hapticbridge.errors import DeviceError, DeviceLost
 from hapticbridge.tick import SAMPLE_DTYPE, TickFlag
 

@@ -9,14 +9,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pid_cases import LAYOUTS, MOUSE
 
-from hapticbridge.device.hid_descriptor import (
+from hapticbridge.device.transport.hid_descriptor import (
     FEATURE,
     INPUT,
     LONGEST_DESCRIPTOR,
     OUTPUT,
     fields_of,
 )
-from hapticbridge.device.hid_layout import Layout, element, place_of
+from hapticbridge.device.transport.hid_layout import Layout, element, place_of
 from hapticbridge.errors import DeviceError
 
 KINDS = {IN: INPUT, OUT: OUTPUT, MODEL_FEATURE: FEATURE}

@@ -34,9 +34,9 @@ class Dragged(SimulatedDevice):
         self.random = np.random.default_rng(1)
         self.has_begun = False
 
-    def start(self, period: float) -> NDArray[np.void]:
+    def start(self, period: float, parts: int = 1) -> NDArray[np.void]:
         self.period = period
-        return super().start(period)
+        return super().start(period, parts)
 
     def read(self, sample: NDArray[np.void]) -> int:
         if self.has_begun:

@@ -17,7 +17,7 @@ ORDER = (
     ("ledger", "inputs", "device"),
     ("guard", "recording", "certificate", "felt"),
     ("provenance", "summary", "workspace", "realtime"),
-    ("bridge", "audit", "identify", "compare", "export"),
+    ("arrangement", "opened", "bridge", "audit", "identify", "compare", "export"),
     ("report", "film", "view", "study", "check", "doctor"),
     ("whatif",),  # runs the bridge and asks the audit, which must not know of either
     ("cli",),

@@ -11,10 +11,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pid_cases import LAYOUTS, NEWTONS, PERIOD, SCALE, TRAVEL, opened
 
-import hapticbridge.device.pid_sheet as sheet
 from hapticbridge.device import SimulatedDevice, open_device
-from hapticbridge.device.pid import PidDevice, open_pid
-from hapticbridge.device.pid_effects import LIFE, RESTART
+from hapticbridge.device.pid import sheet
+from hapticbridge.device.pid.driver import PidDevice, open_pid
+from hapticbridge.device.pid.effects import LIFE, RESTART
 from hapticbridge.device.plugged import tell_nobody
 from hapticbridge.device.profile import Profile, Quantity
 from hapticbridge.errors import DeviceError, DeviceLost

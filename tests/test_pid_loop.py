@@ -12,9 +12,9 @@ from emulated.planar_hand import planar_hand
 from pid_cases import LAYOUTS, NEWTONS, PERIOD, TRAVEL, opened
 
 import hapticbridge as hb
-import hapticbridge.device.pid_sheet as sheet
 from hapticbridge.device import SimulatedDevice
-from hapticbridge.device.pid import open_pid
+from hapticbridge.device.pid import sheet
+from hapticbridge.device.pid.driver import open_pid
 from hapticbridge.device.plugged import tell_nobody
 from hapticbridge.device.profile import read_profile
 from hapticbridge.errors import SafetyTrip

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hapticbridge.device import SimulatedDevice
-from hapticbridge.device.dhd_models import MODELS
+from hapticbridge.device.forcedimension.models import MODELS
 from hapticbridge.device.profile import (
     LOWER_END,
     SHIPPED,

@@ -13,8 +13,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-import hapticbridge.device.rawhid as driver
-from hapticbridge.device.rawhid_frame import (
+from hapticbridge.device.rawhid import driver
+from hapticbridge.device.rawhid.frame import (
     Numbers,
     State,
     Status,
@@ -24,7 +24,7 @@ from hapticbridge.device.rawhid_frame import (
     force_frame,
 )
 
-FIRMWARE = Path(driver.__file__).with_name("rawhid_firmware")
+FIRMWARE = Path(driver.__file__).with_name("firmware")
 SHIM = Path(__file__).with_name("rawhid_firmware_shim.cpp")
 COMPILER = shutil.which("g++") or shutil.which("clang++")
 WRENCH = (1.0, -0.5, 0.25, 0.01, -0.02, 0.03)

@@ -11,9 +11,9 @@ from emulated.rawhid_model import crc
 from hypothesis import given
 from hypothesis import strategies as st
 
-import hapticbridge.device.rawhid as driver
 from hapticbridge.device.base import AXES
-from hapticbridge.device.rawhid_frame import (
+from hapticbridge.device.rawhid import driver
+from hapticbridge.device.rawhid.frame import (
     FRAME_BYTES,
     Numbers,
     State,
@@ -27,7 +27,7 @@ from hapticbridge.device.rawhid_frame import (
     version_of,
 )
 
-DOCUMENT = Path(driver.__file__).with_suffix(".md").read_text(encoding="utf-8")
+DOCUMENT = Path(driver.__file__).parents[1].joinpath("rawhid.md").read_text(encoding="utf-8")
 NAN = math.nan
 
 single = st.floats(-(2.0**99), 2.0**99, width=32)

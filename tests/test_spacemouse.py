@@ -20,8 +20,8 @@ from scipy.spatial.transform import Rotation
 import hapticbridge as hb
 from hapticbridge.device import families
 from hapticbridge.device.plugged import Tell, tell_nobody
-from hapticbridge.device.spacemouse import FAMILY, HELD, SpaceMouseDevice, open_spacemouse
-from hapticbridge.device.spacemouse_reports import Buttons, Deflection, decoded, share
+from hapticbridge.device.spacemouse.driver import FAMILY, HELD, SpaceMouseDevice, open_spacemouse
+from hapticbridge.device.spacemouse.reports import Buttons, Deflection, decoded, share
 from hapticbridge.errors import DeviceError, DeviceLost, SafetyTrip
 from hapticbridge.tick import SAMPLE_DTYPE
 

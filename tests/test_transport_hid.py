@@ -13,12 +13,13 @@ from emulated.hid_seam import HidSeam
 from emulated.spacemouse_model import SpaceMouse
 from emulated.usb_device import StallError
 
-from hapticbridge.device import hid_search, transport_hid
-from hapticbridge.device.hex_log import VARIABLE, HexLog
-from hapticbridge.device.hid_search import HidApi, find
 from hapticbridge.device.plugged import Family, Plugged, UsbId
-from hapticbridge.device.rawhid import open_rawhid
-from hapticbridge.device.transport_hid import QUEUE, HidLink
+from hapticbridge.device.rawhid.finding import open_rawhid
+from hapticbridge.device.transport import hid as transport_hid
+from hapticbridge.device.transport import hid_search
+from hapticbridge.device.transport.hex_log import VARIABLE, HexLog
+from hapticbridge.device.transport.hid import QUEUE, HidLink
+from hapticbridge.device.transport.hid_search import HidApi, find
 from hapticbridge.errors import DeviceError, DeviceLost
 
 ECHO = Family(
@@ -258,7 +259,7 @@ def test_the_log_holds_what_went_over_the_wire(
 def test_a_log_that_is_full_keeps_the_newest_and_says_what_it_dropped(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("hapticbridge.device.hex_log.MOST_LINES", 2)
+    monkeypatch.setattr("hapticbridge.device.transport.hex_log.MOST_LINES", 2)
     log = HexLog(tmp_path / "wire.log")
     for i in range(5):
         log.add(">", bytes([i]))

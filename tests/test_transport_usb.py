@@ -18,13 +18,13 @@ from emulated.handle import Handle
 from emulated.pyusb_backend import PyusbBackend
 
 from hapticbridge.device import SimulatedDevice
-from hapticbridge.device.falcon import FAMILY, FalconDevice, open_falcon
-from hapticbridge.device.falcon_boot import READ_FROM, WRITE_TO, enter_run_mode
-from hapticbridge.device.falcon_packets import SIZE, encode
-from hapticbridge.device.hex_log import HexLog
+from hapticbridge.device.falcon.boot import READ_FROM, WRITE_TO, enter_run_mode
+from hapticbridge.device.falcon.driver import FAMILY, FalconDevice, open_falcon
+from hapticbridge.device.falcon.packets import SIZE, encode
 from hapticbridge.device.plugged import tell_nobody
-from hapticbridge.device.transport_usb import UsbLink
-from hapticbridge.device.usb_search import find, libusb
+from hapticbridge.device.transport.hex_log import HexLog
+from hapticbridge.device.transport.usb import UsbLink
+from hapticbridge.device.transport.usb_search import find, libusb
 from hapticbridge.errors import DeviceError, DeviceLost
 from hapticbridge.tick import SAMPLE_DTYPE
 
@@ -206,7 +206,7 @@ def test_packets_come_whole_and_as_they_are(opened: Open) -> None:
 def test_packets_that_nobody_takes_are_bounded(
     opened: Open, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("hapticbridge.device.transport_usb.MOST_PACKETS", 3)
+    monkeypatch.setattr("hapticbridge.device.transport.usb.MOST_PACKETS", 3)
     link = opened(Host(falcon()))
     enter_run_mode(link)
     time.sleep(0.1)  # the bridge reports its status every millisecond

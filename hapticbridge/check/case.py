@@ -18,7 +18,7 @@ from hapticbridge.check.observation import Observation, observe, quiet
 from hapticbridge.check.places import Places
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo, Motion, SimulatedDevice
-from hapticbridge.device.motion import lissajous
+from hapticbridge.device.trajectory.motion import lissajous
 from hapticbridge.errors import DeviceError, SceneError
 from hapticbridge.rendering import default_method
 from hapticbridge.scene import Scene, SceneSource, compile_scene

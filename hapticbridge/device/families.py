@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from hapticbridge.device import hid_search, usb_search
-from hapticbridge.device.falcon import FAMILY as FALCON
-from hapticbridge.device.forcedimension import FAMILY as FORCE_DIMENSION
-from hapticbridge.device.haply import FAMILY as HAPLY
-from hapticbridge.device.pid import FAMILY as PID
+from hapticbridge.device.falcon.driver import FAMILY as FALCON
+from hapticbridge.device.forcedimension.finding import FAMILY as FORCE_DIMENSION
+from hapticbridge.device.haply.finding import FAMILY as HAPLY
+from hapticbridge.device.pid.driver import FAMILY as PID
 from hapticbridge.device.plugged import Family, Plugged, UsbId
-from hapticbridge.device.rawhid import FAMILY as RAWHID
-from hapticbridge.device.spacemouse import FAMILY as SPACEMOUSE
+from hapticbridge.device.rawhid.finding import FAMILY as RAWHID
+from hapticbridge.device.spacemouse.driver import FAMILY as SPACEMOUSE
+from hapticbridge.device.transport import hid_search, usb_search
 
 FAMILIES: tuple[Family, ...] = (FALCON, SPACEMOUSE, RAWHID, PID, HAPLY, FORCE_DIMENSION)
 """In the order in which they are listed."""

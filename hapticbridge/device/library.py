@@ -10,14 +10,14 @@ from typing import Any
 
 from hapticbridge.device.base import Device
 from hapticbridge.device.families import FAMILIES, family_named
-from hapticbridge.device.hand import Hand
-from hapticbridge.device.motion_csv import read_motion
 from hapticbridge.device.plugged import Tell, tell_nobody
 from hapticbridge.device.profile import modelled, profile_named, profile_of
-from hapticbridge.device.scene_hand import scene_hand
-from hapticbridge.device.simulated import SimulatedDevice
+from hapticbridge.device.simulated.driver import SimulatedDevice
+from hapticbridge.device.simulated.hand import Hand
+from hapticbridge.device.simulated.scene_hand import scene_hand
 from hapticbridge.device.specification import parsed, refuse_unknown
-from hapticbridge.device.trajectory import ReplayDevice, TrajectoryDevice
+from hapticbridge.device.trajectory.driver import ReplayDevice, TrajectoryDevice
+from hapticbridge.device.trajectory.motion_csv import read_motion
 from hapticbridge.errors import DeviceError, choices
 from hapticbridge.scene import Scene
 

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from hapticbridge.arguments import Arguments
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import SimulatedDevice
-from hapticbridge.device.handheld import STATE_DTYPE as DEVICE_DTYPE
-from hapticbridge.device.handheld import next_sample
+from hapticbridge.device.simulated.handheld import STATE_DTYPE as DEVICE_DTYPE
+from hapticbridge.device.simulated.handheld import next_sample
 from hapticbridge.errors import StudyError
 from hapticbridge.jit import compiled_for_threads, direct
 from hapticbridge.kernel.layout import STATE_DTYPE

@@ -16,8 +16,8 @@ from scipy.spatial.transform import Rotation
 
 from hapticbridge.device import AXES, DeviceInfo, Hand, Motion
 from hapticbridge.device.lateness import delay_ticks
-from hapticbridge.device.simulated import SimulatedDevice
-from hapticbridge.device.trajectory import ReplayDevice, TrajectoryDevice
+from hapticbridge.device.simulated.driver import SimulatedDevice
+from hapticbridge.device.trajectory.driver import ReplayDevice, TrajectoryDevice
 from hapticbridge.tick import SAMPLE_DTYPE
 from hapticbridge.whatif.intent import intended
 

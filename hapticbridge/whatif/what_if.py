@@ -15,7 +15,7 @@ from hapticbridge.audit import AuditReport, audit
 from hapticbridge.bridge import Bridge
 from hapticbridge.clock import SimulatedClock
 from hapticbridge.device import Device
-from hapticbridge.device.scene_hand import scene_hand
+from hapticbridge.device.simulated.scene_hand import scene_hand
 from hapticbridge.errors import RecordingError, SafetyTrip
 from hapticbridge.recording import read_recording
 from hapticbridge.whatif.changes import UNITS, Settings, Value

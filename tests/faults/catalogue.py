@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from faults.rig import CAUSE, PERIOD, PRESS, STALE, Outcome, Rig
 from hapticbridge.bridge import Bridge
 from hapticbridge.coupling import Coupling
-from hapticbridge.device.hand import DEFAULT_HAND, Hand
+from hapticbridge.device.simulated.hand import DEFAULT_HAND, Hand
 from hapticbridge.errors import DeviceError, DeviceLost
 from hapticbridge.passivity import WorstHand
 

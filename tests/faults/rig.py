@@ -16,7 +16,7 @@ from hapticbridge.bridge import Bridge
 from hapticbridge.clock import SimulatedClock
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import SimulatedDevice
-from hapticbridge.device.motion import Motion
+from hapticbridge.device.trajectory.motion import Motion
 from hapticbridge.errors import HapticBridgeError
 from hapticbridge.guard import Limits
 from hapticbridge.recording import read_recording

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from hapticbridge.check.motion import motion_for
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Motion
-from hapticbridge.device.motion import pose_at
+from hapticbridge.device.trajectory.motion import pose_at
 from hapticbridge.errors import StudyError
 from hapticbridge.kernel.step import simulate
 from hapticbridge.rendering import IMPLICIT

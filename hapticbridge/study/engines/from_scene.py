@@ -7,7 +7,7 @@ import numpy as np
 
 from hapticbridge.arguments import Array
 from hapticbridge.coupling import Coupling
-from hapticbridge.device.motion import Motion
+from hapticbridge.device.trajectory.motion import Motion
 from hapticbridge.errors import StudyError
 from hapticbridge.kernel.state import COUPLING_ACTUATORS
 from hapticbridge.pose import add, canonical, cross, product, rotated, subtract

@@ -1,0 +1,184 @@
+"""What a run is made of: device, scene, coupling, method, guard, checked against each other."""
+
+from __future__ import annotations
+
+from collections import deque
+from contextlib import ExitStack
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from hapticbridge.certificate import default_coupling, needed_on_axes
+from hapticbridge.clock import Clock, RealClock, period_of
+from hapticbridge.coupling import Coupling
+from hapticbridge.device import Device, device_for
+from hapticbridge.guard import Limits, guarding_for, limits_for, refuse_simulated_time
+from hapticbridge.inputs import Write
+from hapticbridge.kernel.parameters import checked_substeps, refuse_substeps
+from hapticbridge.realtime import wants_real_time
+from hapticbridge.recording.stream import Onlooker
+from hapticbridge.rendering import (
+    contact_stiffness_of,
+    default_method,
+    method_named,
+    refuse_unknowing,
+)
+from hapticbridge.scene import Scene, load_scene
+from hapticbridge.tick import SAMPLE_DTYPE
+from hapticbridge.workspace import Workspace
+
+
+class Arrangement:
+    """What a run is made of, chosen where it was left open and refused where it cannot be.
+
+    A device that it opened itself is let go if something else is refused.
+
+    Attributes:
+        scene: The loaded scene.
+        device: The device, open but not started.
+        coupling: K and B that should be felt.
+        method: How the tool is rendered.
+        clock: What gives the ticks their time.
+        period: T in s.
+    """
+
+    def __init__(
+        self,
+        scene: Scene | str | Path,
+        device: Device | str = "simulated",
+        coupling: Coupling | None = None,
+        *,
+        rate: float = 1000.0,
+        substeps: int = 1,
+        method: str | None = None,
+        contact_stiffness: float | None = None,
+        i_know: bool = False,
+        recording: str | Path | None = None,
+        clock: Clock | None = None,
+        scale: float = 1.0,
+        force_scale: float | None = None,
+        axes: ArrayLike | None = None,
+        absolute: bool = False,
+        limits: Limits | None = None,
+        controller: str | None = None,
+        clutch: int | None = None,
+        dead_man: int | None = None,
+        live: bool = False,
+        onlooker: Onlooker | None = None,
+        pipelined: bool | None = None,
+        realtime: bool | None = None,
+    ) -> None:
+        """Checks everything that can be checked before the device is started.
+
+        Args:
+            scene: A loaded scene, a name, or a path to MJCF.
+            device: A device, or what ``open_device`` understands.
+            coupling: K and B that should be felt; None chooses the stiffest safe one for the
+                device's damping (80 % of the bound, a quarter of b used as damping, less where
+                substeps need it; for a device of unknown damping, that of the default simulated
+                one).
+            rate: Ticks per second, 1 to 1e6.
+            substeps: MuJoCo steps per tick, 1 to 100. With more than one the mean of their wrenches
+                is sent, and the device needs another damping: ``certificate.needed_damping``.
+            method: How the tool is rendered; see ``rendering.METHODS``. None: ``lossless``, or with
+                substeps, which that does not take, ``implicit``.
+            contact_stiffness: K_c in N/m of method ``direct``; None takes the coupling's stiffness.
+            i_know: Accept a method that may kick (``Method.hazard``) on a real device.
+            recording: File to write (``.mcap``), or None; an existing file is replaced.
+            clock: ``RealClock()`` by default; ``SimulatedClock()`` runs as fast as it goes.
+            scale: Handle motion per device motion.
+            force_scale: Force on the device per force on the tool; None takes ``scale``, which
+                keeps power equal on both sides.
+            axes: 3 × 3 rotation from the device's frame to the scene's.
+            absolute: Take the device's poses as poses in the scene instead of relative to its
+                start.
+            limits: Limits on the wrench, within the device's own; None takes these.
+            controller: Passivity controller: ``damper``, ``tank`` or ``off``. It acts where the
+                device was given more than its damping burns and the scene gives up. None:
+                ``damper`` where the device condition does not hold, else ``off``.
+            clutch: Number of the device's button, from 0, that lets it move without the handle.
+            dead_man: Number of the button that must be held for any force.
+            live: Draw a status line on stderr, from the recorder's process.
+            onlooker: Who looks at the run from another process, as ``view.Window`` does; it is
+                started when the bridge is entered and closed when it is left.
+            pipelined: Compute what needs no new sample once the wrench is out, where scene and
+                method let it (``kernel.ahead``): the same numbers to the bit, the wrench sooner,
+                the whole tick 5 % longer. Between two ticks ``scene.data`` then holds the contacts
+                of the new positions, without forces. None: in real time, where a device waits.
+            realtime: Ask the system for real time while the loop runs (``realtime.real_time``);
+                what it refuses is warned of once, with the command that grants it. None: for a real
+                device.
+
+        Raises:
+            HapticBridgeError: An argument is out of range; the message says which and what is
+                valid.
+        """
+        self.scene = scene if isinstance(scene, Scene) else load_scene(scene)
+        self.period = period_of(rate)
+        self._substeps = checked_substeps(substeps)
+        self.method = default_method(substeps) if method is None else method_named(method)
+        refuse_substeps(self.method.scheme, substeps)
+        self._workspace = Workspace.of(scale, force_scale, axes, is_absolute=absolute)
+        self._path = Path(recording) if recording is not None else None
+        self._is_live, self._onlooker = live, onlooker
+        self.clock = clock or RealClock()
+        self._is_pipelined = self.clock.name == RealClock.name if pipelined is None else pipelined
+        with ExitStack() as refused:
+            if isinstance(device, str):
+                refuse_simulated_time(device, self.clock)
+                device = device_for(self.scene, device)
+                refused.callback(device.close)  # else nobody could, if it is refused
+            self.device = device
+            self.coupling = coupling or default_coupling(
+                device.info,
+                self.period,
+                self._workspace.scale,
+                self._workspace.force_scale,
+                self.laws,
+                self.method,
+            )
+            self._limits = limits_for(device.info, limits)
+            self._guarding = guarding_for(
+                device.info,
+                self._limits,
+                self.period,
+                needed=needed_on_axes(
+                    device.info,
+                    self.used,
+                    self.period,
+                    self._workspace.scale,
+                    self._workspace.force_scale,
+                    self.laws,
+                    self.method,
+                ),
+                scale=self._workspace.scale,
+                controller=controller,
+                clutch=clutch,
+                dead_man=dead_man,
+                is_absolute=self._workspace.is_absolute,
+            )
+            refuse_unknowing(self.method, is_real=device.info.is_real, i_know=i_know)
+            # refused here already
+            contact_stiffness_of(self.method, self.coupling, contact_stiffness)
+            refuse_simulated_time(device.info, self.clock)
+            self._is_realtime = wants_real_time(realtime, self.clock, is_real=device.info.is_real)
+            refused.pop_all()
+        self._contact_stiffness = contact_stiffness
+        self._sample = np.zeros(1, SAMPLE_DTYPE)
+        self._inputs: deque[list[Write]] = deque()
+
+    @property
+    def used(self) -> Coupling:
+        """The coupling whose law gives the wrench; ``coupling`` is what should be felt."""
+        return self.method.used(self.coupling, self.period / self._substeps)
+
+    @property
+    def rendered(self) -> Coupling:
+        """``coupling``, but for damping below what the method can show; ``Method.rendered``."""
+        return self.method.rendered(self.used, self.period / self._substeps)
+
+    @property
+    def laws(self) -> int:
+        """How often per tick the wrench on the tool is computed."""
+        return self.method.laws(self._substeps)

@@ -1,0 +1,1 @@
+"""Force Dimension's devices, through the maker's library."""

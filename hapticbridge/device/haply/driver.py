@@ -1,0 +1,230 @@
+"""Haply Inverse3 and its kin: three translations with force, through the maker's own service.
+
+The service answers each message with the state it had when the message came. So a force goes out in
+each tick, and its answer is read at the next: force and question go together, as with the Falcon,
+and the force that answers a sample acts as many whole ticks later as an answer needs to come back.
+At most ``MOST_UNDER_WAY`` messages wait for their answers; where the service is slower than the
+loop, the newest force waits for its turn and older ones are left out, so nothing queues up.
+
+The service filters forces. Its force gate and its damping are set when the device is opened, the
+first by the option ``force_gate`` (what gain switches the gate off is nowhere said; 0 is sent); its
+oscillation damper and its global force scale cannot be set from here, and are named to the user.
+
+Positions are in the service's own frame, right-handed; which way its axes point depends on the
+preset and basis chosen there. No real device has moved under this code yet.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticbridge.device.base import DeviceInfo, checked_period
+from hapticbridge.device.haply import messages
+from hapticbridge.device.haply.messages import SERVICE, Listed
+from hapticbridge.device.haply.timing import measured_timing
+from hapticbridge.device.plugged import Tell, tell_nobody
+from hapticbridge.device.silence import SILENCE, SilenceWatch
+from hapticbridge.device.transport.websocket import Link
+from hapticbridge.errors import DeviceError, DeviceLost
+from hapticbridge.tick import SAMPLE_DTYPE, TickFlag
+
+FORCE_LIMIT = 2.0
+"""In N: what Isaac Lab's driver limits itself to. The maker publishes no continuous force; more is
+to be asked for with the option ``force_limit``."""
+
+SPEED_LIMIT = 5.0
+"""In m/s. No figure was found; a hand is not faster."""
+
+FIRST_ANSWER = 1.0
+"""In s: longest wait for the list of devices and for the first state."""
+
+LONGEST_PERIOD = 0.02
+"""In s. A force holds only for its message; slower, the device falls idle between two ticks."""
+
+MOST_UNDER_WAY = 2
+"""Messages without an answer yet. One would leave the service idle while its answer travels."""
+
+_NOTHING_RECORDED = 0.5  # N m, of torques that are recorded and have no motor: the usual limit
+
+
+class HaplyDevice:
+    """A device of the service that is open: its filters are set, its timing has been measured.
+
+    The sheet's ``rate`` is how often states came with two messages always under way, its ``delay``
+    the time within which 95 % of the answers to single messages came. Mass, damping, friction and
+    resolution are not published; who measured them gives them.
+
+    Args:
+        link: To the service, connected; the list of devices has been read from it.
+        listed: The device.
+        force_gate: Gain of the service's force gate, without unit, >= 0.
+        numbers: Of the data sheet, by name.
+        tell: Told what the service does to forces.
+
+    Attributes:
+        held_back: Forces that were left out because the service was slower than the loop.
+
+    Raises:
+        DeviceError: The service scales positions, or does not answer as it should.
+        DeviceLost: It is gone.
+    """
+
+    def __init__(
+        self,
+        link: Link,
+        listed: Listed,
+        *,
+        force_gate: float = 0.0,
+        numbers: Mapping[str, float] | None = None,
+        tell: Tell = tell_nobody,
+    ) -> None:
+        self._link, self._listed = link, listed
+        self._name = f"{listed.kind} {listed.device_id}"
+        self._is_open, self._is_started = True, False
+        self._under_way = self.held_back = 0
+        self._pending: tuple[float, ...] | None = None
+        known: dict[str, float | None] = {
+            "mass": None, "damping": None, "friction": None, "resolution": None,
+            "force_limit": FORCE_LIMIT, **(numbers or {}),
+        }  # fmt: skip
+        try:
+            messages.refuse_scaled(listed)
+            tell(messages.told_filters(listed, force_gate))
+            self._ask(messages.first_message(listed, force_gate))
+            rate, delay = measured_timing(
+                link, messages.force_message(listed, (0.0, 0.0, 0.0)), self._name
+            )
+            self.info = DeviceInfo(
+                name=listed.kind,
+                axes=("x", "y", "z"),
+                rotational_inertia=None,
+                rotational_damping=None,
+                torque_limit=_NOTHING_RECORDED,
+                speed_limit=SPEED_LIMIT,
+                rate=rate,
+                delay=delay,
+                is_prescribed=False,
+                is_real=True,
+                duration=None,
+                serial=listed.device_id,
+                **known,  # type: ignore[arg-type]
+            )
+        except BaseException:
+            self.close()
+            raise
+        self._sample = np.zeros(1, SAMPLE_DTYPE)
+        self._sample["quaternion"] = (1.0, 0.0, 0.0, 0.0)
+        self._watch = SilenceWatch(link.now())
+
+    def start(self, period: float) -> NDArray[np.void]:
+        """Asks for the state, without force.
+
+        Args:
+            period: The loop's period in s, at most ``LONGEST_PERIOD``.
+
+        Raises:
+            DeviceError: The period is out of range, or the service reports no position.
+            DeviceLost: It is gone or silent.
+        """
+        if checked_period(period) > LONGEST_PERIOD:
+            raise DeviceError(
+                f"{self._name}: a force holds only for its message, so the rate must be at least "
+                f"{1 / LONGEST_PERIOD:g} Hz, not {1 / period:g} Hz"
+            )
+        self._take()
+        self._pending, self.held_back = None, 0
+        self._fill(self._ask(messages.force_message(self._listed, (0.0, 0.0, 0.0))))
+        self._watch = SilenceWatch(self._link.now())
+        self._is_started = True
+        return self._sample.copy()
+
+    def read(self, sample: NDArray[np.void]) -> int:
+        """Reports the newest state that has come; waits for none.
+
+        Args:
+            sample: Shape (1,), ``SAMPLE_DTYPE``, filled in place.
+
+        Returns:
+            0, or ``TickFlag.STALE_SAMPLE`` where the sample repeats the last one.
+
+        Raises:
+            DeviceError: ``start`` has not been called, or what came is no state.
+            DeviceLost: The connection has dropped, the device is not listed any more, or nothing
+                was answered for ``SILENCE``.
+        """
+        if not self._is_started:
+            raise DeviceError(f"{self._name} is read before it was started")
+        newest = self._take()
+        if newest is not None:
+            self._fill(newest)
+        if self._watch.is_silent(self._link.now(), is_new=newest is not None):
+            raise DeviceLost(f"{SERVICE} has not answered for {1e3 * SILENCE:g} ms")
+        sample[0] = self._sample[0]
+        return int(TickFlag.STALE_SAMPLE) if newest is None else 0
+
+    def write(self, wrench: NDArray[np.float64]) -> None:
+        """Sends a force, and with it the next question; the torque is left out.
+
+        Args:
+            wrench: Shape (6,), in the service's frame.
+
+        Raises:
+            DeviceError: The force is not finite.
+            DeviceLost: The connection has dropped.
+        """
+        force = tuple(wrench[:3].tolist())
+        if not all(map(math.isfinite, force)):
+            raise DeviceError(f"{self._name}: a force that is not finite was not sent")
+        self.held_back += self._pending is not None
+        self._pending = force
+        self._send_pending()
+
+    def close(self) -> None:
+        """Commands zero force, waits for its answer up to ``SILENCE``, and ends the connection."""
+        if not self._is_open:
+            return
+        self._is_open = self._is_started = False
+        try:
+            self._take()
+            self._link.send(messages.force_message(self._listed, (0.0, 0.0, 0.0)))
+            for _ in range(self._under_way + 1):
+                self._link.wait(SILENCE)
+        except DeviceLost:
+            pass  # who sends no forces any more leaves the device idle
+        finally:
+            self._link.close()
+
+    def _take(self) -> str | None:
+        """Takes all answers, sends a force that waited for one; returns the newest answer."""
+        answers = self._link.take()
+        self._under_way = max(self._under_way - len(answers), 0)
+        if answers and self._pending is not None:
+            self._send_pending()
+        return answers[-1] if answers else None
+
+    def _send_pending(self) -> None:
+        if self._pending is None or self._under_way >= MOST_UNDER_WAY:
+            return
+        self._link.send(messages.force_message(self._listed, self._pending))
+        self._under_way += 1
+        self._pending = None
+
+    def _ask(self, message: str) -> str:
+        """Sends a message and waits for its answer."""
+        self._link.send(message)
+        answer = None
+        for _ in range(self._under_way + 1):
+            answer = self._link.wait(FIRST_ANSWER)
+        self._under_way = 0
+        if answer is None:
+            raise DeviceLost(f"{SERVICE} does not answer")
+        return answer
+
+    def _fill(self, message: str) -> None:
+        state = messages.state(message, self._listed.device_id)
+        self._sample["position"] = state.position
+        self._sample["buttons"] = state.buttons

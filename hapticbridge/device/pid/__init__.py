@@ -1,0 +1,1 @@
+"""USB force-feedback sticks of the class PID."""

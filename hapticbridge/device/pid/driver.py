@@ -1,0 +1,226 @@
+"""USB force-feedback sticks of the class PID: two axes, a constant force streamed to each."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticbridge.device.base import checked_period
+from hapticbridge.device.pid.effects import Effects
+from hapticbridge.device.pid.reports import PidReports, has_force_feedback
+from hapticbridge.device.pid.sheet import CHANGES, Scale, data_sheet, scale_of
+from hapticbridge.device.pid.stick import Stick
+from hapticbridge.device.plugged import Family, Tell, chosen
+from hapticbridge.device.transport.hex_log import HexLog
+from hapticbridge.device.transport.hid import HidLink
+from hapticbridge.device.transport.hid_layout import Layout
+from hapticbridge.device.transport.hid_search import HidApi, find, polling
+from hapticbridge.errors import DeviceError, DeviceLost
+from hapticbridge.tick import SAMPLE_DTYPE, TickFlag
+
+LOOKS, LOOK_MS = 20, 10
+"""At the start reports are waited for 20 times, up to 10 ms each: 0.2 s for a stick at rest that
+says nothing, less for one that streams."""
+
+STREAMING = 15
+"""Of those, how many must bring a report from a stick that streams; one that speaks only when it is
+moved brings none in a hand that keeps still. Taking the one for the other costs a flag, no more."""
+
+SLOTS = 4
+"""Kinds of report in the loop: force and restart, for each of two effects."""
+
+
+class PidDevice:
+    """A force-feedback stick, its two axes taken for x (to the right) and y (away from the user).
+
+        p = travel/2 (X, −Y),   counts = full · F/newtons
+
+    with X and Y the deflection, -1 to 1. Nothing in the standard says newtons or metres, so both
+    are stated (``Scale``). If they are off by a factor, every force or every length is, and with
+    them K, B and the b that ``identify`` measures: b >= KT/2 + B holds or fails all the same.
+
+    Each axis has a constant-force effect of its own with a fixed direction, so a tick sends one
+    short report per axis whose count has changed, at most two. One effect with a direction would
+    need SetEffect (some 18 bytes) as soon as the angle changes, and SetConstantForce. Pushing a peg
+    into its hole that is 1.62 reports a tick, against 1.44 with two effects; and between the two of
+    a tick its force would point elsewhere, where that of two effects is on its way.
+
+    A silent stick is one at rest: many report only what changes. A pulled plug is an error of the
+    next call.
+
+    Args:
+        link: Reports to and from it, open, with ``SLOTS``.
+        name: What errors call it.
+        scale: Newtons, metres, and signs.
+        known: ``mass``, ``damping``, ``friction`` of the data sheet, where the user knows them.
+        intervals: How often it is asked and told, in s; None where that is unknown.
+        serial: Its serial number.
+
+    Attributes:
+        info: Its data sheet.
+        workspace: Its travel along x, y and (it has none) z in m, as stated or assumed.
+
+    Raises:
+        DeviceError: It does not do what is needed; says what.
+    """
+
+    def __init__(
+        self,
+        link: HidLink,
+        name: str,
+        *,
+        scale: Scale,
+        known: Mapping[str, object] | None = None,
+        intervals: tuple[float | None, float | None] = (None, None),
+        serial: str = "",
+    ) -> None:
+        self._link, self._name = link, name
+        self._is_open = True
+        try:
+            layout = Layout(link.requests.report_descriptor())
+            reports = PidReports(layout)
+            self._stick = Stick(layout)
+        except DeviceError as error:
+            raise DeviceError(f"{name} cannot be driven: {error}") from None
+        self._effects = Effects(link, name, reports, intervals[1])
+        self.info = data_sheet(name, serial, scale, self._stick.step, intervals, dict(known or {}))
+        self.workspace = (scale.travel,) * 3
+        self._reach = np.array([0.5, -0.5]) * scale.travel
+        self._shares = scale.signs / scale.newtons
+        self._sample = np.zeros(1, SAMPLE_DTYPE)
+        self._sample["quaternion"][:, 0] = 1.0
+        self._has_started = self._streams = False
+
+    def start(self, period: float) -> NDArray[np.void]:
+        """Starts the effects with no force, and finds out where the stick stands.
+
+        Args:
+            period: The loop's period in s, finite and > 0.
+
+        Returns:
+            The pose before the first tick, shape (1,), ``SAMPLE_DTYPE``.
+
+        Raises:
+            DeviceError: The period is not, or the stick does not say where it stands.
+            DeviceLost: It is gone.
+        """
+        checked_period(period)
+        self._effects.start(period)
+        self._link.take()
+        came = sum(self._stick.takes(self._link.wait(LOOK_MS)) for _ in range(LOOKS))
+        self._streams = came >= STREAMING
+        if not came and not self._stick.takes(
+            self._link.requests.input_report(*self._stick.report)
+        ):
+            raise DeviceError(f"{self._name} does not say where it stands; move it and start again")
+        self._has_started = True
+        self._fill()
+        return self._sample.copy()
+
+    def read(self, sample: NDArray[np.void]) -> int:
+        """Reports where the stick stands; waits for nothing.
+
+        Args:
+            sample: Shape (1,), ``SAMPLE_DTYPE``, filled in place.
+
+        Returns:
+            0, or ``STALE_SAMPLE`` where a stick that streams has sent nothing since the last read.
+
+        Raises:
+            DeviceLost: The device is gone.
+            DeviceError: It has not been started.
+        """
+        if not self._has_started:
+            raise DeviceError(f"{self._name} is read before it was started")
+        is_new = False
+        for report in self._link.take():
+            is_new |= self._stick.takes(report)
+        if is_new:
+            self._fill()
+        sample[0] = self._sample[0]
+        return 0 if is_new or not self._streams else int(TickFlag.STALE_SAMPLE)
+
+    def write(self, wrench: NDArray[np.float64]) -> None:
+        """Commands a force along x and y, each up to full scale.
+
+        Args:
+            wrench: Shape (6,): force in N, torque in N m, on the device, in the device's frame.
+
+        Raises:
+            DeviceLost: The device is gone.
+            DeviceError: The force is not finite.
+        """
+        shares = self._shares * wrench[:2]
+        if not np.isfinite(shares).all():
+            raise DeviceError(f"{self._name}: a force that is not finite was not sent")
+        self._effects.push(shares.tolist())
+
+    def close(self) -> None:
+        """Stops the effects, switches the motors off and lets the device go."""
+        if not self._is_open:
+            return
+        self._is_open = False
+        try:
+            with contextlib.suppress(DeviceLost):  # then the effects' own end does it
+                self._effects.close()
+        finally:
+            self._link.close()
+
+    def _fill(self) -> None:
+        sample = self._sample[0]
+        sample["position"][:2] = self._reach * self._stick.deflection
+        sample["buttons"] = self._stick.buttons
+
+
+def open_pid(options: Mapping[str, object], tell: Tell, api: HidApi | None = None) -> PidDevice:
+    """Finds and opens a force-feedback stick.
+
+    Args:
+        options: ``serial``, ``log``, ``newtons``, ``travel``, ``reverse``, ``profile``, and numbers
+            of the data sheet, ``CHANGES``.
+        tell: Told what had to be assumed.
+        api: hidapi or what stands for it; its reports are then not sent by a thread.
+
+    Raises:
+        DeviceError: There is none, it cannot be opened, or it cannot do what is needed.
+    """
+    plugged = chosen(FAMILY, find(FAMILY, api), options.get("serial"))
+    scale, known = scale_of(options, plugged.serial, tell)
+    log = options.get("log")
+    link = HidLink.open(
+        plugged,
+        api,
+        is_overlapped=api is None,
+        log=HexLog(None if log is None else str(log)),
+        slots=SLOTS,
+    )
+    try:
+        return PidDevice(
+            link,
+            str(plugged),
+            scale=scale,
+            known=known,
+            intervals=polling(plugged.path) if api is None else (None, None),
+            serial=plugged.serial,
+        )
+    except BaseException:
+        link.close()
+        raise
+
+
+FAMILY = Family(
+    name="pid",
+    about="USB force-feedback sticks of the class PID, any maker's",
+    ids=(),
+    transport="hid",
+    axes="2",
+    force="a share of full scale; newtons= says what that is",
+    rate="125 Hz to 1 kHz, one axis at a time",
+    options=("serial", "log", "newtons", "travel", "reverse", "profile", *CHANGES),
+    open=open_pid,
+    recognises=has_force_feedback,
+)
+"""A class: recognised by its report descriptor, not by a list of products."""

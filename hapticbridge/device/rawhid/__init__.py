@@ -1,0 +1,1 @@
+"""Home-made devices that speak the open protocol of ``device/rawhid.md``."""

@@ -1,0 +1,170 @@
+// See hb_protocol.h and ../../rawhid.md.
+#include "hb_protocol.h"
+
+#include <string.h>
+
+namespace {
+
+const uint8_t MAGIC = 0x48, VERSION = 1;
+const uint8_t STATE = 0x53, SHEET = 0x44, FORCE = 0x46, ASK = 0x3F;
+const uint8_t ENABLE = 1;
+const size_t CRC_AT = HB_FRAME_BYTES - 2;
+
+// Byte by byte, so that the frame is little-endian whatever the processor is.
+void put16(uint8_t* at, uint16_t value) {
+  at[0] = (uint8_t)value;
+  at[1] = (uint8_t)(value >> 8);
+}
+
+void put32(uint8_t* at, uint32_t value) {
+  put16(at, (uint16_t)value);
+  put16(at + 2, (uint16_t)(value >> 16));
+}
+
+uint16_t get16(const uint8_t* at) { return (uint16_t)(at[0] | (uint16_t)at[1] << 8); }
+
+void put_float(uint8_t* at, float value) {
+  uint32_t bits;
+  memcpy(&bits, &value, 4);
+  put32(at, bits);
+}
+
+// The bits of a float32, so that "finite" holds under -ffast-math too.
+uint32_t float_bits(const uint8_t* at) { return get16(at) | (uint32_t)get16(at + 2) << 16; }
+
+bool is_finite(uint32_t bits) { return (bits & 0x7F800000u) != 0x7F800000u; }
+
+float get_float(const uint8_t* at) {
+  uint32_t bits = float_bits(at);
+  float value;
+  memcpy(&value, &bits, 4);
+  return value;
+}
+
+void begin(uint8_t* frame, uint8_t kind, uint8_t option, uint16_t sequence) {
+  memset(frame, 0, HB_FRAME_BYTES);
+  frame[0] = MAGIC;
+  frame[1] = VERSION;
+  frame[2] = kind;
+  frame[3] = option;
+  put16(frame + 4, sequence);
+}
+
+void seal(uint8_t* frame) { put16(frame + CRC_AT, hb_crc16(frame, CRC_AT)); }
+
+}  // namespace
+
+uint16_t hb_crc16(const uint8_t* data, size_t count) {
+  uint16_t crc = 0xFFFF;
+  for (size_t i = 0; i < count; i++) {
+    crc ^= (uint16_t)((uint16_t)data[i] << 8);
+    for (int bit = 0; bit < 8; bit++) {
+      crc = (uint16_t)(crc & 0x8000 ? (uint16_t)(crc << 1) ^ 0x1021 : crc << 1);
+    }
+  }
+  return crc;
+}
+
+HbCommand::HbCommand()
+    : received_us(0), watchdog_us(0), is_enabled(false), has_expired(false), is_unfit(false) {
+  memset(&commanded, 0, sizeof commanded);
+}
+
+HbWrench HbCommand::wrench(uint32_t now_us) {
+  // unsigned, so right across the clock's wrap; once expired it stays so until the next force frame
+  if (!has_expired && (uint32_t)(now_us - received_us) >= watchdog_us) has_expired = true;
+  if (is_enabled && !has_expired && !is_unfit) return commanded;
+  HbWrench none;
+  memset(&none, 0, sizeof none);
+  return none;
+}
+
+HbDevice::HbDevice(const HbSheet& sheet)
+    : sheet_(sheet),
+      sequence_(0),
+      echo_(0),
+      asked_sequence_(0),
+      asked_page_(-1),
+      is_damaged_(false) {}
+
+bool HbDevice::receive(const uint8_t frame[HB_FRAME_BYTES], uint32_t now_us) {
+  if (frame[0] != MAGIC || get16(frame + CRC_AT) != hb_crc16(frame, CRC_AT)) {
+    is_damaged_ = true;
+    return false;
+  }
+  if (frame[1] != VERSION) return false;
+  if (frame[2] == ASK) {
+    asked_page_ = frame[3];
+    asked_sequence_ = get16(frame + 4);
+  } else if (frame[2] == FORCE) {
+    for (int i = 0; i < 6; i++) {
+      if (!is_finite(float_bits(frame + 8 + 4 * i))) return false;
+    }
+    uint16_t watchdog_ms = get16(frame + 6);
+    if (watchdog_ms > HB_LONGEST_WATCHDOG_MS) watchdog_ms = HB_LONGEST_WATCHDOG_MS;
+    for (int i = 0; i < 3; i++) {
+      command_.commanded.force[i] = get_float(frame + 8 + 4 * i);
+      command_.commanded.torque[i] = get_float(frame + 20 + 4 * i);
+    }
+    echo_ = get16(frame + 4);
+    command_.is_enabled = (frame[3] & ENABLE) != 0;
+    command_.watchdog_us = 1000u * watchdog_ms;
+    command_.received_us = now_us;
+    command_.has_expired = false;
+  } else {
+    return false;
+  }
+  is_damaged_ = false;
+  return true;
+}
+
+bool HbDevice::answer(uint8_t frame[HB_FRAME_BYTES]) {
+  const int16_t page = asked_page_;
+  asked_page_ = -1;
+  if (page == 0) {
+    begin(frame, SHEET, 0, asked_sequence_);
+    put16(frame + 6, sheet_.axes);
+    const float numbers[] = {sheet_.rate,
+                             sheet_.mass,
+                             sheet_.damping,
+                             sheet_.rotational_inertia,
+                             sheet_.rotational_damping,
+                             sheet_.friction,
+                             sheet_.resolution,
+                             sheet_.force_limit,
+                             sheet_.torque_limit,
+                             sheet_.speed_limit,
+                             sheet_.delay};
+    for (size_t i = 0; i < sizeof numbers / sizeof *numbers; i++) {
+      put_float(frame + 8 + 4 * i, numbers[i]);
+    }
+  } else if (page == 1) {
+    begin(frame, SHEET, 1, asked_sequence_);
+    const size_t length = strlen(sheet_.name);
+    memcpy(frame + 8, sheet_.name, length < HB_NAME_BYTES ? length : HB_NAME_BYTES);
+  } else {
+    return false;
+  }
+  seal(frame);
+  return true;
+}
+
+void HbDevice::state(const HbMotion& motion, uint32_t now_us, uint8_t frame[HB_FRAME_BYTES]) {
+  command_.is_unfit = (motion.status & (HB_FAULT | HB_NOT_READY)) != 0;
+  wrench(now_us);  // brings command_.has_expired up to now
+  uint8_t status = motion.status & (HB_SATURATED | HB_FAULT | HB_NOT_READY);
+  if (command_.is_enabled) status |= HB_ENABLED;
+  if (command_.has_expired) status |= HB_WATCHDOG;
+  if (is_damaged_) status |= HB_DAMAGED;
+  begin(frame, STATE, status, ++sequence_);
+  put16(frame + 6, motion.buttons);
+  put32(frame + 8, now_us);
+  for (int i = 0; i < 3; i++) {
+    put_float(frame + 12 + 4 * i, motion.position[i]);
+    put_float(frame + 24 + 4 * i, motion.rotation[i]);
+    put_float(frame + 36 + 4 * i, motion.velocity[i]);
+    put_float(frame + 48 + 4 * i, motion.angular_velocity[i]);
+  }
+  put16(frame + 60, echo_);
+  seal(frame);
+}

@@ -1,0 +1,1 @@
+"""A simulated device in a simulated hand."""

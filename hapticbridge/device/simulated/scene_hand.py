@@ -1,0 +1,48 @@
+"""The hand that a scene asks for: who performs the path beside it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from hapticbridge.device.simulated.hand import DEFAULT_HAND, Hand
+from hapticbridge.errors import DeviceError, SceneError
+from hapticbridge.scene import Scene, custom_numbers
+
+SCENE_HAND = "simulated_hand"
+"""Name of the custom numbers in a scene's file."""
+
+_FIELDS = ("stiffness", "damping", "rotational_stiffness", "rotational_damping")
+
+
+def scene_hand(scene: Scene) -> Hand:
+    """Returns the hand that performs a scene's path; ``DEFAULT_HAND`` where it asks for none.
+
+    A relaxed arm (135 N/m) follows a path only where little holds it back; somebody who drives a
+    nail or turns a key grips harder. A scene says so in its own file,
+
+        <custom><numeric name="simulated_hand" data="1000 30"/></custom>
+
+    with stiffness in N/m and damping in N s/m, and after them, where wanted, stiffness in N m/rad
+    and damping in N m s/rad of the rotation. What it does not say, the hand's inertia too, is that
+    of the default hand.
+
+    Args:
+        scene: The scene.
+
+    Raises:
+        SceneError: The numbers are not two or four, or one is not finite or negative.
+    """
+    numbers = custom_numbers(scene.model, SCENE_HAND)
+    if not numbers:
+        return DEFAULT_HAND
+    words = " ".join(f"{number:g}" for number in numbers)
+    where = f"scene '{scene.path}': its custom numbers '{SCENE_HAND}' are '{words}'"
+    if len(numbers) not in (2, 4):
+        raise SceneError(
+            f"{where}; they must be stiffness in N/m and damping in N s/m of the hand, or these "
+            "and the same of its rotation in N m/rad and N m s/rad"
+        )
+    try:
+        return replace(DEFAULT_HAND, **dict(zip(_FIELDS, numbers, strict=False)))
+    except DeviceError as error:
+        raise SceneError(f"{where}; {error}") from None

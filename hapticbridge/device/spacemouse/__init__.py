@@ -1,0 +1,1 @@
+"""3Dconnexion SpaceMouse: input without force."""

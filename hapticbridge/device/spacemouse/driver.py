@@ -1,0 +1,243 @@
+"""3Dconnexion SpaceMouse: six axes of input, as a rate of motion; it has no motors."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticbridge.device.base import AXES, DeviceInfo, checked_number, checked_period
+from hapticbridge.device.plugged import Family, Tell, chosen
+from hapticbridge.device.spacemouse.ids import IDS
+from hapticbridge.device.spacemouse.reports import (
+    LED_OFF,
+    LED_ON,
+    Buttons,
+    Deflection,
+    decoded,
+    share,
+)
+from hapticbridge.device.transport.hex_log import HexLog
+from hapticbridge.device.transport.hid import HidLink, Link
+from hapticbridge.device.transport.hid_search import HidApi, find
+from hapticbridge.errors import DeviceError
+from hapticbridge.pose import Quaternion, canonical, product, quaternion_exp
+from hapticbridge.tick import SAMPLE_DTYPE
+
+SPEED, TURN = 0.05, 0.8
+"""m/s and rad/s at full deflection, unless the user says otherwise: 10 cm, the reach of a desktop
+device, in two seconds, and a quarter of a turn likewise."""
+
+DEAD_BAND = 0.05
+"""Share of full deflection that counts as rest: 17 counts. A hand that pushes along one axis spills
+some per cent into the others, and a worn puck does not return to zero."""
+
+HELD = 0.5
+"""In s. A deflected puck repeats its report some hundred times a second; one that has said nothing
+for this long is out of reach, and must not go on moving the tool. Not verified on hardware."""
+
+# the maker's y points to the user and z down, the bridge's away and up: half a turn about x, which
+# maps rotations as it maps translations
+_TO_BRIDGE = np.array([1.0, -1.0, -1.0, 1.0, -1.0, -1.0])
+
+
+class SpaceMouseDevice:
+    """A handle that moves as long as the puck is pushed, at a speed proportional to it.
+
+        p ← p + v T,   R ← exp(ω T) R
+
+    with v and ω from the deflection beyond the dead band, both in the frame of the base: x to the
+    right, y away from the user, z up. R is composed exactly. The device feels nothing: its motion
+    is prescribed, and what the tool is pushed with is shown and recorded. At rest it sends nothing,
+    which is no sign of its being unplugged.
+
+    Args:
+        link: Reports to and from it, open.
+        name: What it is called.
+        speed: In m/s at full deflection of one axis, > 0.
+        turn: In rad/s, likewise.
+        dead_band: Share of full deflection that counts as rest, 0 to below 1.
+        force_limit: In N, >= 0, for the data sheet: what the recorded wrench is limited to.
+        torque_limit: In N m, >= 0, likewise.
+
+    Raises:
+        DeviceError: A number is out of range.
+    """
+
+    def __init__(
+        self,
+        link: Link,
+        name: str = "spacemouse",
+        *,
+        speed: float = SPEED,
+        turn: float = TURN,
+        dead_band: float = DEAD_BAND,
+        force_limit: float = 10.0,
+        torque_limit: float = 0.5,
+    ) -> None:
+        self._link, self._name = link, name
+        speed = checked_number("speed", speed, "m/s", is_positive=True)
+        turn = checked_number("turn", turn, "rad/s", is_positive=True)
+        self._full = _TO_BRIDGE * np.repeat([speed, turn], 3)
+        self._dead_band = checked_number("dead_band", dead_band, "of full deflection")
+        if self._dead_band >= 1.0:
+            raise DeviceError(f"dead_band = {dead_band!r}: must be below 1, which is full scale")
+        self.info = DeviceInfo(
+            name=name,
+            axes=AXES,
+            mass=None,
+            damping=None,
+            rotational_inertia=None,
+            rotational_damping=None,
+            friction=None,
+            resolution=None,
+            force_limit=force_limit,
+            torque_limit=torque_limit,
+            speed_limit=math.sqrt(3.0) * speed,  # all three axes at full deflection
+            rate=None,
+            delay=None,
+            is_prescribed=True,
+            is_real=False,
+            duration=None,
+        )
+        self._period = 0.0
+        self._is_open, self._has_begun = True, False
+        self._to_origin()
+
+    def start(self, period: float) -> NDArray[np.void]:
+        """Puts the handle to the origin, and the light on.
+
+        Args:
+            period: The loop's period in s, finite and > 0.
+
+        Returns:
+            The pose before the first tick, shape (1,), ``SAMPLE_DTYPE``.
+
+        Raises:
+            DeviceError: The period is not.
+            DeviceLost: It is gone.
+        """
+        self._period = checked_period(period)
+        self._link.take()
+        self._to_origin()
+        self._turn((0.0, 0.0, 0.0))  # compiles before the loop
+        self._light(LED_ON)
+        sample = np.zeros(1, SAMPLE_DTYPE)
+        self._fill(sample)
+        return sample
+
+    def read(self, sample: NDArray[np.void]) -> int:
+        """Moves the handle by one period (the first call does not) and reports its pose.
+
+        Args:
+            sample: Shape (1,), ``SAMPLE_DTYPE``, filled in place.
+
+        Returns:
+            0: the pose is that of this tick, whether the puck has spoken or not.
+
+        Raises:
+            DeviceError: ``start`` has not been called.
+            DeviceLost: The device is gone.
+        """
+        if self._period == 0.0:
+            raise DeviceError(f"{self._name} is read before it was started")
+        if self._has_begun:
+            self._silence += self._period
+            if self._silence > HELD:
+                self._rate[:] = 0.0
+            self._position += self._period * self._rate[:3]
+            x, y, z = (self._period * self._rate[3:]).tolist()
+            self._turn((x, y, z))
+        self._has_begun = True
+        for report in self._link.take():
+            self._take(report)
+        self._fill(sample)
+        return 0
+
+    def write(self, wrench: NDArray[np.float64]) -> None:
+        """Ignores the wrench: there is no motor."""
+
+    def close(self) -> None:
+        """Puts the light out and lets the device go."""
+        if self._is_open:
+            self._is_open = False
+            self._light(LED_OFF)
+            self._link.close()
+
+    def _to_origin(self) -> None:
+        self._position, self._rate = np.zeros(3), np.zeros(6)
+        self._quaternion: Quaternion = (1.0, 0.0, 0.0, 0.0)
+        self._buttons, self._silence = 0, 0.0
+        self._has_begun = False
+
+    def _take(self, report: bytes) -> None:
+        news = decoded(report)
+        if isinstance(news, Deflection):
+            last = news.first + len(news.counts)
+            shares = [share(count, self._dead_band) for count in news.counts]
+            self._rate[news.first : last] = self._full[news.first : last] * shares
+            self._silence = 0.0
+        elif isinstance(news, Buttons):
+            self._buttons = news.bits
+
+    def _turn(self, angle: tuple[float, float, float]) -> None:
+        self._quaternion = canonical(product(quaternion_exp(angle), self._quaternion))
+
+    def _fill(self, sample: NDArray[np.void]) -> None:
+        sample[0] = (self._position, self._quaternion, self._buttons)
+
+    def _light(self, report: bytes) -> None:
+        """Switches the light; some models have none, and nothing depends on it."""
+        with contextlib.suppress(DeviceError):
+            self._link.write(report)
+
+
+def open_spacemouse(
+    options: Mapping[str, object], _tell: Tell, api: HidApi | None = None
+) -> SpaceMouseDevice:
+    """Finds and opens a SpaceMouse.
+
+    Args:
+        options: ``serial``, ``log``, and numbers that ``SpaceMouseDevice`` takes.
+        api: hidapi or what stands for it.
+
+    Raises:
+        DeviceError: There is none, it cannot be opened, or a number is out of range.
+    """
+    plugged = chosen(FAMILY, find(FAMILY, api), options.get("serial"))
+    log = options.get("log")
+    # not overlapped: it is written to only before the loop and after it
+    link = HidLink.open(
+        plugged, api, is_overlapped=False, log=HexLog(None if log is None else str(log))
+    )
+    numbers: dict[str, float] = {
+        key: value  # type: ignore[misc] # checked by the device
+        for key, value in options.items()
+        if key in _NUMBERS
+    }
+    try:
+        device = SpaceMouseDevice(link, plugged.name, **numbers)
+    except BaseException:
+        link.close()
+        raise
+    device.info = replace(device.info, serial=plugged.serial)
+    return device
+
+
+_NUMBERS = ("speed", "turn", "dead_band", "force_limit", "torque_limit")
+
+FAMILY = Family(
+    name="spacemouse",
+    about="3Dconnexion SpaceMouse and its ancestors: input only, its rate moves the handle",
+    ids=IDS,
+    transport="hid",
+    axes="6, by rate",
+    force="none; shown, not felt",
+    rate="about 125 Hz",
+    options=("serial", "log", *_NUMBERS),
+    open=open_spacemouse,
+)

@@ -1,0 +1,1 @@
+"""Devices whose motion is given beforehand."""

@@ -1,0 +1,1 @@
+"""What carries bytes to devices, and what finds them: HID, USB, WebSocket."""

@@ -1,0 +1,97 @@
+"""Which USB devices are plugged in, as libusb and the kernel tell it."""
+
+from __future__ import annotations
+
+import errno
+from collections.abc import Iterable
+from typing import Any
+
+import libusb_package
+import usb.backend.libusb1
+import usb.core
+import usb.util
+
+from hapticbridge.device.plugged import Family, Plugged, access_problem, permission_problem
+from hapticbridge.device.transport.usb_bus import NODES, OnTheBus, members, on_the_bus
+
+
+def libusb() -> Any:
+    """Returns a fresh libusb context for pyusb, or None where there is no libusb or no USB.
+
+    Fresh, because an old one does not hear of devices plugged in later where udev does not run.
+    The system's libusb is preferred to the one of ``libusb-package``.
+    """
+    module = usb.backend.libusb1
+    for find_library in (None, libusb_package.find_library):
+        try:
+            if module.get_backend(find_library=find_library) is not None:
+                # pyusb offers no way to a second context
+                return module._LibUSB(module._lib)
+        except (usb.core.USBError, OSError):
+            continue
+    return None
+
+
+def find(family: Family, backend: Any = None) -> list[Plugged]:
+    """Lists the family's devices that are plugged in, with what keeps each from being opened.
+
+    On Linux the kernel tells, without a device's being opened, which a running loop would feel;
+    elsewhere libusb is asked.
+
+    Args:
+        family: What to look for.
+        backend: A pyusb backend to ask; None takes kernel or libusb.
+
+    Returns:
+        One entry per device, in the order of their places on the bus.
+    """
+    listed = [] if backend is not None else members(family, on_the_bus(), _problem)
+    source = libusb() if backend is None and not listed else backend
+    return listed if source is None else [_described(family, d) for d in devices_of(family, source)]
+
+
+def _problem(device: OnTheBus) -> str | None:
+    if libusb() is None:
+        return "libusb cannot be loaded; reinstall the package 'libusb-package'"
+    return access_problem(str(device.node))
+
+
+def devices_of(family: Family, backend: Any) -> list[Any]:
+    """Returns pyusb's devices that are of a family, in the order of their places on the bus."""
+    try:
+        devices: Iterable[Any] = usb.core.find(find_all=True, backend=backend)
+        known = [d for d in devices if family.model(d.idVendor, d.idProduct) is not None]
+    except (usb.core.USBError, NotImplementedError):
+        return []
+    return sorted(known, key=node_of)
+
+
+def node_of(device: Any) -> str:
+    """Returns where Linux keeps the device of pyusb: what tells two of a model apart."""
+    return str(NODES / f"{device.bus or 0:03d}" / f"{device.address or 0:03d}")
+
+
+def _described(family: Family, device: Any) -> Plugged:
+    node, problem, texts = node_of(device), None, ["", ""]
+    try:
+        device.get_active_configuration()  # opens it; reading texts would hide why it cannot
+        texts = [
+            usb.util.get_string(device, index) or "" if index else ""
+            for index in (device.iProduct, device.iSerialNumber)
+        ]
+    except usb.core.USBError as error:
+        problem = permission_problem(node) if error.errno == errno.EACCES else None
+    except (ValueError, NotImplementedError):
+        pass  # it has no texts, or they cannot be read
+    finally:
+        usb.util.dispose_resources(device)
+    return Plugged(
+        family=family.name,
+        name=texts[0] or family.model(device.idVendor, device.idProduct) or family.name,
+        serial=texts[1],
+        path=node,
+        vendor=device.idVendor,
+        product=device.idProduct,
+        transport="usb",
+        problem=problem,
+    )

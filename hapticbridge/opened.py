@@ -1,0 +1,226 @@
+"""What is open while a bridge is: device, ring, recording, kernel; and how it is left again."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from contextlib import ExitStack
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hapticbridge.arrangement import Arrangement
+from hapticbridge.certificate import condition_sentences
+from hapticbridge.clock import RealClock
+from hapticbridge.errors import DeviceError, HapticBridgeError, SceneError
+from hapticbridge.guard import refuse_stretched_start, wait_until_still
+from hapticbridge.inputs import Write, input_writes
+from hapticbridge.jit import direct
+from hapticbridge.kernel.after import answer_step
+from hapticbridge.kernel.layout import STATE_DTYPE
+from hapticbridge.kernel.publish import finish_tick, publish
+from hapticbridge.kernel.state import Binding
+from hapticbridge.kernel.step import before_step
+from hapticbridge.ledger import Ledger
+from hapticbridge.provenance import attachments, describe_run
+from hapticbridge.realtime import Grant, check_pace, memory_at_rest
+from hapticbridge.recording.stream import RecordStream
+from hapticbridge.rendering import prepare
+from hapticbridge.summary import Summary
+from hapticbridge.tick import TICK_DTYPE
+from hapticbridge.workspace import run_parameters
+
+_NO_FORCE = np.zeros(6)
+
+
+class Opened(Arrangement):
+    """An arrangement that can be entered and left, with the ways into a run and what it says.
+
+    Entering prepares everything and compiles what must be compiled; leaving commands zero force,
+    closes the recording with a reason, and closes the device.
+
+    Attributes:
+        parameters: All that decides what the run computes; once entered.
+    """
+
+    _tick = _overruns = _skipped = 0
+    _stopped_by = _signal = ""
+    _is_open = False
+    _grants: tuple[Grant, ...] = ()
+
+    def __enter__(self) -> Self:
+        # released in reverse order, whatever one of them does: force, recording, ring, device
+        with ExitStack() as resources:
+            resources.callback(self.device.close)
+            self._prepare(resources)
+            resources.callback(self._silence)
+            self._resources = resources.pop_all()
+        self._is_open = True
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self._is_open = False
+        reason = self._stopped_by if error is None else f"{type(error).__name__}: {error}"
+        named = {"signal": self._signal} if self._signal else {}
+        self._event(
+            "stop",
+            reason=reason,
+            **named,
+            overruns=self._overruns,
+            skipped=self._skipped,
+            dropped=self._stream.dropped,
+        )
+        self._resources.__exit__(kind, error, traceback)
+
+    def _prepare(self, resources: ExitStack) -> None:
+        """Compiles the kernel, puts the scene to its start, and opens the recording."""
+        if self._tick or self._is_open:
+            raise HapticBridgeError("a bridge is entered once; make a new one for another run")
+        self.scene.claim()
+        resources.callback(self.scene.release)
+        scene, clock, method = self.scene, self.clock, self.method
+        felt = prepare(scene, self.coupling, self.period, self._substeps, method)
+        self._stream = RecordStream(
+            self._path,
+            self.period,
+            live=self._is_live,
+            is_lossless=clock.is_lossless,
+            onlooker=self._onlooker,
+        )
+        resources.callback(self._stream.close)
+        self._compile()
+        if clock.name == RealClock.name:
+            is_real = self.device.info.is_real
+            check_pace(scene, method, self.period, self._substeps, is_real=is_real)
+        if self._is_realtime:
+            self._grants = resources.enter_context(memory_at_rest())
+        # last, because from here on the device is held, and its pose counts
+        self._sample[:] = self.device.start(self.period)
+        info = self.device.info
+        self.parameters = run_parameters(
+            scene,
+            self.coupling,
+            method,
+            self._sample,
+            period=self.period,
+            felt=felt,
+            substeps=self._substeps,
+            info=info,
+            limits=self._limits,
+            workspace=self._workspace,
+            contact_stiffness=self._contact_stiffness,
+            guarding=self._guarding,
+        )
+        self._binding = binding = Binding(scene.model, scene.data, self.parameters)
+        refuse_stretched_start(binding.state, self._sample, self._limits)
+        if self._stream.is_read:
+            meta = describe_run(
+                scene, self.parameters, binding, method=method.name, device=info, clock=clock.name
+            )
+            self._stream.start(meta, attachments(scene))
+            self._event("start")
+
+    def _come_to_rest(self) -> None:
+        """Waits until a real device is still, before force is enabled.
+
+        Raises:
+            DeviceError: It moves on, or a hand has meanwhile moved an absolute one too far.
+        """
+        wait_until_still(self.device, self._sample, self.period, self.clock)
+        if not self._tick and self._workspace.is_absolute:
+            refuse_stretched_start(self._binding.state, self._sample, self._limits)
+
+    def _compile(self) -> None:
+        """Gets the machine code of the tick ready, so that the first one is not late."""
+        state, row, sample = np.zeros(1, STATE_DTYPE), np.zeros(1, TICK_DTYPE), self._sample
+        rows, cursors = self._stream.rows, self._stream.cursors
+        self._before_step = direct(before_step, state, sample, row, 0, 0.0)
+        self._answer_step = direct(answer_step, state, row, 0)
+        self._publish = direct(publish, row, rows, cursors, 0, 0, 0, 0, 0)
+        self._finish_tick = direct(finish_tick, state, row, rows, cursors, 0, 0, 0, 0, 0, True)
+
+    def _silence(self) -> str:
+        """Commands zero force; returns why that failed, or nothing."""
+        try:
+            self.device.write(_NO_FORCE)
+        except DeviceError as error:
+            return f"zero force could not be sent: {error}"
+        return ""
+
+    def _event(self, event: str, **details: object) -> None:
+        self._stream.event(event, self._tick, self.clock.now(), **details)
+
+    def set_input(
+        self,
+        *,
+        ctrl: Mapping[str, ArrayLike] | None = None,
+        mocap: Mapping[str, ArrayLike] | None = None,
+        joint_force: Mapping[str, ArrayLike] | None = None,
+        body_wrench: Mapping[str, ArrayLike] | None = None,
+    ) -> None:
+        """Changes inputs of the scene from the next tick on; recorded, so the run can be repeated.
+
+        Move mocap bodies slowly: MuJoCo damps their welds and contacts against rest, so a fast
+        move can create energy, and the environment is then called active.
+
+        Args:
+            ctrl: Control per actuator of the scene.
+            mocap: Pose (x, y, z[, qw, qx, qy, qz]) in m per mocap body of the scene.
+            joint_force: Generalised force per joint, in N or N m per degree of freedom.
+            body_wrench: (force, torque) in N and N m per body, world frame, at its centre of mass.
+
+        Raises:
+            SceneError: A name does not exist or has the wrong count of numbers.
+        """
+        self.repeat_input(
+            input_writes(
+                self.scene.model,
+                ctrl=ctrl,
+                mocap=mocap,
+                joint_force=joint_force,
+                body_wrench=body_wrench,
+            )
+        )
+
+    def repeat_input(self, writes: list[Write]) -> None:
+        """As ``set_input``, with the writes that a recording's event ``input`` holds."""
+        if not self.method.meters_inputs:
+            raise SceneError(
+                f"method '{self.method.name}' cannot meter the work of inputs; use 'implicit'"
+            )
+        self._inputs.append(writes)
+
+    @property
+    def ledger(self) -> Ledger:
+        """Energies so far, per port."""
+        return Ledger.of(self._binding.state)
+
+    def latest_records(self, count: int) -> NDArray[np.void]:
+        """Returns copies of the newest records (``TICK_DTYPE``), oldest first."""
+        return self._stream.latest(count)
+
+    def conditions(self) -> tuple[str, ...]:
+        """Returns what is to be said of device and method, one sentence each; known once open."""
+        return condition_sentences(self.device.info, self.parameters, self.method)
+
+    def summary(self) -> Summary:
+        """Returns what the run was so far."""
+        return Summary.of(
+            self._binding.state,
+            self.parameters,
+            self.device.info,
+            self.method,
+            self.coupling,
+            ticks=self._tick,
+            overruns=self._overruns,
+            skipped=self._skipped,
+            dropped=self._stream.dropped,
+            stopped_by=self._stopped_by,
+            recording=self._path,
+        )
