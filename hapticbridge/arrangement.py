@@ -94,9 +94,10 @@ class Arrangement:
             absolute: Take the device's poses as poses in the scene instead of relative to its
                 start.
             limits: Limits on the wrench, within the device's own; None takes these.
-            controller: Passivity controller: ``damper``, ``tank`` or ``off``. It acts where the
-                device was given more than its damping burns and the scene gives up. None:
-                ``damper`` where the device condition does not hold, else ``off``.
+            controller: Passivity controller: ``damper`` acts where the device was given more than
+                its damping burns and the scene gives up, ``environment`` where the scene created
+                more than the coupling's slack; ``tank``, ``off``. None: ``damper`` where the device
+                condition does not hold, else ``environment``.
             clutch: Number of the device's button, from 0, that lets it move without the handle.
             dead_man: Number of the button that must be held for any force.
             live: Draw a status line on stderr, from the recorder's process.

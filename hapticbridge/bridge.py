@@ -14,6 +14,7 @@ from contextlib import ExitStack
 import mujoco
 import numpy as np
 
+from hapticbridge.clock import slept_ns
 from hapticbridge.errors import DeviceError, HapticBridgeError, SafetyTrip
 from hapticbridge.guard import trip_reason
 from hapticbridge.inputs import apply_writes
@@ -24,6 +25,10 @@ from hapticbridge.realtime import Grant, real_time, warn_of_refusals
 from hapticbridge.signals import stopping_on_signals
 from hapticbridge.summary import Summary
 from hapticbridge.tick import TickFlag
+
+SUSPENDED_NS = 50_000_000
+"""A sleep of the machine longer than this ends the run: nobody knows what became of the hand, of
+the device's power, or of who sits there. Reading two clocks differs by microseconds."""
 
 RECORDER_LOOK = 0.1
 """In s, how often the loop looks whether the recorder still lives: 4 µs each time. A run that is to
@@ -36,6 +41,8 @@ class Bridge(Opened):
     Use it as a context manager: entering prepares everything and compiles what must be compiled,
     leaving commands zero force, closes the device and closes the recording.
     """
+
+    _slept = 0
 
     def run(
         self, duration: float | None = None, on_tick: Callable[[int], None] | None = None
@@ -64,6 +71,7 @@ class Bridge(Opened):
             try:
                 self._come_to_rest()
                 self.clock.start(round(self.period * 1e9))
+                self._slept = slept_ns()
                 reason = self._loop(last, on_tick)
             except DeviceError as error:
                 reason = f"tick {self._tick}: {error}"
@@ -160,10 +168,11 @@ class Bridge(Opened):
         """Starts the ramp; between two runs zero was commanded and the device may have moved."""
         if not self._is_open:
             raise HapticBridgeError("the bridge is not open; use 'with Bridge(...) as bridge:'")
-        self._stopped_by = ""
+        before, self._stopped_by = self._stopped_by, ""
         if self._tick:
             self._binding.resume()
-            self._event("resume")
+            self._event("resume", reason=before, **self._named_signal())
+        self._signal = ""
 
     def _take_changes(self) -> None:
         """Takes in what others want changed: between two ticks, and noted with its tick."""
@@ -173,8 +182,14 @@ class Bridge(Opened):
             self._event("input", writes=writes)
 
     def _overrun(self, skipped: int) -> int:
+        """Counts a missed deadline, and ends the run where the machine was asleep meanwhile."""
         self._overruns += 1
         self._skipped += skipped
+        asleep = slept_ns() - self._slept
+        if asleep > SUSPENDED_NS:
+            self._slept += asleep
+            self._event("suspended", seconds=1e-9 * asleep)
+            self.stop("suspend of the machine")
         return int(TickFlag.OVERRUN)
 
     def _trip(self, reason: str) -> None:

@@ -67,11 +67,10 @@ class Opened(Arrangement):
     ) -> None:
         self._is_open = False
         reason = self._stopped_by if error is None else f"{type(error).__name__}: {error}"
-        named = {"signal": self._signal} if self._signal else {}
         self._event(
             "stop",
             reason=reason,
-            **named,
+            **self._named_signal(),
             overruns=self._overruns,
             skipped=self._skipped,
             dropped=self._stream.dropped,
@@ -152,6 +151,10 @@ class Opened(Arrangement):
         except DeviceError as error:
             return f"zero force could not be sent: {error}"
         return ""
+
+    def _named_signal(self) -> dict[str, str]:
+        """What an event says of the signal that ended the run, if one did."""
+        return {"signal": self._signal} if self._signal else {}
 
     def _event(self, event: str, **details: object) -> None:
         self._stream.event(event, self._tick, self.clock.now(), **details)

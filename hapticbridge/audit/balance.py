@@ -122,10 +122,14 @@ class Balance:
         later = _later(ticks, following, late) if late else (device_step, device_turn)
         given = np.sum(sent[:, :3] * later[0], axis=1) + np.sum(sent[:, 3:] * later[1], axis=1)
 
-        expected, guarded = before.guarded.after(ticks, resumed)
-        seen = expected.seen
         stored = ticks["kinetic"] + ticks["potential"] - before.start_energy
         created = stored - coupling_work - ticks["actuator_work"] - ticks["external_work"]
+        linear, angular = _slack_gains(parameters)
+        slack = 0.5 * linear * np.sum(motion.tool_step**2, axis=1)
+        slack += 0.5 * angular * np.sum(motion.tool_turn**2, axis=1)
+        slack = summed(slack, sums["slack"])
+        expected, guarded = before.guarded.after(ticks, resumed, created - slack)
+        seen = expected.seen
         kept, lost = coupling_work, created  # without a law, all that the scene took up
         kept_sum = np.zeros(len(ticks))
         if parameters.has_law:
@@ -149,15 +153,12 @@ class Balance:
         if parameters.device_damping is not None:
             parts = burnt_by_damping(parameters, *later, seen.interval, ~seen.first)
             burnt = summed(parts, sums["burnt"])
-        linear, angular = _slack_gains(parameters)
-        slack = 0.5 * linear * np.sum(motion.tool_step**2, axis=1)
-        slack += 0.5 * angular * np.sum(motion.tool_turn**2, axis=1)
         totals = {
             "coupling_work": coupling_work,
             "throughput": summed(np.abs(work), sums["throughput"]),
             "device_energy": device_energy,
             "device_throughput": summed(np.abs(device_work), sums["device_throughput"]),
-            "slack": summed(slack, sums["slack"]),
+            "slack": slack,
             "given": summed(given, sums["given"]),
             "burnt": burnt,
             "kept": kept_sum,

@@ -114,6 +114,7 @@ class Watch:
         is_released = (ticks["buttons"] & guarding.clutch) != 0
         if guarding.dead_man:
             is_released |= (ticks["buttons"] & guarding.dead_man) == 0
+        is_released |= np.linalg.norm(ticks["device_position"], axis=1) > guarding.reach
         is_silent = is_released.copy()
         if guarding.stale_ticks > 0:
             is_silent |= stale > guarding.stale_ticks

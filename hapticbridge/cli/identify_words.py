@@ -8,13 +8,14 @@ from pathlib import Path
 
 from rich.table import Table
 
-from hapticbridge.cli.terminal import out, plain, quantity
+from hapticbridge.cli.terminal import out, plain
 from hapticbridge.cli.zwidth import next_command
 from hapticbridge.felt import coupling_sentences
 from hapticbridge.identify import Identification
 from hapticbridge.identify.estimate import CONFIDENCE
 from hapticbridge.identify.identification import UNHELD
 from hapticbridge.passivity import ZWidth, z_width
+from hapticbridge.quantity import quantity
 from hapticbridge.rendering import default_method
 from hapticbridge.study.theory import recommended
 

@@ -108,15 +108,19 @@ class Run:
     printed."""
     port: int = 8080
     """Port to serve the view on; 0: any that is free."""
-    controller: Literal["damper", "tank", "off"] | None = None
+    controller: Literal["damper", "environment", "tank", "off"] | None = None
     """Passivity controller: what is done when the device was given more than its damping burns and
-    the scene gives up; by default 'damper' where the device condition does not hold, else 'off'."""
+    the scene gives up, or, 'environment', when the scene created more than the coupling's slack; by
+    default 'damper' where the device condition does not hold, else 'environment'."""
     clutch: int | None = None
     """Button of the device, from 0: while it is held the device moves without the handle."""
     dead_man: int | None = None
     """Button of the device, from 0, that must be held for any force."""
     stretch_limit: float = USUAL_STRETCH
     """Largest distance between handle and tool in m; beyond it the run is stopped."""
+    reach_limit: float = math.inf
+    """Farthest in m that the device may be from the middle of its workspace; beyond it moves
+    without the handle and without force. Choose it short of the device's own stops."""
     energy_limit: float = USUAL_ENERGY
     """Most energy in J that the device may be given beyond what the hand put in; inf for scenes
     whose motors are meant to push the hand."""
@@ -166,6 +170,7 @@ class Run:
                 ramp=self.ramp,
                 stretch=self.stretch_limit,
                 energy=self.energy_limit,
+                reach=self.reach_limit,
             ),
             controller=self.controller,
             clutch=self.clutch,

@@ -150,6 +150,7 @@ _GUARD_PARAMETERS = (
     "most_stretch",
     "most_angle",
     "most_energy",
+    "reach",
 )
 
 _GUARD_RUNNING_COUNTS = (

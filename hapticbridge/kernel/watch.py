@@ -61,11 +61,13 @@ def follow(
 ) -> bool:
     """Decides whether the handle goes where the device went, and how much of the wrench is sent.
 
-    The handle stays where it is while a clutch button is held, or a dead-man button is not, and the
-    wrench fades; it also fades without news for ``stale_ticks``. When that is over, and after a
-    stall, the coupling is re-seated: the handle is put to the tool, so that nothing is stretched,
-    the device's pose now belongs to it, and the wrench rises within ``fade_ticks``. A coupling that
-    was stretched while no force was felt would give back what nobody had put in.
+    The handle stays where it is while a clutch button is held, a dead-man button is not, or the
+    device is beyond its reach (at the edge of its workspace, into whose stops it must not be
+    driven), and the wrench fades; it also fades without news for ``stale_ticks``. When that is
+    over, and after a stall, the coupling is re-seated: the handle is put to the tool, so that
+    nothing is stretched, the device's pose now belongs to it, and the wrench rises within
+    ``fade_ticks``. A coupling that was stretched while no force was felt would give back what
+    nobody had put in.
 
     Args:
         state: The bound state.
@@ -87,6 +89,7 @@ def follow(
     s.since_news = s.since_news + max(elapsed, s.period) if is_stale else 0.0
     was_released = s.is_released != 0
     is_released = (buttons & s.clutch) != 0 or (s.dead_man != 0 and (buttons & s.dead_man) == 0)
+    is_released = is_released or norm(position) > s.reach
     s.is_released = is_released
     is_silent = is_released or (s.stale_ticks > 0 and s.stale_run > s.stale_ticks)
     s.silent_ticks = s.silent_ticks + 1 if is_silent else 0

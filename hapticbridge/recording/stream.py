@@ -32,6 +32,7 @@ KEPT_EVENTS = 4096
 """Events that can be written again should the recorder die; more cost memory alone."""
 
 _ENDED = "the recorder ended in mid-run; the recording stops there"
+_FULL = "the disk is full; the recording ends here, and is whole"
 
 
 class Onlooker(Protocol):
@@ -160,11 +161,13 @@ class RecordStream:
             self._onlooker.event(told)
 
     def look(self) -> None:
-        """Looks whether the recorder still lives; takes some microseconds.
+        """Looks whether the recorder still lives and has room; takes some microseconds.
 
         Raises:
-            RecordingError: It does not.
+            RecordingError: It does not, or its disk is full.
         """
+        if self.recorder is not None and self.recorder.is_disk_full:
+            raise RecordingError(_FULL)
         if self.recorder is not None and not self.recorder.is_alive():
             raise RecordingError(_ENDED)
 
