@@ -127,6 +127,7 @@ class Arrangement:
         self._is_pipelined = self.clock.name == RealClock.name if pipelined is None else pipelined
         with ExitStack() as refused:
             if isinstance(device, str):
+                refuse_simulated_time(device, self.clock)
                 device = device_for(self.scene, device)
                 refused.callback(device.close)  # else nobody could, if it is refused
             self.device = device

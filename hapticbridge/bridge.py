@@ -16,7 +16,7 @@ import numpy as np
 
 from hapticbridge.clock import slept_ns
 from hapticbridge.errors import DeviceError, HapticBridgeError, SafetyTrip
-from hapticbridge.guard import trip_reason, wait_until_still
+from hapticbridge.guard import trip_reason
 from hapticbridge.inputs import apply_writes
 from hapticbridge.kernel.ahead import can_split
 from hapticbridge.kernel.codes import BAD_RESULT, HALF_DONE, OK, RING_FULL
@@ -69,7 +69,7 @@ class Bridge(Opened):
             if self._is_realtime:
                 self._note_grants(stack.enter_context(real_time()))
             try:
-                wait_until_still(self.device, self._sample, self.period, self.clock)
+                self._come_to_rest()
                 self.clock.start(round(self.period * 1e9))
                 self._slept = slept_ns()
                 reason = self._loop(last, on_tick)

@@ -122,8 +122,8 @@ class RealClock:
         return deadline, now, skipped
 
     def now(self) -> int:
-        """Returns ns of running."""
-        return running_ns() - self._origin
+        """Returns ns of running; 0 before the first start."""
+        return running_ns() - self._origin if self._period else 0
 
 
 class SimulatedClock:

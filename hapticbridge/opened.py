@@ -14,7 +14,7 @@ from hapticbridge.arrangement import Arrangement
 from hapticbridge.certificate import condition_sentences
 from hapticbridge.clock import RealClock
 from hapticbridge.errors import DeviceError, HapticBridgeError, SceneError
-from hapticbridge.guard import refuse_stretched_start
+from hapticbridge.guard import refuse_stretched_start, wait_until_still
 from hapticbridge.inputs import Write, input_writes
 from hapticbridge.jit import direct
 from hapticbridge.kernel.after import answer_step
@@ -117,13 +117,23 @@ class Opened(Arrangement):
             guarding=self._guarding,
         )
         self._binding = binding = Binding(scene.model, scene.data, self.parameters)
-        refuse_stretched_start(binding.state, self._limits)
+        refuse_stretched_start(binding.state, self._sample, self._limits)
         if self._stream.is_read:
             meta = describe_run(
                 scene, self.parameters, binding, method=method.name, device=info, clock=clock.name
             )
             self._stream.start(meta, attachments(scene))
             self._event("start")
+
+    def _come_to_rest(self) -> None:
+        """Waits until a real device is still, before force is enabled.
+
+        Raises:
+            DeviceError: It moves on, or a hand has meanwhile moved an absolute one too far.
+        """
+        wait_until_still(self.device, self._sample, self.period, self.clock)
+        if not self._tick and self._workspace.is_absolute:
+            refuse_stretched_start(self._binding.state, self._sample, self._limits)
 
     def _compile(self) -> None:
         """Gets the machine code of the tick ready, so that the first one is not late."""

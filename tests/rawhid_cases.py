@@ -7,7 +7,8 @@ from emulated.rawhid_model import Claims, RawHid
 
 from hapticbridge.device import SimulatedDevice
 from hapticbridge.device.plugged import tell_nobody
-from hapticbridge.device.rawhid.driver import RawHidDevice, open_rawhid
+from hapticbridge.device.rawhid.driver import RawHidDevice
+from hapticbridge.device.rawhid.finding import open_rawhid
 
 PERIOD = 1e-3
 
@@ -16,7 +17,7 @@ def opened(model: RawHid | None = None, **options: object) -> tuple[RawHidDevice
     """Returns the driver, opened; the device; and what it is plugged into."""
     model = model or RawHid(SimulatedDevice())
     seam = HidSeam(model)
-    return open_rawhid(options, tell_nobody, seam), model, seam
+    return open_rawhid(options, tell_nobody, seam, lambda: seam.now), model, seam
 
 
 def paddle() -> RawHid:

@@ -10,6 +10,7 @@ from cli_cases import Called
 from emulated.hid_seam import HidSeam
 from emulated.pid_model import PidStick
 
+from hapticbridge import Bridge, SimulatedClock
 from hapticbridge.cli import devices as command
 from hapticbridge.device.families import FAMILIES, RULES_FILE, plugged_devices, udev_rules
 from hapticbridge.device.forcedimension.library import VARIABLE
@@ -22,6 +23,7 @@ from hapticbridge.device.plugged import (
     permission_problem,
 )
 from hapticbridge.device.transport import hid_search, usb_bus, usb_search
+from hapticbridge.errors import DeviceError
 
 
 def plug(
@@ -291,3 +293,22 @@ def test_how_often_a_device_is_asked_is_read_where_the_kernel_shows_it(
     assert hid_search.report_descriptor("/dev/hidraw3", None) == b"\x05\x01"
     assert hid_search.report_descriptor("/dev/hidraw4", None) == b""
     assert hid_search.polling("/dev/hidraw4") == (None, None)
+
+
+@pytest.mark.parametrize("family", FAMILIES, ids=lambda family: family.name)
+def test_hardware_and_fast_are_refused_together_before_anything_is_opened(
+    call: Called, monkeypatch: pytest.MonkeyPatch, family: Family
+) -> None:
+    def opened(*_: object, **__: object) -> None:
+        raise AssertionError("it was opened first, and its user asked to home it")
+
+    for module in ("hapticbridge.cli.run", "hapticbridge.arrangement"):
+        monkeypatch.setattr(f"{module}.device_for", opened)
+    code, out, err = call("run", "point_mass", "--fast", "--device", f"{family.name}:serial=1")
+    assert (code, out) == (2, "")
+    assert "moves in real time" in err
+    assert "leave out --fast" in err
+    with pytest.raises(DeviceError, match=rf"the device '{family.name}' moves in real time"):
+        Bridge("point_mass", family.name, clock=SimulatedClock())
+    with pytest.raises(AssertionError, match="opened first"):
+        call("run", "point_mass", "--device", family.name)

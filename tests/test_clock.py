@@ -92,6 +92,15 @@ def test_a_late_wake_within_a_period_skips_nothing(wall: Wall) -> None:
     assert wake > deadline + 300_000
 
 
+def test_time_begins_with_the_first_start(wall: Wall) -> None:
+    """What happens before is at 0, not at the hours that the machine has run."""
+    clock = RealClock()
+    wall.ns += 10_000_000_000
+    assert clock.now() == 0
+    clock.start(PERIOD)
+    assert 0 < clock.now() < PERIOD
+
+
 def test_time_stands_still_between_runs(wall: Wall) -> None:
     clock = RealClock()
     clock.start(PERIOD)

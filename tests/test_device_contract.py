@@ -36,7 +36,7 @@ from hapticbridge.device import (
 )
 from hapticbridge.device.pid.driver import open_pid
 from hapticbridge.device.plugged import tell_nobody
-from hapticbridge.device.rawhid.driver import open_rawhid
+from hapticbridge.device.rawhid.finding import open_rawhid
 from hapticbridge.device.spacemouse.driver import open_spacemouse
 from hapticbridge.errors import DeviceError
 from hapticbridge.tick import SAMPLE_DTYPE, TICK_DTYPE

@@ -23,6 +23,7 @@ from faults.rig import Outcome, Rig
 from numpy.typing import NDArray
 
 from hapticbridge.audit import audit
+from hapticbridge.bridge import Bridge
 from hapticbridge.clock import RealClock, SimulatedClock
 from hapticbridge.device.last_word import LastWord
 from hapticbridge.errors import DeviceError, HapticBridgeError, SafetyTrip
@@ -200,16 +201,24 @@ def test_a_device_that_moved_before_the_first_tick_finds_the_coupling_unstretche
 
 
 class Moving:
-    """A device with motors that moves for a while."""
+    """A device with motors that moves for a while, and says where only after it was written to."""
 
     def __init__(self, still_after: int) -> None:
         self.info = replace(ScriptedDevice(lambda _k: (0,) * 7).info, is_real=True)
         self.count, self._still_after = 0, still_after
+        self._is_asked = True
+        self.forces: list[NDArray[np.float64]] = []
 
     def read(self, sample: NDArray[np.void]) -> int:
+        assert self._is_asked, "nobody asked since the last answer"
+        self._is_asked = False
         self.count += 1
-        sample["position"][0, 0] = 1e-3 * min(self.count, self._still_after)
+        sample["position"][0, 0] = 2e-3 * min(self.count, self._still_after)
         return 0
+
+    def write(self, wrench: NDArray[np.float64]) -> None:
+        self._is_asked = True
+        self.forces.append(wrench.copy())
 
 
 def test_force_waits_until_the_device_is_still(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -217,6 +226,7 @@ def test_force_waits_until_the_device_is_still(monkeypatch: pytest.MonkeyPatch) 
     device: Any = Moving(still_after=30)
     wait_until_still(device, np.zeros(1, SAMPLE_DTYPE), 1e-3, RealClock())
     assert device.count > 30
+    assert not np.any(device.forces)
     unread: Any = Moving(still_after=30)
     wait_until_still(unread, np.zeros(1, SAMPLE_DTYPE), 1e-3, SimulatedClock())
     assert unread.count == 0
@@ -224,6 +234,23 @@ def test_force_waits_until_the_device_is_still(monkeypatch: pytest.MonkeyPatch) 
     restless: Any = Moving(still_after=10**6)
     with pytest.raises(DeviceError, match="hold it still"):
         wait_until_still(restless, np.zeros(1, SAMPLE_DTYPE), 1e-3, RealClock())
+
+
+@pytest.mark.parametrize(("strays_to", "is_refused"), [(0.004, False), (0.05, True)])
+def test_an_absolute_device_that_strayed_while_rest_was_waited_for_is_refused(
+    monkeypatch: pytest.MonkeyPatch, strays_to: float, is_refused: bool
+) -> None:
+    """At 2400 N/m the device's 10 N are reached 4.17 mm from the grip."""
+    monkeypatch.setattr(start_module, "STILL_TIME", 0.005)
+    device = ScriptedDevice(lambda tick: (strays_to if tick else 0.0, 0, 0, 1, 0, 0, 0))
+    device.info = replace(device.info, is_real=True)
+    with Bridge("point_mass", device, absolute=True, realtime=False) as bridge:
+        if not is_refused:
+            bridge.run(0.01)
+            return
+        with pytest.raises(SafetyTrip, match="absolute pose puts the handle 50 mm from the grip"):
+            bridge.run(0.01)
+    assert not np.any(device.writes)
 
 
 @pytest.mark.parametrize(
@@ -265,6 +292,7 @@ def test_a_guard_reads_back_as_it_was_written() -> None:
 
 KILLED = """
 import sys, time
+from hapticbridge.bridge import Bridge
 from hapticbridge.clock import RealClock, SimulatedClock
 from hapticbridge.device.last_word import LastWord
 word = LastWord(sys.argv[1], b"\\0zero", b"\\1off")

@@ -10,7 +10,18 @@ import pytest
 PACKAGE = Path(__file__).parents[1] / "hapticbridge"
 
 ORDER = (
-    ("errors", "arguments", "jit", "tick", "pose", "clock", "signals", "picture", "jsonable"),
+    (
+        "errors",
+        "arguments",
+        "jit",
+        "tick",
+        "pose",
+        "clock",
+        "signals",
+        "picture",
+        "jsonable",
+        "quantity",
+    ),
     ("coupling", "kernel", "mechanics", "passivity"),
     ("scene",),
     ("rendering",),

@@ -72,8 +72,19 @@ def test_default_couplings_are_rendered_ten_times_better_than_by_implicit(tmp_pa
     assert 10 * errors["lossless"] < errors["implicit"]
 
 
-@pytest.mark.parametrize("name", ["spun", "arm", "arm in gravity with a spring"])
-def test_turning_tool_and_arm_are_followed_to_second_order(name: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("name", "away", "turned", "lost"),
+    [
+        ("spun", 2e-5, 2e-4, 3.4),
+        ("arm", 1e-5, 2e-4, 3.9),
+        # the spring of a joint is MuJoCo's own, implicit: what it loses falls with T alone
+        ("arm in gravity with a spring", 2e-5, 2e-4, 2.06),
+    ],
+)
+def test_turning_tool_and_arm_are_followed_to_second_order(
+    name: str, away: float, turned: float, lost: float, tmp_path: Path
+) -> None:
+    # in m and rad; how many times less energy is lost at half the step
     asked = Coupling(1000.0, 5.0, 0.0, 0.0)
     xml = ARM.format(gravity=0, spring=0) if name == "arm" else ARM.format(gravity=-9.81, spring=2)
     if name == "spun":
@@ -90,12 +101,14 @@ def test_turning_tool_and_arm_are_followed_to_second_order(name: str, tmp_path: 
     reference = run("lossless", T / 32)
     coarse, fine = run("lossless", T), run("lossless", T / 2)
     errors = distance(coarse, reference)
-    assert errors[0] < 2e-5
-    assert errors[1] < 2e-4
+    assert errors[0] < away
+    assert errors[1] < turned
     assert errors[0] / distance(fine, reference)[0] == pytest.approx(4.0, abs=0.6)
     assert distance(run("implicit", T), reference)[0] > 50 * errors[0]
     # what it creates is given back at once: from the first tick on it never exceeds the start
     assert coarse["environment_energy"].max() <= 1e-9
+    loss, less = (-rows["environment_energy"].min() for rows in (coarse, fine))
+    assert loss / less == pytest.approx(lost, abs=0.15)
 
 
 def test_energy_that_turning_creates_is_given_back(tmp_path: Path) -> None:
@@ -216,15 +229,30 @@ def test_tool_changes_over_before_it_touches_and_back_after() -> None:
     assert step <= others
 
 
-def test_touch_and_go_errs_by_less_than_a_third_of_implicit() -> None:
+@pytest.mark.parametrize(
+    ("frequency", "same_felt", "same_device"),
+    # slow taps stay near for longer, where both are implicit: at the same B a third is not reached
+    [(4.0, 0.31, 0.14), (1.0, 0.50, 0.20)],
+)
+def test_touch_and_go_errs_by_a_share_of_implicit(
+    frequency: float, same_felt: float, same_device: float
+) -> None:
     scene = load_scene("virtual_wall")
-    asked = Coupling(2400.0, 1.7, 1.0, 0.002)
-    errors = {}
-    for method in ("implicit", "lossless"):
-        fine, _ = led(scene, method, asked, tapping(T / 32, 4.0), T / 32)
-        rows, _ = led(scene, method, asked, tapping(T, 4.0), T)
-        errors[method] = distance(rows, fine)[0]
-    assert errors["lossless"] < errors["implicit"] / 3
+
+    def error(method: str, asked: Coupling) -> float:
+        coarse, fine = (
+            led(scene, method, asked, tapping(period, frequency)[: round(1 / period)], period)[0]
+            for period in (T, T / 32)
+        )
+        return distance(coarse, fine)[0]
+
+    felt = Coupling(2400.0, 1.7, 1.0, 0.002)
+    lossless = error("lossless", felt)
+    assert lossless / error("implicit", felt) == pytest.approx(same_felt, rel=0.05)
+    # with the same B', so that both need the same device
+    assert lossless / error("implicit", LOSSLESS.used(felt, T)) == pytest.approx(
+        same_device, rel=0.05
+    )
 
 
 def test_joint_friction_and_constraints_keep_a_tool_implicit() -> None:

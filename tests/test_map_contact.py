@@ -43,6 +43,9 @@ from hapticbridge.study.maps.verdicts import MISSING, VERDICTS
 LIGHT = [(0.03, 0.0, 1)]
 """A peg of 30 g without friction in the first random hand: the hardest case of the search."""
 
+LIGHT_AT_MOUTH = (1000.0, *LIGHT[0])
+"""The same in and out of the hole, at 1000 N/m."""
+
 DAMPED = Treatment((SUGGESTED[0] * PERIOD, SUGGESTED[1]))
 
 
@@ -163,6 +166,21 @@ def test_methods_meet_the_same_hands_and_come_and_go(rig: str) -> None:
         assert one.peak_force == pytest.approx(other.peak_force, rel=0.2)
         assert one.peak_force != other.peak_force
     assert len(cases_of(rig, 0.1)) == {"taps": 40, "mouth": 80}[rig]
+
+
+def test_on_the_same_device_a_jamming_peg_uses_the_same_slack_by_every_method() -> None:
+    case = [LIGHT_AT_MOUTH]
+    (lossless,) = method_runs("mouth", "lossless", case)
+    implicit, compensated = (
+        next(method_runs("mouth", method, case, same_law=True))
+        for method in ("implicit", "compensated")
+    )
+    assert implicit == compensated
+    assert lossless.environment == "active"
+    assert lossless.slack_share == pytest.approx(implicit.slack_share, rel=1e-9)
+    # asked for the same B instead, implicit has another damper, and the peg jams otherwise
+    (felt,) = method_runs("mouth", "implicit", case)
+    assert abs(felt.slack_share / lossless.slack_share - 1) > 0.02
 
 
 def of(environment: str, depth: float, *, created: float = 0.0, first: int = -1) -> ContactRun:

@@ -9,12 +9,15 @@ import resource
 import shutil
 import sys
 import tempfile
+import tracemalloc
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mcap.opcode import Opcode
 from mcap.reader import NonSeekingReader, SeekingReader
 from mcap.writer import Writer
 from mcap_ros2.decoder import DecoderFactory
@@ -167,6 +170,58 @@ def test_whole_chunks_reach_the_file_before_it_is_closed(tmp_path: Path) -> None
     lost = 1000 - recording.ticks.size
     assert 0 <= lost * 435 <= layout.CHUNK_SIZE + 435
     assert read_recording(path).ticks.size == 1000
+
+
+def test_memory_of_the_writer_does_not_grow_with_the_length_of_a_run(tmp_path: Path) -> None:
+    """Its index of chunks waits on disk; as the library keeps it, 40 chunks take 36 kB."""
+    rows, path = random_rows(3000), tmp_path / "run.mcap"
+    writer = RecordingWriter(path, META, FILES, EPOCH)
+    held = []
+    tracemalloc.start()
+    try:
+        for start in range(0, 5 * rows.size, rows.size):
+            rows["deadline_ns"] = (np.arange(start, start + rows.size) + 1) * 1_000_000
+            for first in range(0, rows.size, 100):
+                writer.write_ticks(rows[first : first + 100])
+            writer._mcap.flush()  # type: ignore[no-untyped-call]
+            held.append(tracemalloc.get_traced_memory()[0])
+    finally:
+        tracemalloc.stop()
+    writer.close()
+    assert held[-1] - held[0] < 1024
+    assert list(tmp_path.iterdir()) == [path]
+    ends = chunk_ends(path)
+    assert len(ends) == 50
+    assert path.read_bytes()[ends[-1][0]] == Opcode.MESSAGE_INDEX
+
+
+def test_an_index_that_finds_no_room_ends_the_recording_in_a_sentence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    full = Path("/dev/full")
+    monkeypatch.setattr(tempfile, "TemporaryFile", lambda **_: full.open("wb", buffering=0))
+    writer = RecordingWriter(tmp_path / "run.mcap", META, FILES, EPOCH)
+    with pytest.raises(RecordingError, match=r"cannot write the recording .*No space left"):
+        writer.write_ticks(random_rows(1000))
+    recording = read_recording(tmp_path / "run.mcap")
+    assert recording.is_cut
+    assert recording.ticks.size > 0
+
+
+def test_a_folder_that_takes_no_other_file_still_takes_a_recording(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    make = tempfile.TemporaryFile
+
+    def elsewhere(dir: Path | None = None, **options: Any) -> Any:  # noqa: A002
+        if dir == tmp_path:
+            raise PermissionError(errno.EACCES, "Permission denied")
+        return make(**options)
+
+    monkeypatch.setattr(tempfile, "TemporaryFile", elsewhere)
+    assert same(
+        read_recording(write(tmp_path / "run.mcap", random_rows(900)).path).ticks, random_rows(900)
+    )
 
 
 def test_recording_without_a_tick_is_whole(tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ from emulated.spacemouse_model import SpaceMouse
 from emulated.usb_device import StallError
 
 from hapticbridge.device.plugged import Family, Plugged, UsbId
-from hapticbridge.device.rawhid.driver import open_rawhid
+from hapticbridge.device.rawhid.finding import open_rawhid
 from hapticbridge.device.transport import hid as transport_hid
 from hapticbridge.device.transport import hid_search
 from hapticbridge.device.transport.hex_log import VARIABLE, HexLog

@@ -16,7 +16,6 @@ from hapticbridge.cli.terminal import (
     plain,
     print_json,
     progress,
-    quantity,
     tell,
     write_figure,
 )
@@ -33,6 +32,7 @@ from hapticbridge.identify.measured_profile import measured_profile
 from hapticbridge.identify.picture import draw_identification
 from hapticbridge.passivity import ZWidth, z_width
 from hapticbridge.picture import check_ending
+from hapticbridge.quantity import quantity
 from hapticbridge.rendering import default_method
 from hapticbridge.study.theory import draw_z_width, recommended
 

@@ -17,11 +17,11 @@ from hapticbridge.certificate import default_coupling
 from hapticbridge.cli.run_words import announce, announce_measured, print_summary
 from hapticbridge.cli.terminal import err, out, tell
 from hapticbridge.cli.view import tell_address
-from hapticbridge.clock import RealClock, SimulatedClock, period_of
+from hapticbridge.clock import Clock, RealClock, SimulatedClock, period_of
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Device, DeviceInfo, device_for
 from hapticbridge.errors import HapticBridgeError, RecordingError
-from hapticbridge.guard import USUAL_ENERGY, USUAL_STRETCH, Limits
+from hapticbridge.guard import USUAL_ENERGY, USUAL_STRETCH, Limits, refuse_simulated_time
 from hapticbridge.kernel.parameters import checked_substeps
 from hapticbridge.rendering import Method, default_method, method_named
 from hapticbridge.scene import Scene, load_scene, settings_from
@@ -133,14 +133,18 @@ class Run:
             raise HapticBridgeError(f"duration is {self.duration!r} s; it must be finite and > 0")
         if self.record is not None and self.record.exists() and not self.overwrite:
             raise RecordingError(f"'{self.record}' exists; choose another file or add --overwrite")
+        clock = SimulatedClock() if self.fast else RealClock()
+        refuse_simulated_time(self.device, clock)  # before anybody is asked to home it
         window = Window(Address(self.host, self.port)) if self.view else None
         scene = load_scene(self.scene, self.grip, **settings_from(self.settings))
         with ExitStack() as stack:
             device = device_for(scene, self.device, tell)
             stack.callback(device.close)  # what is refused from here on must not leave it claimed
-            return self._feel(scene, device, stack, window)
+            return self._feel(scene, device, clock, stack, window)
 
-    def _feel(self, scene: Scene, device: Device, stack: ExitStack, window: Window | None) -> int:
+    def _feel(
+        self, scene: Scene, device: Device, clock: Clock, stack: ExitStack, window: Window | None
+    ) -> int:
         """Runs the bridge on a device that is open; returns the exit code."""
         scales = self.scale, self.scale if self.force_scale is None else self.force_scale
         bridge = Bridge(
@@ -153,7 +157,7 @@ class Run:
             contact_stiffness=self.contact_stiffness,
             i_know=self.i_know,
             recording=self.record,
-            clock=SimulatedClock() if self.fast else RealClock(),
+            clock=clock,
             scale=scales[0],
             force_scale=scales[1],
             axes=self.axes,

@@ -9,7 +9,7 @@ from hapticbridge.device.forcedimension.finding import FAMILY as FORCE_DIMENSION
 from hapticbridge.device.haply.finding import FAMILY as HAPLY
 from hapticbridge.device.pid.driver import FAMILY as PID
 from hapticbridge.device.plugged import Family, Plugged, UsbId
-from hapticbridge.device.rawhid.driver import FAMILY as RAWHID
+from hapticbridge.device.rawhid.finding import FAMILY as RAWHID
 from hapticbridge.device.spacemouse.driver import FAMILY as SPACEMOUSE
 from hapticbridge.device.transport import hid_search, usb_search
 

@@ -7,8 +7,11 @@ from numpy.typing import NDArray
 
 from hapticbridge.clock import Clock, RealClock, SimulatedClock
 from hapticbridge.device import Device, DeviceInfo
+from hapticbridge.device.families import family_named
 from hapticbridge.errors import DeviceError
 from hapticbridge.guard.limits import Limits
+from hapticbridge.kernel.handle import handle_pose
+from hapticbridge.pose import canonical
 from hapticbridge.tick import SAMPLE_DTYPE
 
 STILL_TIME, PATIENCE = 0.1, 5.0
@@ -18,12 +21,17 @@ for. A hand that reaches for a device stays for longer than the first."""
 STILL_DISTANCE = 1e-3
 """In m, moved within ``STILL_TIME``: 1 cm/s, what a hand that holds still stays below."""
 
+_NO_FORCE = np.zeros(6)
+
 
 def wait_until_still(device: Device, sample: NDArray[np.void], period: float, clock: Clock) -> None:
     """Waits until a device with motors is still; returns at once for any other.
 
+    It is commanded zero force in every period: a Falcon says where it is only when it is told what
+    force to give, and a device with a watchdog must not find its host silent.
+
     Args:
-        device: Started, under zero force.
+        device: Started.
         sample: Shape (1,), ``SAMPLE_DTYPE``; receives the newest one.
         period: T in s, at which it is read.
         clock: The run's. Only real time is waited for; a clock that somebody drives also drives
@@ -41,6 +49,7 @@ def wait_until_still(device: Device, sample: NDArray[np.void], period: float, cl
     while True:
         clock.wait()
         device.read(sample)
+        device.write(_NO_FORCE)
         now = clock.now()
         begun = now if begun is None else begun
         moved = float(np.linalg.norm(sample["position"][0] - anchor["position"][0]))
@@ -55,34 +64,51 @@ def wait_until_still(device: Device, sample: NDArray[np.void], period: float, cl
             )
 
 
-def refuse_simulated_time(info: DeviceInfo, clock: Clock) -> None:
+def refuse_simulated_time(device: DeviceInfo | str, clock: Clock) -> None:
     """Refuses a clock that runs ahead of a device that lives in real time.
 
     That is a device with motors, and one that follows a hand without end, some time after it.
 
+    Args:
+        device: Its data sheet; or what it is to be opened as, before a user is asked to home it:
+            all hardware lives in real time.
+        clock: The run's.
+
     Raises:
         DeviceError: It is so.
     """
-    follows = info.is_prescribed and info.delay != 0.0 and info.duration is None
-    if (info.is_real or follows) and isinstance(clock, SimulatedClock):
+    if isinstance(device, str):
+        name = device.partition(":")[0]
+        is_bound = family_named(name) is not None
+    else:
+        name = device.name
+        follows = device.is_prescribed and device.delay != 0.0 and device.duration is None
+        is_bound = device.is_real or follows
+    if is_bound and isinstance(clock, SimulatedClock):
         raise DeviceError(
-            f"the device '{info.name}' moves in real time, so the loop cannot run as fast as it "
+            f"the device '{name}' moves in real time, so the loop cannot run as fast as it "
             "goes; leave out --fast (in code: the SimulatedClock)"
         )
 
 
-def refuse_stretched_start(state: NDArray[np.void], limits: Limits) -> None:
+def refuse_stretched_start(
+    state: NDArray[np.void], sample: NDArray[np.void], limits: Limits
+) -> None:
     """Refuses a start at which the coupling would already pull with more than the force limit.
 
     Args:
         state: The kernel's state (``STATE_DTYPE``, one element) before the first tick.
+        sample: Where the device is, shape (1,), ``SAMPLE_DTYPE``.
         limits: Of the run.
 
     Raises:
         DeviceError: Says how far the handle is from the grip, and where the grip is.
     """
     s = state[0]
-    distance = float(np.linalg.norm(s["handle_position"] - s["tool_position"]))
+    x, y, z = sample["position"][0].tolist()
+    quaternion = canonical(tuple(sample["quaternion"][0].tolist()))
+    handle, _ = handle_pose(state, (x, y, z), quaternion)
+    distance = float(np.linalg.norm(np.subtract(handle, s["tool_position"])))
     force = float(s["stiffness"]) * distance
     if force > limits.force:
         raise DeviceError(

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from hapticbridge.errors import RecordingError
 from hapticbridge.recording import format as layout
+from hapticbridge.recording.chunk_index import ChunkIndexFile
 from hapticbridge.recording.format import Attachment
 from hapticbridge.recording.output import Output
 
@@ -57,6 +58,11 @@ class RecordingWriter:
         except OSError as error:
             raise self._refusal(error) from error
         try:
+            self._index = ChunkIndexFile(self.path.parent)
+        except OSError as error:
+            self._output.close()
+            raise self._refusal(error) from error
+        try:
             self._start(meta, attachments)
         except OSError as error:
             raise self._failed(error) from error
@@ -69,6 +75,7 @@ class RecordingWriter:
             enable_crcs=True,
             enable_data_crcs=True,
         )
+        self._index.take_over(self._mcap)
         self._mcap.start(library="hapticbridge")
         self._mcap.add_metadata(layout.METADATA_NAME, dict(meta))
         for item in attachments:
@@ -158,13 +165,17 @@ class RecordingWriter:
         except OSError as error:
             raise self._refusal(error) from error
         finally:
-            self._output.close()
+            self._release()
 
     def _failed(self, error: OSError) -> RecordingError:
         # nothing may follow a half-written chunk: the file is then one that was cut there
         self._is_closed = True
-        self._output.close()
+        self._release()
         return self._refusal(error)
+
+    def _release(self) -> None:
+        self._output.close()
+        self._index.close()
 
     def _refusal(self, error: OSError) -> RecordingError:
         reason = error.strerror or str(error)

@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticbridge.audit import AuditReport
 from hapticbridge.audit.balance import Balance
 from hapticbridge.audit.reached import Reached
 from hapticbridge.device import DeviceInfo
@@ -58,6 +59,18 @@ class Evidence:
     def lateness(self) -> Array:
         """How long after its deadline each tick began, (n,) in s."""
         return np.asarray(1e-9 * (self.ticks["wake_ns"] - self.ticks["deadline_ns"]))
+
+    def judged(self, report: AuditReport) -> tuple[Array, Array]:
+        """Returns what the port at fault has given, and what it may have given, (n,) in J each.
+
+        Args:
+            report: The audit's verdict on the run, ``active``.
+        """
+        if report.port == "device":
+            return self.kicked, np.zeros_like(self.kicked)
+        # asked for strictly, the slack does not count
+        is_slack_used_up = report.environment == "active"
+        return self.created, self.allowed if is_slack_used_up else np.zeros_like(self.allowed)
 
     @classmethod
     def of(cls, recording: Recording) -> Evidence | None:

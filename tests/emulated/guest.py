@@ -5,6 +5,7 @@ The guest sees the host's files, read-only, so the same interpreter and packages
 
 from __future__ import annotations
 
+import contextlib
 import os
 import shlex
 import shutil
@@ -19,7 +20,23 @@ from pathlib import Path
 import platformdirs
 
 CHECKOUT = Path(__file__).resolve().parents[2]
-_MEMORY_MIB = 1024
+_MEMORY_MIB = 2048
+"""Taken from this machine as the guest uses it. 1 GiB holds what the checks need, but not the
+compiler beside it, where the host has not compiled ahead."""
+
+PATIENCE = 150.0
+"""In s of this machine's time: a guest that prints nothing for so long is stopped, where it is to
+print something. The longest check takes a tenth of it on a machine that does nothing else."""
+
+_LOOK = 0.2
+"""In s: how often it is looked whether the guest prints."""
+
+_KILLED = 128 + 9  # exit status of a command that the kernel killed, as a shell tells it
+
+_PIDFF = b"Force feedback for USB HID PID devices"
+"""What hid-pidff prints, so what a kernel's file holds that was built with it."""
+
+NO_PIDFF = "this kernel has no hid-pidff (CONFIG_HID_PID)"
 
 NO_KERNEL = "no User-Mode Linux kernel: scripts/build_uml builds one, or HAPTICBRIDGE_UML names one"
 
@@ -42,13 +59,20 @@ def kernel() -> Path | None:
     return next((place for place in places if os.access(place, os.X_OK)), None)
 
 
+def has_pidff() -> bool:
+    """Tells whether the guest's kernel has Linux's own driver for force feedback."""
+    program = kernel()
+    return program is not None and _PIDFF in program.read_bytes()
+
+
 @dataclass(frozen=True)
 class GuestRun:
     """How a command in the guest ended.
 
     Attributes:
         status: Its exit status; None where the guest ended before it, or took too long.
-        output: What it printed, or what the guest's kernel said where there is no status.
+        output: What it printed, and what the guest's kernel said where there is no status, or where
+            that kernel killed the command.
         seconds: Of this machine's time, boot included.
     """
 
@@ -64,6 +88,7 @@ def run_in_guest(
     environment: Mapping[str, str],
     is_virtual: bool,
     timeout: float = 120.0,
+    patience: float | None = None,
 ) -> GuestRun:
     """Runs a command as the only job of a freshly booted guest.
 
@@ -74,6 +99,7 @@ def run_in_guest(
         is_virtual: Time passes only while everything in the guest waits, so that nothing depends on
             this machine's speed.
         timeout: In s of this machine's time.
+        patience: Likewise: for how long it may print nothing; None: for as long as it likes.
     """
     program = kernel()
     if program is None:
@@ -109,18 +135,37 @@ def run_in_guest(
         errors="replace",
         start_new_session=True,
     )
-    try:
-        console, _ = guest.communicate(timeout=timeout)
-    except subprocess.TimeoutExpired:
-        os.killpg(guest.pid, signal.SIGKILL)
-        guest.communicate()
-        console = f"the guest was stopped after {timeout:g} s"
-    seconds = time.monotonic() - start
     output, status = folder / "output", folder / "status"
+    console = _console(guest, output, timeout, patience)
+    seconds = time.monotonic() - start
+    said = output.read_text(errors="replace") if output.is_file() else ""
     if not status.is_file():
-        said = output.read_text(errors="replace") if output.is_file() else ""
         return GuestRun(None, said + console, seconds)
-    return GuestRun(int(status.read_text()), output.read_text(errors="replace"), seconds)
+    code = int(status.read_text())
+    return GuestRun(code, said + console if code == _KILLED else said, seconds)
+
+
+def _console(
+    guest: subprocess.Popen[str], output: Path, timeout: float, patience: float | None
+) -> str:
+    """Waits for a guest's end, or brings it about; returns what its kernel said, or why."""
+    start = heard = time.monotonic()
+    size, reason = 0, ""
+    while True:
+        try:
+            return guest.communicate(timeout=_LOOK)[0] + reason
+        except subprocess.TimeoutExpired:
+            now = time.monotonic()
+        printed = output.stat().st_size if output.is_file() else 0
+        if printed != size:
+            size, heard = printed, now
+        if now - start > timeout:
+            reason = f"the guest was stopped after {timeout:g} s"
+        elif patience is not None and now - heard > patience:
+            reason = f"the guest was stopped: it had printed nothing for {patience:g} s"
+        if reason:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(guest.pid, signal.SIGKILL)
 
 
 def python_environment() -> dict[str, str]:

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 from emulated.emulator_process import EmulatorProcess
+from emulated.guest import NO_PIDFF
 from emulated.pid_model import PidStick
 
 import hapticbridge as hb
@@ -62,6 +63,7 @@ def _event_node() -> Path | None:
     return Path("/dev/input") / found[0].name if found else None
 
 
+@pytest.mark.skipif("HAPTICBRIDGE_NO_PIDFF" in os.environ, reason=NO_PIDFF)
 @pytest.mark.parametrize("is_odd", [False, True], ids=["usual", "odd"])
 def test_the_kernels_driver_takes_the_stick_and_pushes_it_the_way_it_says(
     plug_usb: Plug, is_odd: bool

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
-from collections.abc import Mapping
-from dataclasses import replace
+import time
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -13,7 +12,6 @@ from numpy.typing import NDArray
 
 from hapticbridge.device.base import AXES, checked_period
 from hapticbridge.device.last_word import LastWord
-from hapticbridge.device.plugged import Family, Tell, UsbId, chosen
 from hapticbridge.device.rawhid.frame import (
     LARGEST,
     LONGEST_WATCHDOG_MS,
@@ -21,11 +19,9 @@ from hapticbridge.device.rawhid.frame import (
     Status,
     force_frame,
 )
-from hapticbridge.device.rawhid.sheet import CHANGES, asked, data_sheet, reports
+from hapticbridge.device.rawhid.sheet import asked, data_sheet, reports
 from hapticbridge.device.rawhid.stream import StateStream
-from hapticbridge.device.transport.hex_log import HexLog
-from hapticbridge.device.transport.hid import HidLink, Link
-from hapticbridge.device.transport.hid_search import HidApi, find
+from hapticbridge.device.transport.hid import Link
 from hapticbridge.errors import DeviceError, DeviceLost
 from hapticbridge.pose import canonical, quaternion_exp
 from hapticbridge.tick import SAMPLE_DTYPE, TickFlag
@@ -41,7 +37,7 @@ SHORTEST_WATCHDOG, WATCHDOG_PERIODS = 0.02, 10
 """The watchdog asked for is ten periods of the loop, but not less than 20 ms: an ordinary kernel
 stalls a loop for some ms now and then, and a force that drops out each time would rattle."""
 
-_NO_WRENCH = (0.0,) * 6
+NO_WRENCH = (0.0,) * 6
 
 
 class RawHidDevice:
@@ -57,6 +53,7 @@ class RawHidDevice:
         link: Reports to and from the device, open.
         name: What errors call it.
         changes: Numbers of the data sheet that go before what the device says of itself.
+        now: Returns the time in s of a clock that only grows.
 
     Attributes:
         info: Its data sheet.
@@ -68,14 +65,20 @@ class RawHidDevice:
             incomplete or out of range.
     """
 
-    def __init__(self, link: Link, name: str, changes: Mapping[str, Any] | None = None) -> None:
-        self._link, self._name = link, name
+    def __init__(
+        self,
+        link: Link,
+        name: str,
+        changes: Mapping[str, Any] | None = None,
+        now: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._link, self._name, self._now = link, name, now
         self._sequence = 0
         self.states = StateStream(name)
         self.info = data_sheet(name, *asked(link, name), dict(changes or {}))
         self._mask = np.array([float(axis in self.info.axes) for axis in AXES])
         self._sample = np.zeros(1, SAMPLE_DTYPE)
-        self._period, self._silent_ticks = 0.0, 0
+        self._period = self._heard = self._read = 0.0
         self._watchdog_ms = LONGEST_WATCHDOG_MS
         self._is_open, self._has_begun = True, False
         self.last_word: LastWord | None = None
@@ -96,7 +99,7 @@ class RawHidDevice:
         self._period = checked_period(period)
         watchdog = max(SHORTEST_WATCHDOG, WATCHDOG_PERIODS * period)
         self._watchdog_ms = min(math.ceil(1e3 * watchdog), LONGEST_WATCHDOG_MS)
-        self._silent_ticks, self._has_begun = 0, False
+        self._has_begun = False
         self.states = states = StateStream(self._name)
         self._link.take()
         for report in reports(self._link, FIRST_STATE_MS):
@@ -111,6 +114,7 @@ class RawHidDevice:
             )
         self._refuse_fault(states.newest)
         self._fill(states.newest)
+        self._heard = self._read = self._now()
         return self._sample.copy()
 
     def read(self, sample: NDArray[np.void]) -> int:
@@ -135,14 +139,16 @@ class RawHidDevice:
             is_new |= states.takes(report)
         if not self._has_begun:  # between the start and the loop nobody took what was sent
             self._has_begun, states.lost = True, 0
+        now = self._now()
+        if is_new or now - self._read > LONGEST_SILENCE + self._period:
+            self._heard = now  # or nobody listened meanwhile: the loop was away, not the device
+        self._read = now
         if not is_new:
-            self._silent_ticks += 1
-            silence = self._silent_ticks * self._period
+            silence = now - self._heard
             if silence > LONGEST_SILENCE:
                 raise DeviceLost(f"{self._name} has sent nothing for {1e3 * silence:.0f} ms")
             sample[0] = self._sample[0]
             return int(TickFlag.STALE_SAMPLE)
-        self._silent_ticks = 0
         self._refuse_fault(states.newest)
         self._fill(states.newest)
         sample[0] = self._sample[0]
@@ -169,7 +175,7 @@ class RawHidDevice:
             return
         self._is_open = False
         try:
-            self._send(force_frame(self._next(), _NO_WRENCH, 1, is_enabled=False))
+            self._send(force_frame(self._next(), NO_WRENCH, 1, is_enabled=False))
         except DeviceLost:
             pass  # its own watchdog does it
         finally:
@@ -213,49 +219,3 @@ class RawHidDevice:
 
     def _send(self, frame: bytes) -> None:
         self._link.write(b"\0" + frame)  # reports without a number: hidapi wants a 0 in front
-
-
-def open_rawhid(
-    options: Mapping[str, object], _tell: Tell, api: HidApi | None = None
-) -> RawHidDevice:
-    """Finds and opens a raw HID device.
-
-    Args:
-        options: ``serial``, ``log``, and numbers of the data sheet that go before its own.
-        api: hidapi or what stands for it; its reports are then not sent by a thread.
-
-    Raises:
-        DeviceError: There is none, or it cannot be opened or does not speak the protocol.
-    """
-    plugged = chosen(FAMILY, find(FAMILY, api), options.get("serial"))
-    log = options.get("log")
-    link = HidLink.open(
-        plugged, api, is_overlapped=api is None, log=HexLog(None if log is None else str(log))
-    )
-    changes = {key: value for key, value in options.items() if key in CHANGES}
-    try:
-        device = RawHidDevice(link, str(plugged), changes)
-    except BaseException:
-        link.close()
-        raise
-    device.info = replace(device.info, serial=plugged.serial)
-    if api is None and plugged.path.startswith("/dev/hidraw"):
-        zero = b"\0" + force_frame(0, _NO_WRENCH, 1, is_enabled=False)
-        with contextlib.suppress(OSError):  # its own watchdog is there in any case
-            device.last_word = LastWord(plugged.path, zero)
-    return device
-
-
-FAMILY = Family(
-    name="rawhid",
-    about="home-made devices that speak hapticbridge/device/rawhid.md (Teensy and the like)",
-    ids=(UsbId(0x16C0, 0x0486, "Teensy raw HID"),),
-    transport="hid",
-    axes="1 to 6, as built",
-    force="as built",
-    rate="to 1 kHz, as built",
-    options=("serial", "log", *CHANGES),
-    open=open_rawhid,
-    usage=(0xFFAB, 0x0200),
-)
-"""Teensy's raw HID interface; its second interface (usage page FFC9) is an emulated serial port."""

@@ -13,6 +13,7 @@ from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
 from hapticbridge.coupling import Coupling
+from hapticbridge.rendering import METHODS
 from hapticbridge.study.maps.contact_bars import Columns, draw_bars
 from hapticbridge.study.maps.contact_hands import random_push, random_taps, recorded
 from hapticbridge.study.maps.contact_rigs import (
@@ -66,12 +67,26 @@ def compared(rig: str, method: str, mass: float) -> dict[str, float | int]:
     return summary(list(method_runs(rig, method, cases_of(rig, mass))))
 
 
-def method_runs(rig: str, method: str, cases: Iterable[Case]) -> Iterator[ContactRun]:
-    """Runs a method through cases; ``taps`` are on a wall, ``mouth`` is in and out of a hole."""
+def method_runs(
+    rig: str, method: str, cases: Iterable[Case], *, same_law: bool = False
+) -> Iterator[ContactRun]:
+    """Runs a method through cases; ``taps`` are on a wall, ``mouth`` is in and out of a hole.
+
+    Args:
+        rig: One of ``RIGS``.
+        method: Its name.
+        cases: What to run it through.
+        same_law: Whether it is asked for what gives it the K and B' that ``lossless`` uses, which
+            need the same device. By default all methods are asked for the same K and B.
+    """
     treatment = Treatment(method=method)
     for stiffness, mass, friction, hand in cases:
         damping, turning = FELT_DAMPING * stiffness * PERIOD, PEG_ROTATION[0] * stiffness
-        coupling = Coupling(stiffness, damping, turning, FELT_DAMPING * turning * PERIOD)
+        felt = Coupling(stiffness, damping, turning, FELT_DAMPING * turning * PERIOD)
+        coupling = felt
+        if same_law:
+            law = METHODS["lossless"].used(felt, PERIOD)
+            coupling = METHODS[method].rendered(law, PERIOD)
         if rig == "taps":
             loop = loop_in("virtual_wall", "contact")
             path, holder = random_taps(hand)
@@ -80,7 +95,7 @@ def method_runs(rig: str, method: str, cases: Iterable[Case]) -> Iterator[Contac
             path, holder = recorded() if hand == 0 else random_push(hand)
         treatment.apply(loop.scene.model, friction)
         set_mass(loop, "tool" if rig == "taps" else "peg", mass)
-        device = firm_device(coupling, path, holder)
+        device = firm_device(felt, path, holder)
         records, run = run_once(loop, device, coupling, treatment, ticks_of(device))
         yield replace(run, depth=deepest(loop, records) if rig == "mouth" else _behind(records))
 

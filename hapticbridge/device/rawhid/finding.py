@@ -1,0 +1,67 @@
+"""Home-made devices that speak the open protocol: finding one among what is plugged in."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+
+from hapticbridge.device.last_word import LastWord
+from hapticbridge.device.plugged import Family, Tell, UsbId, chosen
+from hapticbridge.device.rawhid.driver import NO_WRENCH, RawHidDevice
+from hapticbridge.device.rawhid.frame import force_frame
+from hapticbridge.device.rawhid.sheet import CHANGES
+from hapticbridge.device.transport.hex_log import HexLog
+from hapticbridge.device.transport.hid import HidLink
+from hapticbridge.device.transport.hid_search import HidApi, find
+
+
+def open_rawhid(
+    options: Mapping[str, object],
+    _tell: Tell,
+    api: HidApi | None = None,
+    now: Callable[[], float] = time.monotonic,
+) -> RawHidDevice:
+    """Finds and opens a raw HID device.
+
+    Args:
+        options: ``serial``, ``log``, and numbers of the data sheet that go before its own.
+        api: hidapi or what stands for it; its reports are then not sent by a thread.
+        now: Returns the time in s of a clock that only grows.
+
+    Raises:
+        DeviceError: There is none, or it cannot be opened or does not speak the protocol.
+    """
+    plugged = chosen(FAMILY, find(FAMILY, api), options.get("serial"))
+    log = options.get("log")
+    link = HidLink.open(
+        plugged, api, is_overlapped=api is None, log=HexLog(None if log is None else str(log))
+    )
+    changes = {key: value for key, value in options.items() if key in CHANGES}
+    try:
+        device = RawHidDevice(link, str(plugged), changes, now)
+    except BaseException:
+        link.close()
+        raise
+    device.info = replace(device.info, serial=plugged.serial)
+    if api is None and plugged.path.startswith("/dev/hidraw"):
+        zero = b"\0" + force_frame(0, NO_WRENCH, 1, is_enabled=False)
+        with contextlib.suppress(OSError):  # its own watchdog is there in any case
+            device.last_word = LastWord(plugged.path, zero)
+    return device
+
+
+FAMILY = Family(
+    name="rawhid",
+    about="home-made devices that speak hapticbridge/device/rawhid.md (Teensy and the like)",
+    ids=(UsbId(0x16C0, 0x0486, "Teensy raw HID"),),
+    transport="hid",
+    axes="1 to 6, as built",
+    force="as built",
+    rate="to 1 kHz, as built",
+    options=("serial", "log", *CHANGES),
+    open=open_rawhid,
+    usage=(0xFFAB, 0x0200),
+)
+"""Teensy's raw HID interface; its second interface (usage page FFC9) is an emulated serial port."""
