@@ -20,6 +20,9 @@ from hapticbridge.view.address import Address
 STOP = b'{"command": "stop"}\n'
 """What the process says when the run is to stop."""
 
+PATIENCE = 2.0
+"""In s: how long the process may take to end; the run is over by then, and no force is left."""
+
 _BOOTSTRAP = """
 import sys
 sys.path.insert(0, sys.argv[1])
@@ -111,7 +114,11 @@ class Window:
         self._outbox.put(None)
         if self._process is not None:
             self._process.terminate()
-            self._process.wait()
+            try:
+                self._process.wait(PATIENCE)
+            except subprocess.TimeoutExpired:  # it hangs, or was stopped: that it cannot refuse
+                self._process.kill()
+                self._process.wait()
             for stream in (self._process.stdin, self._process.stdout):
                 with contextlib.suppress(OSError):
                     cast(IO[bytes], stream).close()
