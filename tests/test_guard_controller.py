@@ -55,6 +55,37 @@ def test_a_wall_of_one_and_a_half_times_the_limit_swings_without_and_decays_with
     assert 0.5 < ticks["injected_damping"].max() <= 2.0  # min(b, m/T)
 
 
+def twisted(folder: Path, controller: str) -> Outcome:
+    """As ``knocked``, about an axis: K_r is 1.5 times 2 b_r/T, knocked with 0.1 N m for 5 ms."""
+    rig = Rig(folder)
+    stiff(0.1, None, controller)(rig)
+    inertia = '<inertial pos="0 0 0" mass="1000" diaginertia="1000 1000 1000"/>'
+    rig.scene = folder / "heavy.xml"
+    rig.scene.write_text(HEAVY.replace("<freejoint/>", f"<freejoint/>{inertia}"))
+    rig.coupling = Coupling(400.0, 0.0, 1.5 * 2 * 2e-3 / T, 0.0)
+    rig.guard |= NO_TRIPS
+
+    def refuse(tick: int, wrench: NDArray[np.float64]) -> None:
+        if CAUSE <= tick < CAUSE + 5:
+            wrench[4] += 0.1
+
+    rig.device.refuse = refuse
+    return rig.run(CAUSE)
+
+
+def test_about_an_axis_too_a_wall_beyond_the_limit_swings_without_and_decays_with(
+    tmp_path: Path,
+) -> None:
+    late = slice(CAUSE + 900, CAUSE + 990)
+    without = twisted(tmp_path, "off").torques
+    assert without[late].max() > 0.7 * without[CAUSE + 50 : CAUSE + 90].max() > 0.02
+    with_it = twisted(tmp_path, "damper")
+    assert with_it.torques[late].max() < 0.1 * without[late].max()
+    assert (with_it.flags & ACTIVE).any()
+    assert with_it.report.verdict != "invalid", with_it.report.reason
+    assert with_it.report.resimulation == "bit for bit"
+
+
 @pytest.mark.parametrize("controller", ["damper", "tank"])
 def test_at_ten_times_the_limit_a_free_device_is_calmed(tmp_path: Path, controller: str) -> None:
     outcome = knocked(tmp_path, 10.0, None, controller)

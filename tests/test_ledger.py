@@ -121,7 +121,7 @@ def _closed(run: Run) -> Array:
     return np.asarray(run.stored() - np.cumsum(coupling_work(run)))
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(
     size=box_sizes,
     grip=st.tuples(*[st.floats(-0.03, 0.03)] * 3),
@@ -167,7 +167,7 @@ def test_random_free_motion_closes_the_balance_and_is_strictly_passive(
     assert ledger.slack_share == 0.0
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(
     mass=st.floats(0.01, 1),
     stiffness=st.floats(100, 2e4),

@@ -24,8 +24,8 @@ from hapticbridge.view.address import Address
 BY = "view"
 """Who gave a command of the page, as the recording says."""
 
-GOODBYE = 2.0
-"""In s: how long the process may take to end when it is told to; the run is over by then."""
+PATIENCE = 2.0
+"""In s: how long the process may take to end; the run is over by then, and no force is left."""
 
 _BOOTSTRAP = """
 import sys
@@ -120,8 +120,8 @@ class Window:
         if self._process is not None:
             self._process.terminate()
             try:
-                self._process.wait(GOODBYE)
-            except subprocess.TimeoutExpired:  # it stands still, or a debugger holds it
+                self._process.wait(PATIENCE)
+            except subprocess.TimeoutExpired:  # it hangs, or was stopped: that it cannot refuse
                 self._process.kill()
                 self._process.wait()
             for stream in (self._process.stdin, self._process.stdout):

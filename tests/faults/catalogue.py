@@ -391,7 +391,8 @@ def _watched(how: int) -> Callable[[Rig], None]:
             rig.options["onlooker"] = window = Window(Address("127.0.0.1", 0))
 
             def act(bridge: Bridge, tick: int) -> None:
-                if tick == CAUSE and window.process_id is not None:
+                if tick == CAUSE:
+                    assert window.process_id is not None
                     os.kill(window.process_id, how)
                 if tick >= CAUSE and tick % 100 == 0:
                     bridge.set_input(joint_force={})

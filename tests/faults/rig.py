@@ -160,11 +160,11 @@ class Rig:
     def run(self, cause: int) -> Outcome:
         """Runs it and reports."""
         path, error = self.recording or self.folder / "run.mcap", ""
-        options = {"limits": Limits(force=10.0, torque=0.5, ramp=0.2)} | self.options
         ticks_done = 0
         with ExitStack() as stack:
             if self.around is not None:
                 self.around(stack)
+            options = {"limits": Limits(force=10.0, torque=0.5, ramp=0.2)} | self.options
             try:
                 bridge = Bridge(
                     self.scene,
