@@ -14,6 +14,7 @@ from hapticbridge.errors import CommandError, RecordingError
 from hapticbridge.inputs import apply_writes
 from hapticbridge.opened import Opened
 from hapticbridge.provenance import (
+    MID_RUN,
     MODEL_ATTACHMENT,
     STATE_ATTACHMENT,
     attachments,
@@ -140,14 +141,15 @@ class Commanded(Opened):
         self._stream.tell(
             {
                 "event": "begin",
-                "metadata": self._description(),
+                "metadata": self._description() | {"began": MID_RUN},
                 "attachments": {n: base64.b64encode(d).decode() for n, d in needed.items()},
             }
         )
 
     def _record(self) -> None:
         path = self._next_path()
-        self._stream.record(path, self._description(), attachments(self.scene))
+        meta = self._description() | {"began": MID_RUN}
+        self._stream.record(path, meta, attachments(self.scene))
         self._path = path
         self._event("start")
 

@@ -31,6 +31,9 @@ MODEL_ATTACHMENT = "model.mjb"
 STATE_ATTACHMENT = "start_state.f64"
 SOURCE_PREFIX = "scene/"
 
+MID_RUN = "mid-run"
+"""Metadata ``began`` of a recording whose start is not the scene's own."""
+
 _FLOATS = ("scale", "force_scale", "force_limit", "torque_limit", "contact_stiffness")
 _POSES = ("device_origin", "handle_origin", "device_start")
 _GAINS = ("stiffness", "damping", "rotational_stiffness", "rotational_damping")

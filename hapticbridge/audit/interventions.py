@@ -104,6 +104,16 @@ class Interventions:
         """Returns which of some ticks began with a reset."""
         return np.isin(numbers, self.resets)
 
+    def sentences(self) -> tuple[str, ...]:
+        """Returns what is to be said of a coupling that was changed, if it was."""
+        count, last = len(self.couplings) - 1, self.couplings[-1:]
+        if count < 1:
+            return ()
+        return (
+            f"so it began; commands changed the coupling {count} times, last to K = "
+            f"{last[0].stiffness:g} N/m, B' = {last[0].damping:g} N s/m used",
+        )
+
     def worst(self, info: DeviceInfo, method: Method) -> RunParameters:
         """Returns the run's parameters with the coupling that asks most of the device.
 

@@ -76,6 +76,7 @@ def audit(path: str | Path, *, strict: bool = False) -> AuditReport:
         home = np.array(meta_start(recording.meta, "tool_start"))
         outside = Interventions.of(recording.events, parameters, home)
         facts |= _device_facts(info, parameters, outside.worst(info, method), method, recording)
+        facts["rendered"] += outside.sentences()
     except RecordingError as error:
         return _invalid(facts, Fault(str(error)))
     facts["duration"] = recording.count * parameters.period

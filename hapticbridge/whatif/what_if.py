@@ -14,10 +14,12 @@ from numpy.typing import NDArray
 from hapticbridge.audit import AuditReport, audit
 from hapticbridge.bridge import Bridge
 from hapticbridge.clock import SimulatedClock
+from hapticbridge.commands import CHANGES as COMMANDED
 from hapticbridge.device import Device
 from hapticbridge.device.simulated.scene_hand import scene_hand
 from hapticbridge.errors import RecordingError, SafetyTrip
-from hapticbridge.recording import read_recording
+from hapticbridge.provenance import MID_RUN
+from hapticbridge.recording import Recording, read_recording
 from hapticbridge.tick import TickFlag
 from hapticbridge.whatif.changes import UNITS, Settings, Value
 from hapticbridge.whatif.hands import (
@@ -58,9 +60,15 @@ def what_if(
     report = audit(path)
     if report.verdict == "invalid":
         raise RecordingError(f"what is invalid cannot be simulated again: {report.reason}")
+    recording = read_recording(path)
+    if recording.meta.get("began") == MID_RUN:
+        raise RecordingError(
+            f"'{recording.path}' was begun in mid-run; only what begins at the scene's own start "
+            "can be simulated with changes"
+        )
     with TemporaryDirectory(prefix="hapticbridge-") as name:
         folder = Path(name)
-        run = RecordedRun.of(read_recording(path), folder / "scene")
+        run = RecordedRun.of(recording, folder / "scene")
         return _Experiment(run, report, folder, tell).changed(changes)
 
 
@@ -93,7 +101,7 @@ class _Experiment:
         runs = [self._as_recorded()]
         self._tell(1, 4, "the recorded motion")
         runs.append(self._simulated(PRESCRIBED, self._prescribed(new), new))
-        notes.extend(_unrepeated(self._ticks))
+        notes.extend(_unrepeated(run.recording))
         if runs[0].trip:
             notes.append("what was recorded ends in a trip: these runs end there, too")
         if new.rate != settings.rate:
@@ -199,9 +207,14 @@ class _Experiment:
                 done += count
 
 
-def _unrepeated(ticks: NDArray[np.void]) -> Iterator[str]:
+def _unrepeated(recording: Recording) -> Iterator[str]:
     """Says what these runs have not of the recorded one."""
-    flags = ticks["flags"]
+    flags = recording.ticks["flags"]
+    if commands := sum(event.get("event") in COMMANDED for event in recording.events):
+        yield (
+            f"commands: {commands} changes of the coupling, switches or resets when it was "
+            "recorded, none in these runs"
+        )
     if missed := int(np.count_nonzero(flags & int(TickFlag.OVERRUN))):
         yield (
             f"missed deadlines: {missed} when it was recorded, none in these runs: what the hand "
