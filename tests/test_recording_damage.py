@@ -205,7 +205,6 @@ def test_no_damage_gives_anything_but_a_recording_or_its_error(
 
 
 @given(content=st.binary(max_size=300))
-@settings(deadline=None)
 def test_arbitrary_bytes_behind_the_magic_never_crash(content: bytes) -> None:
     with tempfile.TemporaryDirectory() as name:
         path = Path(name) / "run.mcap"
