@@ -177,7 +177,7 @@ def test_closing_stops_and_frees_the_effects_and_switches_the_motors_off() -> No
 
 def test_another_process_holds_what_takes_the_force_away(monkeypatch: pytest.MonkeyPatch) -> None:
     held: list[LastWordDouble] = []
-    monkeypatch.setattr(driver, "LastWord", lambda *given: held.append(LastWordDouble(*given)))
+    monkeypatch.setattr(driver, "last_word_at", lambda *given: held.append(LastWordDouble(*given)))
     device, model, _ = started(PidStick())
     device.leave_last_word("/dev/hidraw7")
     device.write(wrench(1.0, 1.0))
@@ -190,8 +190,9 @@ def test_another_process_holds_what_takes_the_force_away(monkeypatch: pytest.Mon
 
 def test_a_stick_whose_node_cannot_be_opened_twice_ends_its_effects_by_itself() -> None:
     device, *_ = started(PidStick())
-    device.leave_last_word("/no/such/node")
-    assert device.last_word is None
+    for path in ("/dev/hidraw_of_nobody", "1-4:1.0"):
+        device.leave_last_word(path)
+        assert device.last_word is None
     device.close()
 
 
