@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from hapticbridge.certificate import default_coupling, needed_on_axes
 from hapticbridge.clock import Clock, RealClock, period_of
+from hapticbridge.commands import Allowance, CommandQueue
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Device, device_for
 from hapticbridge.guard import Limits, guarding_for, limits_for, refuse_simulated_time
@@ -168,6 +169,18 @@ class Arrangement:
         self._contact_stiffness = contact_stiffness
         self._sample = np.zeros(1, SAMPLE_DTYPE)
         self._inputs: deque[list[Write]] = deque()
+        allowance = Allowance(
+            info=self.device.info,
+            method=self.method,
+            start=self.rendered,
+            period=self.period,
+            scale=self._workspace.scale,
+            force_scale=self._workspace.force_scale,
+            substeps=self._substeps,
+            limits=self._limits,
+        )
+        can_record = self._path is not None or onlooker is not None or live
+        self._commands = CommandQueue(allowance, can_record=can_record)
 
     @property
     def used(self) -> Coupling:

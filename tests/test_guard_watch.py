@@ -292,8 +292,6 @@ def test_a_guard_reads_back_as_it_was_written() -> None:
 
 KILLED = """
 import sys, time
-from hapticbridge.bridge import Bridge
-from hapticbridge.clock import RealClock, SimulatedClock
 from hapticbridge.device.last_word import LastWord
 word = LastWord(sys.argv[1], b"\\0zero", b"\\1off")
 print("ready", flush=True)

@@ -28,7 +28,8 @@ ORDER = (
     ("ledger", "inputs", "device"),
     ("guard", "recording", "certificate", "felt"),
     ("provenance", "summary", "workspace", "realtime"),
-    ("arrangement", "opened", "bridge", "audit", "identify", "compare", "export"),
+    ("commands",),
+    ("arrangement", "opened", "commanded", "bridge", "audit", "identify", "compare", "export"),
     ("report", "film", "view", "study", "check", "doctor"),
     ("whatif",),  # runs the bridge and asks the audit, which must not know of either
     ("cli",),

@@ -39,7 +39,7 @@ from hapticbridge.tick import TICK_DTYPE
     ),
     data=st.binary(max_size=50),
 )
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_any_record_metadata_and_attachment_survive_the_file(
     records: list[bytes], meta: dict[str, str], data: bytes
 ) -> None:

@@ -74,6 +74,8 @@ def test_a_run_is_active_for_the_cause_that_it_was_made_for(
     assert cause is not None
     assert cause.kind == kind
     assert told in cause.evidence
+    energy, allowed = evidence.judged(report)
+    assert energy[report.tick] - allowed[report.tick] == pytest.approx(report.joules)
     page = tmp_path / "page.html"
     write_report(recording, report, page)
     text = page.read_text(encoding="utf-8")
@@ -112,6 +114,26 @@ def test_missed_deadlines_are_the_cause_where_the_device_bears_the_coupling(made
     ticks["flags"][report.tick - 100 : report.tick - 97] |= int(TickFlag.OVERRUN)
     kind, told = cause_of(recording, report, meta=meta, ticks=ticks)
     assert (kind, told[:24]) == ("rate", "3 deadlines were missed ")
+
+
+def test_swings_over_many_steps_of_the_encoder_are_not_its_quantisation(made: Made) -> None:
+    recording, report = made(report_runs.active_by_rate)
+    sheet = recording.meta["device"].replace('"resolution": 0.0', '"resolution": 1e-9')
+    assert sheet != recording.meta["device"]
+    assert cause_of(recording, report, meta=recording.meta | {"device": sheet})[0] == "rate"
+
+
+def test_a_hard_contact_is_the_cause_also_behind_a_method_with_a_hazard(made: Made) -> None:
+    recording, report = made(report_runs.active_by_contact)
+    meta = recording.meta | {"method": "implicitfast"}
+    assert cause_of(recording, report, meta=meta)[0] == "contact setting"
+
+
+def test_asked_for_strictly_the_slack_is_not_allowed(made: Made) -> None:
+    recording, report = made(report_runs.active_by_contact)
+    evidence = evidence_of(recording)
+    assert evidence.judged(report)[1].any()
+    assert not evidence.judged(replace(report, environment="within slack"))[1].any()
 
 
 def test_bodies_that_were_moved_are_the_cause_before_any_contact(made: Made) -> None:

@@ -137,3 +137,21 @@ def test_missed_deadlines_are_told_because_they_do_not_come_back(tmp_path: Path)
         recorded(path, "point_mass", device, duration=0.05, clock=clock)
         notes = what_if(path, {}).notes
         assert any(note.startswith("missed deadlines: 1") for note in notes) == (missed > 0)
+
+
+class Moved(ScriptedDevice):
+    """A device that somebody moved by 20 mm between its start and its first sample."""
+
+    def start(self, period: float) -> NDArray[np.void]:
+        sample = super().start(period)
+        sample["position"][0, 0] -= 0.02
+        return sample
+
+
+def test_what_moved_before_the_first_tick_is_not_seen_in_the_scene(tmp_path: Path) -> None:
+    path = tmp_path / "moved.mcap"
+    device = Moved(lambda tick: (1e-5 * tick, 0, 0, 1, 0, 0, 0))
+    recorded(path, "point_mass", device, duration=0.05)
+    before, after = (run.ticks for run in what_if(path, {}).runs[:2])
+    assert before["flags"][0] & int(TickFlag.RESEATED)
+    np.testing.assert_allclose(after["handle_position"], before["handle_position"], atol=1e-9)

@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 
 from hapticbridge.audit.controlled import Account
 from hapticbridge.audit.differences import quaternion_product, turn_between
+from hapticbridge.audit.interventions import Interventions
+from hapticbridge.audit.law import poses_before
 from hapticbridge.audit.limited import chained
 from hapticbridge.audit.watched import Seen, Watch, has_flag
 from hapticbridge.kernel.state import RunParameters
@@ -76,26 +78,28 @@ class Guarded:
         return cls(parameters, watch, handle, tool, origin, target, account)
 
     def after(
-        self, ticks: NDArray[np.void], resumed: Array, excess: Array
+        self, ticks: NDArray[np.void], outside: Interventions, excess: Array
     ) -> tuple[Expected, Guarded]:
         """Says what the next records, ``TICK_DTYPE``, at least one, should hold.
 
         Args:
             ticks: The records.
-            resumed: Ticks at which the run went on after a pause without force.
+            outside: What was done to the run while it went on.
             excess: What the environment has created beyond the slack, (n,) in J.
         """
         then = copy.copy(self)
-        seen, then.watch = self.watch.after(ticks, resumed)
+        seen, then.watch = self.watch.after(ticks, outside)
         device = self.watch.device
-        position, orientation = then._follow(ticks)
+        position, orientation = then._follow(ticks, outside)
         parameters = self.parameters
         axes = np.array(parameters.axes).reshape(3, 3)
         on_tool = ticks["wrench_on_tool"]
         force = -parameters.force_scale * on_tool[:, :3] @ axes
         torque = -parameters.force_scale / parameters.scale * on_tool[:, 3:] @ axes
         asked = np.concatenate([force, torque], axis=1)
-        control, then.account = self.account.after(ticks, asked, seen, device, resumed, excess)
+        control, then.account = self.account.after(
+            ticks, asked, seen, device, outside.resumed, excess
+        )
         guarding = parameters.guarding
         starts = seen.first | has_flag(ticks, TickFlag.RESEATED)
         parts = (
@@ -120,7 +124,7 @@ class Guarded:
         wrench = full * seen.share[:, None]
         return Expected(position, orientation, wrench, control.injected, seen), then
 
-    def _follow(self, ticks: NDArray[np.void]) -> tuple[Array, Array]:
+    def _follow(self, ticks: NDArray[np.void], outside: Interventions) -> tuple[Array, Array]:
         """Maps the recorded device poses into the scene: h = h_0 + scale · A (p − p_0).
 
         p_0 and h_0 are the device's pose and the tool's where the coupling was last re-seated;
@@ -128,8 +132,8 @@ class Guarded:
         """
         parameters, count = self.parameters, len(ticks)
         handle, tool, device = (_poses(ticks, name) for name in ("handle", "tool", "device"))
-        before = np.concatenate([self.handle[None], handle[:-1]])
-        tool_before = np.concatenate([self.tool[None], tool[:-1]])
+        before = poses_before(ticks, "handle", self.handle, outside)
+        tool_before = poses_before(ticks, "tool", self.tool, outside)
         is_seated = has_flag(ticks, TickFlag.RESEATED)
         at = np.maximum.accumulate(np.where(is_seated, np.arange(count), -1))
         origin = np.where(at[:, None] >= 0, device[at], self.origin)

@@ -26,6 +26,7 @@ from hapticbridge.kernel.parameters import checked_substeps
 from hapticbridge.rendering import Method, default_method, method_named
 from hapticbridge.scene import Scene, load_scene, settings_from
 from hapticbridge.view import Address, Window
+from hapticbridge.view.window import BY
 
 
 @dataclass(frozen=True, slots=True)
@@ -180,13 +181,13 @@ class Run:
             realtime=self.realtime or None,
         )
         if window is not None:
-            window.on_stop = partial(bridge.stop, "view")
+            window.on_command = partial(bridge.command, by=BY)
         if not self.as_json:
             announce(bridge, scales, self.substeps, is_method_asked=self.method is not None)
         with err.status("preparing (the first run on a machine compiles for about 20 s) …"):
             stack.enter_context(bridge)
         if window is not None:
-            tell_address(window.address, window.url, "watch the run and stop it")
+            tell_address(window.address, window.url, "watch the run, stop it and move the device")
         if not self.as_json:
             announce_measured(bridge)
         summary = bridge.run(self.duration)
