@@ -136,9 +136,6 @@ def test_without_a_damper_the_methods_have_one_law_and_their_runs_are_one(
         for other in others:
             assert other[0] == one[0]
             assert other[1] == pytest.approx(one[1], rel=1e-6)
-    # with a damper they are not: of 2 N s/m implicit uses all, the others none and half
-    told = [settle(2.5, 0.52, 0.0, 2.0, name)[0] for name in METHODS_SHOWN]
-    assert told == ["cycle", "rest", "rest"]
 
 
 @pytest.mark.parametrize(

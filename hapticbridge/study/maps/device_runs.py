@@ -197,9 +197,10 @@ def friction_needed(name: str, damping: NDArray[np.float64]) -> NDArray[np.float
 
 
 def friction_to_rest(name: str, damping: float) -> float:
-    """Returns the least σ at which a pressed device comes to rest: above the largest at which not.
+    """Returns a σ at which a pressed device begins to come to rest.
 
-    0 where it rests at the least that is tried, inf where it never does.
+    0 where it rests at the least that is tried, inf where it never does. With a damper rest and
+    cycle take turns between K Δ/2 and a little above; one of the changes is found.
 
     Args:
         name: The method.
