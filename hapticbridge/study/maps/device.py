@@ -162,7 +162,7 @@ def _of_friction(found: Mapping[str, Any]) -> str:
     return (
         "With a damper, a hand that shakes the device across one encoder step needs f_c = K Δ/2 + "
         f"B′ Δ/T within {error:.2g} %. That, and where one that only presses begins to let it rest, "
-        f"at the values of B that were tried: {needs}."
+        f"rest, at the values of B that were tried: {needs}."
     )
 
 
