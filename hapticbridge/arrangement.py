@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from hapticbridge.certificate import default_coupling, needed_on_axes
 from hapticbridge.clock import Clock, RealClock, period_of
+from hapticbridge.commands import Allowance, CommandQueue
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Device, device_for
 from hapticbridge.guard import Limits, guarding_for, limits_for, refuse_simulated_time
@@ -94,9 +95,10 @@ class Arrangement:
             absolute: Take the device's poses as poses in the scene instead of relative to its
                 start.
             limits: Limits on the wrench, within the device's own; None takes these.
-            controller: Passivity controller: ``damper``, ``tank`` or ``off``. It acts where the
-                device was given more than its damping burns and the scene gives up. None:
-                ``damper`` where the device condition does not hold, else ``off``.
+            controller: Passivity controller: ``damper`` acts where the device was given more than
+                its damping burns and the scene gives up, ``environment`` where the scene created
+                more than the coupling's slack; ``tank``, ``off``. None: ``damper`` where the device
+                condition does not hold, else ``environment``.
             clutch: Number of the device's button, from 0, that lets it move without the handle.
             dead_man: Number of the button that must be held for any force.
             live: Draw a status line on stderr, from the recorder's process.
@@ -167,6 +169,18 @@ class Arrangement:
         self._contact_stiffness = contact_stiffness
         self._sample = np.zeros(1, SAMPLE_DTYPE)
         self._inputs: deque[list[Write]] = deque()
+        allowance = Allowance(
+            info=self.device.info,
+            method=self.method,
+            start=self.rendered,
+            period=self.period,
+            scale=self._workspace.scale,
+            force_scale=self._workspace.force_scale,
+            substeps=self._substeps,
+            limits=self._limits,
+        )
+        can_record = self._path is not None or onlooker is not None or live
+        self._commands = CommandQueue(allowance, can_record=can_record)
 
     @property
     def used(self) -> Coupling:

@@ -3,7 +3,8 @@
     device ──sample──▶ handle ──▶ scene stepped by MuJoCo ──▶ wrench, energies ──▶ device, recording
 
 ``Bridge._loop`` is the loop; the arithmetic before and after MuJoCo's step is in ``kernel.step``.
-What a bridge is made of is in ``arrangement``, what is open while it runs in ``opened``.
+What a bridge is made of is in ``arrangement``, what is open while it runs in ``opened``, and what
+can be asked of it meanwhile in ``commanded``.
 """
 
 from __future__ import annotations
@@ -14,28 +15,34 @@ from contextlib import ExitStack
 import mujoco
 import numpy as np
 
+from hapticbridge.clock import slept_ns
+from hapticbridge.commanded import Commanded
 from hapticbridge.errors import DeviceError, HapticBridgeError, SafetyTrip
 from hapticbridge.guard import trip_reason
-from hapticbridge.inputs import apply_writes
 from hapticbridge.kernel.ahead import can_split
 from hapticbridge.kernel.codes import BAD_RESULT, HALF_DONE, OK, RING_FULL
-from hapticbridge.opened import Opened
 from hapticbridge.realtime import Grant, real_time, warn_of_refusals
 from hapticbridge.signals import stopping_on_signals
 from hapticbridge.summary import Summary
 from hapticbridge.tick import TickFlag
+
+SUSPENDED_NS = 50_000_000
+"""A sleep of the machine longer than this ends the run: nobody knows what became of the hand, of
+the device's power, or of who sits there. Reading two clocks differs by microseconds."""
 
 RECORDER_LOOK = 0.1
 """In s, how often the loop looks whether the recorder still lives: 4 µs each time. A run that is to
 be recorded ends with its recorder."""
 
 
-class Bridge(Opened):
+class Bridge(Commanded):
     """Joins a device and a scene by a virtual coupling and runs the loop between them.
 
     Use it as a context manager: entering prepares everything and compiles what must be compiled,
     leaving commands zero force, closes the device and closes the recording.
     """
+
+    _slept = 0
 
     def run(
         self, duration: float | None = None, on_tick: Callable[[int], None] | None = None
@@ -63,8 +70,13 @@ class Bridge(Opened):
                 self._note_grants(stack.enter_context(real_time()))
             try:
                 self._come_to_rest()
-                self.clock.start(round(self.period * 1e9))
-                reason = self._loop(last, on_tick)
+                while True:
+                    self.clock.start(round(self.period * 1e9))
+                    self._slept = slept_ns()
+                    reason = self._loop(last, on_tick)
+                    if self._pause is None or (reason := reason or self._silence()):
+                        break
+                    last = self._obey_in_pause(last)
             except DeviceError as error:
                 reason = f"tick {self._tick}: {error}"
             finally:
@@ -75,7 +87,7 @@ class Bridge(Opened):
         return self.summary()
 
     def _loop(self, last: int, on_tick: Callable[[int], None] | None) -> str:
-        """The ticks, until the last; returns why the kernel refused one, or nothing."""
+        """The ticks, until the last or a pause; returns why the kernel refused one, or nothing."""
         state, row = self._binding.state, self._binding.row
         model, data, substeps = self.scene.model, self.scene.data, range(self._substeps)
         stream, records, cursors = self._stream, self._stream.rows, self._stream.cursors
@@ -84,7 +96,12 @@ class Bridge(Opened):
         before, answer, finish = self._before_step, self._answer_step, self._finish_tick
         read_device, write_device = self.device.read, self.device.write
         wait, now, hand_over = self.clock.wait, self.clock.now, self._publish
-        inputs, read = self._inputs, 0
+        inputs, commands, later, read = (
+            self._inputs,
+            self._commands.waiting,
+            self._operator.later,
+            0,
+        )
         whole_step, second_half, first_half = (
             self.method.step,
             mujoco.mj_step2,
@@ -99,8 +116,8 @@ class Bridge(Opened):
             deadline, wake, skipped = wait()
             if on_tick is not None:
                 on_tick(self._tick)
-            if inputs:
-                self._take_changes()
+            if (inputs or commands or later) and self._take_changes():
+                return ""
             news = outside[0] = read_device(sample)
             read_before, read = read, now()
             elapsed = 1e-9 * (read - read_before)
@@ -130,14 +147,6 @@ class Bridge(Opened):
             self._tick += 1
         return ""
 
-    def stop(self, by: str = "caller") -> None:
-        """Ends the run after the present tick; may be called from ``on_tick`` or a thread.
-
-        Args:
-            by: Who wants it, for the summary and the recording's event ``stop``; not empty.
-        """
-        self._stopped_by = by or "caller"
-
     def _note_grants(self, grants: tuple[Grant, ...]) -> None:
         """Says once what was refused, and records what was granted."""
         if not self._tick:
@@ -160,21 +169,21 @@ class Bridge(Opened):
         """Starts the ramp; between two runs zero was commanded and the device may have moved."""
         if not self._is_open:
             raise HapticBridgeError("the bridge is not open; use 'with Bridge(...) as bridge:'")
-        self._stopped_by = ""
+        before, self._stopped_by = self._stopped_by, ""
         if self._tick:
             self._binding.resume()
-            self._event("resume")
-
-    def _take_changes(self) -> None:
-        """Takes in what others want changed: between two ticks, and noted with its tick."""
-        while self._inputs:
-            writes = self._inputs.popleft()
-            apply_writes(self.scene.data, writes)
-            self._event("input", writes=writes)
+            self._event("resume", reason=before, **self._named_signal())
+        self._signal = ""
 
     def _overrun(self, skipped: int) -> int:
+        """Counts a missed deadline, and ends the run where the machine was asleep meanwhile."""
         self._overruns += 1
         self._skipped += skipped
+        asleep = slept_ns() - self._slept
+        if asleep > SUSPENDED_NS:
+            self._slept += asleep
+            self._event("suspended", seconds=1e-9 * asleep)
+            self.stop("suspend of the machine")
         return int(TickFlag.OVERRUN)
 
     def _trip(self, reason: str) -> None:

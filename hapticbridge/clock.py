@@ -76,6 +76,16 @@ def running_ns() -> int:
     return time.monotonic_ns()
 
 
+def slept_ns() -> int:
+    """Returns for how long the machine has been suspended since it was booted, in ns; 0 elsewhere.
+
+    Between its two readings some microseconds may pass.
+    """
+    if sys.platform == "linux":
+        return running_ns() - time.monotonic_ns()
+    return 0
+
+
 class RealClock:
     """Wall time: monotonic, absolute deadlines, overruns skipped and counted, never caught up.
 
@@ -112,8 +122,8 @@ class RealClock:
         return deadline, now, skipped
 
     def now(self) -> int:
-        """Returns ns of running."""
-        return running_ns() - self._origin
+        """Returns ns of running; 0 before the first start."""
+        return running_ns() - self._origin if self._period else 0
 
 
 class SimulatedClock:

@@ -42,6 +42,10 @@ class DeviceLost(DeviceError):  # noqa: N818 - as SafetyTrip: what happened, not
     """A device is gone in mid-run: unplugged, or silent for longer than it may be."""
 
 
+class CommandError(HapticBridgeError):
+    """A command to a run that goes on is refused; the run goes on as it was."""
+
+
 class IdentificationError(DeviceError):
     """A run does not tell what a device is: too little motion, a hand on it, a motor at its end."""
 

@@ -24,7 +24,8 @@ class Ledger:
         potential: Potential energy now: gravity and springs.
         coupling_work: Work of the coupling on the tool, Σ f_k·δx_k + τ_k·δφ_k.
         actuator_work: Work of the scene's own actuators.
-        external_work: Work of applied forces, gravity compensation and moved mocap bodies.
+        external_work: Work of applied forces, gravity compensation, moved mocap bodies and resets.
+        tuning_work: Work of commands that changed the coupling, on its spring (``kernel.tuning``).
         environment_energy: Σ E_k: what the simulation created (> 0) or dissipated (< 0).
         device_energy: Energy given to the device by the wrenches that were sent.
         slack: What Σ E_k may reach before the guarantee is lost.
@@ -40,6 +41,7 @@ class Ledger:
     coupling_work: float
     actuator_work: float
     external_work: float
+    tuning_work: float
     environment_energy: float
     device_energy: float
     slack: float
@@ -81,6 +83,7 @@ _ENERGIES = (
     "coupling_work",
     "actuator_work",
     "external_work",
+    "tuning_work",
     "environment_energy",
     "device_energy",
     "slack",

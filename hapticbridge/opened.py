@@ -13,6 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 from hapticbridge.arrangement import Arrangement
 from hapticbridge.certificate import condition_sentences
 from hapticbridge.clock import RealClock
+from hapticbridge.commands import Repeater
+from hapticbridge.coupling import Coupling
 from hapticbridge.errors import DeviceError, HapticBridgeError, SceneError
 from hapticbridge.guard import refuse_stretched_start, wait_until_still
 from hapticbridge.inputs import Write, input_writes
@@ -23,7 +25,7 @@ from hapticbridge.kernel.publish import finish_tick, publish
 from hapticbridge.kernel.state import Binding
 from hapticbridge.kernel.step import before_step
 from hapticbridge.ledger import Ledger
-from hapticbridge.provenance import attachments, describe_run
+from hapticbridge.provenance import attachments, describe_run, start_state
 from hapticbridge.realtime import Grant, check_pace, memory_at_rest
 from hapticbridge.recording.stream import RecordStream
 from hapticbridge.rendering import prepare
@@ -67,11 +69,10 @@ class Opened(Arrangement):
     ) -> None:
         self._is_open = False
         reason = self._stopped_by if error is None else f"{type(error).__name__}: {error}"
-        named = {"signal": self._signal} if self._signal else {}
         self._event(
             "stop",
             reason=reason,
-            **named,
+            **self._named_signal(),
             overruns=self._overruns,
             skipped=self._skipped,
             dropped=self._stream.dropped,
@@ -102,29 +103,44 @@ class Opened(Arrangement):
             self._grants = resources.enter_context(memory_at_rest())
         # last, because from here on the device is held, and its pose counts
         self._sample[:] = self.device.start(self.period)
-        info = self.device.info
-        self.parameters = run_parameters(
+        self._bind(self.coupling, felt)
+        refuse_stretched_start(self._binding.state, self._sample, self._limits)
+        if self._stream.is_read:
+            self._stream.start(self._description(), attachments(scene))
+            self._event("start")
+
+    def _bind(self, coupling: Coupling, felt: Coupling | None, start_elastic: float = 0.0) -> None:
+        """Lets a run begin in the state in which the scene is."""
+        scene = self.scene
+        self.parameters = parameters = run_parameters(
             scene,
-            self.coupling,
-            method,
+            coupling,
+            self.method,
             self._sample,
             period=self.period,
             felt=felt,
             substeps=self._substeps,
-            info=info,
+            info=self.device.info,
             limits=self._limits,
             workspace=self._workspace,
             contact_stiffness=self._contact_stiffness,
             guarding=self._guarding,
+            start_elastic=start_elastic,
         )
-        self._binding = binding = Binding(scene.model, scene.data, self.parameters)
-        refuse_stretched_start(binding.state, self._sample, self._limits)
-        if self._stream.is_read:
-            meta = describe_run(
-                scene, self.parameters, binding, method=method.name, device=info, clock=clock.name
-            )
-            self._stream.start(meta, attachments(scene))
-            self._event("start")
+        start = start_state(scene.model, scene.data).tobytes()
+        self._binding = binding = Binding(scene.model, scene.data, parameters)
+        repeater = Repeater(binding, scene.model, scene.data, self.method, parameters, start)
+        self._repeater = repeater
+
+    def _description(self) -> dict[str, str]:
+        return describe_run(
+            self.scene,
+            self.parameters,
+            self._binding,
+            method=self.method.name,
+            device=self.device.info,
+            clock=self.clock.name,
+        )
 
     def _come_to_rest(self) -> None:
         """Waits until a real device is still, before force is enabled.
@@ -152,6 +168,10 @@ class Opened(Arrangement):
         except DeviceError as error:
             return f"zero force could not be sent: {error}"
         return ""
+
+    def _named_signal(self) -> dict[str, str]:
+        """What an event says of the signal that ended the run, if one did."""
+        return {"signal": self._signal} if self._signal else {}
 
     def _event(self, event: str, **details: object) -> None:
         self._stream.event(event, self._tick, self.clock.now(), **details)

@@ -37,6 +37,7 @@ _GAINS = ("stiffness", "damping", "rotational_stiffness", "rotational_damping")
 STARTS = {"handle_start": 7, "tool_start": 7, "start_kinetic": 1, "start_potential": 1}
 """What the ledger counts from, with its count of numbers: poses in m, energies in J."""
 
+_ELASTIC = "start_elastic"
 _STORED = {"start_kinetic": "kinetic", "start_potential": "potential"}
 _MOST_TICKS = 2**31
 _STATE = mujoco.mjtState.mjSTATE_INTEGRATION
@@ -94,6 +95,20 @@ def restore_state(model: mujoco.MjModel, data: mujoco.MjData, state: bytes) -> N
     mujoco.mj_setState(model, data, np.frombuffer(state, dtype="<f8").astype(np.float64), _STATE)
 
 
+def elastic_energy(data: mujoco.MjData) -> float:
+    """Returns what constraints store at most, Σ |λ_i r_i| in J.
+
+    A spring whose force λ grows with its way r stores ∫ λ dr <= λ r. Rows without a residual
+    (friction) store nothing.
+
+    Args:
+        data: After ``restore_state``, so that it is the same wherever it is computed.
+    """
+    return float(np.sum(np.abs(data.efc_force * np.minimum(data.efc_pos, 0.0)))) + float(
+        np.sum(np.abs(data.efc_force[: data.ne] * np.maximum(data.efc_pos[: data.ne], 0.0)))
+    )
+
+
 def attachments(scene: Scene) -> list[Attachment]:
     """Returns the scene's sources, its compiled model and its start, as the recording keeps them.
 
@@ -137,6 +152,8 @@ def describe_run(
     for name, count in STARTS.items():
         start = start_of(binding.state, name)
         meta[name] = json.dumps(start if count > 1 else start[0])
+    if parameters.start_elastic:
+        meta[_ELASTIC] = repr(parameters.start_elastic)
     return meta | {
         "period_s": repr(parameters.period),
         "substeps": str(parameters.substeps),
@@ -257,6 +274,7 @@ def parameters_of(meta: Mapping[str, str]) -> RunParameters:
             device_damping=burning,
             device_rotational_damping=rotational,
             guarding=Guarding.from_json(meta["guard"]) if "guard" in meta else UNGUARDED,
+            start_elastic=meta_float(meta, _ELASTIC) if _ELASTIC in meta else 0.0,
         )
     except RecordingError:
         raise

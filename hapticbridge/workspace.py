@@ -90,6 +90,7 @@ def run_parameters(
     workspace: Workspace = SAME_FRAME,
     contact_stiffness: float | None = None,
     guarding: Guarding = UNGUARDED,
+    start_elastic: float = 0.0,
 ) -> RunParameters:
     """Returns the parameters of a run that starts now.
 
@@ -106,6 +107,7 @@ def run_parameters(
         workspace: The map from the device's frame to the scene's.
         contact_stiffness: K_c in N/m of a tool without mass; None takes the coupling's stiffness.
         guarding: What the guard does within a tick.
+        start_elastic: What constraints store at most, in J, where the run begins in mid-motion.
 
     Raises:
         HapticBridgeError: A value is out of range.
@@ -132,4 +134,5 @@ def run_parameters(
         device_damping=burning,
         device_rotational_damping=rotational,
         guarding=guarding,
+        start_elastic=start_elastic,
     )

@@ -13,6 +13,7 @@ from audit_cases import (
     tapped,
 )
 from cli_cases import Called
+from hypothesis import settings
 from numpy.typing import NDArray
 from outside_scenes import (
     hand_file,
@@ -24,6 +25,10 @@ from scene_cases import GRIPPED, ticks
 
 from hapticbridge.cli import main
 from hapticbridge.recording import Recording, read_recording
+
+# a deadline is a timing, and other work on the machine must fail no test
+settings.register_profile("hapticbridge")
+settings.load_profile("hapticbridge")
 
 
 @pytest.fixture(scope="module")

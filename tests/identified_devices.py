@@ -7,12 +7,15 @@ from collections.abc import Callable
 import numpy as np
 from emulated.dhd_stub import Stub
 from emulated.hid_seam import DrivingClock
+from emulated.pid_model import PidStick
 from emulated.rawhid_model import RawHid
 from falcon_cases import Bench
 from haply_cases import Bench as HaplyBench
+from pid_cases import NEWTONS, TRAVEL
+from pid_cases import opened as opened_stick
 from rawhid_cases import opened
 
-from hapticbridge.clock import Clock
+from hapticbridge.clock import Clock, SimulatedClock
 from hapticbridge.device import Device, SimulatedDevice
 from hapticbridge.identify import AxisFit, identify
 
@@ -21,6 +24,16 @@ PERIOD = 1e-3
 
 def _unheld(numbers: dict[str, float]) -> SimulatedDevice:
     return SimulatedDevice(hand=None, **numbers)  # type: ignore[arg-type]
+
+
+def _simulated(numbers: dict[str, float]) -> tuple[Device, Clock]:
+    return _unheld({**numbers, "resolution": 1e-5}), SimulatedClock()
+
+
+def _pid(numbers: dict[str, float]) -> tuple[Device, Clock]:
+    stick = PidStick(_unheld(numbers), newtons=NEWTONS, travel=TRAVEL)
+    device, _, seam = opened_stick(stick)
+    return device, DrivingClock(seam)
 
 
 def _falcon(numbers: dict[str, float]) -> tuple[Device, Clock]:
@@ -45,8 +58,10 @@ def _forcedimension(numbers: dict[str, float]) -> tuple[Device, Clock]:
 
 
 DRIVERS: dict[str, Callable[[dict[str, float]], tuple[Device, Clock]]] = {
+    "simulated": _simulated,
     "falcon": _falcon,
     "rawhid": _rawhid,
+    "pid": _pid,
     "haply": _haply,
     "forcedimension": _forcedimension,
 }

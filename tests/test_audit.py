@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation
 from hapticbridge.audit import audit
 from hapticbridge.audit.balance import Balance
 from hapticbridge.audit.differences import turn_between
+from hapticbridge.audit.interventions import Interventions
 from hapticbridge.audit.reached import Reached
 from hapticbridge.bridge import Bridge
 from hapticbridge.clock import SimulatedClock
@@ -96,7 +97,7 @@ def test_balance_agrees_with_the_kernel_and_with_a_sum_by_hand(held: Recording) 
             np.array(starts["tool_start"]),
             starts["start_kinetic"][0] + starts["start_potential"][0],
         ),
-        np.zeros(0),
+        Interventions(parameters, np.array(starts["tool_start"])),
     )
     # rounding of 200 summed works of 1e-3 J
     for name in ("coupling_work", "device_energy", "environment_energy"):

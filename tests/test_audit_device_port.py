@@ -14,6 +14,7 @@ from random_hands import random_motion
 from hapticbridge.audit import audit
 from hapticbridge.audit.balance import Balance
 from hapticbridge.audit.device_port import kept_behind_a_law
+from hapticbridge.audit.interventions import Interventions
 from hapticbridge.audit.reached import Reached
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import SimulatedDevice
@@ -40,17 +41,27 @@ RUN = RunParameters(
 )
 
 
-def test_the_balance_is_the_identity_behind_the_bound() -> None:
-    """Any motion of handle and tool; the first tick is a jump of both, out of rest."""
+@pytest.mark.parametrize("change", [0.0, 0.5])
+def test_the_balance_is_the_identity_behind_the_bound(change: float) -> None:
+    """Any motion of handle and tool; the first tick is a jump of both, out of rest.
+
+    Also where K and B are others in every tick: what that does to the spring is the command's.
+    """
     generator = np.random.default_rng(5)
-    count, k, b = 40, RUN.coupling.stiffness, RUN.coupling.damping
+    count = 40
+    k = RUN.coupling.stiffness * (1 + change * generator.uniform(-1, 1, count))
+    b = RUN.coupling.damping * (1 + change * generator.uniform(-1, 1, count))
+    none = np.zeros(count)
+    gains = np.stack([k, b, none, none], axis=1)
     h, x = generator.normal(0, 1e-3, (2, count, 3))
     d, moved = (np.diff(v, axis=0, prepend=np.zeros((1, 3))) for v in (h, x))
     e, de = h - x, d - moved
-    force = k * e + b / T * de
+    force = k[:, None] * e + b[:, None] / T * de
     still = np.zeros((count, 3))
     parts, held = kept_behind_a_law(
         RUN,
+        gains=(np.concatenate([gains[:1], gains[:-1]]), gains),
+        pulled=(e + moved, still),
         stretch=(e, still),
         stretched=(de, still),
         work=(np.sum(force * moved, axis=1), np.zeros(count)),
@@ -61,21 +72,21 @@ def test_the_balance_is_the_identity_behind_the_bound() -> None:
 
     kept = np.cumsum(parts) + held
 
-    def norm(v: np.ndarray, weight: float) -> np.ndarray:
+    def norm(v: np.ndarray, weight: float | np.ndarray) -> np.ndarray:
         return np.asarray(weight * np.sum(v**2, axis=-1))
 
     own = 1.5  # N s/m, burnt over every tick but the jump
     last = count - 1
     given = -np.sum(force[:-1] * d[1:]) - np.sum(norm(d[1:], own / T))
-    middle = slice(1, last)
+    middle, before = slice(1, last), slice(0, last - 1)
     squares = (
-        norm(moved[middle], (k + b / T) / 2)
-        + norm(de[: last - 1] + d[middle], b / T / 2)
-        + norm(d[middle], (own - b) / T - k / 2)
+        norm(moved[middle], (k + b / T)[middle] / 2)
+        + norm(de[before] + d[middle], b[before] / T / 2)
+        + norm(d[middle], (own - (b[before] + b[middle]) / 2) / T - k[before] / 2)
     ).sum()
-    squares += norm(de[last - 1] + d[last], b / T / 2)
-    squares += norm(d[last], own / T - k / 2 - b / T / 2)
-    squares += norm(moved[last], k / 2) - b / T * np.sum(de[last] * moved[last])
+    squares += norm(de[last - 1] + d[last], b[last - 1] / T / 2)
+    squares += norm(d[last], own / T - k[last - 1] / 2 - b[last - 1] / T / 2)
+    squares += norm(moved[last], k[last] / 2) - b[last] / T * np.sum(de[last] * moved[last])
     assert given + kept[last] == pytest.approx(-squares, rel=1e-12)
 
 
@@ -87,8 +98,12 @@ def kept(
     e = np.zeros((count, 3))
     e[:, 0] = stretch
     none = np.zeros((count, 3))
+    coupling = run.coupling
+    gains = np.tile([coupling.stiffness, coupling.damping, 0.0, 0.0], (count, 1))
     parts, held = kept_behind_a_law(
         run,
+        gains=(gains, gains),
+        pulled=(e, none),
         stretch=(e, none),
         stretched=(none, none),
         work=(np.full(count, work), np.zeros(count)),
@@ -138,7 +153,7 @@ def balance(path: Path, damping: float | None = None, rotational: float = 1.0) -
         parameters_of(recording.meta), device_damping=damping, device_rotational_damping=rotational
     )
     starts = {name: meta_start(recording.meta, name) for name in STARTS}
-    resumed = [e["tick"] for e in recording.events if e["event"] == "resume"]
+    home = np.array(starts["tool_start"])
     return Balance.of(
         recording.ticks,
         parameters,
@@ -148,7 +163,7 @@ def balance(path: Path, damping: float | None = None, rotational: float = 1.0) -
             np.array(starts["tool_start"]),
             starts["start_kinetic"][0] + starts["start_potential"][0],
         ),
-        np.array(resumed, dtype=np.float64),
+        Interventions.of(recording.events, parameters, home),
     )
 
 

@@ -60,7 +60,6 @@ def test_rewriting_alone_changes_no_verdict(tap: Recording, held: Recording, fol
 
 @settings(
     max_examples=120,
-    deadline=None,
     derandomize=True,
     suppress_health_check=[HealthCheck.function_scoped_fixture],
 )
@@ -219,7 +218,6 @@ def test_device_that_no_force_moves_is_not_certified_whatever_damping_it_claims(
 
 @settings(
     max_examples=60,
-    deadline=None,
     derandomize=True,
     suppress_health_check=[HealthCheck.function_scoped_fixture],
 )

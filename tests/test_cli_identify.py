@@ -21,10 +21,13 @@ def test_it_prints_draws_and_saves_what_it_measured(
     assert main([*words, "--plot", str(fit), "--zwidth", str(width)]) == 0
     told = capsys.readouterr().out
     assert "resolution 20 µm" in told
+    assert "a hand that only damps cannot be told from the device" in " ".join(told.split())
+    assert "speed squared" not in told
     assert "the largest safe stiffness is 29" in told  # 2 b / T at the lower end of b
     assert fit.read_bytes().startswith(b"\x89PNG") and "<svg" in width.read_text(encoding="utf-8")
     found = read_profile(profile)
     damping = found.quantities["damping"]
+    assert "a hand that only damps cannot be told from the device" in damping.source
     assert damping.value == pytest.approx(1.5, rel=0.01)
     assert damping.interval is not None and damping.interval[0] < 1.5 < damping.interval[1]
     assert found.quantities["rotational_damping"].value == pytest.approx(2e-3, rel=0.01)
@@ -41,12 +44,22 @@ def test_a_profile_that_cannot_be_written_costs_no_measurement(
     assert "cannot write" in told.err and "Traceback" not in told.err
 
 
+def test_the_help_says_which_hand_cannot_be_seen(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["identify", "--help"])
+    told = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    assert "one that only damps cannot be told from the device" in told
+
+
 def test_as_json_it_tells_the_same(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["identify", FREE, "--axes", "y", "--duration", "5", "--json"]) == 0
     facts = json.loads(capsys.readouterr().out)
     assert facts["axes"]["y"]["damping"]["value"] == pytest.approx(1.5, rel=0.02)
     assert facts["largest_stiffness"] == pytest.approx(3000, rel=0.03)
     assert facts["profile"] is None
+    assert "only damps" in facts["assumed"]
+    estimate = facts["axes"]["y"]["damping"]
+    assert estimate["half_width"] > 0.0 and estimate["below"] >= 0.0
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,8 @@ import time
 import pytest
 
 from hapticbridge import clock as clock_module
-from hapticbridge.clock import RealClock, SimulatedClock, running_ns
+from hapticbridge.bridge import SUSPENDED_NS
+from hapticbridge.clock import RealClock, SimulatedClock, running_ns, slept_ns
 
 PERIOD = 1_000_000
 
@@ -91,6 +92,15 @@ def test_a_late_wake_within_a_period_skips_nothing(wall: Wall) -> None:
     assert wake > deadline + 300_000
 
 
+def test_time_begins_with_the_first_start(wall: Wall) -> None:
+    """What happens before is at 0, not at the hours that the machine has run."""
+    clock = RealClock()
+    wall.ns += 10_000_000_000
+    assert clock.now() == 0
+    clock.start(PERIOD)
+    assert 0 < clock.now() < PERIOD
+
+
 def test_time_stands_still_between_runs(wall: Wall) -> None:
     clock = RealClock()
     clock.start(PERIOD)
@@ -108,4 +118,11 @@ def test_real_time_passes_while_the_machine_is_suspended(monkeypatch: pytest.Mon
         return suspended if which == time.CLOCK_BOOTTIME else 0
 
     monkeypatch.setattr(time, "clock_gettime_ns", told)
-    assert running_ns() == suspended
+    monkeypatch.setattr(time, "monotonic_ns", lambda: 0)
+    assert running_ns() == slept_ns() == suspended
+
+
+@pytest.mark.skipif(not hasattr(time, "CLOCK_BOOTTIME"), reason="only Linux tells")
+def test_a_machine_that_is_awake_does_not_sleep() -> None:
+    before = slept_ns()
+    assert abs(slept_ns() - before) < SUSPENDED_NS

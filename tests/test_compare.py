@@ -184,3 +184,13 @@ def test_damage_is_told_and_what_is_no_recording_refused(
         other = rewritten(recording, tmp_path / "period.mcap", meta={"period_s": period})
         with pytest.raises(RecordingError, match="period_s"):
             compare(tap, other)
+
+
+def test_another_guard_is_another_run_though_no_tick_shows_it(tap: Path, tmp_path: Path) -> None:
+    recording = read_recording(tap)
+    guard = recording.meta["guard"].replace('"stretch": 0.2', '"stretch": 0.1')
+    assert guard != recording.meta["guard"]
+    found = compare(tap, rewritten(recording, tmp_path / "guarded.mcap", meta={"guard": guard}))
+    assert found.first is None
+    assert list(found.decisive) == ["guard"]
+    assert not found.is_same

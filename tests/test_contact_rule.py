@@ -278,7 +278,7 @@ def test_refsafe_raises_what_the_step_cannot_resolve() -> None:
     st.lists(st.floats(0.01, 0.99), min_size=2, max_size=2),
     st.floats(2e-5, 1e-3), st.floats(0.1, 0.9), st.floats(1, 4),
 )  # fmt: skip
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 def test_impedance_is_the_one_that_mujoco_gives_a_contact_0_1_mm_deep(
     impedances: list[float], width: float, midpoint: float, power: float
 ) -> None:
@@ -371,7 +371,7 @@ GEOM = st.fixed_dictionaries(
        st.sampled_from(["", '<exclude body1="link" body2="world"/>',
                         '<exclude body1="tool" body2="box"/>', '<pair geom1="a" geom2="d"/>']),
 )  # fmt: skip
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_settings_and_pairs_are_those_of_mujocos_own_contacts(
     geoms: list[dict[str, object]], flag: str, more: str
 ) -> None:

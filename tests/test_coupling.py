@@ -141,7 +141,7 @@ def test_recorded_wrench_is_the_mean_of_the_coupling_law_at_the_poses(
     assert (np.abs(law).max(axis=0) > 1e-3).all()  # in every direction
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(
     st.floats(10, 2e4),
     st.floats(0, 10),

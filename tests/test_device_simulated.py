@@ -189,7 +189,7 @@ def test_a_free_device_coasts_and_loses_what_its_damper_takes() -> None:
     friction=st.floats(0.05, 0.4),
     damping=st.sampled_from([0.0, 0.3, 3.0]),
 )
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_friction_stops_a_free_device_where_the_closed_form_says(
     period: float, kick: float, friction: float, damping: float
 ) -> None:
@@ -214,7 +214,7 @@ def test_friction_stops_a_free_device_where_the_closed_form_says(
 
 
 @given(share=st.floats(-1.0, 1.0))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_friction_holds_any_smaller_force(share: float) -> None:
     samples, velocities = run(
         SimulatedDevice(hand=None, friction=0.5), along_x(np.full(20, 0.5 * share))
@@ -305,7 +305,7 @@ def test_friction_in_a_moving_hand_agrees_with_event_detection(
 
 
 @given(friction=st.floats(0.01, 2.0), stiffness=st.floats(10.0, 300.0), speed=st.floats(1e-3, 1.0))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_a_pulling_hand_breaks_the_device_loose_when_the_closed_form_says(
     friction: float, stiffness: float, speed: float
 ) -> None:

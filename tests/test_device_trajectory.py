@@ -46,7 +46,7 @@ def recorded(count: int) -> NDArray[np.void]:
 
 
 @given(seed=st.integers(0, 10_000), period=st.floats(5e-4, 0.05))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_rows_are_interpolated_linearly_and_by_slerp(seed: int, period: float) -> None:
     rng = np.random.default_rng(seed)
     times = rng.uniform(-5.0, 5.0) + np.cumsum(rng.uniform(1e-3, 0.1, 8))

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +20,7 @@ from hapticbridge.doctor.diagnosis import diagnose, judged
 from hapticbridge.doctor.machine import Finding, System, findings
 from hapticbridge.doctor.wakeups import bare_turn
 from hapticbridge.errors import HapticBridgeError
-from hapticbridge.realtime import Grant, Lateness, real_time
+from hapticbridge.realtime import Grant, Lateness, real_time, stolen_time
 from hapticbridge.realtime.remedies import CONTAINER, SHELL
 
 GRANTED = (Grant("scheduling", True, "SCHED_FIFO at priority 80"),)
@@ -108,6 +110,26 @@ def test_a_virtual_machine_is_told(tmp_path: Path, flags: str, is_good: bool | N
     seen = found(tmp_path, {"proc/cpuinfo": f"flags\t\t: {flags}"})["host"]
     assert seen.is_good is is_good
     assert ("this is a virtual machine" in seen.sentence) != bool(is_good)
+
+
+@pytest.mark.parametrize(("stolen", "is_good"), [(0.0, None), (0.019, None), (0.021, False)])
+def test_a_host_that_took_more_than_a_thousandth_of_the_time_is_blamed(
+    tmp_path: Path, stolen: float, is_good: bool | None
+) -> None:
+    system = system_with(tmp_path, {"proc/cpuinfo": "flags\t\t: fpu hypervisor"})
+    seen = {item.name: item for item in findings(system, GRANTED, stolen, 20.0)}["host"]
+    assert seen.is_good is is_good
+    assert ("it took" in seen.sentence) == (stolen > 0)
+    assert "run on the machine itself" in seen.remedy
+
+
+def test_what_the_host_took_is_read_from_the_kernel(tmp_path: Path) -> None:
+    place = tmp_path / "stat"
+    assert stolen_time(tmp_path) is None
+    place.write_text("cpu  1 2 3 4 5 6 7 250 9 10\ncpu0 1 2 3 4 5 6 7 99 9 10\n")
+    assert stolen_time(tmp_path) == pytest.approx(250 / os.sysconf("SC_CLK_TCK"))
+    place.write_text("cpu  1 2 3\n")
+    assert stolen_time(tmp_path) is None
 
 
 def test_what_one_shell_may_is_also_said_for_good(tmp_path: Path) -> None:
@@ -255,18 +277,63 @@ def test_the_loops_take_turns_and_share_the_time(quick: list[tuple[str, int, int
     assert result.verdict == "fit"
 
 
-@pytest.mark.parametrize("output", [CYCLICTEST, None])
+@pytest.mark.parametrize("output", [CYCLICTEST, "it failed: no reason"])
 def test_cyclictest_takes_its_turns_where_it_is_and_may(
-    quick: list[tuple[str, int, int]], monkeypatch: pytest.MonkeyPatch, output: str | None
+    quick: list[tuple[str, int, int]], monkeypatch: pytest.MonkeyPatch, output: str
 ) -> None:
+    late = cyclictest.parsed(output)
+    asked: list[tuple[Any, ...]] = []
+
+    def run(*arguments: Any, **_locks: bool) -> Any:
+        asked.append(arguments)
+        return output if late is None else late
+
     monkeypatch.setattr(cyclictest, "is_there", lambda: True)
-    monkeypatch.setattr(cyclictest, "run", lambda *_: output and cyclictest.parsed(output))
+    monkeypatch.setattr(cyclictest, "run", run)
+    monkeypatch.setattr(diagnosis, "current_priority", lambda: 40)
     result = diagnose(1000.0, 6.0)
-    assert ("cyclictest" in result.lateness) == (output is not None)
+    assert ("cyclictest" in result.lateness) == (late is not None)
     said = {finding.name: finding.sentence for finding in result.findings}["baseline"]
-    assert ("could not run" in said) == (output is None)
-    if output is not None:
+    if late is None:  # tried once, and the two others share the time
+        assert "but it failed: no reason" in said
+        assert len(asked) == 1
+        assert result.lateness["bridge"].ticks == 3000
+    else:
         assert result.lateness["cyclictest"].missed == 2 * 2 * 61
+        assert asked[1:] == [(1_000_000, 1000, 40)] * 2
+        assert result.lateness["bridge"].ticks == 2000
+
+
+@pytest.mark.parametrize(
+    ("is_there", "priority", "outcome", "words"),
+    [
+        (False, 80, CYCLICTEST, "not installed"),
+        (True, 0, CYCLICTEST, "needs SCHED_FIFO, which was refused"),
+        (True, 80, CYCLICTEST, ""),
+        (True, 80, "Unable to change!\nMissing capabilities.\n", "it failed: Missing capabil"),
+        (True, 80, subprocess.TimeoutExpired("cyclictest", 5.0), "did not come to an end"),
+        (True, 80, FileNotFoundError(2, "No such file"), "cannot be started (No such file)"),
+    ],
+)
+def test_why_cyclictest_does_not_run_is_said(
+    monkeypatch: pytest.MonkeyPatch, is_there: bool, priority: int, outcome: Any, words: str
+) -> None:
+    commands: list[list[str]] = []
+
+    def call(command: list[str], **_options: Any) -> Any:
+        commands.append(command)
+        if isinstance(outcome, Exception):
+            raise outcome
+        is_done = outcome is CYCLICTEST
+        return subprocess.CompletedProcess(command, 1 - is_done, outcome * is_done, outcome)
+
+    monkeypatch.setattr(subprocess, "run", call)
+    monkeypatch.setattr(cyclictest, "is_there", lambda: is_there)
+    said = cyclictest.refusal(priority, locks_memory=False)
+    assert words in said
+    assert bool(said) == bool(words)
+    assert all("--priority=80" in each and "--mlockall" not in each for each in commands)
+    assert bool(commands) == (is_there and priority > 0)
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 from emulated.falcon_model import leg_angles
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -22,9 +22,6 @@ from hapticbridge.device.falcon.kinematics import (
     inverse,
 )
 from hapticbridge.device.falcon.statics import jacobian, thigh_torques
-
-COMPILES = settings(deadline=None)
-"""The first example of a law may have to compile what it is about."""
 
 MIDDLE = np.array([0.0, 0.0, 0.125])
 
@@ -111,7 +108,6 @@ def test_nine_newton_along_the_axis_take_the_published_torque() -> None:
     np.testing.assert_allclose(torques, 0.226, atol=5e-4)
 
 
-@COMPILES
 @given(st.tuples(*[st.floats(allow_nan=True, allow_infinity=True)] * 3))
 def test_any_angles_give_a_place_within_reach_or_leave_it(angles: tuple[float, ...]) -> None:
     place = MIDDLE.copy()
@@ -122,7 +118,6 @@ def test_any_angles_give_a_place_within_reach_or_leave_it(angles: tuple[float, .
         assert place.tolist() == MIDDLE.tolist()
 
 
-@COMPILES
 @given(st.tuples(*[st.floats(allow_nan=True, allow_infinity=True)] * 3))
 def test_any_place_gives_finite_angles_or_none(place: tuple[float, ...]) -> None:
     angles = np.full(3, 7.0)

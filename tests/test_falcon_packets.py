@@ -1,15 +1,12 @@
 from __future__ import annotations
 
 import numpy as np
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from hapticbridge.device.falcon.packets import ReplyStream, Request, encode
 
 STATUS = b"\x01\x60"
-
-COMPILES = settings(deadline=None)
-"""The first example of a law may have to compile what it is about."""
 
 numbers = st.integers(-32768, 32767)
 
@@ -41,7 +38,6 @@ def test_the_number_of_the_description_is_read_as_described() -> None:
     assert newest(stream) == ([1447, 0, -1], 0, 0)
 
 
-@COMPILES
 @given(st.tuples(numbers, numbers, numbers), st.integers(0, 15))
 def test_a_packet_to_the_device_is_written_as_described(
     motors: tuple[int, int, int], flags: int
@@ -59,7 +55,6 @@ def test_a_number_too_large_for_a_packet_becomes_the_largest_of_its_sign() -> No
     assert packet.tobytes() == f"<{digits(32767)}{digits(-32767)}AAAA{chr(0x41 + 9)}A>".encode()
 
 
-@COMPILES
 @given(st.tuples(numbers, numbers, numbers), st.integers(0, 15), st.integers(0, 7))
 def test_every_reply_is_read_back(encoders: tuple[int, int, int], buttons: int, homed: int) -> None:
     stream = ReplyStream()
@@ -68,7 +63,6 @@ def test_every_reply_is_read_back(encoders: tuple[int, int, int], buttons: int, 
     assert stream.dropped == 0
 
 
-@COMPILES
 @given(st.lists(st.tuples(numbers, numbers, numbers), min_size=1), st.integers(1, 62))
 def test_how_a_stream_is_cut_into_packets_changes_nothing(
     counts: list[tuple[int, int, int]], size: int
@@ -78,7 +72,6 @@ def test_how_a_stream_is_cut_into_packets_changes_nothing(
     assert newest(stream)[0] == list(counts[-1])
 
 
-@COMPILES
 @given(st.lists(st.binary(max_size=80), max_size=20))
 def test_any_bytes_are_taken_and_a_reply_after_them_is_found(packets: list[bytes]) -> None:
     stream = ReplyStream()
@@ -91,7 +84,6 @@ def test_any_bytes_are_taken_and_a_reply_after_them_is_found(packets: list[bytes
     assert newest(stream) == ([7, -8, 9], 5, 0)
 
 
-@COMPILES
 @given(
     st.lists(
         st.one_of(st.tuples(numbers, numbers, numbers), st.binary(max_size=15).map(bytes)),
@@ -113,7 +105,6 @@ def test_garbage_between_replies_costs_no_reply(
     assert stream.dropped == garbage
 
 
-@COMPILES
 @given(st.tuples(numbers, numbers, numbers), st.integers(0, 15), st.integers(0, 255))
 def test_a_reply_with_a_byte_lost_or_put_in_is_not_believed(
     encoders: tuple[int, int, int], at: int, extra: int

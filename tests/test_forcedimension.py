@@ -240,6 +240,21 @@ def test_buttons_are_the_librarys() -> None:
     assert sample["buttons"][0] == 0b101
 
 
+def test_what_the_library_does_not_know_comes_from_the_profile_of_its_model() -> None:
+    """Shipped profiles are named by model, and once none was ever found."""
+    told: list[str] = []
+    for kind, resolution in ((OMEGA3, 1e-5), (SIGMA7, 1.5e-6), (203, None)):
+        stub = Stub(kind)
+        stub.call("limits", 15.0, 0.3)
+        device = open_device(f"forcedimension:library={stub.file}", tell=told.append)
+        device.close()
+        assert device.info.resolution == resolution
+        assert device.info.damping is None
+    missing = [sentence for sentence in told if "there is no profile" in sentence]
+    (sentence,) = missing
+    assert "there is no profile of 'lambda.3'; there are 'delta.3', 'lambda.7'" in sentence
+
+
 def test_a_spec_names_the_library_the_device_and_its_numbers() -> None:
     stub = Stub()
     device = open_device(f"forcedimension:library={stub.file},gravity=0,damping=1.5,resolution=0")

@@ -7,14 +7,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 from audit_cases import recorded, tapped, verdict_of
-from faults.catalogue import NO_TRIPS, stiff
+from faults.catalogue import HEAVY, NO_TRIPS, stiff
 from faults.rig import CAUSE, Outcome, Rig
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
-from hapticbridge.audit.guarded import _capped_sum
+from hapticbridge.audit.controlled import capped_sum
+from hapticbridge.coupling import Coupling
 from hapticbridge.device import SimulatedDevice
 from hapticbridge.guard import guarding_for, limits_for
 from hapticbridge.kernel.account import keep_account
-from hapticbridge.kernel.guarding import DAMPER, OFF
+from hapticbridge.kernel.guarding import DAMPER, ENVIRONMENT
 from hapticbridge.kernel.layout import STATE_DTYPE
 from hapticbridge.passivity import WorstHand
 from hapticbridge.recording import read_recording
@@ -52,6 +55,37 @@ def test_a_wall_of_one_and_a_half_times_the_limit_swings_without_and_decays_with
     assert 0.5 < ticks["injected_damping"].max() <= 2.0  # min(b, m/T)
 
 
+def twisted(folder: Path, controller: str) -> Outcome:
+    """As ``knocked``, about an axis: K_r is 1.5 times 2 b_r/T, knocked with 0.1 N m for 5 ms."""
+    rig = Rig(folder)
+    stiff(0.1, None, controller)(rig)
+    inertia = '<inertial pos="0 0 0" mass="1000" diaginertia="1000 1000 1000"/>'
+    rig.scene = folder / "heavy.xml"
+    rig.scene.write_text(HEAVY.replace("<freejoint/>", f"<freejoint/>{inertia}"))
+    rig.coupling = Coupling(400.0, 0.0, 1.5 * 2 * 2e-3 / T, 0.0)
+    rig.guard |= NO_TRIPS
+
+    def refuse(tick: int, wrench: NDArray[np.float64]) -> None:
+        if CAUSE <= tick < CAUSE + 5:
+            wrench[4] += 0.1
+
+    rig.device.refuse = refuse
+    return rig.run(CAUSE)
+
+
+def test_about_an_axis_too_a_wall_beyond_the_limit_swings_without_and_decays_with(
+    tmp_path: Path,
+) -> None:
+    late = slice(CAUSE + 900, CAUSE + 990)
+    without = twisted(tmp_path, "off").torques
+    assert without[late].max() > 0.7 * without[CAUSE + 50 : CAUSE + 90].max() > 0.02
+    with_it = twisted(tmp_path, "damper")
+    assert with_it.torques[late].max() < 0.1 * without[late].max()
+    assert (with_it.flags & ACTIVE).any()
+    assert with_it.report.verdict != "invalid", with_it.report.reason
+    assert with_it.report.resimulation == "bit for bit"
+
+
 @pytest.mark.parametrize("controller", ["damper", "tank"])
 def test_at_ten_times_the_limit_a_free_device_is_calmed(tmp_path: Path, controller: str) -> None:
     outcome = knocked(tmp_path, 10.0, None, controller)
@@ -63,13 +97,58 @@ def test_at_ten_times_the_limit_a_free_device_is_calmed(tmp_path: Path, controll
 @pytest.mark.parametrize("scene", ["peg_in_hole", "hammer"])
 def test_on_a_certified_device_the_controller_is_idle(tmp_path: Path, scene: str) -> None:
     rows = []
-    for controller in ("damper", "off"):
+    for controller in ("damper", None, "off"):
         path = tmp_path / f"{controller}.mcap"
         summary = recorded(path, scene, duration=2.0, controller=controller)
         assert summary.is_certified
         rows.append(read_recording(path).ticks)
     for name in set(TICK_DTYPE.names or ()) - set(CLOCK_FIELDS):
-        np.testing.assert_array_equal(rows[0][name], rows[1][name], err_msg=name)
+        np.testing.assert_array_equal(rows[0][name], rows[2][name], err_msg=name)
+        np.testing.assert_array_equal(rows[1][name], rows[2][name], err_msg=name)
+
+
+def shaken(folder: Path, controller: str | None) -> Outcome:
+    """A light tool in a method that creates energy, on a device that bears the coupling."""
+    rig = Rig(folder, duration=3.0)
+    rig.scene = folder / "light.xml"
+    rig.scene.write_text(HEAVY.replace("1000", "0.05"))
+    times = np.arange(0.0, 9.0, 0.01)
+    along = 0.02 * np.sin(6 * np.pi * times) * np.minimum(times, 1.0)
+    rig.points = tuple(zip(times.tolist(), along.tolist(), strict=True))
+    rig.coupling = Coupling(2000.0, 0.5, 1.0, 5e-4)
+    rig.options = {"method": "implicitfast", "i_know": True, "controller": controller}
+    return rig.run(CAUSE)
+
+
+def test_what_the_environment_creates_beyond_the_slack_is_kept_from_a_certified_device(
+    tmp_path: Path,
+) -> None:
+    without = shaken(tmp_path, "off")
+    assert without.report.certified
+    assert without.report.environment == "active"
+    assert without.energy > 1e-3
+    with_it = shaken(tmp_path, None)
+    assert with_it.energy < 0.3 * without.energy
+    rows = read_recording(tmp_path / "run.mcap").ticks
+    acts = rows["injected_damping"] > 0
+    assert acts.any()
+    assert ((rows["flags"] & ACTIVE) != 0).tolist() == acts.tolist()
+    excess = rows["environment_energy"] - slack_of(rows, 2000.0 + 0.5 / T, 1.0 + 5e-4 / T)
+    assert (excess[:-1][acts[1:]] > 0).all()  # and nowhere else
+    # two other routes: the audit's arrays, and the kernel again
+    assert with_it.report.verdict == "active", with_it.report.reason
+    assert with_it.report.port == "environment"
+    assert with_it.report.resimulation == "bit for bit"
+
+
+def slack_of(rows: NDArray[np.void], linear: float, angular: float) -> NDArray[np.float64]:
+    """Returns Σ ½‖δx‖²_{K+B/T} + ½‖δφ‖²; the tool starts at the first row's pose."""
+    moved = np.diff(rows["tool_position"], axis=0, prepend=rows["tool_position"][:1])
+    turned = Rotation.from_quat(rows["tool_quaternion"], scalar_first=True)
+    turns = (turned[1:] * turned[:-1].inv()).as_rotvec()
+    squares = 0.5 * linear * np.sum(moved**2, axis=1)
+    squares[1:] += 0.5 * angular * np.sum(turns**2, axis=1)
+    return np.cumsum(squares)
 
 
 def test_a_device_with_too_little_damping_is_credited_with_half_of_it() -> None:
@@ -79,7 +158,7 @@ def test_a_device_with_too_little_damping_is_credited_with_half_of_it() -> None:
     assert (enough.credit, enough.rotational_credit) == (2.0, 2e-3)
     short = guarding_for(info, limits, T, needed=(2.1, 1e-3))
     assert (short.credit, short.rotational_credit) == (1.0, 2e-3)
-    assert (enough.controller, short.controller) == (OFF, DAMPER)
+    assert (enough.controller, short.controller) == (ENVIRONMENT, DAMPER)
     light = guarding_for(SimulatedDevice(mass=1e-3).info, limits, T)
     assert light.most_damping == pytest.approx(1.0)  # m/T, below b
 
@@ -105,7 +184,7 @@ def test_the_audits_capped_sum_is_the_recursion() -> None:
     for row in values:
         total = np.maximum(total + row, -0.05)
         expected.append(total)
-    np.testing.assert_allclose(_capped_sum(values, 0.05), expected, atol=1e-15)
+    np.testing.assert_allclose(capped_sum(values, 0.05), expected, atol=1e-15)
 
 
 def test_a_changed_injected_damping_does_not_pass_the_audit(tmp_path: Path) -> None:

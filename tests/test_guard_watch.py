@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import math
 import signal
 import subprocess
 import sys
@@ -16,9 +18,11 @@ import pytest
 from audit_cases import ScriptedDevice, verdict_of
 from bridge_runs import fast
 from cli_cases import Called
+from faults.catalogue import FAULTS, PUSHER
 from faults.rig import Outcome, Rig
 from numpy.typing import NDArray
 
+from hapticbridge.audit import audit
 from hapticbridge.bridge import Bridge
 from hapticbridge.clock import RealClock, SimulatedClock
 from hapticbridge.device.last_word import LastWord
@@ -79,6 +83,77 @@ def test_a_dead_man_must_be_held_for_any_force(tmp_path: Path) -> None:
     assert not outcome.forces[DOWN + 25 :].any()
     assert outcome.report.resimulation == "bit for bit"
     assert outcome.report.verdict == "passive"
+
+
+@pytest.mark.parametrize("scale", [1.0, 2.0])
+def test_a_coupling_that_is_stretched_too_far_stops_the_run(tmp_path: Path, scale: float) -> None:
+    """The tool stays at the wall; the limit counts the device's motion, whatever the scale."""
+    outcomes = {}
+    for stretch in (3e-3, 0.2):
+        limits = Limits(force=10.0, torque=0.5, ramp=0.2, stretch=stretch)
+        rig = Rig(tmp_path, options={"limits": limits, "scale": scale})
+        outcomes[stretch] = rig.run(DOWN)
+        ticks = read_recording(tmp_path / "run.mcap").ticks
+        distance = np.linalg.norm(ticks["handle_position"] - ticks["tool_position"], axis=1)
+        limit = scale * stretch
+        assert (distance[:-1] <= limit).all()
+        assert (distance[-1] > limit) == (stretch == 3e-3)  # seen a tick later
+    stopped = outcomes[3e-3]
+    assert "farther from the handle than the stretch limit" in stopped.error
+    assert "stretch limit" in stopped.report.reason
+    assert stopped.last_is_zero
+    assert stopped.report.resimulation == "bit for bit"
+    assert not outcomes[0.2].error
+
+
+@pytest.mark.parametrize("angle", [2.8, math.inf])
+def test_a_coupling_that_is_turned_too_far_stops_the_run(tmp_path: Path, angle: float) -> None:
+    """A tool on a rail cannot turn; at half a turn the torque would change sides."""
+    scene = tmp_path / "rail.xml"
+    scene.write_text(PUSHER)
+    device = ScriptedDevice(lambda k: (0, 0, 0, np.cos(2e-3 * k), 0, 0, np.sin(2e-3 * k)))
+    path, error = tmp_path / "run.mcap", ""
+    limits = Limits(force=10.0, torque=0.5, ramp=0.0, angle=angle, energy=math.inf)
+    with fast(scene, device, limits=limits, recording=path) as bridge:
+        try:
+            bridge.run(0.9)
+        except SafetyTrip as trip:
+            error = str(trip)
+    ticks = read_recording(path).ticks
+    torque = ticks["wrench_on_tool"][:, 5]
+    if angle == math.inf:
+        assert not error
+        assert torque.min() < -1.0 < 1.0 < torque.max()
+        return
+    assert "turned from the handle by more than the angle limit" in error
+    assert len(ticks) == pytest.approx(angle / 4e-3, abs=2)
+    assert (torque[1:] > 0).all()
+    assert not device.writes[-1].any()
+    assert "angle limit" in audit(path).reason
+
+
+def test_beyond_its_reach_a_device_moves_without_handle_and_force(tmp_path: Path) -> None:
+    fault = next(fault for fault in FAULTS if fault.name == "edge of the workspace")
+    rows = {}
+    for reach in (0.0125, 1.0):
+        rig = Rig(tmp_path)
+        fault.do(rig)
+        rig.options["limits"] = replace(rig.options["limits"], reach=reach)
+        rig.run(fault.cause)
+        rows[reach] = read_recording(tmp_path / "run.mcap").ticks
+    ticks, free = rows[0.0125], rows[1.0]
+    is_out = np.linalg.norm(ticks["device_position"], axis=1) > 0.0125
+    assert is_out.any()
+    assert ((ticks["flags"] & CLUTCH) != 0).tolist() == is_out.tolist()
+    begun = int(np.argmax(is_out))
+    out = begun + np.arange(np.argmin(is_out[begun:]))  # the first time that it is there
+    assert not ticks["wrench_on_device"][out[0] + 25 : out[-1]].any()
+    assert np.ptp(ticks["handle_position"][out], axis=0).max() == 0.0
+    assert ticks["flags"][out[-1] + 1] & RESEATED
+    assert np.linalg.norm(ticks["wrench_on_device"][out[-1] + 1, :3]) < 0.01 * LIMIT
+    # without an edge the same hand presses on
+    assert not (free["flags"] & CLUTCH).any()
+    assert np.linalg.norm(free["wrench_on_device"][out, :3], axis=1).max() > 5.0
 
 
 @pytest.mark.parametrize("flag", [CLUTCH, RESEATED])
@@ -181,7 +256,7 @@ def test_an_absolute_device_that_strayed_while_rest_was_waited_for_is_refused(
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"controller": "magic"}, "there are 'damper', 'off', 'tank'"),
+        ({"controller": "magic"}, "there are 'damper', 'environment', 'off', 'tank'"),
         ({"clutch": -1}, "clutch button is -1"),
         ({"dead_man": 99}, "dead-man button is 99"),
         ({"clutch": 1, "dead_man": 1}, "exclude each other"),
@@ -194,7 +269,8 @@ def test_what_the_guard_is_not_is_refused(options: dict[str, Any], message: str)
 
 
 @pytest.mark.parametrize(
-    "change", [{"rise": -1.0}, {"stretch": 0.0}, {"angle": 4.0}, {"energy": float("nan")}]
+    "change",
+    [{"rise": -1.0}, {"stretch": 0.0}, {"angle": 4.0}, {"energy": float("nan")}, {"reach": 0.0}],
 )
 def test_limits_that_cannot_be_are_refused(change: dict[str, float]) -> None:
     with pytest.raises(DeviceError, match="it must be"):
@@ -206,6 +282,8 @@ def test_a_guard_reads_back_as_it_was_written() -> None:
     guarding = guarding_for(info, Limits(force=10.0, torque=0.5), 1e-3, clutch=2)
     assert Guarding.from_json(guarding.to_json()) == guarding
     assert Guarding.from_json(UNGUARDED.to_json()) == UNGUARDED
+    older = {k: v for k, v in json.loads(guarding.to_json()).items() if k != "reach"}
+    assert Guarding.from_json(json.dumps(older)) == guarding
     for text in ("", "{}", "[1]", guarding.to_json().replace("0.05", '"x"')):
         with pytest.raises(HapticBridgeError, match="guard"):
             Guarding.from_json(text)
@@ -214,10 +292,8 @@ def test_a_guard_reads_back_as_it_was_written() -> None:
 
 KILLED = """
 import sys, time
-from hapticbridge.bridge import Bridge
-from hapticbridge.clock import RealClock, SimulatedClock
 from hapticbridge.device.last_word import LastWord
-word = LastWord(sys.argv[1], b"\\0zero")
+word = LastWord(sys.argv[1], b"\\0zero", b"\\1off")
 print("ready", flush=True)
 time.sleep(60)
 """
@@ -237,7 +313,7 @@ def test_a_killed_process_still_says_zero_and_one_that_closed_does_not(tmp_path:
     process.send_signal(signal.SIGKILL)
     process.wait()
     limit = time.monotonic() + 20.0
-    while node.read_bytes() != 3 * b"\0zero":
+    while node.read_bytes() != 3 * b"\0zero\1off":
         assert time.monotonic() < limit, "nobody said zero"
     process.stdout.close()
     word = LastWord(str(quiet), b"\0zero")

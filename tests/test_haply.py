@@ -14,8 +14,7 @@ from haply_cases import PERIOD, Bench
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hapticbridge.device import SimulatedDevice, open_device
-from hapticbridge.device.haply import driver as haply_device
+from hapticbridge.device import SimulatedDevice, open_device, silence
 from hapticbridge.device.haply import finding as haply
 from hapticbridge.device.haply import messages
 from hapticbridge.device.haply.driver import FORCE_LIMIT, MOST_UNDER_WAY, HaplyDevice
@@ -337,7 +336,7 @@ def test_a_force_that_is_not_finite_and_a_slow_loop_are_refused() -> None:
 def test_over_real_sockets_it_runs_and_the_wire_is_logged(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(haply_device, "SILENCE", 5.0)  # a busy machine stalls for longer than 50 ms
+    monkeypatch.setattr(silence, "SILENCE", 5.0)  # a busy machine stalls for longer than 50 ms
     service = HaplyService({"049D": SimulatedDevice(damping=50.0)}, resolution=1e-6)
     sample = np.zeros(1, SAMPLE_DTYPE)
     log = tmp_path / "wire.log"

@@ -141,7 +141,7 @@ def test_bad_sample_is_refused_and_changes_nothing(field: str, value: tuple[floa
     go_on(run, samples_of(sines(21)[20:]))
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(
     st.lists(
         st.one_of(st.floats(), st.floats(-2, 2), st.just(1e9), st.just(0.0)),

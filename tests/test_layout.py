@@ -10,14 +10,26 @@ import pytest
 PACKAGE = Path(__file__).parents[1] / "hapticbridge"
 
 ORDER = (
-    ("errors", "arguments", "jit", "tick", "pose", "clock", "signals", "picture", "jsonable"),
+    (
+        "errors",
+        "arguments",
+        "jit",
+        "tick",
+        "pose",
+        "clock",
+        "signals",
+        "picture",
+        "jsonable",
+        "quantity",
+    ),
     ("coupling", "kernel", "mechanics", "passivity"),
     ("scene",),
     ("rendering",),
     ("ledger", "inputs", "device"),
     ("guard", "recording", "certificate", "felt"),
     ("provenance", "summary", "workspace", "realtime"),
-    ("arrangement", "opened", "bridge", "audit", "identify", "compare", "export"),
+    ("commands",),
+    ("arrangement", "opened", "commanded", "bridge", "audit", "identify", "compare", "export"),
     ("report", "film", "view", "study", "check", "doctor"),
     ("whatif",),  # runs the bridge and asks the audit, which must not know of either
     ("cli",),

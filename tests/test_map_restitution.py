@@ -60,7 +60,7 @@ def test_upright_without_friction_all_laws_and_mujoco_agree() -> None:
     friction=st.floats(0.0, 1.0),
     slide=st.floats(-1.0, 1.0),
 )
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_the_contact_of_the_scenes_never_gains(angle: float, friction: float, slide: float) -> None:
     found = drop("scenes", angle, friction, slide)
     assert found.energy_change < 0

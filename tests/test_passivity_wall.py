@@ -34,7 +34,7 @@ THETA = np.union1d(np.linspace(1e-4, np.pi, 20_001), np.geomspace(1e-6, 1e-1, 40
     st.integers(0, 6),
     st.floats(-3, 2),
 )
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_bound_and_worst_frequency_are_those_of_a_dense_sweep(
     log_k: float, log_b: float, scheme: Discretization, delay: int, log_lag: float
 ) -> None:

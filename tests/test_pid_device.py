@@ -12,13 +12,19 @@ from hypothesis import strategies as st
 from pid_cases import LAYOUTS, NEWTONS, PERIOD, SCALE, TRAVEL, opened
 
 from hapticbridge.device import SimulatedDevice, open_device
-from hapticbridge.device.pid import sheet
+from hapticbridge.device.pid import driver, sheet
 from hapticbridge.device.pid.driver import PidDevice, open_pid
 from hapticbridge.device.pid.effects import LIFE, RESTART
 from hapticbridge.device.plugged import tell_nobody
 from hapticbridge.device.profile import Profile, Quantity
 from hapticbridge.errors import DeviceError, DeviceLost
 from hapticbridge.tick import SAMPLE_DTYPE, TickFlag
+
+
+class LastWordDouble:
+    def __init__(self, path: str, *reports: bytes) -> None:
+        self.path, self.reports = path, reports
+
 
 STALE = int(TickFlag.STALE_SAMPLE)
 
@@ -167,6 +173,26 @@ def test_closing_stops_and_frees_the_effects_and_switches_the_motors_off() -> No
     assert not model.is_enabled
     assert not model.effects
     assert model.force() == (0.0, 0.0)
+
+
+def test_another_process_holds_what_takes_the_force_away(monkeypatch: pytest.MonkeyPatch) -> None:
+    held: list[LastWordDouble] = []
+    monkeypatch.setattr(driver, "LastWord", lambda *given: held.append(LastWordDouble(*given)))
+    device, model, _ = started(PidStick())
+    device.leave_last_word("/dev/hidraw7")
+    device.write(wrench(1.0, 1.0))
+    assert model.force() != (0.0, 0.0)
+    assert held[0].path == "/dev/hidraw7"
+    for report in held[0].reports:  # the bridge is dead by now
+        device._link.send(report)
+    assert (model.force(), model.is_enabled, model.effects) == ((0.0, 0.0), False, {})
+
+
+def test_a_stick_whose_node_cannot_be_opened_twice_ends_its_effects_by_itself() -> None:
+    device, *_ = started(PidStick())
+    device.leave_last_word("/no/such/node")
+    assert device.last_word is None
+    device.close()
 
 
 def test_what_another_program_left_in_the_stick_is_cleared() -> None:

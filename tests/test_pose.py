@@ -8,7 +8,7 @@ from typing import TypeAlias
 import mujoco
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
@@ -35,9 +35,6 @@ Array: TypeAlias = NDArray[np.float64]
 
 # a handful of products of numbers <= 1, each rounded to 1.1e-16
 ROUNDING = 4e-15
-
-# the first call compiles
-untimed = settings(deadline=None)
 
 numbers = st.floats(-10, 10, allow_subnormal=False)
 vectors = st.tuples(numbers, numbers, numbers)
@@ -68,7 +65,6 @@ angles = st.one_of(
 )
 
 
-@untimed
 @given(vectors, vectors, numbers)
 def test_vector_algebra_is_that_of_numpy(a: Vector, b: Vector, factor: float) -> None:
     x, y = np.array(a), np.array(b)
@@ -81,7 +77,6 @@ def test_vector_algebra_is_that_of_numpy(a: Vector, b: Vector, factor: float) ->
     assert norm(a) == pytest.approx(float(np.linalg.norm(x)), rel=ROUNDING)
 
 
-@untimed
 @given(quaternions, quaternions)
 def test_product_and_conjugate_are_those_of_mujoco(a: Quaternion, b: Quaternion) -> None:
     expected = np.zeros(4)
@@ -91,7 +86,6 @@ def test_product_and_conjugate_are_those_of_mujoco(a: Quaternion, b: Quaternion)
     assert conjugate(a) == tuple(expected)
 
 
-@untimed
 @given(quaternions, vectors)
 def test_rotated_is_mujocos_rotation_of_a_vector(q: Quaternion, v: Vector) -> None:
     expected = np.zeros(3)
@@ -99,7 +93,6 @@ def test_rotated_is_mujocos_rotation_of_a_vector(q: Quaternion, v: Vector) -> No
     assert rotated(q, v) == pytest.approx(expected, abs=100 * ROUNDING)
 
 
-@untimed
 @given(directions, angles)
 def test_exponential_is_mujocos_quaternion_of_axis_and_angle(axis: Vector, angle: float) -> None:
     expected = np.zeros(4)
@@ -107,7 +100,6 @@ def test_exponential_is_mujocos_quaternion_of_axis_and_angle(axis: Vector, angle
     assert quaternion_exp(scaled(angle, axis)) == pytest.approx(expected, abs=ROUNDING)
 
 
-@untimed
 @given(quaternions)
 @example((0.0, 1.0, 0.0, 0.0))
 @example((-1.0, 0.0, 0.0, 0.0))
@@ -121,7 +113,6 @@ def test_logarithm_is_mujocos_velocity_over_one_second(q: Quaternion) -> None:
     assert norm(quaternion_log(q)) <= math.pi * (1 + ROUNDING)
 
 
-@untimed
 @given(directions, angles)
 @example((1.0, 0.0, 0.0), 0.0)
 @example((1.0, 0.0, 0.0), 5e-324)
@@ -132,7 +123,6 @@ def test_logarithm_undoes_the_exponential(axis: Vector, angle: float) -> None:
     assert again == pytest.approx(vector, rel=1e-12, abs=max(1e-14 * angle, 1e-320))
 
 
-@untimed
 @given(quaternions, quaternions)
 def test_rotation_between_is_in_the_world_frame(a: Quaternion, b: Quaternion) -> None:
     vector = rotation_between(a, b)
@@ -147,7 +137,6 @@ def test_rotation_between_is_in_the_world_frame(a: Quaternion, b: Quaternion) ->
         assert vector == pytest.approx(start.apply(local), abs=4 * ROUNDING)
 
 
-@untimed
 @given(quaternions, st.floats(0.5, 2))
 def test_canonical_has_unit_length_and_a_scalar_that_is_not_negative(
     q: Quaternion, length: float
@@ -160,7 +149,6 @@ def test_canonical_has_unit_length_and_a_scalar_that_is_not_negative(
     )
 
 
-@untimed
 @given(quaternions, st.floats(0.5, 2))
 def test_canonical_is_idempotent_to_the_bit(q: Quaternion, length: float) -> None:
     once = canonical((length * q[0], length * q[1], length * q[2], length * q[3]))

@@ -10,11 +10,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hapticbridge.device import SimulatedDevice
+from hapticbridge.device.forcedimension.models import MODELS
 from hapticbridge.device.profile import (
+    LOWER_END,
     SHIPPED,
     UNITS,
     Profile,
     Quantity,
+    modelled,
     profile_named,
     profile_of,
     profiles,
@@ -46,6 +49,71 @@ def test_shipped_profiles_give_a_source_for_every_number(path: Path) -> None:
         assert quantity.source
         if quantity.value is None:
             assert "no figure" in quantity.source or "without a" in quantity.source, name
+
+
+@pytest.mark.parametrize("path", sorted(SHIPPED.glob("*.toml")), ids=lambda path: path.stem)
+def test_shipped_profiles_state_every_number_that_matters_or_that_it_is_unknown(path: Path) -> None:
+    profile = read_profile(path)
+    stated = set(profile.quantities)
+    assert stated >= {
+        "workspace", "force_limit", "mass", "damping", "friction", "resolution", "rate",
+    }  # fmt: skip
+    assert profile.axes
+    measured = {*LOWER_END, "resolution"}
+    for name, quantity in profile.quantities.items():
+        assert "'hapticbridge identify' measures it" not in quantity.source or name in measured
+
+
+@pytest.mark.parametrize(
+    ("driver", "model", "stem"),
+    [
+        ("forcedimension", "omega.3", "omega3"),
+        ("forcedimension", "omega.7 left", "omega3"),
+        ("forcedimension", "delta.3", "delta3"),
+        ("forcedimension", "sigma.7", "sigma7"),
+        ("forcedimension", "lambda.7 left", "lambda7"),
+        ("haply", "inverse3", "inverse3"),
+        ("haply", "Minverse", "minverse"),
+    ],
+)
+def test_a_shipped_profile_is_found_by_the_model_that_the_driver_reports(
+    driver: str, model: str, stem: str
+) -> None:
+    found = profile_of(driver, "S 1", model)
+    assert found is not None and found.path == SHIPPED / f"{stem}.toml"
+    other = {"haply": "forcedimension", "forcedimension": "haply"}[driver]
+    assert profile_of(other, "S 1", model) is None
+
+
+def test_every_model_that_a_profile_names_is_one_that_the_driver_reports() -> None:
+    assert set(modelled("forcedimension")) <= {model.name for model in MODELS.values()}
+    assert set(modelled("haply")) == {"inverse3", "minverse"}
+    assert modelled("falcon") == ()
+
+
+def test_what_was_measured_of_one_model_is_not_taken_for_another(tmp_path: Path) -> None:
+    measured = Profile(
+        "mine",
+        "forcedimension",
+        "",
+        None,
+        "",
+        {"damping": Quantity(9.0, "measured", (8.0, 10.0))},
+        models=("omega.3",),
+    )
+    (own(tmp_path) / "forcedimension.toml").write_text(measured.to_toml(), encoding="utf-8")
+    found = profile_of("forcedimension", "", "omega.3")
+    assert found is not None and found.name == "mine"
+    for model, path in (("sigma.7", SHIPPED / "sigma7.toml"), ("lambda.3", None)):
+        other = profile_of("forcedimension", "", model)
+        assert (None if other is None else other.path) == path
+
+
+def test_a_broken_file_for_another_device_is_not_read(tmp_path: Path) -> None:
+    (own(tmp_path) / "pid-7.toml").write_text("format = ", encoding="utf-8")
+    assert profile_of("haply", "049D", "inverse3") is not None
+    with pytest.raises(DeviceError, match="is not TOML"):
+        profile_of("pid", "7")
 
 
 def test_nobody_publishes_the_damping() -> None:
@@ -129,6 +197,8 @@ HEAD = 'format = 1\nname = "n"\ndevice = "falcon"\n'
         ('format = 1\ndevice = "falcon"\n', "name = ''"),
         (HEAD + "colour = 3\n", "it holds 'colour'; it may hold 'damping'"),
         (HEAD + 'axes = ["z", "x"]\n', "axes = ['z', 'x']"),
+        (HEAD + 'models = "omega.3"\n', "models = 'omega.3': must be a list of texts"),
+        (HEAD + 'models = [""]\n', "models = ['']: must be"),
         (HEAD + "damping = 2\n", "[damping] must hold value, source"),
         (HEAD + "[damping]\nvalue = 2\n", "[damping] needs a source"),
         (HEAD + '[damping]\nvalue = -2.0\nsource = "s"\n', "[damping] value = -2.0: must be"),

@@ -8,6 +8,7 @@ import os
 import resource
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,7 @@ from hapticbridge.realtime import (
     check_pace,
     lateness_of,
     memory_at_rest,
+    pace,
     real_time,
     wants_real_time,
 )
@@ -34,6 +36,8 @@ from hapticbridge.realtime.remedies import CONTAINER, PRIORITY, SHELL
 from hapticbridge.recording import read_recording
 from hapticbridge.rendering import METHODS, prepare
 from hapticbridge.scene import load_scene
+from hapticbridge.view.address import Address
+from hapticbridge.view.window import Window
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="real time is Linux's")
 
@@ -173,16 +177,22 @@ def test_a_lower_limit_on_priority_is_used(monkeypatch: pytest.MonkeyPatch, limi
     with real_time() as grants:
         assert named(grants, "scheduling").is_granted
         assert got == [min(limit, PRIORITY)]
+        said = named(grants, "scheduling").sentence
+        assert ("the limit 'ulimit -r' allows no more" in said) == (limit < PRIORITY)
 
 
-@pytest.mark.parametrize(("limit", "flags"), [(resource.RLIM_INFINITY, 3), (1 << 30, 1)])
+@pytest.mark.parametrize(
+    ("limit", "flags"), [(resource.RLIM_INFINITY, 3), (1 << 50, 1), (1 << 23, 3)]
+)
 def test_memory_to_come_is_locked_only_where_no_limit_can_fail_it(
     library: Library, monkeypatch: pytest.MonkeyPatch, limit: int, flags: int
 ) -> None:
+    """This process has more than 8 MB already: if it may lock that, the limit does not bind it."""
     monkeypatch.setattr(resource, "getrlimit", lambda _which: (limit, limit))
-    with memory_at_rest():
+    with memory_at_rest() as grants:
         pass
     assert library.asked == [flags, 0]
+    assert ("not what is added later" in named(grants, "memory").sentence) == (flags == 1)
 
 
 def test_an_isolated_core_is_taken_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -226,22 +236,62 @@ def test_a_run_goes_on_without_the_permission_says_so_once_and_records_it(
         bridge.run(0.02)
     assert sum("SCHED_FIFO was refused" in str(item.message) for item in warned) == 1
     assert sum("memory could not be locked" in str(item.message) for item in warned) == 1
-    events = [event for event in read_recording(path).events if event["event"] == "real_time"]
+    noted = read_recording(path).events
+    assert [event["time_ns"] for event in noted[:2]] == [0, 0]  # before time began
+    events = [event for event in noted if event["event"] == "real_time"]
     assert len(events) == 2
     assert "refused" in str(events[0]["scheduling"])
     assert "frozen" in str(events[0]["collector"])
 
 
-@pytest.mark.parametrize("pipelined", [False, True])
-def test_ten_thousand_ticks_allocate_nothing_that_stays(pipelined: bool) -> None:
+class Heap(ctypes.Structure):
+    """What ``mallinfo2`` of the C library tells, in bytes where it is not a count."""
+
+    _fields_ = (
+        *((name, ctypes.c_size_t) for name in ("arena", "ordblks", "smblks", "hblks", "hblkhd")),
+        *((name, ctypes.c_size_t) for name in ("usmblks", "fsmblks", "uordblks")),
+        *((name, ctypes.c_size_t) for name in ("fordblks", "keepcost")),
+    )
+
+
+def heap_reader() -> Callable[[], int]:
+    """Returns what tells how many bytes MuJoCo and the kernel hold: Python counts only its own."""
+    tell = getattr(ctypes.CDLL(None), "mallinfo2", None)
+    if tell is None:
+        return lambda: 0
+    tell.restype = Heap
+
+    def held() -> int:
+        heap = tell()
+        return int(heap.hblkhd + heap.uordblks)
+
+    return held
+
+
+@pytest.mark.parametrize(("pipelined", "controller"), [(False, "tank"), (True, "damper")])
+@pytest.mark.parametrize("watched", ["by nobody", "by the recorder", "by recorder and viewer"])
+def test_ten_thousand_ticks_allocate_nothing_that_stays(
+    tmp_path: Path, pipelined: bool, controller: str, watched: str
+) -> None:
     """Python's own numbers come and go; a tick that keeps one more object would show 10 000."""
-    blocks = np.zeros(2, dtype=np.int64)
+    watchers: dict[str, Any] = {}
+    if "recorder" in watched:
+        watchers["recording"] = tmp_path / "run.mcap"
+    if "viewer" in watched:
+        pytest.importorskip("viser", reason="needs the extra 'view'")
+        watchers["onlooker"] = Window(Address("127.0.0.1", 0))
+    blocks, held = np.zeros(2, dtype=np.int64), np.zeros(2, dtype=np.int64)
+    read_heap = heap_reader()
 
     def count(tick: int) -> None:
         if tick in (2000, 12_000):
+            held[tick // 12_000] = read_heap()
             blocks[tick // 12_000] = sys.getallocatedblocks()
 
-    with fast("peg_in_hole", "simulated", pipelined=pipelined) as bridge:
+    with fast(
+        "peg_in_hole", "simulated", pipelined=pipelined, controller=controller, clutch=0, **watchers
+    ) as bridge:
+        read_heap()
         gc.collect()
         gc.disable()
         try:
@@ -250,6 +300,7 @@ def test_ten_thousand_ticks_allocate_nothing_that_stays(pipelined: bool) -> None
             gc.enable()
     assert blocks[0] > 0
     assert blocks[1] - blocks[0] == 0
+    assert abs(held[1] - held[0]) < 10_000
 
 
 def test_percentiles_are_latenesses_that_were_seen() -> None:
@@ -280,6 +331,15 @@ def test_a_scene_too_slow_is_refused_for_a_real_device_and_warned_of_for_others(
         start, (scene.data.qpos, scene.data.time, scene.data.qacc_warmstart), strict=True
     ):
         np.testing.assert_array_equal(before, after)
+
+
+@pytest.mark.parametrize(("needed", "held"), [(6e-3, "130 Hz"), (1.04e-3, "770 Hz")])
+def test_the_rate_that_is_offered_is_a_plain_number(
+    monkeypatch: pytest.MonkeyPatch, needed: float, held: str
+) -> None:
+    monkeypatch.setattr(pace, "step_time", lambda *_: needed)
+    with pytest.raises(SceneError, match=f"needs .* ms .* could hold about {held}: "):
+        check_pace(load_scene("point_mass"), METHODS["implicit"], 1e-3, 1, is_real=True)
 
 
 def test_the_rate_that_is_offered_leaves_a_fifth_of_the_period() -> None:

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import errno
 import io
 import json
+import resource
 import shutil
+import sys
 import tempfile
+import tracemalloc
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mcap.opcode import Opcode
 from mcap.reader import NonSeekingReader, SeekingReader
 from mcap.writer import Writer
 from mcap_ros2.decoder import DecoderFactory
@@ -20,6 +26,7 @@ from recording_cases import EPOCH, FILES, META, chunk_ends, random_rows, same, w
 from hapticbridge.errors import RecordingError
 from hapticbridge.recording import Attachment, RecordingWriter, read_recording, repair
 from hapticbridge.recording import format as layout
+from hapticbridge.recording.output import RESERVE
 from hapticbridge.tick import TICK_DTYPE
 
 
@@ -32,7 +39,7 @@ from hapticbridge.tick import TICK_DTYPE
     ),
     data=st.binary(max_size=50),
 )
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_any_record_metadata_and_attachment_survive_the_file(
     records: list[bytes], meta: dict[str, str], data: bytes
 ) -> None:
@@ -165,6 +172,58 @@ def test_whole_chunks_reach_the_file_before_it_is_closed(tmp_path: Path) -> None
     assert read_recording(path).ticks.size == 1000
 
 
+def test_memory_of_the_writer_does_not_grow_with_the_length_of_a_run(tmp_path: Path) -> None:
+    """Its index of chunks waits on disk; as the library keeps it, 40 chunks take 36 kB."""
+    rows, path = random_rows(3000), tmp_path / "run.mcap"
+    writer = RecordingWriter(path, META, FILES, EPOCH)
+    held = []
+    tracemalloc.start()
+    try:
+        for start in range(0, 5 * rows.size, rows.size):
+            rows["deadline_ns"] = (np.arange(start, start + rows.size) + 1) * 1_000_000
+            for first in range(0, rows.size, 100):
+                writer.write_ticks(rows[first : first + 100])
+            writer._mcap.flush()  # type: ignore[no-untyped-call]
+            held.append(tracemalloc.get_traced_memory()[0])
+    finally:
+        tracemalloc.stop()
+    writer.close()
+    assert held[-1] - held[0] < 1024
+    assert list(tmp_path.iterdir()) == [path]
+    ends = chunk_ends(path)
+    assert len(ends) == 50
+    assert path.read_bytes()[ends[-1][0]] == Opcode.MESSAGE_INDEX
+
+
+def test_an_index_that_finds_no_room_ends_the_recording_in_a_sentence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    full = Path("/dev/full")
+    monkeypatch.setattr(tempfile, "TemporaryFile", lambda **_: full.open("wb", buffering=0))
+    writer = RecordingWriter(tmp_path / "run.mcap", META, FILES, EPOCH)
+    with pytest.raises(RecordingError, match=r"cannot write the recording .*No space left"):
+        writer.write_ticks(random_rows(1000))
+    recording = read_recording(tmp_path / "run.mcap")
+    assert recording.is_cut
+    assert recording.ticks.size > 0
+
+
+def test_a_folder_that_takes_no_other_file_still_takes_a_recording(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    make = tempfile.TemporaryFile
+
+    def elsewhere(dir: Path | None = None, **options: Any) -> Any:  # noqa: A002
+        if dir == tmp_path:
+            raise PermissionError(errno.EACCES, "Permission denied")
+        return make(**options)
+
+    monkeypatch.setattr(tempfile, "TemporaryFile", elsewhere)
+    assert same(
+        read_recording(write(tmp_path / "run.mcap", random_rows(900)).path).ticks, random_rows(900)
+    )
+
+
 def test_recording_without_a_tick_is_whole(tmp_path: Path) -> None:
     write(tmp_path / "run.mcap", random_rows(0), events=False)
     recording = read_recording(tmp_path / "run.mcap")
@@ -229,6 +288,31 @@ def test_writer_refuses_what_it_cannot_write(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match="must be text, not 3"):
         RecordingWriter(tmp_path / "run.mcap", {"a": 3}, (), EPOCH)  # type: ignore[dict-item]
     assert not (tmp_path / "run.mcap").exists()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="room can be claimed on Linux alone")
+def test_room_for_the_end_is_claimed_ahead_and_given_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "run.mcap"
+    writer = RecordingWriter(path, META, FILES, EPOCH)
+    writer.write_ticks(np.zeros(1000, TICK_DTYPE))
+    assert path.stat().st_blocks * 512 > RESERVE > 20 * path.stat().st_size
+    assert not writer.is_full
+    # from here on the file may not grow by more than it has claimed, as on a full disk
+    monkeypatch.setattr(writer._output, "_allocate", lambda *_: errno.ENOSPC)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (path.stat().st_size + RESERVE, limits[1]))
+    try:
+        writer.write_ticks(random_rows(2000))
+        assert writer.is_full
+        writer.close()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    # what is not used is given back: on ext4 by the length alone, elsewhere as a hole
+    assert path.stat().st_blocks * 512 < path.stat().st_size + 2**16
+    recording = read_recording(path)
+    assert (len(recording.ticks), recording.is_cut) == (3000, False)
 
 
 def test_a_file_that_is_being_recorded_to_is_not_taken_over(tmp_path: Path) -> None:

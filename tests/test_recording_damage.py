@@ -180,7 +180,7 @@ def test_zeros_behind_the_last_whole_record_are_a_cut_and_no_damage(
 
 
 @given(data=st.data())
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 def test_no_damage_gives_anything_but_a_recording_or_its_error(
     whole: Path, data: st.DataObject
 ) -> None:
@@ -205,7 +205,6 @@ def test_no_damage_gives_anything_but_a_recording_or_its_error(
 
 
 @given(content=st.binary(max_size=300))
-@settings(deadline=None)
 def test_arbitrary_bytes_behind_the_magic_never_crash(content: bytes) -> None:
     with tempfile.TemporaryDirectory() as name:
         path = Path(name) / "run.mcap"

@@ -2,21 +2,31 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import report_runs
 from audit_cases import rewritten
 from chromium import browser
+from PIL import Image
 
 from hapticbridge.audit import AuditReport, audit
+from hapticbridge.kernel.guarding import TANK
+from hapticbridge.quantity import quantity
 from hapticbridge.recording import Recording, read_recording
 from hapticbridge.report import write_report
 from hapticbridge.report.cause import likely_cause
+from hapticbridge.report.energies import draw_energies
 from hapticbridge.report.evidence import Evidence
-from hapticbridge.report.panels import ACTIVITIES, BINS, draw_energies, draw_motion, draw_timing
+from hapticbridge.report.facts import MOST_EVENTS, event_rows, guard_facts
+from hapticbridge.report.motion import draw_motion
+from hapticbridge.report.panels import BINS
+from hapticbridge.report.timing import activities, draw_timing
 from hapticbridge.tick import TickFlag
 
 pytestmark = pytest.mark.filterwarnings("ignore:scene '.*floor.xml'")
@@ -38,6 +48,12 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
     return make
 
 
+def evidence_of(recording: Recording) -> Evidence:
+    evidence = Evidence.of(recording)
+    assert evidence is not None
+    return evidence
+
+
 @pytest.mark.parametrize(
     ("run", "port", "kind", "told"),
     [
@@ -53,18 +69,19 @@ def test_a_run_is_active_for_the_cause_that_it_was_made_for(
 ) -> None:
     recording, report = made(run)
     assert (report.verdict, report.port) == ("active", port)
-    evidence = Evidence.of(recording)
-    assert evidence is not None
+    evidence = evidence_of(recording)
     cause = likely_cause(evidence, report)
     assert cause is not None
     assert cause.kind == kind
     assert told in cause.evidence
+    energy, allowed = evidence.judged(report)
+    assert energy[report.tick] - allowed[report.tick] == pytest.approx(report.joules)
     page = tmp_path / "page.html"
     write_report(recording, report, page)
     text = page.read_text(encoding="utf-8")
     assert f"Likely cause: <strong>{kind}</strong>" in text
     assert f"<td>{report.tick}, at {report.tick * 1e-3:.3f} s</td>" in text  # type: ignore[operator]
-    assert f"{1e3 * report.joules:.3g} mJ" in text
+    assert f"{quantity(report.joules, 'J')} there" in text
 
 
 def test_the_same_run_without_its_cause_is_given_another_one(made: Made, tmp_path: Path) -> None:
@@ -73,17 +90,66 @@ def test_the_same_run_without_its_cause_is_given_another_one(made: Made, tmp_pat
     sheet = recording.meta["device"].replace('"friction": 0.0', '"friction": 0.5')
     assert sheet != recording.meta["device"]
     changed = rewritten(recording, tmp_path / "rubbed.mcap", meta={"device": sheet})
-    evidence = Evidence.of(read_recording(changed))
-    assert evidence is not None
+    evidence = evidence_of(read_recording(changed))
     cause = likely_cause(evidence, report)
     assert cause is not None
     assert cause.kind == "rate"
 
 
+def cause_of(recording: Recording, report: AuditReport, **parts: Any) -> tuple[str, str]:
+    cause = likely_cause(evidence_of(Recording(**{**vars(recording), **parts})), report)
+    assert cause is not None
+    return cause.kind, cause.evidence
+
+
+def test_missed_deadlines_are_the_cause_where_the_device_bears_the_coupling(made: Made) -> None:
+    recording, report = made(report_runs.active_by_rate)
+    assert report.tick is not None
+    sheet = recording.meta["device"].replace('"damping": 2.0', '"damping": 20.0')
+    assert sheet != recording.meta["device"]
+    meta, ticks = recording.meta | {"device": sheet}, recording.ticks.copy()
+    assert cause_of(recording, report, meta=meta)[0] == "unknown"
+    ticks["flags"][[report.tick - 500, report.tick + 1]] |= int(TickFlag.OVERRUN)
+    assert cause_of(recording, report, meta=meta, ticks=ticks)[0] == "unknown"  # not before it
+    ticks["flags"][report.tick - 100 : report.tick - 97] |= int(TickFlag.OVERRUN)
+    kind, told = cause_of(recording, report, meta=meta, ticks=ticks)
+    assert (kind, told[:24]) == ("rate", "3 deadlines were missed ")
+
+
+def test_swings_over_many_steps_of_the_encoder_are_not_its_quantisation(made: Made) -> None:
+    recording, report = made(report_runs.active_by_rate)
+    sheet = recording.meta["device"].replace('"resolution": 0.0', '"resolution": 1e-9')
+    assert sheet != recording.meta["device"]
+    assert cause_of(recording, report, meta=recording.meta | {"device": sheet})[0] == "rate"
+
+
+def test_a_hard_contact_is_the_cause_also_behind_a_method_with_a_hazard(made: Made) -> None:
+    recording, report = made(report_runs.active_by_contact)
+    meta = recording.meta | {"method": "implicitfast"}
+    assert cause_of(recording, report, meta=meta)[0] == "contact setting"
+
+
+def test_asked_for_strictly_the_slack_is_not_allowed(made: Made) -> None:
+    recording, report = made(report_runs.active_by_contact)
+    evidence = evidence_of(recording)
+    assert evidence.judged(report)[1].any()
+    assert not evidence.judged(replace(report, environment="within slack"))[1].any()
+
+
+def test_bodies_that_were_moved_are_the_cause_before_any_contact(made: Made) -> None:
+    recording, report = made(report_runs.active_by_contact)
+    assert report.tick is not None
+    moved = {"event": "input", "tick": report.tick - 5, "writes": [["mocap_pos", 0, [0, 0, 1]]]}
+    kind, told = cause_of(recording, report, events=[*recording.events, moved])
+    assert kind == "inputs"
+    assert "moved 1 times" in told
+    later = moved | {"tick": report.tick + 1}
+    assert cause_of(recording, report, events=[*recording.events, later])[0] == "contact setting"
+
+
 def test_a_passive_run_has_no_moment_and_no_cause(run_file: Path, tmp_path: Path) -> None:
     recording, report = read_recording(run_file), audit(run_file)
-    evidence = Evidence.of(recording)
-    assert evidence is not None
+    evidence = evidence_of(recording)
     assert likely_cause(evidence, report) is None
     page = tmp_path / "page.html"
     write_report(recording, report, page)
@@ -92,8 +158,7 @@ def test_a_passive_run_has_no_moment_and_no_cause(run_file: Path, tmp_path: Path
 
 def test_the_bound_is_drawn_beside_what_was_created(made: Made) -> None:
     recording, report = made(report_runs.active_by_method)
-    evidence = Evidence.of(recording)
-    assert evidence is not None
+    evidence = evidence_of(recording)
     lines = {line.get_label(): line for line in draw_energies(evidence).axes[1].get_lines()}
     created = np.asarray(lines["created by the environment"].get_ydata())
     allowed = np.asarray(lines["allowed at most"].get_ydata())
@@ -119,8 +184,7 @@ def long_and_wild(run_file: Path) -> Recording:
 
 def test_a_long_page_stays_small_and_keeps_its_peaks(run_file: Path, tmp_path: Path) -> None:
     recording, page = long_and_wild(run_file), tmp_path / "page.html"
-    evidence = Evidence.of(recording)
-    assert evidence is not None
+    evidence = evidence_of(recording)
     line = draw_motion(evidence).axes[0].get_lines()[0]
     assert len(np.asarray(line.get_ydata())) <= 2 * BINS + 1
     assert np.asarray(line.get_ydata()).max() == 77.0
@@ -133,25 +197,95 @@ def test_what_was_at_work_is_drawn_when_it_was(run_file: Path) -> None:
     ticks = recording.ticks.copy()
     ticks["flags"] = 0
     ticks["flags"][40:60] = int(TickFlag.FORCE_LIMITED)
-    evidence = Evidence.of(Recording(**{**vars(recording), "ticks": ticks}))
-    assert evidence is not None
-    row = [flag for flag, _ in ACTIVITIES].index(TickFlag.FORCE_LIMITED)
-    bars = [b.get_paths() for b in draw_timing(evidence).axes[1].collections]
-    assert [len(paths) for paths in bars] == [int(i == row) for i in range(len(ACTIVITIES))]
+    evidence = evidence_of(Recording(**{**vars(recording), "ticks": ticks}))
+    names = [name for name, _ in activities(evidence)]
+    row = names.index("force limited")
+    bars = [b.get_paths() for b in draw_timing(evidence).axes[-1].collections]
+    assert [len(paths) for paths in bars] == [int(i == row) for i in range(len(names))]
     extent = bars[row][0].get_extents()
     assert (extent.x0, extent.x1) == pytest.approx((0.040, 0.060), abs=1e-9)
+
+
+def test_what_the_guard_did_is_drawn_and_told(run_file: Path, tmp_path: Path) -> None:
+    """Samples that stay away, a controller, a re-seating and a trip, made up in a quiet run."""
+    recording = read_recording(run_file)
+    guard = replace(evidence_of(recording).parameters.guarding, controller=TANK, stale_ticks=10)
+    ticks = recording.ticks.copy()
+    ticks["flags"] = 0
+    ticks["flags"][20:50] = int(TickFlag.STALE_SAMPLE)
+    ticks["flags"][50] = int(TickFlag.RESEATED)
+    ticks["flags"][60:70] = int(TickFlag.CONTROLLER_ACTIVE)
+    ticks["injected_damping"][60:70] = 1.5
+    events = [*recording.events, {"event": "trip", "tick": len(ticks), "reason": "it jumped"}]
+    changed = Recording(
+        **{
+            **vars(recording),
+            "ticks": ticks,
+            "events": events,
+            "meta": recording.meta | {"guard": guard.to_json()},
+        }
+    )
+    evidence = evidence_of(changed)
+    shown = dict(activities(evidence))
+    assert np.flatnonzero(shown["faded: no samples"]).tolist() == list(range(30, 50))
+    assert np.flatnonzero(shown["re-seated"]).tolist() == [50]
+    assert np.flatnonzero(shown["tripped"]).tolist() == [len(ticks) - 1]
+    damped = draw_timing(evidence).axes[-1].get_lines()[0]
+    assert np.asarray(damped.get_ydata()).max() == 1.5
+    assert ("controller", "tank") in guard_facts(evidence)
+    page = tmp_path / "page.html"
+    write_report(changed, audit(run_file), page)
+    text = page.read_text(encoding="utf-8")
+    assert "tank, at work in" in text
+    assert "up to 1.5 N s/m injected" in text
+    assert "reason it jumped" in text
+
+
+def test_a_run_in_real_time_shows_how_late_its_ticks_were(run_file: Path) -> None:
+    recording = read_recording(run_file)
+    assert "lateness" not in draw_timing(evidence_of(recording)).axes[0].get_xlabel()
+    ticks = recording.ticks.copy()
+    ticks["wake_ns"] = ticks["deadline_ns"] + 1000 * np.arange(len(ticks))
+    late = Recording(**{**vars(recording), "ticks": ticks})
+    histogram = draw_timing(evidence_of(late)).axes[0]
+    counts = [bar.get_height() for bar in histogram.patches]  # type: ignore[attr-defined]
+    assert sum(counts) == len(ticks)
+    assert histogram.get_xlim()[1] > len(ticks) - 2
+
+
+def test_what_stopped_a_run_is_listed_after_any_number_of_inputs() -> None:
+    inputs = [{"event": "input", "tick": i, "time_ns": i} for i in range(2 * MOST_EVENTS)]
+    trip = {"event": "trip", "tick": 400, "time_ns": 400_000_000, "reason": "it jumped"}
+    rows = event_rows([{"event": "start", "tick": 0, "time_ns": 0}, *inputs, trip])
+    assert len(rows) == MOST_EVENTS
+    assert [row[0] for row in rows[:2]] == ["start", "input"]
+    assert rows[-1] == ("trip", "400", "0.400 s", "reason it jumped")
+
+
+def test_a_passive_run_of_a_device_that_does_not_bear_its_coupling_says_so(
+    run_file: Path, tmp_path: Path
+) -> None:
+    page, report = tmp_path / "page.html", audit(run_file)
+    for certified in (True, False):
+        judged = replace(report, certified=certified)
+        write_report(read_recording(run_file), judged, page)
+        text = page.read_text(encoding="utf-8")
+        assert ("The device does not bear this coupling" in text) is not certified
 
 
 def test_a_browser_shows_the_page_without_a_request_or_a_complaint(
     made: Made, tmp_path: Path
 ) -> None:
     page = tmp_path / "page.html"
-    write_report(*made(report_runs.active_by_contact), page)
+    picture = io.BytesIO()
+    Image.new("RGB", (64, 40)).save(picture, "png")
+    write_report(*made(report_runs.active_by_contact), page, picture.getvalue())
     with browser(tmp_path) as tab:
         shown = tab()
         shown.open(page.as_uri())
-        assert shown.value("document.querySelector('h1').innerText").endswith("active (active)")
+        assert shown.value("document.querySelector('h1').innerText").endswith(": active")
         assert shown.value("document.querySelectorAll('svg').length") == 4
         assert shown.value("document.documentElement.scrollWidth <= innerWidth")
-        assert shown.requests == [page.as_uri()]
+        assert shown.value("document.querySelector('img').naturalWidth") == 64
+        assert [each for each in shown.requests if not each.startswith("data:")] == [page.as_uri()]
         assert shown.complaints == []

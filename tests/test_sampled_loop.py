@@ -82,7 +82,7 @@ def test_runs_give_the_reconstructed_table(
     assert stability_limit(loop) == pytest.approx(needed, abs=1e-4)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(
     st.floats(10, 1e5),
     st.floats(0, 1.5),
@@ -121,7 +121,7 @@ def test_the_run_grows_below_the_bound_and_decays_above() -> None:
     assert np.abs(decayed[-100:]).max() < 1e-3 * np.abs(decayed[:100]).max()
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(
     st.floats(0.1, 20),
     st.floats(0.02, 0.999),

@@ -95,7 +95,7 @@ def test_every_element_that_fits_follows_the_value_and_nothing_else_changes(tmp_
     assert set(different) <= {"bvh_aabb"}
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(st.floats(0.01, 0.1))
 def test_a_number_of_the_scene_is_offset_plus_factor_times_value(
     tmp_path_factory: pytest.TempPathFactory, value: float

@@ -41,9 +41,7 @@ def test_tool_inside_something_is_refused_with_pair_and_depth(tmp_path: Path) ->
 @example(depth=0.05e-3)
 @example(depth=0.099e-3)
 @example(depth=0.101e-3)
-@settings(
-    max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
+@settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_start_is_refused_exactly_beyond_a_tenth_of_a_millimetre(
     tmp_path: Path, depth: float
 ) -> None:

@@ -19,7 +19,7 @@ T = 1e-3
 
 
 @given(st.floats(1, 1e5), st.floats(1e-3, 50))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_alternatives_follow_their_closed_forms(stiffness: float, damping: float) -> None:
     lossless, compensated, asked, half, low_pass, tustin, wall, anywhere, line = alternatives(
         Coupling(stiffness, damping, 0, 0), T, 2 * T

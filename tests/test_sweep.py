@@ -158,7 +158,7 @@ VALUES = st.one_of(
 )
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(values=st.lists(st.tuples(VALUES, VALUES), min_size=1, max_size=5))
 @example(
     values=[("", "\n"), ("a\rb", "x"), (-0.0, 5e-324), (True, "True"), (1, 1.0), ("", "nan\0")]

@@ -30,11 +30,13 @@ from test_view_address import OUTSIDE, outside
 from hapticbridge.audit import audit
 from hapticbridge.bridge import Bridge
 from hapticbridge.clock import SimulatedClock
+from hapticbridge.commands import Command, Couple, Switch
+from hapticbridge.commands.command import Stop, line_of
 from hapticbridge.errors import HapticBridgeError
 from hapticbridge.recording import Recording, Ring, read_recording
 from hapticbridge.view.address import COOKIE, Address
 from hapticbridge.view.trace import LINES, Trace
-from hapticbridge.view.window import STOP, Window
+from hapticbridge.view.window import Window
 
 pytest.importorskip("viser", reason="needs the extra 'view'")
 
@@ -324,7 +326,7 @@ def test_the_button_of_the_page_stops_the_run_and_the_recording_says_who_did(
         Bridge(scene, ScriptedDevice(pressed), LOOSE, recording=path, onlooker=window) as bridge,
         browser(tmp_path) as tab,
     ):
-        window.on_stop = partial(bridge.stop, "view")
+        window.on_command = partial(bridge.command, by="view")
         page = tab()
         page.open(window.url)
         button = "[...document.querySelectorAll('button')].find(b => b.innerText == 'stop the run')"
@@ -340,25 +342,37 @@ def test_the_button_of_the_page_stops_the_run_and_the_recording_says_who_did(
     assert audit(path).verdict == "passive"
 
 
+SWITCH = line_of(Switch(force=False))
+
+
 @pytest.mark.parametrize(
-    ("said", "times"),
+    ("said", "heard", "refused"),
     [
-        (STOP, 1),
-        (STOP + STOP, 1),
-        (b'{"command": "stop", "force": 99}\n', 0),
-        (b'{"command": "stiffness", "value": 1e9}\n', 0),
-        (b"x" * 100_000 + b"\n" + STOP, 0),
-        (b"", 0),
+        (line_of(Stop()), [Stop()], 0),
+        (SWITCH + line_of(Couple(900.0, 0.5)), [Switch(force=False), Couple(900.0, 0.5)], 0),
+        (b'{"command": "stop", "force": 99}\n' + SWITCH, [Switch(force=False)], 1),
+        (b'{"command": "couple", "stiffness": 1e999, "damping": 0}\n', [], 1),
+        (b'{"command": "couple", "stiffness": NaN, "damping": 0}\n', [], 1),
+        (b'{"command": "couple", "stiffness": true, "damping": 0}\n', [], 1),
+        (b'{"command": "switch", "force": 1}\n', [], 1),
+        (b'{"command": "exec"}\n[]\n\xff\n\n', [], 4),
+        (b"x" * 100_000 + b"\n" + SWITCH, [], 0),  # longer than a command: deaf from then on
+        (b"", [], 0),
     ],
 )
-def test_a_run_obeys_one_command_once_and_nothing_else(said: bytes, times: int) -> None:
+def test_a_run_hears_commands_and_nothing_else(
+    said: bytes, heard: list[Command], refused: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("hapticbridge.view.window.INTERVAL", 0.0)
     window = Window(Address("127.0.0.1", 0))
-    heard: list[bool] = []
-    window.on_stop = partial(heard.append, True)
+    commands: list[Command] = []
+    window.on_command = commands.append
     process = types.SimpleNamespace(stdout=io.BytesIO(said))
     window._process = process  # type: ignore[assignment] # of a process, only what it says
     window._listen()
-    assert len(heard) == times
+    assert commands == heard
+    answers = [json.loads(window._outbox.get() or b"") for _ in range(window._outbox.qsize())]
+    assert [answer["event"] for answer in answers] == ["refused"] * refused
 
 
 def test_a_view_that_cannot_be_served_is_said_before_the_run(floor: Path, call: Called) -> None:

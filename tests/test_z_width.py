@@ -83,7 +83,7 @@ def test_too_much_coupling_damping_leaves_no_stiffness(delay: int, tau: float) -
 
 
 @given(st.floats(0.1, 20), st.floats(0, 20), st.floats(0.02, 2), st.integers(0, 2))
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 def test_what_is_passive_against_a_wall_is_stable_without_a_hand(
     b: float, damping: float, mass: float, delay: int
 ) -> None:
@@ -130,7 +130,7 @@ def test_without_delay_the_line_is_where_the_bound_meets_the_device(
 
 
 @given(st.floats(0.1, 50), st.integers(1, 4), st.sampled_from([0.0, 1e-3]))
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 def test_with_delay_the_line_is_where_the_wall_meets_the_device(
     b: float, delay: int, tau: float
 ) -> None:
@@ -174,7 +174,7 @@ def test_corner_is_the_default_coupling_where_only_damping_limits(b: float, mass
 
 
 @given(st.floats(0.1, 20), st.integers(0, 3), st.sampled_from([0.0, 5e-4]))
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 def test_corner_lies_inside_the_region(b: float, delay: int, tau: float) -> None:
     z = z_width(
         b, T, mass=0.1, friction=0.02, resolution=1e-5, delay=delay, filter_time=tau, points=5
@@ -218,7 +218,7 @@ def test_unknown_friction_is_said_to_be_unknown() -> None:
 
 
 @given(st.floats(1, 1e5), st.floats(0, 50), st.integers(0, 5), st.sampled_from([0.0, 2e-3]))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_spectrum_reaches_its_supremum_at_the_worst_frequency(
     stiffness: float, damping: float, delay: int, tau: float
 ) -> None:

@@ -23,6 +23,7 @@ from hapticbridge.audit.differences import (
     turn_between,
     turns,
 )
+from hapticbridge.audit.interventions import Interventions
 from hapticbridge.audit.law import Motion, wrench_by_law
 from hapticbridge.audit.reached import Reached
 from hapticbridge.kernel.state import RunParameters
@@ -81,7 +82,7 @@ class Balance:
         ticks: NDArray[np.void],
         parameters: RunParameters,
         before: Reached,
-        resumed: Array,
+        outside: Interventions,
         late: int = 0,
         following: NDArray[np.void] | None = None,
     ) -> Balance:
@@ -91,17 +92,19 @@ class Balance:
             ticks: Records without gaps, ``TICK_DTYPE``, at least one.
             parameters: The run's.
             before: What the ticks before them left.
-            resumed: Ticks at which the run went on after a pause without force.
+            outside: What was done to the run while it went on.
             late: After how many ticks a wrench answers a sample: what was sent in row k acted on
                 the motion between rows k + late and k + late + 1.
             following: The records after these, as many as ``late``, or fewer where they end.
         """
         sums = before.sums
-        motion = Motion.of(ticks, before.handle, before.tool)
+        numbers = ticks["tick"]
+        motion = Motion.of(ticks, before.handle, before.tool, outside)
+        gains = outside.laws(numbers)
         recorded = ticks["wrench_on_tool"]
         law = recorded
         if parameters.has_law and parameters.laws == 1:
-            law = wrench_by_law(ticks, parameters.coupling, parameters.period, motion)
+            law = wrench_by_law(ticks, gains, parameters.period, motion)
         works = (
             np.sum(recorded[:, :3] * motion.tool_step, axis=1),
             np.sum(recorded[:, 3:] * motion.tool_turn, axis=1),
@@ -113,7 +116,7 @@ class Balance:
         )
 
         sent = np.concatenate([before.sent[None], ticks["wrench_on_device"][:-1]])
-        sent[np.isin(ticks["tick"], resumed)] = 0.0
+        sent[np.isin(numbers, outside.resumed)] = 0.0
         device_step = steps(ticks["device_position"], before.device[:3])
         device_turn = turns(ticks["device_quaternion"], before.device[3:])
         device_work = np.sum(sent[:, :3] * device_step, axis=1)
@@ -122,10 +125,14 @@ class Balance:
         later = _later(ticks, following, late) if late else (device_step, device_turn)
         given = np.sum(sent[:, :3] * later[0], axis=1) + np.sum(sent[:, 3:] * later[1], axis=1)
 
-        expected, guarded = before.guarded.after(ticks, resumed)
-        seen = expected.seen
         stored = ticks["kinetic"] + ticks["potential"] - before.start_energy
         created = stored - coupling_work - ticks["actuator_work"] - ticks["external_work"]
+        linear, angular = _slack_gains(parameters, gains)
+        slack = 0.5 * linear * np.sum(motion.tool_step**2, axis=1)
+        slack += 0.5 * angular * np.sum(motion.tool_turn**2, axis=1)
+        slack = summed(slack, sums["slack"])
+        expected, guarded = before.guarded.after(ticks, outside, created - slack)
+        seen = expected.seen
         kept, lost = coupling_work, created  # without a law, all that the scene took up
         kept_sum = np.zeros(len(ticks))
         if parameters.has_law:
@@ -134,6 +141,8 @@ class Balance:
             lost = np.minimum(created, 0.0)
             parts, held = kept_behind_a_law(
                 parameters,
+                gains=(outside.laws(numbers - 1), gains),
+                pulled=(motion.pulled, motion.turned),
                 stretch=(motion.stretch, motion.twist),
                 stretched=motion.stretched,
                 work=works,
@@ -149,15 +158,12 @@ class Balance:
         if parameters.device_damping is not None:
             parts = burnt_by_damping(parameters, *later, seen.interval, ~seen.first)
             burnt = summed(parts, sums["burnt"])
-        linear, angular = _slack_gains(parameters)
-        slack = 0.5 * linear * np.sum(motion.tool_step**2, axis=1)
-        slack += 0.5 * angular * np.sum(motion.tool_turn**2, axis=1)
         totals = {
             "coupling_work": coupling_work,
             "throughput": summed(np.abs(work), sums["throughput"]),
             "device_energy": device_energy,
             "device_throughput": summed(np.abs(device_work), sums["device_throughput"]),
-            "slack": summed(slack, sums["slack"]),
+            "slack": slack,
             "given": summed(given, sums["given"]),
             "burnt": burnt,
             "kept": kept_sum,
@@ -191,17 +197,16 @@ class Balance:
         )
 
 
-def _slack_gains(parameters: RunParameters) -> tuple[float, float]:
-    """Returns K + B/T and K_r + B_r/T of the coupling that the tool was held by.
+def _slack_gains(parameters: RunParameters, gains: Array) -> tuple[Array, Array]:
+    """Returns K + B/T and K_r + B_r/T of the coupling that the tool was held by, (n,) each.
 
     With n laws a tick only half of K/n + B/T counts; without a coupling law nothing does.
     """
-    coupling = parameters.coupling
     if not parameters.has_law:
-        return 0.0, 0.0
+        return np.zeros(len(gains)), np.zeros(len(gains))
     n, share = parameters.laws, 1.0 if parameters.laws == 1 else SLACK_SHARE
-    linear = coupling.stiffness / n + coupling.damping / parameters.period
-    angular = coupling.rotational_stiffness / n + coupling.rotational_damping / parameters.period
+    linear = gains[:, 0] / n + gains[:, 1] / parameters.period
+    angular = gains[:, 2] / n + gains[:, 3] / parameters.period
     return share * linear, share * angular
 
 

@@ -57,6 +57,8 @@ def passed_shares(ticks: NDArray[np.void], parameters: RunParameters) -> tuple[A
 def kept_behind_a_law(
     parameters: RunParameters,
     *,
+    gains: tuple[Array, Array],
+    pulled: tuple[Array, Array],
     stretch: tuple[Array, Array],
     stretched: tuple[Array, Array],
     work: tuple[Array, Array],
@@ -68,16 +70,20 @@ def kept_behind_a_law(
 ) -> tuple[Array, Array]:
     """Returns what coupling and tool took up of what the handle gave, in J of the scene.
 
-        Σ c_k w_k + r_k V(e_k) − Σ max(0, r_k − r_{k−1}) (V(e_k) + ½‖δe_k‖²_{B/T})
+        Σ c_k w_k + r_k V(e_k) − Σ max(0, r_k − r_{k−1}) (V(e_k) + ½‖δe_k‖²_{B/T}) − Σ W_k
 
     V is the energy of a spring whose force stops growing at the limit, ½ K e² below it. With b >=
     K T/2 + B and no limit in play, what the device is given less what it burns and plus this is
     never above zero, whatever hand and tool do: the identity behind (6), in which V(e) at the end
     stands on the left. The last sum is what a force that is switched on finds stretched already,
-    in a ramp or after a jump of the device before its first tick.
+    in a ramp or after a jump of the device before its first tick. W_k = r_{k−1} (V_k(p_k) −
+    V_{k−1}(p_k)), p = h_k − x_{k−1}, is what a command did to the spring by changing K
+    (``kernel.tuning``): neither scene nor coupling gave that up.
 
     Args:
         parameters: The run's, of a method with a coupling law and one law a tick.
+        gains: K, B', K_r and B'_r in the tick before each and in each, (n, 4) each.
+        pulled: p in m and as rotation vectors, (n, 3) each.
         stretch: e in m and as rotation vectors, (n, 3) each.
         stretched: Their changes in each tick.
         work: Of force and of torque on the tool in each tick, (n,) each in J.
@@ -95,30 +101,32 @@ def kept_behind_a_law(
     References:
         Brown & Colgate 1997, eq. (6); here summed over time instead of frequency by frequency.
     """
-    coupling = parameters.coupling
     limits = (
         parameters.force_limit / parameters.force_scale,
         parameters.torque_limit * parameters.scale / parameters.force_scale,
     )
-    stiffness = (coupling.stiffness, coupling.rotational_stiffness)
-    damping = (coupling.damping, coupling.rotational_damping)
+    before = np.concatenate([[share_before], share[:-1]])
     rise = np.where(since_start == 0, share, np.diff(share, prepend=share_before))
     summed, held = np.zeros(len(share)), np.zeros(len(share))
-    for k, b, limit, e, de, w, c in zip(
-        stiffness, damping, limits, stretch, stretched, work, passed, strict=True
+    for column, limit, e, p, de, w, c in zip(
+        (0, 2), limits, stretch, pulled, stretched, work, passed, strict=True
     ):
+        k_before, k, b = gains[0][:, column], gains[1][:, column], gains[1][:, column + 1]
         spring = _spring_energy(k, np.linalg.norm(e, axis=1), limit)
         found = spring + 0.5 * b / parameters.period * np.sum(de**2, axis=1)
         taken = np.where(since_start > 0, c * w, 0.0)
         summed += taken - rise * found
+        if np.any(k != k_before):
+            length = np.linalg.norm(p, axis=1)
+            turned = _spring_energy(k, length, limit) - _spring_energy(k_before, length, limit)
+            summed -= before * turned
         if has_end:
             held += share * spring
     return summed, held
 
 
-def _spring_energy(stiffness: float, length: Array, limit: float) -> Array:
-    """Returns ∫ min(K e, limit) de, in J."""
-    if stiffness == 0:
-        return np.zeros_like(length)
-    elastic = np.minimum(length, limit / stiffness)
+def _spring_energy(stiffness: Array, length: Array, limit: float) -> Array:
+    """Returns ∫ min(K e, limit) de, in J; for each K and length, (n,) each."""
+    at_limit = np.divide(limit, stiffness, out=np.full_like(length, np.inf), where=stiffness > 0)
+    elastic = np.minimum(length, at_limit)
     return np.asarray(0.5 * stiffness * elastic**2 + limit * (length - elastic))

@@ -21,6 +21,8 @@ def how_it_ended(events: Sequence[Mapping[str, Any]]) -> str:
             clauses.append(f"the bridge died after tick {event.get('tick')}")
         elif name == "recorder_died":
             clauses.append("the recorder died in mid-run")
+        elif name == "suspended":
+            clauses.append(f"the machine was asleep for {event.get('seconds', 0):.3g} s")
         elif name == "stop" and event.get("signal"):
             clauses.append(f"stopped by {event['signal']} at tick {event.get('tick')}")
         elif name == "stop" and reason not in ("duration", "signal", "caller", None, ""):

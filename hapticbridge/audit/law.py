@@ -8,13 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.audit.differences import (
-    product_conjugate,
+    conjugate,
+    quaternion_product,
     rotate,
-    steps,
     turn_between,
-    turns,
 )
-from hapticbridge.coupling import Coupling
+from hapticbridge.audit.interventions import Interventions
 from hapticbridge.tick import TickFlag
 
 Array = NDArray[np.float64]
@@ -31,7 +30,9 @@ class Motion:
         tool_turn: The tool's.
         stretch: h − x.
         twist: The turn that takes the tool to the handle.
-        twist_before: The same before the first of these ticks, (3,).
+        twist_before: The same in the tick before each.
+        pulled: h_k − x_{k−1}, the stretch after the handle's step and before the tool's.
+        turned: The turn that takes the tool of the tick before to the handle.
         carried: The tool's turn in each tick as quaternions, (n, 4).
     """
 
@@ -42,26 +43,37 @@ class Motion:
     stretch: Array
     twist: Array
     twist_before: Array
+    pulled: Array
+    turned: Array
     carried: Array
 
     @classmethod
-    def of(cls, ticks: NDArray[np.void], handle: Array, tool: Array) -> Motion:
+    def of(
+        cls, ticks: NDArray[np.void], handle: Array, tool: Array, outside: Interventions
+    ) -> Motion:
         """Returns the motion of records.
 
         Args:
             ticks: ``TICK_DTYPE``.
             handle: Handle pose (7,) before the first of them.
             tool: Tool pose (7,), likewise.
+            outside: What was done to the run; a reset puts both poses to another place before a
+                tick, and that is no motion.
         """
+        handle_before = poses_before(ticks, "handle", handle, outside)
+        tool_before = poses_before(ticks, "tool", tool, outside)
+        handles, tools = ticks["handle_quaternion"], ticks["tool_quaternion"]
         return cls(
-            handle_step=steps(ticks["handle_position"], handle[:3]),
-            tool_step=steps(ticks["tool_position"], tool[:3]),
-            handle_turn=turns(ticks["handle_quaternion"], handle[3:]),
-            tool_turn=turns(ticks["tool_quaternion"], tool[3:]),
+            handle_step=ticks["handle_position"] - handle_before[:, :3],
+            tool_step=ticks["tool_position"] - tool_before[:, :3],
+            handle_turn=turn_between(handle_before[:, 3:], handles),
+            tool_turn=turn_between(tool_before[:, 3:], tools),
             stretch=ticks["handle_position"] - ticks["tool_position"],
-            twist=turn_between(ticks["tool_quaternion"], ticks["handle_quaternion"]),
-            twist_before=turn_between(tool[3:], handle[3:]),
-            carried=product_conjugate(ticks["tool_quaternion"], tool[3:]),
+            twist=turn_between(tools, handles),
+            twist_before=turn_between(tool_before[:, 3:], handle_before[:, 3:]),
+            pulled=ticks["handle_position"] - tool_before[:, :3],
+            turned=turn_between(tool_before[:, 3:], handles),
+            carried=quaternion_product(tools, conjugate(tool_before[:, 3:])),
         )
 
     @property
@@ -70,29 +82,41 @@ class Motion:
         return self.handle_step - self.tool_step, self.handle_turn - self.tool_turn
 
 
-def wrench_by_law(
-    ticks: NDArray[np.void], coupling: Coupling, period: float, motion: Motion
-) -> Array:
+def wrench_by_law(ticks: NDArray[np.void], gains: Array, period: float, motion: Motion) -> Array:
     """Returns the wrench on the tool that the coupling gives, (n, 6) in N and N m.
 
     Args:
         ticks: Records with one law each; their flags say which rule the torque follows.
-        coupling: K and B.
+        gains: K, B', K_r and B'_r in each of them, (n, 4).
         period: T in s.
         motion: Of the records.
     """
     step, turn = motion.stretched
-    force = coupling.stiffness * motion.stretch + coupling.damping / period * step
-    torque = coupling.rotational_stiffness * motion.twist
-    torque = torque + coupling.rotational_damping / period * turn
+    k, b, k_r, b_r = (gains[:, column, None] for column in range(4))
+    force = k * motion.stretch + b / period * step
+    torque = k_r * motion.twist + b_r / period * turn
     is_midpoint = (ticks["flags"] & int(TickFlag.MIDPOINT)) != 0
     if np.any(is_midpoint):
         # the turn that takes the tool from the tick before to this one carries what was then
         carried = motion.carried
-        before = np.vstack([motion.twist_before[None], motion.twist[:-1]])
-        spring = 0.5 * (motion.twist + rotate(carried, before))
+        spring = 0.5 * (motion.twist + rotate(carried, motion.twist_before))
         midway = 0.5 * (motion.handle_turn + rotate(carried, motion.handle_turn)) - motion.tool_turn
-        rate = coupling.rotational_damping / period + 0.5 * coupling.rotational_stiffness
-        midpoint = coupling.rotational_stiffness * spring + rate * midway
+        midpoint = k_r * spring + (b_r / period + 0.5 * k_r) * midway
         torque = np.where(is_midpoint[:, None], midpoint, torque)
     return np.concatenate([force, torque], axis=1)
+
+
+def poses_before(
+    ticks: NDArray[np.void], body: str, before: Array, outside: Interventions
+) -> Array:
+    """Returns the poses from which the motion of records begins, (n, 7).
+
+    Args:
+        ticks: ``TICK_DTYPE``.
+        body: ``handle`` or ``tool``.
+        before: Its pose (7,) before the first of them.
+        outside: What was done to the run.
+    """
+    poses = np.concatenate([ticks[f"{body}_position"], ticks[f"{body}_quaternion"]], axis=1)
+    poses = np.concatenate([before[None], poses[:-1]])
+    return np.where(outside.is_reset(ticks["tick"])[:, None], outside.home, poses)

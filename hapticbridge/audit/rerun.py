@@ -12,6 +12,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticbridge.commands import CHANGES as COMMANDED
+from hapticbridge.commands import Repeater
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.inputs import apply_writes
 from hapticbridge.kernel.state import COUPLING_ACTUATORS, Binding, RunParameters
@@ -20,6 +22,7 @@ from hapticbridge.provenance import (
     MODEL_ATTACHMENT,
     STARTS,
     STATE_ATTACHMENT,
+    elastic_energy,
     meta_start,
     processor,
     restore_state,
@@ -38,7 +41,7 @@ FOREIGN_TOLERANCE = 1e-9
 vector instructions round differently. Larger would hide tampering, smaller would refuse honest
 recordings."""
 
-CHANGES = ("input", "resume")
+_CHANGES = ("input", "resume", *COMMANDED)
 """Events that change what the next ticks compute."""
 
 
@@ -71,10 +74,15 @@ class Rerun:
         self.data = data = mujoco.MjData(model)
         # an error inside the C symbol would end the process, so MuJoCo takes its first step in
         # Python
-        restore_state(model, data, recording.attachments[STATE_ATTACHMENT])
-        method_named(recording.meta.get("method", "")).step(model, data)
-        restore_state(model, data, recording.attachments[STATE_ATTACHMENT])
+        start = recording.attachments[STATE_ATTACHMENT]
+        method = method_named(recording.meta.get("method", ""))
+        restore_state(model, data, start)
+        method.step(model, data)
+        restore_state(model, data, start)
+        if parameters.start_elastic:
+            _check_elastic(parameters.start_elastic, elastic_energy(data))
         self._binding = Binding(model, data, parameters)
+        self._commands = Repeater(self._binding, model, data, method, parameters, start)
         _check_start(recording, self._binding.state)
 
     def warm_up(self) -> None:
@@ -96,7 +104,7 @@ class Rerun:
 
     def note(self, event: Mapping[str, Any]) -> None:
         """Takes an event of a run that still goes on; those that change nothing are passed over."""
-        if event.get("event") in CHANGES:
+        if event.get("event") in _CHANGES:
             self._changes.append(event)
         if event.get("event") == "resume":
             self._resumed.append(event.get("tick"))
@@ -166,6 +174,9 @@ class Rerun:
         self._changed = int(event["tick"])
         if event["event"] == "resume":
             self._binding.resume()
+            return
+        if event["event"] in COMMANDED:
+            self._commands.apply(event)
             return
         try:
             apply_writes(self.data, event.get("writes", []))
@@ -239,6 +250,15 @@ def _check_start(recording: RecordingFile, state: NDArray[np.void]) -> None:
             raise RecordingError(
                 f"metadata '{name}' is {recorded}, the attached scene starts with {present}"
             )
+
+
+def _check_elastic(claimed: float, present: float) -> None:
+    """Refuses a start that is said to store more than the attached scene's constraints do."""
+    if not abs(claimed - present) <= FOREIGN_TOLERANCE * (1.0 + present):
+        raise RecordingError(
+            f"metadata 'start_elastic' is {claimed!r} J, the attached scene's constraints store "
+            f"{present!r} J at most"
+        )
 
 
 def is_same_processor(recording: RecordingFile) -> bool:

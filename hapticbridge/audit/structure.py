@@ -9,8 +9,10 @@ from itertools import chain
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticbridge.audit.interventions import Interventions
 from hapticbridge.audit.watched import Seen, Watch
 from hapticbridge.kernel.state import RunParameters
+from hapticbridge.kernel.watch import DEVICE_BUTTONS
 from hapticbridge.recording import RecordingFile
 from hapticbridge.tick import CLOCK_FIELDS, TICK_DTYPE, TickFlag
 
@@ -58,7 +60,7 @@ def file_fault(recording: RecordingFile) -> Fault | None:
 
 
 def structure_fault(
-    blocks: Iterable[NDArray[np.void]], parameters: RunParameters, resumed: NDArray[np.float64]
+    blocks: Iterable[NDArray[np.void]], parameters: RunParameters, outside: Interventions
 ) -> Fault | None:
     """Returns the first thing that makes records no plausible ones of a run.
 
@@ -67,23 +69,32 @@ def structure_fault(
     Args:
         blocks: The records in order, ``TICK_DTYPE``, none of the blocks empty.
         parameters: Of the recorded run.
-        resumed: Ticks at which the run went on after a pause without force.
+        outside: What was done to the run while it went on.
     """
     found: dict[int, Fault] = {}
     before: NDArray[np.void] = np.zeros(0, TICK_DTYPE)
     count, watch = 0, Watch.at_start(parameters)
     for ticks in blocks:
-        seen, watch = watch.after(ticks, resumed)
+        seen, watch = watch.after(ticks, outside)
         checks = chain(
             _number_faults(ticks, count),
             _time_faults(ticks, before, count, parameters),
             _flag_faults(ticks, before, seen),
+            _command_faults(ticks, outside),
         )
         for rank, fault in enumerate(checks):
             if fault is not None:
                 found.setdefault(rank, fault)
         before, count = ticks[-1:], count + len(ticks)
     return found[min(found)] if found else None
+
+
+def _command_faults(ticks: NDArray[np.void], outside: Interventions) -> Iterator[Fault | None]:
+    """Holds the bits of commands in the records against the events that set them."""
+    wrong = (ticks["buttons"] & ~DEVICE_BUTTONS) != outside.buttons(ticks["tick"])
+    tick = int(ticks["tick"][np.argmax(wrong)])
+    text = f"buttons of tick {tick} do not show what the events commanded"
+    yield Fault(text, tick, "buttons") if wrong.any() else None
 
 
 def _number_faults(ticks: NDArray[np.void], count: int) -> Iterator[Fault | None]:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from hapticbridge.audit.balance import Balance
 from hapticbridge.audit.ending import how_it_ended
+from hapticbridge.audit.interventions import Interventions
 from hapticbridge.audit.judgement import Judgement
 from hapticbridge.audit.physics import physics_fault
 from hapticbridge.audit.reached import Reached
@@ -72,18 +73,19 @@ def audit(path: str | Path, *, strict: bool = False) -> AuditReport:
         parameters = replace(
             parameters, device_damping=burning, device_rotational_damping=rotational
         )
-        facts |= _device_facts(info, parameters, method, recording)
+        home = np.array(meta_start(recording.meta, "tool_start"))
+        outside = Interventions.of(recording.events, parameters, home)
+        facts |= _device_facts(info, parameters, outside.worst(info, method), method, recording)
     except RecordingError as error:
         return _invalid(facts, Fault(str(error)))
     facts["duration"] = recording.count * parameters.period
     facts["unchecked"] = _unchecked(parameters, method)
-    resumed = np.array([float(e["tick"]) for e in recording.events if _is_resume(e)])
-    fault = file_fault(recording) or structure_fault(recording.blocks(), parameters, resumed)
+    fault = file_fault(recording) or structure_fault(recording.blocks(), parameters, outside)
     if fault:
         return _invalid(facts, fault)
     passed = _Passed(recording, parameters, is_watched=facts["certified"] is not True)
     try:
-        fault = passed.by(resumed, delay_ticks(info, parameters.period) or 0)
+        fault = passed.by(outside, delay_ticks(info, parameters.period) or 0)
         facts["energies"] = passed.judgement.energies
         if fault:
             return _invalid(facts, fault)
@@ -105,10 +107,6 @@ def audit(path: str | Path, *, strict: bool = False) -> AuditReport:
     tripped = f"; {ended}" if ended else ""
     unchecked = f"; {report.unchecked}" if report.unchecked else ""
     return replace(report, reason=report.reason + tripped + unchecked)
-
-
-def _is_resume(event: dict[str, Any]) -> bool:
-    return event.get("event") == "resume" and isinstance(event.get("tick"), int)
 
 
 def _event_counts(recording: RecordingFile) -> dict[str, int]:
@@ -134,13 +132,17 @@ def _device_and_method(
 
 
 def _device_facts(
-    info: DeviceInfo, parameters: RunParameters, method: Method, recording: RecordingFile
+    info: DeviceInfo,
+    parameters: RunParameters,
+    worst: RunParameters,
+    method: Method,
+    recording: RecordingFile,
 ) -> dict[str, Any]:
     try:
-        conditions = run_conditions(info, parameters, method)
+        conditions = run_conditions(info, worst, method)
         return {
             "certified": is_run_certified(conditions, method),
-            "conditions": condition_sentences(info, parameters, method),
+            "conditions": condition_sentences(info, worst, method),
             "damping_margin": damping_margin(conditions),
             "rendered": coupling_sentences(
                 parameters.coupling,
@@ -192,11 +194,11 @@ class _Passed:
         except RecordingError as error:
             self._error = error
 
-    def by(self, resumed: NDArray[np.float64], late: int) -> Fault | None:
+    def by(self, outside: Interventions, late: int) -> Fault | None:
         """Looks at every tick; returns the earliest fault of the records themselves.
 
         Args:
-            resumed: Ticks at which the run went on after a pause without force.
+            outside: What was done to the run while it went on.
             late: After how many ticks a wrench answers a sample.
 
         Raises:
@@ -209,7 +211,7 @@ class _Passed:
         fault = None
         late = min(late, self._recording.count)
         for ticks, following in _with_following(self._recording.blocks(), late):
-            balance = Balance.of(ticks, self._parameters, reached, resumed, late, following)
+            balance = Balance.of(ticks, self._parameters, reached, outside, late, following)
             reached = balance.reached
             self.judgement.add(ticks, balance)
             fault = fault or physics_fault(ticks, balance)

@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.audit.differences import steps, turns
+from hapticbridge.audit.interventions import Interventions
 from hapticbridge.kernel.state import RunParameters
-from hapticbridge.kernel.watch import STILL, STILL_TURN
+from hapticbridge.kernel.watch import CLUTCHED, FORCE_OFF, STILL, STILL_TURN
 from hapticbridge.tick import TickFlag
 
 Array = NDArray[np.float64]
@@ -91,16 +92,16 @@ class Watch:
         is_released = parameters.guarding.dead_man != 0
         return cls(parameters, np.array(parameters.device_start), is_released=is_released)
 
-    def after(self, ticks: NDArray[np.void], resumed: Array) -> tuple[Seen, Watch]:
+    def after(self, ticks: NDArray[np.void], outside: Interventions) -> tuple[Seen, Watch]:
         """Looks at the next records, ``TICK_DTYPE``, at least one.
 
         Args:
             ticks: The records.
-            resumed: Ticks at which the run went on after a pause without force.
+            outside: What was done to the run while it went on.
         """
         guarding, period = self.parameters.guarding, self.parameters.period
         index = np.arange(len(ticks))
-        first = (ticks["tick"] == 0) | np.isin(ticks["tick"], resumed)
+        first = (ticks["tick"] == 0) | np.isin(ticks["tick"], outside.resumed)
         raw = np.diff(ticks["read_ns"], prepend=self.read_ns) * 1e-9
         elapsed = np.maximum(raw, period)
         is_stale = has_flag(ticks, TickFlag.STALE_SAMPLE)
@@ -111,10 +112,11 @@ class Watch:
         for k in (1 + np.flatnonzero(is_stale[:-1])).tolist():
             interval[k] += interval[k - 1]
 
-        is_released = (ticks["buttons"] & guarding.clutch) != 0
+        is_released = (ticks["buttons"] & (guarding.clutch | CLUTCHED)) != 0
         if guarding.dead_man:
             is_released |= (ticks["buttons"] & guarding.dead_man) == 0
-        is_silent = is_released.copy()
+        is_released |= np.linalg.norm(ticks["device_position"], axis=1) > guarding.reach
+        is_silent = is_released | ((ticks["buttons"] & FORCE_OFF) != 0)
         if guarding.stale_ticks > 0:
             is_silent |= stale > guarding.stale_ticks
         silence = run_lengths(is_silent, self.silent)
@@ -125,7 +127,8 @@ class Watch:
         moved = np.linalg.norm(steps(ticks["device_position"], self.device[:3]), axis=1)
         turned = np.linalg.norm(turns(ticks["device_quaternion"], self.device[3:]), axis=1)
         has_strayed = first & guarding.reseats & ((moved > STILL) | (turned > STILL_TURN))
-        is_seated = ~is_released & (was_released | has_news | has_stalled | has_strayed)
+        is_reset = outside.is_reset(ticks["tick"])
+        is_seated = ~is_released & (was_released | has_news | has_stalled | has_strayed | is_reset)
 
         begins = first | is_seated
         last = np.maximum.accumulate(np.where(begins, index, -1))

@@ -10,7 +10,8 @@ from hapticbridge.check.draft import Setting
 from hapticbridge.check.lean import Lean, find_lean
 from hapticbridge.check.simplifications import OTHER_MOTIONS
 from hapticbridge.check.trial import MAY_GO, Trial
-from hapticbridge.cli.terminal import err, out, plain, progress, quantity
+from hapticbridge.cli.terminal import err, out, plain, progress
+from hapticbridge.quantity import quantity
 
 _HEADINGS = ("alone", "cost", "JND", "force, RMS", "peak", "torque, RMS", "tool off by")
 """Of the table; JND: felt error in just noticeable differences."""

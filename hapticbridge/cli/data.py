@@ -9,9 +9,10 @@ from typing import Annotated, Literal
 
 import tyro
 
-from hapticbridge.cli.terminal import err, out, plain, quantity
+from hapticbridge.cli.terminal import err, out, plain
 from hapticbridge.compare import Comparison, Difference, compare
 from hapticbridge.export import export
+from hapticbridge.quantity import quantity
 
 
 @dataclass(frozen=True, slots=True)

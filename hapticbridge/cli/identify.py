@@ -2,39 +2,34 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
 from typing import Annotated
 
 import tyro
-from rich.table import Table
 
+from hapticbridge.cli.identify_words import facts, print_result, safe_width, why_none
 from hapticbridge.cli.terminal import (
-    out,
-    plain,
     print_json,
     progress,
-    quantity,
     tell,
     write_figure,
 )
-from hapticbridge.cli.zwidth import next_command
 from hapticbridge.clock import RealClock, SimulatedClock, period_of
 from hapticbridge.device import AXES, open_device
 from hapticbridge.device.profile import Profile, own_folder
 from hapticbridge.errors import HapticBridgeError, choices
-from hapticbridge.felt import coupling_sentences
-from hapticbridge.identify import Identification, identify
-from hapticbridge.identify.fit import CONFIDENCE
-from hapticbridge.identify.identification import DURATION, FORCE_SHARE, TRAVEL
+from hapticbridge.identify import identify
+from hapticbridge.identify.identification import (
+    FORCE_SHARE,
+    TRAVEL,
+    duration_at,
+)
 from hapticbridge.identify.measured_profile import measured_profile
 from hapticbridge.identify.picture import draw_identification
-from hapticbridge.passivity import ZWidth, z_width
 from hapticbridge.picture import check_ending
-from hapticbridge.rendering import default_method
-from hapticbridge.study.theory import draw_z_width, recommended
+from hapticbridge.study.theory import draw_z_width
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +37,9 @@ class Identify:
     """Measure a device's mass, damping, friction, resolution and delay: let go of it first.
 
     Each axis moves by itself for some seconds, with little force and travel; Ctrl-C leaves no
-    force. The result is a profile, which 'run' takes by itself for the same unit. Example:
+    force. A hand that moves or holds is refused; one that only damps cannot be told from the
+    device, and makes its damping too large. The result is a profile, which 'run' takes by itself
+    for the same unit. Example:
         hapticbridge identify simulated:hand=none,damping=1.5,friction=0.1 --plot fit.png
     """
 
@@ -50,8 +47,8 @@ class Identify:
     """As 'run --device' takes it."""
     axes: tuple[str, ...] = ()
     """Which axes (x y z rx ry rz); by default all that the device has."""
-    duration: float = DURATION
-    """Seconds per axis."""
+    duration: float | None = None
+    """Seconds per axis; by default 12, more below 333 Hz."""
     travel: float = TRAVEL[0]
     """Travel to each side in m."""
     turn: float = TRAVEL[1]
@@ -75,7 +72,9 @@ class Identify:
         for path in (self.plot, self.zwidth):
             if path is not None:
                 check_ending(path)
-        self._check()
+        period = period_of(self.rate)
+        duration = duration_at(period) if self.duration is None else self.duration
+        self._check(duration)
         if self.plot is not None and self.plot == self.zwidth:
             raise HapticBridgeError(f"--plot and --zwidth both name '{self.plot}'")
         device = open_device(self.device, tell=tell)
@@ -86,9 +85,9 @@ class Identify:
                 result = identify(
                     device,
                     clock,
-                    period=period_of(self.rate),
+                    period=period,
                     axes=axes,
-                    duration=self.duration,
+                    duration=duration,
                     travel=(self.travel, self.turn),
                     force_share=self.force_share,
                     progress=lambda axis, share: show(
@@ -97,21 +96,21 @@ class Identify:
                 )
         finally:
             device.close()
-        z = _z_width(result)
+        z = safe_width(result)
         profile = measured_profile(
             result,
             device=self.device.partition(":")[0],
             serial=device.info.serial,
             date=date.today().isoformat(),
-            duration=self.duration,
+            duration=duration,
             workspace=getattr(device, "workspace", None),
         )
         path = self._place(profile, is_real=device.info.is_real)
         # first, so that a file that cannot be written costs nothing that was measured
         if self.as_json:
-            print_json(_facts(result, z, path))
+            print_json(facts(result, z, path))
         else:
-            _print(result, z)
+            print_result(result, z)
         if path is not None:
             _write(profile, path)
             tell(f"wrote {path}")
@@ -122,17 +121,16 @@ class Identify:
             if target is not None and figure is not None:
                 write_figure(figure, target)
         if self.zwidth is not None and z is None:
-            tell(f"'{self.zwidth}' is not drawn: {_why_none(result)}")
+            tell(f"'{self.zwidth}' is not drawn: {why_none(result)}")
         return 0
 
-    def _check(self) -> None:
-        for name, least, most, unit in (
-            ("duration", 2.0, 600.0, "s"),
-            ("travel", 1e-4, 1.0, "m"),
-            ("turn", 1e-3, 3.0, "rad"),
-            ("force_share", 1e-3, 1.0, ""),
+    def _check(self, duration: float) -> None:
+        for name, value, least, most, unit in (
+            ("duration", duration, 2.0, 600.0, "s"),
+            ("travel", self.travel, 1e-4, 1.0, "m"),
+            ("turn", self.turn, 1e-3, 3.0, "rad"),
+            ("force_share", self.force_share, 1e-3, 1.0, ""),
         ):
-            value = getattr(self, name)
             if not least <= value <= most:
                 told = name.replace("_", "-")
                 raise HapticBridgeError(
@@ -158,87 +156,3 @@ def _write(profile: Profile, path: Path) -> None:
         path.write_text(profile.to_toml(), encoding="utf-8")
     except OSError as error:
         raise HapticBridgeError(f"cannot write '{path}': {error.strerror}") from None
-
-
-def _z_width(result: Identification) -> ZWidth | None:
-    """Returns the couplings that are safe with the lower ends of what was measured."""
-    damping = result.of_all("damping", turns=False)
-    mass = result.of_all("mass", turns=False)
-    friction = result.of_all("friction", turns=False)
-    delay = result.of_all("delay", turns=False, most=True)
-    if damping is None or mass is None or friction is None or delay is None:
-        return None
-    if damping.least <= 0.0:
-        return None
-    period = result.runs[next(iter(result.runs))].period
-    late = delay.least / period  # the interval must leave zero for a delay to be one
-    return z_width(
-        damping.least,
-        period,
-        mass=mass.least,
-        friction=max(friction.least, 0.0),
-        resolution=result.resolution or 0.0,
-        delay=math.ceil(delay.most / period) if late > 0.05 else 0,
-    )
-
-
-def _print(result: Identification, z: ZWidth | None) -> None:
-    for turns, units in ((False, ("kg", "N s/m", "N")), (True, ("kg m²", "N m s/rad", "N m"))):
-        names = zip(("mass", "damping", "friction"), units, strict=True)
-        headings = [f"{name} ({unit})" for name, unit in names]
-        table = Table("axis", *headings, "delay (ms)", box=None, pad_edge=False)
-        for axis, fit in result.fits.items():
-            if (len(axis) == 2) == turns:
-                table.add_row(
-                    axis,
-                    fit.mass.told(),
-                    fit.damping.told(),
-                    fit.friction.told(),
-                    f"{1e3 * fit.delay.value:.2f} ± {1e3 * fit.delay.half_width:.2f}",
-                )
-        if table.row_count:
-            out.print(table)
-    out.print(
-        f"period {1e3 * result.period:.4g} ms, spread {quantity(result.period_spread, 's')}, "
-        f"one in a thousand longer than {1e3 * result.period_most:.4g} ms"
-    )
-    if result.resolution is not None:
-        step = quantity(result.resolution, "m") if result.resolution else "none seen"
-        out.print(f"resolution {step}")
-    out.print(f"± holds the true value with {CONFIDENCE:.0%}")
-    if left := [axis for axis in result.info.axes if axis not in result.fits]:
-        out.print(f"not measured: {', '.join(left)}; a profile takes axes of a kind for alike")
-    if z is None:
-        out.print(_why_none(result))
-        return
-    out.print(
-        f"with the lower ends (b = {z.device_damping:.4g} N s/m) the largest safe stiffness is "
-        f"{z.limit[0]:.4g} N/m at B' = 0 ({z.corner_limited_by})"
-    )
-    (told,) = coupling_sentences(z.corner, default_method(), z.period, 1)
-    felt = recommended(z)
-    out.print(f"use {told}")
-    out.print(f"next: {plain(next_command(felt.stiffness, felt.damping, 1.0 / z.period))}")
-
-
-def _why_none(result: Identification) -> str:
-    if result.of_all("damping", turns=False) is None:
-        return "none of x, y, z was measured: the stiffness that the device can show is not known"
-    return "damping may be zero: no coupling is safe for any hand"
-
-
-def _facts(result: Identification, z: ZWidth | None, path: Path | None) -> dict[str, object]:
-    return {
-        "device": result.info.name,
-        "axes": {axis: asdict(fit) for axis, fit in result.fits.items()},
-        "resolution": result.resolution,
-        "period": result.period,
-        "period_spread": result.period_spread,
-        "period_most": result.period_most,
-        "confidence": CONFIDENCE,
-        "largest_stiffness": None if z is None else float(z.limit[0]),
-        "coupling": None
-        if z is None
-        else {"stiffness": recommended(z).stiffness, "damping": recommended(z).damping},
-        "profile": None if path is None else str(path),
-    }

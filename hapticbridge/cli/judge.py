@@ -13,10 +13,11 @@ import tyro
 from hapticbridge.audit import AuditReport, audit
 from hapticbridge.cli.judge_many import print_audits, print_unreadable
 from hapticbridge.cli.judge_what_if import print_what_if
-from hapticbridge.cli.terminal import err, out, plain, progress, quantity
+from hapticbridge.cli.terminal import err, out, plain, progress
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.film import Shot, still
 from hapticbridge.picture import check_ending
+from hapticbridge.quantity import quantity
 from hapticbridge.recording import Recording, read_recording, repair
 from hapticbridge.report import plot_recording, telling_time, write_report
 from hapticbridge.study.audits import (
@@ -74,8 +75,9 @@ class Audit:
     ] = ()
     """Simulate the recorded hand again with this changed, as often as wanted: stiffness, damping,
     rotational_stiffness, rotational_damping, method, rate, substeps, scale, force_scale,
-    contact_stiffness, or a parameter of the scene. Twice: with the recorded motion, and, where the
-    device is known, with a model hand. With --plot both are drawn (one file only)."""
+    contact_stiffness, controller, or a parameter of the scene. Twice: with the recorded motion,
+    and, where the device is known, with a model hand. With --plot both are drawn (one file
+    only)."""
 
     def execute(self) -> int:
         """Audits; returns the exit code."""

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from rich.table import Table
 
-from hapticbridge.cli.terminal import err, out, plain, quantity
+from hapticbridge.cli.terminal import err, out, plain
+from hapticbridge.quantity import quantity
 from hapticbridge.whatif import WhatIf, WhatIfRun
 
 _PEAK_UNITS = {"force": "N", "torque": "N m", "stretch": "m"}

@@ -26,6 +26,7 @@ from hapticbridge.kernel.parameters import checked_substeps
 from hapticbridge.rendering import Method, default_method, method_named
 from hapticbridge.scene import Scene, load_scene, settings_from
 from hapticbridge.view import Address, Window
+from hapticbridge.view.window import BY
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,15 +109,19 @@ class Run:
     printed."""
     port: int = 8080
     """Port to serve the view on; 0: any that is free."""
-    controller: Literal["damper", "tank", "off"] | None = None
+    controller: Literal["damper", "environment", "tank", "off"] | None = None
     """Passivity controller: what is done when the device was given more than its damping burns and
-    the scene gives up; by default 'damper' where the device condition does not hold, else 'off'."""
+    the scene gives up, or, 'environment', when the scene created more than the coupling's slack; by
+    default 'damper' where the device condition does not hold, else 'environment'."""
     clutch: int | None = None
     """Button of the device, from 0: while it is held the device moves without the handle."""
     dead_man: int | None = None
     """Button of the device, from 0, that must be held for any force."""
     stretch_limit: float = USUAL_STRETCH
     """Largest distance between handle and tool in m; beyond it the run is stopped."""
+    reach_limit: float = math.inf
+    """Farthest in m that the device may be from the middle of its workspace; beyond it moves
+    without the handle and without force. Choose it short of the device's own stops."""
     energy_limit: float = USUAL_ENERGY
     """Most energy in J that the device may be given beyond what the hand put in; inf for scenes
     whose motors are meant to push the hand."""
@@ -166,6 +171,7 @@ class Run:
                 ramp=self.ramp,
                 stretch=self.stretch_limit,
                 energy=self.energy_limit,
+                reach=self.reach_limit,
             ),
             controller=self.controller,
             clutch=self.clutch,
@@ -175,13 +181,13 @@ class Run:
             realtime=self.realtime or None,
         )
         if window is not None:
-            window.on_stop = partial(bridge.stop, "view")
+            window.on_command = partial(bridge.command, by=BY)
         if not self.as_json:
             announce(bridge, scales, self.substeps, is_method_asked=self.method is not None)
         with err.status("preparing (the first run on a machine compiles for about 20 s) …"):
             stack.enter_context(bridge)
         if window is not None:
-            tell_address(window.address, window.url, "watch the run and stop it")
+            tell_address(window.address, window.url, "watch the run, stop it and move the device")
         if not self.as_json:
             announce_measured(bridge)
         summary = bridge.run(self.duration)

@@ -10,9 +10,10 @@ from rich.table import Table
 
 from hapticbridge.bridge import Bridge
 from hapticbridge.certificate import device_conditions
-from hapticbridge.cli.terminal import err, out, quantity
+from hapticbridge.cli.terminal import err, out
 from hapticbridge.coupling import Coupling
 from hapticbridge.felt import coupling_sentences, is_always_held
+from hapticbridge.quantity import quantity
 from hapticbridge.rendering import default_method, method_named
 from hapticbridge.summary import Summary
 

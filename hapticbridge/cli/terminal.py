@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -21,8 +20,6 @@ out = Console(highlight=False, soft_wrap=True)
 
 err = Console(stderr=True, highlight=False, soft_wrap=True)
 """Progress, warnings and errors, on stderr, so that a pipe gets results alone."""
-
-_PREFIXES = ((1.0, ""), (1e-3, "m"), (1e-6, "µ"), (1e-9, "n"))
 
 
 def plain(text: str) -> str:
@@ -74,13 +71,3 @@ def write_figure(figure: Figure, path: Path) -> None:
 def print_json(facts: object) -> None:
     """Prints facts as JSON on stdout, with null in place of numbers that JSON does not have."""
     out.print_json(json.dumps(jsonable(facts), allow_nan=False))
-
-
-def quantity(value: float, unit: str) -> str:
-    """Formats a number with an SI prefix and three digits: ``-3.41 mJ``, ``0 J``."""
-    if value == 0 or not math.isfinite(value):
-        return f"{value:g} {unit}"
-    for factor, prefix in _PREFIXES:
-        if abs(value) >= factor:
-            return f"{value / factor:.3g} {prefix}{unit}"
-    return f"{value:.2g} {unit}"

@@ -33,6 +33,7 @@ DECISIVE = (
     "force_limit",
     "torque_limit",
     "ramp_ticks",
+    "guard",
     "device",
     "device_start",
     "device_origin",

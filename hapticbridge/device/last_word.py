@@ -2,7 +2,7 @@
 
 A bridge that is killed (SIGKILL), or whose interpreter crashes, runs no line of its own any more. A
 child that holds a second handle to the same device node sees its end of a pipe close, and then
-writes the report it was given. It is possible where two processes may hold one device: hidraw. USB
+writes the reports it was given. It is possible where two processes may hold one device: hidraw. USB
 interfaces belong to the one that claimed them; there the device's own watchdog is all there is.
 """
 
@@ -18,14 +18,15 @@ _CHILD = """
 import os, signal, sys, time
 for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGTSTP"):
     signal.signal(getattr(signal, name), signal.SIG_IGN)
-device, report = int(sys.argv[1]), bytes.fromhex(sys.argv[2])
+device, reports = int(sys.argv[1]), [bytes.fromhex(text) for text in sys.argv[2:]]
 os.write(1, b"r")
 if not os.read(0, 1):
     for _ in range(3):
-        try:
-            os.write(device, report)
-        except OSError:
-            pass
+        for report in reports:
+            try:
+                os.write(device, report)
+            except OSError:
+                pass
         time.sleep(0.002)
 """
 # three times, because a report of the dead bridge may still be on its way behind the first
@@ -35,21 +36,21 @@ PATIENCE = 5.0
 
 
 class LastWord:
-    """Holds a report that is written to a device node if this process ends without ``close``.
+    """Holds reports that are written to a device node if this process ends without ``close``.
 
     Args:
         path: The device node; opened once more, for writing.
-        report: What is written, the report's number first.
+        reports: What is written, each with its number first.
 
     Raises:
         OSError: The node cannot be opened again, or no process started.
     """
 
-    def __init__(self, path: str, report: bytes) -> None:
+    def __init__(self, path: str, *reports: bytes) -> None:
         node = os.open(path, os.O_WRONLY | os.O_NOCTTY)
         try:
             self._process = subprocess.Popen(
-                [sys.executable, "-I", "-S", "-c", _CHILD, str(node), report.hex()],
+                [sys.executable, "-I", "-S", "-c", _CHILD, str(node), *(r.hex() for r in reports)],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 pass_fds=(node,),

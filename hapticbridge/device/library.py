@@ -11,7 +11,7 @@ from typing import Any
 from hapticbridge.device.base import Device
 from hapticbridge.device.families import FAMILIES, family_named
 from hapticbridge.device.plugged import Tell, tell_nobody
-from hapticbridge.device.profile import profile_named, profile_of
+from hapticbridge.device.profile import modelled, profile_named, profile_of
 from hapticbridge.device.simulated.driver import SimulatedDevice
 from hapticbridge.device.simulated.hand import Hand
 from hapticbridge.device.simulated.scene_hand import scene_hand
@@ -74,7 +74,10 @@ def open_device(spec: str, *, tell: Tell = tell_nobody, **options: object) -> De
         device = family.open(asked, tell)
         try:
             if wanted is None:
-                chosen = profile_of(name, device.info.serial)
+                model = device.info.name
+                chosen = profile_of(name, device.info.serial, model)
+                if chosen is None and (models := modelled(name)):
+                    tell(f"there is no profile of '{model}'; there are {choices(models)}")
             if chosen is not None:
                 device.info = chosen.fill(device.info)
         except BaseException:

@@ -8,6 +8,7 @@ know, above all the damping b.
     name = "Novint Falcon"
     device = "falcon"            # the driver it is for
     serial = "FT000001"          # only in a profile of one unit
+    models = ["omega.3"]         # what the driver calls those it holds for; none: for all
 
     [damping]                    # one table per number of the data sheet, SI units
     value = 1.7                  # or "unknown"
@@ -78,6 +79,7 @@ class Profile:
         about: What else there is to say, in a sentence; may be empty.
         quantities: By name, see ``UNITS``.
         path: The file.
+        models: What the driver calls the models that it holds for; empty where for all.
     """
 
     name: str
@@ -87,6 +89,15 @@ class Profile:
     about: str
     quantities: Mapping[str, Quantity]
     path: Path | None = None
+    models: tuple[str, ...] = ()
+
+    def is_for(self, model: str) -> bool:
+        """Returns whether it holds for a model, as the driver calls it; "" stands for any."""
+        return not model or not self.models or self.names(model)
+
+    def names(self, model: str) -> bool:
+        """Returns whether it names a model, in whatever case."""
+        return model.casefold() in (known.casefold() for known in self.models)
 
     def fill(self, info: DeviceInfo) -> DeviceInfo:
         """Returns a data sheet with what was unknown in it filled in.
@@ -116,6 +127,8 @@ class Profile:
         plain |= {name: getattr(self, name) for name in _TEXTS if getattr(self, name)}
         if self.axes is not None:
             plain["axes"] = list(self.axes)
+        if self.models:
+            plain["models"] = list(self.models)
         for name, quantity in self.quantities.items():
             value = quantity.value
             table: dict[str, object] = {
@@ -157,19 +170,42 @@ def profile_named(name: str) -> Profile:
     raise DeviceError(f"unknown profile '{name}'; there are {choices(known)}, or a .toml file")
 
 
-def profile_of(device: str, serial: str = "") -> Profile | None:
-    """Returns the profile of a unit, else that of its kind, else None.
+def profile_of(device: str, serial: str = "", model: str = "") -> Profile | None:
+    """Returns the profile of a unit, else that of its model, else that of its driver, else None.
 
-    A user's ``DEVICE-SERIAL.toml`` goes before ``DEVICE.toml``, and either before a shipped one.
+    A user's ``DEVICE-SERIAL.toml`` goes before ``DEVICE.toml``, which goes before the shipped one
+    that names the model; a file of the user's with its name goes in its place.
+
+    Args:
+        device: Name of the driver.
+        serial: Of the unit; may be empty.
+        model: What the driver calls it; empty: only a profile for all models of the driver.
 
     Raises:
         DeviceError: The file is not valid.
     """
     known = profiles()
-    for name in (f"{device}-{serial}" if serial else device, device):
-        if name in known:
-            return read_profile(known[name])
-    return None
+    names = [f"{device}-{serial}"] if serial else []
+    for name in (*names, device):
+        if name in known and (found := read_profile(known[name])).is_for(model):
+            return found
+    return next((found for found in _by_model(device) if found.names(model)), None)
+
+
+def modelled(device: str) -> tuple[str, ...]:
+    """Returns the models of a driver that there are profiles for.
+
+    Raises:
+        DeviceError: A file is not valid.
+    """
+    return tuple(model for found in _by_model(device) for model in found.models)
+
+
+def _by_model(device: str) -> list[Profile]:
+    # only names that are shipped: a broken file of the user's for another device is not read here
+    known = profiles()
+    found = [read_profile(known[path.stem]) for path in sorted(SHIPPED.glob("*.toml"))]
+    return [profile for profile in found if profile.device == device and profile.models]
 
 
 def read_profile(path: Path) -> Profile:
@@ -202,12 +238,16 @@ def _profile(raw: dict[str, object], path: Path) -> Profile:
         not isinstance(axes, list) or not axes or [a for a in AXES if a in axes] != axes
     ):
         raise DeviceError(f"axes = {axes!r}: must be of {', '.join(AXES)}, in this order")
+    models = raw.pop("models", [])
+    if not isinstance(models, list) or not all(isinstance(m, str) and m for m in models):
+        raise DeviceError(f"models = {models!r}: must be a list of texts that are not empty")
     if unknown := raw.keys() - UNITS.keys():
         raise DeviceError(f"it holds {choices(unknown)}; it may hold {choices(UNITS)}")
     return Profile(
         axes=None if axes is None else tuple(axes),
         quantities={name: _quantity(name, table) for name, table in raw.items()},
         path=path,
+        models=tuple(models),
         **{name: str(text) for name, text in texts.items()},
     )
 

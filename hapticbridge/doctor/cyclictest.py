@@ -12,15 +12,24 @@ import subprocess
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.realtime.remedies import PRIORITY
+from hapticbridge.realtime import Lateness, lateness_of
 
 INSTALL = "sudo apt install rt-tests"
 _LONGEST_US = 50_000
 """Width of the histogram in µs; later wake-ups are counted at the maximum."""
 
+_TRIAL_NS = 1_000_000
+_PATIENCE = 5.0
+"""Time in s beyond twice what its wake-ups take, after which it is given up."""
+
 _BAR = re.compile(r"^(\d{6,}) (\d+)", re.MULTILINE)
 _MAXIMUM = re.compile(r"^# Max Latencies: (\d+)", re.MULTILINE)
 _OVERFLOWS = re.compile(r"^# Histogram Overflows: (\d+)", re.MULTILINE)
+
+
+def lateness(period_ns: int, late_ns: NDArray[np.int64]) -> Lateness:
+    """Returns the numbers of a run: a whole period late is a deadline that was skipped."""
+    return lateness_of(late_ns, int((late_ns // period_ns).sum()))
 
 
 def is_there() -> bool:
@@ -28,30 +37,63 @@ def is_there() -> bool:
     return shutil.which("cyclictest") is not None
 
 
-def run(period_ns: int, ticks: int) -> NDArray[np.int64] | None:
+def refusal(priority: int, *, locks_memory: bool) -> str:
+    """Returns why the program cannot be run here, or nothing.
+
+    Args:
+        priority: Of the loop under SCHED_FIFO, 0 where that was refused: it runs at no other.
+        locks_memory: Whether the loop may lock its memory.
+    """
+    if not is_there():
+        return "it is not installed"
+    if priority <= 0:
+        return "it needs SCHED_FIFO, which was refused"
+    answer = run(_TRIAL_NS, 1, priority, locks_memory=locks_memory)
+    return answer if isinstance(answer, str) else ""
+
+
+def run(
+    period_ns: int,
+    ticks: int,
+    priority: int,
+    *,
+    locks_memory: bool,
+    core: int | None = None,
+) -> NDArray[np.int64] | str:
     """Runs one thread at the loop's priority; returns how late each tick woke in ns.
 
     Args:
         period_ns: In ns; the program takes whole µs.
-        ticks: How many wake-ups.
+        ticks: How many wake-ups; it skips the deadlines that it missed.
+        priority: Under SCHED_FIFO, 1 to 99.
+        locks_memory: Whether its memory is locked.
+        core: Where it runs; None: anywhere.
 
     Returns:
-        None where it failed, as it does without the permission for real time.
+        Why there is nothing, in words, where it failed.
     """
     period_us = max(round(period_ns * 1e-3), 1)
-    command = ["cyclictest", "--quiet", "--mlockall", f"--priority={PRIORITY}"]
-    command += [f"--interval={period_us}", f"--loops={ticks}", f"--histogram={_LONGEST_US}"]
+    command = ["cyclictest", "--quiet", f"--priority={priority}", f"--interval={period_us}"]
+    command += [f"--loops={ticks}", f"--histogram={_LONGEST_US}"]
+    command += ["--mlockall"] if locks_memory else []
+    command += [] if core is None else [f"--affinity={core}"]
     try:
         done = subprocess.run(
             command,
             capture_output=True,
             text=True,
-            timeout=10.0 + 5e-9 * period_ns * ticks,
+            timeout=_PATIENCE + 2e-9 * period_ns * ticks,
             check=False,
         )
-    except (OSError, subprocess.TimeoutExpired):
-        return None
-    return parsed(done.stdout) if done.returncode == 0 else None
+    except subprocess.TimeoutExpired:
+        return f"it did not come to an end at {1e9 / period_ns:g} Hz"
+    except OSError as error:
+        return f"it cannot be started ({error.strerror})"
+    late = parsed(done.stdout) if done.returncode == 0 else None
+    if late is None:
+        said = (done.stderr or done.stdout).strip().splitlines() or [f"status {done.returncode}"]
+        return f"it failed: {said[-1].strip()}"
+    return late
 
 
 def parsed(text: str) -> NDArray[np.int64] | None:

@@ -11,7 +11,13 @@ from hapticbridge.doctor import cyclictest
 from hapticbridge.doctor.machine import Finding, System, findings
 from hapticbridge.doctor.wakeups import Wakeups, bare_turn, clock_turn
 from hapticbridge.errors import HapticBridgeError
-from hapticbridge.realtime import Lateness, memory_at_rest, real_time
+from hapticbridge.realtime import (
+    Lateness,
+    current_priority,
+    memory_at_rest,
+    real_time,
+    stolen_time,
+)
 
 LATE_SHARE = 0.25
 """Share of the period by which a tick may be late, no unit. The coupling is chosen at 80 % of the
@@ -71,39 +77,43 @@ def diagnose(
         )
     period_ns = round(period_of(rate) * 1e9)
     bridge, bare, baseline = Wakeups("bridge"), Wakeups("bare sleep"), Wakeups(BASELINE)
-    loops = [bridge, bare] + ([baseline] if cyclictest.is_there() else [])
-    rounds = max(1, round(duration / (TURN * len(loops))))
-    ticks = max(1, round(duration / (rounds * len(loops)) * 1e9 / period_ns))
+    machine = system or System()
+    before = stolen_time(machine.proc)
     with memory_at_rest() as at_rest:
+        with real_time():
+            priority = current_priority()
+        is_locked = all(grant.is_granted for grant in at_rest)
+        refused = cyclictest.refusal(priority, locks_memory=is_locked)
+        loops = [bridge, bare] + ([] if refused else [baseline])
+        rounds = max(1, round(duration / (TURN * len(loops))))
+        ticks = max(1, round(duration / (rounds * len(loops)) * 1e9 / period_ns))
         for turn in range(rounds):
             bare.add(*bare_turn(period_ns, ticks))
             with real_time() as granted:
                 bridge.add(*clock_turn(period_ns, ticks))
-            if baseline in loops:
-                late = cyclictest.run(period_ns, ticks)
-                if late is not None:
-                    # it keeps its deadlines and skips none: a whole period late is a missed one
-                    baseline.add(late, int((late // period_ns).sum()))
+            if not refused:
+                late = cyclictest.run(period_ns, ticks, priority, locks_memory=is_locked)
+                if isinstance(late, str):
+                    refused = late  # and is not tried again
+                else:
+                    baseline.add(late, cyclictest.lateness(period_ns, late).missed)
             tell(duration * (turn + 1) / rounds, duration)
     lateness = {loop.name: loop.lateness() for loop in loops if loop.late_ns}
-    found = findings(system or System(), at_rest + granted)
-    found += (_baseline(lateness),)
+    stolen = (stolen_time(machine.proc) or 0.0) - (before or 0.0)
+    found = findings(machine, at_rest + granted, stolen, duration)
+    found += (_baseline("" if BASELINE in lateness else refused),)
     verdict, sentence = judged(lateness, found, rate)
     return Diagnosis(rate, lateness, found, verdict, sentence)
 
 
-def _baseline(lateness: dict[str, Lateness]) -> Finding:
-    if BASELINE in lateness:
+def _baseline(refused: str) -> Finding:
+    if not refused:
         return Finding("baseline", None, "cyclictest ran in turns with the loop, as a program in C")
-    if cyclictest.is_there():
-        return Finding(
-            "baseline", None, "cyclictest is there, but could not run: it needs the same permission"
-        )
     return Finding(
         "baseline",
         None,
-        "cyclictest is not installed, so there is no program in C to compare with",
-        cyclictest.INSTALL,
+        f"no program in C to compare with: cyclictest is one, but {refused}",
+        "" if cyclictest.is_there() else cyclictest.INSTALL,
     )
 
 

@@ -9,10 +9,10 @@ from hapticbridge.certificate import assumed_damping
 from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import DeviceError, choices
 from hapticbridge.guard.limits import Limits
-from hapticbridge.kernel.guarding import DAMPER, MOST_BUTTONS, OFF, TANK, Guarding
+from hapticbridge.kernel.guarding import DAMPER, ENVIRONMENT, MOST_BUTTONS, OFF, TANK, Guarding
 
-CONTROLLERS = {"damper": DAMPER, "tank": TANK, "off": OFF}
-"""Passivity controllers by name; the first is the default."""
+CONTROLLERS = {"damper": DAMPER, "environment": ENVIRONMENT, "tank": TANK, "off": OFF}
+"""Passivity controllers by name."""
 
 SURPLUS = 0.05
 """In J: what earlier dissipation may pay for. A default coupling holds 0.021 J at 10 N, contacts
@@ -86,9 +86,9 @@ def guarding_for(
             damping can: its account stays balanced, and the controller idle.
         scale: Handle motion per device motion.
         controller: One of ``CONTROLLERS``; None: ``damper`` where the device has less damping than
-            the coupling needs, else ``off``. A device that has it needs none, and a spring that was
-            turned far beyond the torque limit gives back more than the surplus covers: there the
-            account would blame an honest run.
+            the coupling needs, else ``environment``. A device that has it needs none for what it
+            does itself, and a spring that was turned far beyond the torque limit gives back more
+            than the surplus covers: there the account of both ports would blame an honest run.
         clutch: Button that lets the device move without the handle.
         dead_man: Button that must be held for any force.
         is_absolute: Whether the device's pose is one in the scene; it is then not re-seated before
@@ -111,6 +111,7 @@ def guarding_for(
         dead_man=buttons[1],
         stretch=limits.stretch * scale,
         angle=limits.angle,
+        reach=limits.reach,
     )
     if info.is_prescribed:
         return common
@@ -123,7 +124,7 @@ def guarding_for(
     own = period if info.rate is None else max(1.0 / info.rate, period)
     return replace(
         common,
-        controller=CONTROLLERS[controller or ("off" if is_borne else "damper")],
+        controller=CONTROLLERS[controller or ("environment" if is_borne else "damper")],
         credit=credit[0],
         rotational_credit=credit[1],
         most_damping=min(linear, math.inf if info.mass is None else info.mass / period),

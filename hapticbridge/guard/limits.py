@@ -43,6 +43,9 @@ class Limits:
             run is stopped. So it is beyond the others:
         angle: Largest angle between them in rad, > 0 and < π, or inf.
         energy: Most energy in J that the device may be given beyond what the hand put in, > 0.
+        reach: Farthest in m that the device may be from the middle of its workspace, the origin of
+            its frame, > 0. It is not stopped there: beyond, it moves without the handle and
+            without force, as with a clutch.
 
     Raises:
         DeviceError: A value is not finite or out of range.
@@ -55,6 +58,7 @@ class Limits:
     stretch: float = USUAL_STRETCH
     angle: float = USUAL_ANGLE
     energy: float = USUAL_ENERGY
+    reach: float = math.inf
 
     def __post_init__(self) -> None:
         for name, unit in (("force", "N"), ("torque", "N m")):
@@ -65,7 +69,7 @@ class Limits:
             raise DeviceError(f"start ramp is {self.ramp!r} s; it must be 0 to {LONGEST_RAMP:g}")
         if not 0 <= self.rise <= LONGEST_RAMP:
             raise DeviceError(f"rise is {self.rise!r} s; it must be 0 to {LONGEST_RAMP:g}")
-        for name, unit in (("stretch", "m"), ("energy", "J")):
+        for name, unit in (("stretch", "m"), ("energy", "J"), ("reach", "m")):
             value = getattr(self, name)
             if not value > 0:
                 raise DeviceError(f"{name} limit is {value!r} {unit}; it must be > 0, inf for none")

@@ -19,7 +19,14 @@ LOWEST, HIGHEST, TONES = 0.7, 12.0, 9
 high ones mass; above 12 Hz an axis of 1 kg moves less than an encoder sees, below 0.7 Hz a run of
 12 s holds too few swings."""
 
-_TILT = -0.3  # amplitude over frequency: all tones then move a damped axis by similar amounts
+SLOW_PERIOD = 0.003
+"""In s: a loop of longer periods moves the axis as much more slowly and for as much longer, because
+a window of the fit needs ``weak_form.LEAST_SAMPLES`` of them within half a swing."""
+
+_TILT, _SLOW_TILT = -0.3, -1.0
+"""Power of the frequency that a tone's amplitude follows. All tones then move a damped axis by
+similar amounts; in slow loops the low ones move it more, or its swings would be too short for
+``weak_form.LEAST_SAMPLES``."""
 
 START_SHARE = 0.03
 """Share of the force limit with which the signal starts. It grows until the axis moves."""
@@ -79,6 +86,15 @@ speed per kind of axis, the pose at the start, the displacement from it (m, then
 rad), now and one tick ago, the integral of the springs in N and N m, and the signal's."""
 
 
+def stretch(period: float) -> float:
+    """Returns by how much all times of a run are longer than at 333 Hz and more, 1 there.
+
+    Args:
+        period: T in s.
+    """
+    return max(1.0, period / SLOW_PERIOD)
+
+
 def signal(axis_index: int, ticks: int, period: float) -> NDArray[np.float64]:
     """Returns tones of random phase between −1 and 1, another one for each axis, the same always.
 
@@ -88,11 +104,12 @@ def signal(axis_index: int, ticks: int, period: float) -> NDArray[np.float64]:
         period: T in s.
     """
     generator = np.random.default_rng(axis_index)
-    frequencies = np.geomspace(LOWEST, HIGHEST, TONES)
+    frequencies = np.geomspace(LOWEST, HIGHEST, TONES) / stretch(period)
+    tilt = _TILT if period <= SLOW_PERIOD else _SLOW_TILT
     phases = generator.uniform(0.0, 2.0 * np.pi, TONES)
     time = period * np.arange(ticks)
     tones = np.sin(2.0 * np.pi * frequencies[:, None] * time + phases[:, None])
-    summed = (frequencies**_TILT) @ tones
+    summed = (frequencies**tilt) @ tones
     return np.asarray(summed / np.abs(summed).max())
 
 
@@ -122,14 +139,15 @@ def next_wrench(
     if code != OK:
         return code
     deflection = abs(s.place[s.axis])
-    s.reach = max(deflection, s.reach * math.exp(-s.period / _MEMORY))
+    time = min(s.period, SLOW_PERIOD)  # what a slow loop stretches
+    s.reach = max(deflection, s.reach * math.exp(-time / _MEMORY))
     kind = 0 if s.axis < 3 else 1
     if deflection > s.travel[kind]:
         s.amplitude *= math.exp(-s.period / _RESCUE)
     elif s.reach > TOO_MUCH * s.travel[kind]:
-        s.amplitude *= math.exp(-s.period / SHRINKING)
+        s.amplitude *= math.exp(-time / SHRINKING)
     elif s.reach < ENOUGH * s.travel[kind]:
-        s.amplitude = min(s.amplitude * math.exp(s.period / GROWTH), s.force[kind])
+        s.amplitude = min(s.amplitude * math.exp(time / GROWTH), s.force[kind])
     oldest = past[s.tick % len(past)]
     for i in range(6):
         spring = CENTRING[0] if i < 3 else CENTRING[1]

@@ -1,8 +1,12 @@
-"""Everything that a minute of small motions tells of a device, or why it tells nothing."""
+"""Everything that a minute of small motions tells of a device, or why it tells nothing.
+
+What no motion tells: who damps. A hand, a glove or a cable that only damps, without stiffness and
+without moving by itself, adds its damping to b in the equation of motion, where nothing sets the
+two apart. Such a b is too large, which is the unsafe side; ``UNHELD`` says so wherever b is told.
+"""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -12,10 +16,19 @@ from numpy.typing import NDArray
 from hapticbridge.clock import Clock
 from hapticbridge.device import Device, DeviceInfo
 from hapticbridge.errors import IdentificationError
+from hapticbridge.identify.axis_fit import AxisFit
+from hapticbridge.identify.estimate import Estimate
+from hapticbridge.identify.excitation import stretch
 from hapticbridge.identify.experiment import Allowance, AxisRun, move_axis
-from hapticbridge.identify.fit import AxisFit, Estimate, fit_axis
+from hapticbridge.identify.fit import fit_axis
+from hapticbridge.identify.resolution import step_of
 
 Array = NDArray[np.float64]
+
+UNHELD = (
+    "that nobody held it is the user's word: a hand that only damps cannot be told from the device"
+)
+"""Goes with every b that was measured."""
 
 DURATION = 12.0
 """Seconds per axis: eight swings of the slowest tone. The half-widths fall with its square root."""
@@ -43,9 +56,6 @@ PRECISION = 0.2
 
 MOST_STALE = 0.5
 """Share of ticks without a new sample beyond which the loop runs too fast for the device."""
-
-MOST_STEPS = 2_000_000
-"""Step of resolution below travel/MOST_STEPS is none: rounding of a double, or of a float."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -92,7 +102,7 @@ def identify(
     *,
     period: float,
     axes: tuple[str, ...] | None = None,
-    duration: float = DURATION,
+    duration: float | None = None,
     travel: tuple[float, float] = TRAVEL,
     force_share: float = FORCE_SHARE,
     progress: Callable[[str, float], None] | None = None,
@@ -107,7 +117,7 @@ def identify(
         clock: Not started yet.
         period: T in s of the loop.
         axes: Which; None: all that the device has.
-        duration: Seconds per axis.
+        duration: Seconds per axis; None: ``duration_at`` the period.
         travel: To each side, in m and rad.
         force_share: Share of the device's limits that may be used.
         progress: Called with the axis and the share of its run that is done.
@@ -128,6 +138,7 @@ def identify(
         # a turn is not faster than the rim of a 50 mm handle at the device's speed
         speed=(info.speed_limit, info.speed_limit / 0.025),
     )
+    duration = duration_at(period) if duration is None else duration
     device.start(period)
     clock.start(round(period * 1e9))
     runs, fits = {}, {}
@@ -154,6 +165,15 @@ def identify(
         period_spread=1e-9 * float(np.rint(1e9 * intervals).std()),
         period_most=float(np.quantile(intervals, 0.999)),
     )
+
+
+def duration_at(period: float) -> float:
+    """Returns how many seconds an axis takes unless somebody says otherwise: 12, more below 333 Hz.
+
+    Args:
+        period: T in s.
+    """
+    return DURATION * stretch(period)
 
 
 def _bound(progress: Callable[[str, float], None], axis: str) -> Callable[[float], None]:
@@ -206,29 +226,3 @@ def _resolution(info: DeviceInfo, runs: dict[str, AxisRun]) -> float | None:
         return None
     # joint encoders make no even steps in space; a driver then knows better
     return max(found) or info.resolution or 0.0
-
-
-def step_of(position: Array) -> float:
-    """Returns the step of a reported position, 0 where it has none.
-
-    All differences between positions that occur must be multiples of it. It is found as the
-    smallest difference, and made exact by all of them: Σ n d / Σ n² over the differences d = n Δ.
-
-    Args:
-        position: In m, NaN where there is none.
-    """
-    values = np.unique(position[np.isfinite(position)])
-    if len(values) < 3:
-        return 0.0
-    gaps = np.diff(values)
-    span = float(values[-1] - values[0])
-    gaps = gaps[gaps > span / MOST_STEPS]  # equal numbers, reached by different roundings
-    if not gaps.size:
-        return 0.0
-    step = float(gaps.min())
-    counts = np.rint(gaps / step)
-    if np.abs(gaps / step - counts).max() > 0.02 or len(gaps) < 3:
-        return 0.0
-    step = float(counts @ gaps / (counts @ counts))
-    total = round(span / step)
-    return span / total if math.isclose(span / total, step, rel_tol=1e-3) else 0.0

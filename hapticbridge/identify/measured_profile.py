@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from hapticbridge.device.profile import Profile, Quantity
-from hapticbridge.identify.fit import Estimate
-from hapticbridge.identify.identification import Identification
+from hapticbridge.identify.estimate import Estimate
+from hapticbridge.identify.identification import UNHELD, Identification
 
 _FIELDS = {
     "mass": ("mass", False),
@@ -36,7 +36,7 @@ def measured_profile(
             with it.
     """
     info = result.info
-    source = f"identified on {date}: {duration:g} s per axis ({', '.join(result.fits)}), unheld"
+    source = f"identified on {date}: {duration:g} s per axis ({', '.join(result.fits)}); {UNHELD}"
     quantities: dict[str, Quantity] = {}
     for name, (field, turns) in _FIELDS.items():
         found = result.of_all(field, turns=turns)
@@ -61,6 +61,7 @@ def measured_profile(
         axes=info.axes,
         about="",
         quantities=quantities,
+        models=(info.name,),
     )
 
 

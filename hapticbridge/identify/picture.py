@@ -6,9 +6,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from hapticbridge.identify.fit import AxisFit
+from hapticbridge.identify.axis_fit import AxisFit
 from hapticbridge.identify.identification import Identification
-from hapticbridge.identify.weak_form import windows
+from hapticbridge.identify.weak_form import noise_of, windows
 from hapticbridge.picture import new_figure
 
 _COLOURS = {"x": "#a51d2d", "y": "#1b7837", "z": "#1a5fb4"}
@@ -21,7 +21,7 @@ def draw_identification(result: Identification) -> Figure:
     """Draws, for each axis, the force that neither its mass nor a constant takes, over the speed.
 
     Each point is one window: F − M x'' − c against x'. A device that obeys the law lies on the
-    line b x' + f_c sign(x').
+    line b x' + b_2 x' |x'| + f_c sign(x'); b_2 is there where it was seen.
 
     Args:
         result: What ``identify`` returned.
@@ -39,8 +39,10 @@ def draw_identification(result: Identification) -> Figure:
         panel.set_ylabel("torque F − M x'' − c (N m)" if turns else "force F − M x'' − c (N)")
         panel.grid(alpha=0.3)
         panel.legend(fontsize="small", loc="upper left")
+    bends = any(fit.drag.is_seen for fit in result.fits.values())
+    law = f"b v + {'b_2 v |v| + ' if bends else ''}f_c sign(v)"
     figure.suptitle(
-        f"What resists {result.info.name}: points measured, lines b v + f_c sign(v)",
+        f"What resists {result.info.name}: points measured, lines {law}",
         fontsize="medium",
         parse_math=False,
     )
@@ -51,14 +53,15 @@ def _draw_axis(panel: Axes, result: Identification, axis: str, fit: AxisFit) -> 
     run, colour = result.runs[axis], _COLOURS[axis[-1]]
     turns = len(axis) == 2
     step = 0.0 if turns else result.resolution or 0.0
-    found = windows(run.position, run.force, run.period, fit.window, step, fit.delay.value)
+    noise = noise_of(run.position, step)
+    found = windows(run.position, run.force, run.period, fit.window, step, fit.delay.value, noise)
     area = found.columns[:, 3]
     speed = found.columns[:, 1] / area
     rest = found.right / area - fit.mass.value * found.columns[:, 0] / area - fit.offset.value
     panel.plot(speed, rest, ".", color=colour, ms=3, zorder=3)
     most = float(np.abs(speed).max())
     line = np.linspace(-most, most, 400)
-    force = fit.damping.value * line + fit.friction.value * np.sign(line)
+    force = fit.resistance(line)
     units = ("N m s/rad", "N m") if turns else ("N s/m", "N")
     panel.plot(
         line,

@@ -17,6 +17,7 @@ order in T, telescopes to nothing because x and x' are continuous: what is left 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -41,9 +42,22 @@ little: neighbours see the same errors. Fewer leave out what lies between."""
 _PARTS = 8
 """Into how many parts of a window must each bring motion, so that a stick within is noticed."""
 
+_SPANS = 12
+"""Into how many parts of a window, over which the speed is taken for the drag. More make it of the
+rounding of the position; fewer smooth it: by 0.6 % of the drag with twelve, where half a swing
+fills the window."""
+
+_MEDIAN = 0.6745  # of the size of a normal deviate, over its RMS
+
+_ROUNDING = 0.4
+"""Share of the resolution below which noise is that of rounding, which is 1/√12 = 0.29."""
+
+_SURE = 2.0
+"""Times the RMS of the difference of two means by which it must differ from zero."""
+
 LEAST_STEPS = 6
-"""Steps of resolution that a window must cross. Below, the rounding of the position is no longer
-small beside the motion."""
+"""Steps of resolution (of noise: √12 times its RMS, as if it were the rounding to such steps) that
+a window must cross. Below, the rounding of the position is no longer small beside the motion."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,19 +69,32 @@ class Windows:
         right: ∫φ F(t − d), in N s, shape (n,).
         begin: First sample of each window, shape (n,).
         position: ∫φ x, in m s, shape (n,): the column of a spring.
+        drag: ∫φ x' |x'|, in m²/s, shape (n,): the column of a drag that grows with speed squared.
         excess: ∫φ e(t − d), in N s, where e is what F exceeds half of its largest distance from its
             median by, shape (n,): the column of a motor that gives less than it is told.
+        noise_share: Of the squares of the columns of M and b, whichever is more, what the noise and
+            the rounding of the position make: by so much least squares make a number too small.
+        mass_noise: RMS of what they make of the column of M, in m/s.
     """
 
     columns: Array
     right: Array
     begin: NDArray[np.int64]
     position: Array
+    drag: Array
     excess: Array
+    noise_share: float
+    mass_noise: float
 
 
 def windows(
-    position: Array, force: Array, period: float, length: float, resolution: float, delay: float
+    position: Array,
+    force: Array,
+    period: float,
+    length: float,
+    resolution: float,
+    delay: float,
+    noise: float = 0.0,
 ) -> Windows:
     """Returns the averaged equations of motion of a run.
 
@@ -78,6 +105,7 @@ def windows(
         length: Of a window, in s; at least ``LEAST_SAMPLES`` periods.
         resolution: Step of the position in m, 0 where it is exact.
         delay: d in s, from a write until the force acts, 0 or more.
+        noise: RMS of the position's noise in m, beyond its rounding; 0: none.
     """
     count = max(round(length / period), LEAST_SAMPLES)
     length = count * period
@@ -104,33 +132,65 @@ def windows(
         np.lib.stride_tricks.sliding_window_view(values, count + held)[begin - held]
         for values in (force, excess)
     )
-    direction = _direction(x, resolution)
+    trembling = math.sqrt(noise**2 + resolution**2 / 12.0)
+    direction = _direction(x, trembling)
     moves = direction != 0.0
     x, f, e = x[moves], f[moves], e[moves]
     begin, direction = begin[moves], direction[moves]
     x = x - x[:, :1]  # ∫φ' and ∫φ'' vanish: only rounding depends on where the window lies
-    ones = np.full(len(begin), area)
+    of_mass, of_damping = trapezoid * second, -trapezoid * first
     columns = np.stack(
         [
-            x @ (trapezoid * second),
-            -(x @ (trapezoid * first)),
+            x @ of_mass,
+            x @ of_damping,
             direction * area,
-            ones,
+            np.full(len(begin), area),
             -(f @ slope),
         ],
         axis=1,
     )
     bump = _BUMP(nodes) * trapezoid
     absolute = position[begin] * area + x @ bump
-    return Windows(columns, f @ weight, begin, absolute, e @ weight)
+    # what noise and rounding make of the two columns, RMS
+    made = trembling * np.linalg.norm([of_mass, of_damping], axis=1)
+    squares = np.mean(columns[:, :2] ** 2, axis=0) if len(begin) else np.ones(2)
+    share = float(np.max(made**2 / np.maximum(squares, 1e-300)))
+    # speed over a span between samples, which lies in the span's middle
+    span = max(count // _SPANS, 1)
+    speed = (x[:, span:] - x[:, :-span]) / (span * period)
+    middle = (np.arange(count + 1 - span) + 0.5 * span) / count
+    drag = (speed * np.abs(speed)) @ (_BUMP(middle) * period)
+    return Windows(columns, f @ weight, begin, absolute, drag, e @ weight, share, float(made[0]))
 
 
-def _direction(x: Array, resolution: float) -> Array:
-    """Returns ±1 where a window keeps moving one way, 0 where it does not."""
-    steps = np.diff(x, axis=1)
-    edges = np.linspace(0, steps.shape[1], _PARTS + 1).astype(np.int64)[:-1]
-    travelled = np.add.reduceat(steps, edges, axis=1)
-    is_long = np.abs(x[:, -1] - x[:, 0]) >= LEAST_STEPS * resolution
-    up = (steps >= 0.0).all(axis=1) & (travelled > 0.0).all(axis=1)
-    down = (steps <= 0.0).all(axis=1) & (travelled < 0.0).all(axis=1)
+def noise_of(position: Array, resolution: float) -> float:
+    """Returns the RMS of a position's noise in m, 0 where it is no more than that of its rounding.
+
+    Sixth differences leave nothing of a smooth motion, and of white noise its RMS times √924. Their
+    median is taken, so that the few ticks in which friction turns round count for nothing.
+
+    Args:
+        position: x in m at the samples, shape (n,); NaN where there is none.
+        resolution: Step of the position in m, 0 where it is exact.
+    """
+    differences = np.diff(position, 6)
+    differences = differences[np.isfinite(differences)]
+    if not len(differences):
+        return 0.0
+    noise = float(np.median(np.abs(differences))) / (_MEDIAN * np.sqrt(924.0))
+    return noise if noise > _ROUNDING * resolution + 1e-9 else 0.0
+
+
+def _direction(x: Array, trembling: float) -> Array:
+    """Returns ±1 where a window keeps moving one way, 0 where it does not.
+
+    The mean of each of its parts must go that way, by more than noise and rounding would move it:
+    single steps may go back, as they do where joints with encoders make a position in space.
+    """
+    edges = np.linspace(0, x.shape[1], _PARTS + 1).astype(np.int64)
+    lengths = np.diff(edges)
+    steps = np.diff(np.add.reduceat(x, edges[:-1], axis=1) / lengths, axis=1)
+    margin = _SURE * trembling * np.sqrt(2.0 / lengths.min())
+    is_long = np.abs(x[:, -1] - x[:, 0]) >= LEAST_STEPS * np.sqrt(12.0) * trembling
+    up, down = (steps > margin).all(axis=1), (steps < -margin).all(axis=1)
     return np.where(is_long, up.astype(np.float64) - down.astype(np.float64), 0.0)

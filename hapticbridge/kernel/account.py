@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.jit import compiled
-from hapticbridge.kernel.guarding import DAMPER, TANK
+from hapticbridge.kernel.guarding import DAMPER, ENVIRONMENT, TANK
 from hapticbridge.pose import Vector, scaled
 
 CONTROLLER_ACTIVE = 32
@@ -140,6 +140,12 @@ def control(state: NDArray[np.void], force: Vector, torque: Vector) -> tuple[Vec
     damping only adds to it: there the second bound, that of energy-bounding control, lowers the
     stiffness that is felt until the damper bears it.
 
+    For the environment's port alone the debt is what it created beyond the slack that the coupling
+    leaves it, Σ E_k − Σ ½‖δx_k‖²_{K+B/T}, as the tick before left both: up to there a device that
+    bears its coupling stays passive whatever the environment does. Beyond, the damper acts as
+    above, until each axis has burnt or given back what it was given. A damper on the tool would sit
+    nearer to the cause, and makes contacts create more (as scaling the tool's velocity does).
+
     The tank scales the wrench so that the work it does over the next tick, at the speed of the last
     one, is no more than what the tank holds. By itself it acts whether there is a debt or not;
     behind the damper only then, for what α cannot pay because it is clipped, and not in such a
@@ -150,8 +156,10 @@ def control(state: NDArray[np.void], force: Vector, torque: Vector) -> tuple[Vec
     """
     s = state[0]
     s.injected_damping = 0.0
-    if s.controller == DAMPER:
+    if s.controller == DAMPER or (s.controller == ENVIRONMENT and s.has_law):
         debt = s.account - THRESHOLD
+        if s.controller == ENVIRONMENT:
+            debt = s.environment_energy - s.slack - THRESHOLD
         if debt > 0.0:
             b, b_r = s.most_damping, s.most_rotational_damping
             x, on_x = _held_back(state, 0, 0, force[0], b, debt)
@@ -164,7 +172,7 @@ def control(state: NDArray[np.void], force: Vector, torque: Vector) -> tuple[Vec
             if s.injected_damping > 0.0 or (x, y, z) != force or (rx, ry, rz) != torque:
                 s.flags |= CONTROLLER_ACTIVE
             force, torque = (x, y, z), (rx, ry, rz)
-            is_swinging = False
+            is_swinging = s.controller == ENVIRONMENT  # the tank counts the other debt
             for i in range(6):
                 is_swinging = is_swinging or _swings(state, i)
             if not is_swinging:

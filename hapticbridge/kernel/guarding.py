@@ -9,11 +9,15 @@ from typing import Any
 
 from hapticbridge.errors import HapticBridgeError
 
-OFF, DAMPER, TANK = 0, 1, 2
-"""Passivity controllers: none, damping against the motion, or a tank that scales the wrench."""
+OFF, DAMPER, TANK, ENVIRONMENT = 0, 1, 2, 3
+"""Passivity controllers: none; damping against the motion, for what both ports owe; a tank that
+scales the wrench; damping for what the environment's port owes alone."""
 
 MOST_BUTTONS = 32
 """Buttons that a mask may name; no handle has more."""
+
+LATER = frozenset({"reach"})
+"""What came after the first recordings with a guard, which do without."""
 
 _POSITIVE = ("force_rise", "torque_rise", "longest_stall")
 _TRIPS = ("speed", "turn_speed", "stretch", "angle", "energy")
@@ -31,7 +35,7 @@ class Guarding:
     """What the guard does within a tick; everything is off by default.
 
     Attributes:
-        controller: ``OFF``, ``DAMPER`` or ``TANK``.
+        controller: ``OFF``, ``DAMPER``, ``TANK`` or ``ENVIRONMENT``.
         credit: Damping in N s/m that the energy account takes the device to burn.
         rotational_credit: Likewise in N m s/rad.
         most_damping: Largest damping in N s/m that the controller adds on an axis.
@@ -50,6 +54,8 @@ class Guarding:
         stretch: Length of the coupling in m above which it is stopped.
         angle: Angle between handle and tool in rad, likewise.
         energy: Energy in J given to the device beyond what the hand put in, likewise.
+        reach: Distance in m of the device from the origin of its frame beyond which it moves
+            without the handle and without force.
 
     Raises:
         HapticBridgeError: A value is out of range.
@@ -74,15 +80,16 @@ class Guarding:
     stretch: float = math.inf
     angle: float = math.inf
     energy: float = math.inf
+    reach: float = math.inf
 
     def __post_init__(self) -> None:
-        if self.controller not in (OFF, DAMPER, TANK):
-            raise HapticBridgeError(f"controller is {self.controller!r}; it must be 0, 1 or 2")
+        if self.controller not in (OFF, DAMPER, TANK, ENVIRONMENT):
+            raise HapticBridgeError(f"controller is {self.controller!r}; it must be 0 to 3")
         for name in _NOT_NEGATIVE:
             value = getattr(self, name)
             if not _is_number(value) or not 0 <= value < math.inf:
                 raise HapticBridgeError(f"guard: {name} is {value!r}; it must be finite and >= 0")
-        for name in (*_POSITIVE, *_TRIPS):
+        for name in (*_POSITIVE, *_TRIPS, "reach"):
             value = getattr(self, name)
             if not _is_number(value) or not value > 0:
                 raise HapticBridgeError(f"guard: {name} is {value!r}; it must be > 0")
@@ -107,7 +114,8 @@ class Guarding:
             values = dict(json.loads(text))
         except (ValueError, TypeError, RecursionError):
             values = {}
-        if values.keys() != {field.name for field in fields(cls)}:
+        names = {field.name for field in fields(cls)}
+        if not names - LATER <= values.keys() <= names:
             raise HapticBridgeError(f"metadata 'guard' is {text!r:.80}; it does not name a guard")
         numbers: dict[str, Any] = {k: math.inf if v is None else v for k, v in values.items()}
         return cls(**numbers)

@@ -150,12 +150,16 @@ _GUARD_PARAMETERS = (
     "most_stretch",
     "most_angle",
     "most_energy",
+    "reach",
 )
 
 _GUARD_RUNNING_COUNTS = (
     "outside",
     "watch_flags",
+    "commanded",
     "is_released",
+    "is_seated_anew",
+    "tuning_ticks",
     "stale_run",
     "silent_ticks",
     "rise_ticks",
@@ -199,6 +203,7 @@ _RUNNING = (
     "coupling_work",
     "actuator_work",
     "external_work",
+    "tuning_work",
     "environment_energy",
     "lossless_debt",
     "device_energy",
@@ -232,7 +237,7 @@ STATE_DTYPE = np.dtype(
     + [(name, "<f8") for name in _RUNNING]
     + [(name, "<i8") for name in _GUARD_COUNTS + _GUARD_RUNNING_COUNTS]
     + [(name, "<f8") for name in _GUARD_PARAMETERS + _GUARD_RUNNING]
-    + [("reversals", "<i8", 6)]
+    + [("reversals", "<i8", 6), ("gains", "<f8", 6), ("tuning_goal", "<f8", 12)]
     + [(name, "<f8", 6) for name in ("axis_account", "device_velocity", "slewed")]
 )
 """Addresses, sizes, parameters, the previous tick's poses, and the energies so far. Poses are

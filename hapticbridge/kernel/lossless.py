@@ -38,6 +38,7 @@ from hapticbridge.kernel.balanced_velocity import (
 from hapticbridge.kernel.handle import quaternion_of, vector_of
 from hapticbridge.kernel.midpoint import twist_in_tool
 from hapticbridge.kernel.native import floats, ints, mj_factor_m, mj_passive
+from hapticbridge.kernel.tuning import set_gains
 from hapticbridge.pose import Vector, scaled, subtract
 
 HOLD_TICKS = 5
@@ -45,8 +46,6 @@ HOLD_TICKS = 5
 a wall 5 and 20 changed over equally often, in a peg's hole 17 and 10 times in 5 s; the largest jump
 of the wrench is that of the implicit form with both. More keeps the implicit form's damping longer
 after a contact: tapping on a wall errs by 33 µm at 5 ticks and by 48 µm at 20."""
-
-_GAINS = 10  # doubles that an actuator has for its gain, and for its bias (mjNGAIN, mjNBIAS)
 
 
 @compiled
@@ -75,21 +74,7 @@ def apply_carried(state: NDArray[np.void]) -> None:
 
 
 @compiled
-def _set_gains(state: NDArray[np.void], share: float) -> None:
-    """Gives the coupling's actuators a share of K and B'."""
-    s = state[0]
-    for axis in range(6):
-        stiffness, damping = s.stiffness, s.damping
-        if axis >= 3:
-            stiffness, damping = s.rotational_stiffness, s.rotational_damping
-        actuator = s.coupling_actuator_id + axis
-        floats(s.gainprm + 8 * _GAINS * actuator, 1)[0] = share * damping
-        bias = floats(s.biasprm + 8 * _GAINS * actuator, 3)
-        bias[1], bias[2] = -share * stiffness, -share * damping
-
-
-@compiled
-def _leave(state: NDArray[np.void]) -> None:
+def leave(state: NDArray[np.void]) -> None:
     """Goes over to the implicit form: u becomes v, nothing is carried over."""
     s = state[0]
     u, v = floats(s.qvel, s.nv), floats(s.velocity, s.nv)
@@ -97,7 +82,7 @@ def _leave(state: NDArray[np.void]) -> None:
     for i in range(s.nv):
         u[i] = v[i]
         own[i] = 0.0
-    _set_gains(state, 1.0)
+    set_gains(state, 1.0)
     s.is_midpoint = 0
 
 
@@ -124,7 +109,7 @@ def _enter(state: NDArray[np.void], force: Vector, torque: Vector) -> None:
             u[i] = v[i] - half[i]
     write_bias(state, s.qvel, s.bias_at_u)
     keep_carried(state)
-    _set_gains(state, 0.5)
+    set_gains(state, 0.5)
     s.is_midpoint = 1
 
 
@@ -151,7 +136,7 @@ def finish_lossless(state: NDArray[np.void]) -> None:
         balance(state, s.law_work)
     s.hold = HOLD_TICKS if s.is_near else max(s.hold - 1, 0)
     if s.was_midpoint and s.is_near:
-        _leave(state)
+        leave(state)
     elif not s.was_midpoint and s.hold == 0:
         _enter(state, force, torque)
     twist = twist_in_tool(state, quaternion_of(s.tool_quaternion))

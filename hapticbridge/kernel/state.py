@@ -13,12 +13,14 @@ from hapticbridge.kernel.direct import balance_contacts, tool_map
 from hapticbridge.kernel.guarding import Guarding
 from hapticbridge.kernel.handle import handle_pose
 from hapticbridge.kernel.layout import STATE_DTYPE
+from hapticbridge.kernel.lossless import leave
 from hapticbridge.kernel.meter import refresh_energies
 from hapticbridge.kernel.midpoint import start_twist
 from hapticbridge.kernel.parameters import RunParameters as RunParameters  # noqa: PLC0414
 from hapticbridge.kernel.parameters import rotation_numbers as rotation_numbers  # noqa: PLC0414
 from hapticbridge.kernel.scheme import DIRECT, LOSSLESS, WELD
 from hapticbridge.kernel.tree import has_passive_forces, tree_of_tool
+from hapticbridge.kernel.tuning import TUNED, set_gains, tuned_values
 from hapticbridge.tick import TICK_DTYPE
 
 HANDLE = "handle"
@@ -31,6 +33,9 @@ COUPLING_ACTUATORS = tuple(
     f"coupling_{kind}_{axis}" for kind in ("force", "torque") for axis in ("x", "y", "z")
 )
 """Names of the six actuators that couple the grip to the handle, in the order of a wrench."""
+
+Gains = tuple[tuple[float, float, float], tuple[float, float, float]]
+"""Factor of the control, stiffness and damping of the actuators that push, and that turn."""
 
 _TRIPS = ("speed", "turn_speed", "stretch", "angle", "energy")
 
@@ -65,6 +70,60 @@ class Binding:
         self.state["wrench_on_device"] = self.state["slewed"] = 0.0
         self.state["has_positions"] = 0  # whoever had the scene meanwhile may have changed it
 
+    def tune(self, parameters: RunParameters, gains: Gains, ticks: int) -> None:
+        """Lets the coupling become another one from the next tick on; see ``kernel.tuning``.
+
+        Args:
+            parameters: The run's, with the new coupling.
+            gains: Of its actuators (``rendering.Method.gains``).
+            ticks: How many ticks that takes, >= 1.
+        """
+        self.state["tuning_goal"] = (*tuned_values(parameters), *gains[0], *gains[1])
+        self.state["tuning_ticks"] = ticks
+
+    def command(self, bits: int) -> None:
+        """Sets which of ``watch.FORCE_OFF`` and ``watch.CLUTCHED`` hold from the next tick on."""
+        self.state["commanded"] = bits
+
+    def take_reset(self) -> None:
+        """Goes on after somebody put the scene's data back to a start, all at once.
+
+        The handle is seated at the tool and the device's pose belongs to it from the next tick on,
+        so the coupling is at rest. What the scene stores more or less than before is the work of
+        whoever put it there, and is booked at the port ``external``; what the device was given
+        before is not forgiven by it.
+        """
+        state, model, data = self.state, self._model, self._data
+        before = float(state["kinetic"][0] + state["potential"][0])
+        self._seat(model, data)
+        state["handle_position"] = state["tool_position"]
+        state["handle_quaternion"] = state["tool_quaternion"]
+        state["wrench_on_tool"] = 0.0  # what a held wrench would push with
+        state["has_positions"] = state["is_midpoint"] = state["is_near"] = state["hold"] = 0
+        refresh_energies(state)
+        after = float(state["kinetic"][0] + state["potential"][0])
+        state["external_work"] += after - before
+        start, ratio = float(state["start_energy"][0]), state["force_scale"] / state["scale"]
+        state["given"] += ratio * (min(before - start, 0.0) - min(after - start, 0.0))
+        state["is_seated_anew"] = 1
+        if state["scheme"][0] == LOSSLESS:
+            self._owned["qfrc_applied"][: model.nv] = data.qfrc_applied
+            self._owned["last_written"][: model.nv] = data.qfrc_applied
+            self._owned["carried_force"][:] = 0.0
+            set_gains(state, 1.0)
+            start_twist(state)
+
+    def let_go(self) -> None:
+        """Leaves the scene as one that nobody carries anything over in, its energy unchanged.
+
+        For a start from here: another binding then finds all there is in model and data.
+        """
+        state = self.state
+        if state["scheme"][0] == LOSSLESS:
+            if state["is_midpoint"][0]:
+                leave(state)
+            self._data.qfrc_applied[:] = self._owned["qfrc_applied"][: self._model.nv]
+
     def _fill_parameters(self, model: mujoco.MjModel, parameters: RunParameters) -> None:
         state = self.state
         first = model.actuator(COUPLING_ACTUATORS[0]).id
@@ -81,11 +140,10 @@ class Binding:
             state[name] = getattr(parameters, name)
         state["timestep"] = model.opt.timestep
         state["ramp_ticks"] = state["rise_ticks"] = parameters.ramp_ticks
-        coupling = parameters.coupling
-        for name in ("stiffness", "damping", "rotational_stiffness", "rotational_damping"):
-            state[name] = getattr(coupling, name)
+        for name, value in zip(TUNED, tuned_values(parameters), strict=True):
+            state[name] = value
+        state["gains"] = _gains_of(model, first, parameters)
         state["scheme"], state["laws"] = parameters.scheme, parameters.laws
-        state["slack_stiffness"], state["slack_rotational_stiffness"] = parameters.slack_gains()
         state["contact_stiffness"] = parameters.contact_stiffness
         state["device_damping"] = parameters.device_damping or 0.0
         state["device_rotational_damping"] = parameters.device_rotational_damping or 0.0
@@ -156,27 +214,30 @@ class Binding:
         self._owned |= owned
         state["qfrc_written"] = self._data.qfrc_applied.ctypes.data
         state["qfrc_passive"] = self._data.qfrc_passive.ctypes.data
-        state["gainprm"] = model.actuator_gainprm.ctypes.data
-        state["biasprm"] = model.actuator_biasprm.ctypes.data
         state["njnt"], state["grip_body_id"] = model.njnt, body
         state["is_never_free"] = tree.is_never_free
         state["has_passive"] = has_passive_forces(model)
 
-    def _start(self, model: mujoco.MjModel, data: mujoco.MjData, parameters: RunParameters) -> None:
+    def _seat(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
+        """Takes the tool's pose, and those of the scene's mocap bodies, as they are."""
         state = self.state
         mujoco.mj_kinematics(model, data)
         grip = int(state["grip_site_id"][0])
         orientation = data.site_xquat[grip]
         state["tool_position"] = data.site_xpos[grip]
         state["tool_quaternion"] = orientation if orientation[0] >= 0 else -orientation
+        mocap_previous = self._owned["mocap_previous"]
+        mocap_previous[: model.nmocap, :3] = data.mocap_pos
+        mocap_previous[: model.nmocap, 3:] = data.mocap_quat
+
+    def _start(self, model: mujoco.MjModel, data: mujoco.MjData, parameters: RunParameters) -> None:
+        state = self.state
+        self._seat(model, data)
         device = parameters.device_start
         x, y, z, qw, qx, qy, qz = device
         handle, handle_orientation = handle_pose(self.state, (x, y, z), (qw, qx, qy, qz))
         state["device_position"], state["device_quaternion"] = device[:3], device[3:]
         state["handle_position"], state["handle_quaternion"] = handle, handle_orientation
-        mocap_previous = self._owned["mocap_previous"]
-        mocap_previous[: model.nmocap, :3] = data.mocap_pos
-        mocap_previous[: model.nmocap, 3:] = data.mocap_quat
         for name in ("first_unstrict", "first_active", "first_kick"):
             state[name] = -1
         if parameters.scheme == DIRECT:
@@ -184,9 +245,24 @@ class Binding:
             balance_contacts(state)
         else:
             refresh_energies(state)
-        state["start_energy"] = state["kinetic"] + state["potential"]
+        state["start_energy"] = state["kinetic"] + state["potential"] + parameters.start_elastic
+        state["own_before"] = -parameters.start_elastic
         if parameters.scheme == LOSSLESS:
             start_twist(state)
+
+
+def _gains_of(model: mujoco.MjModel, first: int, parameters: RunParameters) -> tuple[float, ...]:
+    """Returns the whole gains of the coupling's actuators: of those that push, then that turn."""
+    if parameters.scheme == LOSSLESS:  # the model may have half of them
+        coupling = parameters.coupling
+        k, b = coupling.stiffness, coupling.damping
+        kr, br = coupling.rotational_stiffness, coupling.rotational_damping
+        return b, k, b, br, kr, br
+    gains: list[float] = []
+    for actuator in (first, first + 3):
+        bias = model.actuator_biasprm[actuator]
+        gains += [float(model.actuator_gainprm[actuator, 0]), -float(bias[1]), -float(bias[2])]
+    return tuple(gains)
 
 
 def _bind_addresses(
@@ -214,6 +290,8 @@ def _bind_addresses(
     for name in struct_fields.split():
         state[name] = native.field_address(data, name)
     state["warnings"] = native.field_address(data, "warning")
+    state["gainprm"] = model.actuator_gainprm.ctypes.data
+    state["biasprm"] = model.actuator_biasprm.ctypes.data
 
     # actgravcomp hands a joint's gravity compensation to its actuators; the rest is passive
     passive = np.ascontiguousarray(

@@ -32,7 +32,8 @@ from hapticbridge.kernel.lossless import apply_carried
 from hapticbridge.kernel.native import floats, mj_fwd_position, mj_step
 from hapticbridge.kernel.ports import note_moved_mocap_bodies
 from hapticbridge.kernel.scheme import DIRECT, HELD, LOSSLESS
-from hapticbridge.kernel.watch import follow, refused
+from hapticbridge.kernel.tuning import retune
+from hapticbridge.kernel.watch import DEVICE_BUTTONS, follow, refused
 from hapticbridge.pose import (
     canonical,
     conjugate,
@@ -136,7 +137,7 @@ def before_step(
         store_quaternion(s.device_quaternion, quaternion)
 
         handle, orientation = vector_of(s.handle_position), quaternion_of(s.handle_quaternion)
-        buttons = sample[0].buttons
+        buttons = (sample[0].buttons & DEVICE_BUTTONS) | s.commanded
         if follow(state, position, quaternion, moved, turned, buttons, elapsed):
             handle, orientation = handle_pose(state, position, quaternion)
         store_vector(s.handle_step, subtract(handle, vector_of(s.handle_position)))
@@ -147,9 +148,11 @@ def before_step(
         store_quaternion(s.handle_quaternion, orientation)
         if s.nmocap > 1:
             note_moved_mocap_bodies(state)
+        if s.tuning_ticks > 0:
+            retune(state)
 
         r.tick = s.tick
-        r.buttons = sample[0].buttons
+        r.buttons = buttons
         store_vector(r.device_position, position)
         store_quaternion(r.device_quaternion, quaternion)
         store_vector(r.handle_position, handle)

@@ -13,6 +13,13 @@ from hapticbridge.pose import Quaternion, Vector, norm, rotation_between, subtra
 CLUTCH, STALE_SAMPLE, RESEATED = 128, 256, 2048
 """Of ``TickFlag``: the compiler cannot read an enumeration."""
 
+DEVICE_BUTTONS = 2**32 - 1
+"""Bits of a record's ``buttons`` that the device's own buttons have; those above are commands."""
+
+FORCE_OFF, CLUTCHED = 1 << 40, 1 << 41
+"""Commands that hold as long as their bit is set: no force, though the handle follows the device;
+or a clutch, as if a button for it were held."""
+
 STILL = 1e-4
 """In m. A device that moved by more between its start and the first tick is re-seated; less is what
 a hand that holds still does, and leaves a coupling of 2400 N/m with 0.24 N."""
@@ -61,11 +68,13 @@ def follow(
 ) -> bool:
     """Decides whether the handle goes where the device went, and how much of the wrench is sent.
 
-    The handle stays where it is while a clutch button is held, or a dead-man button is not, and the
-    wrench fades; it also fades without news for ``stale_ticks``. When that is over, and after a
-    stall, the coupling is re-seated: the handle is put to the tool, so that nothing is stretched,
-    the device's pose now belongs to it, and the wrench rises within ``fade_ticks``. A coupling that
-    was stretched while no force was felt would give back what nobody had put in.
+    The handle stays where it is while a clutch is held (by a button or by command), a dead-man
+    button is not, or the device is beyond its reach (at the edge of its workspace, into whose stops
+    it must not be driven), and the wrench fades; it also fades without news for ``stale_ticks``,
+    and while the force is off by command. When that is over, and after a stall, the coupling is
+    re-seated: the handle is put to the tool, so that nothing is stretched, the device's pose now
+    belongs to it, and the wrench rises within ``fade_ticks``. A coupling that was stretched while
+    no force was felt would give back what nobody had put in.
 
     Args:
         state: The bound state.
@@ -86,9 +95,12 @@ def follow(
     s.stale_run = s.stale_run + 1 if is_stale else 0
     s.since_news = s.since_news + max(elapsed, s.period) if is_stale else 0.0
     was_released = s.is_released != 0
-    is_released = (buttons & s.clutch) != 0 or (s.dead_man != 0 and (buttons & s.dead_man) == 0)
+    is_released = (buttons & (s.clutch | CLUTCHED)) != 0
+    is_released = is_released or (s.dead_man != 0 and (buttons & s.dead_man) == 0)
+    is_released = is_released or norm(position) > s.reach
     s.is_released = is_released
-    is_silent = is_released or (s.stale_ticks > 0 and s.stale_run > s.stale_ticks)
+    is_silent = is_released or (buttons & FORCE_OFF) != 0
+    is_silent = is_silent or (s.stale_ticks > 0 and s.stale_run > s.stale_ticks)
     s.silent_ticks = s.silent_ticks + 1 if is_silent else 0
     if is_released:
         s.watch_flags = CLUTCH
@@ -96,7 +108,9 @@ def follow(
     is_first = s.tick == s.ramp_start
     has_stalled = elapsed > s.longest_stall and not is_first
     has_strayed = is_first and s.reseats and (norm(moved) > STILL or norm(turned) > STILL_TURN)
-    is_asked = (s.outside & RESEATED) != 0  # a recorded run is simulated again
+    # after a reset, or in a recorded run that is simulated again
+    is_asked = s.is_seated_anew != 0 or (s.outside & RESEATED) != 0
+    s.is_seated_anew = 0
     has_news = was_silent and not is_silent
     if was_released or has_news or has_stalled or has_strayed or is_asked:
         s.watch_flags |= RESEATED

@@ -1,10 +1,13 @@
 """What the loop asks of the system, and how late it wakes."""
 
 from hapticbridge.realtime.grants import Grant as Grant
+from hapticbridge.realtime.grants import current_priority as current_priority
+from hapticbridge.realtime.grants import loop_core as loop_core
 from hapticbridge.realtime.grants import memory_at_rest as memory_at_rest
 from hapticbridge.realtime.grants import real_time as real_time
 from hapticbridge.realtime.grants import wants_real_time as wants_real_time
 from hapticbridge.realtime.grants import warn_of_refusals as warn_of_refusals
+from hapticbridge.realtime.host import stolen_time as stolen_time
 from hapticbridge.realtime.lateness import Lateness as Lateness
 from hapticbridge.realtime.lateness import lateness_of as lateness_of
 from hapticbridge.realtime.pace import check_pace as check_pace

@@ -99,6 +99,11 @@ def real_time(core: int | None = None) -> Iterator[tuple[Grant, ...]]:
         yield _timer(restore), _core(restore, core), _scheduling(restore)
 
 
+def current_priority() -> int:
+    """Returns the calling thread's priority under SCHED_FIFO, 1 to 99; 0 where it has none."""
+    return os.sched_getparam(0).sched_priority if hasattr(os, "sched_getparam") else 0
+
+
 def warn_of_refusals(grants: tuple[Grant, ...]) -> None:
     """Warns once of each request that was refused, with the command that grants it."""
     for grant in grants:
@@ -129,7 +134,10 @@ def _scheduling(restore: ExitStack) -> Grant:
             reason = error.strerror
         else:
             restore.callback(os.sched_setscheduler, 0, policy, parameter)
-            return Grant(name, True, f"SCHED_FIFO at priority {priority}")
+            less = f", not {PRIORITY}: the limit 'ulimit -r' allows no more"
+            return Grant(
+                name, True, f"SCHED_FIFO at priority {priority}{less * (priority < PRIORITY)}"
+            )
     return Grant(
         name,
         False,
@@ -145,14 +153,19 @@ def _memory(restore: ExitStack) -> Grant:
         return Grant(name, False, f"memory is not locked on {sys.platform}; only Linux does it")
     library = ctypes.CDLL(None, use_errno=True)
     limit = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0]
-    is_unlimited = limit == resource.RLIM_INFINITY
-    # under a limit, locking what comes would make the allocation beyond it fail in mid-run
+    # under a limit, locking what comes would make the allocation beyond it fail in mid-run; what is
+    # larger already can only be locked by a process that no limit binds (CAP_IPC_LOCK)
+    is_bound = limit != resource.RLIM_INFINITY and _mapped() <= limit
     whole = _LOCK_PRESENT | _LOCK_FUTURE
-    for flags in (whole, _LOCK_PRESENT) if is_unlimited else (_LOCK_PRESENT,):
+    for flags in (_LOCK_PRESENT,) if is_bound else (whole, _LOCK_PRESENT):
         if library.mlockall(flags) == 0:
             restore.callback(library.munlockall)
-            share = "all memory is" if flags == whole else "the memory in use is"
-            return Grant(name, True, f"{share} locked")
+            shown = "all memory is locked"
+            if flags != whole:
+                shown = "the memory in use is locked, not what is added later"
+            if is_bound:
+                shown += f": the limit 'ulimit -l' of {shown_limit(limit, 1024)} kB could fail it"
+            return Grant(name, True, shown)
     reason = os.strerror(ctypes.get_errno())
     return Grant(
         name,
@@ -161,6 +174,12 @@ def _memory(restore: ExitStack) -> Grant:
         f"{shown_limit(limit, 1024)} kB): a page that the system took away makes a tick late",
         way_to_grant(),
     )
+
+
+def _mapped() -> int:
+    """Returns the size in bytes of what the process has mapped, which is what would be locked."""
+    pages = Path("/proc/self/statm").read_text(encoding="utf-8").split()[0]
+    return int(pages) * resource.getpagesize()
 
 
 def _timer(restore: ExitStack) -> Grant:
@@ -182,9 +201,8 @@ def _core(restore: ExitStack, core: int | None) -> Grant:
     name = "core"
     if not hasattr(os, "sched_setaffinity"):
         return Grant(name, False, f"{sys.platform} pins no thread to a core; only Linux does")
-    allowed = os.sched_getaffinity(0)
-    isolated = _isolated_cores()
-    chosen = core if core is not None else min(isolated, default=max(allowed))
+    allowed, isolated = os.sched_getaffinity(0), _isolated_cores()
+    chosen = loop_core() if core is None else core
     try:
         os.sched_setaffinity(0, {chosen})
     except (OSError, ValueError, OverflowError) as error:
@@ -192,6 +210,11 @@ def _core(restore: ExitStack, core: int | None) -> Grant:
     restore.callback(os.sched_setaffinity, 0, allowed)
     kind = "isolated core" if chosen in isolated else "core"
     return Grant(name, True, f"pinned to {kind} {chosen} of {len(allowed | isolated)}")
+
+
+def loop_core() -> int:
+    """Returns the core on which a loop is put unless it is told another; only on Linux."""
+    return min(_isolated_cores(), default=max(os.sched_getaffinity(0)))
 
 
 def _isolated_cores() -> set[int]:

@@ -17,8 +17,8 @@ STEPS, LONGEST = 50, 0.1
 median that one interruption does not move, and no wait that anybody notices."""
 
 BESIDE_THE_STEP = 5e-6
-"""Time in s of a tick beside MuJoCo's step: device, wrench, ledger and record take 2.3 to 3.3 µs on
-a 3 GHz core. Less promises a rate that cannot be held."""
+"""Time in s of a tick beside MuJoCo's step: device, wrench, ledger, guard and record take 3 to
+4 µs on a 3 GHz core. Less promises a rate that cannot be held."""
 
 SPARE = 0.8
 """Share of the period that a tick may fill, no unit. Contacts cost more than the start does, and a
@@ -45,10 +45,11 @@ def check_pace(
     needed = substeps * step_time(scene, method)
     if needed <= period:
         return
+    held = float(f"{rate_for(needed):.2g}")  # two digits, and no exponent
     message = (
         f"scene '{scene.name}' needs {needed * 1e3:.3g} ms of MuJoCo a tick at its start, the "
-        f"period is {period * 1e3:.3g} ms; it could hold about {rate_for(needed):.2g} Hz: lower "
-        "the rate, or see with 'hapticbridge check' what costs the time"
+        f"period is {period * 1e3:.3g} ms; it could hold about {held:g} Hz: lower the "
+        "rate, or see with 'hapticbridge check' what costs the time"
     )
     if is_real:
         raise SceneError(message)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import sys
+from pathlib import Path
 
 PRIORITY = 80
 """Priority under SCHED_FIFO, 1 to 99. The kernel's own interrupt threads run at 50, and the clock's
@@ -18,8 +20,8 @@ LASTING = (
 )
 """For a group of users, for good; ``ulimit -r`` and ``ulimit -l`` then show the new limits."""
 
-CAPABILITIES = "sudo setcap cap_sys_nice,cap_ipc_lock+ep $(readlink -f $(which python3))"
-"""For whoever starts this interpreter: nothing but this program should use it."""
+CAPABILITIES = f"sudo setcap cap_sys_nice,cap_ipc_lock+ep {Path(sys.executable).resolve()}"
+"""For whoever starts this interpreter, behind whatever link; who may is then anybody."""
 
 CONTAINER = f"docker run --cap-add=SYS_NICE --cap-add=IPC_LOCK --ulimit rtprio={PRIORITY} …"
 """For a container, whose administrator has no more rights than it was given."""

@@ -54,6 +54,9 @@ class Recorder:
         live: Whether the process shows the state of the run on standard error.
         epoch_ns: Unix time of the run's start, in ns; now if it is not given.
 
+    Attributes:
+        is_disk_full: Whether the disk is; the file then takes no more than a run that ends.
+
     Raises:
         RecordingError: The ring is not shared, metadata or attachments cannot be written, or the
             process cannot be started.
@@ -85,6 +88,7 @@ class Recorder:
         self._outbox = bytearray()
         self._is_configured = False
         self._is_closed = False
+        self.is_disk_full = False
         self._has_failed = False
         self._process = _start()
         self._input = cast(IO[bytes], self._process.stdin)
@@ -199,7 +203,11 @@ class Recorder:
     def _listen(self) -> None:
         with cast(IO[bytes], self._process.stdout) as answers:
             for line in answers:
-                self._answers.put(json.loads(line))
+                answer = json.loads(line)
+                if "full" in answer:
+                    self.is_disk_full = True
+                else:
+                    self._answers.put(answer)
         self._answers.put({"exited": True})
 
 

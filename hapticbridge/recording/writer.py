@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import errno
-import os
-import stat
-import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import BinaryIO, cast
@@ -16,56 +13,11 @@ from numpy.typing import NDArray
 
 from hapticbridge.errors import RecordingError
 from hapticbridge.recording import format as layout
+from hapticbridge.recording.chunk_index import ChunkIndexFile
 from hapticbridge.recording.format import Attachment
-
-if sys.platform != "win32":
-    import fcntl
+from hapticbridge.recording.output import Output
 
 __all__ = ["Attachment", "RecordingWriter"]
-
-
-class _Output:
-    """A file that hands each write to the operating system whole and at once.
-
-    The MCAP library writes a finished chunk in one call; a buffer in between would keep its end
-    until the next one, and a kill would lose it.
-    """
-
-    def __init__(self, path: Path, mode: str) -> None:
-        # not truncated before it is locked: another bridge may be recording to the same file
-        flags = os.O_WRONLY | os.O_CREAT | getattr(os, "O_BINARY", 0)
-        flags |= os.O_EXCL if "x" in mode else 0
-        self._file = os.fdopen(os.open(path, flags, 0o666), "wb", buffering=0)
-        try:
-            if sys.platform != "win32":
-                fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            if stat.S_ISREG(os.fstat(self._file.fileno()).st_mode):
-                self._file.truncate(0)
-        except BlockingIOError as error:
-            self._file.close()
-            raise OSError(errno.EBUSY, "another bridge is recording to it") from error
-        self._position = 0
-
-    def write(self, data: bytes) -> int:
-        view = memoryview(data)
-        while view:
-            written = self._file.write(view)
-            view = view[written:]
-        self._position += len(data)
-        return len(data)
-
-    def tell(self) -> int:
-        return self._position
-
-    def flush(self) -> None:
-        """Nothing is held back."""
-
-    def sync(self) -> None:
-        if stat.S_ISREG(os.fstat(self._file.fileno()).st_mode):
-            os.fsync(self._file.fileno())
-
-    def close(self) -> None:
-        self._file.close()
 
 
 class RecordingWriter:
@@ -102,8 +54,13 @@ class RecordingWriter:
         self._sequence = 0
         self._is_closed = False
         try:
-            self._output = _Output(self.path, "xb" if exclusive else "wb")
+            self._output = Output(self.path, is_new=exclusive)
         except OSError as error:
+            raise self._refusal(error) from error
+        try:
+            self._index = ChunkIndexFile(self.path.parent)
+        except OSError as error:
+            self._output.close()
             raise self._refusal(error) from error
         try:
             self._start(meta, attachments)
@@ -118,6 +75,7 @@ class RecordingWriter:
             enable_crcs=True,
             enable_data_crcs=True,
         )
+        self._index.take_over(self._mcap)
         self._mcap.start(library="hapticbridge")
         self._mcap.add_metadata(layout.METADATA_NAME, dict(meta))
         for item in attachments:
@@ -136,6 +94,11 @@ class RecordingWriter:
         self._events = self._mcap.register_channel(
             layout.EVENT_TOPIC, layout.EVENT_ENCODING, event_schema
         )
+
+    @property
+    def is_full(self) -> bool:
+        """Whether the disk is: what is still written goes into room that was claimed before."""
+        return self._output.is_full
 
     def write_ticks(self, rows: NDArray[np.void]) -> None:
         """Appends records.
@@ -202,13 +165,17 @@ class RecordingWriter:
         except OSError as error:
             raise self._refusal(error) from error
         finally:
-            self._output.close()
+            self._release()
 
     def _failed(self, error: OSError) -> RecordingError:
         # nothing may follow a half-written chunk: the file is then one that was cut there
         self._is_closed = True
-        self._output.close()
+        self._release()
         return self._refusal(error)
+
+    def _release(self) -> None:
+        self._output.close()
+        self._index.close()
 
     def _refusal(self, error: OSError) -> RecordingError:
         reason = error.strerror or str(error)

@@ -10,7 +10,9 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticbridge.audit import AuditReport
 from hapticbridge.audit.balance import Balance
+from hapticbridge.audit.interventions import Interventions
 from hapticbridge.audit.reached import Reached
 from hapticbridge.device import DeviceInfo
 from hapticbridge.device.lateness import delay_ticks
@@ -59,6 +61,18 @@ class Evidence:
         """How long after its deadline each tick began, (n,) in s."""
         return np.asarray(1e-9 * (self.ticks["wake_ns"] - self.ticks["deadline_ns"]))
 
+    def judged(self, report: AuditReport) -> tuple[Array, Array]:
+        """Returns what the port at fault has given, and what it may have given, (n,) in J each.
+
+        Args:
+            report: The audit's verdict on the run, ``active``.
+        """
+        if report.port == "device":
+            return self.kicked, np.zeros_like(self.kicked)
+        # asked for strictly, the slack does not count
+        is_slack_used_up = report.environment == "active"
+        return self.created, self.allowed if is_slack_used_up else np.zeros_like(self.allowed)
+
     @classmethod
     def of(cls, recording: Recording) -> Evidence | None:
         """Returns what can be drawn of a recording; None for a damaged one, or one without ticks.
@@ -106,20 +120,14 @@ def _balances(
 ) -> Iterator[Balance]:
     """Yields the balance block by block: of a long run one takes many times the records' room."""
     starts = {name: np.array(meta_start(recording.meta, name)) for name in STARTS}
-    resumed = [
-        float(event["tick"])
-        for event in recording.events
-        if event.get("event") == "resume" and isinstance(event.get("tick"), int)
-    ]
+    outside = Interventions.of(recording.events, parameters, starts["tool_start"])
     ticks, late = recording.ticks, delay_ticks(info, parameters.period) or 0
     energy = float(starts["start_kinetic"][0] + starts["start_potential"][0])
     reached = Reached.at_start(parameters, starts["handle_start"], starts["tool_start"], energy)
     for begin in range(0, len(ticks), BLOCK):
         end = begin + BLOCK
         following = ticks[end : end + late]
-        balance = Balance.of(
-            ticks[begin:end], parameters, reached, np.array(resumed), late, following
-        )
+        balance = Balance.of(ticks[begin:end], parameters, reached, outside, late, following)
         reached = balance.reached
         yield balance
 

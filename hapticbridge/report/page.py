@@ -3,64 +3,36 @@
 from __future__ import annotations
 
 import base64
-import json
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jinja2 import Environment, PackageLoader, select_autoescape
 
 from hapticbridge.audit import AuditReport
-from hapticbridge.device import DATA_SHEET_UNITS
 from hapticbridge.errors import RecordingError
 from hapticbridge.picture import inline_svg
 from hapticbridge.provenance import meta_float
+from hapticbridge.quantity import quantity
 from hapticbridge.recording import Recording
 from hapticbridge.report.cause import likely_cause
 from hapticbridge.report.curves import draw_recording
+from hapticbridge.report.energies import draw_energies
 from hapticbridge.report.evidence import Evidence
-from hapticbridge.report.panels import (
-    ACTIVITIES,
-    draw_energies,
-    draw_moment,
-    draw_motion,
-    draw_timing,
+from hapticbridge.report.facts import (
+    MOST_EVENTS,
+    device_facts,
+    event_rows,
+    guard_facts,
+    head_facts,
+    percent,
+    run_facts,
+    software_facts,
 )
-
-MOST_EVENTS = 200
-"""Events that a page lists; a run with scripted inputs has one per tick."""
-
-FACTS = {
-    "scene": "",
-    "scene_parameters": "",
-    "method": "",
-    "started": "",
-    "clock": "",
-    "period_s": "s",
-    "substeps": "",
-    "stiffness": "N/m",
-    "damping": "N s/m",
-    "rotational_stiffness": "N m/rad",
-    "rotational_damping": "N m s/rad",
-    "scale": "",
-    "force_scale": "",
-    "force_limit": "N",
-    "torque_limit": "N m",
-    "ramp_ticks": "",
-    "scene_sha256": "",
-}
-"""Metadata that a page shows, with their units; the gains are those of the law, B' and not B."""
-
-DEVICE_FACTS = {"name": "", "axes": ""} | DATA_SHEET_UNITS
-"""What a page shows of the device's data sheet, with units."""
-
-
-def _mapping(text: str) -> dict[str, object]:
-    """Returns a JSON object of the metadata; an empty one where it is damaged."""
-    try:
-        return dict(json.loads(text))
-    except (ValueError, TypeError, RecursionError):
-        return {}
+from hapticbridge.report.moment import draw_moment
+from hapticbridge.report.motion import draw_motion
+from hapticbridge.report.timing import activities, draw_timing
 
 
 def telling_time(recording: Recording, report: AuditReport) -> float:
@@ -96,19 +68,21 @@ def write_report(
     environment = Environment(
         loader=PackageLoader("hapticbridge", "templates"), autoescape=select_autoescape()
     )
-    evidence = Evidence.of(recording)
+    environment.filters["quantity"] = quantity
+    evidence, meta = Evidence.of(recording), recording.meta
     page = environment.get_template("report.html").render(
         report=asdict(report),
-        meta=recording.meta,
-        facts=FACTS,
-        device=_mapping(recording.meta.get("device", "")),
-        device_facts=DEVICE_FACTS,
-        versions=_mapping(recording.meta.get("versions", "")),
-        host=_mapping(recording.meta.get("host", "")),
-        events=recording.events[:MOST_EVENTS],
+        name=report.path.name,
+        details={
+            "Run": run_facts(meta),
+            "Device": device_facts(meta),
+            "Guard": [] if evidence is None else guard_facts(evidence),
+            "Software": software_facts(meta),
+        },
+        events=event_rows(recording.events),
         more_events=max(len(recording.events) - MOST_EVENTS, 0),
         scene=scene and base64.b64encode(scene).decode(),
-        run=None if evidence is None else _drawn(evidence, report),
+        run=None if evidence is None else _drawn(evidence, report, recording),
         curves="" if evidence is not None else _bare_curves(recording),
     )
     try:
@@ -125,23 +99,33 @@ def _bare_curves(recording: Recording) -> str:
         return ""
 
 
-def _drawn(evidence: Evidence, report: AuditReport) -> dict[str, object]:
+def _drawn(evidence: Evidence, report: AuditReport, recording: Recording) -> dict[str, object]:
     """Returns what the page tells of a run whose numbers can be drawn."""
-    cause = likely_cause(evidence, report)
-    lateness, flags = evidence.lateness, evidence.ticks["flags"]
+    lateness, period = evidence.lateness, evidence.parameters.period
+    is_timed = bool(lateness.any())
     return {
+        "head": head_facts(report, recording.meta, evidence),
         "motion": inline_svg(draw_motion(evidence)),
         "energies": inline_svg(draw_energies(evidence)),
         "timing": inline_svg(draw_timing(evidence)),
-        "moment": cause and inline_svg(draw_moment(evidence, report)),
-        "time": report.tick and report.tick * evidence.parameters.period,
+        "moment": _moment(evidence, report, period),
+        "lateness": [float(np.percentile(lateness, p)) for p in (50, 99, 100)] if is_timed else [],
+        "shares": [(name, percent(on)) for name, on in activities(evidence) if on.any()],
+    }
+
+
+def _moment(evidence: Evidence, report: AuditReport, period: float) -> dict[str, Any] | None:
+    """Returns when a port became active, by how much then and at most, and why."""
+    cause = likely_cause(evidence, report)
+    if cause is None or report.tick is None:
+        return None
+    energy, allowed = evidence.judged(report)
+    excess = energy - allowed
+    worst = int(np.argmax(excess))
+    return {
+        "drawn": inline_svg(draw_moment(evidence, report)),
+        "time": report.tick * period,
         "cause": cause,
-        "rate": 1 / evidence.parameters.period,
-        "lateness": [float(1e6 * np.percentile(lateness, p)) for p in (50, 99, 100)],
-        "shares": [(name, float(np.mean((flags & int(flag)) != 0))) for flag, name in ACTIVITIES],
-        "injected": float(evidence.ticks["injected_damping"].max()),
-        "peaks": [
-            float(np.linalg.norm(evidence.ticks["wrench_on_device"][:, part], axis=1).max())
-            for part in (slice(0, 3), slice(3, 6))
-        ],
+        "worst": float(excess[worst]),
+        "worst_tick": int(evidence.ticks["tick"][worst]),
     }

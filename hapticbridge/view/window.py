@@ -1,4 +1,4 @@
-"""The view as the bridge sees it: a process that is told what happens, and never asked."""
+"""The view as the bridge sees it: a process that is told what happens, and may ask for little."""
 
 from __future__ import annotations
 
@@ -8,17 +8,24 @@ import json
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from queue import SimpleQueue
 from typing import IO, cast
 
-from hapticbridge.errors import HapticBridgeError
+from hapticbridge.commands import Command, command_of
+from hapticbridge.commands.command import LONGEST_LINE
+from hapticbridge.commands.queue import INTERVAL
+from hapticbridge.errors import CommandError, HapticBridgeError
 from hapticbridge.recording import Attachment
 from hapticbridge.view.address import Address
 
-STOP = b'{"command": "stop"}\n'
-"""What the process says when the run is to stop."""
+BY = "view"
+"""Who gave a command of the page, as the recording says."""
+
+PATIENCE = 2.0
+"""In s: how long the process may take to end; the run is over by then, and no force is left."""
 
 _BOOTSTRAP = """
 import sys
@@ -49,8 +56,9 @@ class Window:
 
     Attributes:
         address: Likewise.
-        on_stop: Called once, from a thread, when somebody presses the page's button: the one
-            command that a page has. Whatever else its process may say is not listened to.
+        on_command: Called from a thread with what somebody asks for on the page; raises a
+            ``CommandError`` where it is refused, and the page then says why. Whatever else its
+            process may say is no command.
         url: What to open in a browser, once it is shown.
 
     Raises:
@@ -63,7 +71,7 @@ class Window:
         self._outbox: SimpleQueue[bytes | None] = SimpleQueue()
         self._process: subprocess.Popen[bytes] | None = None
         self.url = ""
-        self.on_stop: Callable[[], None] | None = None
+        self.on_command: Callable[[Command], None] | None = None
 
     def start(
         self, ring: str, metadata: Mapping[str, str], attachments: Sequence[Attachment]
@@ -111,7 +119,11 @@ class Window:
         self._outbox.put(None)
         if self._process is not None:
             self._process.terminate()
-            self._process.wait()
+            try:
+                self._process.wait(PATIENCE)
+            except subprocess.TimeoutExpired:  # it hangs, or was stopped: that it cannot refuse
+                self._process.kill()
+                self._process.wait()
             for stream in (self._process.stdin, self._process.stdout):
                 with contextlib.suppress(OSError):
                     cast(IO[bytes], stream).close()
@@ -123,10 +135,19 @@ class Window:
 
     def _listen(self) -> None:
         process = self._process
+        stream = cast(IO[bytes], process and process.stdout)
         with contextlib.suppress(OSError, ValueError):
-            said = cast(IO[bytes], process and process.stdout).readline(len(STOP))
-            if said == STOP and self.on_stop is not None:
-                self.on_stop()
+            while line := stream.readline(LONGEST_LINE + 1):
+                if not line.endswith(b"\n"):
+                    return  # longer than any command: this is not our page's process any more
+                try:
+                    command = command_of(line)
+                    if self.on_command is not None:
+                        self.on_command(command)
+                except CommandError as error:
+                    self.event({"event": "refused", "reason": str(error)})
+                # the loop shares the interpreter's lock with this thread: a flood must not take it
+                time.sleep(INTERVAL)
 
     def _send(self) -> None:
         process = self._process

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, fields, replace
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import RecordingError, choices
+from hapticbridge.guard import CONTROLLERS
 from hapticbridge.rendering import METHODS, Method, method_named
 
 UNITS = {
@@ -21,6 +22,7 @@ UNITS = {
     "scale": "",
     "force_scale": "",
     "contact_stiffness": "N/m",
+    "controller": "",
 }
 """What may be changed beside the scene's own parameters, with units."""
 
@@ -42,6 +44,7 @@ class Settings:
         force_scale: Force on the device per force on the tool.
         contact_stiffness: K_c in N/m of method ``direct``; None takes the coupling's.
         scene: Values of the scene's parameters, by name.
+        controller: Passivity controller by name; None: what the bridge chooses for the device.
     """
 
     coupling: Coupling
@@ -52,6 +55,7 @@ class Settings:
     force_scale: float
     contact_stiffness: float | None
     scene: Mapping[str, float]
+    controller: str | None = None
 
     def value(self, name: str) -> Value | None:
         """Returns what a name of ``UNITS`` or of the scene stands for."""
@@ -59,6 +63,8 @@ class Settings:
             return float(getattr(self.coupling, name))
         if name == "method":
             return self.method.name
+        if name == "controller":
+            return self.controller or "as the device needs"
         if name in UNITS:
             value: Value | None = getattr(self, name)
             return value
@@ -86,6 +92,7 @@ class Settings:
         scale = float(given.get("scale", self.scale))
         is_equal = self.scale == self.force_scale
         contact = given.get("contact_stiffness", self.contact_stiffness)
+        controller = given.get("controller", self.controller)
         if method.has_coupling and "contact_stiffness" not in given:
             contact = None
         return Settings(
@@ -97,6 +104,7 @@ class Settings:
             force_scale=float(given.get("force_scale", scale if is_equal else self.force_scale)),
             contact_stiffness=None if contact is None else float(contact),
             scene={name: float(given.get(name, was)) for name, was in self.scene.items()},
+            controller=None if controller is None else str(controller),
         )
 
 
@@ -122,9 +130,12 @@ def changes_from(words: Iterable[str]) -> dict[str, Value]:
 
 def _checked(name: str, value: Value) -> Value:
     """Returns a value of the kind that its name asks for; the range is the run's to check."""
-    if name == "method":
-        if value not in METHODS:
-            raise RecordingError(f"method is {value!r:.60}; choose one of {choices(METHODS)}")
+    named: dict[str, Collection[object]] = {"method": METHODS, "controller": CONTROLLERS}
+    if name in named:
+        if value not in named[name]:
+            raise RecordingError(
+                f"{name} is {value!r:.60}; choose one of {choices(map(str, named[name]))}"
+            )
         return value
     try:
         number = float(value)

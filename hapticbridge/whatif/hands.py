@@ -38,6 +38,23 @@ def missing_for_closed_loop(info: DeviceInfo) -> str:
     return ""
 
 
+class _Buttons:
+    """The recorded buttons at the times of a loop, which may have another rate."""
+
+    def __init__(self, ticks: NDArray[np.void], period: float) -> None:
+        self._pressed, self._recorded = ticks["buttons"].copy(), period
+        self._tick, self._share = 0, 1.0
+
+    def start(self, period: float) -> None:
+        self._tick, self._share = 0, period / self._recorded
+
+    def read(self, sample: NDArray[np.void]) -> None:
+        """Puts those of this tick into a sample; after the last they stay as they are."""
+        row = int(self._tick * self._share + 1e-9)  # a period in decimals is rounded
+        sample["buttons"] = self._pressed[min(row, len(self._pressed) - 1)]
+        self._tick += 1
+
+
 class RecordedMotion(ReplayDevice):
     """The recorded samples, one a tick, from where the device was before the first one."""
 
@@ -73,10 +90,18 @@ class ResampledMotion(TrajectoryDevice):
             speed_limit=info.speed_limit,
         )
         self._before = start
+        self._buttons = _Buttons(ticks, period)
 
     def start(self, period: float) -> NDArray[np.void]:
         """See ``Device.start``."""
+        self._buttons.start(period)
         return _placed(super().start(period), self._before)
+
+    def read(self, sample: NDArray[np.void]) -> int:
+        """See ``TrajectoryDevice.read``."""
+        flags = super().read(sample)
+        self._buttons.read(sample)
+        return flags
 
 
 class IdentifiedDevice(SimulatedDevice):
@@ -115,12 +140,14 @@ class IdentifiedDevice(SimulatedDevice):
         self._motion = intended(info, hand, ticks, period, start)
         self._start = np.array(start)
         self._origin = Rotation.from_quat(self._start[3:], scalar_first=True)
+        self._buttons = _Buttons(ticks, period)
         self._felt = np.array([axis in info.axes for axis in AXES], dtype=np.float64)
         self.info = replace(info, is_real=False, duration=float(self._motion[-1, 0]))
 
     def start(self, period: float, parts: int = 1) -> NDArray[np.void]:
         """See ``SimulatedDevice.start``; the hand may pull from the start on."""
         sample = super().start(period, parts)
+        self._buttons.start(period)
         state = self._states[0]
         state["target_position"] = self._motion[0, 1:4]
         state["target_quaternion"] = self._motion[0, 4:]
@@ -129,6 +156,7 @@ class IdentifiedDevice(SimulatedDevice):
     def read(self, sample: NDArray[np.void]) -> int:
         """See ``SimulatedDevice.read``."""
         flags = super().read(sample)
+        self._buttons.read(sample)
         self._there(sample)
         return flags
 

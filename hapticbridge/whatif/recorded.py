@@ -8,14 +8,16 @@ import warnings
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
+from hapticbridge.certificate import needed_on_axes
 from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import HapticBridgeError, RecordingError
-from hapticbridge.guard import Limits
+from hapticbridge.guard import CONTROLLERS, Limits, guarding_for
 from hapticbridge.kernel.state import RunParameters
 from hapticbridge.provenance import SOURCE_PREFIX, compiled_model, parameters_of
 from hapticbridge.recording import Recording
-from hapticbridge.rendering import method_named, prepare
+from hapticbridge.rendering import Method, method_named, prepare
 from hapticbridge.scene import Scene, load_scene, scene_parameters
+from hapticbridge.tick import TickFlag
 from hapticbridge.whatif.changes import Settings
 
 _NOWHERE = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
@@ -68,6 +70,7 @@ class RecordedRun:
             force_scale=parameters.force_scale,
             contact_stiffness=parameters.contact_stiffness or None,
             scene={str(name): float(value) for name, value in values.items()},
+            controller=_controller(info, parameters, method),
         )
         return cls(recording, parameters, info, settings, _write_scene(recording, folder))
 
@@ -78,9 +81,39 @@ class RecordedRun:
 
     @property
     def limits(self) -> Limits:
-        """Of the run, its ramp in s."""
-        p = self.parameters
-        return Limits(force=p.force_limit, torque=p.torque_limit, ramp=p.ramp_ticks * p.period)
+        """Of the run, times in s."""
+        p, guarding = self.parameters, self.parameters.guarding
+        return Limits(
+            force=p.force_limit,
+            torque=p.torque_limit,
+            rise=p.force_limit * p.period / guarding.force_rise,  # 0 where it may step
+            ramp=p.ramp_ticks * p.period,
+            stretch=guarding.stretch / p.scale,
+            angle=guarding.angle,
+            energy=guarding.energy,
+        )
+
+    @property
+    def clutch(self) -> int | None:
+        """Number of the button, from 0, that let the device move without the handle."""
+        return _button(self.parameters.guarding.clutch)
+
+    @property
+    def dead_man(self) -> int | None:
+        """Number of the button that had to be held for any force."""
+        return _button(self.parameters.guarding.dead_man)
+
+    @property
+    def start(self) -> tuple[float, ...]:
+        """Device pose (7,) that the handle's counts from when the run begins.
+
+        Where the device moved before the first tick, that re-seated the coupling: what it had moved
+        until then is not to be seen in the scene.
+        """
+        first = self.recording.ticks[0]
+        if not int(first["flags"]) & int(TickFlag.RESEATED):
+            return self.parameters.device_start
+        return (*first["device_position"].tolist(), *first["device_quaternion"].tolist())
 
     def scene(self, settings: Settings) -> Scene:
         """Loads the scene with the parameters of some settings.
@@ -104,6 +137,22 @@ class RecordedRun:
         prepare(scene, settings.coupling, 1.0 / settings.rate, settings.substeps, settings.method)
         found = hashlib.sha256(compiled_model(scene.model)).hexdigest()
         return found == self.recording.meta.get("scene_sha256")
+
+
+def _controller(info: DeviceInfo, parameters: RunParameters, method: Method) -> str | None:
+    """Returns the run's passivity controller; None if it is what a bridge chooses by itself."""
+    p = parameters
+    scales = p.scale, p.force_scale
+    needed = needed_on_axes(info, p.coupling, p.period, *scales, p.laws, method)
+    limits = Limits(force=p.force_limit, torque=p.torque_limit)
+    usual = guarding_for(info, limits, p.period, needed=needed, scale=p.scale)
+    if usual.controller == p.guarding.controller:
+        return None
+    return next(name for name, code in CONTROLLERS.items() if code == p.guarding.controller)
+
+
+def _button(mask: int) -> int | None:
+    return mask.bit_length() - 1 if mask else None
 
 
 def _write_scene(recording: Recording, folder: Path) -> Path:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -18,6 +18,7 @@ from hapticbridge.device import Device
 from hapticbridge.device.simulated.scene_hand import scene_hand
 from hapticbridge.errors import RecordingError, SafetyTrip
 from hapticbridge.recording import read_recording
+from hapticbridge.tick import TickFlag
 from hapticbridge.whatif.changes import UNITS, Settings, Value
 from hapticbridge.whatif.hands import (
     IdentifiedDevice,
@@ -92,6 +93,9 @@ class _Experiment:
         runs = [self._as_recorded()]
         self._tell(1, 4, "the recorded motion")
         runs.append(self._simulated(PRESCRIBED, self._prescribed(new), new))
+        notes.extend(_unrepeated(self._ticks))
+        if runs[0].trip:
+            notes.append("what was recorded ends in a trip: these runs end there, too")
         if new.rate != settings.rate:
             notes.append(
                 "the recorded motion is linear between its samples: at another rate its speed "
@@ -123,12 +127,12 @@ class _Experiment:
 
     def _prescribed(self, settings: Settings) -> Device:
         kind = RecordedMotion if settings.rate == self._run.settings.rate else ResampledMotion
-        start = self._run.parameters.device_start
+        start = self._run.start
         return kind(self._ticks, self._period, start, self._run.info)
 
     def _identified(self, settings: Settings) -> Device:
         hand = scene_hand(self._run.scene(settings))
-        start = self._run.parameters.device_start
+        start = self._run.start
         return IdentifiedDevice(self._run.info, hand, self._ticks, self._period, start)
 
     def _hand_error(self, same: WhatIfRun) -> float:
@@ -154,6 +158,9 @@ class _Experiment:
             axes=np.array(run.parameters.axes),
             absolute=run.is_absolute,
             limits=run.limits,
+            controller=settings.controller,
+            clutch=run.clutch,
+            dead_man=run.dead_man,
         )
         trip = ""
         with warnings.catch_warnings(record=True) as caught:
@@ -190,6 +197,18 @@ class _Experiment:
             if count > 0:
                 bridge.run(count * bridge.period, on_tick)
                 done += count
+
+
+def _unrepeated(ticks: NDArray[np.void]) -> Iterator[str]:
+    """Says what these runs have not of the recorded one."""
+    flags = ticks["flags"]
+    if missed := int(np.count_nonzero(flags & int(TickFlag.OVERRUN))):
+        yield (
+            f"missed deadlines: {missed} when it was recorded, none in these runs: what the hand "
+            "did meanwhile it does here in one tick"
+        )
+    if (flags & int(TickFlag.CONTROLLER_ACTIVE)).any():
+        yield "a controller was at work; the prescribed run has none, because nobody feels it"
 
 
 def _peaks(ticks: NDArray[np.void]) -> dict[str, float]:

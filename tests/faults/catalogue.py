@@ -4,13 +4,18 @@ from __future__ import annotations
 
 import os
 import resource
+import shutil
 import signal
+import subprocess
+import sys
+import tempfile
 import time
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +25,11 @@ from hapticbridge.bridge import Bridge
 from hapticbridge.coupling import Coupling
 from hapticbridge.device.simulated.hand import DEFAULT_HAND, Hand
 from hapticbridge.errors import DeviceError, DeviceLost
+from hapticbridge.guard import Limits
 from hapticbridge.passivity import WorstHand
+from hapticbridge.recording.ring import HEAD, TAIL
+from hapticbridge.view.address import Address
+from hapticbridge.view.window import Window
 
 PUSHER = """<mujoco><compiler angle="radian"/>
 <option timestep="0.001" integrator="discrete" gravity="0 0 0" cone="elliptic"/>
@@ -191,8 +200,12 @@ def acting(act: Callable[[Bridge], None], at: int = CAUSE) -> Callable[[Rig], No
     return do
 
 
-def _bad_acceleration(bridge: Bridge) -> None:
+def _bad_velocity(bridge: Bridge) -> None:
     bridge.scene.data.qvel[:] = 2e10
+
+
+def _bad_acceleration(bridge: Bridge) -> None:
+    bridge.scene.data.qfrc_applied[:] = 1e11
 
 
 def _diverge(bridge: Bridge) -> None:
@@ -280,9 +293,131 @@ def _fill_disk(bridge: Bridge) -> None:
     resource.prlimit(recorder._process.pid, resource.RLIMIT_FSIZE, (size + 1000, size + 1000))
 
 
+def _full_tmpfs(rig: Rig) -> None:
+    """The recording lies on a small disk of its own, which somebody fills."""
+    disk = rig.folder / "disk"
+
+    def around(stack: ExitStack) -> None:
+        disk.mkdir()
+        subprocess.run(["mount", "-t", "tmpfs", "-o", "size=12m", "none", disk], check=True)
+        stack.callback(lambda: subprocess.run(["umount", disk], check=True))
+
+    def fill(bridge: Bridge, tick: int) -> None:
+        if tick == CAUSE:
+            with (disk / "rubbish").open("wb", buffering=0) as file, suppress(OSError):
+                while True:
+                    file.write(bytes(4096))
+        cursors = bridge._stream.cursors
+        while tick > CAUSE and tick % 50 == 0 and cursors[TAIL] < cursors[HEAD]:
+            time.sleep(1e-3)  # the recorder keeps up, as it does in real time
+
+    rig.around, rig.on_tick = around, fill
+    rig.recording = disk / "run.mcap"
+
+
+def _full_ring(rig: Rig) -> None:
+    """The recorder stands still for 1 s behind a ring of 0.2 s."""
+
+    def around(stack: ExitStack) -> None:
+        stack.enter_context(patch("hapticbridge.recording.stream.RING_SECONDS", 0.2))
+
+    def act(bridge: Bridge, tick: int) -> None:
+        recorder, cursors = bridge._stream.recorder, bridge._stream.cursors
+        assert recorder is not None
+        if CAUSE <= tick < CAUSE + 1000:
+            if tick == CAUSE:
+                os.kill(recorder._process.pid, signal.SIGSTOP)
+            return
+        os.kill(recorder._process.pid, signal.SIGCONT)
+        while tick % 50 == 0 and cursors[TAIL] < cursors[HEAD]:
+            time.sleep(1e-3)  # the recorder keeps up, as it does in real time
+
+    rig.around, rig.on_tick, rig.duration = around, act, 3.0
+    rig.clock.is_lossless = False
+
+
+def can_mount() -> bool:
+    """Tells whether this process may mount a file system, as root in its own namespace may."""
+    with tempfile.TemporaryDirectory() as folder:
+        command = ["mount", "-t", "tmpfs", "-o", "size=64k", "none", folder]
+        if sys.platform != "linux" or shutil.which("mount") is None:
+            return False
+        done = subprocess.run(command, check=False, capture_output=True)
+        if done.returncode == 0:
+            subprocess.run(["umount", folder], check=True)
+        return done.returncode == 0
+
+
+def _suspended(rig: Rig) -> None:
+    """The machine sleeps for 5 s, in which the hand goes 20 mm deeper."""
+    rig.points = (*PRESS[:3], (1.5, 0.0804), (1.7, 0.1004), (9.0, 0.1004))
+    asleep = 0
+
+    def around(stack: ExitStack) -> None:
+        stack.enter_context(patch("hapticbridge.bridge.slept_ns", lambda: asleep))
+
+    def corrupt(tick: int, sample: NDArray[np.void]) -> int:
+        nonlocal asleep
+        if tick == CAUSE:
+            asleep = 5_000_000_000
+        return pass_time(tick, sample)
+
+    pass_time = _passing(rig, CAUSE, 5.0)
+    rig.around, rig.device.corrupt = around, corrupt
+
+
+_SPECTATOR = """
+import json, sys, time
+sys.path.insert(0, sys.argv[1])
+from hapticbridge.recording import Ring
+job = json.loads(sys.stdin.buffer.readline())
+for _, size in job["attachments"]:
+    sys.stdin.buffer.read(size)
+ring = Ring.attach(job["ring"])
+print(json.dumps({"url": "nowhere"}), flush=True)
+while True:
+    ring.latest(1)
+    time.sleep(0.01)
+"""
+
+
+def _watched(how: int) -> Callable[[Rig], None]:
+    """Somebody looks on, and their process gets a signal: killed, or stopped without an end."""
+
+    def do(rig: Rig) -> None:
+        def around(stack: ExitStack) -> None:
+            stack.enter_context(patch("hapticbridge.view.window.check_view"))
+            stack.enter_context(patch("hapticbridge.view.window._BOOTSTRAP", _SPECTATOR))
+            rig.options["onlooker"] = window = Window(Address("127.0.0.1", 0))
+
+            def act(bridge: Bridge, tick: int) -> None:
+                if tick == CAUSE:
+                    assert window.process_id is not None
+                    os.kill(window.process_id, how)
+                if tick >= CAUSE and tick % 100 == 0:
+                    bridge.set_input(joint_force={})
+
+            rig.on_tick = act
+
+        rig.around = around
+
+    return do
+
+
+def _edge(rig: Rig) -> None:
+    """The hand pushes the device over the edge of its workspace, and comes back."""
+    rig.options = {"limits": Limits(force=10.0, torque=0.5, ramp=0.2, reach=0.0125)}
+    rig.points = (*PRESS[:2], (0.9, 0.02), (1.5, 0.02), (1.6, 0.0804), (1.9, 0.0), (9.0, 0.0))
+
+
 NO_TRIPS = dict.fromkeys(("speed", "turn_speed", "stretch", "angle", "energy"), np.inf)
 
 UNGUARDED = {"controller": 0, **NO_TRIPS}
+
+RING_FULL = Fault("ring full for 1 s", _full_ring, "goes on")
+"""The one that loses records, after its cause; they are counted."""
+
+DISK_FULL = Fault("disk full", _full_tmpfs, "stops", "the disk is full", within=600)
 
 FAULTS = (
     Fault("pose that is no number", corrupting(_nan), "trip", "pose is not finite"),
@@ -301,15 +436,22 @@ FAULTS = (
     Fault("write fails", _write_fails, "trip", "is gone"),
     Fault("write blocks for 1 s", _write_blocks, "re-seats", "", {"longest_stall": np.inf}),
     Fault("write is cut short", _write_is_cut, "trip", "16 of 48 bytes"),
-    Fault("MuJoCo warns: bad velocity", acting(_bad_acceleration), "trip", "diverged"),
+    Fault("MuJoCo warns: bad velocity", acting(_bad_velocity), "trip", "diverged"),
+    Fault("MuJoCo warns: bad acceleration", acting(_bad_acceleration), "trip", "diverged"),
     Fault("scene diverges", acting(_diverge), "trip", "diverged"),
     Fault("motor drives the tool", _motor, "trip", "more energy", NO_TRIPS, cause=500, within=900),
     Fault("10 x too stiff, free", stiff(10, None), "goes on", "", UNGUARDED),
     Fault("10 x too stiff, in a hand", stiff(10, DEFAULT_HAND), "goes on"),
+    Fault("edge of the workspace", _edge, "fades", within=150),
     Fault("encoder steps of 50 µm", _quantised, "goes on"),
     Fault("error in the user's code", acting(_raise), "stops", "ZeroDivisionError"),
     Fault("recorder killed", acting(_kill_recorder), "stops", "recorder died", within=101),
-    Fault("disk full", acting(_fill_disk), "stops", "recorder died", within=999),
+    Fault("recording may not grow", acting(_fill_disk), "stops", "recorder died", within=999),
+    *([DISK_FULL] if can_mount() else []),
+    RING_FULL,
+    Fault("viewer killed", _watched(signal.SIGKILL), "goes on"),
+    Fault("viewer hangs", _watched(signal.SIGSTOP), "goes on"),
+    Fault("machine suspended for 5 s", _suspended, "stops", "suspend of the machine"),
     Fault("Ctrl-C", acting(_signal(signal.SIGINT)), "stops", "SIGINT"),
     Fault("SIGTERM", acting(_signal(signal.SIGTERM)), "stops", "SIGTERM"),
     Fault("SIGHUP", acting(_signal(signal.SIGHUP)), "stops", "SIGHUP"),

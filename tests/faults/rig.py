@@ -147,6 +147,7 @@ class Rig:
     on_tick: Callable[[Bridge, int], None] | None = None
     around: Callable[[ExitStack], None] | None = None
     clock: FaultClock = field(default_factory=FaultClock)
+    recording: Path | None = None
     _device: FaultyDevice | None = None
 
     @property
@@ -158,13 +159,13 @@ class Rig:
 
     def run(self, cause: int) -> Outcome:
         """Runs it and reports."""
-        path, error = self.folder / "run.mcap", ""
-        options = {"limits": Limits(force=10.0, torque=0.5, ramp=0.2)} | self.options
+        path, error = self.recording or self.folder / "run.mcap", ""
         ticks_done = 0
-        try:
-            with ExitStack() as stack:
-                if self.around is not None:
-                    self.around(stack)
+        with ExitStack() as stack:
+            if self.around is not None:
+                self.around(stack)
+            options = {"limits": Limits(force=10.0, torque=0.5, ramp=0.2)} | self.options
+            try:
                 bridge = Bridge(
                     self.scene,
                     self.device,
@@ -179,9 +180,9 @@ class Rig:
                         bridge.run(self.duration, self.on_tick and (lambda k: self._act(bridge, k)))
                     finally:
                         ticks_done = bridge._tick
-        except (HapticBridgeError, ZeroDivisionError) as raised:
-            error = f"{type(raised).__name__}: {raised}"
-        return Outcome.of(self, path, cause, error, ticks_done)
+            except (HapticBridgeError, ZeroDivisionError) as raised:
+                error = f"{type(raised).__name__}: {raised}"
+            return Outcome.of(self, path, cause, error, ticks_done)
 
     def _act(self, bridge: Bridge, tick: int) -> None:
         if self.on_tick is not None:
@@ -203,6 +204,7 @@ class Outcome:
         ticks: Ticks that were done, and ``rows`` records of them in the file.
         report: The audit's; None where there is no file.
         events: Names of the recording's events.
+        dropped: Records that were lost, as the event ``stop`` says.
         flags: Of each record.
     """
 
@@ -217,6 +219,7 @@ class Outcome:
     rows: int
     report: AuditReport
     events: list[str]
+    dropped: int
     flags: NDArray[np.int64]
     forces: NDArray[np.float64]
     torques: NDArray[np.float64]
@@ -243,6 +246,7 @@ class Outcome:
             rows=len(recording.ticks),
             report=audit(path),
             events=[str(event["event"]) for event in recording.events],
+            dropped=sum(int(str(event.get("dropped", 0))) for event in recording.events),
             flags=recording.ticks["flags"],
             forces=forces,
             torques=np.linalg.norm(wrenches[:, 3:], axis=1),

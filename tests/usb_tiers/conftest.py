@@ -64,3 +64,12 @@ def plug_hid(request: pytest.FixtureRequest) -> Iterator[Plug]:
 def no_spin(monkeypatch: pytest.MonkeyPatch) -> None:
     """Lets the loop's clock sleep to its deadline; in virtual time a spin would hardly end."""
     monkeypatch.setattr("hapticbridge.clock.SPIN_NS", 0)
+
+
+@pytest.fixture(autouse=True)
+def _patience(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Bears silent devices for longer on the wall clock: a busy machine stalls their processes."""
+    if not IS_TIME_VIRTUAL:
+        monkeypatch.setattr("hapticbridge.device.falcon.driver.SILENCE", 5.0)
+        monkeypatch.setattr("hapticbridge.device.rawhid.driver.LONGEST_SILENCE", 5.0)
+        monkeypatch.setattr("hapticbridge.device.transport.hid.LONGEST_WRITE", 5.0)

@@ -35,9 +35,10 @@ from hapticbridge.device.falcon.motion import (
     resolution,
 )
 from hapticbridge.device.falcon.packets import SIZE, ReplyStream, Request
-from hapticbridge.device.falcon.start import LONGEST_PERIOD, SILENCE, bring_up, home, insist, silent
+from hapticbridge.device.falcon.start import LONGEST_PERIOD, bring_up, home, insist, silent
 from hapticbridge.device.falcon.timing import measured_timing
 from hapticbridge.device.plugged import Family, Tell, UsbId, chosen, tell_nobody
+from hapticbridge.device.silence import SILENCE, SilenceWatch
 from hapticbridge.device.transport.hex_log import HexLog
 from hapticbridge.device.transport.usb import UsbLink
 from hapticbridge.device.transport.usb_search import find
@@ -109,7 +110,7 @@ class FalconDevice:
         self._last = np.zeros(1, SAMPLE_DTYPE)
         self._packet = array.array("B", bytes(SIZE))
         self._bytes = np.frombuffer(self._packet, np.uint8)
-        self._believed = self._read = 0.0
+        self._watch = SilenceWatch(link.now())
         self._asked = self._asked_before = self._sampled_after = 0.0
 
     def start(self, period: float) -> NDArray[np.void]:
@@ -138,8 +139,9 @@ class FalconDevice:
                 f"{self._name}: encoders at {reply['encoders'][0].tolist()} are no position of the "
                 "grip; switch its power off and on, so that it is homed again"
             )
-        self._believed = self._read = self._link.now()
-        self._asked = self._asked_before = self._sampled_after = self._read
+        now = self._link.now()
+        self._watch = SilenceWatch(now)
+        self._asked = self._asked_before = self._sampled_after = now
         self._is_started = True
         return sample.copy()
 
@@ -164,20 +166,16 @@ class FalconDevice:
         for packet in self._link.take():
             found += self._stream.feed(packet)
         now = self._link.now()
-        if now - self._read > SILENCE:
-            self._believed = now  # nobody asked meanwhile: the loop was away, not the device
-        self._read = now
-        flag = int(TickFlag.STALE_SAMPLE)
+        is_believed = False
         if found:
             # a reply may be to the last question or the one before: no older than that is its pose
             elapsed, self._sampled_after = now - self._sampled_after, self._asked_before
-            if self._believe(self._motion, self._stream.reply, self._last, elapsed) == BELIEVED:
-                self._believed = now
-                flag = 0
-        if now - self._believed > SILENCE:
+            verdict = self._believe(self._motion, self._stream.reply, self._last, elapsed)
+            is_believed = verdict == BELIEVED
+        if self._watch.is_silent(now, is_new=is_believed):
             raise silent(self._name)
         sample[:] = self._last
-        return flag
+        return 0 if is_believed else int(TickFlag.STALE_SAMPLE)
 
     def write(self, wrench: NDArray[np.float64]) -> None:
         """Sends a force, and with it the next question; the torque is left out.

@@ -14,10 +14,8 @@ from hapticbridge.device.falcon.boot import (
 )
 from hapticbridge.device.falcon.packets import ReplyStream, Request
 from hapticbridge.device.plugged import Tell
+from hapticbridge.device.silence import SILENCE
 from hapticbridge.errors import DeviceError, DeviceLost
-
-SILENCE = 0.05
-"""In s: a Falcon that gave no reply that can be believed for so long is lost. Fifty replies."""
 
 LONGEST_PERIOD = 0.02
 """In s. It is asked once a tick; slower, two lost replies would already count as silence."""

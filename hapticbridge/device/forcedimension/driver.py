@@ -33,14 +33,12 @@ from hapticbridge.device.forcedimension.library import (
 )
 from hapticbridge.device.forcedimension.models import MODELS, Model, limits_of, quaternion_of
 from hapticbridge.device.plugged import Tell, tell_nobody
+from hapticbridge.device.silence import SILENCE, SilenceWatch
 from hapticbridge.errors import DeviceError, DeviceLost
 from hapticbridge.tick import SAMPLE_DTYPE, TickFlag
 
 SPEED_LIMIT = 5.0
 """In m/s. No figure was found; a hand is not faster."""
-
-SILENCE = 0.05
-"""In s: without a fresh sample for so long, the device is taken for gone."""
 
 SHORTEST_WATCHDOG, WATCHDOG_PERIODS = 0.02, 10
 """The watchdog asked for is ten periods of the loop, but not less than 20 ms, for an ordinary
@@ -138,7 +136,7 @@ class ForceDimensionDevice:
         self._tell = tell
         self._sample = np.zeros(1, SAMPLE_DTYPE)
         self._sample["quaternion"] = (1.0, 0.0, 0.0, 0.0)
-        self._fresh = self._read = 0.0
+        self._watch = SilenceWatch(dhd.now())
 
     def start(self, period: float) -> NDArray[np.void]:
         """Sets the watchdog, switches the motors on without force, and reads the pose.
@@ -171,7 +169,7 @@ class ForceDimensionDevice:
             if self._dhd.now() - begin > SILENCE:
                 raise DeviceLost(f"{self._name} gives no fresh sample")
         self._fill()
-        self._fresh = self._read = self._dhd.now()
+        self._watch = SilenceWatch(self._dhd.now())
         self._is_started = True
         return self._sample.copy()
 
@@ -190,18 +188,14 @@ class ForceDimensionDevice:
         """
         if not self._is_started:
             raise DeviceError(f"{self._name} is read before it was started")
-        code, now = self._get(), self._dhd.now()
-        if now - self._read > SILENCE:
-            self._fresh = now  # the loop was away, not the device
-        self._read = now
-        flag = int(TickFlag.STALE_SAMPLE)
-        if code != TIMEGUARD:
+        is_fresh = self._get() != TIMEGUARD
+        now = self._dhd.now()
+        if is_fresh:
             self._fill()
-            self._fresh, flag = now, 0
-        if now - self._fresh > SILENCE:
+        if self._watch.is_silent(now, is_new=is_fresh):
             raise DeviceLost(f"{self._name} has given no fresh sample for {1e3 * SILENCE:g} ms")
         sample[0] = self._sample[0]
-        return flag
+        return 0 if is_fresh else int(TickFlag.STALE_SAMPLE)
 
     def write(self, wrench: NDArray[np.float64]) -> None:
         """Commands a wrench, on the axes that have motors.

@@ -27,6 +27,7 @@ from hapticbridge.device.haply import messages
 from hapticbridge.device.haply.messages import SERVICE, Listed
 from hapticbridge.device.haply.timing import measured_timing
 from hapticbridge.device.plugged import Tell, tell_nobody
+from hapticbridge.device.silence import SILENCE, SilenceWatch
 from hapticbridge.device.transport.websocket import Link
 from hapticbridge.errors import DeviceError, DeviceLost
 from hapticbridge.tick import SAMPLE_DTYPE, TickFlag
@@ -37,9 +38,6 @@ to be asked for with the option ``force_limit``."""
 
 SPEED_LIMIT = 5.0
 """In m/s. No figure was found; a hand is not faster."""
-
-SILENCE = 0.05
-"""In s: without an answer for so long, the service is taken for gone."""
 
 FIRST_ANSWER = 1.0
 """In s: longest wait for the list of devices and for the first state."""
@@ -120,7 +118,7 @@ class HaplyDevice:
             raise
         self._sample = np.zeros(1, SAMPLE_DTYPE)
         self._sample["quaternion"] = (1.0, 0.0, 0.0, 0.0)
-        self._answered = self._read = 0.0
+        self._watch = SilenceWatch(link.now())
 
     def start(self, period: float) -> NDArray[np.void]:
         """Asks for the state, without force.
@@ -140,7 +138,7 @@ class HaplyDevice:
         self._take()
         self._pending, self.held_back = None, 0
         self._fill(self._ask(messages.force_message(self._listed, (0.0, 0.0, 0.0))))
-        self._answered = self._read = self._link.now()
+        self._watch = SilenceWatch(self._link.now())
         self._is_started = True
         return self._sample.copy()
 
@@ -161,18 +159,12 @@ class HaplyDevice:
         if not self._is_started:
             raise DeviceError(f"{self._name} is read before it was started")
         newest = self._take()
-        now = self._link.now()
-        if now - self._read > SILENCE:
-            self._answered = now  # nobody asked meanwhile: the loop was away, not the service
-        self._read = now
-        flag = int(TickFlag.STALE_SAMPLE)
         if newest is not None:
             self._fill(newest)
-            self._answered, flag = now, 0
-        if now - self._answered > SILENCE:
+        if self._watch.is_silent(self._link.now(), is_new=newest is not None):
             raise DeviceLost(f"{SERVICE} has not answered for {1e3 * SILENCE:g} ms")
         sample[0] = self._sample[0]
-        return flag
+        return int(TickFlag.STALE_SAMPLE) if newest is None else 0
 
     def write(self, wrench: NDArray[np.float64]) -> None:
         """Sends a force, and with it the next question; the torque is left out.

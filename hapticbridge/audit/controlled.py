@@ -1,0 +1,151 @@
+"""What the passivity controller should have made of the wrench, from records alone.
+
+The second computation of ``kernel.account``, over whole arrays, block by block.
+"""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticbridge.audit.differences import steps, turns
+from hapticbridge.audit.watched import Seen
+from hapticbridge.kernel.account import BOUND, SWINGS, TANK_START, THRESHOLD, WINDOW
+from hapticbridge.kernel.guarding import DAMPER, ENVIRONMENT, TANK
+from hapticbridge.kernel.state import RunParameters
+
+Array = NDArray[np.float64]
+
+
+class Controlled(NamedTuple):
+    """What the controller makes of the wrench.
+
+    Attributes:
+        wrench: With damping or the tank's share, (n, 6).
+        change: By how much each component may change from tick to tick, (n, 6); inf: at will.
+        injected: The damping added, (n,).
+    """
+
+    wrench: Array
+    change: Array
+    injected: Array
+
+
+@dataclass(slots=True)
+class Account:
+    """Where the energy account has got to.
+
+    Attributes:
+        parameters: The run's.
+        own: What the scene stored in the tick before, but for what its motors and users put in, J.
+        sent: Wrench (6,) that was sent then.
+        gained: What the account gets for that tick, in J.
+        account: In J.
+        axes: Accounts (6,) of the axes, in J.
+        velocity: Of the device in the tick before, (6,).
+        excess: What the environment had created beyond the slack then, in J.
+        reversed: Where the motion of each axis was reversed in the last ticks, (n, 6).
+    """
+
+    parameters: RunParameters
+    own: float
+    sent: Array = field(default_factory=lambda: np.zeros(6))
+    gained: float = 0.0
+    account: float = 0.0
+    axes: Array = field(default_factory=lambda: np.zeros(6))
+    velocity: Array = field(default_factory=lambda: np.zeros(6))
+    excess: float = 0.0
+    reversed: NDArray[np.bool_] = field(default_factory=lambda: np.zeros((WINDOW, 6), bool))
+
+    def after(
+        self,
+        ticks: NDArray[np.void],
+        wrench: Array,
+        seen: Seen,
+        device: Array,
+        resumed: Array,
+        excess: Array,
+    ) -> tuple[Controlled, Account]:
+        """Says what the controller makes of the wrenches of the next records, at least one.
+
+        Args:
+            ticks: The records, ``TICK_DTYPE``.
+            wrench: What the coupling asks to be sent, (n, 6).
+            seen: What the watch saw.
+            device: Device pose (7,) in the tick before.
+            resumed: Ticks at which the run went on after a pause without force.
+            excess: What the environment has created beyond the slack, (n,) in J.
+        """
+        then = copy.copy(self)
+        parameters, guarding = self.parameters, self.parameters.guarding
+        nothing, free = np.zeros(len(ticks)), np.full((len(ticks), 6), np.inf)
+        acts = guarding.controller in (DAMPER, TANK)
+        acts |= guarding.controller == ENVIRONMENT and parameters.has_law
+        if not acts:
+            return Controlled(wrench, free, nothing), then
+        position, quaternion = ticks["device_position"], ticks["device_quaternion"]
+        moved = np.concatenate([steps(position, device[:3]), turns(quaternion, device[3:])], axis=1)
+        velocity = np.where(seen.first, 0.0, 1.0 / seen.interval)[:, None] * moved
+        sent = np.concatenate([self.sent[None], ticks["wrench_on_device"][:-1]])
+        sent[np.isin(ticks["tick"], resumed)] = 0.0
+        credit = np.repeat([guarding.credit, guarding.rotational_credit], 3)
+        given = (sent - credit * velocity) * moved
+        gained = then._gained(ticks, wrench, seen.share)
+        total = given.sum(axis=1) + np.concatenate([[self.gained], gained[:-1]])
+        account = capped_sum(total, guarding.surplus, self.account)
+        axes = capped_sum(given, guarding.surplus, self.axes)
+        reverses = np.concatenate([self.velocity[None], velocity[:-1]]) * velocity < 0
+        history = np.concatenate([self.reversed, reverses])
+        count = np.cumsum(history, axis=0)
+        swings = count[WINDOW:] - count[:-WINDOW] >= SWINGS
+        then.sent, then.gained = ticks["wrench_on_device"][-1].copy(), float(gained[-1])
+        then.account, then.axes = float(account[-1]), axes[-1]
+        then.velocity, then.reversed = velocity[-1], history[-WINDOW:]
+        if guarding.controller == TANK:
+            share = _tank_share(parameters, wrench, velocity, account)
+            return Controlled(wrench * share[:, None], free, nothing), then
+        debt = account - THRESHOLD
+        if guarding.controller == ENVIRONMENT:
+            debt = np.concatenate([[self.excess], excess[:-1]]) - THRESHOLD
+            then.excess = float(excess[-1])
+        owed = np.minimum(debt[:, None], axes)
+        most = np.repeat([guarding.most_damping, guarding.most_rotational_damping], 3)
+        square, zero = parameters.period * velocity**2, np.zeros_like(owed)
+        damping = np.divide(owed, square, out=zero, where=(owed > 0) & (square > 0))
+        damping = np.minimum(damping, most)
+        change = np.where((owed > 0) & swings, BOUND * most * np.abs(velocity), np.inf)
+        held = wrench - damping * velocity
+        if guarding.controller == ENVIRONMENT:
+            return Controlled(held, change, damping[:, :3].max(axis=1)), then
+        # the tank comes last, and only where no axis is bounded
+        pays = (debt > 0) & ~swings.any(axis=1)
+        share = np.where(pays, _tank_share(parameters, held, velocity, account), 1.0)
+        return Controlled(held * share[:, None], change, damping[:, :3].max(axis=1)), then
+
+    def _gained(self, ticks: NDArray[np.void], wrench: Array, share: Array) -> Array:
+        """Returns what the account gets for each tick: what the scene took up of what was felt."""
+        own = ticks["kinetic"] + ticks["potential"] - ticks["actuator_work"]
+        own = own - ticks["external_work"]
+        change = np.diff(own, prepend=self.own)
+        self.own = float(own[-1])
+        asked = np.linalg.norm(wrench[:, :3], axis=1)
+        sent = np.linalg.norm(ticks["wrench_on_device"][:, :3], axis=1)
+        passed = np.minimum(np.divide(sent, asked, out=share.copy(), where=asked > 0), 1.0)
+        return np.asarray(self.parameters.force_scale / self.parameters.scale * passed * change)
+
+
+def capped_sum(values: Array, surplus: float, before: float | Array = 0.0) -> Array:
+    """Returns x_k = max(x_{k−1} + v_k, −surplus), x_{−1} = before, along the first axis."""
+    total = before + np.cumsum(values, axis=0)
+    return np.asarray(total + np.maximum(np.maximum.accumulate(-surplus - total, axis=0), 0.0))
+
+
+def _tank_share(parameters: RunParameters, wrench: Array, velocity: Array, account: Array) -> Array:
+    """Returns the share of the wrench that the tank pays for, (n,)."""
+    work = parameters.period * np.sum(wrench * velocity, axis=1)
+    level = np.maximum(TANK_START - account, 0.0)
+    return np.where(work > level, level / np.where(work > level, work, 1.0), 1.0)

@@ -1,0 +1,52 @@
+"""Limits on norm and change, as ``kernel.wrench`` applies them, from records alone."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+def _limited(vector: Array, limit: float) -> Array:
+    """Shortens what is longer than the limit."""
+    norm = np.linalg.norm(vector, axis=-1, keepdims=True)
+    return np.asarray(vector * np.where(norm > limit, limit / np.maximum(norm, 1e-300), 1.0))
+
+
+def chained(
+    vector: Array,
+    change: Array,
+    limit: float,
+    rise: float,
+    starts: NDArray[np.bool_],
+    first: Array,
+) -> Array:
+    """Limits a vector where its change since the row before, as that was sent, is bounded.
+
+    Args:
+        vector: (n, 3).
+        change: Most change of each component, (n, 3); inf where there is no bound.
+        limit: Largest norm.
+        rise: Largest norm of the change.
+        starts: Rows before which it was zero.
+        first: What was sent before the first row, (3,).
+    """
+    sent = _limited(vector, limit)
+    before = np.concatenate([first[None], sent[:-1]])
+    before[starts] = 0.0
+    is_bounded = np.isfinite(change).any(axis=1)
+    is_bounded |= np.linalg.norm(sent - before, axis=1) > rise
+    done = -1
+    for begin in np.flatnonzero(is_bounded).tolist():
+        for k in range(max(begin, done + 1), len(sent)):
+            last = np.zeros(3) if starts[k] else sent[k - 1] if k else first
+            plain = sent[k].copy()
+            asked = np.clip(vector[k], last - change[k], last + change[k])
+            step = _limited(asked, limit) - last
+            length = float(np.linalg.norm(step))
+            sent[k] = last + (step if length <= rise else rise / length * step)
+            done = k
+            if np.array_equal(sent[k], plain):
+                break
+    return sent

@@ -1,0 +1,164 @@
+"""What a run is asked for while it goes on: inputs of its scene, commands, a recorder."""
+
+from __future__ import annotations
+
+import base64
+from dataclasses import replace
+from pathlib import Path
+from typing import Self
+
+from hapticbridge.clock import RealClock, SimulatedClock
+from hapticbridge.commands import Command, Operator, Record
+from hapticbridge.commands.command import Stop
+from hapticbridge.errors import CommandError, RecordingError
+from hapticbridge.inputs import apply_writes
+from hapticbridge.opened import Opened
+from hapticbridge.provenance import (
+    MODEL_ATTACHMENT,
+    STATE_ATTACHMENT,
+    attachments,
+    elastic_energy,
+    restore_state,
+    start_state,
+)
+from hapticbridge.summary import Summary
+
+
+class Commanded(Opened):
+    """A bridge that takes inputs and commands between two ticks, and notes each with its tick."""
+
+    _pause: Record | None = None
+    _earlier_ticks = 0
+    _earlier_fault: tuple[int, str] | None = None
+
+    def __enter__(self) -> Self:
+        super().__enter__()
+        if self._onlooker is not None:
+            self._commands.warm_up()
+        self._operator = Operator(self._commands, self._event)
+        self._operator.begin(self._repeater, self._guarding.fade_ticks)
+        return self
+
+    def command(self, command: Command, by: str = "caller") -> None:
+        """Asks for something while the run goes on; from any thread, or from ``on_tick``.
+
+        It is done between two ticks and recorded with its tick, so that the run can be repeated. A
+        recorder that is started in mid-run gets a run that begins there: with tick 0, energies that
+        are counted from it, and the state that the scene is in, so that its file is audited like
+        any other. While it starts or stops, which takes about half a second, nothing is felt.
+
+        Args:
+            command: A coupling, a switch, a reset, a recorder to be started or stopped, an end.
+            by: Who asks, for the recording.
+
+        Raises:
+            CommandError: The device does not allow it, the last command is too recent, or this run
+                cannot do it; nothing changes then.
+        """
+        if isinstance(command, Stop):
+            self.stop(by)
+            return
+        if isinstance(command, Record):
+            if type(self.clock) not in (RealClock, SimulatedClock):
+                raise CommandError("a clock of another kind cannot begin anew; nothing is recorded")
+            if command.on == self._stream.is_recording:
+                state = "already" if command.on else "not"
+                raise CommandError(f"this run is {state} being recorded")
+        self._commands.offer(command, by)
+
+    def stop(self, by: str = "caller") -> None:
+        """Ends the run after the present tick; may be called from ``on_tick`` or a thread.
+
+        Args:
+            by: Who wants it, for the summary and the recording's event ``stop``; not empty.
+        """
+        self._stopped_by = by or "caller"
+
+    def summary(self) -> Summary:
+        """Returns what the run was so far; energies count from where it last began anew."""
+        now = super().summary()
+        ticks = now.ticks + self._earlier_ticks
+        fault = self._earlier_fault or now.fault
+        return replace(now, ticks=ticks, duration=ticks * self.period, fault=fault)
+
+    def _take_changes(self) -> bool:
+        """Takes in what others want changed: between two ticks, and noted with its tick.
+
+        Returns:
+            Whether the loop must pause for it.
+        """
+        while self._inputs:
+            writes = self._inputs.popleft()
+            apply_writes(self.scene.data, writes)
+            self._event("input", writes=writes)
+        if self._commands.waiting or self._operator.later:
+            self._pause = self._operator.act(self._tick)
+        return self._pause is not None
+
+    def _obey_in_pause(self, last: int) -> int:
+        """Starts or stops the recorder while nothing is felt.
+
+        Args:
+            last: Tick at which the run ends, or −1.
+
+        Returns:
+            The same, as the ticks are counted from now on.
+        """
+        record, self._pause = self._pause, None
+        try:
+            if record is not None and record.on:
+                last = last if last < 0 else last - self._tick
+                self._begin_anew()
+                self._record()
+            else:
+                self._event("stop", reason="recording stopped", dropped=self._stream.dropped)
+                self._stream.stop_recording()
+        except RecordingError as error:
+            self._stream.tell({"event": "refused", "reason": str(error)})
+        path = str(self._path) if self._stream.is_recording else None
+        self._stream.tell({"event": "recording", "path": path})
+        if self._tick:
+            self._binding.resume()
+            self._event("resume")
+        else:
+            self._operator.begin(self._repeater, self._guarding.fade_ticks)
+        return last
+
+    def _begin_anew(self) -> None:
+        """Lets a run begin in the state that the scene is in, with tick 0."""
+        scene, method = self.scene, self.method
+        self._earlier_ticks += self._tick
+        self._earlier_fault = self._earlier_fault or self.ledger.fault
+        self._tick, self.clock = 0, type(self.clock)()
+        self._binding.let_go()
+        scene.set_gains(*method.gains(self._operator.used, self.period / self._substeps))
+        # as whoever simulates the file again will find it
+        restore_state(scene.model, scene.data, start_state(scene.model, scene.data).tobytes())
+        self._bind(self._operator.felt, self.parameters.felt, elastic_energy(scene.data))
+        files = {item.name: item.data for item in attachments(scene)}
+        needed = {name: files[name] for name in (MODEL_ATTACHMENT, STATE_ATTACHMENT)}
+        self._stream.tell(
+            {
+                "event": "begin",
+                "metadata": self._description(),
+                "attachments": {n: base64.b64encode(d).decode() for n, d in needed.items()},
+            }
+        )
+
+    def _record(self) -> None:
+        path = self._next_path()
+        self._stream.record(path, self._description(), attachments(self.scene))
+        self._path = path
+        self._event("start")
+
+    def _next_path(self) -> Path:
+        """Returns the first of NAME.mcap, NAME-2.mcap, NAME-3.mcap … that does not exist."""
+        base = self._path or Path(f"{self.scene.name}.mcap")
+        stem, _, number = base.stem.rpartition("-")
+        if not (stem and number.isdecimal()):
+            stem = base.stem
+        candidate, count = base.with_stem(stem), 1
+        while candidate.exists():
+            count += 1
+            candidate = base.with_stem(f"{stem}-{count}")
+        return candidate

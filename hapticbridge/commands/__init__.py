@@ -1,0 +1,13 @@
+"""What may be asked of a run while it goes on, and how it is done so that it can be repeated."""
+
+from hapticbridge.commands.allowance import Allowance as Allowance
+from hapticbridge.commands.change import CHANGES as CHANGES
+from hapticbridge.commands.change import Repeater as Repeater
+from hapticbridge.commands.command import Command as Command
+from hapticbridge.commands.command import Couple as Couple
+from hapticbridge.commands.command import Record as Record
+from hapticbridge.commands.command import Reset as Reset
+from hapticbridge.commands.command import Switch as Switch
+from hapticbridge.commands.command import command_of as command_of
+from hapticbridge.commands.operator import Operator as Operator
+from hapticbridge.commands.queue import CommandQueue as CommandQueue

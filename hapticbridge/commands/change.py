@@ -1,0 +1,117 @@
+"""What a command changes in a run, as the event that a recording keeps and a re-simulation repeats.
+
+    coupling   stiffness, damping, rotational_stiffness, rotational_damping of the law; ticks
+    switch     force, clutch
+    reset      (nothing: the scene goes back to the state that the recording starts with)
+
+The loop applies the very event that it then records, so both ways are one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import fields, replace
+from typing import Any
+
+import mujoco
+
+from hapticbridge.coupling import Coupling
+from hapticbridge.errors import HapticBridgeError, RecordingError
+from hapticbridge.kernel.state import Binding, RunParameters
+from hapticbridge.kernel.watch import CLUTCHED, FORCE_OFF
+from hapticbridge.provenance import restore_state
+from hapticbridge.rendering import Method
+
+CHANGES = ("coupling", "switch", "reset")
+"""Events that commands leave behind."""
+
+TUNING_TIME = 0.5
+"""In s: how long a change of the coupling takes, however small. From nothing to 2400 N/m at the
+full 10 N it lets the spring gain 42 mW at most; shorter is felt as a blow, longer as a slider that
+drags behind."""
+
+
+def tuning_ticks(period: float) -> int:
+    """Returns in how many ticks of ``period`` seconds a coupling changes."""
+    return max(round(TUNING_TIME / period), 1)
+
+
+def coupling_in(event: Mapping[str, Any], parameters: RunParameters) -> Coupling:
+    """Returns the coupling that an event ``coupling`` names.
+
+    Raises:
+        RecordingError: It names none, the run has no coupling law, or it changes too fast.
+    """
+    tick = event.get("tick")
+    try:
+        coupling = Coupling(**{field.name: event.get(field.name) for field in fields(Coupling)})  # type: ignore[arg-type] # what is none is refused there
+    except HapticBridgeError as error:
+        raise RecordingError(f"event 'coupling' at tick {tick!r} is damaged: {error}") from None
+    if not parameters.has_law:
+        raise RecordingError(f"event 'coupling' at tick {tick!r}: the run has no coupling law")
+    if event.get("ticks") != tuning_ticks(parameters.period):
+        raise RecordingError(
+            f"event 'coupling' at tick {tick!r} changes within {event.get('ticks')!r} ticks; it "
+            f"takes {tuning_ticks(parameters.period)}"
+        )
+    return coupling
+
+
+def bits_in(event: Mapping[str, Any]) -> int:
+    """Returns the bits of a record's ``buttons`` that an event ``switch`` asks for.
+
+    Raises:
+        RecordingError: It does not say.
+    """
+    force, clutch = event.get("force"), event.get("clutch")
+    if not isinstance(force, bool) or not isinstance(clutch, bool):
+        raise RecordingError(
+            f"event 'switch' at tick {event.get('tick')!r} is damaged: force is {force!r}, clutch "
+            f"{clutch!r}; they must be true or false"
+        )
+    return (0 if force else FORCE_OFF) | (CLUTCHED if clutch else 0)
+
+
+class Repeater:
+    """Applies the events of commands to a run, be it live or simulated again.
+
+    Args:
+        binding: The run's.
+        model: Of the scene.
+        data: Likewise.
+        method: How the tool is rendered.
+        parameters: Of the run, as it began.
+        start: The scene's state at the start (``provenance.start_state``), as bytes.
+    """
+
+    def __init__(
+        self,
+        binding: Binding,
+        model: mujoco.MjModel,
+        data: mujoco.MjData,
+        method: Method,
+        parameters: RunParameters,
+        start: bytes,
+    ) -> None:
+        self._binding, self._model, self._data = binding, model, data
+        self._method, self._parameters, self._start = method, parameters, start
+
+    def apply(self, event: Mapping[str, Any]) -> None:
+        """Does what an event of ``CHANGES`` says, before the tick that it names.
+
+        Raises:
+            RecordingError: The event is damaged.
+        """
+        kind, parameters = event.get("event"), self._parameters
+        if kind == "coupling":
+            coupling = coupling_in(event, parameters)
+            gains = self._method.gains(coupling, parameters.period / parameters.substeps)
+            goal = replace(parameters, coupling=coupling)
+            self._binding.tune(goal, gains, tuning_ticks(parameters.period))
+        elif kind == "switch":
+            self._binding.command(bits_in(event))
+        elif kind == "reset":
+            if not self._method.has_coupling:
+                raise RecordingError(f"event 'reset': method '{self._method.name}' has none")
+            restore_state(self._model, self._data, self._start)
+            self._binding.take_reset()

@@ -1,0 +1,21 @@
+"""The methods that render a rigid tool, behind one interface.
+
+A method decides how the coupling's wrench reaches the tool: which integrator MuJoCo uses, which
+gains its actuators get, whether a weld replaces them, or whether there is a coupling at all. The
+tick's arithmetic is the kernel's in every method, and so are ledger, records and audit.
+"""
+
+from hapticbridge.rendering.method import Gains as Gains
+from hapticbridge.rendering.method import Method as Method
+from hapticbridge.rendering.method import refuse_unknowing as refuse_unknowing
+from hapticbridge.rendering.methods import COMPENSATED as COMPENSATED
+from hapticbridge.rendering.methods import IMPLICIT as IMPLICIT
+from hapticbridge.rendering.methods import LOSSLESS_COUPLING as LOSSLESS_COUPLING
+from hapticbridge.rendering.methods import METHODS as METHODS
+from hapticbridge.rendering.methods import default_method as default_method
+from hapticbridge.rendering.methods import method_named as method_named
+from hapticbridge.rendering.preparation import MEASURED_AGAIN as MEASURED_AGAIN
+from hapticbridge.rendering.preparation import check_prepared as check_prepared
+from hapticbridge.rendering.preparation import check_scene as check_scene
+from hapticbridge.rendering.preparation import contact_stiffness_of as contact_stiffness_of
+from hapticbridge.rendering.preparation import prepare as prepare

@@ -1,0 +1,214 @@
+"""What a page says of a run in words and numbers."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticbridge.audit import AuditReport
+from hapticbridge.device import DATA_SHEET_UNITS
+from hapticbridge.guard import CONTROLLERS
+from hapticbridge.quantity import quantity
+from hapticbridge.report.evidence import Evidence
+from hapticbridge.tick import TickFlag
+
+Facts = list[tuple[str, str]]
+
+MOST_EVENTS = 200
+"""Events that a page lists; a run with scripted inputs has one per tick."""
+
+_LONGEST = 200
+"""Letters of an event that are shown; an input names every number that it wrote."""
+
+_RUN = {
+    "scene": "",
+    "scene_parameters": "",
+    "method": "",
+    "started": "",
+    "clock": "",
+    "period_s": "s",
+    "substeps": "",
+    "stiffness": "N/m",
+    "damping": "N s/m",
+    "rotational_stiffness": "N m/rad",
+    "rotational_damping": "N m s/rad",
+    "scale": "",
+    "force_scale": "",
+    "force_limit": "N",
+    "torque_limit": "N m",
+    "ramp_ticks": "ticks",
+    "scene_sha256": "",
+}
+"""Metadata that a page shows, with their units; the gains are those of the law, B' and not B."""
+
+_NAMES = {
+    "period_s": "period",
+    "damping": "damping used",
+    "rotational_damping": "rotational damping used",
+}
+"""What a page calls them, where that is not their name."""
+
+_DEVICE = {"name": "", "axes": ""} | DATA_SHEET_UNITS
+
+_WITHOUT = {"rate": "the loop's", "duration": "without end"}
+"""What it means that a data sheet leaves these open; of all else it means that nobody knows."""
+
+_GUARD = {
+    "controller": "",
+    "surplus": "J",
+    "credit": "N s/m",
+    "most_damping": "N s/m",
+    "rotational_credit": "N m s/rad",
+    "most_rotational_damping": "N m s/rad",
+    "force_rise": "N a tick",
+    "torque_rise": "N m a tick",
+    "stale_ticks": "ticks",
+    "fade_ticks": "ticks",
+    "longest_stall": "s",
+    "stretch": "m",
+    "angle": "rad",
+    "speed": "m/s",
+    "turn_speed": "rad/s",
+    "energy": "J",
+    "clutch": "(mask of buttons)",
+    "dead_man": "(mask of buttons)",
+}
+"""What the guard may do, with units; ``kernel.guarding.Guarding`` says what each is."""
+
+
+def json_object(text: str) -> dict[str, Any]:
+    """Returns a JSON object of the metadata; an empty one where it is damaged."""
+    try:
+        return dict(json.loads(text))
+    except (ValueError, TypeError, RecursionError):
+        return {}
+
+
+def run_facts(meta: Mapping[str, str]) -> Facts:
+    """Returns what was set: names, and values with their units."""
+    told = {name: meta[name] for name in _RUN if name in meta}
+    if values := json_object(told.get("scene_parameters", "")):
+        told["scene_parameters"] = _listed(values)
+    elif told.get("scene_parameters") == "{}":
+        del told["scene_parameters"]
+    return [(_NAMES.get(n, _spaced(n)), _valued(value, _RUN[n])) for n, value in told.items()]
+
+
+def device_facts(meta: Mapping[str, str]) -> Facts:
+    """Returns what the device's data sheet says."""
+    sheet = json_object(meta.get("device", ""))
+    for name, meant in _WITHOUT.items():
+        if name in sheet and sheet[name] is None:
+            sheet[name] = meant
+    return [(_spaced(n), _valued(sheet[n], unit)) for n, unit in _DEVICE.items() if n in sheet]
+
+
+def software_facts(meta: Mapping[str, str]) -> Facts:
+    """Returns versions and machine."""
+    told = json_object(meta.get("versions", "")) | json_object(meta.get("host", ""))
+    return [(name, str(value)) for name, value in told.items()]
+
+
+def guard_facts(evidence: Evidence) -> Facts:
+    """Returns what the guard was set to; what it did not do is left out."""
+    guarding = asdict(evidence.parameters.guarding)
+    told = [("controller", controller_of(evidence))]
+    for name, unit in _GUARD.items():
+        value = guarding[name]
+        if name != "controller" and value not in (0, math.inf):
+            told.append((_spaced(name), _valued(value, unit)))
+    return told
+
+
+def controller_of(evidence: Evidence) -> str:
+    """Returns the name of the run's passivity controller."""
+    names = {code: name for name, code in CONTROLLERS.items()}
+    return names[evidence.parameters.guarding.controller]
+
+
+def head_facts(report: AuditReport, meta: Mapping[str, str], evidence: Evidence) -> Facts:
+    """Returns what is to be known first: what was run, how it went, and what was checked."""
+    parameters, flags = evidence.parameters, evidence.ticks["flags"]
+    ports = evidence.ticks["wrench_on_device"]
+    force, torque = (float(np.linalg.norm(ports[:, p], axis=1).max()) for p in _PARTS)
+    missed = int(np.count_nonzero(flags & int(TickFlag.OVERRUN)))
+    in_time = "in simulated time" if meta.get("clock") == "simulated" else f"{missed} missed"
+    told = [
+        ("scene", meta.get("scene", "")),
+        ("device", f"{evidence.info.name}, {len(evidence.info.axes)} axes"),
+        ("method", f"{evidence.method.name}, {1 / parameters.period:g} Hz"),
+        *(("coupling", sentence) for sentence in report.rendered[:1]),
+        ("ran", f"{report.duration:.3f} s, {report.ticks} ticks, {in_time}"),
+        ("at most", f"{quantity(force, 'N')}, {quantity(torque, 'N m')} on the device"),
+        ("controller", _controlled(evidence)),
+    ]
+    borne = {True: "bears the coupling", False: "does not bear it", None: "not judged"}
+    told.append(("device condition", borne[report.certified]))
+    if report.slack_share:
+        told.append(("slack used", f"{report.slack_share:.0%}"))
+    return [*told, ("simulated again", report.resimulation or "not reached")]
+
+
+_PARTS = slice(0, 3), slice(3, 6)
+
+
+def _controlled(evidence: Evidence) -> str:
+    name = controller_of(evidence)
+    active = (evidence.ticks["flags"] & int(TickFlag.CONTROLLER_ACTIVE)) != 0
+    if not active.any():
+        return name if name == "off" else f"{name}, never at work"
+    most = float(evidence.ticks["injected_damping"].max())
+    injected = f", up to {most:.3g} N s/m injected" if most else ""
+    return f"{name}, at work in {percent(active)} of the ticks{injected}"
+
+
+def percent(is_on: NDArray[np.bool_]) -> str:
+    """Returns in which share of the ticks something was on; what happened at all is not 0 %."""
+    share = 100 * float(np.mean(is_on))
+    return f"{share:.2g}%" if share < 99.5 else f"{share:.0f}%"
+
+
+def event_rows(events: Sequence[Mapping[str, Any]]) -> list[tuple[str, str, str, str]]:
+    """Returns name, tick, time and the rest of events, at most ``MOST_EVENTS``, in their order.
+
+    Where there are more, inputs are left out first: they are many, and what stopped a run is last.
+    """
+    ranked = sorted(range(len(events)), key=lambda i: (events[i].get("event") == "input", i))
+    kept = sorted(ranked[:MOST_EVENTS])
+    return [_event(events[index]) for index in kept]
+
+
+def _event(event: Mapping[str, Any]) -> tuple[str, str, str, str]:
+    rest = {k: v for k, v in event.items() if k not in ("event", "tick", "time_ns")}
+    time = event.get("time_ns")
+    at = f"{1e-9 * time:.3f} s" if isinstance(time, int) else "–"
+    text = _listed({k: v for k, v in rest.items() if v not in ("", None)})
+    text = text if len(text) <= _LONGEST else f"{text[: _LONGEST - 1]}…"
+    return str(event.get("event"))[:_LONGEST], str(event.get("tick", "–"))[:_LONGEST], at, text
+
+
+def _listed(values: Mapping[str, Any]) -> str:
+    return ", ".join(f"{name} {_valued(value, '')}" for name, value in values.items())
+
+
+def _spaced(name: str) -> str:
+    return name.replace("_", " ")
+
+
+def _valued(value: object, unit: str) -> str:
+    """Returns a value with its unit; numbers, also such as text holds, without rounding's tail."""
+    if value is None:
+        return "unknown"
+    if isinstance(value, list | tuple):
+        return ", ".join(map(str, value))
+    try:
+        text = str(value) if isinstance(value, bool) else f"{float(str(value)):.10g}"
+    except ValueError:
+        return str(value)  # a word has no unit
+    return f"{text} {unit}".rstrip()

@@ -1,0 +1,115 @@
+"""What becomes of a run when its page, or whoever looks at it, misbehaves: nothing."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from audit_cases import ScriptedDevice
+from report_runs import LOOSE
+from test_bridge_commands import FLOOR, swaying
+
+from hapticbridge.audit import audit
+from hapticbridge.bridge import Bridge
+from hapticbridge.clock import SimulatedClock
+from hapticbridge.recording import read_recording
+from hapticbridge.tick import TICK_DTYPE
+from hapticbridge.view.address import Address
+from hapticbridge.view.window import Window
+
+pytest.importorskip("viser", reason="needs the extra 'view'")
+
+from page_client import Hand, hand
+
+# viser's threads and sockets end with the process
+pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+
+TICKS = 1500
+
+Deed = Callable[[Window, contextlib.ExitStack], None]
+
+
+def _process(window: Window) -> int:
+    assert window.process_id is not None
+    return window.process_id
+
+
+def killed(window: Window, _: contextlib.ExitStack) -> None:
+    os.kill(_process(window), signal.SIGKILL)
+
+
+def standing_still(window: Window, _: contextlib.ExitStack) -> None:
+    os.kill(_process(window), signal.SIGSTOP)
+
+
+def watched_by_ten(window: Window, stack: contextlib.ExitStack) -> None:
+    """Ten browsers, none of which reads a word: the slowest that there are."""
+    for _ in range(10):
+        stack.enter_context(hand(window.url))
+
+
+def flooded(window: Window, stack: contextlib.ExitStack) -> None:
+    """A browser that asks for ten thousand impossible things at once."""
+    page: Hand = stack.enter_context(hand(window.url))
+    for number in range(10_000):
+        page.send("stiffness K (N/m)", value=1e6 + number)
+
+
+def shouted_at(window: Window, stack: contextlib.ExitStack) -> None:
+    """A browser that sends more than a message may hold, and noise."""
+    page: Hand = stack.enter_context(hand(window.url))
+    with contextlib.suppress(Exception):
+        page.socket.send(b"\xff" * 100)
+        page.socket.send(b"x" * (1 << 20))
+
+
+def run(folder: Path, name: str, deed: Deed | None) -> tuple[Path, Any, float]:
+    scene, path = folder / "floor.xml", folder / f"{name}.mcap"
+    scene.write_text(FLOOR)
+    window = None if deed is None else Window(Address("127.0.0.1", 0))
+    with contextlib.ExitStack() as stack:
+
+        def disturb(tick: int) -> None:
+            if deed is not None and window is not None and tick == 300:
+                deed(window, stack)
+            if tick % 10 == 0 and deed is not None:
+                time.sleep(1e-3)  # so that what was done has the time to do harm
+
+        with Bridge(
+            str(scene),
+            ScriptedDevice(swaying),
+            LOOSE,
+            recording=path,
+            clock=SimulatedClock(),
+            onlooker=window,
+        ) as bridge:
+            if window is not None:
+                window.on_command = partial(bridge.command, by="view")
+            summary = bridge.run(TICKS * 1e-3, disturb)
+            began = time.monotonic()
+    return path, summary, time.monotonic() - began
+
+
+@pytest.mark.parametrize("deed", [killed, standing_still, watched_by_ten, flooded, shouted_at])
+def test_a_page_in_trouble_changes_no_number_of_the_run(deed: Deed, tmp_path: Path) -> None:
+    alone, _, _ = run(tmp_path, "alone", None)
+    path, summary, _ = run(tmp_path, "seen", deed)
+    assert (summary.ticks, summary.dropped, summary.overruns) == (TICKS, 0, 0)
+    undisturbed, disturbed = read_recording(alone), read_recording(path)
+    for name in TICK_DTYPE.names or ():
+        np.testing.assert_array_equal(disturbed.ticks[name], undisturbed.ticks[name])
+    report = audit(path)
+    assert (report.verdict, report.resimulation) == ("passive", "bit for bit")
+
+
+def test_a_page_that_stands_still_holds_nobody_up_at_the_end(tmp_path: Path) -> None:
+    _, _, seconds = run(tmp_path, "seen", standing_still)
+    assert seconds < 30  # it is killed after 2 s; without that it would never end

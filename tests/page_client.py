@@ -1,0 +1,82 @@
+"""Whoever speaks to the page's socket by hand: what a browser would send, and what none would."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import msgspec
+import viser
+import zstandard
+from websockets.sync.client import connect
+from websockets.sync.connection import Connection
+from websockets.typing import Subprotocol
+
+PATIENCE = 60.0
+"""In s, for a page to tell what it holds."""
+
+
+class Hand:
+    """A connection to a page.
+
+    Attributes:
+        socket: The connection.
+        elements: Of the page, by their labels: uuid and what they were made with.
+    """
+
+    def __init__(self, socket: Connection) -> None:
+        self.socket = socket
+        self.elements: dict[str, dict[str, Any]] = {}
+
+    def read(self, seconds: float) -> list[dict[str, Any]]:
+        """Returns what the page sends within a time, and notes its elements."""
+        found: list[dict[str, Any]] = []
+        end = time.monotonic() + seconds
+        while (left := end - time.monotonic()) > 0:
+            with contextlib.suppress(TimeoutError):
+                frame = self.socket.recv(timeout=left)
+                assert isinstance(frame, bytes)
+                size, packed = (int.from_bytes(frame[i : i + 8], "little") for i in (0, 8))
+                inner = zstandard.ZstdDecompressor().decompress(
+                    frame[16 : 16 + packed], max_output_size=size
+                )
+                found += msgspec.msgpack.decode(inner)["messages"]
+        for message in found:
+            label = message.get("props", {}).get("label")
+            if label:
+                self.elements[label] = message
+        return found
+
+    def find(self, label: str) -> dict[str, Any]:
+        """Returns an element once the page has told of it."""
+        end = time.monotonic() + PATIENCE
+        while label not in self.elements:
+            assert time.monotonic() < end, f"the page has no {label}: {list(self.elements)}"
+            self.read(0.2)
+        return self.elements[label]
+
+    def send(self, label: str, **updates: Any) -> None:
+        """Sends what a browser sends when an element is changed; unlike one, anything."""
+        self._say(type="GuiUpdateMessage", uuid=self.find(label)["uuid"], updates=updates)
+
+    def introduce(self) -> None:
+        """Sends the camera; before that a page listens to nobody."""
+        zero, one = (0.0, 0.0, 0.0), {"fov": 1.0, "near": 0.01, "far": 10.0}
+        pose = {"wxyz": (1.0, 0.0, 0.0, 0.0), "position": zero, "look_at": zero}
+        size = {"image_height": 100, "image_width": 100, "up_direction": (0.0, 0.0, 1.0)}
+        self._say(type="ViewerCameraMessage", **one, **pose, **size)
+
+    def _say(self, **message: Any) -> None:
+        self.socket.send(msgspec.msgpack.encode(message))
+
+
+@contextlib.contextmanager
+def hand(url: str) -> Iterator[Hand]:
+    """Connects to a page."""
+    version = [Subprotocol(f"viser-v{viser.__version__}")]
+    with connect(url.replace("http", "ws"), subprotocols=version, max_size=None) as socket:
+        found = Hand(socket)
+        found.introduce()
+        yield found

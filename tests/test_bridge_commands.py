@@ -1,0 +1,319 @@
+"""Commands in a run: what they do to it, what is booked, and that its recording can be judged."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from audit_cases import ScriptedDevice, recorded, rewritten, without_model
+from report_runs import ANVIL, LOOSE
+
+from hapticbridge.audit import audit
+from hapticbridge.bridge import Bridge
+from hapticbridge.clock import SimulatedClock
+from hapticbridge.commands import Command, Couple, Record, Reset, Switch
+from hapticbridge.commands.change import tuning_ticks
+from hapticbridge.coupling import Coupling
+from hapticbridge.errors import CommandError
+from hapticbridge.recording import read_recording
+
+T = 1e-3
+STEPS = tuning_ticks(T)
+
+FLOOR = """<mujoco model="floor">
+  <option timestep="0.001" integrator="discrete" cone="elliptic" gravity="0 0 -1"/>
+  <worldbody>
+    <geom type="plane" size="0.1 0.1 0.01"/>
+    <body name="ball" pos="0 0 0.03">
+      <freejoint/>
+      <geom type="sphere" size="0.02" mass="0.1"/>
+      <site name="grip"/>
+    </body>
+  </worldbody>
+</mujoco>"""
+
+
+def swaying(tick: int) -> tuple[float, ...]:
+    return (0.01 * math.sin(0.01 * tick), 0, max(-1e-4 * tick, -0.012), 1, 0, 0, 0)
+
+
+class Script:
+    """Gives commands at ticks of the whole run, however often it began anew."""
+
+    def __init__(self, commands: Mapping[int, Command]) -> None:
+        self.commands, self.done = commands, 0
+        self.stiffness: list[float] = []
+        self.bound: list[float] = []
+
+    def __call__(self, bridge: Bridge, _: int) -> None:
+        bridge._commands._now = lambda: self.done * T
+        if self.done in self.commands:
+            bridge.command(self.commands[self.done], by="test")
+        state = bridge._binding.state[0]
+        self.stiffness.append(float(state["stiffness"]))
+        self.bound.append(float(state["stiffness"] * T / 2 + state["damping"]))
+        self.done += 1
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Iterator[Callable[..., Any]]:
+    def start(
+        commands: Mapping[int, Command],
+        seconds: float,
+        scene: str = FLOOR,
+        pose: Callable[[int], tuple[float, ...]] = swaying,
+        coupling: Coupling = LOOSE,
+        damping: float = 2.0,
+        **options: Any,
+    ) -> tuple[Any, Path, Script]:
+        file, path = tmp_path / "scene.xml", tmp_path / "run.mcap"
+        file.write_text(scene)
+        script = Script(commands)
+        device = ScriptedDevice(pose, damping=damping)
+        summary = recorded(
+            path, str(file), device, coupling, duration=seconds, on_tick=script, **options
+        )
+        return summary, path, script
+
+    yield start
+
+
+EVERYTHING: dict[int, Command] = {
+    60: Couple(1000.0, 0.5),
+    300: Couple(3000.0, 0.4),  # before the change before it is over
+    900: Switch(force=False),
+    960: Switch(force=True),
+    1020: Switch(clutch=True),
+    1080: Switch(clutch=False),
+    1140: Reset(),
+}
+
+
+@pytest.mark.parametrize("method", ["lossless", "implicit", "compensated", "explicit"])
+@pytest.mark.parametrize("pipelined", [False, True])
+def test_a_run_with_commands_is_repeated_bit_for_bit_and_passive(
+    run: Callable[..., Any], method: str, pipelined: bool
+) -> None:
+    summary, path, script = run(EVERYTHING, 1.4, method=method, pipelined=pipelined)
+    report = audit(path)
+    assert (report.verdict, report.resimulation) == ("passive", "bit for bit")
+    assert report.certified is True
+    assert (summary.verdict, summary.is_certified) == ("passive", True)
+    # on the way no tick asks more of the device than both ends do
+    assert max(script.bound) <= 2.0 * (1 + 1e-12)
+    assert script.stiffness[-1] == 3000.0
+
+
+def test_each_command_lands_in_an_event_with_its_tick(run: Callable[..., Any]) -> None:
+    _, path, _ = run(EVERYTHING, 1.4)
+    recording = read_recording(path)
+    told = [(e["event"], e["tick"]) for e in recording.events]
+    assert told == [
+        ("start", 0),
+        ("coupling", 60),
+        ("coupling", 300),
+        ("switch", 900),
+        ("switch", 960),
+        ("switch", 1020),
+        ("switch", 1080),
+        ("switch", 1140),  # the force fades
+        ("reset", 1161),
+        ("switch", 1161),
+        ("stop", 1400),
+    ]
+    assert {e["by"] for e in recording.events if "by" in e} == {"test"}
+
+
+def stretched(tick: int) -> tuple[float, ...]:
+    """Pulled 2 mm aside within 0.2 s, held, and let back between 0.9 and 1.1 s."""
+    way = 2e-3 * (min(tick / 200, 1.0) if tick < 900 else max(1 - (tick - 900) / 200, 0.0))
+    return (way, 0, 0, 1, 0, 0, 0)
+
+
+def grown(path: Path, change: float) -> float:
+    """Returns by how much springs that grow by a part of K in each tick of a change grow."""
+    ticks = read_recording(path).ticks
+    stretch = ticks["handle_position"][1:] - ticks["tool_position"][:-1]
+    squares = np.sum(stretch[249 : 249 + STEPS] ** 2, axis=1)
+    return float(np.sum(0.5 * change / STEPS * squares))
+
+
+def test_a_change_of_stiffness_gives_the_spring_half_of_it_times_its_stretch_squared(
+    run: Callable[..., Any],
+) -> None:
+    summary, path, script = run({250: Couple(3000.0, 1.6)}, 0.85, ANVIL, stretched)
+    # 2 mm, while the anvil of 20 t gives way by 0.05 mm
+    assert summary.energies["tuning_work"] == pytest.approx(500.0 * 2e-3**2, rel=0.03)
+    assert summary.energies["tuning_work"] == pytest.approx(grown(path, 1000.0), rel=1e-9)
+    climb = np.diff(script.stiffness)[250 : 250 + STEPS]
+    np.testing.assert_allclose(climb, 1000.0 / STEPS, rtol=1e-9)
+    assert summary.energies["environment_energy"] <= 1e-9
+
+
+def test_what_a_command_gave_to_the_device_is_not_called_activity(run: Callable[..., Any]) -> None:
+    # a device without the damping that the coupling needs, so that its port is watched
+    soft = Coupling(1000.0, 0.1, 2.0, 1e-3)
+    options = {"method": "implicit", "pose": stretched, "scene": ANVIL, "damping": 0.55}
+    _, path, _ = run({}, 1.2, coupling=replace(soft, damping=0.2), **options)
+    assert audit(path).certified is False
+    energy = read_recording(path).ticks["device_energy"][-1]
+    assert energy < 0  # what was put in came out, but for the dampers' share
+    _, path, _ = run(
+        {300: Couple(1050.0, 0.0)}, 1.2, coupling=replace(soft, damping=0.2), **options
+    )
+    recording, report = read_recording(path), audit(path)
+    assert report.certified is False
+    assert recording.ticks["device_energy"][-1] > energy + 0.5 * 0.5 * 50.0 * 2e-3**2
+    assert (report.verdict, report.resimulation) == ("passive", "bit for bit")
+
+
+def test_softening_takes_energy_away(run: Callable[..., Any]) -> None:
+    summary, path, _ = run({250: Couple(1000.0, 0.6)}, 0.85, ANVIL, stretched)
+    assert summary.energies["tuning_work"] == pytest.approx(grown(path, -1000.0), rel=1e-9)
+    assert summary.energies["tuning_work"] < -1.9e-3
+    assert audit(path).verdict == "passive"
+
+
+def test_force_off_sends_none_and_the_tool_still_follows(run: Callable[..., Any]) -> None:
+    _, path, _ = run({600: Switch(force=False)}, 1.0)
+    ticks = read_recording(path).ticks
+    assert not ticks["wrench_on_device"][621:].any()
+    assert np.abs(ticks["wrench_on_device"][:600]).max() > 0.1
+    aside = ticks["tool_position"][:, 0]
+    assert np.ptp(aside[650:]) > 5e-3
+    assert audit(path).verdict == "passive"
+
+
+def test_a_clutch_by_command_is_one_by_button(run: Callable[..., Any]) -> None:
+    _, path, _ = run({600: Switch(clutch=True), 800: Switch(clutch=False)}, 1.0)
+    ticks = read_recording(path).ticks
+    handle = ticks["handle_position"]
+    np.testing.assert_array_equal(handle[600:800], np.tile(handle[599], (200, 1)))
+    np.testing.assert_allclose(handle[800], ticks["tool_position"][799], atol=1e-15)
+    assert np.abs(np.diff(ticks["device_position"][600:800], axis=0)).max() > 0
+
+
+def test_a_reset_puts_the_scene_back_and_books_what_that_takes(run: Callable[..., Any]) -> None:
+    _, path, _ = run({600: Reset()}, 0.8)
+    ticks = read_recording(path).ticks
+    # 20 ms to fade, then the jump; within a tick the ball falls by 1e-6 m
+    np.testing.assert_allclose(ticks["tool_position"][621], [0, 0, 0.03], atol=1e-5)
+    assert np.linalg.norm(ticks["tool_position"][620] - [0, 0, 0.03]) > 5e-3
+    assert not ticks["wrench_on_device"][620].any()
+    stored = ticks["kinetic"] + ticks["potential"]
+    jump = ticks["external_work"][621] - ticks["external_work"][620]
+    assert jump == pytest.approx(stored[621] - stored[620], abs=1e-6)
+    np.testing.assert_allclose(np.abs(ticks["external_work"][:621]).max(), 0, atol=1e-15)
+    # the hand goes on from where it was without a blow
+    change = np.linalg.norm(np.diff(ticks["wrench_on_device"][620:700, :3], axis=0), axis=1)
+    assert change.max() < 0.5
+    assert audit(path).verdict == "passive"
+
+
+@pytest.mark.parametrize("is_blind", [False, True])
+@pytest.mark.parametrize(
+    ("event", "change"),
+    [
+        ("coupling", {"tick": 61}),
+        ("coupling", {"stiffness": 1001.0}),
+        ("coupling", {"ticks": 1}),
+        ("coupling", {"damping": -1.0}),
+        ("switch", {"force": True}),
+        ("switch", {"tick": 901}),
+        ("switch", {"clutch": 1}),
+        ("reset", {"event": "nothing"}),
+        ("reset", {"tick": 1162}),
+        ("reset", {"tick": "x"}),
+    ],
+)
+def test_an_event_that_was_changed_is_found(
+    run: Callable[..., Any], event: str, change: dict[str, Any], is_blind: bool
+) -> None:
+    _, path, _ = run(EVERYTHING, 1.2)
+    recording = read_recording(path)
+    if is_blind:  # without a re-simulation, from records and events alone
+        recording = without_model(recording)
+    events = [dict(e) for e in recording.events]
+    first = next(e for e in events if e["event"] == event)
+    first |= change
+    assert audit(rewritten(recording, path.with_name("changed.mcap"), events=events)).verdict == (
+        "invalid"
+    )
+
+
+def test_a_recorder_started_in_mid_run_writes_a_file_that_is_judged_like_any_other(
+    run: Callable[..., Any],
+) -> None:
+    summary, path, _ = run(
+        {
+            60: Couple(1000.0, 0.5),
+            300: Record(on=False),
+            700: Couple(3000.0, 1.6),
+            900: Switch(clutch=True),
+            1400: Record(on=True),  # pressed on the floor, in motion, with the clutch held
+            1500: Switch(clutch=False),
+            1600: Couple(2000.0, 1.2),
+        },
+        2.5,
+    )
+    assert summary.recording == path.with_name("run-2.mcap")
+    assert (summary.ticks, summary.duration) == (2500, pytest.approx(2.5))
+    first, second = read_recording(path), read_recording(path.with_name("run-2.mcap"))
+    assert len(first.ticks) == 321
+    assert len(second.ticks) == 2500 - 1420  # a pause asks twice before one tick
+    assert first.events[-1]["reason"] == "recording stopped"
+    for file in (first.path, second.path):
+        report = audit(file)
+        assert (report.verdict, report.resimulation) == ("passive", "bit for bit")
+    # it begins where the run was, with the coupling that it had
+    assert float(second.meta["stiffness"]) == 3000.0
+    assert second.ticks["tool_position"][0, 2] < 0.0201
+    assert second.ticks["deadline_ns"][0] == 1_000_000
+    assert float(second.meta["start_elastic"]) > 0
+
+
+def test_a_start_that_claims_more_elastic_energy_than_there_is_is_found(
+    run: Callable[..., Any],
+) -> None:
+    _, path, _ = run({200: Record(on=False), 1300: Record(on=True)}, 1.6)
+    recording = read_recording(path.with_name("run-2.mcap"))
+    claimed = {"start_elastic": repr(float(recording.meta["start_elastic"]) + 1e-3)}
+    report = audit(rewritten(recording, path.with_name("changed.mcap"), meta=claimed))
+    assert report.verdict == "invalid"
+
+
+def test_a_recorder_that_cannot_start_leaves_the_run_going(
+    run: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    nowhere = tmp_path / "gone" / "run.mcap"
+    monkeypatch.setattr("hapticbridge.commanded.Commanded._next_path", lambda _: nowhere)
+    summary, path, _ = run({200: Record(on=False), 1300: Record(on=True)}, 1.6)
+    assert summary.ticks == 1600
+    assert audit(path).verdict == "passive"
+    assert not nowhere.exists()
+
+
+def test_a_run_refuses_what_it_has_already_and_what_its_device_does_not_bear(
+    run: Callable[..., Any],
+) -> None:
+    for command, reason in (
+        (Record(on=True), "already being recorded"),
+        (Couple(4100.0, 0.0), "and this one has 2"),
+    ):
+        with pytest.raises(CommandError, match=reason):
+            run({10: command}, 0.1)
+
+
+def test_a_run_that_nobody_else_can_see_cannot_start_a_recorder(tmp_path: Path) -> None:
+    file = tmp_path / "scene.xml"
+    file.write_text(FLOOR)
+    with Bridge(str(file), ScriptedDevice(swaying), LOOSE, clock=SimulatedClock()) as bridge:
+        with pytest.raises(CommandError, match="cannot start a recorder"):
+            bridge.command(Record(on=True))
+        bridge.command(Switch(force=False))
+        assert bridge.run(0.05).ticks == 50

@@ -1,0 +1,216 @@
+"""Commands: what gets into a run, and that nothing beyond the device's bound ever does."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+from audit_cases import COUPLING, ScriptedDevice
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hapticbridge.certificate import needed_on_axes
+from hapticbridge.commands import (
+    Allowance,
+    Command,
+    CommandQueue,
+    Couple,
+    Record,
+    Reset,
+    Switch,
+    command_of,
+)
+from hapticbridge.commands.command import LONGEST_LINE, Stop, line_of
+from hapticbridge.commands.queue import INTERVAL, MOST_WAITING, PAUSE_INTERVAL
+from hapticbridge.errors import CommandError
+from hapticbridge.guard import Limits
+from hapticbridge.rendering import method_named
+
+T = 1e-3
+INFO = ScriptedDevice(lambda _: (0, 0, 0, 1, 0, 0, 0)).info
+"""b = 2 N s/m: BC97 (6) gives K <= 2 b/T = 4000 N/m at B' = 0."""
+
+
+def allowance(method: str = "implicit", scale: float = 1.0, **changes: float | None) -> Allowance:
+    return Allowance(
+        info=replace(INFO, **changes),  # type: ignore[arg-type] # numbers of a device alone
+        method=method_named(method),
+        start=COUPLING,
+        period=T,
+        scale=scale,
+        force_scale=scale,
+        substeps=1,
+        limits=Limits(force=10.0, torque=0.5),
+    )
+
+
+@pytest.mark.parametrize(
+    ("method", "stiffest", "most_damped"),
+    [
+        # b >= K T/2 + B
+        ("implicit", 2 * (2 - 0.5) / T, 2 - 1000 * T / 2),
+        # B' = B - K T/2, 0 at least
+        ("lossless", 2 * 2 / T, 2.0),
+        # B' = B - K T, 0 at least
+        ("compensated", 2 * 2 / T, 2 + 1000 * T / 2),
+    ],
+)
+def test_the_sliders_end_where_the_bound_does(
+    method: str, stiffest: float, most_damped: float
+) -> None:
+    allowed = allowance(method)
+    assert allowed.most_stiffness(0.5) == pytest.approx(stiffest, rel=1e-9)
+    assert allowed.most_damping(1000.0) == pytest.approx(most_damped, rel=1e-9)
+    allowed.check(0.9999 * stiffest, 0.5)
+    allowed.check(1000.0, 0.9999 * most_damped)
+    for couple in ((1.0001 * stiffest, 0.5), (1000.0, 1.0001 * most_damped)):
+        with pytest.raises(CommandError, match=r"needs a device of .* N s/m, and this one has 2"):
+            allowed.check(*couple)
+
+
+def test_the_bound_scales_with_motion_and_force() -> None:
+    assert allowance(scale=2.0).most_stiffness(0.0) == pytest.approx(4000 / 4, rel=1e-9)
+
+
+def test_an_unknown_damping_is_the_one_that_the_default_coupling_takes() -> None:
+    allowed = allowance(damping=None)
+    assert allowed.most_stiffness(0.0) == pytest.approx(2 * allowed.damping / T, rel=1e-9)
+    assert "taken for it" in allowed.reason()
+    assert "taken for it" not in allowance().reason()
+
+
+def test_the_softest_coupling_still_shows_the_whole_force() -> None:
+    least = allowance().least_stiffness
+    assert least == pytest.approx(max(10.0 / 0.2, 0.05 * 4000))  # 10 N within 0.2 m; a share
+    allowance().check(least, 0.0)
+    with pytest.raises(CommandError, match="longer than the run allows"):
+        allowance().check(0.999 * least, 0.0)
+
+
+def test_without_a_coupling_law_there_is_nothing_to_change() -> None:
+    with pytest.raises(CommandError, match="'weld' has no coupling law"):
+        allowance("weld").check(1000.0, 0.0)
+
+
+class Time:
+    """Seconds that a test sets."""
+
+    now = 100.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+def test_commands_that_follow_too_soon_are_refused() -> None:
+    time = Time()
+    queue = CommandQueue(allowance(), now=time)
+    queue.offer(Switch(force=False), "test")
+    time.now += 0.99 * INTERVAL
+    with pytest.raises(CommandError, match="too recent"):
+        queue.offer(Switch(force=True), "test")
+    time.now += 0.02 * INTERVAL
+    queue.offer(Reset(), "test")
+    time.now += 0.99 * PAUSE_INTERVAL
+    queue.offer(Couple(1000.0, 0.5), "test")
+    time.now += INTERVAL / 2
+    with pytest.raises(CommandError, match="too recent"):
+        queue.offer(Record(on=True), "test")
+    assert [type(command) for command, _ in queue.waiting] == [Switch, Reset, Couple]
+
+
+def test_a_loop_that_takes_nothing_is_told_nothing_more() -> None:
+    time = Time()
+    queue = CommandQueue(allowance(), now=time)
+    for _ in range(MOST_WAITING):
+        time.now += 1.0
+        queue.offer(Switch(force=True), "test")
+    time.now += 1.0
+    with pytest.raises(CommandError, match="stands still"):
+        queue.offer(Switch(force=False), "test")
+    assert len(queue.waiting) == MOST_WAITING
+    assert all(command == Switch(force=True) for command, _ in queue.waiting)
+
+
+def test_what_the_run_cannot_do_is_refused() -> None:
+    with pytest.raises(CommandError, match="recorder"):
+        CommandQueue(allowance(), can_record=False).offer(Record(on=True), "test")
+    with pytest.raises(CommandError, match="without mass"):
+        CommandQueue(allowance("direct")).offer(Reset(), "test")
+
+
+numbers = st.floats() | st.integers() | st.booleans() | st.none() | st.text(max_size=4)
+
+
+@settings(max_examples=100, deadline=None)
+@given(
+    method=st.sampled_from(["implicit", "lossless", "compensated", "explicit"]),
+    stiffness=numbers | st.floats(0, 1e4),
+    damping=numbers | st.floats(0, 4),
+)
+def test_nothing_gets_in_that_needs_more_than_the_device_has(
+    method: str, stiffness: object, damping: object
+) -> None:
+    queue = CommandQueue(allowance(method))
+    line = b'{"command": "couple", "stiffness": %s, "damping": %s}'
+    said = line % tuple(_json(value) for value in (stiffness, damping))
+    try:
+        queue.offer(command_of(said), "test")
+    except CommandError:
+        assert not queue.waiting
+        return
+    [(command, _)] = queue.waiting
+    assert isinstance(command, Couple)
+    felt = queue.allowance.felt(command.stiffness, command.damping)
+    used = queue.allowance.used(felt)
+    assert math.isfinite(used.stiffness)
+    assert used.stiffness * T / 2 + used.damping <= 2.0 * (1 + 1e-8)
+
+
+def _json(value: object) -> bytes:
+    names = {True: b"true", False: b"false", None: b"null"}
+    if isinstance(value, bool) or value is None:
+        return names[value]
+    return repr(value).encode() if isinstance(value, int | float) else b'"x"'
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.binary(max_size=2 * LONGEST_LINE))
+def test_any_bytes_are_a_command_or_refused(said: bytes) -> None:
+    try:
+        command = command_of(said)
+    except CommandError:
+        return
+    assert command_of(line_of(command)) == command
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        Couple(1234.5, 0.1),
+        Switch(force=False),
+        Switch(clutch=True),
+        Switch(),
+        Reset(),
+        Record(on=True),
+        Stop(),
+    ],
+)
+def test_a_command_reads_back_as_it_was_written(command: Command) -> None:
+    assert command_of(line_of(command)) == command
+    assert len(line_of(command)) <= LONGEST_LINE
+
+
+@pytest.mark.parametrize("substeps", [1, 4])
+@pytest.mark.parametrize("delay", [0.0, 1e-3])
+def test_what_is_needed_is_what_the_certificate_says(substeps: int, delay: float) -> None:
+    allowed = replace(allowance(delay=delay), substeps=substeps)
+    for stiffness, damping in ((200.0, 0.0), (1000.0, 0.7), (3000.0, 0.1)):
+        used = allowed.used(allowed.felt(stiffness, damping))
+        laws = allowed.method.laws(substeps)
+        said = needed_on_axes(allowed.info, used, T, 1.0, 1.0, laws, allowed.method)[0]
+        need = allowed.needed(stiffness, damping)
+        if substeps == 1 and not delay:
+            assert need == pytest.approx(said, rel=1e-9)
+        else:  # read off a table, on the safe side
+            assert said * (1 - 1e-9) <= need <= 1.01 * said

@@ -1,0 +1,217 @@
+"""The controls of the page: what a browser's hand does to a run, and what no hand can."""
+
+from __future__ import annotations
+
+import base64
+import contextlib
+import os
+import threading
+import time
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from audit_cases import ScriptedDevice, recorded
+from chromium import Tab, browser
+from report_runs import LOOSE
+from test_bridge_commands import FLOOR, Script, swaying
+
+from hapticbridge.audit import audit
+from hapticbridge.bridge import Bridge
+from hapticbridge.commands import Couple, Record, Switch, command_of
+from hapticbridge.commands.command import Stop
+from hapticbridge.errors import HapticBridgeError
+from hapticbridge.provenance import MODEL_ATTACHMENT, STATE_ATTACHMENT
+from hapticbridge.recording import Ring, read_recording
+from hapticbridge.view.address import Address
+from hapticbridge.view.window import Window
+
+pytest.importorskip("viser", reason="needs the extra 'view'")
+
+from page_client import Hand, hand
+
+from hapticbridge.view.controls import Outlet, allowance_of
+from hapticbridge.view.live import Show
+
+# viser's threads and sockets end with the process
+pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+
+K, B = "stiffness K (N/m)", "damping B (N s/m)"
+
+ATTACHED = (MODEL_ATTACHMENT, STATE_ATTACHMENT)
+
+PATIENCE = 60.0
+"""In s, for anything to happen in a run; it ends by itself after twice as long."""
+
+
+def until(condition: Callable[[], Any]) -> None:
+    end = time.monotonic() + PATIENCE
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.02)
+
+
+@contextlib.contextmanager
+def running(folder: Path) -> Iterator[tuple[Bridge, Window]]:
+    """A run in real time with its page, until the block is over."""
+    scene, window = folder / "floor.xml", Window(Address("127.0.0.1", 0))
+    scene.write_text(FLOOR)
+    failed: list[BaseException] = []
+
+    def run() -> None:
+        try:
+            bridge.run(2 * PATIENCE)
+        except HapticBridgeError as error:
+            failed.append(error)
+
+    device, path = ScriptedDevice(swaying), folder / "run.mcap"
+    with Bridge(str(scene), device, LOOSE, recording=path, onlooker=window) as bridge:
+        window.on_command = partial(bridge.command, by="view")
+        thread = threading.Thread(target=run)
+        thread.start()
+        try:
+            yield bridge, window
+        finally:
+            bridge.stop("test")
+            thread.join()
+    assert not failed
+
+
+def events(path: Path, name: str) -> list[dict[str, Any]]:
+    return [event for event in read_recording(path).events if event["event"] == name]
+
+
+def stiffness(bridge: Bridge) -> float:
+    return float(bridge._binding.state["stiffness"][0])
+
+
+def pressed(tab: Tab, key: str) -> None:
+    for kind in ("keyDown", "keyUp"):
+        tab._ask("Input.dispatchKeyEvent", type=kind, key=key, code=key)
+
+
+def test_a_slider_of_the_page_moves_the_stiffness_and_the_recording_says_so(
+    tmp_path: Path,
+) -> None:
+    with running(tmp_path) as (bridge, window), browser(tmp_path) as tab:
+        page = tab()
+        page.open(window.url, 1200, 1300)
+        page.wait_for("document.querySelectorAll('[role=slider]').length >= 2")
+        page.wait_for("document.body.innerText.includes('They end where the device')")
+        page.value("document.querySelectorAll('[role=slider]')[0].focus()")
+        before = stiffness(bridge)
+        pressed(page, "Home")  # its least value
+        least = allowance_of(bridge._description()).least_stiffness
+        until(lambda: stiffness(bridge) == pytest.approx(least))
+        page.wait_for("document.body.innerText.includes('K goes to 200 N/m')")
+        page.picture(tmp_path / "controls.png")
+        assert page.complaints == []
+    told = events(tmp_path / "run.mcap", "coupling")
+    assert before == LOOSE.stiffness
+    assert told[-1]["stiffness"] == pytest.approx(least)
+    assert told[-1]["by"] == "view"
+    report = audit(tmp_path / "run.mcap")
+    assert (report.verdict, report.resimulation) == ("passive", "bit for bit")
+    assert (tmp_path / "controls.png").stat().st_size > 10_000
+
+
+def answers(page: Hand, word: str) -> str:
+    """Returns what the page says with a word in it, once it does."""
+    end = time.monotonic() + PATIENCE
+    while time.monotonic() < end:
+        for message in page.read(0.2):
+            said = str(message.get("updates", {}).get("_markdown", ""))
+            if word in said:
+                return said
+    raise AssertionError(f"the page never said {word}")
+
+
+def test_nothing_that_is_sent_by_hand_exceeds_a_limit(tmp_path: Path) -> None:
+    with running(tmp_path) as (bridge, window), hand(window.url) as page:
+        page.send(K, value=1e6)
+        assert "needs a device of 500 N s/m, and this one has 2" in answers(page, "refused")
+        # a slider without an end, and values that are none
+        page.send(K, max=1e9, value=9e8)
+        page.send(B, max=1e9, value=50.0)
+        page.send(K, value=float("nan"))
+        page.send(K, value=-5.0)
+        page.send(K, value="x")
+        time.sleep(1.0)
+        page.send(K, value=1500.0)  # the page still listens, and so does the run
+        until(lambda: stiffness(bridge) == pytest.approx(1500.0))
+        needs = bridge._binding.state[0]
+        assert needs["stiffness"] * bridge.period / 2 + needs["damping"] <= 2.0
+    recording = read_recording(tmp_path / "run.mcap")
+    told = events(tmp_path / "run.mcap", "coupling")
+    assert told
+    for event in told:
+        assert event["stiffness"] * 1e-3 / 2 + event["damping"] <= 2.0 * (1 + 1e-9)
+    assert recording.ticks.size
+    assert audit(tmp_path / "run.mcap").verdict == "passive"
+
+
+def test_the_page_starts_a_recorder_in_mid_run_and_says_where(tmp_path: Path) -> None:
+    with running(tmp_path) as (bridge, window), browser(tmp_path) as tab:
+        page = tab()
+        page.open(window.url, 1200, 1300)
+        for label, word in (("stop", "not recording"), ("start", "recording to")):
+            button = (
+                "[...document.querySelectorAll('button')]"
+                f".find(b => b.innerText == '{label} recording')"
+            )
+            page.wait_for(f"!!{button}")
+            page.value(f"{button}.click()")
+            page.wait_for(f"document.body.innerText.includes('{word}')")
+            time.sleep(1.0)  # the least time between two pauses
+        until(lambda: bridge._tick > 200)
+        page.wait_for("document.body.innerText.includes('run-2.mcap')")
+    for name in ("run.mcap", "run-2.mcap"):
+        report = audit(tmp_path / name)
+        assert (report.verdict, report.resimulation) == ("passive", "bit for bit")
+
+
+def test_commands_reach_the_bridge_slowly_and_the_newest_wins() -> None:
+    read, write = os.pipe()
+    outlet = Outlet(write)
+    for stiffness in range(1, 1000):
+        outlet.ask(Couple(float(stiffness), 0.5))
+    outlet.ask(Switch(force=False))
+    outlet.ask(Switch(clutch=True))
+    outlet.ask(Stop())
+    thread = threading.Thread(target=outlet.run, daemon=True)
+    thread.start()
+    with os.fdopen(read, "rb") as stream:
+        said = [command_of(stream.readline()) for _ in range(3)]
+    assert said == [Stop(), Couple(999.0, 0.5), Switch(force=False, clutch=True)]
+    os.close(write)
+
+
+def test_the_view_follows_a_run_that_began_anew(tmp_path: Path) -> None:
+    scene = tmp_path / "floor.xml"
+    scene.write_text(FLOOR)
+    script = Script({200: Record(on=False), 1300: Record(on=True)})
+    recorded(
+        tmp_path / "run.mcap",
+        str(scene),
+        ScriptedDevice(swaying),
+        LOOSE,
+        duration=1.8,
+        on_tick=script,
+    )
+    first, second = (read_recording(tmp_path / name) for name in ("run.mcap", "run-2.mcap"))
+    ring = Ring.local(4096)
+    show = Show(ring, first, lag=5)
+    ring.append(first.ticks)
+    show.look()
+    files = {n: base64.b64encode(second.attachments[n]).decode() for n in ATTACHED}
+    show.note({"event": "begin", "metadata": second.meta, "attachments": files})
+    assert show.look() is None  # what is left of the old run is none of the new one
+    ring.append(second.ticks[:100])
+    sight = show.look()
+    assert sight is not None
+    assert not show.is_lost
+    body = show.model.body("ball").id
+    np.testing.assert_allclose(sight.places[body], second.ticks["tool_position"][94], atol=1e-9)
