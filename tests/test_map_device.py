@@ -336,6 +336,8 @@ def test_the_map_is_drawn_and_says_what_was_found(tmp_path: Path) -> None:
     # B = 3 is asked for, 2 and 1 are left; K T = 2
     for name, needed in (("implicit", 2.0), ("compensated", 1.0), ("lossless", 1.5)):
         assert said["friction"][name]["shaken"] == pytest.approx([needed], rel=1e-6)
-    names = [text.get_text() for text in files.finding.figure.axes[1].get_legend().get_texts()]
+    legend = files.finding.figure.axes[1].get_legend()
+    assert legend is not None
+    names = [text.get_text() for text in legend.get_texts()]
     assert [name.partition(":")[0] for name in names[1:4]] == list(METHODS_SHOWN)
     assert "at 100 % of the points" in files.finding.paragraph

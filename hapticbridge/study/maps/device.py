@@ -161,7 +161,7 @@ def _of_friction(found: Mapping[str, Any]) -> str:
     needs = "; ".join(_needs_of(name, found.get(name)) for name in METHODS_SHOWN)
     return (
         "With a damper, a hand that shakes the device across one encoder step needs f_c = K Δ/2 + "
-        f"B′ Δ/T within {error:.2g} %. That, and where one that only presses begins to let it rest, "
+        f"B′ Δ/T within {error:.2g} %. That, and where one that only presses begins to let it "
         f"rest, at the values of B that were tried: {needs}."
     )
 
