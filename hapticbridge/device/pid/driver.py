@@ -202,7 +202,7 @@ def open_pid(options: Mapping[str, object], tell: Tell, api: HidApi | None = Non
         DeviceError: There is none, it cannot be opened, or it cannot do what is needed.
     """
     plugged = chosen(FAMILY, find(FAMILY, api), options.get("serial"))
-    scale, known = scale_of(options, plugged.serial, tell)
+    scale, known = scale_of(options, plugged.serial, str(plugged), tell)
     log = options.get("log")
     link = HidLink.open(
         plugged,
