@@ -206,6 +206,7 @@ class Moving:
     def __init__(self, still_after: int) -> None:
         self.info = replace(ScriptedDevice(lambda _k: (0,) * 7).info, is_real=True)
         self.count, self._still_after = 0, still_after
+        self.times: list[float] = []
         self._is_asked = True
         self.forces: list[NDArray[np.float64]] = []
 
@@ -213,6 +214,7 @@ class Moving:
         assert self._is_asked, "nobody asked since the last answer"
         self._is_asked = False
         self.count += 1
+        self.times.append(time.monotonic())
         sample["position"][0, 0] = 2e-3 * min(self.count, self._still_after)
         return 0
 
@@ -226,6 +228,7 @@ def test_force_waits_until_the_device_is_still(monkeypatch: pytest.MonkeyPatch) 
     device: Any = Moving(still_after=30)
     wait_until_still(device, np.zeros(1, SAMPLE_DTYPE), 1e-3, RealClock())
     assert device.count > 30
+    assert device.times[-1] - device.times[29] > 0.015  # still for that long, not just once
     assert not np.any(device.forces)
     unread: Any = Moving(still_after=30)
     wait_until_still(unread, np.zeros(1, SAMPLE_DTYPE), 1e-3, SimulatedClock())

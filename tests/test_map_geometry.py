@@ -15,10 +15,13 @@ from map_tables import Row, without_rows, written
 
 from hapticbridge.device import Hand, Motion, SimulatedDevice
 from hapticbridge.errors import StudyError
+from hapticbridge.passivity import minimum_damping
+from hapticbridge.rendering import METHODS
 from hapticbridge.scene import load_scene
 from hapticbridge.study.maps.fitting_peg import (
     DEVICE_DAMPING,
     PERIOD,
+    ROTATIONAL_DAMPING,
     contact_stiffness_limit,
     device_and_coupling,
     first_growth,
@@ -28,7 +31,15 @@ from hapticbridge.study.maps.fitting_peg import (
     set_length,
     torque,
 )
-from hapticbridge.study.maps.geometry import GEOMETRY, LENGTH, evaluate, points
+from hapticbridge.study.maps.geometry import GEOMETRY
+from hapticbridge.study.maps.geometry_runs import (
+    BEHIND,
+    BOUNDS,
+    LENGTH,
+    METHODS_SHOWN,
+    evaluate,
+    points,
+)
 from hapticbridge.study.maps.stability_map import Point, run_map
 from hapticbridge.study.maps.verdicts import MISSING, VERDICTS
 
@@ -52,6 +63,36 @@ def test_behind_the_coupling_the_limit_is_that_of_6_at_every_length(length: floa
     found = evaluate({"what": "limit", "method": "implicit", "length": length, "stiffness": 0.0})
     # 2 (b_θ − B_r)/T = 3; the peg's and its contacts' own give leave 3 %, always on the safe side
     assert 3.0 <= float(found["limit"]) <= 3.1
+
+
+@pytest.mark.parametrize("length", LENGTH)
+@pytest.mark.parametrize("method", ["compensated", "lossless"])
+def test_what_takes_its_lag_off_bears_a_third_more_at_every_length(
+    method: str, length: float
+) -> None:
+    # nothing is left of B_r at 2 b_θ/T = 4; the same give, on the safe side
+    assert is_stable(method, length, 3.98)
+    assert not is_stable(method, length, 4.12)
+
+
+def test_the_bound_of_a_method_is_what_its_law_asks_of_the_device() -> None:
+    assert pytest.approx({"implicit": 3.0, "compensated": 4.0, "lossless": 4.0}) == BOUNDS
+    for name, bound in BOUNDS.items():
+        _, coupling = device_and_coupling(name, bound)
+        used = METHODS[name].used(coupling, PERIOD)
+        needed = minimum_damping(used, PERIOD, axis="rotation")
+        assert needed == pytest.approx(DEVICE_DAMPING)
+
+
+@pytest.mark.parametrize("stiffness", [0.4, 2.0])
+def test_in_its_hole_lossless_is_implicit_with_the_damper_that_it_uses(
+    stiffness: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = torque(run("lossless", 0.1, stiffness))
+    damping = max(ROTATIONAL_DAMPING - stiffness * PERIOD / 2, 0.0)
+    assert not np.allclose(found, torque(run("implicit", 0.1, stiffness)), rtol=1e-3)
+    monkeypatch.setattr("hapticbridge.study.maps.fitting_peg.ROTATIONAL_DAMPING", damping)
+    np.testing.assert_array_equal(found, torque(run("implicit", 0.1, stiffness)))
 
 
 def test_a_peg_too_long_is_felt_to_grow_from_the_first_ticks_on_and_its_twin_is_not() -> None:
@@ -172,6 +213,8 @@ WRITTEN = [
     limited("implicit", 0.01, 3.06),
     limited("implicit", 0.05, 2.4),
     limited("implicit", 0.2, 3.6),
+    limited("lossless", 0.01, 4.4),
+    limited("lossless", 0.2, 4.2),
 ]
 
 
@@ -191,7 +234,14 @@ def test_boundary_and_paragraph_follow_from_a_made_up_table() -> None:
     said = found.paragraph
     assert "up to 277 mm with contacts of 100 N/m and up to 31.1 mm with 1e+04 N/m" in said
     assert "within 10 % of L = 2 √(b_θ/(T K_c))" in said
-    assert "between 2.4 and 3.6 N m/rad over all lengths" in said
+    assert (
+        "'implicit', between 2.4 and 3.6 N m/rad over all lengths, within 20 % of the 3 N" in said
+    )
+    assert "'compensated', no point could be computed; 'lossless', between 4.2 and 4.4 N" in said
+    assert "within 10 % of the 4 N m/rad of eq. (6). Eq. (6) does not know L." in said
+    lossless = found.boundary["lossless"]
+    assert (lossless["predicted_6"], lossless["largest"]) == (pytest.approx(4.0), 4.4)
+    assert lossless["largest_deviation"] == pytest.approx(0.1)
     left = found.figure.axes[0]
     cells = np.asarray(left.collections[0].get_array())
     names = [[VERDICTS[int(number)] for number in row] for row in cells]
@@ -208,8 +258,8 @@ def as_if(point: Point, failing: str) -> dict[str, float | str | bool]:
     raise AssertionError
 
 
-@pytest.mark.parametrize("method", ["direct", "implicit"])
-def test_a_method_that_fails_is_named_and_the_other_is_drawn(method: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("method", METHODS_SHOWN)
+def test_a_method_that_fails_is_named_and_the_others_are_drawn(method: str, tmp_path: Path) -> None:
     half = [at for at in points(32) if at["method"] == method]
     with ThreadPoolExecutor(1) as executor:
         files = run_map(
@@ -220,11 +270,11 @@ def test_a_method_that_fails_is_named_and_the_other_is_drawn(method: str, tmp_pa
         )
     assert files.failed == len(half)
     assert files.table.read_text(encoding="utf-8").count("StudyError: not today") == len(half)
-    where = {"direct": "Rendered directly", "implicit": "Behind the coupling"}
+    where = {"direct": "Rendered directly"} | {name: f"'{name}'" for name in BEHIND}
     for name, words in where.items():
         assert (f"{words}, {MISSING}" in files.finding.paragraph) == (name == method)
     assert "nan" not in files.finding.paragraph
-    texts = [[text.get_text() for text in axes.texts] for axes in files.finding.figure.axes[:2]]
+    texts = [[text.get_text() for text in axes.texts] for axes in files.finding.figure.axes[:4]]
     assert texts == [[MISSING] if name == method else [] for name in where]
 
 
@@ -232,7 +282,7 @@ def test_a_search_without_an_end_is_no_limit() -> None:
     rows = [limited("implicit", 0.1, 0.0), limited("implicit", 0.2, float("inf"))]
     found = GEOMETRY.read(written(rows))
     assert found.boundary["implicit"]["largest_over_smallest"] is None
-    assert found.paragraph.endswith("Behind the coupling, no limit was found.")
+    assert "largest K_r: 'implicit', no limit was found; 'compensated', no point" in found.paragraph
     mixed = GEOMETRY.read(written([*rows, limited("implicit", 0.3, 3.0)]))
     assert mixed.boundary["implicit"]["largest_over_smallest"] == 1.0
 
@@ -250,7 +300,10 @@ def test_the_map_says_what_its_table_holds(tmp_path: Path) -> None:
     assert files.failed == 0
     boundary = files.finding.boundary
     assert boundary["direct"]["largest_deviation"] < 0.15
-    assert boundary["implicit"]["largest_over_smallest"] < 1.05
+    for name in BEHIND:
+        assert boundary[name]["largest_over_smallest"] < 1.05
+        assert boundary[name]["largest_deviation"] < 0.03
+    assert boundary["lossless"]["smallest"] > 1.3 * boundary["implicit"]["largest"]
     assert "within" in files.finding.paragraph
     assert files.picture.stat().st_size > 10_000
 

@@ -48,7 +48,7 @@ def read(device: PidDevice, seam: HidSeam, seconds: float = PERIOD) -> tuple[int
 @pytest.fixture(autouse=True)
 def _no_profiles(monkeypatch: pytest.MonkeyPatch) -> None:
     """Whoever runs the tests may have profiles of their own."""
-    monkeypatch.setattr(sheet, "profile_of", lambda device, serial: None)
+    monkeypatch.setattr(sheet, "profile_of", lambda device, serial, model: None)
 
 
 @pytest.mark.parametrize("name", LAYOUTS)
@@ -177,7 +177,7 @@ def test_closing_stops_and_frees_the_effects_and_switches_the_motors_off() -> No
 
 def test_another_process_holds_what_takes_the_force_away(monkeypatch: pytest.MonkeyPatch) -> None:
     held: list[LastWordDouble] = []
-    monkeypatch.setattr(driver, "LastWord", lambda *given: held.append(LastWordDouble(*given)))
+    monkeypatch.setattr(driver, "last_word_at", lambda *given: held.append(LastWordDouble(*given)))
     device, model, _ = started(PidStick())
     device.leave_last_word("/dev/hidraw7")
     device.write(wrench(1.0, 1.0))
@@ -190,8 +190,9 @@ def test_another_process_holds_what_takes_the_force_away(monkeypatch: pytest.Mon
 
 def test_a_stick_whose_node_cannot_be_opened_twice_ends_its_effects_by_itself() -> None:
     device, *_ = started(PidStick())
-    device.leave_last_word("/no/such/node")
-    assert device.last_word is None
+    for path in ("/dev/hidraw_of_nobody", "1-4:1.0"):
+        device.leave_last_word(path)
+        assert device.last_word is None
     device.close()
 
 
@@ -274,17 +275,17 @@ def test_a_profile_says_the_scale_and_no_other_goes_with_its_numbers(
         "workspace": Quantity((0.05, 0.05, 0.05), "a ruler"),
     }
     profile = Profile("stick", "pid", "P1", None, "", quantities)
-    asked: list[tuple[str, str]] = []
+    asked: list[tuple[str, str, str]] = []
 
-    def profile_of(device: str, serial: str) -> Profile:
-        asked.append((device, serial))
+    def profile_of(device: str, serial: str, model: str) -> Profile:
+        asked.append((device, serial, model))
         return profile
 
     monkeypatch.setattr(sheet, "profile_of", profile_of)
     model = PidStick()
     model.place = (1.0, 0.0)
     device = open_pid({"damping": 1.0, "newtons": 7.0}, tell_nobody, HidSeam(model))
-    assert asked == [("pid", "P1")]
+    assert asked == [("pid", "P1", device.info.name)]
     assert device.info.force_limit == 7.0
     assert device.start(PERIOD)["position"][0, 0] == pytest.approx(0.025)
     with pytest.raises(DeviceError, match=r"newtons = 3\.0: .* was measured with 7, .* leave out"):

@@ -135,7 +135,7 @@ def test_what_was_identified_holds_with_the_scale_that_it_was_identified_with(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Assumed 10 N and 0.1 m: all that is measured is off by the same factors as the force."""
-    monkeypatch.setattr(sheet, "profile_of", lambda device, serial: None)
+    monkeypatch.setattr(sheet, "profile_of", lambda device, serial, model: None)
     mechanics = SimulatedDevice(hand=None, mass=0.3, damping=2.0)
     seam = HidSeam(PidStick(mechanics, newtons=NEWTONS, travel=TRAVEL))
     device = open_pid({}, tell_nobody, seam)

@@ -12,6 +12,7 @@ import errno
 import os
 import stat
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 if sys.platform != "win32":
@@ -58,6 +59,7 @@ class Output:
             raise OSError(errno.EBUSY, "another bridge is recording to it") from error
         self._position = self._claimed = 0
         self._claims = self._is_regular and sys.platform == "linux"
+        self._fallocate = _fallocate() if self._claims else None
         self.is_full = False
 
     def write(self, data: bytes) -> int:
@@ -103,8 +105,19 @@ class Output:
 
     def _allocate(self, mode: int, start: int, size: int) -> int:
         """Returns the error's number of Linux's fallocate, 0 for none."""
-        libc = ctypes.CDLL(None, use_errno=True)
         first, length = ctypes.c_int64(start), ctypes.c_int64(size)
-        if libc.fallocate64(self._file.fileno(), mode, first, length) == 0:
+        if self._fallocate is None:
+            return errno.EOPNOTSUPP
+        if self._fallocate(self._file.fileno(), mode, first, length) == 0:
             return 0
         return ctypes.get_errno()
+
+
+def _fallocate() -> Callable[..., int] | None:
+    """Returns Linux's fallocate with offsets of 64 bits, which Python's os lacks; None without."""
+    libc = ctypes.CDLL(None, use_errno=True)
+    for name in ("fallocate64", "fallocate"):  # not every C library has both
+        if hasattr(libc, name):
+            found: Callable[..., int] = getattr(libc, name)
+            return found
+    return None

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.device.base import checked_period
-from hapticbridge.device.last_word import LastWord
+from hapticbridge.device.last_word import LastWord, last_word_at
 from hapticbridge.device.pid.effects import Effects
 from hapticbridge.device.pid.reports import PidReports, has_force_feedback
 from hapticbridge.device.pid.sheet import CHANGES, Scale, data_sheet, scale_of
@@ -181,8 +181,7 @@ class PidDevice:
         Args:
             path: The device node.
         """
-        with contextlib.suppress(OSError):  # the effects end by themselves in any case
-            self.last_word = LastWord(path, *self._effects.farewell())
+        self.last_word = last_word_at(path, *self._effects.farewell())
 
     def _fill(self) -> None:
         sample = self._sample[0]
@@ -203,7 +202,7 @@ def open_pid(options: Mapping[str, object], tell: Tell, api: HidApi | None = Non
         DeviceError: There is none, it cannot be opened, or it cannot do what is needed.
     """
     plugged = chosen(FAMILY, find(FAMILY, api), options.get("serial"))
-    scale, known = scale_of(options, plugged.serial, tell)
+    scale, known = scale_of(options, plugged.serial, str(plugged), tell)
     log = options.get("log")
     link = HidLink.open(
         plugged,
@@ -224,7 +223,7 @@ def open_pid(options: Mapping[str, object], tell: Tell, api: HidApi | None = Non
     except BaseException:
         link.close()
         raise
-    if api is None and plugged.path.startswith("/dev/hidraw"):
+    if api is None:
         device.leave_last_word(plugged.path)
     return device
 

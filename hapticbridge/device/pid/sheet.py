@@ -50,24 +50,26 @@ class Scale:
 
 
 def scale_of(
-    options: Mapping[str, object], serial: str, tell: Tell
+    options: Mapping[str, object], serial: str, model: str, tell: Tell
 ) -> tuple[Scale, dict[str, object]]:
     """Returns the scale, and what else of the options is for the data sheet.
 
-    What the user says goes first, then the unit's or the family's profile (``force_limit``: newtons
-    at full scale; ``workspace``: travel), then an assumption, of which the user is told. What a
-    profile was measured with must not be changed: its b would be in other units than the force.
+    What the user says goes first, then the profile of the unit or its model (``force_limit``:
+    newtons at full scale; ``workspace``: travel), then an assumption, of which the user is told.
+    What a profile was measured with must not be changed: its b would be in other units than the
+    force.
 
     Args:
         options: As given to ``open_device``.
         serial: The unit's.
+        model: What the stick calls itself; the profile of another model is not taken.
         tell: Takes the sentence.
 
     Raises:
         DeviceError: A number is out of range, contradicts the profile, or states what nobody can
             know without the scale.
     """
-    measured = _measured_with(options.get("profile"), serial)
+    measured = _measured_with(options.get("profile"), serial, model)
     for name, value in measured.items():
         asked = options.get(name, value)
         if value is not None and asked != value:
@@ -102,9 +104,9 @@ def scale_of(
     return Scale(newtons, travel, signs), changes
 
 
-def _measured_with(named: object, serial: str) -> dict[str, float | None]:
+def _measured_with(named: object, serial: str, model: str) -> dict[str, float | None]:
     """Returns the scale that a profile's numbers are in; None where it does not say."""
-    profile = profile_of("pid", serial) if named is None else None
+    profile = profile_of("pid", serial, model) if named is None else None
     if named not in (None, "none"):
         profile = profile_named(str(named))
     known = {} if profile is None else {k: q.value for k, q in profile.quantities.items()}

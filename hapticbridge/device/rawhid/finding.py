@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 
-from hapticbridge.device.last_word import LastWord
+from hapticbridge.device.last_word import last_word_at
 from hapticbridge.device.plugged import Family, Tell, UsbId, chosen
 from hapticbridge.device.rawhid.driver import NO_WRENCH, RawHidDevice
 from hapticbridge.device.rawhid.frame import force_frame
@@ -45,10 +44,9 @@ def open_rawhid(
         link.close()
         raise
     device.info = replace(device.info, serial=plugged.serial)
-    if api is None and plugged.path.startswith("/dev/hidraw"):
+    if api is None:
         zero = b"\0" + force_frame(0, NO_WRENCH, 1, is_enabled=False)
-        with contextlib.suppress(OSError):  # its own watchdog is there in any case
-            device.last_word = LastWord(plugged.path, zero)
+        device.last_word = last_word_at(plugged.path, zero)
     return device
 
 

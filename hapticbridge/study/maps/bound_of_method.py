@@ -26,6 +26,18 @@ def used_damping(
     return np.asarray(np.maximum(np.asarray(damping, dtype=np.float64) - taken, 0.0))
 
 
+def law_in_words(name: str, subscript: str = "") -> str:
+    """Returns which damping a method's law uses, as titles and legends say it.
+
+    Args:
+        name: The method.
+        subscript: Of K and B: empty, or ``_r`` in rotation.
+    """
+    lag = METHODS[name].lag
+    taken = {0.0: "", 0.5: f" − K{subscript} T/2"}.get(lag, f" − K{subscript} T")
+    return f"B{subscript}′ = B{subscript}{taken}"
+
+
 def needed_by_6(
     name: str, stiffness: ArrayLike, damping: ArrayLike, period: float
 ) -> NDArray[np.float64]:

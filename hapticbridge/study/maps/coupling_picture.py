@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from hapticbridge.picture import new_figure
 from hapticbridge.rendering import METHODS
-from hapticbridge.study.maps.bound_of_method import needed_by_6, used_damping
+from hapticbridge.study.maps.bound_of_method import law_in_words, needed_by_6, used_damping
 from hapticbridge.study.maps.coupling_runs import (
     DAMPING,
     DEVICE_DAMPING,
@@ -80,9 +80,7 @@ def _note(name: str) -> str:
     method = METHODS[name]
     if not method.has_law:
         return ": free, and tapping"
-    if method.lag == 0.0:
-        return ""
-    return ", B′ = B − K T" + ("" if method.lag == 1.0 else "/2")
+    return f", {law_in_words(name)}" if method.lag else ""
 
 
 def _draw_theory(axes: Axes, name: str, *, has_wall: bool) -> None:

@@ -1,4 +1,9 @@
-"""Map ``device``: what encoder steps and dry friction of a device make of a wall."""
+"""Map ``device``: what encoder steps and dry friction of a device make of a wall.
+
+Diolaiti's regions are those of a spring alone, B = 0, of which no method takes anything off: the
+law is one for ``implicit``, ``compensated`` and ``lossless``, and one of them is run. With a damper
+they differ by their B', and each is measured.
+"""
 
 from __future__ import annotations
 
@@ -15,12 +20,14 @@ from hapticbridge.study.maps.device_picture import draw
 from hapticbridge.study.maps.device_runs import (
     DAMPERS,
     LARGE,
+    METHODS_SHOWN,
     PERIOD,
     QUANTUM,
     RANGE,
     REGIONS,
     RESOLUTION,
     STIFFNESS,
+    friction_needed,
     friction_to_rest,
     region_of,
     settle,
@@ -35,19 +42,24 @@ SMALLEST = 1e-4
 
 
 def points(count: int) -> Sequence[Point]:
-    """Returns a grid of β and σ, and some dampers at which the friction needed is measured."""
+    """Returns a grid of β and σ, and dampers by method at which the friction needed is measured."""
     side = max(3, round(count**0.5))
     values = np.geomspace(*RANGE, side)
     cells: list[Point] = [
-        {"what": "cell", "beta": float(beta), "sigma": float(sigma), "damping": 0.0}
+        _point("cell", METHODS_SHOWN[0], float(beta), float(sigma), 0.0)
         for beta in values
         for sigma in values
     ]
     dampers: list[Point] = [
-        {"what": "friction", "beta": 0.0, "sigma": 0.0, "damping": float(damping)}
+        _point("friction", name, 0.0, 0.0, float(damping))
+        for name in METHODS_SHOWN
         for damping in np.linspace(*DAMPERS, max(3, side // 3))
     ]
     return cells + dampers
+
+
+def _point(what: str, method: str, beta: float, sigma: float, damping: float) -> Point:
+    return {"what": what, "method": method, "beta": beta, "sigma": sigma, "damping": damping}
 
 
 def evaluate(point: Point) -> Mapping[str, float | str | bool]:
@@ -56,8 +68,8 @@ def evaluate(point: Point) -> Mapping[str, float | str | bool]:
     Or measures the friction that pays for a coupling's damper.
     """
     if point["what"] == "friction":
-        damping = float(point["damping"])
-        return {"needed_at_rest": friction_to_rest(damping), "needed_shaken": shaken(damping)}
+        law = str(point["method"]), float(point["damping"])
+        return {"needed_at_rest": friction_to_rest(*law), "needed_shaken": shaken(*law)}
     beta, sigma = float(point["beta"]), float(point["sigma"])
     small, small_range, _ = settle(beta, sigma, 0.0)
     large, large_range, run = settle(beta, sigma, LARGE)
@@ -75,7 +87,8 @@ def evaluate(point: Point) -> Mapping[str, float | str | bool]:
 def read(table: Table) -> Finding:
     """Compares regions over β and σ, and the friction that a damper needs, with theory.
 
-    Where no point of one of the two was computed it is left out, and the paragraph says so.
+    Where no point of one of the two, or of a method, was computed it is left out, and the
+    paragraph says so.
 
     Raises:
         StudyError: No point was computed at all.
@@ -88,7 +101,11 @@ def read(table: Table) -> Finding:
         "stiffness": STIFFNESS,
         "resolution": RESOLUTION,
         "regions": _regions(cells) if len(cells) else {},
-        "friction": _friction(dampers) if len(dampers) else {},
+        "friction": {
+            name: _friction(name, mine)
+            for name in METHODS_SHOWN
+            if len(mine := dampers.select(dampers["method"] == name))
+        },
     }
     said = [_of_regions(boundary["regions"]), _of_friction(boundary["friction"])]
     return Finding(draw(cells, boundary["friction"]), " ".join(said), boundary)
@@ -106,9 +123,9 @@ def _regions(cells: Table) -> dict[str, Any]:
     }
 
 
-def _friction(dampers: Table) -> dict[str, Any]:
-    """Returns σ needed at each B, measured twice and by theory, σ = ½ + B/(K T)."""
-    predicted = 0.5 + dampers["damping"] / (PERIOD * STIFFNESS)
+def _friction(name: str, dampers: Table) -> dict[str, Any]:
+    """Returns σ that a method needs at each B, measured twice and by theory."""
+    predicted = friction_needed(name, dampers["damping"])
     shaken_needs = dampers.numbers("needed_shaken")
     return {
         "damping": dampers["damping"].tolist(),
@@ -140,12 +157,22 @@ def _of_regions(found: Mapping[str, Any]) -> str:
 def _of_friction(found: Mapping[str, Any]) -> str:
     if not found:
         return f"Friction against the damper: {MISSING}."
-    error = max(100 * found["worst_ratio_error"], SMALLEST)
+    error = max(SMALLEST, *(100 * mine["worst_ratio_error"] for mine in found.values()))
+    needs = "; ".join(_needs_of(name, found.get(name)) for name in METHODS_SHOWN)
     return (
         "With a damper, a hand that shakes the device across one encoder step needs f_c = K Δ/2 + "
-        f"B Δ/T within {error:.2g} %, while one that only presses lets it rest "
-        f"from {min(found['pressed']):.3g} to {max(found['pressed']):.3g} "
-        "K Δ on, at the values of B that were tried."
+        f"B′ Δ/T within {error:.2g} %. That, and where one that only presses begins to let it "
+        f"rest, at the values of B that were tried: {needs}."
+    )
+
+
+def _needs_of(name: str, mine: Mapping[str, Any] | None) -> str:
+    if mine is None:
+        return f"'{name}': {MISSING}"
+    shaken_needs, pressed = mine["shaken"], mine["pressed"]
+    return (
+        f"'{name}' shaken {min(shaken_needs):.3g} to {max(shaken_needs):.3g} K Δ, pressed "
+        f"{min(pressed):.3g} to {max(pressed):.3g} K Δ"
     )
 
 

@@ -1,4 +1,8 @@
-"""Runs of a device with encoder steps and dry friction on a wall, and what they did."""
+"""Runs of a device with encoder steps and dry friction on a wall, and what they did.
+
+Against a wall a method is the law that it uses: K beside B' = B − a K T, at least 0, with a = 0 for
+``implicit``, 1 for ``compensated`` and ½ for ``lossless``.
+"""
 
 from __future__ import annotations
 
@@ -11,13 +15,18 @@ from hapticbridge.device import Hand, Motion, SimulatedDevice
 from hapticbridge.rendering import METHODS
 from hapticbridge.study.closed_loop import LoopOutcome
 from hapticbridge.study.maps.bisection import largest_stable
+from hapticbridge.study.maps.bound_of_method import used_damping
 from hapticbridge.study.maps.rigs import loop_in, set_tool_mass
 
 RANGE = (0.1, 2.0)
 """Of β and of σ, even in their logarithms."""
 
-DAMPERS = (0.0, 1.5)
-"""Range of B in N s/m for the friction that a coupling's damper needs."""
+METHODS_SHOWN = ("implicit", "compensated", "lossless")
+"""Methods whose need for friction is measured, which the bounds allow on a real device."""
+
+DAMPERS = (0.0, 3.0)
+"""Range of B in N s/m asked for, for the friction that a coupling's damper needs: K T/2 and K T,
+below which ``lossless`` and ``compensated`` use none, are 1 and 2."""
 
 REGIONS = ("passive", "locally stable", "bounded limit cycle", "unstable")
 
@@ -67,7 +76,7 @@ most to its start."""
 FRICTION = (0.01, 10.0)
 """Range of σ in which that at which a pressed device rests is searched."""
 
-DAMPED = 4.0
+DAMPED = 5.0
 """b in N s/m while B is varied, above K T/2 + B throughout."""
 
 SHAKEN = 0.05
@@ -90,7 +99,7 @@ def region_of(small: str, large: str) -> str:
 
 
 def settle(
-    beta: float, sigma: float, knock: float, damping: float = 0.0
+    beta: float, sigma: float, knock: float, damping: float = 0.0, name: str = "implicit"
 ) -> tuple[str, float, LoopOutcome]:
     """Runs a device that a hand presses on a wall, after a knock.
 
@@ -98,7 +107,8 @@ def settle(
         beta: b/(K T), without unit, >= 0.
         sigma: f_c/(K Δ), without unit, >= 0.
         knock: Displacement at the start in steps of the encoder.
-        damping: B in N s/m, >= 0.
+        damping: B in N s/m asked for, >= 0. At 0 all of ``METHODS_SHOWN`` have one law.
+        name: The method.
 
     Returns:
         ``rest``, ``cycle`` (motion that neither ends nor grows), ``falls`` (it is still on its way
@@ -108,7 +118,7 @@ def settle(
     device = pressed_device(beta, sigma)
     start = np.array([knock * RESOLUTION, 0.0, 0.0, 0.0, 0.0, 0.0])
     ticks = TICKS if knock else TICKS // 2
-    run = _wall(device, damping, ticks, start)
+    run = _wall(name, device, damping, ticks, start)
     steps = run.records["device_position"][:, 0] / RESOLUTION
     width = ticks // 6
     if run.ticks < ticks or np.abs(steps).max() > DIVERGED * max(knock, 2 * PRESSED):
@@ -155,12 +165,12 @@ def pressed_device(beta: float, sigma: float, limit: float = 10.0) -> SimulatedD
 
 
 def _wall(
-    device: SimulatedDevice, damping: float, ticks: int, knock: NDArray[np.float64]
+    name: str, device: SimulatedDevice, damping: float, ticks: int, knock: NDArray[np.float64]
 ) -> LoopOutcome:
     return loop_in("virtual_wall", "heavy for device", make_heavy).run(
         device,
         Coupling(STIFFNESS, damping, 0.0, 0.0),
-        METHODS["implicit"],
+        METHODS[name],
         period=PERIOD,
         ticks=ticks,
         knock=knock,
@@ -173,25 +183,44 @@ def make_heavy(model: mujoco.MjModel) -> None:
     set_tool_mass(model, "tool", WALL_MASS)
 
 
-def friction_to_rest(damping: float) -> float:
-    """Returns the least σ at which a pressed device comes to rest: above the largest at which not.
+def friction_needed(name: str, damping: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Returns the σ that theory asks for, ½ + B'/(K T): f_c = K Δ/2 + B' Δ/T.
 
-    0 where it rests at the least that is tried, inf where it never does.
+    Args:
+        name: The method, whose law uses B'.
+        damping: B in N s/m asked for, >= 0.
+
+    References:
+        Abbott & Okamura 2005.
+    """
+    return 0.5 + used_damping(name, STIFFNESS, damping, PERIOD) / (PERIOD * STIFFNESS)
+
+
+def friction_to_rest(name: str, damping: float) -> float:
+    """Returns a σ at which a pressed device begins to come to rest.
+
+    0 where it rests at the least that is tried, inf where it never does. With a damper rest and
+    cycle take turns between K Δ/2 and a little above; one of the changes is found.
+
+    Args:
+        name: The method.
+        damping: B in N s/m asked for, >= 0.
     """
     beta = DAMPED / (STIFFNESS * PERIOD)
     return largest_stable(
-        lambda sigma: settle(beta, sigma, 0.0, damping)[0] != "rest", *FRICTION
+        lambda sigma: settle(beta, sigma, 0.0, damping, name)[0] != "rest", *FRICTION
     ).middle
 
 
-def shaken(damping: float) -> float:
+def shaken(name: str, damping: float) -> float:
     """Returns the σ that pays for what the motor gives a hand that shakes it across one step.
 
     The hand is stiff and moves the device to and fro across a border between two encoder steps,
     once a tick; the motor's work on it, over the way, is the friction that would take it.
 
     Args:
-        damping: B in N s/m, >= 0.
+        name: The method.
+        damping: B in N s/m asked for, >= 0.
     """
     ticks = 400
     side = np.where(np.arange(ticks + 2) % 2 == 0, -0.5, 0.5) * SHAKEN
@@ -207,7 +236,7 @@ def shaken(damping: float) -> float:
         hand=Hand(mass=0.0, damping=1e6, stiffness=1e9),
         path=Motion(PERIOD * np.arange(way.size), path),
     )
-    run = _wall(device, damping, way.size - 1, np.zeros(6))
+    run = _wall(name, device, damping, way.size - 1, np.zeros(6))
     first = way.size - 300
     force = run.records["wrench_on_device"][first:-1, 0]
     moved = np.diff(way)[first : first + force.size]

@@ -52,7 +52,7 @@ def device_and_coupling(name: str, stiffness: float) -> tuple[SimulatedDevice, C
     the translation is four times what two contacts could need: translation is not what fails.
 
     Args:
-        name: ``direct`` or ``implicit``.
+        name: ``direct``, or a method with a coupling.
         stiffness: K_c in N/m per wall, or K_r in N m/rad.
     """
     if name == "direct":
@@ -78,7 +78,7 @@ def run(name: str, length: float, stiffness: float) -> LoopOutcome:
     """Runs a peg that fills its hole, handle midway, behind the rotational damper alone.
 
     Args:
-        name: ``direct`` or ``implicit``.
+        name: ``direct``, or a method with a coupling.
         length: L in m: of the peg, and so between contacts on opposite walls.
         stiffness: K_c in N/m per wall, or K_r in N m/rad.
 

@@ -1,4 +1,8 @@
-"""Map ``rate``: how stiff a wall may be at each period, delay, jitter and share of lost ticks."""
+"""Map ``rate``: how stiff a wall may be at each period, delay, jitter and share of lost ticks.
+
+At even ticks for ``implicit``, ``compensated`` and ``lossless`` at the same B asked for, each
+against the bound for the B' that its law uses.
+"""
 
 from __future__ import annotations
 
@@ -15,6 +19,7 @@ from hapticbridge.study.maps.rate_runs import (
     DELAYS,
     DEVICE_DAMPING,
     HANDS,
+    METHODS_SHOWN,
     UNEVEN,
     evaluate,
     points,
@@ -33,9 +38,9 @@ LINES = ("mean", "balanced", "longest")
 
 
 def read(table: Table) -> Finding:
-    """Compares the largest K with theory, by period and delay, by jitter, and by lost ticks.
+    """Compares the largest K with theory: by method, period and delay; by jitter; by lost ticks.
 
-    A delay or a hand of which no point was computed is left out, and the paragraph says so.
+    A method, a delay or a hand without a computed point is left out, and the paragraph says so.
 
     Raises:
         StudyError: No point was computed at all.
@@ -44,18 +49,19 @@ def read(table: Table) -> Finding:
     boundary = {
         "device_damping": DEVICE_DAMPING,
         "damping": DAMPING,
-        "by_delay": _by_delay(table.select(table["what"] == "delay")),
+        "methods": {name: _by_delay(name, table) for name in METHODS_SHOWN},
         "uneven": {what: _uneven(table.select(table["what"] == what)) for what in UNEVEN},
     }
     return Finding(draw(boundary), _paragraph(boundary), boundary)
 
 
-def _by_delay(rows: Table) -> dict[str, Any]:
+def _by_delay(name: str, table: Table) -> dict[str, Any]:
+    rows = table.select((table["what"] == "delay") & (table["method"] == name))
     found: dict[str, Any] = {}
     for delay in np.unique(rows["delay"]):
         mine = rows.select(rows["delay"] == delay)
         period, limit = mine["period"], mine.numbers("limit")
-        predicted = np.array([wall_limit(float(t), int(delay)) for t in period])
+        predicted = np.array([wall_limit(name, float(t), int(delay)) for t in period])
         found[str(int(delay))] = {
             "period": period.tolist(),
             "measured": limit.tolist(),
@@ -88,30 +94,51 @@ def _uneven(rows: Table) -> dict[str, Any]:
 
 
 def _paragraph(boundary: Mapping[str, Any]) -> str:
-    said = [_of_delays(boundary["by_delay"])]
+    said = [_of_even(boundary["methods"])]
+    said += [_of_method(name, mine) for name, mine in boundary["methods"].items()]
     said += [_of_uneven(what, mine) for what, mine in boundary["uneven"].items()]
     return ". ".join(said) + "."
 
 
-def _of_delays(by_delay: Mapping[str, Any]) -> str:
+def _of_even(methods: Mapping[str, Mapping[str, Any]]) -> str:
+    delays = [mine for by_delay in methods.values() for mine in by_delay.values()]
+    if not delays:
+        return f"Even ticks: {MISSING}"
+    known = [mine["worst_ratio_error"] for mine in delays if mine["worst_ratio_error"] is not None]
+    periods = [1e3 * period for mine in delays for period in mine["period"]]
+    return (
+        f"At even ticks, T = {min(periods):.3g} to {max(periods):.3g} ms and {DAMPING:g} N s/m "
+        "asked for, the worst hand turns the wall unstable "
+        f"{per_cent(max(known, default=None))} of the bound for its method and delay. Wall, b, B "
+        "and worst hand have no time but T: with K T kept, the runs at all periods are one loop "
+        "to another scale. With a delay a damper helps on a wall, so that B′ taken off costs "
+        "stiffness there"
+    )
+
+
+def _of_method(name: str, by_delay: Mapping[str, Any]) -> str:
     left_out = [str(delay) for delay in range(DELAYS) if str(delay) not in by_delay]
     if len(left_out) == DELAYS:
-        return f"Even ticks: {MISSING}"
-    errors = [mine["worst_ratio_error"] for mine in by_delay.values()]
-    known = [error for error in errors if error is not None]
-    periods = [1e3 * period for mine in by_delay.values() for period in mine["period"]]
-    text = (
-        f"At even ticks, T = {min(periods):.3g} to {max(periods):.3g} ms, the worst hand turns the "
-        f"wall unstable {per_cent(max(known, default=None))} of the bound for its delay. Wall, b, "
-        "B and worst hand have no time but T: with K T kept, the runs at all periods are one loop "
-        "to another scale"
-    )
+        return f"'{name}' at even ticks: {MISSING}"
+    at_each = [
+        f"{100 * share:.0f} %" + (f" at {delay}" if delay != "0" else " without a delay")
+        for delay, mine in by_delay.items()
+        if (share := _share(mine)) is not None
+    ]
+    text = f"'{name}' bears, of K = 2b/T, {', '.join(at_each) or 'nothing that was found'}"
     slope = by_delay.get("0", {}).get("slope")
     if slope is not None:
-        text += f", and without a delay K was found to go with T to the power {slope:.3f}"
+        text += f"; without a delay K was found to go with T to the power {slope:.3f}"
     if left_out:
-        text += f". Delay of {', '.join(left_out)} samples: {MISSING}"
+        text += f"; delay of {', '.join(left_out)} samples: {MISSING}"
     return text
+
+
+def _share(mine: Mapping[str, Any]) -> float | None:
+    """Returns the mean over the periods of K T/(2b); None where no K was found."""
+    share = np.array(mine["measured"]) * np.array(mine["period"]) / (2 * DEVICE_DAMPING)
+    known = share[np.isfinite(share) & (share > 0)]
+    return float(known.mean()) if known.size else None
 
 
 def _of_uneven(what: str, mine: Mapping[str, Any]) -> str:
@@ -138,8 +165,9 @@ def _of_uneven(what: str, mine: Mapping[str, Any]) -> str:
 
 RATE = StabilityMap(
     name="rate",
-    about="largest stiffness of a wall against period and delay, and against jitter and lost ticks",
-    default_points=100,
+    about="largest stiffness of a wall against period and delay by method, and against jitter and "
+    "lost ticks",
+    default_points=110,
     points=points,
     evaluate=evaluate,
     read=read,

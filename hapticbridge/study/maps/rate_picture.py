@@ -1,4 +1,4 @@
-"""How the map ``rate`` is drawn: even ticks above, jitter and lost ticks below."""
+"""How the map ``rate`` is drawn: even ticks above, a panel a method; uneven ones below."""
 
 from __future__ import annotations
 
@@ -12,12 +12,14 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
 from hapticbridge.picture import new_figure
+from hapticbridge.study.maps.bound_of_method import law_in_words
 from hapticbridge.study.maps.palette import THEORY_COLOUR
 from hapticbridge.study.maps.rate_runs import (
     DAMPING,
     DELAYS,
     DEVICE_DAMPING,
     HANDS,
+    METHODS_SHOWN,
     UNEVEN_PERIOD,
     WALL_MASS,
 )
@@ -38,13 +40,24 @@ AXES = {
 MARKERS = dict(zip(HANDS, "os", strict=True))
 
 
+SHOWN = (15.0, 7e4)
+"""Range of K in N/m at even ticks: all bounds at b, and room for the names below them."""
+
+
 def draw(boundary: Mapping[str, Any]) -> Figure:
     """Draws what ``rate.read`` found."""
-    figure = new_figure(8, 7.6)
-    grid = figure.add_gridspec(2, 2, height_ratios=(1.25, 1))
-    _draw_delays(figure.add_subplot(grid[0, :]), boundary["by_delay"])
-    first = figure.add_subplot(grid[1, 0])
-    panels = (first, figure.add_subplot(grid[1, 1], sharey=first))
+    figure = new_figure(8, 8.4)
+    grid = figure.add_gridspec(2, 6, height_ratios=(1.25, 1))
+    above: list[Axes] = []
+    for place, (name, by_delay) in enumerate(boundary["methods"].items()):
+        where = grid[0, 2 * place : 2 * place + 2]
+        axes = figure.add_subplot(where, sharey=above[0] if above else None)
+        _draw_delays(axes, name, by_delay)
+        axes.tick_params(labelleft=not above)
+        above.append(axes)
+    above[0].set_ylabel("largest stable K (N/m)")
+    first = figure.add_subplot(grid[1, :3])
+    panels = (first, figure.add_subplot(grid[1, 3:], sharey=first))
     for axes, (what, words) in zip(panels, AXES.items(), strict=True):
         _draw_uneven(axes, boundary["uneven"][what], words)
     first.set_ylabel("largest stable K (N/m)")
@@ -57,13 +70,16 @@ def draw(boundary: Mapping[str, Any]) -> Figure:
         for label, style in STYLES.values()
     ]
     figure.suptitle(
-        f"Largest stable K on a wall: behind the coupling is a tool of {1e-3 * WALL_MASS:g} t\n"
-        f"method 'implicit', device damping b = {DEVICE_DAMPING:g} N s/m",
+        f"Largest stable K on a wall: behind the coupling is a tool of {1e-3 * WALL_MASS:g} t, "
+        f"device damping b = {DEVICE_DAMPING:g} N s/m\n"
+        f"above: even ticks, B = {DAMPING:g} N s/m asked for, the law uses B′ (0 at least);\n"
+        "circles: measured with the worst hand",
         fontsize="medium",
     )
+    names = ", ".join(METHODS_SHOWN)
     figure.legend(
         handles=handles,
-        title=f"lower panels: T = {1e3 * UNEVEN_PERIOD:g} ms, B = 0",
+        title=f"below: T = {1e3 * UNEVEN_PERIOD:g} ms, B = 0, for which {names} have one law",
         title_fontsize="small",
         loc="outside lower center",
         ncols=2,
@@ -73,26 +89,33 @@ def draw(boundary: Mapping[str, Any]) -> Figure:
     return figure
 
 
-def _draw_delays(axes: Axes, by_delay: Mapping[str, Any]) -> None:
-    # one hue, darker the later: a delay is a quantity, and verdicts own the other colours
+def _draw_delays(axes: Axes, name: str, by_delay: Mapping[str, Any]) -> None:
+    # one hue, lighter the later: a delay is a quantity, and verdicts own the other colours
     shade = matplotlib.colormaps["Blues_r"]
+    axes.set_xscale("log")
+    axes.set_yscale("log")
     for delay, mine in by_delay.items():
         colour, period = shade(0.65 * int(delay) / (DELAYS - 1)), 1e3 * np.array(mine["period"])
-        samples = "sample" if delay == "1" else "samples"
-        label = f"bound, delay of {delay} {samples}"
-        axes.loglog(period, mine["predicted"], color=colour, label=label)
+        axes.plot(period, mine["predicted"], color=colour, label=delay)
         axes.plot(period, _drawable(mine["measured"]), "o", color=colour, mfc="white", ms=5)
     if by_delay:
-        axes.plot([], [], "o", color="black", mfc="white", label="measured: worst hand")
-        axes.legend(fontsize="small")
+        axes.legend(
+            title="bound, delay in samples",
+            title_fontsize="small",
+            fontsize="small",
+            ncols=3,
+            loc="lower left",
+            handlelength=1.2,
+            columnspacing=1.0,
+        )
     else:
         say_missing(axes)
+    axes.set_ylim(*SHOWN)
+    axes.set_title(f"{name}, {law_in_words(name)}", fontsize="medium")
     axes.set_xlabel("period T (ms)")
-    ticks = (0.1, 0.2, 0.5, 1, 2, 5)
+    ticks = (0.1, 0.3, 1, 3)
     axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
     axes.xaxis.set_minor_formatter(NullFormatter())
-    axes.set_ylabel("largest stable K (N/m)")
-    axes.set_title(f"even ticks, B = {DAMPING:g} N s/m", fontsize="medium")
     axes.grid(visible=True, which="both", alpha=0.25)
 
 

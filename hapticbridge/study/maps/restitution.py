@@ -1,4 +1,8 @@
-"""Map ``restitution``: a rod after one contact of MuJoCo's, against three laws of impact."""
+"""Map ``restitution``: a rod after one contact of MuJoCo's, against three laws of impact.
+
+No rendering method plays a part: the rod has no handle and no coupling, and what its contact does
+is MuJoCo's alone, by integrator and contact setting.
+"""
 
 from __future__ import annotations
 
