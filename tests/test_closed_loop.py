@@ -65,7 +65,13 @@ def test_records_are_those_of_the_live_loop_to_the_bit(scene: str, method: str) 
     )
     limits = Limits(force=1e9, torque=1e9, ramp=0.0)
     with Bridge(
-        load_scene(scene), device(), COUPLING, clock=SimulatedClock(), method=method, limits=limits
+        load_scene(scene),
+        device(),
+        COUPLING,
+        clock=SimulatedClock(),
+        method=method,
+        limits=limits,
+        controller="off",  # the study looks at methods without one
     ) as bridge:
         bridge.run(duration=1.5)
         expected = bridge.latest_records(1500)

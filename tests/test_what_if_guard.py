@@ -109,7 +109,8 @@ def test_a_model_hand_feels_the_controller_that_is_asked_for(tmp_path: Path) -> 
     assert not at_work["off"].any()
     assert at_work["damper"].any()
     with pytest.raises(
-        RecordingError, match="controller is 'dampr'; choose one of 'damper', 'off'"
+        RecordingError,
+        match="controller is 'dampr'; choose one of 'damper', 'environment', 'off', 'tank'",
     ):
         what_if(path, {"controller": "dampr"})
 

@@ -7,7 +7,7 @@ ten minutes at 1 kHz (600 000 records) take about a second.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -52,9 +52,9 @@ class RecordingFile:
     count: int
     last_tick: int
     flags: int
-    events: list[dict[str, Any]]
+    events: list[dict[str, Any]] = field(repr=False)
     meta: dict[str, str]
-    attachments: dict[str, bytes]
+    attachments: dict[str, bytes] = field(repr=False)  # megabytes
     is_cut: bool
     digest: str | None
     computed_digest: str
