@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -148,3 +150,13 @@ def test_wrong_usage_is_exit_code_2_without_a_traceback(
     code, out, err = call(*arguments)
     assert (code, out) == (2, "")
     assert err and "Traceback" not in err
+
+
+def test_help_into_a_reader_that_went_away_ends_without_a_traceback() -> None:
+    command = [sys.executable, "-m", "hapticbridge", "--help"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    assert process.stdout is not None
+    process.stdout.close()
+    _, told = process.communicate(timeout=120)
+    assert process.returncode == 1
+    assert told == b""

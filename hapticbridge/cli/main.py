@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import warnings
 from collections.abc import Iterator, Sequence
@@ -80,6 +81,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except HapticBridgeError as error:
         print_error(error)
         return USAGE_ERROR
+    except BrokenPipeError:  # 'hapticbridge --help | head': nobody reads any more
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is left goes nowhere
+        return 1
     except KeyboardInterrupt:
         err.print("interrupted")
         return 130
