@@ -161,6 +161,10 @@ def test_a_device_with_too_little_damping_is_credited_with_half_of_it() -> None:
     assert (enough.controller, short.controller) == (ENVIRONMENT, DAMPER)
     light = guarding_for(SimulatedDevice(mass=1e-3).info, limits, T)
     assert light.most_damping == pytest.approx(1.0)  # m/T, below b
+    assert light.most_rotational_damping == 2e-3  # b, below I/T
+    slight = guarding_for(SimulatedDevice(rotational_inertia=1e-6).info, limits, T)
+    assert slight.most_rotational_damping == pytest.approx(1e-3)
+    assert slight.most_damping == 2.0
 
 
 def test_an_hour_of_dissipation_pays_for_no_more_than_the_surplus() -> None:
