@@ -167,19 +167,30 @@ def test_a_device_with_too_little_damping_is_credited_with_half_of_it() -> None:
     assert slight.most_damping == 2.0
 
 
-def test_an_hour_of_dissipation_pays_for_no_more_than_the_surplus() -> None:
+@pytest.mark.parametrize("axis", range(6))
+def test_an_hour_of_dissipation_pays_for_no_more_than_the_surplus(axis: int) -> None:
     state = np.zeros(1, STATE_DTYPE)
     state["period"], state["scale"], state["force_scale"], state["tick"] = T, 1.0, 1.0, 1
     state["surplus"] = 0.05
-    nothing = (0.0, 0.0, 0.0)
-    state["wrench_on_device"][0, 0] = -2.0
+    state["wrench_on_device"][0, axis] = -2.0
+
+    def move(by: float) -> None:
+        motion = np.zeros(6)
+        motion[axis] = by
+        x, y, z, rx, ry, rz = motion.tolist()
+        keep_account(state, (x, y, z), (rx, ry, rz), T)
+
     for _ in range(1000):
-        keep_account(state, (1e-3, 0.0, 0.0), nothing, T)  # the hand pushes in 2 mJ each time
+        move(1e-3)  # the hand pushes in 2 mJ each time
+    expected = np.zeros(6)
+    expected[axis] = -0.05
     assert state["account"][0] == -0.05
+    assert state["axis_account"][0].tolist() == expected.tolist()
     assert state["given"][0] == pytest.approx(-2.0)
     for _ in range(30):
-        keep_account(state, (-1e-3, 0.0, 0.0), nothing, T)
+        move(-1e-3)
     assert state["account"][0] == pytest.approx(0.01)
+    assert state["axis_account"][0, axis] == pytest.approx(0.01)
 
 
 def test_the_audits_capped_sum_is_the_recursion() -> None:

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from hapticbridge.audit import audit
 from hapticbridge.bridge import Bridge
 from hapticbridge.clock import RealClock, SimulatedClock
+from hapticbridge.commands import Switch
 from hapticbridge.device.last_word import LastWord
 from hapticbridge.errors import DeviceError, HapticBridgeError, SafetyTrip
 from hapticbridge.guard import UNLIMITED, Limits, guarding_for, wait_until_still
@@ -68,6 +69,24 @@ def test_a_clutch_moves_the_device_without_the_handle_and_comes_back_without_a_s
     assert np.flatnonzero(ticks["flags"] & RESEATED).tolist() == [UP]
     assert outcome.energy < 0.05
     assert (outcome.report.verdict, outcome.report.resimulation) == ("passive", "bit for bit")
+
+
+def test_a_clutch_let_go_while_the_force_is_off_puts_the_handle_to_the_tool(
+    tmp_path: Path,
+) -> None:
+    """The tool follows without force: a handle put where the device went would fling it there."""
+    rig = Rig(tmp_path, options={"clutch": 3})
+    rig.device.corrupt = pressed(3, lambda k: DOWN <= k < UP)
+    switches = {UP - 100: Switch(force=False), UP + 300: Switch(force=True)}
+    rig.on_tick = lambda bridge, k: bridge.command(switches[k]) if k in switches else None
+    outcome = rig.run(DOWN)
+    ticks = read_recording(tmp_path / "run.mcap").ticks
+    apart = ticks["handle_position"][UP] - ticks["tool_position"][UP - 1]
+    assert np.linalg.norm(apart) < 1e-4
+    assert np.linalg.norm(np.ptp(ticks["device_position"][DOWN:UP], axis=0)) > 0.01
+    assert not outcome.forces[UP : UP + 300].any()
+    assert ticks["flags"][UP] & RESEATED
+    assert outcome.report.resimulation == "bit for bit"
 
 
 def test_without_a_clutch_the_button_is_a_button(tmp_path: Path) -> None:
@@ -176,6 +195,23 @@ def test_the_force_changes_no_faster_than_it_may(rise: float, most: float) -> No
         bridge.run(0.06)
         flags = bridge.latest_records(60)["flags"]
     steps = np.linalg.norm(np.diff(device.writes[:60], axis=0)[:, :3], axis=1)
+    assert steps.max() == pytest.approx(most)
+    assert bool((flags & int(TickFlag.SLEW_LIMITED)).any()) == (rise > 0)
+
+
+@pytest.mark.parametrize(("rise", "most"), [(2e-3, 0.25), (0.0, 0.5), (5e-3, 0.1)])
+def test_the_torque_changes_no_faster_than_it_may(rise: float, most: float) -> None:
+    # a hand that turns by 0.4 rad in 2 ms, slower than the fastest turn: 0.96 N m
+    def turned(tick: int) -> tuple[float, ...]:
+        half = 0.1 * min(max(tick - 49, 0), 2)
+        return (0, 0, 0, math.cos(half), 0, 0, math.sin(half))
+
+    device = ScriptedDevice(turned)
+    limits = Limits(force=10.0, torque=0.5, ramp=0.0, rise=rise)
+    with fast("virtual_wall", device, limits=limits) as bridge:
+        bridge.run(0.06)
+        flags = bridge.latest_records(60)["flags"]
+    steps = np.linalg.norm(np.diff(device.writes[:60], axis=0)[:, 3:], axis=1)
     assert steps.max() == pytest.approx(most)
     assert bool((flags & int(TickFlag.SLEW_LIMITED)).any()) == (rise > 0)
 
