@@ -285,12 +285,22 @@ def _wall_clock(rig: Rig) -> None:
     rig.around = around
 
 
-def _fill_disk(bridge: Bridge) -> None:
-    """From here on the recorder's file may not grow, as on a disk that is full."""
-    recorder, path = bridge._stream.recorder, bridge._path
-    assert recorder is not None and path is not None
-    size = path.stat().st_size
-    resource.prlimit(recorder._process.pid, resource.RLIMIT_FSIZE, (size + 1000, size + 1000))
+def _fill_disk(rig: Rig) -> None:
+    """From the cause on the recorder's file may not grow, as on a disk that is full."""
+
+    def fill(bridge: Bridge, tick: int) -> None:
+        recorder, path, cursors = bridge._stream.recorder, bridge._path, bridge._stream.cursors
+        assert recorder is not None and path is not None
+        process = recorder._process
+        if tick == CAUSE:
+            size = path.stat().st_size + 1000
+            resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (size, size))
+        while tick > CAUSE and tick % 50 == 0 and cursors[TAIL] < cursors[HEAD]:
+            if process.poll() is not None:
+                break
+            time.sleep(1e-3)  # the recorder keeps up, as it does in real time
+
+    rig.on_tick = fill
 
 
 def _full_tmpfs(rig: Rig) -> None:
@@ -419,6 +429,9 @@ RING_FULL = Fault("ring full for 1 s", _full_ring, "goes on")
 
 DISK_FULL = Fault("disk full", _full_tmpfs, "stops", "the disk is full", within=600)
 
+PUSHED = 566
+"""The tick whose sample shows that the motor gave the hand more than the energy limit."""
+
 FAULTS = (
     Fault("pose that is no number", corrupting(_nan), "trip", "pose is not finite"),
     Fault("infinite quaternion", corrupting(_infinite), "trip", "pose is not finite"),
@@ -439,14 +452,14 @@ FAULTS = (
     Fault("MuJoCo warns: bad velocity", acting(_bad_velocity), "trip", "diverged"),
     Fault("MuJoCo warns: bad acceleration", acting(_bad_acceleration), "trip", "diverged"),
     Fault("scene diverges", acting(_diverge), "trip", "diverged"),
-    Fault("motor drives the tool", _motor, "trip", "more energy", NO_TRIPS, cause=500, within=900),
+    Fault("motor drives the tool", _motor, "trip", "more energy", NO_TRIPS, cause=PUSHED),
     Fault("10 x too stiff, free", stiff(10, None), "goes on", "", UNGUARDED),
     Fault("10 x too stiff, in a hand", stiff(10, DEFAULT_HAND), "goes on"),
     Fault("edge of the workspace", _edge, "fades", within=150),
     Fault("encoder steps of 50 µm", _quantised, "goes on"),
     Fault("error in the user's code", acting(_raise), "stops", "ZeroDivisionError"),
     Fault("recorder killed", acting(_kill_recorder), "stops", "recorder died", within=101),
-    Fault("recording may not grow", acting(_fill_disk), "stops", "recorder died", within=999),
+    Fault("recording may not grow", _fill_disk, "stops", "recorder died", within=600),
     *([DISK_FULL] if can_mount() else []),
     RING_FULL,
     Fault("viewer killed", _watched(signal.SIGKILL), "goes on"),

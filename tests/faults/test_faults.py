@@ -12,9 +12,10 @@ import pytest
 from audit_cases import ScriptedDevice
 from bridge_runs import fast, sway
 
-from faults.catalogue import FAULTS, RING_FULL, Fault
-from faults.rig import CAUSE, Outcome
+from faults.catalogue import FAULTS, PUSHED, RING_FULL, Fault
+from faults.rig import CAUSE, Outcome, Rig
 from hapticbridge.audit import audit
+from hapticbridge.guard import USUAL_ENERGY
 from hapticbridge.recording import read_recording
 from hapticbridge.tick import TickFlag
 
@@ -72,6 +73,23 @@ def test_without_its_guard_the_fault_does_harm(fault: Fault, tmp_path: Path) -> 
         assert torques[CAUSE : CAUSE + 5].max() > 0.3
     else:
         assert outcome.energy > MOST_ENERGY
+
+
+@pytest.mark.parametrize("energy", [USUAL_ENERGY, 0.046])
+def test_a_motors_push_is_cut_off_one_tick_after_the_energy_limit(
+    tmp_path: Path, energy: float
+) -> None:
+    """The hand's own meter says when; a limit that is a little higher ends it later."""
+    fault = next(fault for fault in FAULTS if fault.cause == PUSHED)
+    rig = Rig(tmp_path)
+    fault.do(rig)
+    rig.guard = {"energy": energy}
+    rig.run(fault.cause)
+    seen = int(np.argmax(np.array(rig.device.to_the_hand) > energy)) - 1
+    assert (seen == PUSHED) == (energy == USUAL_ENERGY)
+    pushes = [tick for tick, wrench in rig.device.writes if wrench.any()]
+    assert pushes[-1] == seen
+    assert rig.device.writes[-1][0] == seen + 1
 
 
 def test_a_signal_at_any_tick_ends_a_run_with_zero_force(tmp_path: Path) -> None:
