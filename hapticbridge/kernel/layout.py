@@ -173,6 +173,7 @@ _GUARD_RUNNING = (
     "given",
     "kicked",
     "injected_damping",
+    "injected_rotational_damping",
 )
 
 _POSES = ("device", "handle", "tool")
