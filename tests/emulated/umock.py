@@ -58,7 +58,8 @@ class Umock(FrontEnd):
                 client = UsbfsClient(connection, pipe, self._device)
             else:
                 assert isinstance(self._device, HidDevice)
-                client = HidrawClient(connection, pipe, self._device)
+                is_alone = not any(isinstance(one, HidrawClient) for one in self._clients.values())
+                client = HidrawClient(connection, pipe, self._device, is_alone=is_alone)
             self._clients[connection.fileno()] = client
         elif not self._clients[file].serve(now):
             self._clients.pop(file).close()
@@ -68,8 +69,8 @@ class Umock(FrontEnd):
         readers = [one for one in self._clients.values() if isinstance(one, HidrawClient)]
         if readers and isinstance(self._device, HidDevice):
             while (report := self._device.take_report()) is not None:
-                for reader in readers:
-                    reader.feed(report)
+                # one pipe stands for the node, so one program reads: who else opened it only writes
+                readers[0].feed(report)
         return due
 
     def unplug(self) -> None:

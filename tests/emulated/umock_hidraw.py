@@ -19,13 +19,16 @@ from emulated.usb_device import StallError
 class HidrawClient(Client):
     """A program that has a hidraw node open."""
 
-    def __init__(self, connection: socket.socket, pipe: Path, device: HidDevice) -> None:
+    def __init__(
+        self, connection: socket.socket, pipe: Path, device: HidDevice, *, is_alone: bool = True
+    ) -> None:
         super().__init__(connection, pipe)
         self._device = device
         self._blank = b"" if device.has_numbered_reports else b"\0"
         self._reports: deque[bytes] = deque()
         self._waiting: tuple[int, int] | None = None
-        self._drain()
+        if is_alone:  # else what is in the pipe is another's
+            self._drain()
 
     def feed(self, report: bytes) -> None:
         """Gives the client an input report; beyond 64 waiting ones the newest are lost."""
