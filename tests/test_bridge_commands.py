@@ -152,6 +152,8 @@ def test_a_change_of_stiffness_gives_the_spring_half_of_it_times_its_stretch_squ
     # 2 mm, while the anvil of 20 t gives way by 0.05 mm
     assert summary.energies["tuning_work"] == pytest.approx(500.0 * 2e-3**2, rel=0.03)
     assert summary.energies["tuning_work"] == pytest.approx(grown(path, 1000.0), rel=1e-9)
+    # the audit says so too, from its own sum
+    assert f"which gave the coupling {grown(path, 1000.0):.3g} J" in audit(path).rendered[-1]
     climb = np.diff(script.stiffness)[250 : 250 + STEPS]
     np.testing.assert_allclose(climb, 1000.0 / STEPS, rtol=1e-9)
     assert summary.energies["environment_energy"] <= 1e-9
