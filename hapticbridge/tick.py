@@ -74,13 +74,15 @@ TICK_DTYPE = np.dtype(
         ("environment_energy", "<f8"),
         ("device_energy", "<f8"),
         ("injected_damping", "<f8"),
+        ("injected_rotational_damping", "<f8"),
     ]
 )
 """One record. Row k holds the sample read in tick k, the wrench computed from it, and the energies
 after the step. Positions in m, quaternions (w, x, y, z) with w >= 0, wrenches (force in N, torque
 in N m) in the world frame about the grip (``wrench_on_tool``) or in the device's frame
-(``wrench_on_device``), energies and cumulative works in J. ``injected_damping`` in N s/m is the
-largest that the passivity controller added on an axis of translation."""
+(``wrench_on_device``), energies and cumulative works in J. ``injected_damping`` in N s/m and
+``injected_rotational_damping`` in N m s/rad are the largest that the passivity controller added on
+an axis of either kind."""
 
 _POSITION, _QUATERNION = (("x", "y", "z"), "m"), (("w", "x", "y", "z"), "1")
 _WRENCH = ("fx", "fy", "fz", "tx", "ty", "tz"), "N"
@@ -94,7 +96,7 @@ _PARTS: dict[str, tuple[tuple[str, ...], str]] = {
     "wrench_on_tool": _WRENCH,
     "wrench_on_device": _WRENCH,
 }
-_UNITS = {
+UNITS = {
     "deadline_ns": "ns",
     "wake_ns": "ns",
     "read_ns": "ns",
@@ -107,6 +109,7 @@ _UNITS = {
     "environment_energy": "J",
     "device_energy": "J",
     "injected_damping": "N s/m",
+    "injected_rotational_damping": "N m s/rad",
 }
 
 
@@ -129,7 +132,7 @@ class Column(NamedTuple):
 def _columns() -> Iterator[Column]:
     for field in TICK_DTYPE.names or ():
         if field not in _PARTS:
-            yield Column(field, field, None, _UNITS.get(field, "1"))
+            yield Column(field, field, None, UNITS.get(field, "1"))
             continue
         parts, unit = _PARTS[field]
         for index, part in enumerate(parts):

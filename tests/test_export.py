@@ -33,6 +33,7 @@ UNITS = {
     "wrench_on_device_tx": "N m",
     "device_energy": "J",
     "injected_damping": "N s/m",
+    "injected_rotational_damping": "N m s/rad",
 }
 """Written down once more, by hand."""
 

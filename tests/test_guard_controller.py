@@ -87,6 +87,16 @@ def test_about_an_axis_too_a_wall_beyond_the_limit_swings_without_and_decays_wit
     assert (with_it.flags & ACTIVE).any()
     assert with_it.report.verdict != "invalid", with_it.report.reason
     assert with_it.report.resimulation == "bit for bit"
+    recording = read_recording(tmp_path / "run.mcap")
+    ticks = recording.ticks.copy()
+    turning = ticks["injected_rotational_damping"]
+    assert not ticks["injected_damping"].any()
+    assert 0.0 < turning.max() <= 2e-3  # the device's own, in N m s/rad
+    at = int(np.argmax(turning))
+    turning[at] *= 1.05
+    report = verdict_of(recording, tmp_path, ticks=ticks)
+    found = (report.verdict, report.port, report.tick)
+    assert found == ("invalid", "injected_rotational_damping", at)
 
 
 @pytest.mark.parametrize("controller", ["damper", "tank"])

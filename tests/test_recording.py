@@ -103,7 +103,7 @@ def test_schema_lists_every_field_with_its_type() -> None:
     assert lines[0] == "int64 tick"
     assert "float64[3] device_position" in lines
     assert "float64[6] wrench_on_device" in lines
-    assert lines[-1] == "float64 injected_damping"
+    assert lines[-1] == "float64 injected_rotational_damping"
     assert len(lines) == len(TICK_DTYPE.names or ())
 
 
@@ -168,12 +168,12 @@ def test_whole_chunks_reach_the_file_before_it_is_closed(tmp_path: Path) -> None
     recording = read_recording(copy)
     assert recording.is_cut
     lost = 1000 - recording.ticks.size
-    assert 0 <= lost * 435 <= layout.CHUNK_SIZE + 435
+    assert 0 <= lost * 443 <= layout.CHUNK_SIZE + 443
     assert read_recording(path).ticks.size == 1000
 
 
 def test_memory_of_the_writer_does_not_grow_with_the_length_of_a_run(tmp_path: Path) -> None:
-    """Its index of chunks waits on disk; as the library keeps it, 40 chunks take 36 kB."""
+    """Its index of chunks waits on disk; as the library keeps it, 44 chunks take 40 kB."""
     rows, path = random_rows(3000), tmp_path / "run.mcap"
     writer = RecordingWriter(path, META, FILES, EPOCH)
     held = []
@@ -194,7 +194,7 @@ def test_memory_of_the_writer_does_not_grow_with_the_length_of_a_run(tmp_path: P
     assert held[-1] - held[0] < 1024
     assert list(tmp_path.iterdir()) == [path]
     ends = chunk_ends(path)
-    assert len(ends) == 50
+    assert len(ends) == 55
     assert path.read_bytes()[ends[-1][0]] == Opcode.MESSAGE_INDEX
 
 

@@ -46,7 +46,8 @@ class Balance:
         wrench_on_tool: The coupling law at the recorded poses, (n, 6) in N and N m; the recorded
             wrench itself where the recorded poses alone do not tell it.
         wrench_on_device: What the guard should have sent for the recorded wrench, (n, 6).
-        injected_damping: What the passivity controller should have added, (n,) in N s/m.
+        injected_damping: What the passivity controller should have added at most on an axis of
+            translation and of rotation, (n, 2) in N s/m and N m s/rad.
         handle_position: Where the recorded device pose puts the handle, (n, 3) in m.
         handle_turn: By how much the recorded handle is turned from where it should be, (n,) in rad.
         coupling_work: Cumulative Σ f·δx + τ·δφ of the recorded wrench, (n,) in J; as recorded

@@ -27,7 +27,8 @@ class Controlled(NamedTuple):
     Attributes:
         wrench: With damping or the tank's share, (n, 6).
         change: By how much each component may change from tick to tick, (n, 6); inf: at will.
-        injected: The damping added, (n,).
+        injected: The most damping added on an axis of translation and of rotation, (n, 2) in
+            N s/m and N m s/rad.
     """
 
     wrench: Array
@@ -84,7 +85,7 @@ class Account:
         """
         then = copy.copy(self)
         parameters, guarding = self.parameters, self.parameters.guarding
-        nothing, free = np.zeros(len(ticks)), np.full((len(ticks), 6), np.inf)
+        nothing, free = np.zeros((len(ticks), 2)), np.full((len(ticks), 6), np.inf)
         acts = guarding.controller in (DAMPER, TANK)
         acts |= guarding.controller == ENVIRONMENT and parameters.has_law
         if not acts:
@@ -124,11 +125,11 @@ class Account:
         change = np.where((owed > 0) & swings, BOUND * most * np.abs(velocity), np.inf)
         held = wrench - damping * velocity
         if guarding.controller == ENVIRONMENT:
-            return Controlled(held, change, damping[:, :3].max(axis=1)), then
+            return Controlled(held, change, _largest(damping)), then
         # the tank comes last, and only where no axis is bounded
         pays = (debt > 0) & ~swings.any(axis=1)
         share = np.where(pays, _tank_share(parameters, held, velocity, account), 1.0)
-        return Controlled(held * share[:, None], change, damping[:, :3].max(axis=1)), then
+        return Controlled(held * share[:, None], change, _largest(damping)), then
 
     def _gained(self, ticks: NDArray[np.void], wrench: Array, share: Array) -> Array:
         """Returns what the account gets for each tick: what the scene took up of what was felt."""
@@ -146,6 +147,11 @@ def capped_sum(values: Array, surplus: float, before: float | Array = 0.0) -> Ar
     """Returns x_k = max(x_{k−1} + v_k, −surplus), x_{−1} = before, along the first axis."""
     total = before + np.cumsum(values, axis=0)
     return np.asarray(total + np.maximum(np.maximum.accumulate(-surplus - total, axis=0), 0.0))
+
+
+def _largest(damping: Array) -> Array:
+    """Returns the largest of three axes of either kind, (n, 2)."""
+    return np.asarray(damping.reshape(-1, 2, 3).max(axis=2))
 
 
 def _tank_share(parameters: RunParameters, wrench: Array, velocity: Array, account: Array) -> Array:

@@ -32,7 +32,8 @@ class Expected:
         position: Of the handle, (n, 3) in m.
         orientation: Of the handle, (n, 4).
         wrench: That was sent to the device, (n, 6).
-        injected: Damping that the controller added, (n,) in N s/m.
+        injected: The most damping that the controller added on an axis of translation and of
+            rotation, (n, 2) in N s/m and N m s/rad.
         seen: What the watch saw.
     """
 

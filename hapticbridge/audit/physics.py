@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from hapticbridge.audit.balance import Balance
 from hapticbridge.audit.structure import TOLERANCE, Fault
 from hapticbridge.audit.watched import has_flag
-from hapticbridge.tick import TickFlag
+from hapticbridge.tick import UNITS, TickFlag
 
 CONTROLLED_TOLERANCE = 1e-5
 """Relative difference while the passivity controller acts: it divides a small debt by a squared
@@ -65,13 +65,14 @@ def physics_fault(ticks: NDArray[np.void], balance: Balance) -> Fault | None:
             )
         )
     is_off = (ticks["flags"] & int(TickFlag.CONTROLLER_ACTIVE)) == 0
-    damping = np.where(is_off, np.abs(ticks["injected_damping"]), 0.0)
-    faults.append(
-        _first("injected_damping", start, damping, np.zeros(len(ticks)), "N s/m", "flags")
-    )
-    wrong = np.abs(ticks["injected_damping"] - balance.injected_damping)
-    allowed = CONTROLLED_TOLERANCE * (1 + np.abs(balance.injected_damping))
-    faults.append(_first("injected_damping", start, wrong, allowed, "N s/m", "poses and energies"))
+    for kind, name in enumerate(("injected_damping", "injected_rotational_damping")):
+        unit = UNITS[name]
+        damping = np.where(is_off, np.abs(ticks[name]), 0.0)
+        faults.append(_first(name, start, damping, np.zeros(len(ticks)), unit, "flags"))
+        expected = balance.injected_damping[:, kind]
+        allowed = CONTROLLED_TOLERANCE * (1 + np.abs(expected))
+        wrong = np.abs(ticks[name] - expected)
+        faults.append(_first(name, start, wrong, allowed, unit, "poses and energies"))
     found = [fault for fault in faults if fault is not None]
     return min(found, key=lambda fault: fault.tick or 0) if found else None
 

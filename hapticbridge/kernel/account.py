@@ -161,7 +161,7 @@ def control(state: NDArray[np.void], force: Vector, torque: Vector) -> tuple[Vec
         Hannaford & Ryu 2002 (damper); Kim & Ryu 2010 (bound); Franken et al. 2011 (tank).
     """
     s = state[0]
-    s.injected_damping = 0.0
+    s.injected_damping = s.injected_rotational_damping = 0.0
     if s.controller == DAMPER or (s.controller == ENVIRONMENT and s.has_law):
         debt = s.account - THRESHOLD
         if s.controller == ENVIRONMENT:
@@ -171,11 +171,13 @@ def control(state: NDArray[np.void], force: Vector, torque: Vector) -> tuple[Vec
             x, on_x = _held_back(state, 0, 0, force[0], b, debt)
             y, on_y = _held_back(state, 0, 1, force[1], b, debt)
             z, on_z = _held_back(state, 0, 2, force[2], b, debt)
-            rx, _ = _held_back(state, 3, 0, torque[0], b_r, debt)
-            ry, _ = _held_back(state, 3, 1, torque[1], b_r, debt)
-            rz, _ = _held_back(state, 3, 2, torque[2], b_r, debt)
+            rx, on_rx = _held_back(state, 3, 0, torque[0], b_r, debt)
+            ry, on_ry = _held_back(state, 3, 1, torque[1], b_r, debt)
+            rz, on_rz = _held_back(state, 3, 2, torque[2], b_r, debt)
             s.injected_damping = max(on_x, on_y, on_z)
-            if s.injected_damping > 0.0 or (x, y, z) != force or (rx, ry, rz) != torque:
+            s.injected_rotational_damping = max(on_rx, on_ry, on_rz)
+            is_damped = s.injected_damping > 0.0 or s.injected_rotational_damping > 0.0
+            if is_damped or (x, y, z) != force or (rx, ry, rz) != torque:
                 s.flags |= CONTROLLER_ACTIVE
             force, torque = (x, y, z), (rx, ry, rz)
             is_swinging = s.controller == ENVIRONMENT  # the tank counts the other debt

@@ -149,3 +149,4 @@ def _record(state: NDArray[np.void], row: NDArray[np.void]) -> None:
     r.external_work = s.external_work
     r.environment_energy, r.device_energy = s.environment_energy, s.device_energy
     r.injected_damping = s.injected_damping
+    r.injected_rotational_damping = s.injected_rotational_damping

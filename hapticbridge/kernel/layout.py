@@ -175,6 +175,7 @@ _GUARD_RUNNING = (
     "excess",
     "excess_before",
     "injected_damping",
+    "injected_rotational_damping",
 )
 
 _POSES = ("device", "handle", "tool")

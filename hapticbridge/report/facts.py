@@ -163,8 +163,15 @@ def _controlled(evidence: Evidence) -> str:
     active = (evidence.ticks["flags"] & int(TickFlag.CONTROLLER_ACTIVE)) != 0
     if not active.any():
         return name if name == "off" else f"{name}, never at work"
-    most = float(evidence.ticks["injected_damping"].max())
-    injected = f", up to {most:.3g} N s/m injected" if most else ""
+    most = {
+        unit: float(evidence.ticks[field].max())
+        for field, unit in (
+            ("injected_damping", "N s/m"),
+            ("injected_rotational_damping", "N m s/rad"),
+        )
+    }
+    amounts = [f"{damping:.3g} {unit}" for unit, damping in most.items() if damping]
+    injected = f", up to {' and '.join(amounts)} injected" if amounts else ""
     return f"{name}, at work in {percent(active)} of the ticks{injected}"
 
 

@@ -49,9 +49,10 @@ def draw_timing(evidence: Evidence) -> Figure:
     In simulated time no tick is late, and without a controller at work nothing is injected: those
     panels are then left out.
     """
-    injected = evidence.ticks["injected_damping"]
-    is_timed, is_damped = bool(evidence.lateness.any()), bool(injected.any())
-    heights = [2.4] * is_timed + [3.2] + [1.8] * is_damped
+    kinds = (("injected_damping", "N s/m"), ("injected_rotational_damping", "N m s/rad"))
+    injected = [(evidence.ticks[f], unit) for f, unit in kinds if evidence.ticks[f].any()]
+    is_timed = bool(evidence.lateness.any())
+    heights = [2.4] * is_timed + [3.2] + [1.8] * len(injected)
     figure = new_figure(8, sum(heights))
     panels = list(np.atleast_1d(figure.subplots(len(heights), 1, height_ratios=heights)))
     if is_timed:
@@ -66,9 +67,9 @@ def draw_timing(evidence: Evidence) -> Figure:
     active.set_xlim(time[0], end)
     active.set_ylim(len(shown) - 0.5, -0.5)  # the first on top
     active.grid(alpha=0.3, axis="x")
-    for damped in panels:
-        curve(damped, time, injected, color="#e66100", label="injected by the controller")
-        damped.set_ylabel("damping (N s/m)")
+    for damped, (damping, unit) in zip(panels, injected, strict=True):
+        curve(damped, time, damping, color="#e66100", label="injected by the controller")
+        damped.set_ylabel(f"damping ({unit})")
         finish(damped)
         damped.set_xlim(time[0], end)
     (panels or [active])[-1].set_xlabel("time (s)")
