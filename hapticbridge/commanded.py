@@ -59,12 +59,13 @@ class Commanded(Opened):
         if isinstance(command, Stop):
             self.stop(by)
             return
+        if not self._is_open:
+            raise CommandError("the bridge is not open; nobody would do what is asked for")
         if isinstance(command, Record):
             if type(self.clock) not in (RealClock, SimulatedClock):
                 raise CommandError("a clock of another kind cannot begin anew; nothing is recorded")
-            if command.on == self._stream.is_recording:
-                state = "already" if command.on else "not"
-                raise CommandError(f"this run is {state} being recorded")
+            if reason := self._needless(command):
+                raise CommandError(reason)
         self._commands.offer(command, by)
 
     def stop(self, by: str = "caller") -> None:
@@ -94,7 +95,17 @@ class Commanded(Opened):
             self._event("input", writes=writes)
         if self._commands.waiting or self._operator.later:
             self._pause = self._operator.act(self._tick)
+        # asked for twice before the first was done: a pause would leave a hole in the recording
+        if self._pause is not None and (reason := self._needless(self._pause)):
+            self._pause = None
+            self._stream.tell({"event": "refused", "reason": reason})
         return self._pause is not None
+
+    def _needless(self, record: Record) -> str:
+        """Returns why a recorder need not be started or stopped, or nothing."""
+        if record.on != self._stream.is_recording:
+            return ""
+        return f"this run is {'already' if record.on else 'not'} being recorded"
 
     def _obey_in_pause(self, last: int) -> int:
         """Starts or stops the recorder while nothing is felt.
@@ -114,7 +125,7 @@ class Commanded(Opened):
             else:
                 self._event("stop", reason="recording stopped", dropped=self._stream.dropped)
                 self._stream.stop_recording()
-        except RecordingError as error:
+        except (RecordingError, OSError) as error:  # a name too long for the disk is one too
             self._stream.tell({"event": "refused", "reason": str(error)})
         path = str(self._path) if self._stream.is_recording else None
         self._stream.tell({"event": "recording", "path": path})

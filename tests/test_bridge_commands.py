@@ -19,7 +19,8 @@ from hapticbridge.clock import SimulatedClock
 from hapticbridge.commands import Command, Couple, Record, Reset, Switch
 from hapticbridge.commands.change import tuning_ticks
 from hapticbridge.coupling import Coupling
-from hapticbridge.errors import CommandError, RecordingError
+from hapticbridge.errors import CommandError, RecordingError, SafetyTrip
+from hapticbridge.guard import Limits
 from hapticbridge.recording import read_recording
 from hapticbridge.whatif import what_if
 
@@ -72,13 +73,12 @@ def run(tmp_path: Path) -> Iterator[Callable[..., Any]]:
         damping: float = 2.0,
         **options: Any,
     ) -> tuple[Any, Path, Script]:
-        file, path = tmp_path / "scene.xml", tmp_path / "run.mcap"
+        file, path = tmp_path / "scene.xml", options.pop("path", tmp_path / "run.mcap")
         file.write_text(scene)
         script = Script(commands)
+        options.setdefault("on_tick", script)
         device = ScriptedDevice(pose, damping=damping)
-        summary = recorded(
-            path, str(file), device, coupling, duration=seconds, on_tick=script, **options
-        )
+        summary = recorded(path, str(file), device, coupling, duration=seconds, **options)
         return summary, path, script
 
     yield start
@@ -152,6 +152,8 @@ def test_a_change_of_stiffness_gives_the_spring_half_of_it_times_its_stretch_squ
     # 2 mm, while the anvil of 20 t gives way by 0.05 mm
     assert summary.energies["tuning_work"] == pytest.approx(500.0 * 2e-3**2, rel=0.03)
     assert summary.energies["tuning_work"] == pytest.approx(grown(path, 1000.0), rel=1e-9)
+    # the audit says so too, from its own sum
+    assert f"which gave the coupling {grown(path, 1000.0):.3g} J" in audit(path).rendered[-1]
     climb = np.diff(script.stiffness)[250 : 250 + STEPS]
     np.testing.assert_allclose(climb, 1000.0 / STEPS, rtol=1e-9)
     assert summary.energies["environment_energy"] <= 1e-9
@@ -178,6 +180,37 @@ def test_softening_takes_energy_away(run: Callable[..., Any]) -> None:
     summary, path, _ = run({250: Couple(1000.0, 0.6)}, 0.85, ANVIL, stretched)
     assert summary.energies["tuning_work"] == pytest.approx(grown(path, -1000.0), rel=1e-9)
     assert summary.energies["tuning_work"] < -1.9e-3
+    assert audit(path).verdict == "passive"
+
+
+GUARDED = Limits(force=10.0, torque=0.5, ramp=0.05)
+
+
+def rubbed_and_pressed(tick: int) -> tuple[float, ...]:
+    """Moved to and fro against the coupling's damper until 2 s, then 40 mm aside and back."""
+    if tick < 2000:
+        swing = min(max((tick - 100) / 200, 0.0), (2000 - tick) / 200, 1.0)
+        way = 0.04 * swing * math.sin(0.02 * tick)
+    else:
+        way = 0.04 * min(max((tick - 2500) / 400, 0.0), 1.0, max((3800 - tick) / 400, 0.0))
+    return (way, 0, 0, 1, 0, 0, 0)
+
+
+def test_what_a_hand_rubbed_away_pays_for_no_command(run: Callable[..., Any]) -> None:
+    options = {"scene": ANVIL, "pose": rubbed_and_pressed, "limits": GUARDED, "controller": None}
+    options |= {"method": "implicit", "coupling": Coupling(2000.0, 0.9, 2.0, 5e-4)}
+    # pressed in at 200 N/m, let out at 3000 N/m: 0.2 J from whoever turns the gains
+    pump = {1900: Couple(200.0, 0.0), 2900: Couple(3000.0, 0.0)}
+    with pytest.raises(SafetyTrip, match=r"tick 36.*more energy beyond what the hand put in"):
+        run(pump, 4.0, **options)
+
+
+def test_what_a_spring_still_holds_is_given_back_after_a_command(run: Callable[..., Any]) -> None:
+    options = {"scene": ANVIL, "pose": rubbed_and_pressed, "limits": GUARDED, "controller": None}
+    options |= {"method": "implicit", "coupling": Coupling(2000.0, 0.9, 2.0, 5e-4)}
+    # 40 mm at 2000 N/m and 10 N: 0.375 J go in and come out
+    summary, path, _ = run({2950: Couple(1990.0, 0.9)}, 4.0, **options)
+    assert summary.stopped_by == "duration"
     assert audit(path).verdict == "passive"
 
 
@@ -298,6 +331,43 @@ def test_a_recorder_that_cannot_start_leaves_the_run_going(
     assert summary.ticks == 1600
     assert audit(path).verdict == "passive"
     assert not nowhere.exists()
+
+
+def test_a_recorder_asked_for_while_it_starts_is_started_once(run: Callable[..., Any]) -> None:
+    def twice(bridge: Bridge, tick: int) -> None:
+        if script.done == 1310:  # as another page does while the first one's is not open yet
+            bridge._commands.waiting.append((Record(on=True), "another"))
+        script(bridge, tick)
+
+    script = Script({200: Record(on=False), 1300: Record(on=True)})
+    _, path, _ = run({}, 1.7, on_tick=twice)
+    second = path.with_name("run-2.mcap")
+    assert not path.with_name("run-3.mcap").exists()
+    assert len(read_recording(second).ticks) == 1700 - 1320
+    assert audit(second).verdict == "passive"
+
+
+def test_a_name_that_the_disk_does_not_take_leaves_the_run_going(
+    run: Callable[..., Any], tmp_path: Path
+) -> None:
+    path = tmp_path / ("a" * 250 + ".mcap")  # 255 bytes; with -2 it is too long
+    summary, _, _ = run({200: Record(on=False), 1300: Record(on=True)}, 1.6, path=path)
+    assert summary.ticks == 1600
+    assert audit(path).verdict == "passive"
+
+
+def test_a_bridge_that_is_not_open_takes_no_command(tmp_path: Path) -> None:
+    file = tmp_path / "scene.xml"
+    file.write_text(FLOOR)
+    bridge = Bridge(str(file), ScriptedDevice(swaying), LOOSE, clock=SimulatedClock())
+    for command in (Record(on=True), Couple(1000.0, 0.5)):
+        with pytest.raises(CommandError, match="not open"):
+            bridge.command(command)
+    with bridge:
+        bridge.command(Couple(1000.0, 0.5))
+        bridge.run(0.05)
+    with pytest.raises(CommandError, match="not open"):
+        bridge.command(Switch(force=False))
 
 
 def test_a_run_refuses_what_it_has_already_and_what_its_device_does_not_bear(

@@ -84,8 +84,17 @@ def test_the_softest_coupling_still_shows_the_whole_force() -> None:
     least = allowance().least_stiffness
     assert least == pytest.approx(max(10.0 / 0.2, 0.05 * 4000))  # 10 N within 0.2 m; a share
     allowance().check(least, 0.0)
-    with pytest.raises(CommandError, match="longer than the run allows"):
+    with pytest.raises(CommandError, match="no longer feels"):
         allowance().check(0.999 * least, 0.0)
+
+
+def test_a_run_that_began_softer_may_stay_so() -> None:
+    # else a touch of the damping alone would take the stiffness to the slider's end
+    soft = replace(allowance(damping=50.0), start=replace(COUPLING, stiffness=300.0))
+    assert soft.least_stiffness == 300.0
+    soft.check(300.0, 1.0)
+    with pytest.raises(CommandError, match="no longer feels"):
+        soft.check(299.0, 1.0)
 
 
 def test_without_a_coupling_law_there_is_nothing_to_change() -> None:

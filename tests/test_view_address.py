@@ -67,6 +67,7 @@ def test_token_opens_and_nothing_else_does(way: str) -> None:
     for wrong in ("", address.token[:-1], address.token + "x", "ü", address.token.swapcase()):
         assert "token" in said(wrong)
     assert "token" in address.refusal("/", {"host": OUTSIDE})
+    assert "token" in address.refusal("//[", {"host": OUTSIDE})  # no path that can be read
 
 
 def test_a_name_that_may_be_bound_anew_is_refused_and_a_number_is_not() -> None:

@@ -16,6 +16,7 @@ from hapticbridge.audit.device_port import (
     burnt_by_damping,
     kept_behind_a_law,
     passed_shares,
+    work_of_commands,
 )
 from hapticbridge.audit.differences import (
     steps,
@@ -59,6 +60,7 @@ class Balance:
         kicked: What the device was given beyond what its damping burns and scene and coupling
             give up, (n,) in J; zero for an unknown damping, or several laws a tick. Behind a
             coupling law what the environment created is not in it: that is the other port's.
+        commanded: What commands that changed the coupling gave to what is felt, (n,) in J.
         reached: What the balance of the next ticks begins with.
     """
 
@@ -74,6 +76,7 @@ class Balance:
     environment_energy: Array
     slack: Array
     kicked: Array
+    commanded: Array
 
     reached: Reached
 
@@ -136,14 +139,19 @@ class Balance:
         seen = expected.seen
         kept, lost = coupling_work, created  # without a law, all that the scene took up
         kept_sum = np.zeros(len(ticks))
+        turned = np.zeros(len(ticks))
         if parameters.has_law:
+            around = outside.laws(numbers - 1), gains
+            pulled = motion.pulled, motion.turned
+            share_before = np.concatenate([[before.share], seen.share[:-1]])
+            turned = work_of_commands(parameters, around, pulled, share_before)
             # the slack pays for what the environment creates, but a ramp or a limit lets through
             # only a share of the slack: counted here, it would blame a device that bears its law
             lost = np.minimum(created, 0.0)
             parts, held = kept_behind_a_law(
                 parameters,
-                gains=(outside.laws(numbers - 1), gains),
-                pulled=(motion.pulled, motion.turned),
+                gains=around,
+                pulled=pulled,
                 stretch=(motion.stretch, motion.twist),
                 stretched=motion.stretched,
                 work=works,
@@ -168,6 +176,7 @@ class Balance:
             "given": summed(given, sums["given"]),
             "burnt": burnt,
             "kept": kept_sum,
+            "commanded": summed(turned, sums["commanded"]),
         }
         last = ticks[-1]
         return cls(
@@ -185,6 +194,7 @@ class Balance:
             environment_energy=created,
             slack=totals["slack"],
             kicked=_kicked(parameters, totals["given"], burnt, lost + kept),
+            commanded=totals["commanded"],
             reached=Reached(
                 handle=np.concatenate([last["handle_position"], last["handle_quaternion"]]),
                 tool=np.concatenate([last["tool_position"], last["tool_quaternion"]]),

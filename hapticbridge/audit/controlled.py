@@ -48,7 +48,8 @@ class Account:
         account: In J.
         axes: Accounts (6,) of the axes, in J.
         velocity: Of the device in the tick before, (6,).
-        excess: What the environment had created beyond the slack then, in J.
+        over: What the environment had created beyond the slack then, in J.
+        excess: The same, of which no more than the surplus was ever saved, in J.
         reversed: Where the motion of each axis was reversed in the last ticks, (n, 6).
     """
 
@@ -59,6 +60,7 @@ class Account:
     account: float = 0.0
     axes: Array = field(default_factory=lambda: np.zeros(6))
     velocity: Array = field(default_factory=lambda: np.zeros(6))
+    over: float = 0.0
     excess: float = 0.0
     reversed: NDArray[np.bool_] = field(default_factory=lambda: np.zeros((WINDOW, 6), bool))
 
@@ -111,8 +113,10 @@ class Account:
             return Controlled(wrench * share[:, None], free, nothing), then
         debt = account - THRESHOLD
         if guarding.controller == ENVIRONMENT:
-            debt = np.concatenate([[self.excess], excess[:-1]]) - THRESHOLD
-            then.excess = float(excess[-1])
+            created = np.diff(excess, prepend=self.over)
+            owed = capped_sum(created, guarding.surplus, self.excess)
+            debt = np.concatenate([[self.excess], owed[:-1]]) - THRESHOLD
+            then.over, then.excess = float(excess[-1]), float(owed[-1])
         owed = np.minimum(debt[:, None], axes)
         most = np.repeat([guarding.most_damping, guarding.most_rotational_damping], 3)
         square, zero = parameters.period * velocity**2, np.zeros_like(owed)

@@ -101,28 +101,51 @@ def kept_behind_a_law(
     References:
         Brown & Colgate 1997, eq. (6); here summed over time instead of frequency by frequency.
     """
-    limits = (
-        parameters.force_limit / parameters.force_scale,
-        parameters.torque_limit * parameters.scale / parameters.force_scale,
-    )
     before = np.concatenate([[share_before], share[:-1]])
     rise = np.where(since_start == 0, share, np.diff(share, prepend=share_before))
     summed, held = np.zeros(len(share)), np.zeros(len(share))
-    for column, limit, e, p, de, w, c in zip(
-        (0, 2), limits, stretch, pulled, stretched, work, passed, strict=True
+    for column, limit, e, de, w, c in zip(
+        (0, 2), _limits(parameters), stretch, stretched, work, passed, strict=True
     ):
-        k_before, k, b = gains[0][:, column], gains[1][:, column], gains[1][:, column + 1]
+        k, b = gains[1][:, column], gains[1][:, column + 1]
         spring = _spring_energy(k, np.linalg.norm(e, axis=1), limit)
         found = spring + 0.5 * b / parameters.period * np.sum(de**2, axis=1)
         taken = np.where(since_start > 0, c * w, 0.0)
         summed += taken - rise * found
-        if np.any(k != k_before):
-            length = np.linalg.norm(p, axis=1)
-            turned = _spring_energy(k, length, limit) - _spring_energy(k_before, length, limit)
-            summed -= before * turned
         if has_end:
             held += share * spring
-    return summed, held
+    return summed - work_of_commands(parameters, gains, pulled, before), held
+
+
+def work_of_commands(
+    parameters: RunParameters,
+    gains: tuple[Array, Array],
+    pulled: tuple[Array, Array],
+    share_before: Array,
+) -> Array:
+    """Returns W_k of ``kept_behind_a_law``, what commands did to the springs, (n,) in J.
+
+    Args:
+        parameters: The run's.
+        gains: K, B', K_r and B'_r in the tick before each and in each, (n, 4) each.
+        pulled: h_k − x_{k−1} in m and as rotation vectors, (n, 3) each.
+        share_before: The share of the wrench that was let through in the tick before each, (n,).
+    """
+    work = np.zeros(len(share_before))
+    for column, limit, p in zip((0, 2), _limits(parameters), pulled, strict=True):
+        k_before, k = gains[0][:, column], gains[1][:, column]
+        if np.any(k != k_before):
+            length = np.linalg.norm(p, axis=1)
+            work += _spring_energy(k, length, limit) - _spring_energy(k_before, length, limit)
+    return share_before * work
+
+
+def _limits(parameters: RunParameters) -> tuple[float, float]:
+    """Returns force and torque on the tool at which no more reaches the device, N and N m."""
+    return (
+        parameters.force_limit / parameters.force_scale,
+        parameters.torque_limit * parameters.scale / parameters.force_scale,
+    )
 
 
 def _spring_energy(stiffness: Array, length: Array, limit: float) -> Array:

@@ -104,14 +104,19 @@ class Interventions:
         """Returns which of some ticks began with a reset."""
         return np.isin(numbers, self.resets)
 
-    def sentences(self) -> tuple[str, ...]:
-        """Returns what is to be said of a coupling that was changed, if it was."""
+    def sentences(self, given: float | None = None) -> tuple[str, ...]:
+        """Returns what is to be said of a coupling that was changed, if it was.
+
+        Args:
+            given: What that gave to what is felt, in J; None while it is not known.
+        """
         count, last = len(self.couplings) - 1, self.couplings[-1:]
         if count < 1:
             return ()
         return (
             f"so it began; commands changed the coupling {count} times, last to K = "
-            f"{last[0].stiffness:g} N/m, B' = {last[0].damping:g} N s/m used",
+            f"{last[0].stiffness:g} N/m, B' = {last[0].damping:g} N s/m used"
+            + ("" if given is None else f", which gave the coupling {given:.3g} J"),
         )
 
     def worst(self, info: DeviceInfo, method: Method) -> RunParameters:

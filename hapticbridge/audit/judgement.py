@@ -31,11 +31,13 @@ class Judgement:
             condition needs no watch behind a coupling law: that is the proof.
         energies: Energies after the newest tick, in J.
         slack_share: Largest share of the slack that was used.
+        commanded: What commands gave to the coupling by the newest tick, in J.
     """
 
     is_watched: bool
     energies: dict[str, float] = field(default_factory=dict)
     slack_share: float = 0.0
+    commanded: float = 0.0
     _unstrict: _Excess | None = None
     _active: _Excess | None = None
     _kicked: _Excess | None = None
@@ -55,6 +57,7 @@ class Judgement:
         if self.is_watched:
             kicked = balance.kicked > rounding
             self._kicked = self._kicked or _first(kicked, balance.kicked, start)
+        self.commanded = float(balance.commanded[-1])
         last = ticks[-1]
         self.energies = {name: float(last[name]) for name in _RECORDED} | {
             "coupling_work": float(balance.coupling_work[-1]),

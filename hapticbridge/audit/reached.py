@@ -21,6 +21,7 @@ SUMS = (
     "given",
     "burnt",
     "kept",
+    "commanded",
 )
 """What is summed over ticks."""
 

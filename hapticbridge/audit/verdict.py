@@ -76,7 +76,8 @@ def audit(path: str | Path, *, strict: bool = False) -> AuditReport:
         home = np.array(meta_start(recording.meta, "tool_start"))
         outside = Interventions.of(recording.events, parameters, home)
         facts |= _device_facts(info, parameters, outside.worst(info, method), method, recording)
-        facts["rendered"] += outside.sentences()
+        rendered = facts["rendered"]
+        facts["rendered"] = rendered + outside.sentences()
     except RecordingError as error:
         return _invalid(facts, Fault(str(error)))
     facts["duration"] = recording.count * parameters.period
@@ -88,6 +89,7 @@ def audit(path: str | Path, *, strict: bool = False) -> AuditReport:
     try:
         fault = passed.by(outside, delay_ticks(info, parameters.period) or 0)
         facts["energies"] = passed.judgement.energies
+        facts["rendered"] = rendered + outside.sentences(passed.judgement.commanded)
         if fault:
             return _invalid(facts, fault)
         outcome = passed.outcome()

@@ -19,8 +19,8 @@ from hapticbridge.guard import Limits
 from hapticbridge.rendering import Method
 
 SOFTEST = 0.05
-"""Least stiffness that can be asked for, as a share of the largest; no unit. It applies where no
-stretch limit gives one. Softer, a hand no longer feels where the tool is."""
+"""Least stiffness that can be asked for, as a share of the largest; no unit. Softer, a hand no
+longer feels where the tool is; but a run that began softer may stay so."""
 
 _HALVINGS = 60
 
@@ -118,15 +118,17 @@ class Allowance:
 
     @cached_property
     def least_stiffness(self) -> float:
-        """The least K in N/m: softer, the run would be stopped before the force is full.
+        """The least K in N/m: that which the run began with, or less.
 
-        K >= F/(s_f s_h stretch limit): the guard stops a run whose coupling is too long.
+        K >= F/(s_f s_h stretch limit), for the guard stops a run whose coupling is too long before
+        its force is full; and no less than ``SOFTEST`` of the largest. Were it more than what the
+        run began with, a touch of the damping alone would make the coupling stiffer.
         """
         reach = self.scale * self.force_scale * self.limits.stretch
         softest = SOFTEST * self.most_stiffness(0.0)
         if math.isfinite(reach):
             softest = min(max(softest, self.limits.force / reach), self.most_stiffness(0.0))
-        return softest
+        return min(softest, self.start.stiffness)
 
     def reason(self) -> str:
         """Returns why the sliders end where they do, in a sentence."""
@@ -150,8 +152,8 @@ class Allowance:
         least = self.least_stiffness
         if stiffness < least * (1.0 - 1e-9):
             raise CommandError(
-                f"stiffness is {stiffness:g} N/m; below {least:.4g} N/m the coupling is longer "
-                "than the run allows before the force is full"
+                f"stiffness is {stiffness:g} N/m; below {least:.4g} N/m a hand no longer feels "
+                "where the tool is, or the run stops before the force is full"
             )
         needed = self.needed(stiffness, damping)
         if not needed <= self.damping * (1.0 + 1e-9):

@@ -46,6 +46,9 @@ def keep_account(state: NDArray[np.void], moved: Vector, turned: Vector, interva
     through w·δp − b δp²/t, so one account covers both ports. A surplus is capped: an hour of
     dissipation does not pay for a minute of activity.
 
+    ``excess`` is what the environment's port owes alone, Σ E_k − Σ ½‖δx_k‖²_{K+B/T}, with its own
+    surplus capped in the same way.
+
     ``kicked`` is what the device was given beyond what the hand put in, w·δp − b δp²/t summed, less
     what the scene has given up of what it stored at the start. Motors of the scene pay for nothing
     there.
@@ -58,6 +61,9 @@ def keep_account(state: NDArray[np.void], moved: Vector, turned: Vector, interva
     """
     s = state[0]
     stored = s.kinetic + s.potential - s.start_energy
+    over = s.environment_energy - s.slack
+    s.excess = max(s.excess + (over - s.excess_before), -s.surplus)
+    s.excess_before = over
     own = stored - s.actuator_work - s.external_work
     gained = (s.force_scale / s.scale) * s.passed * (own - s.own_before)
     s.own_before = own
@@ -141,10 +147,10 @@ def control(state: NDArray[np.void], force: Vector, torque: Vector) -> tuple[Vec
     stiffness that is felt until the damper bears it.
 
     For the environment's port alone the debt is what it created beyond the slack that the coupling
-    leaves it, Σ E_k − Σ ½‖δx_k‖²_{K+B/T}, as the tick before left both: up to there a device that
-    bears its coupling stays passive whatever the environment does. Beyond, the damper acts as
-    above, until each axis has burnt or given back what it was given. A damper on the tool would sit
-    nearer to the cause, and makes contacts create more (as scaling the tool's velocity does).
+    leaves it, ``excess`` as the tick before left it: up to there a device that bears its coupling
+    stays passive whatever the environment does. Beyond, the damper acts as above, until each axis
+    has burnt or given back what it was given. A damper on the tool would sit nearer to the cause,
+    and makes contacts create more (as scaling the tool's velocity does).
 
     The tank scales the wrench so that the work it does over the next tick, at the speed of the last
     one, is no more than what the tank holds. By itself it acts whether there is a debt or not;
@@ -159,7 +165,7 @@ def control(state: NDArray[np.void], force: Vector, torque: Vector) -> tuple[Vec
     if s.controller == DAMPER or (s.controller == ENVIRONMENT and s.has_law):
         debt = s.account - THRESHOLD
         if s.controller == ENVIRONMENT:
-            debt = s.environment_energy - s.slack - THRESHOLD
+            debt = s.excess - THRESHOLD
         if debt > 0.0:
             b, b_r = s.most_damping, s.most_rotational_damping
             x, on_x = _held_back(state, 0, 0, force[0], b, debt)

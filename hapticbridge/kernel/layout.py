@@ -172,6 +172,8 @@ _GUARD_RUNNING = (
     "passed",
     "given",
     "kicked",
+    "excess",
+    "excess_before",
     "injected_damping",
     "injected_rotational_damping",
 )

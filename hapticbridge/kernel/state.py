@@ -20,7 +20,7 @@ from hapticbridge.kernel.parameters import RunParameters as RunParameters  # noq
 from hapticbridge.kernel.parameters import rotation_numbers as rotation_numbers  # noqa: PLC0414
 from hapticbridge.kernel.scheme import DIRECT, LOSSLESS, WELD
 from hapticbridge.kernel.tree import has_passive_forces, tree_of_tool
-from hapticbridge.kernel.tuning import TUNED, set_gains, tuned_values
+from hapticbridge.kernel.tuning import TUNED, forget_dissipation, set_gains, tuned_values
 from hapticbridge.tick import TICK_DTYPE
 
 HANDLE = "handle"
@@ -78,6 +78,7 @@ class Binding:
             gains: Of its actuators (``rendering.Method.gains``).
             ticks: How many ticks that takes, >= 1.
         """
+        forget_dissipation(self.state)
         self.state["tuning_goal"] = (*tuned_values(parameters), *gains[0], *gains[1])
         self.state["tuning_ticks"] = ticks
 
@@ -105,6 +106,7 @@ class Binding:
         state["external_work"] += after - before
         start, ratio = float(state["start_energy"][0]), state["force_scale"] / state["scale"]
         state["given"] += ratio * (min(before - start, 0.0) - min(after - start, 0.0))
+        forget_dissipation(state)
         state["is_seated_anew"] = 1
         if state["scheme"][0] == LOSSLESS:
             self._owned["qfrc_applied"][: model.nv] = data.qfrc_applied

@@ -16,10 +16,14 @@ work, and the environment's own balance (14) does not see the gains. W is booked
 Two things bound it. Gains move in a straight line over ``tuning_ticks`` ticks, so W_k per tick is
 at most ½ (K_goal − K)/n ‖p‖²; and every coupling in between needs no more damping than one of the
 ends, because the need is convex in K and B. And the guard's energy limit counts all that the device
-was given beyond what the hand put in: W is in it, so it never exceeds that limit.
+was given beyond what the hand put in: W is in it. So that an hour of dissipation does not pay for
+what a command does, each command caps what the hand has saved up by then
+(``forget_dissipation``).
 """
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,6 +60,34 @@ def tuned_values(parameters: RunParameters) -> tuple[float, ...]:
     coupling = parameters.coupling
     law = (getattr(coupling, name) for name in TUNED[:4])
     return (*law, *parameters.slack_gains())
+
+
+def forget_dissipation(state: NDArray[np.void]) -> None:
+    """Caps what the hand may have put in before a command, for the guard's energy limit.
+
+        given ← max(given, −(surplus + r V + r max(S − S_0, 0))),   r = force_scale/scale
+
+    V is the energy of coupling springs whose wrench stops growing at the limits, S − S_0 what the
+    scene has taken up: both may come back to the hand. What is gone for good may not: else a hand
+    that has rubbed away 1 J could be given as much by a slider that is moved at the right moments.
+
+    Args:
+        state: The bound state, between two ticks.
+    """
+    s = state[0]
+    ratio = float(s["force_scale"] / s["scale"])
+    stretch = float(np.linalg.norm(s["handle_position"] - s["tool_position"]))
+    cosine = abs(float(np.dot(s["handle_quaternion"], s["tool_quaternion"])))
+    kept = max(float(s["kinetic"] + s["potential"] - s["start_energy"]), 0.0)
+    kept += _spring(float(s["stiffness"]), stretch, float(s["force_limit"] / s["force_scale"]))
+    twist, most = 2.0 * math.acos(min(cosine, 1.0)), float(s["torque_limit"]) / ratio
+    kept += _spring(float(s["rotational_stiffness"]), twist, most)
+    s["given"] = max(float(s["given"]), -(float(s["surplus"]) + ratio * kept))
+
+
+def _spring(stiffness: float, length: float, limit: float) -> float:
+    elastic = min(length, limit / stiffness) if stiffness > 0.0 else 0.0
+    return 0.5 * stiffness * elastic**2 + min(stiffness * length, limit) * (length - elastic)
 
 
 @compiled

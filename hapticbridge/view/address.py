@@ -90,7 +90,10 @@ class Address:
 
     def is_in_query(self, path: str) -> bool:
         """Returns whether a request's path carries the token, which a cookie is then to keep."""
-        shown = parse_qs(urlsplit(path).query).get("token", [""])[0]
+        try:
+            shown = parse_qs(urlsplit(path).query).get("token", [""])[0]
+        except ValueError:  # no path at all
+            return False
         return bool(self.token) and _are_equal(shown, self.token)
 
     def _is_own(self, host: str) -> bool:
