@@ -16,6 +16,7 @@ from hapticbridge.opened import Opened
 from hapticbridge.provenance import (
     MID_RUN,
     MODEL_ATTACHMENT,
+    RESET_ATTACHMENT,
     STATE_ATTACHMENT,
     attachments,
     elastic_energy,
@@ -147,20 +148,21 @@ class Commanded(Opened):
         # as whoever simulates the file again will find it
         restore_state(scene.model, scene.data, start_state(scene.model, scene.data).tobytes())
         self._bind(self._operator.felt, self.parameters.felt, elastic_energy(scene.data))
-        files = {item.name: item.data for item in attachments(scene)}
-        needed = {name: files[name] for name in (MODEL_ATTACHMENT, STATE_ATTACHMENT)}
+        files = {item.name: item.data for item in attachments(scene, self._reset_state)}
+        names = (MODEL_ATTACHMENT, STATE_ATTACHMENT, RESET_ATTACHMENT)
+        needed = {name: files[name] for name in names}
         self._stream.tell(
             {
                 "event": "begin",
-                "metadata": self._description() | {"began": MID_RUN},
+                "metadata": self._description() | {"began": MID_RUN, "home": self._home},
                 "attachments": {n: base64.b64encode(d).decode() for n, d in needed.items()},
             }
         )
 
     def _record(self) -> None:
         path = self._next_path()
-        meta = self._description() | {"began": MID_RUN}
-        self._stream.record(path, meta, attachments(self.scene))
+        meta = self._description() | {"began": MID_RUN, "home": self._home}
+        self._stream.record(path, meta, attachments(self.scene, self._reset_state))
         self._path = path
         self._event("start")
 

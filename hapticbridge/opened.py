@@ -103,7 +103,9 @@ class Opened(Arrangement):
             self._grants = resources.enter_context(memory_at_rest())
         # last, because from here on the device is held, and its pose counts
         self._sample[:] = self.device.start(self.period)
+        self._reset_state = start_state(scene.model, scene.data).tobytes()
         self._bind(self.coupling, felt)
+        self._home = self._description()["tool_start"]
         refuse_stretched_start(self._binding.state, self._sample, self._limits)
         if self._stream.is_read:
             self._stream.start(self._description(), attachments(scene))
@@ -127,9 +129,9 @@ class Opened(Arrangement):
             guarding=self._guarding,
             start_elastic=start_elastic,
         )
-        start = start_state(scene.model, scene.data).tobytes()
         self._binding = binding = Binding(scene.model, scene.data, parameters)
-        repeater = Repeater(binding, scene.model, scene.data, self.method, parameters, start)
+        reset = self._reset_state
+        repeater = Repeater(binding, scene.model, scene.data, self.method, parameters, reset)
         self._repeater = repeater
 
     def _description(self) -> dict[str, str]:

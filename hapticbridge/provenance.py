@@ -29,6 +29,7 @@ from hapticbridge.scene import Scene
 
 MODEL_ATTACHMENT = "model.mjb"
 STATE_ATTACHMENT = "start_state.f64"
+RESET_ATTACHMENT = "reset_state.f64"
 SOURCE_PREFIX = "scene/"
 
 MID_RUN = "mid-run"
@@ -112,10 +113,15 @@ def elastic_energy(data: mujoco.MjData) -> float:
     )
 
 
-def attachments(scene: Scene) -> list[Attachment]:
+def attachments(scene: Scene, reset: bytes | None = None) -> list[Attachment]:
     """Returns the scene's sources, its compiled model and its start, as the recording keeps them.
 
     Call it after the scene was prepared and reset: gains and timestep are part of the model.
+
+    Args:
+        scene: The scene.
+        reset: Where a reset leads to (``start_state``), if not to the start: the recording of a run
+            that was on its way already.
     """
     kept = [
         Attachment(SOURCE_PREFIX + source.name, "application/octet-stream", source.data)
@@ -125,6 +131,8 @@ def attachments(scene: Scene) -> list[Attachment]:
     state = start_state(scene.model, scene.data).astype("<f8").tobytes()
     kept.append(Attachment(MODEL_ATTACHMENT, "application/octet-stream", model))
     kept.append(Attachment(STATE_ATTACHMENT, "application/octet-stream", state))
+    if reset is not None:
+        kept.append(Attachment(RESET_ATTACHMENT, "application/octet-stream", reset))
     return kept
 
 
@@ -226,6 +234,15 @@ def meta_start(meta: Mapping[str, str], name: str) -> list[float]:
     if STARTS[name] == 1:
         return [meta_float(meta, name)]
     return list(meta_numbers(meta, name, STARTS[name]))
+
+
+def meta_home(meta: Mapping[str, str]) -> list[float]:
+    """Returns the tool pose (7,) to which a reset leads: ``home``, else where the recording starts.
+
+    Raises:
+        RecordingError: It is not as many finite numbers.
+    """
+    return list(meta_numbers(meta, "home", 7)) if "home" in meta else meta_start(meta, "tool_start")
 
 
 def meta_count(meta: Mapping[str, str], name: str) -> int:

@@ -21,6 +21,7 @@ from hapticbridge.commands.change import tuning_ticks
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import CommandError, RecordingError, SafetyTrip
 from hapticbridge.guard import Limits
+from hapticbridge.provenance import RESET_ATTACHMENT
 from hapticbridge.recording import read_recording
 from hapticbridge.whatif import what_if
 
@@ -310,6 +311,28 @@ def test_a_recorder_started_in_mid_run_writes_a_file_that_is_judged_like_any_oth
     assert second.ticks["tool_position"][0, 2] < 0.0201
     assert second.ticks["deadline_ns"][0] == 1_000_000
     assert float(second.meta["start_elastic"]) > 0
+
+
+def test_a_reset_leads_to_where_the_run_began_whenever_it_is_recorded(
+    run: Callable[..., Any],
+) -> None:
+    _, path, _ = run({200: Record(on=False), 1300: Record(on=True), 2400: Reset()}, 2.7)
+    recording = read_recording(path.with_name("run-2.mcap"))
+    at = next(event["tick"] for event in recording.events if event["event"] == "reset")
+    height = recording.ticks["tool_position"][:, 2]
+    assert height[at - 1] < 0.025
+    assert height[at] == pytest.approx(0.03, abs=1e-4)
+    report = audit(recording.path)
+    assert report.verdict == "passive", report.reason
+    assert report.resimulation == "bit for bit"
+    kept = dict(recording.attachments)
+    del kept[RESET_ATTACHMENT]
+    lost = rewritten(replace(recording, attachments=kept), path.with_name("lost.mcap"))
+    assert audit(lost).verdict == "invalid"
+    short = {RESET_ATTACHMENT: b"short"}
+    report = audit(rewritten(recording, path.with_name("short.mcap"), attachments=short))
+    assert report.verdict == "invalid"
+    assert "'reset_state.f64' has 5 bytes" in report.reason
 
 
 def test_a_start_that_claims_more_elastic_energy_than_there_is_is_found(

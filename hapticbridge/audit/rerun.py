@@ -20,6 +20,7 @@ from hapticbridge.kernel.state import COUPLING_ACTUATORS, Binding, RunParameters
 from hapticbridge.kernel.step import simulate_recorded
 from hapticbridge.provenance import (
     MODEL_ATTACHMENT,
+    RESET_ATTACHMENT,
     STARTS,
     STATE_ATTACHMENT,
     elastic_energy,
@@ -82,7 +83,13 @@ class Rerun:
         if parameters.start_elastic:
             _check_elastic(parameters.start_elastic, elastic_energy(data))
         self._binding = Binding(model, data, parameters)
-        self._commands = Repeater(self._binding, model, data, method, parameters, start)
+        reset = recording.attachments.get(RESET_ATTACHMENT, start)
+        if len(reset) != len(start):
+            raise RecordingError(
+                f"attachment '{RESET_ATTACHMENT}' has {len(reset)} bytes, '{STATE_ATTACHMENT}' "
+                f"{len(start)}"
+            )
+        self._commands = Repeater(self._binding, model, data, method, parameters, reset)
         _check_start(recording, self._binding.state)
 
     def warm_up(self) -> None:

@@ -2,7 +2,7 @@
 
     coupling   stiffness, damping, rotational_stiffness, rotational_damping of the law; ticks
     switch     force, clutch
-    reset      (nothing: the scene goes back to the state that the recording starts with)
+    reset      (nothing: the scene goes back to where the run began, recorded or not)
 
 The loop applies the very event that it then records, so both ways are one.
 """

@@ -18,7 +18,7 @@ from hapticbridge.device import DeviceInfo
 from hapticbridge.device.lateness import delay_ticks
 from hapticbridge.errors import HapticBridgeError
 from hapticbridge.kernel.state import RunParameters
-from hapticbridge.provenance import MODEL_ATTACHMENT, STARTS, meta_start, parameters_of
+from hapticbridge.provenance import MODEL_ATTACHMENT, STARTS, meta_home, meta_start, parameters_of
 from hapticbridge.recording import Recording
 from hapticbridge.recording.reader import BLOCK
 from hapticbridge.rendering import Method, method_named
@@ -120,7 +120,8 @@ def _balances(
 ) -> Iterator[Balance]:
     """Yields the balance block by block: of a long run one takes many times the records' room."""
     starts = {name: np.array(meta_start(recording.meta, name)) for name in STARTS}
-    outside = Interventions.of(recording.events, parameters, starts["tool_start"])
+    home = np.array(meta_home(recording.meta))
+    outside = Interventions.of(recording.events, parameters, home)
     ticks, late = recording.ticks, delay_ticks(info, parameters.period) or 0
     energy = float(starts["start_kinetic"][0] + starts["start_potential"][0])
     reached = Reached.at_start(parameters, starts["handle_start"], starts["tool_start"], energy)
