@@ -25,7 +25,7 @@ from hapticbridge.provenance import (
     processor,
     versions,
 )
-from hapticbridge.recording import Recording, read_recording
+from hapticbridge.recording import Recording, read_recording, repair
 from hapticbridge.recording.format import Digest
 
 DEVICE_POSE = ("device_position", "device_quaternion")
@@ -266,3 +266,20 @@ def test_other_processor_may_round_differently_but_not_more(tap: Recording, fold
     assert verdict_of(tap, folder, ticks=ticks).verdict == "invalid"
     ticks["solver_iterations"][60] += 1
     assert verdict_of(tap, folder, ticks=ticks, meta=host).verdict == "invalid"
+
+
+def test_a_cut_file_may_lack_rows_before_its_stop_and_no_other_may(
+    tap: Recording, tmp_path: Path
+) -> None:
+    short = rewritten(tap, tmp_path / "short.mcap", ticks=tap.ticks[:150])
+    assert audit(short).reason.startswith("the run stopped before tick 201")
+    cut, mended = tmp_path / "cut.mcap", tmp_path / "mended.mcap"
+    cut.write_bytes(short.read_bytes()[:-100])
+    assert [e["tick"] for e in read_recording(cut).events if e["event"] == "stop"] == [201]
+    repair(cut, mended)
+    for path in (cut, mended):
+        assert audit(path).verdict == "passive", audit(path).reason
+    longer = [e | {"tick": 149} if e["event"] == "stop" else e for e in tap.events]
+    file = rewritten(tap, tmp_path / "longer.mcap", ticks=tap.ticks[:150], events=longer)
+    file.write_bytes(file.read_bytes()[:-100])
+    assert audit(file).verdict == "invalid"
