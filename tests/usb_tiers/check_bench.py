@@ -8,12 +8,12 @@ from typing import Any
 
 import hidraw
 import pytest
-import usb.backend.libusb1
 import usb.core
 import usb.util
 from emulated.echo import VENDOR, EchoHid, EchoUsb
 from emulated.emulator_process import EmulatorProcess
 
+from hapticbridge.device.transport.usb_search import libusb
 from usb_tiers.conftest import IS_TIME_VIRTUAL, Plug
 from usb_tiers.waiting import wait_for
 
@@ -24,9 +24,7 @@ ROUND_TRIPS = 1000
 
 def _found() -> Any:
     """Returns the bulk echo, None where it is not seen, through a context that looks anew."""
-    usb.backend.libusb1.get_backend()
-    backend = usb.backend.libusb1._LibUSB(usb.backend.libusb1._lib)
-    return usb.core.find(idVendor=VENDOR, idProduct=EchoUsb.product, backend=backend)
+    return usb.core.find(idVendor=VENDOR, idProduct=EchoUsb.product, backend=libusb())
 
 
 @pytest.fixture

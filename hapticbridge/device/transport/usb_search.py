@@ -13,6 +13,7 @@ import usb.util
 
 from hapticbridge.device.plugged import Family, Plugged, access_problem, permission_problem
 from hapticbridge.device.transport.usb_bus import NODES, OnTheBus, members, on_the_bus
+from hapticbridge.device.transport.usb_context import UsbContext
 
 
 def libusb() -> Any:
@@ -26,7 +27,7 @@ def libusb() -> Any:
         try:
             if module.get_backend(find_library=find_library) is not None:
                 # pyusb offers no way to a second context
-                return module._LibUSB(module._lib)
+                return UsbContext(module._lib)
         except (usb.core.USBError, OSError):
             continue
     return None
