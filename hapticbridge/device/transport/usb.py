@@ -99,6 +99,7 @@ class UsbLink:
             raise DeviceError(f"{plugged} has just been unplugged")
         try:
             _claim(device)
+        # the second is how pyusb says LIBUSB_ERROR_NOT_SUPPORTED: no driver lets it be opened
         except (usb.core.USBError, NotImplementedError) as error:
             usb.util.dispose_resources(device)
             number = getattr(error, "errno", None)
@@ -232,7 +233,7 @@ def _claim(device: Any) -> None:
         if device.is_kernel_driver_active(0):
             device.detach_kernel_driver(0)
     except NotImplementedError:
-        pass  # no such thing on this system
+        pass  # as pyusb says that this system has no drivers to detach
     try:
         device.get_active_configuration()
     except usb.core.USBError as error:

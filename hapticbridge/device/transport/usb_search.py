@@ -62,7 +62,7 @@ def devices_of(family: Family, backend: Any) -> list[Any]:
     try:
         devices: Iterable[Any] = usb.core.find(find_all=True, backend=backend)
         known = [d for d in devices if family.model(d.idVendor, d.idProduct) is not None]
-    except (usb.core.USBError, NotImplementedError):
+    except (usb.core.USBError, NotImplementedError):  # the second: libusb cannot list them here
         return []
     return sorted(known, key=node_of)
 
@@ -83,7 +83,7 @@ def _described(family: Family, device: Any) -> Plugged:
     except usb.core.USBError as error:
         problem = permission_problem(node) if error.errno == errno.EACCES else None
     except (ValueError, NotImplementedError):
-        pass  # it has no texts, or they cannot be read
+        pass  # it has no texts, or libusb cannot open it here (as pyusb says that)
     finally:
         usb.util.dispose_resources(device)
     return Plugged(
