@@ -80,3 +80,15 @@ def hand(url: str) -> Iterator[Hand]:
         found = Hand(socket)
         found.introduce()
         yield found
+
+
+def said(page: Hand, word: str) -> str:
+    """Returns what the page says with a word in it, once it does."""
+    end = time.monotonic() + PATIENCE
+    while time.monotonic() < end:
+        for message in page.read(0.2):
+            for part in (message.get("updates", {}), message.get("props", {})):
+                text = str(part.get("_markdown", ""))
+                if word in text:
+                    return text
+    raise AssertionError(f"the page never said {word}")

@@ -79,6 +79,33 @@ def test_latest_gives_the_newest_records_oldest_first(
     assert ring.latest(count)["tick"].tolist() == list(range(newest - kept + 1, newest + 1))
 
 
+@given(capacity=st.integers(2, 9), written=st.lists(st.integers(0, 12), min_size=1, max_size=60))
+def test_who_reads_on_from_a_number_misses_only_what_was_overwritten(
+    capacity: int, written: list[int]
+) -> None:
+    ring, counts, end = Ring.local(capacity), iter(written), 0
+
+    def write() -> None:  # the producer goes on between any two steps of whoever reads
+        nonlocal end
+        for row in numbered(end, end + next(counts, 0)):
+            ring.rows[end % capacity] = row
+            end += 1
+        # it may be amid the next one, too
+        ring.rows[end % capacity]["tick"] = -1
+        ring.cursors[HEAD] = end
+
+    ring._fence = write  # type: ignore[method-assign] # it is called between the steps
+    number = 0
+    for _ in written:
+        asked, before = number, int(ring.cursors[HEAD])
+        first, rows = ring.since(asked)
+        number = first + len(rows)
+        np.testing.assert_array_equal(rows["tick"], np.arange(first, number))
+        assert asked <= first <= number
+        assert number >= before  # all that was there is told, unless it is gone
+        assert first == asked or first == end - capacity + 1
+
+
 def test_what_is_taken_is_a_copy() -> None:
     ring = Ring.local(2)
     ring.append(numbered(0, 2))

@@ -28,6 +28,7 @@ from report_runs import LOOSE
 from test_view_address import OUTSIDE, outside
 
 from hapticbridge.audit import audit
+from hapticbridge.audit.rerun import Rerun
 from hapticbridge.bridge import Bridge
 from hapticbridge.clock import SimulatedClock
 from hapticbridge.commands import Command, Couple, Switch
@@ -44,9 +45,10 @@ import websockets.exceptions
 from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 
-from hapticbridge.view.live import Show
 from hapticbridge.view.props import props_of
 from hapticbridge.view.replay import Replay, Theatre
+from hapticbridge.view.show import Show
+from hapticbridge.view.sight import Sight
 
 # viser's threads and sockets end with the process
 pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
@@ -162,38 +164,134 @@ def live(recording: Recording, capacity: int) -> tuple[Show, Ring]:
     return Show(ring, recording), ring
 
 
+def glance(show: Show) -> Sight | None:
+    show.gather()
+    return show.look()
+
+
 def test_live_view_follows_the_ring_and_reads_it_without_freeing_anything(floor: Path) -> None:
     recording = read_recording(floor)
     show, ring = live(recording, 4096)
     ring.cursors[1] = 0
-    assert show.look() is None
+    assert glance(show) is None
     for start, end in ((0, 33), (33, 700), (700, 1500)):
         ring.append(recording.ticks[start:end])
-        sight = show.look()
+        sight = glance(show)
         assert sight is not None
         row = recording.ticks[end - 1]
         ball = sight.places[show.model.body("ball").id]
         np.testing.assert_allclose(ball, row["tool_position"], atol=1e-9)
     assert sight is not None
     assert len(sight.contact_places) == 1
-    assert show.look() is None
+    assert glance(show) is None
     assert ring.cursors[1] == 0
-    assert not show.is_lost
+    assert not show.warning
 
 
-def test_a_view_that_fell_behind_says_so_and_goes_on(floor: Path) -> None:
+def test_records_that_come_while_the_view_reads_are_shown_the_next_time(
+    floor: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     recording = read_recording(floor)
+    show, ring = live(recording, 4096)
+    ring.cursors[1] = 0
+
+    def wait() -> None:  # whoever reads is put aside between any two steps
+        head = int(ring.cursors[0])
+        ring.rows[head : head + 7] = recording.ticks[head : head + 7]
+        ring.cursors[0] = head + 7
+
+    monkeypatch.setattr(ring, "_fence", wait)
+    for _ in range(40):
+        sight = glance(show)
+    assert sight is not None
+    assert not show.warning
+
+
+def behind(recording: Recording, first: int) -> tuple[Show, Ring]:
+    """A view that saw 50 records and then none until the ring holds 63 up to another tick."""
     show, ring = live(recording, 64)
     ring.rows[:50] = recording.ticks[:50]
     ring.cursors[0] = 50
-    assert show.look() is not None
-    assert not show.is_lost
-    ring.rows[:] = recording.ticks[200:264][np.argsort(np.arange(200, 264) % 64)]
-    ring.cursors[0] = 264
-    sight = show.look()
+    assert glance(show) is not None
+    assert not show.warning
+    bring(ring, recording, first)
+    return show, ring
+
+
+def bring(ring: Ring, recording: Recording, end: int) -> None:
+    ticks = np.arange(end - 64, end)
+    ring.rows[ticks % 64] = recording.ticks[ticks]
+    ring.cursors[0] = end
+
+
+def test_a_view_that_fell_behind_says_so_and_picks_the_run_up_again(
+    floor: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recording = read_recording(floor)
+    monkeypatch.delattr(Rerun, "restart")  # the scene stays as it was left
+    show, ring = behind(recording, 900)
+    for end in range(900, 1000, 20):
+        bring(ring, recording, end)
+        sight = glance(show)
     assert sight is not None
-    assert show.is_lost
-    np.testing.assert_array_equal(sight.grip, recording.ticks["tool_position"][263])
+    assert "skipped 0.79 s" in show.warning  # 50 to 837 ms
+    assert "mm from where" not in show.warning
+    last = recording.ticks[979]
+    np.testing.assert_array_equal(sight.grip, last["tool_position"])
+    ball = sight.places[show.model.body("ball").id]
+    np.testing.assert_allclose(ball, last["tool_position"], atol=2e-4)
+    # pressed on the floor again, with the force that the coupling has by the record
+    force = sight.contact_forces.sum(axis=0)
+    np.testing.assert_allclose(force[2], -last["wrench_on_tool"][2], rtol=0.1)
+
+
+def test_the_margin_of_a_run_that_was_skipped_is_never_drawn_larger_than_it_is(
+    floor: Path, replay: Replay
+) -> None:
+    recording = read_recording(floor)
+    show, ring = behind(recording, 900)
+    for end in range(900, 1480, 20):
+        bring(ring, recording, end)
+        glance(show)
+    curves = show.curves()
+    assert curves is not None
+    drawn, true = curves[1][4][-1], replay.trace.curves()[1][4][-1]
+    assert 0 < drawn < true
+
+
+def test_a_tool_that_cannot_be_put_anywhere_is_led_and_its_distance_is_said(
+    tmp_path: Path,
+) -> None:
+    hinged = FLOOR.replace("<freejoint/>", '<joint axis="0 1 0" pos="0 0 0.1" range="-1 1"/>')
+    scene, path = tmp_path / "arm.xml", tmp_path / "arm.mcap"
+    scene.write_text(hinged.replace('pos="0 0 0.03"', 'pos="0 0 0.1"'))
+    recorded(path, str(scene), ScriptedDevice(pressed), LOOSE, duration=1.5)
+    recording = read_recording(path)
+    show, ring = behind(recording, 500)
+    for end in range(500, 1400, 60):
+        bring(ring, recording, end)
+        glance(show)
+    assert "skipped" in show.warning
+    assert "mm from where it is drawn" not in show.warning
+    recording.ticks["tool_position"][:, 1] += 0.05  # where no hinge lets it be
+    bring(ring, recording, 1450)
+    glance(show)
+    assert "the tool is 50 mm from where it is drawn" in show.warning
+
+
+def test_news_that_come_too_late_are_said_and_do_not_hold_the_view_up(floor: Path) -> None:
+    recording = read_recording(floor)
+    show, ring = live(recording, 4096)
+    ring.cursors[1] = 0
+    ring.append(recording.ticks[:100])
+    glance(show)
+    show.note({"event": "switch", "tick": 90, "force": True, "clutch": False})
+    ring.append(recording.ticks[100:200])
+    sight = glance(show)
+    assert sight is not None
+    assert "lost the run at 0.1 s" in show.warning
+    ball = sight.places[show.model.body("ball").id]
+    np.testing.assert_allclose(ball, recording.ticks["tool_position"][199], atol=2e-4)
 
 
 def answer(
@@ -402,8 +500,8 @@ def test_an_event_of_the_run_reaches_the_view(floor: Path) -> None:
     # as the bridge tells it: what was set before tick 10
     show.note(json.loads(json.dumps({"event": "input", "tick": 10, "writes": [["ctrl", 99, [1]]]})))
     ring.append(recording.ticks[:10])
-    show.look()
-    assert not show.is_lost
+    glance(show)
+    assert not show.warning
     ring.append(recording.ticks[10:20])
-    show.look()
-    assert show.is_lost  # the scene has no such control: applied, not passed over
+    glance(show)
+    assert show.warning  # the scene has no such control: applied, not passed over

@@ -21,7 +21,7 @@ from test_bridge_commands import FLOOR, Script, swaying
 
 from hapticbridge.audit import audit
 from hapticbridge.bridge import Bridge
-from hapticbridge.commands import Couple, Record, Switch, command_of
+from hapticbridge.commands import Couple, Record, Reset, Switch, command_of
 from hapticbridge.commands.command import Stop
 from hapticbridge.errors import HapticBridgeError
 from hapticbridge.provenance import MODEL_ATTACHMENT, STATE_ATTACHMENT
@@ -31,10 +31,10 @@ from hapticbridge.view.window import Window
 
 pytest.importorskip("viser", reason="needs the extra 'view'")
 
-from page_client import Hand, hand
+from page_client import hand, said
 
 from hapticbridge.view.controls import Outlet, allowance_of
-from hapticbridge.view.live import Show
+from hapticbridge.view.show import Show
 
 # viser's threads and sockets end with the process
 pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
@@ -118,21 +118,10 @@ def test_a_slider_of_the_page_moves_the_stiffness_and_the_recording_says_so(
     assert (tmp_path / "controls.png").stat().st_size > 10_000
 
 
-def answers(page: Hand, word: str) -> str:
-    """Returns what the page says with a word in it, once it does."""
-    end = time.monotonic() + PATIENCE
-    while time.monotonic() < end:
-        for message in page.read(0.2):
-            said = str(message.get("updates", {}).get("_markdown", ""))
-            if word in said:
-                return said
-    raise AssertionError(f"the page never said {word}")
-
-
 def test_nothing_that_is_sent_by_hand_exceeds_a_limit(tmp_path: Path) -> None:
     with running(tmp_path) as (bridge, window), hand(window.url) as page:
         page.send(K, value=1e6)
-        assert "needs a device of 500 N s/m, and this one has 2" in answers(page, "refused")
+        assert "needs a device of 500 N s/m, and this one has 2" in said(page, "refused")
         # a slider without an end, and values that are none
         page.send(K, max=1e9, value=9e8)
         page.send(B, max=1e9, value=50.0)
@@ -205,13 +194,41 @@ def test_the_view_follows_a_run_that_began_anew(tmp_path: Path) -> None:
     ring = Ring.local(4096)
     show = Show(ring, first, lag=5)
     ring.append(first.ticks)
+    show.gather()
     show.look()
     files = {n: base64.b64encode(second.attachments[n]).decode() for n in ATTACHED}
     show.note({"event": "begin", "metadata": second.meta, "attachments": files})
+    show.gather()
     assert show.look() is None  # what is left of the old run is none of the new one
     ring.append(second.ticks[:100])
+    show.gather()
     sight = show.look()
     assert sight is not None
-    assert not show.is_lost
+    assert not show.warning
     body = show.model.body("ball").id
     np.testing.assert_allclose(sight.places[body], second.ticks["tool_position"][94], atol=1e-9)
+
+
+def test_what_was_asked_for_while_the_view_was_behind_is_known_to_it_all_the_same(
+    tmp_path: Path,
+) -> None:
+    scene, path = tmp_path / "floor.xml", tmp_path / "run.mcap"
+    scene.write_text(FLOOR)
+    script = Script({300: Couple(1500.0, 0.5), 400: Reset()})
+    recorded(path, str(scene), ScriptedDevice(swaying), LOOSE, duration=2.0, on_tick=script)
+    recording = read_recording(path)
+    ring = Ring.local(64)
+    show = Show(ring, recording)
+    for end in (60, *range(1700, 1980, 40)):
+        ticks = np.arange(max(end - 64, 0), end)
+        ring.rows[ticks % 64] = recording.ticks[ticks]
+        ring.cursors[0] = end
+        show.gather()
+        sight = show.look()
+    assert sight is not None
+    assert "skipped" in show.warning
+    body = show.model.body("ball").id
+    last = recording.ticks[1939]
+    np.testing.assert_allclose(sight.places[body], last["tool_position"], atol=5e-4)
+    used = recording.events[[e["event"] for e in recording.events].index("coupling")]
+    assert show._run.binding.state["stiffness"][0] == used["stiffness"]

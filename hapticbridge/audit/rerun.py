@@ -57,6 +57,7 @@ class Rerun:
     Attributes:
         model: The attached scene.
         data: Its state after the last tick that was simulated.
+        binding: The kernel's state bound to both.
         done: How many ticks that are.
         is_over: Whether a sample or a result was not finite, so that nothing follows.
 
@@ -75,26 +76,26 @@ class Rerun:
         self.data = data = mujoco.MjData(model)
         # an error inside the C symbol would end the process, so MuJoCo takes its first step in
         # Python
-        start = recording.attachments[STATE_ATTACHMENT]
+        self._start = start = recording.attachments[STATE_ATTACHMENT]
         method = method_named(recording.meta.get("method", ""))
         restore_state(model, data, start)
         method.step(model, data)
         restore_state(model, data, start)
         if parameters.start_elastic:
             _check_elastic(parameters.start_elastic, elastic_energy(data))
-        self._binding = Binding(model, data, parameters)
+        self.binding = Binding(model, data, parameters)
         reset = recording.attachments.get(RESET_ATTACHMENT, start)
         if len(reset) != len(start):
             raise RecordingError(
                 f"attachment '{RESET_ATTACHMENT}' has {len(reset)} bytes, '{STATE_ATTACHMENT}' "
                 f"{len(start)}"
             )
-        self._commands = Repeater(self._binding, model, data, method, parameters, reset)
-        _check_start(recording, self._binding.state)
+        self._commands = Repeater(self.binding, model, data, method, parameters, reset)
+        _check_start(recording, self.binding.state)
 
     def warm_up(self) -> None:
         """Compiles what ``add`` needs, so that the first call takes no longer than others."""
-        binding = self._binding
+        binding = self.binding
         simulate_recorded(
             binding.state,
             np.zeros(0, SAMPLE_DTYPE),
@@ -107,7 +108,7 @@ class Rerun:
     @property
     def slack(self) -> float:
         """What the environment may have created by now, in J."""
-        return float(self._binding.state["slack"][0])
+        return float(self.binding.state["slack"][0])
 
     def note(self, event: Mapping[str, Any]) -> None:
         """Takes an event of a run that still goes on; those that change nothing are passed over."""
@@ -142,7 +143,9 @@ class Rerun:
             end = len(ticks)
             if self._changes:
                 end = min(self._due(self._changes[0]) - self.done, end)
-            state, row, part = self._binding.state, self._binding.row, slice(done, end)
+            if end < done:  # in a run that goes on, news may be slower than records
+                raise RecordingError(f"an event before tick {self.done + done} came after it")
+            state, row, part = self.binding.state, self.binding.row, slice(done, end)
             count = simulate_recorded(
                 state, samples[part], outside[part], elapsed[part], row, rows[part]
             )
@@ -152,6 +155,32 @@ class Rerun:
                 self._apply(self._changes.popleft())
         self.done += done
         return rows[:done]
+
+    def jump(self, tick: int, ahead: int = 0) -> None:
+        """Goes on from another tick, without those between; what was changed by then is changed.
+
+        The time of the next reading counts from 0.
+
+        Args:
+            tick: By which changes are applied.
+            ahead: How many ticks before it the next one to be simulated counts as.
+
+        Raises:
+            RecordingError: An event by then is damaged; it is left out.
+        """
+        self.done, self._read_ns, self.is_over = tick - ahead, 0, False
+        while self._changes:
+            event = self._changes.popleft()  # a damaged one is complained of once
+            if self._due(event) > tick:
+                self._changes.appendleft(event)
+                break
+            self._apply(event)
+
+    def restart(self) -> None:
+        """Puts the scene back to where the recording began, whatever became of it."""
+        restore_state(self.model, self.data, self._start)
+        self.binding.take_reset()
+        self.is_over = False
 
     def finish(self) -> None:
         """Applies the events after the last tick.
@@ -180,7 +209,7 @@ class Rerun:
     def _apply(self, event: Mapping[str, Any]) -> None:
         self._changed = int(event["tick"])
         if event["event"] == "resume":
-            self._binding.resume()
+            self.binding.resume()
             return
         if event["event"] in COMMANDED:
             self._commands.apply(event)

@@ -208,6 +208,26 @@ class Ring:
         overwritten = int(self.cursors[HEAD]) - self.capacity - start
         return copied[overwritten:] if overwritten > 0 else copied
 
+    def since(self, number: int) -> tuple[int, NDArray[np.void]]:
+        """Copies the records from a number on that are still in the ring; frees nothing.
+
+        The number says where to go on, however many records come in between two calls.
+
+        Args:
+            number: Of the first record that is wanted, counted from the ring's start, >= 0.
+
+        Returns:
+            The number of the first record that is still there, and the records, oldest first.
+        """
+        head = int(self.cursors[HEAD])
+        self._fence()
+        # the oldest place of a full ring is the one that is written next
+        start = max(min(number, head), head - self.capacity + 1)
+        copied = self._copy(start, head)
+        self._fence()
+        overwritten = max(int(self.cursors[HEAD]) - self.capacity + 1 - start, 0)
+        return start + overwritten, copied[overwritten:]
+
     def close(self) -> None:
         """Removes the shared memory's name if this ring created it; its arrays stay valid."""
         if self._is_owner:

@@ -27,7 +27,7 @@ from hapticbridge.view.window import Window
 
 pytest.importorskip("viser", reason="needs the extra 'view'")
 
-from page_client import Hand, hand
+from page_client import Hand, hand, said
 
 # viser's threads and sockets end with the process
 pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
@@ -113,3 +113,32 @@ def test_a_page_in_trouble_changes_no_number_of_the_run(deed: Deed, tmp_path: Pa
 def test_a_page_that_stands_still_holds_nobody_up_at_the_end(tmp_path: Path) -> None:
     _, _, seconds = run(tmp_path, "seen", standing_still)
     assert seconds < 30  # it is killed after 2 s; without that it would never end
+
+
+def test_a_page_that_slept_too_long_says_what_it_skipped_and_goes_on(tmp_path: Path) -> None:
+    scene, path = tmp_path / "floor.xml", tmp_path / "run.mcap"
+    scene.write_text(FLOOR)
+    window = Window(Address("127.0.0.1", 0))
+    told: list[str] = []
+
+    def disturb(tick: int) -> None:
+        if tick == 300:
+            time.sleep(0.5)  # it has seen the beginning
+            os.kill(_process(window), signal.SIGSTOP)
+        if tick == 9000:  # the ring holds 8000
+            os.kill(_process(window), signal.SIGCONT)
+            with hand(window.url) as page:
+                told.append(said(page, "skipped"))
+
+    with Bridge(
+        str(scene),
+        ScriptedDevice(swaying),
+        LOOSE,
+        recording=path,
+        clock=SimulatedClock(),
+        onlooker=window,
+    ) as bridge:
+        summary = bridge.run(9.1, disturb)
+    assert (summary.ticks, summary.dropped) == (9100, 0)
+    assert "may stand elsewhere" in told[0]
+    assert audit(path).resimulation == "bit for bit"
