@@ -160,6 +160,44 @@ def test_a_change_of_stiffness_gives_the_spring_half_of_it_times_its_stretch_squ
     assert summary.energies["environment_energy"] <= 1e-9
 
 
+def turned(tick: int) -> tuple[float, ...]:
+    """Turned by 0.1 rad within 0.2 s and held."""
+    half = 0.05 * min(tick / 200, 1.0)
+    return (0, 0, 0, math.cos(half), 0, math.sin(half), 0)
+
+
+@pytest.mark.parametrize("method", ["lossless", "implicit", "explicit"])
+def test_a_change_of_turning_stiffness_gives_half_of_it_times_the_angle_squared(
+    run: Callable[..., Any], method: str
+) -> None:
+    commands = {250: Couple(2000.0, 0.8, 3.0, 4e-4)}
+    summary, path, _ = run(commands, 0.85, ANVIL, turned, method=method)
+    ticks = read_recording(path).ticks
+    both = ticks["handle_quaternion"][1:], ticks["tool_quaternion"][:-1]
+    angle = 2 * np.arccos(np.sum(both[0] * both[1], axis=1))[249 : 249 + STEPS]
+    assert 0.09 < angle.mean() < 0.1  # the anvil gives way by some milliradians
+    # from 2 to 3 N m/rad in equal steps, while nothing is stretched
+    grown_by = float(np.sum(0.5 / STEPS * angle**2))
+    assert summary.energies["tuning_work"] == pytest.approx(grown_by, rel=1e-6)
+    event = next(e for e in read_recording(path).events if e["event"] == "coupling")
+    assert event["rotational_stiffness"] == 3.0
+    report = audit(path)
+    assert (report.verdict, report.resimulation) == ("passive", "bit for bit")
+    assert "K_r = 3 N m/rad" in report.rendered[-1]
+    # the torque in the end is that of the new spring
+    last = 2 * np.arccos(np.sum(both[0][-1] * both[1][-1]))
+    assert ticks["wrench_on_tool"][-1, 4] == pytest.approx(3.0 * last, rel=0.02)
+
+
+def test_a_change_of_the_one_kind_of_gains_leaves_the_other(run: Callable[..., Any]) -> None:
+    commands = {60: Couple(1000.0, 1.0, 1.0, 1e-3), 620: Couple(1500.0, 1.0)}
+    _, path, _ = run(commands, 1.3)
+    told = [e for e in read_recording(path).events if e["event"] == "coupling"]
+    assert [e["rotational_stiffness"] for e in told] == [1.0, 1.0]
+    assert told[0]["rotational_damping"] == told[1]["rotational_damping"]
+    assert audit(path).resimulation == "bit for bit"
+
+
 def test_what_a_command_gave_to_the_device_is_not_called_activity(run: Callable[..., Any]) -> None:
     # a device without the damping that the coupling needs, so that its port is watched
     soft = Coupling(1000.0, 0.1, 2.0, 1e-3)

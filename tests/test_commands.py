@@ -59,7 +59,7 @@ def allowance(method: str = "implicit", scale: float = 1.0, **changes: float | N
 def test_the_sliders_end_where_the_bound_does(
     method: str, stiffest: float, most_damped: float
 ) -> None:
-    allowed = allowance(method)
+    allowed = allowance(method).translation
     assert allowed.most_stiffness(0.5) == pytest.approx(stiffest, rel=1e-9)
     assert allowed.most_damping(1000.0) == pytest.approx(most_damped, rel=1e-9)
     allowed.check(0.9999 * stiffest, 0.5)
@@ -70,36 +70,92 @@ def test_the_sliders_end_where_the_bound_does(
 
 
 def test_the_bound_scales_with_motion_and_force() -> None:
-    assert allowance(scale=2.0).most_stiffness(0.0) == pytest.approx(4000 / 4, rel=1e-9)
+    assert allowance(scale=2.0).translation.most_stiffness(0.0) == pytest.approx(4000 / 4, rel=1e-9)
 
 
 def test_an_unknown_damping_is_the_one_that_the_default_coupling_takes() -> None:
     allowed = allowance(damping=None)
-    assert allowed.most_stiffness(0.0) == pytest.approx(2 * allowed.damping / T, rel=1e-9)
+    span = allowed.translation
+    assert span.most_stiffness(0.0) == pytest.approx(2 * span.damping / T, rel=1e-9)
     assert "taken for it" in allowed.reason()
     assert "taken for it" not in allowance().reason()
 
 
 def test_the_softest_coupling_still_shows_the_whole_force() -> None:
-    least = allowance().least_stiffness
+    allowed = allowance().translation
+    least = allowed.least_stiffness
     assert least == pytest.approx(max(10.0 / 0.2, 0.05 * 4000))  # 10 N within 0.2 m; a share
-    allowance().check(least, 0.0)
+    allowed.check(least, 0.0)
     with pytest.raises(CommandError, match="no longer feels"):
-        allowance().check(0.999 * least, 0.0)
+        allowed.check(0.999 * least, 0.0)
 
 
 def test_a_run_that_began_softer_may_stay_so() -> None:
     # else a touch of the damping alone would take the stiffness to the slider's end
-    soft = replace(allowance(damping=50.0), start=replace(COUPLING, stiffness=300.0))
+    began = replace(COUPLING, stiffness=300.0)
+    soft = replace(allowance(damping=50.0), start=began).translation
     assert soft.least_stiffness == 300.0
     soft.check(300.0, 1.0)
     with pytest.raises(CommandError, match="no longer feels"):
         soft.check(299.0, 1.0)
 
 
+@pytest.mark.parametrize(
+    ("method", "stiffest", "most_damped"),
+    [
+        # b_r = 2e-3 N m s/rad >= (s_f/s_h) (K_r T/2 + B_r), and B_r' as above
+        ("implicit", 2 * (2e-3 - 5e-4) / T, 2e-3 - 1.0 * T / 2),
+        ("lossless", 2 * 2e-3 / T, 2e-3),
+        ("compensated", 2 * 2e-3 / T, 2e-3 + 1.0 * T / 2),
+    ],
+)
+def test_turning_ends_where_its_own_bound_does(
+    method: str, stiffest: float, most_damped: float
+) -> None:
+    allowed = allowance(method)
+    assert allowed.rotation is not None
+    assert allowed.rotation.most_stiffness(5e-4) == pytest.approx(stiffest, rel=1e-9)
+    assert allowed.rotation.most_damping(1.0) == pytest.approx(most_damped, rel=1e-9)
+    allowed.check(Couple(1000.0, 0.5, 0.9999 * stiffest, 5e-4))
+    for turning in ((1.0001 * stiffest, 5e-4), (1.0, 1.0001 * most_damped)):
+        with pytest.raises(CommandError, match=r"rotational .* device of .* N m s/rad, .* 0\.002"):
+            allowed.check(Couple(1000.0, 0.5, *turning))
+    with pytest.raises(CommandError, match="rotational stiffness is 0 N m/rad"):
+        allowed.check(Couple(1000.0, 0.5, 0.0, 0.0))
+    with pytest.raises(CommandError, match="needs a device of"):  # each has its own bound
+        allowed.check(Couple(1.01 * 2 * 2 / T, 0.0, 1.0, 0.0))
+
+
+def test_angles_are_not_scaled_and_torques_are() -> None:
+    for scales in ((2.0, 2.0), (2.0, 1.0), (1.0, 2.0)):
+        scaled = replace(allowance(), scale=scales[0], force_scale=scales[1]).rotation
+        assert scaled is not None
+        most = 2 * 2e-3 / T * scales[0] / scales[1]
+        assert scaled.most_stiffness(0.0) == pytest.approx(most, rel=1e-9)
+
+
+def test_a_device_that_does_not_turn_has_no_gains_for_it() -> None:
+    allowed = replace(allowance(), info=replace(INFO, axes=("x", "y", "z")))
+    assert allowed.rotation is None
+    assert len(allowed.spans) == 1
+    allowed.check(Couple(1000.0, 0.5))
+    with pytest.raises(CommandError, match="'scripted' feels no torque"):
+        allowed.check(Couple(1000.0, 0.5, 1.0, 0.0))
+
+
+def test_turning_gains_come_together() -> None:
+    # each alone would be checked against the other's value of now, which may change until then
+    for turning in ((1.0, None), (None, 1e-3)):
+        with pytest.raises(CommandError, match="together"):
+            Couple(1000.0, 0.5, *turning)
+    for value in (math.nan, math.inf, -1.0, "x", True):
+        with pytest.raises(CommandError, match="rotational"):
+            Couple(1000.0, 0.5, value, 0.0)  # type: ignore[arg-type] # what a wire may say
+
+
 def test_without_a_coupling_law_there_is_nothing_to_change() -> None:
     with pytest.raises(CommandError, match="'weld' has no coupling law"):
-        allowance("weld").check(1000.0, 0.0)
+        allowance("weld").check(Couple(1000.0, 0.0))
 
 
 class Time:
@@ -170,7 +226,7 @@ def test_nothing_gets_in_that_needs_more_than_the_device_has(
         return
     [(command, _)] = queue.waiting
     assert isinstance(command, Couple)
-    felt = queue.allowance.felt(command.stiffness, command.damping)
+    felt = queue.allowance.felt(command, COUPLING)
     used = queue.allowance.used(felt)
     assert math.isfinite(used.stiffness)
     assert used.stiffness * T / 2 + used.damping <= 2.0 * (1 + 1e-8)
@@ -197,6 +253,7 @@ def test_any_bytes_are_a_command_or_refused(said: bytes) -> None:
     "command",
     [
         Couple(1234.5, 0.1),
+        Couple(*(1e3 * math.pi * 10.0**-number for number in (0, 3, 3, 6))),
         Switch(force=False),
         Switch(clutch=True),
         Switch(),
@@ -215,10 +272,10 @@ def test_a_command_reads_back_as_it_was_written(command: Command) -> None:
 def test_what_is_needed_is_what_the_certificate_says(substeps: int, delay: float) -> None:
     allowed = replace(allowance(delay=delay), substeps=substeps)
     for stiffness, damping in ((200.0, 0.0), (1000.0, 0.7), (3000.0, 0.1)):
-        used = allowed.used(allowed.felt(stiffness, damping))
+        used = allowed.used(allowed.felt(Couple(stiffness, damping), COUPLING))
         laws = allowed.method.laws(substeps)
         said = needed_on_axes(allowed.info, used, T, 1.0, 1.0, laws, allowed.method)[0]
-        need = allowed.needed(stiffness, damping)
+        need = allowed.translation.needed(stiffness, damping)
         if substeps == 1 and not delay:
             assert need == pytest.approx(said, rel=1e-9)
         else:  # read off a table, on the safe side

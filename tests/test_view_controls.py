@@ -104,7 +104,7 @@ def test_a_slider_of_the_page_moves_the_stiffness_and_the_recording_says_so(
         page.value("document.querySelectorAll('[role=slider]')[0].focus()")
         before = stiffness(bridge)
         pressed(page, "Home")  # its least value
-        least = allowance_of(bridge._description()).least_stiffness
+        least = allowance_of(bridge._description()).translation.least_stiffness
         until(lambda: stiffness(bridge) == pytest.approx(least))
         page.wait_for("document.body.innerText.includes('K goes to 200 N/m')")
         page.picture(tmp_path / "controls.png")

@@ -110,12 +110,18 @@ class Interventions:
         Args:
             given: What that gave to what is felt, in J; None while it is not known.
         """
-        count, last = len(self.couplings) - 1, self.couplings[-1:]
+        count = len(self.couplings) - 1
         if count < 1:
             return ()
+        began, last = self.couplings[0], self.couplings[-1]
+        turning = (
+            ""
+            if last.rotational_stiffness == began.rotational_stiffness
+            else (f", K_r = {last.rotational_stiffness:g} N m/rad")
+        )
         return (
             f"so it began; commands changed the coupling {count} times, last to K = "
-            f"{last[0].stiffness:g} N/m, B' = {last[0].damping:g} N s/m used"
+            f"{last.stiffness:g} N/m{turning}, B' = {last.damping:g} N s/m used"
             + ("" if given is None else f", which gave the coupling {given:.3g} J"),
         )
 

@@ -9,8 +9,8 @@ from typing import Any
 from hapticbridge.arguments import Arguments, shown
 from hapticbridge.errors import CommandError, choices
 
-LONGEST_LINE = 200
-"""Bytes of a line; the longest command has some 90."""
+LONGEST_LINE = 250
+"""Bytes of a line; the longest command has some 170."""
 
 _ARGUMENTS = Arguments(CommandError)
 
@@ -22,6 +22,9 @@ class Couple:
     Attributes:
         stiffness: K in N/m that is to be felt, finite and > 0.
         damping: B in N s/m that is to be felt, finite and >= 0.
+        rotational_stiffness: K_r in N m/rad likewise, finite and >= 0.
+        rotational_damping: B_r in N m s/rad likewise. Both or neither, which leaves them as they
+            are: a bound holds for the two together.
 
     Raises:
         CommandError: A value is out of range.
@@ -29,10 +32,19 @@ class Couple:
 
     stiffness: float
     damping: float
+    rotational_stiffness: float | None = None
+    rotational_damping: float | None = None
 
     def __post_init__(self) -> None:
         _ARGUMENTS.number("stiffness", self.stiffness, "N/m", least=0.0, is_open=True)
         _ARGUMENTS.number("damping", self.damping, "N s/m", least=0.0)
+        turning = self.rotational_stiffness, self.rotational_damping
+        if turning == (None, None):
+            return
+        if turning[0] is None or turning[1] is None:
+            raise CommandError("rotational stiffness and damping are asked for together")
+        _ARGUMENTS.number("rotational stiffness", turning[0], "N m/rad", least=0.0)
+        _ARGUMENTS.number("rotational damping", turning[1], "N m s/rad", least=0.0)
 
 
 @dataclass(frozen=True, slots=True)

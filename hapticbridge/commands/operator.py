@@ -71,7 +71,7 @@ class Operator:
             return None
         command, by = self._queue.waiting.popleft()
         if isinstance(command, Couple):
-            self.felt = self._queue.allowance.felt(command.stiffness, command.damping)
+            self.felt = self._queue.allowance.felt(command, self.felt)
             law = asdict(self.used)
             ticks = tuning_ticks(self._queue.allowance.period)
             self._do({"event": "coupling", **law, "ticks": ticks, "by": by})

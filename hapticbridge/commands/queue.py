@@ -56,7 +56,8 @@ class CommandQueue:
     def warm_up(self) -> None:
         """Computes what takes long, so that no command is the first one."""
         if self.allowance.method.has_law:
-            self.allowance.needed(self.allowance.least_stiffness, 0.0)
+            for span in self.allowance.spans:
+                span.needed(span.least_stiffness, 0.0)
 
     def offer(self, command: Command, by: str) -> None:
         """Hands a command over, or refuses it.
@@ -88,7 +89,7 @@ class CommandQueue:
 
     def _check(self, command: Command) -> None:
         if isinstance(command, Couple):
-            self.allowance.check(command.stiffness, command.damping)
+            self.allowance.check(command)
         elif isinstance(command, Reset) and not self.allowance.method.has_coupling:
             raise CommandError(
                 "a tool without mass is where the hand is; there is nothing to reset"

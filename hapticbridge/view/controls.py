@@ -11,8 +11,8 @@ import json
 import os
 import threading
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import fields
 from typing import Any
 
 import viser
@@ -20,11 +20,14 @@ import viser
 from hapticbridge.commands import Allowance, Command, Couple, Record, Reset, Switch
 from hapticbridge.commands.command import Stop, line_of
 from hapticbridge.commands.queue import INTERVAL
+from hapticbridge.commands.span import UNITS
+from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import CommandError
 from hapticbridge.guard import Limits
 from hapticbridge.provenance import parameters_of
 from hapticbridge.rendering import method_named
+from hapticbridge.view.sliders import SYMBOLS, Sliders
 
 SHARED = "**Anyone with this address can watch this run, stop it, and move the device.**"
 
@@ -35,9 +38,6 @@ the next one would come too close, and be refused."""
 STILL = 0.5
 """In s: for so long after the last touch a slider is not put anywhere; it may be in a hand."""
 
-_DIGITS = 1e-3  # N s/m
-_ROUNDING = 1.0 + 1e-9  # a bound of 2 that was found as 1.9999999999 is one of 2
-
 
 def allowance_of(metadata: Mapping[str, str]) -> Allowance:
     """Returns what the device of a run allows, from the run's metadata."""
@@ -47,6 +47,7 @@ def allowance_of(metadata: Mapping[str, str]) -> Allowance:
         force=parameters.force_limit,
         torque=parameters.torque_limit,
         stretch=guarding.stretch / parameters.scale,
+        angle=guarding.angle,
     )
     return Allowance(
         info=info,
@@ -113,57 +114,38 @@ class Controls:
         self, server: viser.ViserServer, allowance: Allowance, ask: Callable[[Command], None]
     ) -> None:
         self._allowance, self._ask = allowance, ask
-        self._coupling = (allowance.start.stiffness, allowance.start.damping)
         self._touched = 0.0
+        self._sliders: tuple[Sliders, ...] = ()
+        self._said = {"recording": "", "force": "", "answer": ""}
         gui = server.gui
         with gui.add_folder("control"):
             stop = gui.add_button("stop the run", color="red")
             if allowance.method.has_law:
-                self._add_sliders(gui)
+                self._sliders = tuple(Sliders(gui, s, self._want) for s in allowance.spans)
+                self._bounds = gui.add_markdown(self._ends())
             force = gui.add_checkbox("force", initial_value=True)
             clutch = gui.add_checkbox("clutch (the hand moves alone)", initial_value=False)
             reset = gui.add_button("back to the start")
             self._record = gui.add_button("start recording")
             self.answer = gui.add_markdown("")
-        self._force, self._clutch, self._is_recording = force, clutch, False
-        force.on_update(lambda _: ask(Switch(force=force.value)))
-        clutch.on_update(lambda _: ask(Switch(clutch=clutch.value)))
+        self._coupling = self._shown()
+        self._is_recording = False
+        force.on_update(lambda _: ask(Switch(force=bool(force.value))))
+        clutch.on_update(lambda _: ask(Switch(clutch=bool(clutch.value))))
         reset.on_click(lambda _: ask(Reset()))
         self._record.on_click(lambda _: ask(Record(not self._is_recording)))
         stop.on_click(lambda _: ask(Stop()))
 
-    def _add_sliders(self, gui: viser.GuiApi) -> None:
-        allowance = self._allowance
-        stiffness, damping = self._coupling
-        least = allowance.least_stiffness
-        most = allowance.most_stiffness(damping), allowance.most_damping(stiffness)
-        self._stiffness = gui.add_slider(
-            "stiffness K (N/m)",
-            _up(least),
-            max(_down(most[0]), _up(least)),
-            1.0,
-            min(max(stiffness, _up(least)), max(_down(most[0]), _up(least))),
-        )
-        self._damping = gui.add_slider(
-            "damping B (N s/m)",
-            0.0,
-            max(_floor(most[1]), _DIGITS),
-            _DIGITS,
-            min(damping, max(_floor(most[1]), _DIGITS)),
-        )
-        self._bounds = gui.add_markdown(self._told())
-        self._stiffness.on_update(lambda _: self._want())
-        self._damping.on_update(lambda _: self._want())
+    def _shown(self) -> tuple[float, ...]:
+        return tuple(value for sliders in self._sliders for value in sliders.value)
 
-    def _told(self) -> str:
-        return (
-            f"K ends at {self._stiffness.max:g} N/m, B at {self._damping.max:g} N s/m. "
-            f"{self._allowance.reason()}"
-        )
+    def _ends(self) -> str:
+        ends = "; ".join(sliders.ends() for sliders in self._sliders)
+        return f"{ends}. {self._allowance.reason()}"
 
     def _want(self) -> None:
         """Asks for what the sliders show, unless the run has it already."""
-        asked = (float(self._stiffness.value), float(self._damping.value))
+        asked = self._shown()
         if asked == self._coupling:
             return
         self._touched = time.monotonic()
@@ -175,58 +157,54 @@ class Controls:
     def note(self, event: Mapping[str, Any]) -> None:
         """Takes an event of the run; the controls then show how it is, not what was asked for."""
         kind = event.get("event")
-        if kind == "coupling" and self._allowance.method.has_law:
-            method, allowance = self._allowance.method, self._allowance
-            law = {name: float(event[name]) for name in ("stiffness", "damping")}
-            step = allowance.period / allowance.substeps
-            felt = method.rendered(replace(allowance.start, **law), step)
-            if time.monotonic() - self._touched > STILL:
-                self._show(felt.stiffness, felt.damping)
-            else:
-                self._bound(felt.stiffness, felt.damping)
-            self.answer.content = f"K goes to {felt.stiffness:g} N/m, B to {felt.damping:.3g} N s/m"
+        if kind == "coupling" and self._sliders:
+            self._take_coupling(event)
         elif kind == "switch":
-            self.answer.content = "" if event.get("force") else "the force is off"
+            self._say("force", "" if event.get("force") else "the force is off")
         elif kind == "reset":
-            self.answer.content = "the scene is back at its start"
+            self._say("answer", "the scene is back at its start")
         elif kind == "recording":
             path = event.get("path")
             self._is_recording = path is not None
             self._record.label = "stop recording" if path else "start recording"
-            self.answer.content = f"recording to {path}" if path else "not recording"
+            self._say("recording", f"recording to {path}" if path else "not recording")
         elif kind == "refused":
             self._refuse(str(event.get("reason")))
 
-    def _refuse(self, reason: str) -> None:
-        self.answer.content = f"**refused:** {json.dumps(reason, ensure_ascii=False)[1:-1]}"
-        if self._allowance.method.has_law:
-            self._show(*self._coupling)
-
-    def _show(self, stiffness: float, damping: float) -> None:
-        """Puts the sliders to a coupling."""
-        self._bound(stiffness, damping)
-        shown = (
-            min(max(stiffness, self._stiffness.min), self._stiffness.max),
-            min(damping, self._damping.max),
+    def _take_coupling(self, event: Mapping[str, Any]) -> None:
+        method, allowance = self._allowance.method, self._allowance
+        law = {field.name: float(event[field.name]) for field in fields(Coupling)}
+        felt = method.rendered(Coupling(**law), allowance.period / allowance.substeps)
+        gains = [sliders.span.gains(felt) for sliders in self._sliders]
+        if time.monotonic() - self._touched > STILL:
+            self._show([value for pair in gains for value in pair])
+        else:
+            for sliders, pair in zip(self._sliders, gains, strict=True):
+                sliders.bound(*pair)
+            self._bounds.content = self._ends()
+        told = "; ".join(
+            f"{symbol[0]} goes to {pair[0]:.4g} {unit[0]}, {symbol[1]} to {pair[1]:.3g} {unit[1]}"
+            for symbol, unit, pair in (
+                (SYMBOLS[sliders.span.axis], UNITS[sliders.span.axis], pair)
+                for sliders, pair in zip(self._sliders, gains, strict=True)
+            )
         )
-        self._coupling = shown
-        self._stiffness.value, self._damping.value = shown
+        self._say("answer", told)
 
-    def _bound(self, stiffness: float, damping: float) -> None:
-        """Puts the end of each slider to where the other one lets it go."""
-        allowance = self._allowance
-        self._stiffness.max = max(_down(allowance.most_stiffness(damping)), self._stiffness.min)
-        self._damping.max = max(_floor(allowance.most_damping(stiffness)), _DIGITS)
-        self._bounds.content = self._told()
+    def _refuse(self, reason: str) -> None:
+        self._say("answer", f"**refused:** {json.dumps(reason, ensure_ascii=False)[1:-1]}")
+        self._show(self._coupling)
 
+    def _say(self, what: str, words: str) -> None:
+        """Says one thing without taking back the others."""
+        self._said[what] = words
+        self.answer.content = "  \n".join(words for words in self._said.values() if words)
 
-def _up(value: float) -> float:
-    return float(-(-value // 1.0))
-
-
-def _down(value: float) -> float:
-    return float(value * _ROUNDING // 1.0)
-
-
-def _floor(value: float) -> float:
-    return round(value * _ROUNDING // _DIGITS * _DIGITS, 3)
+    def _show(self, values: Sequence[float]) -> None:
+        """Puts the sliders to a coupling."""
+        if not self._sliders:
+            return
+        pairs = zip(values[::2], values[1::2], strict=True)
+        shown = [sliders.show(*pair) for sliders, pair in zip(self._sliders, pairs, strict=True)]
+        self._coupling = tuple(value for pair in shown for value in pair)
+        self._bounds.content = self._ends()

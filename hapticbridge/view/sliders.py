@@ -1,0 +1,105 @@
+"""Two sliders for one kind of axis: stiffness and damping, each as far as the other lets it go."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import viser
+
+from hapticbridge.commands.span import UNITS, Span
+
+FINENESS = 1e-3
+"""Least step of a slider as a share of its largest value, rounded down to a power of ten: finer is
+not felt, coarser is."""
+
+_ROUNDING = 1.0 + 1e-9  # a bound of 2 that was found as 1.9999999999 is one of 2
+
+SYMBOLS = {"translation": ("K", "B"), "rotation": ("K_r", "B_r")}
+_WORDS = {
+    "translation": ("stiffness", "damping"),
+    "rotation": ("turning stiffness", "turning damping"),
+}
+
+
+class Sliders:
+    """Stiffness and damping along one kind of axis.
+
+    Args:
+        gui: Where.
+        span: What the device allows.
+        want: Called when a hand has moved one of them.
+
+    Attributes:
+        span: Likewise.
+    """
+
+    def __init__(self, gui: viser.GuiApi, span: Span, want: Callable[[], None]) -> None:
+        self.span = span
+        stiffness, damping = span.gains(span.start)
+        self._steps = (
+            _step(max(span.most_stiffness(0.0), stiffness)),
+            _step(max(span.most_damping(span.least_stiffness), damping)),
+        )
+        least = _up(span.least_stiffness, self._steps[0])
+        most = self._ends(stiffness, damping, least)
+        labels = [
+            f"{word} {symbol} ({unit})"
+            for word, symbol, unit in zip(
+                _WORDS[span.axis], SYMBOLS[span.axis], UNITS[span.axis], strict=True
+            )
+        ]
+        self._stiffness = gui.add_slider(
+            labels[0], least, most[0], self._steps[0], min(max(stiffness, least), most[0])
+        )
+        self._damping = gui.add_slider(
+            labels[1], 0.0, most[1], self._steps[1], min(damping, most[1])
+        )
+        self._stiffness.on_update(lambda _: want())
+        self._damping.on_update(lambda _: want())
+
+    @property
+    def value(self) -> tuple[float, float]:
+        """What they show; whatever a browser has sent."""
+        return self._stiffness.value, self._damping.value
+
+    def show(self, stiffness: float, damping: float) -> tuple[float, float]:
+        """Puts them to a stiffness and damping; returns what they then show."""
+        self.bound(stiffness, damping)
+        shown = (
+            min(max(stiffness, self._stiffness.min), self._stiffness.max),
+            min(damping, self._damping.max),
+        )
+        self._stiffness.value, self._damping.value = shown
+        return shown
+
+    def bound(self, stiffness: float, damping: float) -> None:
+        """Puts the end of each to where the other one lets it go."""
+        self._stiffness.max, self._damping.max = self._ends(stiffness, damping, self._stiffness.min)
+
+    def ends(self) -> str:
+        """Says where they end."""
+        symbols, units = SYMBOLS[self.span.axis], UNITS[self.span.axis]
+        return (
+            f"{symbols[0]} ends at {self._stiffness.max:g} {units[0]}, "
+            f"{symbols[1]} at {self._damping.max:g} {units[1]}"
+        )
+
+    def _ends(self, stiffness: float, damping: float, least: float) -> tuple[float, float]:
+        steps, span = self._steps, self.span
+        return (
+            max(_down(span.most_stiffness(damping), steps[0]), least + steps[0]),
+            max(_down(span.most_damping(stiffness), steps[1]), steps[1]),
+        )
+
+
+def _step(most: float) -> float:
+    return float(f"1e{math.floor(math.log10(FINENESS * most)):d}")
+
+
+def _up(value: float, step: float) -> float:
+    return float(f"{math.ceil(value / step / _ROUNDING) * step:.12g}")
+
+
+def _down(value: float, step: float) -> float:
+    return float(f"{math.floor(value * _ROUNDING / step) * step:.12g}")
