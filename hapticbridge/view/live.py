@@ -36,6 +36,9 @@ BREATH = 0.005
 """In s, least time between taking records and simulating them; meanwhile the thread that listens
 hears what happened before them, however busy the machine is."""
 
+FAREWELL = 0.3
+"""In s: how long the process stays once the run is over, so that the last words reach the page."""
+
 LAG = 0.03
 """In s: how old a record is when it is shown. What changed the run in that tick comes another way,
 in some milliseconds, and must be known before the tick is simulated; nobody sees 30 ms."""
@@ -68,10 +71,18 @@ def _calm() -> None:
         os.nice(BEHIND)
 
 
+def _ending(event: dict[str, Any]) -> str:
+    """Returns why a run ended, if that is what an event says."""
+    if event.get("event") == "trip" or (event.get("event") == "stop" and "overruns" in event):
+        return str(event.get("reason"))
+    return ""
+
+
 def _follow(
     show: Show, page: Page, controls: Controls, inbox: queue.SimpleQueue[dict[str, Any] | None]
-) -> None:
-    plotted, due = 0.0, time.monotonic()
+) -> str:
+    """Shows a run until it is over; returns why it is."""
+    plotted, due, over = 0.0, time.monotonic(), ""
     while True:
         began = time.monotonic()
         # from the last due time on, so that a late picture does not make all later ones late
@@ -82,7 +93,8 @@ def _follow(
         while not inbox.empty():
             event = inbox.get()
             if event is None:
-                return
+                return over
+            over = over or _ending(event)
             show.note(event)
             controls.note(event)
         sight = show.look()
@@ -122,5 +134,7 @@ def run() -> None:
     inbox: queue.SimpleQueue[dict[str, Any] | None] = queue.SimpleQueue()
     threading.Thread(target=_listen, args=(stream, inbox), daemon=True).start()
     threading.Thread(target=outlet.run, daemon=True).start()
-    _follow(show, page, controls, inbox)
+    reason = _follow(show, page, controls, inbox) or "the bridge is gone"
+    page.status.content = f"**The run is over** ({reason}). This is how it was at the end."
+    time.sleep(FAREWELL)
     os._exit(0)  # viser's threads would hold an ordinary exit up

@@ -118,7 +118,7 @@ class Window:
         """Ends the process."""
         self._outbox.put(None)
         if self._process is not None:
-            self._process.terminate()
+            # its input ends, and it tells its page so
             try:
                 self._process.wait(PATIENCE)
             except subprocess.TimeoutExpired:  # it hangs, or was stopped: that it cannot refuse
@@ -157,3 +157,4 @@ class Window:
             while (piece := self._outbox.get()) is not None:
                 stream.write(piece)
                 stream.flush()
+            stream.close()
