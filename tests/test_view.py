@@ -151,11 +151,10 @@ def test_every_shape_is_drawn_at_its_size(tmp_path: Path) -> None:
     props = props_of(mujoco.MjModel.from_xml_string(text))
     assert len(props) == len(shapes)
     for prop, (_, half) in zip(props, shapes.values(), strict=True):
-        np.testing.assert_allclose(prop.corners.max(axis=0), half, rtol=0.02, atol=1e-9)
-        np.testing.assert_allclose(
-            prop.corners.min(axis=0), np.negative(half), rtol=0.02, atol=1e-9
-        )
-        assert (prop.colour, prop.opacity) == ((255, 0, 0), 0.5)
+        corners = prop.triangles.reshape(-1, 3)
+        np.testing.assert_allclose(corners.max(axis=0), half, rtol=0.02, atol=1e-9)
+        np.testing.assert_allclose(corners.min(axis=0), np.negative(half), rtol=0.02, atol=1e-9)
+        assert prop.skin.image.tolist() == [[[255, 0, 0, 128]]]
 
 
 def live(recording: Recording, capacity: int) -> tuple[Show, Ring]:

@@ -108,16 +108,11 @@ class Page:
             body: scene.add_frame(f"/body{body}", show_axes=False) for body in range(model.nbody)
         }
         for index, prop in enumerate(props_of(model)):
-            scene.add_mesh_simple(
+            scene.add_glb(
                 f"/body{prop.body}/geom{index}",
-                prop.corners,
-                prop.faces,
-                color=prop.colour,
-                opacity=None if prop.opacity == 1.0 else prop.opacity,
+                prop.glb(),
                 position=prop.place,
                 wxyz=prop.turn,
-                flat_shading=True,
-                side="double",
             )
         self._handle = scene.add_icosphere(
             "/handle", radius=0.02 * extent, color=(26, 95, 180), opacity=0.45

@@ -1,4 +1,4 @@
-"""The bodies of a MuJoCo scene as triangles, with their colours."""
+"""The bodies of a MuJoCo scene as triangles, with their materials."""
 
 from __future__ import annotations
 
@@ -8,6 +8,9 @@ import mujoco
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
+from PIL import Image
+
+from hapticbridge.view.skin import Skin, is_around, skin_of
 
 SHOWN_GROUPS = 3
 """Geoms of the groups below are shown, as MuJoCo does: the others are for collision alone."""
@@ -15,7 +18,13 @@ SHOWN_GROUPS = 3
 PLANE_SIDE = 4.0
 """Times the scene's extent: how large a plane without end is drawn."""
 
-_GREY = np.array([0.5, 0.5, 0.5, 1.0])
+LEAST_TRIANGLES = 2000
+"""Of a geom with a cube texture, each of whose triangles shows but one of the cube's sides."""
+
+CREASE = 40.0
+"""In degrees: triangles that meet at more than that show an edge; at less, a round surface."""
+
+_CREASE_COSINE = float(np.cos(np.radians(CREASE)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,19 +35,37 @@ class Prop:
         body: Index of the body that it moves with.
         place: In the body's frame, (3,) in m.
         turn: Likewise, a quaternion (4,).
-        corners: Shape (n, 3) in m.
-        faces: Indices into them, (m, 3).
-        colour: Red, green, blue, 0 to 255.
-        opacity: 0 to 1.
+        triangles: Shape (m, 3, 3) in m.
+        normals: Of their corners, (m, 3, 3).
+        skin: How it looks.
     """
 
     body: int
     place: NDArray[np.float64]
     turn: NDArray[np.float64]
-    corners: NDArray[np.float32]
-    faces: NDArray[np.uint32]
-    colour: tuple[int, int, int]
-    opacity: float
+    triangles: NDArray[np.float64]
+    normals: NDArray[np.float64]
+    skin: Skin
+
+    def glb(self) -> bytes:
+        """Returns it as a file that browsers draw (binary glTF)."""
+        skin, has_glass = self.skin, self.skin.opacity < 1.0
+        uv = skin.places.reshape(-1, 2) * (1.0, -1.0) + (0.0, 1.0)  # trimesh counts v upwards
+        material = trimesh.visual.material.PBRMaterial(
+            baseColorTexture=Image.fromarray(skin.image),
+            roughnessFactor=skin.roughness,
+            metallicFactor=skin.metallic,
+            doubleSided=True,
+            alphaMode="BLEND" if has_glass else "OPAQUE",
+        )
+        mesh = trimesh.Trimesh(
+            vertices=self.triangles.reshape(-1, 3),
+            faces=np.arange(3 * len(self.triangles)).reshape(-1, 3),
+            vertex_normals=self.normals.reshape(-1, 3),
+            visual=trimesh.visual.TextureVisuals(uv=uv, material=material),
+            process=False,
+        )
+        return bytes(mesh.export(file_type="glb", include_normals=True))
 
 
 def props_of(model: mujoco.MjModel) -> list[Prop]:
@@ -46,28 +73,53 @@ def props_of(model: mujoco.MjModel) -> list[Prop]:
     props = []
     for geom in range(model.ngeom):
         shape = _shape(model, geom)
-        colour = _colour(model, geom)
-        if shape is None or model.geom_group[geom] >= SHOWN_GROUPS or colour[3] == 0.0:
+        if shape is None or model.geom_group[geom] >= SHOWN_GROUPS:
             continue
-        red, green, blue = (round(255 * float(part)) for part in colour[:3])
+        corners, faces = np.asarray(shape[0], np.float64), np.asarray(shape[1], np.int64)
+        triangles = corners[faces]
+        normals = _normals(faces, triangles)
+        if is_around(model, geom):
+            while len(triangles) < LEAST_TRIANGLES:
+                triangles, normals = _quartered(triangles), _quartered(normals)
+        skin = skin_of(model, geom, triangles)
+        if skin.opacity == 0.0:
+            continue
         props.append(
             Prop(
                 body=int(model.geom_bodyid[geom]),
                 place=model.geom_pos[geom].copy(),
                 turn=model.geom_quat[geom].copy(),
-                corners=np.asarray(shape[0], dtype=np.float32),
-                faces=np.asarray(shape[1], dtype=np.uint32),
-                colour=(red, green, blue),
-                opacity=float(colour[3]),
+                triangles=triangles,
+                normals=normals,
+                skin=skin,
             )
         )
     return props
 
 
-def _colour(model: mujoco.MjModel, geom: int) -> NDArray[np.float64]:
-    own, material = model.geom_rgba[geom], int(model.geom_matid[geom])
-    is_own = material < 0 or not np.allclose(own, _GREY)
-    return np.asarray(own if is_own else model.mat_rgba[material], dtype=np.float64)
+def _quartered(corners: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Returns four triangles for each, (4 m, 3, 3)."""
+    middles = 0.5 * (corners + np.roll(corners, -1, axis=1))
+    parts = [np.stack([corners[:, n], middles[:, n], middles[:, n - 1]], axis=1) for n in range(3)]
+    return np.concatenate([*parts, middles])
+
+
+def _normals(faces: NDArray[np.int64], triangles: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Returns the normals of the triangles' corners: of the surface there, but at edges."""
+    across = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    flat = across / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-30)
+    # every pair of triangles' corners that are at the same place
+    at = faces.ravel()
+    order, counts = np.argsort(at, kind="stable"), np.bincount(at)
+    many = counts[at]
+    one = np.repeat(np.arange(len(at)), many)
+    number = np.arange(len(one)) - np.repeat(np.cumsum(many) - many, many)
+    other = order[(np.cumsum(counts) - counts)[at[one]] + number]
+    is_round = np.einsum("ij,ij->i", flat[one // 3], flat[other // 3]) > _CREASE_COSINE
+    summed = np.zeros((len(at), 3))
+    np.add.at(summed, one[is_round], across[other[is_round] // 3])
+    length = np.linalg.norm(summed, axis=1, keepdims=True)
+    return np.asarray(summed / np.maximum(length, 1e-30)).reshape(triangles.shape)
 
 
 def _shape(
@@ -97,7 +149,7 @@ def _primitive(kind: mujoco.mjtGeom, size: NDArray[np.float64]) -> trimesh.Trime
         ball.apply_scale(size if kind == mujoco.mjtGeom.mjGEOM_ELLIPSOID else size[0])
         return ball
     if kind == mujoco.mjtGeom.mjGEOM_CAPSULE:
-        capsule = trimesh.creation.capsule(height=2 * size[1], radius=size[0], count=(16, 16))
+        capsule = trimesh.creation.capsule(height=2 * size[1], radius=size[0], count=(32, 32))
         capsule.apply_translation(-capsule.bounds.mean(axis=0))
         return capsule
     if kind == mujoco.mjtGeom.mjGEOM_CYLINDER:
