@@ -116,17 +116,18 @@ def run() -> None:
     # what viser prints is no answer to the bridge
     answers, sys.stdout = sys.stdout, sys.stderr
     stream = sys.stdin.buffer
-    job, facts = _told(stream)
+    job, told = _told(stream)
     try:
-        lag = round(LAG / parameters_of(facts.meta).period)
-        show = Show(Ring.attach(job["ring"]), facts, lag)
+        lag = round(LAG / parameters_of(told.meta).period)
+        show = Show(Ring.attach(job["ring"]), told, lag)
         address = Address(job["host"], job["port"], job["token"])
         server = serve(address)
         outlet = Outlet(answers.fileno())
         if not address.is_loopback:
             server.gui.add_markdown(SHARED)
-        controls = Controls(server, allowance_of(facts.meta), outlet.ask)
-        page = Page(server, show.model, show.parameters, dict(facts.meta), show.reference)
+        page = Page(server, show.model, show.parameters, dict(told.meta), show.reference)
+        controls = Controls(server, allowance_of(told.meta), outlet.ask)
+        page.add_curves()
     except HapticBridgeError as error:
         print(json.dumps({"error": str(error)}), file=answers, flush=True)
         return

@@ -11,9 +11,9 @@ import viser
 from numpy.typing import NDArray
 
 from hapticbridge.felt import coupling_sentences, is_always_held
-from hapticbridge.film.stage import LONGEST_ARROW, force_colour
 from hapticbridge.kernel.state import RunParameters
 from hapticbridge.rendering import method_named
+from hapticbridge.view.ghost import LONGEST_ARROW, Ghost
 from hapticbridge.view.props import props_of
 from hapticbridge.view.sight import Sight
 from hapticbridge.view.trace import PLOTS
@@ -22,7 +22,14 @@ Array = NDArray[np.float64]
 
 COLOURS = ("#1a5fb4", "#b3261e", "#2e7d32", "#e66100")
 
-_HAND = (230, 97, 0)
+_SMALL = {"font": "11px sans-serif", "ticks": {"size": 4}, "gap": 2}
+_AXES: tuple[dict[str, Any], ...] = ({"size": 22, **_SMALL}, {"size": 52, **_SMALL})
+
+_COLOURS_MEAN = (
+    "Blue ghost: the handle. Spring: the coupling, {length}, green at rest, red at the largest "
+    "force. Orange: the force on the hand. Turquoise: contacts and their forces."
+)
+
 _CONTACT = (77, 208, 225)
 
 
@@ -48,31 +55,50 @@ class Page:
         self._server, self.reference = server, reference
         self._extent = float(model.stat.extent)
         self._build_scene(model)
+        self._ghost = Ghost(server.scene, model, parameters.grip)
         server.gui.set_panel_label(f"hapticbridge: {facts.get('scene', '')}")
-        self._words = server.gui.add_markdown(_told(model, parameters, facts))
         self.status = server.gui.add_markdown("waiting for the first tick")
-        self._plots = []
+        self._told, self._times = _told(model, parameters, facts), 0
+        self._plots: list[viser.GuiUplotHandle] = []
+
+    def add_curves(self) -> None:
+        """Adds the curves and what the colours mean, below what is there."""
+        gui = self._server.gui
+        self._words = gui.add_markdown("")
+        self._explain()
         for title, names in PLOTS:
-            series: list[dict[str, Any]] = [{"label": "s"}]
+            series: list[dict[str, Any]] = [{"label": "time (s)"}]
             series += [
                 {"label": name, "stroke": colour, "width": 1.5}
                 for name, colour in zip(names, COLOURS, strict=False)
             ]
             nothing = tuple(np.zeros(2) for _ in series)
             self._plots.append(
-                server.gui.add_uplot(
+                gui.add_uplot(
                     nothing,
                     tuple(series),
-                    title=title,
-                    height=150,
+                    title=f"{title} over time (s)",
+                    height=122,
+                    padding=(8, 8, 0, 0),
                     scales={"x": {"time": False}},
+                    axes=_AXES,
                     legend={"show": len(names) > 1},
                 )
             )
+        gui.add_markdown(self._told)
+
+    def allow(self, stretch: float) -> None:
+        """Makes room for a distance between handle and tool, in m."""
+        self._ghost.allow(stretch)
+
+    def _explain(self) -> None:
+        if self._times != self._ghost.times:
+            self._times = times = self._ghost.times
+            length = f"{times} times as long as it is" if times > 1 else "as long as it is"
+            self._words.content = _COLOURS_MEAN.format(length=length)
 
     def show(self, sight: Sight) -> None:
         """Draws an instant."""
-        strength = float(np.linalg.norm(sight.force))
         with self._server.atomic():
             for body, frame in self._bodies.items():
                 place, turn = sight.places[body], sight.turns[body]
@@ -80,15 +106,10 @@ class Page:
                     frame.position = place
                 if not np.array_equal(frame.wxyz, turn):
                     frame.wxyz = turn
-            self._handle.position = sight.handle
-            self._spring.points = np.array([[sight.grip, sight.handle]], dtype=np.float32)
-            colour = np.round(255 * force_colour(strength, self.reference)).astype(np.uint8)
-            self._spring.colors = np.broadcast_to(colour, (1, 2, 3)).copy()
-            reach = LONGEST_ARROW * self._extent / max(self.reference, strength)
-            tip = sight.handle - reach * sight.force
-            self._arrow.points = np.array([[sight.handle, tip]], dtype=np.float32)
-            self._arrow.visible = strength > 1e-3 * self.reference
-            self._show_contacts(sight, reach)
+            self._ghost.show(sight, self.reference)
+            self._show_contacts(sight)
+        if self._plots:
+            self._explain()
 
     def plot(self, time: Array, lines: Sequence[Array]) -> None:
         """Draws the curves.
@@ -114,19 +135,12 @@ class Page:
                 position=prop.place,
                 wxyz=prop.turn,
             )
-        self._handle = scene.add_icosphere(
-            "/handle", radius=0.02 * extent, color=(26, 95, 180), opacity=0.45
-        )
         nothing = np.zeros((1, 2, 3), dtype=np.float32)
-        self._spring = scene.add_line_segments(
-            "/coupling", nothing, (0, 0, 0), thickness=0.012 * extent
-        )
         thin = {
             "shaft_radius": 0.006 * extent,
             "head_radius": 0.016 * extent,
             "head_length": 0.04 * extent,
         }
-        self._arrow = scene.add_arrows("/force in the hand", nothing, _HAND, **thin)
         self._pushes = scene.add_arrows("/contact forces", nothing, _CONTACT, **thin, visible=False)
         self._contacts = scene.add_point_cloud(
             "/contacts",
@@ -141,7 +155,9 @@ class Page:
         self._server.initial_camera.position = tuple(centre + away * np.array([0.7, -0.8, 0.6]))
         self._server.initial_camera.near = 0.01 * extent
 
-    def _show_contacts(self, sight: Sight, reach: float) -> None:
+    def _show_contacts(self, sight: Sight) -> None:
+        strength = float(np.linalg.norm(sight.force))
+        reach = LONGEST_ARROW * self._extent / max(self.reference, strength)
         touches = bool(len(sight.contact_places))
         self._contacts.visible = self._pushes.visible = touches
         if touches:
@@ -161,5 +177,4 @@ def _told(model: mujoco.MjModel, parameters: RunParameters, facts: dict[str, str
         is_always_held=is_always_held(model, parameters.grip),
     )
     lines = [f"Method **{method.name}**, {1 / parameters.period:g} Hz", *sentences]
-    lines.append("Orange: force in the hand. Spring: green at rest, red at the largest force.")
     return "  \n".join(lines)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -58,8 +60,8 @@ class Replay:
                 progress(number + 1, count)
 
     def at(self, moment: float) -> Sight:
-        """Returns the instant nearest to a time in s."""
-        number = round(moment / self.step)
+        """Returns the instant nearest to a time in s; the first for what is no time."""
+        number = round(moment / self.step) if math.isfinite(moment) else 0
         return self.sights[min(max(number, 0), len(self.sights) - 1)]
 
 
@@ -95,10 +97,12 @@ class Theatre:
             dict(stage.recording.meta),
             stage.reference,
         )
+        self._page.allow(max(float(np.linalg.norm(s.handle - s.grip)) for s in replay.sights))
+        self._page.add_curves()
         if len(replay.trace) > 1:
             self._page.plot(*replay.trace.curves())
         self.show(0.0)
-        self.slider.on_update(lambda _: self.show(self.slider.value))
+        self.slider.on_update(lambda _: self.show(self._asked()))
 
     def show(self, moment: float) -> None:
         """Shows the instant nearest to a time in s."""
@@ -106,13 +110,21 @@ class Theatre:
         self._page.show(sight)
         self._page.status.content = f"**{sight.time:.3f} s**, {np.linalg.norm(sight.force):.2f} N"
 
+    def _asked(self) -> float:
+        """Returns the time that the slider shows; a browser may send anything."""
+        asked: object = self.slider.value
+        return float(asked) if isinstance(asked, int | float) else 0.0
+
     def play(self, is_over: threading.Event) -> None:
         """Moves the slider with the time where that is asked for, until it is over."""
+        before = time.monotonic()
         while not is_over.wait(FRAME):
+            now, last = time.monotonic(), self._replay.sights[-1].time
             if self._playing.value:
-                following = self.slider.value + FRAME
-                self.slider.value = 0.0 if following > self.slider.max else following
+                following = self._asked() + now - before
+                self.slider.value = following if 0.0 <= following <= last else 0.0
                 self.show(self.slider.value)
+            before = now
 
     def close(self) -> None:
         """Ends serving."""

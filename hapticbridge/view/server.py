@@ -43,9 +43,10 @@ def serve(address: Address) -> viser.ViserServer:
     if not _is_guarded(server.get_port(), address):
         stop(server)
         raise HapticBridgeError("this version of viser lets everybody in; nothing is served")
-    # viser would carry the page to a server of its own on the internet if a browser asked for it
-    for message in (viser._messages.ShareUrlRequest, viser._messages.ShareUrlDisconnect):
-        server._websock_server.unregister_handler(message)
+    # viser would carry the page to a server of its own on the internet if a browser asked for it,
+    # and keep files that a browser sends
+    for name in ("ShareUrlRequest", "ShareUrlDisconnect", "FileTransferStartUpload"):
+        server._websock_server.unregister_handler(getattr(viser._messages, name))
     server.gui.configure_theme(
         control_width="large",
         show_logo=False,

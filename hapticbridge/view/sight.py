@@ -23,6 +23,7 @@ class Sight:
         places: Where each body is, (nbody, 3) in m.
         turns: How each is turned, quaternions (nbody, 4).
         handle: Where the handle is, (3,) in m.
+        handle_turn: How it is turned, a quaternion (4,).
         grip: Where the grip on the tool is, (3,) in m.
         force: On the tool, (3,) in N; the hand feels the opposite.
         contact_places: Shape (n, 3), n <= ``MOST_CONTACTS``, in m.
@@ -33,6 +34,7 @@ class Sight:
     places: Array
     turns: Array
     handle: Array
+    handle_turn: Array
     grip: Array
     force: Array
     contact_places: Array
@@ -63,6 +65,7 @@ class Sight:
             places=data.xpos.copy(),
             turns=data.xquat.copy(),
             handle=row["handle_position"][0].copy(),
+            handle_turn=row["handle_quaternion"][0].copy(),
             grip=row["tool_position"][0].copy(),
             force=row["wrench_on_tool"][0, :3].copy(),
             contact_places=np.array(data.contact.pos[:count]).reshape(count, 3),

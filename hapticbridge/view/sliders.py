@@ -49,12 +49,9 @@ class Sliders:
                 _WORDS[span.axis], SYMBOLS[span.axis], UNITS[span.axis], strict=True
             )
         ]
-        self._stiffness = gui.add_slider(
-            labels[0], least, most[0], self._steps[0], min(max(stiffness, least), most[0])
-        )
-        self._damping = gui.add_slider(
-            labels[1], 0.0, most[1], self._steps[1], min(damping, most[1])
-        )
+        shown = self._shown(stiffness, damping, (least, 0.0), most)
+        self._stiffness = gui.add_slider(labels[0], least, most[0], self._steps[0], shown[0])
+        self._damping = gui.add_slider(labels[1], 0.0, most[1], self._steps[1], shown[1])
         self._stiffness.on_update(lambda _: want())
         self._damping.on_update(lambda _: want())
 
@@ -66,10 +63,8 @@ class Sliders:
     def show(self, stiffness: float, damping: float) -> tuple[float, float]:
         """Puts them to a stiffness and damping; returns what they then show."""
         self.bound(stiffness, damping)
-        shown = (
-            min(max(stiffness, self._stiffness.min), self._stiffness.max),
-            min(damping, self._damping.max),
-        )
+        most = self._stiffness.max, self._damping.max
+        shown = self._shown(stiffness, damping, (self._stiffness.min, 0.0), most)
         self._stiffness.value, self._damping.value = shown
         return shown
 
@@ -85,6 +80,17 @@ class Sliders:
             f"{symbols[1]} at {self._damping.max:g} {units[1]}"
         )
 
+    def _shown(
+        self,
+        stiffness: float,
+        damping: float,
+        least: tuple[float, float],
+        most: tuple[float, float],
+    ) -> tuple[float, float]:
+        near = (_near(v, step) for v, step in zip((stiffness, damping), self._steps, strict=True))
+        first, second = (min(max(*pair), end) for *pair, end in zip(near, least, most, strict=True))
+        return first, second
+
     def _ends(self, stiffness: float, damping: float, least: float) -> tuple[float, float]:
         steps, span = self._steps, self.span
         return (
@@ -95,6 +101,10 @@ class Sliders:
 
 def _step(most: float) -> float:
     return float(f"1e{math.floor(math.log10(FINENESS * most)):d}")
+
+
+def _near(value: float, step: float) -> float:
+    return float(f"{round(value / step) * step:.12g}")
 
 
 def _up(value: float, step: float) -> float:
