@@ -31,7 +31,7 @@ from hapticbridge.view.replay import Replay, Theatre  # noqa: E402
 WIDTH = 800
 """Of a picture in pixels; pages are drawn larger and made smaller, so that all of it fits."""
 
-SETTLED = 6.0
+SETTLED = 15.0
 """Seconds until a page without a graphics card has drawn what it was told."""
 
 
@@ -42,7 +42,9 @@ def save(tab: Tab, target: Path) -> None:
         image = Image.open(io.BytesIO((Path(folder) / "page.png").read_bytes())).convert("RGB")
     height = round(image.height * WIDTH / image.width)
     image = image.resize((WIDTH, height), Image.Resampling.LANCZOS)
-    image.quantize(256, dither=Image.Dither.NONE).save(target, optimize=True)
+    image.quantize(256, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE).save(
+        target, optimize=True
+    )
 
 
 def draw_view(tab: Tab, file: Path, target: Path) -> None:
@@ -50,7 +52,7 @@ def draw_view(tab: Tab, file: Path, target: Path) -> None:
     replay = Replay(file)
     theatre = Theatre(replay, Address("127.0.0.1", 0))
     moment = telling_time(read_recording(file), audit(file))
-    tab.open(theatre.url, 1200, 860)
+    tab.open(theatre.url, 1200, 900)
     tab.wait_for("document.querySelectorAll('canvas').length >= 5")
     theatre.slider.value = round(moment, 3)
     theatre.show(moment)

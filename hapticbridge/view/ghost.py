@@ -15,7 +15,7 @@ import mujoco
 import numpy as np
 import trimesh
 import viser
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from hapticbridge.film.stage import force_colour
 from hapticbridge.view.props import props_of
@@ -42,7 +42,7 @@ MOST_ASIDE = 0.3
 TURNS, POINTS = 9, 108
 """Of the spring."""
 
-_BLUE, _HAND = (26, 95, 180), (210, 75, 0)
+_BLUE, _HAND = (26, 95, 180), (230, 97, 0)
 
 
 class Ghost:
@@ -72,7 +72,7 @@ class Ghost:
         self._arrow = scene.add_arrows(
             "/force in the hand",
             nothing[:1],
-            _HAND,
+            linear(_HAND),
             shaft_radius=0.01 * extent,
             head_radius=0.025 * extent,
             head_length=0.06 * extent,
@@ -95,7 +95,7 @@ class Ghost:
         stretch = float(np.linalg.norm(way))
         self.allow(stretch)
         self._handle.position, self._handle.wxyz = sight.handle, sight.handle_turn
-        colour = np.round(255 * force_colour(strength, reference)).astype(np.uint8)
+        colour = linear(255.0 * force_colour(strength, reference))
         # it begins outside of what the hand holds, unless it truly ends at the tool
         start = sight.handle
         if self.times > 1 and stretch > 0.0:
@@ -106,12 +106,23 @@ class Ghost:
             start = start + min(aside, MOST_ASIDE * self._extent) * along
         end = start + self.times * way
         self._spring.points = coil(start, end, 0.02 * self._extent).astype(np.float32)
-        self._spring.colors = np.broadcast_to(colour, (POINTS, 2, 3)).copy()
+        self._spring.colors = np.full((POINTS, 2, 3), colour, dtype=np.uint8)
         self._arrow.visible = strength > 1e-3 * reference
         if self._arrow.visible:
             reach = LONGEST_ARROW * self._extent / max(reference, strength)
             points = np.array([[end, end - reach * sight.force]])
             self._arrow.points = points.astype(np.float32)
+
+
+def linear(colour: ArrayLike) -> tuple[int, int, int]:
+    """Returns a colour as viser wants it for lines and arrows, which it draws lighter than it is.
+
+    It takes their numbers, 0 to 255, for shares of light and not for sRGB.
+    """
+    share = np.asarray(colour, dtype=np.float64) / 255.0
+    light = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
+    red, green, blue = np.round(255.0 * light).astype(int).tolist()
+    return red, green, blue
 
 
 def shell(model: mujoco.MjModel, grip: str) -> trimesh.Trimesh:

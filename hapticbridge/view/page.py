@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from hapticbridge.felt import coupling_sentences, is_always_held
 from hapticbridge.kernel.state import RunParameters
 from hapticbridge.rendering import method_named
-from hapticbridge.view.ghost import LONGEST_ARROW, Ghost
+from hapticbridge.view.ghost import LONGEST_ARROW, Ghost, linear
 from hapticbridge.view.props import props_of
 from hapticbridge.view.sight import Sight
 from hapticbridge.view.trace import PLOTS
@@ -141,7 +141,9 @@ class Page:
             "head_radius": 0.016 * extent,
             "head_length": 0.04 * extent,
         }
-        self._pushes = scene.add_arrows("/contact forces", nothing, _CONTACT, **thin, visible=False)
+        self._pushes = scene.add_arrows(
+            "/contact forces", nothing, linear(_CONTACT), **thin, visible=False
+        )
         self._contacts = scene.add_point_cloud(
             "/contacts",
             np.zeros((1, 3), dtype=np.float32),
