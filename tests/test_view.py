@@ -42,6 +42,7 @@ from hapticbridge.view.window import Window
 pytest.importorskip("viser", reason="needs the extra 'view'")
 
 import websockets.exceptions
+from page_client import hand, said
 from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 
@@ -328,7 +329,8 @@ def test_the_server_answers_its_own_page_alone(replay: Replay) -> None:
         assert not is_let_in("127.0.0.1", port, additional_headers={"Host": "evil.example"})
         # viser's own way out to the internet is gone
         handlers = theatre._server._websock_server._incoming_handlers
-        assert not any(handlers[kind] for kind in handlers if "ShareUrl" in kind.__name__)
+        gone = ("ShareUrl", "FileTransferStart")  # nor does it keep files for anybody
+        assert not any(handlers[kind] for kind in handlers if kind.__name__.startswith(gone))
         with socket.socket() as probe, pytest.raises(OSError, match="refused"):
             probe.connect((OUTSIDE, port))  # served on loopback's first address alone
 
@@ -379,6 +381,18 @@ def test_a_browser_sees_the_tool_move_with_the_slider(replay: Replay, tmp_path: 
         own = ("data:", "blob:", theatre.url)
         assert [request[:99] for request in page.requests if not request.startswith(own)] == []
         assert page.complaints == []
+
+
+def test_whatever_a_browser_sends_for_the_time_the_replay_goes_on(
+    replay: Replay, capfd: pytest.CaptureFixture[str]
+) -> None:
+    with served(replay, Address("127.0.0.1", 0)) as (theatre, _), hand(theatre.url) as page:
+        for value in (float("nan"), float("inf"), -1e308, "x", None, [1.0], {"a": 1}):
+            page.send("time (s)", value=value)
+        page.send("play", value="x")
+        page.send("time (s)", value=1.2)
+        assert said(page, "**1.2").startswith("**1.200 s**")
+    assert "Traceback" not in capfd.readouterr().err
 
 
 def test_a_killed_view_and_ten_deaf_browsers_do_not_touch_the_run(

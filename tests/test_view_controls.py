@@ -40,6 +40,7 @@ from hapticbridge.view.show import Show
 pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 
 K, B = "stiffness K (N/m)", "damping B (N s/m)"
+KR, BR = "turning stiffness K_r (N m/rad)", "turning damping B_r (N m s/rad)"
 
 ATTACHED = (MODEL_ATTACHMENT, STATE_ATTACHMENT)
 
@@ -131,15 +132,47 @@ def test_nothing_that_is_sent_by_hand_exceeds_a_limit(tmp_path: Path) -> None:
         time.sleep(1.0)
         page.send(K, value=1500.0)  # the page still listens, and so does the run
         until(lambda: stiffness(bridge) == pytest.approx(1500.0))
+        page.send(KR, value=1e3)
+        assert "needs a device of 0.5 N m s/rad, and this one has 0.002" in said(page, "0.5 N m")
+        for value in (float("nan"), -1.0, None, [1.0], "x"):
+            page.send(BR, value=value)
+        time.sleep(0.5)
+        page.send(KR, value=3.0)
+        until(lambda: bridge._binding.state["rotational_stiffness"][0] == pytest.approx(3.0))
         needs = bridge._binding.state[0]
+        assert (
+            needs["rotational_stiffness"] * bridge.period / 2 + needs["rotational_damping"] <= 2e-3
+        )
         assert needs["stiffness"] * bridge.period / 2 + needs["damping"] <= 2.0
     recording = read_recording(tmp_path / "run.mcap")
     told = events(tmp_path / "run.mcap", "coupling")
     assert told
     for event in told:
         assert event["stiffness"] * 1e-3 / 2 + event["damping"] <= 2.0 * (1 + 1e-9)
+        turning = event["rotational_stiffness"] * 1e-3 / 2 + event["rotational_damping"]
+        assert turning <= 2e-3 * (1 + 1e-9)
+    assert told[-1]["rotational_stiffness"] == 3.0
     assert recording.ticks.size
-    assert audit(tmp_path / "run.mcap").verdict == "passive"
+    report = audit(tmp_path / "run.mcap")
+    assert (report.verdict, report.resimulation) == ("passive", "bit for bit")
+
+
+def test_why_a_recorder_did_not_start_stays_on_the_page(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with running(tmp_path) as (bridge, window), hand(window.url) as page:
+        page.send("stop recording", value=True)
+        said(page, "not recording")
+        until(lambda: not bridge._stream.is_recording)
+        monkeypatch.setattr(bridge, "_next_path", lambda: tmp_path / "no folder" / "run.mcap")
+        time.sleep(1.0)  # the least time between two pauses
+        page.send("stop recording", value=True)  # the same button, which has another label now
+        reason = said(page, "refused")
+        assert "no folder" in reason
+        assert "not recording" in reason
+        # nor does the force that comes back take it away
+        page.send("force", value=False)
+        assert "no folder" in said(page, "the force is off")
 
 
 def test_the_page_starts_a_recorder_in_mid_run_and_says_where(tmp_path: Path) -> None:

@@ -61,8 +61,9 @@ class Replay:
 
     def at(self, moment: float) -> Sight:
         """Returns the instant nearest to a time in s; the first for what is no time."""
-        number = round(moment / self.step) if math.isfinite(moment) else 0
-        return self.sights[min(max(number, 0), len(self.sights) - 1)]
+        if math.isnan(moment):
+            return self.sights[0]
+        return self.sights[round(min(max(moment / self.step, 0.0), len(self.sights) - 1.0))]
 
 
 class Theatre:
@@ -102,7 +103,7 @@ class Theatre:
         if len(replay.trace) > 1:
             self._page.plot(*replay.trace.curves())
         self.show(0.0)
-        self.slider.on_update(lambda _: self.show(self._asked()))
+        self.slider.on_update(lambda _: self.show(self.slider.value))
 
     def show(self, moment: float) -> None:
         """Shows the instant nearest to a time in s."""
@@ -110,18 +111,13 @@ class Theatre:
         self._page.show(sight)
         self._page.status.content = f"**{sight.time:.3f} s**, {np.linalg.norm(sight.force):.2f} N"
 
-    def _asked(self) -> float:
-        """Returns the time that the slider shows; a browser may send anything."""
-        asked: object = self.slider.value
-        return float(asked) if isinstance(asked, int | float) else 0.0
-
     def play(self, is_over: threading.Event) -> None:
         """Moves the slider with the time where that is asked for, until it is over."""
         before = time.monotonic()
         while not is_over.wait(FRAME):
             now, last = time.monotonic(), self._replay.sights[-1].time
             if self._playing.value:
-                following = self._asked() + now - before
+                following = self.slider.value + now - before
                 self.slider.value = following if 0.0 <= following <= last else 0.0
                 self.show(self.slider.value)
             before = now

@@ -88,7 +88,9 @@ def _behind(address: Address) -> Iterator[None]:
 
     # viser looks the name up in its server's thread, which runs once ViserServer() returns
     module.serve = guarded
-    logging.getLogger("websockets.server").setLevel(logging.CRITICAL)  # refusals are no news
+    # refusals are no news, nor is what viser cannot read of what a browser sends
+    for name in ("websockets.server", "asyncio"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)
     try:
         yield
     finally:
