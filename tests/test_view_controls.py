@@ -21,9 +21,11 @@ from test_bridge_commands import FLOOR, Script, swaying
 
 from hapticbridge.audit import audit
 from hapticbridge.bridge import Bridge
+from hapticbridge.clock import SimulatedClock
 from hapticbridge.commands import Couple, Record, Reset, Switch, command_of
 from hapticbridge.commands.command import Stop
-from hapticbridge.errors import HapticBridgeError
+from hapticbridge.errors import HapticBridgeError, SafetyTrip
+from hapticbridge.guard import Limits
 from hapticbridge.provenance import MODEL_ATTACHMENT, STATE_ATTACHMENT
 from hapticbridge.recording import Ring, read_recording
 from hapticbridge.view.address import Address
@@ -265,3 +267,30 @@ def test_what_was_asked_for_while_the_view_was_behind_is_known_to_it_all_the_sam
     np.testing.assert_allclose(sight.places[body], last["tool_position"], atol=5e-4)
     used = recording.events[[e["event"] for e in recording.events].index("coupling")]
     assert show._run.binding.state["stiffness"][0] == used["stiffness"]
+
+
+@pytest.mark.parametrize(("stretch", "why"), [(0.2, "duration"), (1e-6, "stretch limit")])
+def test_the_page_keeps_its_last_picture_and_says_why_the_run_ended(
+    tmp_path: Path, stretch: float, why: str
+) -> None:
+    scene, window = tmp_path / "floor.xml", Window(Address("127.0.0.1", 0))
+    scene.write_text(FLOOR)
+    bridge = Bridge(
+        str(scene),
+        ScriptedDevice(swaying),
+        LOOSE,
+        clock=SimulatedClock(),
+        onlooker=window,
+        limits=Limits(force=10.0, torque=0.5, stretch=stretch),
+    )
+    told: list[str] = []
+    stack = contextlib.ExitStack()
+    with contextlib.suppress(SafetyTrip), bridge:
+        page = stack.enter_context(hand(window.url))
+        reader = threading.Thread(target=lambda: told.append(said(page, "The run is over")))
+        reader.start()
+        bridge.run(0.3)
+    reader.join()
+    with contextlib.suppress(Exception):  # the page is gone
+        stack.close()
+    assert why in told[0]

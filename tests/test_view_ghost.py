@@ -13,10 +13,11 @@ from hypothesis import strategies as st
 
 pytest.importorskip("viser", reason="needs the extra 'view'")
 
+import trimesh
+
 from hapticbridge.view.ghost import (
     FARTHEST,
     LONGEST_ARROW,
-    MOST_ASIDE,
     MOST_TIMES,
     SHELL,
     Ghost,
@@ -24,6 +25,7 @@ from hapticbridge.view.ghost import (
     enlargement,
     linear,
     shell,
+    way_out,
 )
 from hapticbridge.view.sight import Sight
 
@@ -100,8 +102,9 @@ def test_spring_and_arrow_point_to_where_the_hand_is_pulled(stretch: float) -> N
         np.testing.assert_allclose(end, seen.grip, atol=1e-6)
     else:
         assert ghost.times == MOST_TIMES
-        top = shell(mujoco.MjModel.from_xml_string(TOOL), "grip").vertices[:, 2].max()
-        assert start[2] - seen.handle[2] == pytest.approx(min(top, MOST_ASIDE), abs=1e-6)
+        # out of the box, which is turned by 20 degrees, on its side of 0.06 m or at its end
+        out = min((0.06 + SHELL) / np.sin(np.radians(20)), 0.2 + SHELL + 0.05)
+        assert 0.1 < start[2] - seen.handle[2] <= out
         np.testing.assert_allclose(end - start, (0, 0, ghost.times * stretch), atol=1e-6)
     tail, tip = stage.__dict__["/force in the hand"].points[0]
     np.testing.assert_allclose(tail, end, atol=1e-6)
@@ -118,6 +121,16 @@ def test_the_spring_is_green_at_rest_and_red_at_the_largest_force() -> None:
         found.append((red, green))
     assert found[0][1] > 3 * found[0][0]
     assert found[1][0] > 3 * found[1][1]
+
+
+def test_the_way_out_is_to_the_last_surface() -> None:
+    balls = [trimesh.creation.icosphere(subdivisions=4, radius=radius) for radius in (0.5, 1.0)]
+    balls[1].apply_translation((0, 0, 3.0))
+    triangles = np.concatenate([ball.triangles for ball in balls])
+    assert way_out(triangles, np.array([0.0, 0, 1])) == pytest.approx(4.0, rel=1e-3)
+    for along in ((1, 0, 0), (0, 0, -1), (0.6, 0.0, -0.8)):
+        assert way_out(triangles, np.array(along, float)) == pytest.approx(0.5, rel=5e-3)
+    assert way_out(balls[1].triangles, np.array([1.0, 0, 0])) == 0.0
 
 
 @given(st.floats(1e-9, 10.0), st.floats(0.0, 10.0))

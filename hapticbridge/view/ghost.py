@@ -36,9 +36,6 @@ SHELL = 0.012
 """Of the scene's extent: how far the shell is from the tool. Nearer it flickers, farther it looks
 like another tool."""
 
-MOST_ASIDE = 0.3
-"""Of the scene's extent: how far from the handle an enlarged spring begins at most."""
-
 TURNS, POINTS = 9, 108
 """Of the spring."""
 
@@ -63,8 +60,9 @@ class Ghost:
         self._longest, self.times = 0.0, 1
         self._handle = scene.add_frame("/handle", show_axes=False)
         faces = np.asarray(self._shell.faces)
-        self._corners = np.asarray(self._shell.vertices)
-        scene.add_mesh_simple("/handle/shell", self._corners, faces, color=_BLUE, opacity=0.3)
+        corners = np.asarray(self._shell.vertices)
+        self._triangles = corners[faces]
+        scene.add_mesh_simple("/handle/shell", corners, faces, color=_BLUE, opacity=0.3)
         nothing = np.zeros((POINTS, 2, 3), dtype=np.float32)
         self._spring = scene.add_line_segments(
             "/coupling", nothing, (0, 0, 0), thickness=0.012 * extent
@@ -102,8 +100,8 @@ class Ghost:
             turn = np.zeros(9)
             mujoco.mju_quat2Mat(turn, sight.handle_turn)
             along = way / stretch
-            aside = float((self._corners @ (turn.reshape(3, 3).T @ along)).max())
-            start = start + min(aside, MOST_ASIDE * self._extent) * along
+            aside = way_out(self._triangles, turn.reshape(3, 3).T @ along)
+            start = start + aside * along
         end = start + self.times * way
         self._spring.points = coil(start, end, 0.02 * self._extent).astype(np.float32)
         self._spring.colors = np.full((POINTS, 2, 3), colour, dtype=np.uint8)
@@ -153,6 +151,30 @@ def shell(model: mujoco.MjModel, grip: str) -> trimesh.Trimesh:
     if not parts:
         return trimesh.creation.icosphere(subdivisions=2, radius=2.0 * away)
     return trimesh.util.concatenate(parts)
+
+
+def way_out(triangles: Array, along: Array) -> float:
+    """Returns how far it is from the origin to the last surface in a direction, in m, or 0.
+
+    Args:
+        triangles: Of the surfaces, (m, 3, 3) in m.
+        along: A unit vector.
+
+    References:
+        Möller & Trumbore, "Fast, minimum storage ray–triangle intersection", 1997.
+    """
+    first, second = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
+    across = np.cross(along, second)
+    volume = np.einsum("ij,ij->i", first, across)
+    meets = np.abs(volume) > 1e-30
+    first, second, across = first[meets], second[meets], across[meets]
+    back, volume = -triangles[meets, 0], volume[meets]
+    u = np.einsum("ij,ij->i", back, across) / volume
+    other = np.cross(back, first)
+    v = other @ along / volume
+    far = np.einsum("ij,ij->i", second, other) / volume
+    is_hit = (u >= -1e-9) & (v >= -1e-9) & (u + v <= 1.0 + 1e-9) & (far > 0.0)
+    return float(far[is_hit].max(initial=0.0))
 
 
 def enlargement(room: float, stretch: float) -> int:
