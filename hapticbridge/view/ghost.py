@@ -36,7 +36,7 @@ SHELL = 0.012
 """Of the scene's extent: how far the shell is from the tool. Nearer it flickers, farther it looks
 like another tool."""
 
-TURNS, POINTS = 9, 108
+TURNS, POINTS = 8, 64
 """Of the spring."""
 
 _BLUE, _HAND = (26, 95, 180), (230, 97, 0)

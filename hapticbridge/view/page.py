@@ -27,7 +27,8 @@ _AXES: tuple[dict[str, Any], ...] = ({"size": 22, **_SMALL}, {"size": 52, **_SMA
 
 _COLOURS_MEAN = (
     "Blue ghost: the handle. Spring: the coupling, {length}, green at rest, red at the largest "
-    "force. Orange: the force on the hand. Turquoise: contacts and their forces."
+    "force. Orange arrow: the force on the hand, the longest is {longest} N. Turquoise: contacts "
+    "and their forces, the longest is {strongest} N."
 )
 
 _CONTACT = (77, 208, 225)
@@ -53,12 +54,12 @@ class Page:
         reference: float,
     ) -> None:
         self._server, self.reference = server, reference
-        self._extent = float(model.stat.extent)
+        self._extent, self._strongest = float(model.stat.extent), 0.0
         self._build_scene(model)
         self._ghost = Ghost(server.scene, model, parameters.grip)
         server.gui.set_panel_label(f"hapticbridge: {facts.get('scene', '')}")
         self.status = server.gui.add_markdown("waiting for the first tick")
-        self._told, self._times = _told(model, parameters, facts), 0
+        self._told = _told(model, parameters, facts)
         self._plots: list[viser.GuiUplotHandle] = []
 
     def add_curves(self) -> None:
@@ -87,15 +88,21 @@ class Page:
             )
         gui.add_markdown(self._told)
 
-    def allow(self, stretch: float) -> None:
-        """Makes room for a distance between handle and tool, in m."""
-        self._ghost.allow(stretch)
+    def allow(self, sights: Sequence[Sight]) -> None:
+        """Makes room for what is known to come."""
+        for sight in sights:
+            self._ghost.allow(float(np.linalg.norm(sight.handle - sight.grip)))
+            self._strongest = max(self._strongest, _strongest(sight))
 
     def _explain(self) -> None:
-        if self._times != self._ghost.times:
-            self._times = times = self._ghost.times
-            length = f"{times} times as long as it is" if times > 1 else "as long as it is"
-            self._words.content = _COLOURS_MEAN.format(length=length)
+        times = self._ghost.times
+        said = _COLOURS_MEAN.format(
+            length=f"{times} times as long as it is" if times > 1 else "as long as it is",
+            longest=f"{self.reference:.2g}",
+            strongest=f"{max(self._strongest, self.reference):.2g}",
+        )
+        if self._words.content != said:
+            self._words.content = said
 
     def show(self, sight: Sight) -> None:
         """Draws an instant."""
@@ -158,8 +165,8 @@ class Page:
         self._server.initial_camera.near = 0.01 * extent
 
     def _show_contacts(self, sight: Sight) -> None:
-        strength = float(np.linalg.norm(sight.force))
-        reach = LONGEST_ARROW * self._extent / max(self.reference, strength)
+        self._strongest = max(self._strongest, self.reference, _strongest(sight))
+        reach = LONGEST_ARROW * self._extent / self._strongest
         touches = bool(len(sight.contact_places))
         self._contacts.visible = self._pushes.visible = touches
         if touches:
@@ -167,6 +174,12 @@ class Page:
             self._contacts.points = places
             tips = places + reach * sight.contact_forces
             self._pushes.points = np.stack([places, tips], axis=1).astype(np.float32)
+
+
+def _strongest(sight: Sight) -> float:
+    """Returns the largest force of an instant; a lever's contacts carry far more than the hand."""
+    contacts = np.linalg.norm(sight.contact_forces, axis=1)
+    return float(max(np.linalg.norm(sight.force), contacts.max(initial=0.0)))
 
 
 def _told(model: mujoco.MjModel, parameters: RunParameters, facts: dict[str, str]) -> str:

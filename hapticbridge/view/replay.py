@@ -98,7 +98,7 @@ class Theatre:
             dict(stage.recording.meta),
             stage.reference,
         )
-        self._page.allow(max(float(np.linalg.norm(s.handle - s.grip)) for s in replay.sights))
+        self._page.allow(replay.sights)
         self._page.add_curves()
         if len(replay.trace) > 1:
             self._page.plot(*replay.trace.curves())
