@@ -41,11 +41,6 @@ def turns(values: Array, before: Array) -> Array:
     return turn_between(np.concatenate([before[None], values[:-1]]), values)
 
 
-def product_conjugate(values: Array, before: Array) -> Array:
-    """Returns q_k ⊗ q_{k−1}⁻¹ over rows (n, 4), with q_{−1} = before."""
-    return quaternion_product(values, conjugate(np.concatenate([before[None], values[:-1]])))
-
-
 def summed(values: Array, before: float) -> Array:
     """Returns the sums up to each of the values, of what was before too.
 
