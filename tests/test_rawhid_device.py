@@ -14,7 +14,7 @@ from rawhid_cases import PERIOD, opened, paddle
 from scipy.spatial.transform import Rotation
 
 from hapticbridge.device import SimulatedDevice
-from hapticbridge.device.base import AXES
+from hapticbridge.device.data_sheet import AXES
 from hapticbridge.device.plugged import tell_nobody
 from hapticbridge.device.rawhid.driver import LONGEST_SILENCE, RawHidDevice
 from hapticbridge.device.rawhid.finding import open_rawhid

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from hapticbridge.audit.interventions import Interventions
 from hapticbridge.audit.watched import Seen, Watch
-from hapticbridge.kernel.state import RunParameters
+from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.watch import DEVICE_BUTTONS
 from hapticbridge.recording import RecordingFile
 from hapticbridge.tick import CLOCK_FIELDS, TICK_DTYPE, TickFlag

@@ -14,8 +14,9 @@ from hapticbridge.check.rehearsal import rehearsal_parameters
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import SceneError
 from hapticbridge.jit import direct
+from hapticbridge.kernel.codes import OK
 from hapticbridge.kernel.state import Binding
-from hapticbridge.kernel.step import OK, after_step, before_step
+from hapticbridge.kernel.step import after_step, before_step
 from hapticbridge.ledger import Ledger
 from hapticbridge.scene import Scene
 

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import SceneError
 from hapticbridge.kernel.parameters import RunParameters
+from hapticbridge.kernel.simulation import simulate
 from hapticbridge.kernel.state import Binding
-from hapticbridge.kernel.step import simulate
 from hapticbridge.ledger import Ledger
 from hapticbridge.rendering import default_method, prepare
 from hapticbridge.scene import Scene

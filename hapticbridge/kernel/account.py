@@ -10,11 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.jit import compiled
+from hapticbridge.kernel.codes import CONTROLLER_ACTIVE
 from hapticbridge.kernel.guarding import DAMPER, ENVIRONMENT, TANK
 from hapticbridge.pose import Vector, scaled
-
-CONTROLLER_ACTIVE = 32
-"""Of ``TickFlag``: the compiler cannot read an enumeration."""
 
 THRESHOLD = 1e-5
 """In J. The controller acts on a debt above it. Rounding and the first-order error of turning tools

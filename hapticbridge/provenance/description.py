@@ -15,8 +15,9 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.kernel.guarding import UNGUARDED, Guarding
+from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.scheme import WELD
-from hapticbridge.kernel.state import Binding, RunParameters
+from hapticbridge.kernel.state import Binding
 from hapticbridge.provenance.metadata import meta_count, meta_float, meta_numbers
 from hapticbridge.provenance.start import (
     STARTS,

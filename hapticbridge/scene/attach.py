@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 
 from hapticbridge.errors import SceneError, choices
-from hapticbridge.kernel.state import COUPLING_ACTUATORS, HANDLE
+from hapticbridge.kernel.names import COUPLING_ACTUATORS, HANDLE
 
 _PREFIX = "hapticbridge_"
 """Keeps the default class that comes along with the handle apart from the scene's classes."""

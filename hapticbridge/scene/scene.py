@@ -10,7 +10,7 @@ import numpy as np
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import SceneError
-from hapticbridge.kernel.state import COUPLING_ACTUATORS, WELD_NAME
+from hapticbridge.kernel.names import COUPLING_ACTUATORS, WELD_NAME
 from hapticbridge.scene.compiler import compiled
 from hapticbridge.scene.source import SourceFile
 from hapticbridge.scene.start import go_to_start

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import mujoco
 
-from hapticbridge.kernel.state import HANDLE
+from hapticbridge.kernel.names import HANDLE
 
 START_KEYFRAME = "home"
 """Name of the keyframe that a scene starts from, if it has one."""

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import SceneError
-from hapticbridge.kernel.state import HANDLE, WELD_NAME
+from hapticbridge.kernel.names import HANDLE, WELD_NAME
 from hapticbridge.scene.start import go_to_start
 
 IMPEDANCE = 0.95

@@ -23,7 +23,7 @@ from ctypes import byref, c_double, c_ushort
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.device.base import AXES, DeviceInfo, checked_period
+from hapticbridge.device.data_sheet import AXES, DeviceInfo, checked_period
 from hapticbridge.device.forcedimension.library import (
     MOST_WATCHDOG,
     SATURATED,

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.device.base import AXES, checked_period
+from hapticbridge.device.data_sheet import AXES, checked_period
 from hapticbridge.device.last_word import LastWord
 from hapticbridge.device.rawhid.frame import (
     LARGEST,

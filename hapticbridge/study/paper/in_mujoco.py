@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import SceneError
+from hapticbridge.kernel.codes import OK
 from hapticbridge.kernel.state import Binding
-from hapticbridge.kernel.step import OK, after_step, before_step
+from hapticbridge.kernel.step import after_step, before_step
 from hapticbridge.passivity import WorstHand
 from hapticbridge.passivity.stability import threshold
 from hapticbridge.rendering import IMPLICIT, prepare
