@@ -139,10 +139,10 @@ def test_jobs_are_processes_at_most(monkeypatch: pytest.MonkeyPatch, runs: Path)
     monkeypatch.setattr(processes, "ProcessPoolExecutor", Counting)
     monkeypatch.setattr(processes, "cores", lambda: 64)
     files = find_recordings([runs])
-    for jobs, processes in ((3, 3), (50, len(files))):
+    for jobs, expected in ((3, 3), (50, len(files))):
         with pytest.raises(OSError, match="no processes"):
             audit_all(files, jobs=jobs)
-        assert counts.pop() == processes
+        assert counts.pop() == expected
     assert len(audit_all(files, jobs=None)) == len(files)  # few: in this process
     assert not counts
     wrong: Any
