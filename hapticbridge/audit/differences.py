@@ -1,4 +1,4 @@
-"""From tick to tick, over whole arrays: steps, turns, sums, and the time since the force rose."""
+"""From tick to tick, over whole arrays: steps, turns and sums."""
 
 from __future__ import annotations
 

@@ -22,7 +22,6 @@ TANK_START = 5e-3
 """In J: what the tank holds at first. It must lend what a spring gives back before the account has
 seen it: 5 N at 2400 N/m hold 5 mJ. More lets a larger kick pass, less softens contacts."""
 
-
 SWINGS, WINDOW = 4, 8
 """So many reversals of the motion within so many ticks tell that an axis swings from sample to
 sample. A mass of 0.1 kg on 40 000 N/m reverses once in five ticks, a worst hand in each."""

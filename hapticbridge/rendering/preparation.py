@@ -28,7 +28,6 @@ _INTEGRATORS = {
     "discrete": mujoco.mjtIntegrator.mjINT_DISCRETE,
 }
 
-
 _ARGUMENTS = Arguments(SceneError)
 
 MEASURED_AGAIN = 1e-6

@@ -31,7 +31,6 @@ _KINDS: dict[int, Kind] = {
     mujoco.mjtGeom.mjGEOM_MESH: "mesh",
 }
 
-
 _WITHOUT = (
     mujoco.mjtDisableBit.mjDSBL_CONTACT,
     mujoco.mjtDisableBit.mjDSBL_CONSTRAINT,

@@ -42,7 +42,6 @@ step with a free light tool keeps about 3e-8 N alive, which neither grows nor fa
 TOLERANCE = 1e-4
 """Relative width at which a bisection ends: less than what ``TICKS`` let one tell."""
 
-
 Hand = Callable[[float], float]
 """Takes the force on the device in N that is held from now on, returns the handle's next step in
 m/s of mean velocity."""
