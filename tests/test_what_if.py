@@ -16,10 +16,12 @@ from cli_cases import Called
 
 from hapticbridge.bridge import Bridge
 from hapticbridge.commands import Command, Couple, Record, Reset, Switch
+from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo, Hand
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.provenance import SOURCE_PREFIX
 from hapticbridge.recording import read_recording
+from hapticbridge.scene import load_scene
 from hapticbridge.tick import TICK_DTYPE
 from hapticbridge.whatif import WhatIf, WhatIfRun, changes_from, what_if
 from hapticbridge.whatif.intent import intended
@@ -210,6 +212,37 @@ def test_the_model_hand_gives_way_as_a_spring_against_a_spring_does(softer: What
     assert deep[1] - deep[0] > 1e-3
 
 
+@pytest.mark.parametrize(
+    ("changes", "live"),
+    [
+        ({"stiffness": 600, "damping": 0.6}, {"coupling": (600.0, 0.6)}),
+        ({"rate": 2000}, {"rate": 2000}),
+        ({"distance": 0.012, "mass": 0.1}, {"scene": {"distance": 0.012, "mass": 0.1}}),
+    ],
+)
+def test_the_closed_loop_is_what_a_live_run_with_that_setting_does(
+    changes: dict[str, Any], live: dict[str, Any], wall: Path, softer: WhatIf, tmp_path: Path
+) -> None:
+    """The same simulated hand, asked directly; the what-if knows only what it did elsewhere."""
+    scene = load_scene("virtual_wall", **live.pop("scene", {}))
+    stiffness, damping = live.pop("coupling", (2400.0, 1.7))
+    coupling = Coupling(
+        stiffness=stiffness, damping=damping, rotational_stiffness=2.4, rotational_damping=1.7e-3
+    )
+    path, hand = tmp_path / "live.mcap", wall.with_name("hand.csv")
+    recorded(path, scene, f"simulated:path={hand}", coupling, duration=DURATION, **live)
+    truth, before = read_recording(path).ticks, softer.runs[0].ticks
+    found = softer if "stiffness" in changes else what_if(wall, changes)
+    guess = run_of(found, "closed loop").ticks
+    assert len(guess) == len(truth)
+    off = np.abs(guess["device_position"] - truth["device_position"]).max()
+    assert off < 0.15e-3  # of 20 mm
+    forces = [np.linalg.norm(t["wrench_on_tool"][:, :3], axis=1) for t in (guess, truth, before)]
+    assert np.abs(forces[0] - forces[1]).max() < 0.05 * forces[1].max()
+    if "rate" not in changes:  # and it is not what was recorded
+        assert np.abs(forces[2] - forces[1]).max() > 0.2 * forces[1].max()
+
+
 def test_the_model_hand_follows_the_recording_where_nothing_changed(softer: WhatIf) -> None:
     travel = np.ptp(softer.runs[0].ticks["device_position"], axis=0).max()
     assert travel > 5e-3
@@ -328,7 +361,7 @@ def test_the_command_shows_runs_side_by_side_and_draws_them(
     command = ("audit", wall, "--what-if", "stiffness=5000", "--plot", picture)
     code, out, err = call(*command)
     assert code == 1  # 2 N s/m do not bear it
-    assert "stiffness: 2400 -> 5000 N/m" in out
+    assert "stiffness: 2400 N/m -> 5000 N/m" in out
     assert out.index("recorded") < out.index("prescribed") < out.index("closed loop")
     assert "off the recorded motion" in err
     assert picture.stat().st_size > 10_000
