@@ -3,49 +3,30 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import report_runs
-from audit_cases import rewritten
 from chromium import browser
 from PIL import Image
+from report_runs import Made
 
-from hapticbridge.audit import AuditReport, audit
+from hapticbridge.audit import audit
 from hapticbridge.kernel.guarding import TANK
-from hapticbridge.quantity import quantity
 from hapticbridge.recording import Recording, read_recording
 from hapticbridge.report import write_report
-from hapticbridge.report.cause import likely_cause
 from hapticbridge.report.energies import draw_energies
 from hapticbridge.report.evidence import Evidence
 from hapticbridge.report.facts import MOST_EVENTS, event_rows, guard_facts
+from hapticbridge.report.likely import likely_cause
 from hapticbridge.report.motion import draw_motion
 from hapticbridge.report.panels import BINS
 from hapticbridge.report.timing import activities, draw_timing
 from hapticbridge.tick import TickFlag
 
 pytestmark = pytest.mark.filterwarnings("ignore:scene '.*floor.xml'")
-
-Made = Callable[[Callable[[Path], Path]], tuple[Recording, AuditReport]]
-
-
-@pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
-    """Makes a golden recording once, and judges it."""
-    folder, kept = tmp_path_factory.mktemp("golden"), {}
-
-    def make(run: Callable[[Path], Path]) -> tuple[Recording, AuditReport]:
-        if run not in kept:
-            path = run(folder)
-            kept[run] = read_recording(path), audit(path)
-        return kept[run]
-
-    return make
 
 
 def evidence_of(recording: Recording) -> Evidence:
@@ -54,97 +35,11 @@ def evidence_of(recording: Recording) -> Evidence:
     return evidence
 
 
-@pytest.mark.parametrize(
-    ("run", "port", "kind", "told"),
-    [
-        (report_runs.active_by_method, "environment", "method", "implicitfast"),
-        (report_runs.active_by_contact, "environment", "contact setting", 'solref "-20000 -50"'),
-        (report_runs.active_by_rate, "device", "rate", "at 2500 Hz translation would hold"),
-        (report_runs.active_by_delay, "device", "delay", "2 ticks old"),
-        (report_runs.active_by_quantisation, "device", "quantisation", "0.45 N"),
-    ],
-)
-def test_a_run_is_active_for_the_cause_that_it_was_made_for(
-    run: Callable[[Path], Path], port: str, kind: str, told: str, made: Made, tmp_path: Path
-) -> None:
-    recording, report = made(run)
-    assert (report.verdict, report.port) == ("active", port)
-    evidence = evidence_of(recording)
-    cause = likely_cause(evidence, report)
-    assert cause is not None
-    assert cause.kind == kind
-    assert told in cause.evidence
-    energy, allowed = evidence.judged(report)
-    assert energy[report.tick] - allowed[report.tick] == pytest.approx(report.joules)
-    page = tmp_path / "page.html"
-    write_report(recording, report, page)
-    text = page.read_text(encoding="utf-8")
-    assert f"Likely cause: <strong>{kind}</strong>" in text
-    assert f"<td>{report.tick}, at {report.tick * 1e-3:.3f} s</td>" in text  # type: ignore[operator]
-    assert f"{quantity(report.joules, 'J')} there" in text
-
-
-def test_the_same_run_without_its_cause_is_given_another_one(made: Made, tmp_path: Path) -> None:
-    # the device of the coarse encoder, with enough friction to hold still between its steps
-    recording, report = made(report_runs.active_by_quantisation)
-    sheet = recording.meta["device"].replace('"friction": 0.0', '"friction": 0.5')
-    assert sheet != recording.meta["device"]
-    changed = rewritten(recording, tmp_path / "rubbed.mcap", meta={"device": sheet})
-    evidence = evidence_of(read_recording(changed))
-    cause = likely_cause(evidence, report)
-    assert cause is not None
-    assert cause.kind == "rate"
-
-
-def cause_of(recording: Recording, report: AuditReport, **parts: Any) -> tuple[str, str]:
-    cause = likely_cause(evidence_of(Recording(**{**vars(recording), **parts})), report)
-    assert cause is not None
-    return cause.kind, cause.evidence
-
-
-def test_missed_deadlines_are_the_cause_where_the_device_bears_the_coupling(made: Made) -> None:
-    recording, report = made(report_runs.active_by_rate)
-    assert report.tick is not None
-    sheet = recording.meta["device"].replace('"damping": 2.0', '"damping": 20.0')
-    assert sheet != recording.meta["device"]
-    meta, ticks = recording.meta | {"device": sheet}, recording.ticks.copy()
-    assert cause_of(recording, report, meta=meta)[0] == "unknown"
-    ticks["flags"][[report.tick - 500, report.tick + 1]] |= int(TickFlag.OVERRUN)
-    assert cause_of(recording, report, meta=meta, ticks=ticks)[0] == "unknown"  # not before it
-    ticks["flags"][report.tick - 100 : report.tick - 97] |= int(TickFlag.OVERRUN)
-    kind, told = cause_of(recording, report, meta=meta, ticks=ticks)
-    assert (kind, told[:24]) == ("rate", "3 deadlines were missed ")
-
-
-def test_swings_over_many_steps_of_the_encoder_are_not_its_quantisation(made: Made) -> None:
-    recording, report = made(report_runs.active_by_rate)
-    sheet = recording.meta["device"].replace('"resolution": 0.0', '"resolution": 1e-9')
-    assert sheet != recording.meta["device"]
-    assert cause_of(recording, report, meta=recording.meta | {"device": sheet})[0] == "rate"
-
-
-def test_a_hard_contact_is_the_cause_also_behind_a_method_with_a_hazard(made: Made) -> None:
-    recording, report = made(report_runs.active_by_contact)
-    meta = recording.meta | {"method": "implicitfast"}
-    assert cause_of(recording, report, meta=meta)[0] == "contact setting"
-
-
 def test_asked_for_strictly_the_slack_is_not_allowed(made: Made) -> None:
     recording, report = made(report_runs.active_by_contact)
     evidence = evidence_of(recording)
     assert evidence.judged(report)[1].any()
     assert not evidence.judged(replace(report, environment="within slack"))[1].any()
-
-
-def test_bodies_that_were_moved_are_the_cause_before_any_contact(made: Made) -> None:
-    recording, report = made(report_runs.active_by_contact)
-    assert report.tick is not None
-    moved = {"event": "input", "tick": report.tick - 5, "writes": [["mocap_pos", 0, [0, 0, 1]]]}
-    kind, told = cause_of(recording, report, events=[*recording.events, moved])
-    assert kind == "inputs"
-    assert "moved 1 times" in told
-    later = moved | {"tick": report.tick + 1}
-    assert cause_of(recording, report, events=[*recording.events, later])[0] == "contact setting"
 
 
 def test_a_passive_run_has_no_moment_and_no_cause(run_file: Path, tmp_path: Path) -> None:

@@ -16,7 +16,6 @@ from hapticbridge.picture import inline_svg
 from hapticbridge.provenance import meta_float
 from hapticbridge.quantity import quantity
 from hapticbridge.recording import Recording
-from hapticbridge.report.cause import likely_cause
 from hapticbridge.report.curves import draw_recording
 from hapticbridge.report.energies import draw_energies
 from hapticbridge.report.evidence import Evidence
@@ -30,6 +29,7 @@ from hapticbridge.report.facts import (
     run_facts,
     software_facts,
 )
+from hapticbridge.report.likely import likely_cause
 from hapticbridge.report.moment import draw_moment
 from hapticbridge.report.motion import draw_motion
 from hapticbridge.report.timing import activities, draw_timing
