@@ -164,8 +164,8 @@ class LossyDevice(SimulatedDevice):
 
     _reads = 0
 
-    def start(self, period: float) -> NDArray[np.void]:
-        self._last = super().start(period)
+    def start(self, period: float, parts: int = 1) -> NDArray[np.void]:
+        self._last = super().start(period, parts)
         return self._last.copy()
 
     def read(self, sample: NDArray[np.void]) -> int:

@@ -64,11 +64,9 @@ def check_contacts(
         is_thorough: Whether to say too where a contact is soft or solved with the approximate
             diagonal: MuJoCo's defaults, for which nobody asked. Otherwise only what is likely to
             create more energy than the slack allows.
-        only: Pairs of geoms to look at, whether of the tool or not; None: all that the tool can
-            have.
+        only: Pairs of geoms to look at; None: all that the tool can have.
     """
-    option = model.opt
-    where: dict[ContactSetting, list[str]] = {}
+    option, where = model.opt, dict[ContactSetting, list[str]]()
     pairs = contact_settings(model, grip) if only is None else settings_among(model)
     for first, second, setting in pairs:
         if only is not None and frozenset((first, second)) not in only:
