@@ -166,5 +166,5 @@ def _told(model: mujoco.MjModel, parameters: RunParameters, facts: dict[str, str
         is_always_held=is_always_held(model, parameters.grip),
     )
     lines = [f"Method **{method.name}**, {1 / parameters.period:g} Hz", *sentences]
-    lines.append("Orange: force in the hand. Spring: green at rest, red at the largest force.")
+    lines.append("Orange: force in the hand. Spring: pale at rest, red at the largest force.")
     return "  \n".join(lines)
