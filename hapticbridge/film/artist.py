@@ -127,7 +127,9 @@ def _draw(job: dict[str, Any]) -> None:
     out = Path(job["out"])
     try:
         if out.suffix == ".png":
-            Image.fromarray(camera.frame(tick)).quantize(256).save(out, optimize=True)
+            # the median cut would lose the colours of what is thin: spring and arrow
+            picture = Image.fromarray(camera.frame(tick)).quantize(256, Image.Quantize.MAXCOVERAGE)
+            picture.save(out, optimize=True)
         else:
             _film(stage, camera, job)
     except OSError as error:
