@@ -127,9 +127,8 @@ def _draw(job: dict[str, Any]) -> None:
     out = Path(job["out"])
     try:
         if out.suffix == ".png":
-            # the median cut would lose the colours of what is thin: spring and arrow
-            picture = Image.fromarray(camera.frame(tick)).quantize(256, Image.Quantize.MAXCOVERAGE)
-            picture.save(out, optimize=True)
+            # in 256 colours the sky would have steps, or what is thin another colour
+            Image.fromarray(camera.frame(tick)).save(out, optimize=True)
         else:
             _film(stage, camera, job)
     except OSError as error:
