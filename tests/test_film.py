@@ -130,20 +130,33 @@ def test_picture_shows_the_moment_asked_for(sway: Path, call: Called, tmp_path: 
 
 
 def stopped(done: int, _: int) -> None:
-    if done == 2:
+    if done == 20:
         raise KeyboardInterrupt
 
 
+EAGER = """#!/bin/sh
+for last; do :; done
+echo half a film > "$last"
+cat > /dev/null
+"""
+"""An ffmpeg that writes where it is told to as soon as it starts."""
+
+
 def test_an_interrupted_film_leaves_what_was_there_and_nothing_else(
-    sway: Path, tmp_path: Path
+    sway: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("imageio_ffmpeg", reason="a film needs the extra 'view'")
-    film, shot = tmp_path / "sway.mp4", Shot(width=64, height=48, fps=120)
+    program, folder = tmp_path / "ffmpeg", tmp_path / "films"
+    program.write_text(EAGER)
+    program.chmod(0o755)
+    monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(program))
+    folder.mkdir()
+    film = folder / "sway.mp4"
     film.write_bytes(b"an older film")
     with pytest.raises(KeyboardInterrupt):
-        drawn_or_skip(sway, film, shot, stopped)
+        drawn_or_skip(sway, film, Shot(width=64, height=48, fps=120), stopped)
     assert film.read_bytes() == b"an older film"
-    assert list(tmp_path.iterdir()) == [film]
+    assert list(folder.iterdir()) == [film]
 
 
 @pytest.mark.parametrize(

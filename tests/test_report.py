@@ -17,6 +17,7 @@ from PIL import Image
 from report_runs import Made
 
 from hapticbridge.audit import audit
+from hapticbridge.errors import RecordingError
 from hapticbridge.kernel.guarding import TANK
 from hapticbridge.quantity import quantity
 from hapticbridge.recording import Recording, read_recording
@@ -220,6 +221,8 @@ def test_a_page_replaces_no_recording_and_no_picture(
     code, out, err = call("audit", run_file, "--report", target)
     assert (code, out) == (2, "")  # before anything is computed
     assert str(target) in err
+    with pytest.raises(RecordingError, match="page"):
+        write_report(read_recording(run_file), audit(run_file), target)
     assert not target.exists() or target.read_bytes() == b"what was there"
 
 
