@@ -31,7 +31,7 @@ from hapticbridge.study.audits import (
 from hapticbridge.whatif import changes_from, draw_what_if, what_if, write_what_if
 
 SCENE_SIZE = 640, 400
-"""Of the scene's picture on a page, in pixels: some 50 kB of a page's megabyte."""
+"""Of the scene's picture on a page, in pixels: some 150 kB of a page's megabyte."""
 
 _USUAL_EVENTS = ("start", "stop", "input")
 _COLOURS = {"passive": "green", "active": "red", "invalid": "magenta"}
