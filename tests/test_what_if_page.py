@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import report_runs
-from audit_cases import recorded
+from audit_cases import ScriptedDevice, recorded
 from chromium import browser
 from cli_cases import Called
 from PIL import Image
@@ -25,7 +25,7 @@ def made_active(tmp_path_factory: pytest.TempPathFactory) -> WhatIf:
     """A passive run that another method makes active, prescribed and in a hand."""
     folder = tmp_path_factory.mktemp("page")
     path = folder / "run.mcap"
-    device = report_runs.ScriptedDevice(report_runs._circling)
+    device = ScriptedDevice(report_runs._circling)
     recorded(path, "point_mass", device, report_runs.LOOSE, duration=0.3)
     return what_if(path, {"method": "implicitfast", "stiffness": 2500})
 

@@ -23,11 +23,11 @@ from hapticbridge.report import plot_recording, telling_time, write_report
 from hapticbridge.study.audits import (
     audit_all,
     check_table_name,
-    find_recordings,
     reports_of,
     worst_exit_code,
     write_audits,
 )
+from hapticbridge.study.findings import find_recordings
 from hapticbridge.whatif import changes_from, draw_what_if, what_if, write_what_if
 
 SCENE_SIZE = 640, 400
