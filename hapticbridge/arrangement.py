@@ -18,7 +18,7 @@ from hapticbridge.guard import Limits, guarding_for, limits_for, refuse_simulate
 from hapticbridge.inputs import Write
 from hapticbridge.kernel.parameters import checked_substeps, refuse_substeps
 from hapticbridge.realtime import wants_real_time
-from hapticbridge.recording.stream import Onlooker
+from hapticbridge.recording.onlooker import Onlooker
 from hapticbridge.rendering import (
     contact_stiffness_of,
     default_method,

@@ -342,6 +342,7 @@ def test_a_start_that_claims_more_elastic_energy_than_there_is_is_found(
     claimed = {"start_elastic": repr(float(recording.meta["start_elastic"]) + 1e-3)}
     report = audit(rewritten(recording, path.with_name("changed.mcap"), meta=claimed))
     assert report.verdict == "invalid"
+    assert "'start_elastic'" in report.reason
 
 
 def test_a_recorder_that_cannot_start_leaves_the_run_going(

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from hapticbridge.audit.differences import steps, turns
 from hapticbridge.audit.interventions import Interventions
-from hapticbridge.kernel.state import RunParameters
+from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.watch import CLUTCHED, FORCE_OFF, STILL, STILL_TURN
 from hapticbridge.tick import TickFlag
 

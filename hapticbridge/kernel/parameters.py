@@ -12,7 +12,7 @@ from hapticbridge.arguments import Arguments
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import HapticBridgeError
 from hapticbridge.kernel.guarding import UNGUARDED, Guarding
-from hapticbridge.kernel.scheme import COUPLED, DIRECT, HELD, LOSSLESS, WELD
+from hapticbridge.kernel.scheme import COUPLED, DIRECT, HELD, LOSSLESS, WELD, has_law, laws_per_tick
 
 SLACK_SHARE = 0.5
 """Share of ½‖δx_i‖²_{K + nB/T} that counts as slack where n > 1 laws are computed in a tick; no
@@ -139,20 +139,17 @@ class RunParameters:
             np.allclose(rotation.reshape(3, 3) @ rotation.reshape(3, 3).T, np.eye(3), atol=1e-12)
             and np.linalg.det(rotation.reshape(3, 3)) > 0
         ):
-            raise HapticBridgeError(
-                f"axes is {self.axes!r}; it must be the 9 numbers of a right-handed rotation "
-                "matrix, row by row"
-            )
+            raise _no_rotation(self.axes)
 
     @property
     def laws(self) -> int:
         """How often per tick the wrench on the tool is computed."""
-        return 1 if self.scheme == HELD else self.substeps
+        return laws_per_tick(self.scheme, self.substeps)
 
     @property
     def has_law(self) -> bool:
         """Whether the coupling law gives the wrench."""
-        return self.scheme in (COUPLED, HELD, LOSSLESS)
+        return has_law(self.scheme)
 
     def slack_gains(self) -> tuple[float, float]:
         """Returns gain g in N/m and its rotational counterpart in N m/rad: slack = Σ ½ g ‖δx_k‖².
@@ -205,7 +202,10 @@ def rotation_numbers(matrix: ArrayLike) -> tuple[float, ...]:
                 return tuple(square.ravel().tolist())
             left, _, right = np.linalg.svd(square)
             return tuple((left @ right).ravel().tolist())
-    raise HapticBridgeError(
-        f"axes is {matrix!r}; it must be the 9 numbers of a right-handed rotation matrix, "
-        "row by row"
+    raise _no_rotation(matrix)
+
+
+def _no_rotation(axes: object) -> HapticBridgeError:
+    return HapticBridgeError(
+        f"axes is {axes!r}; it must be the 9 numbers of a right-handed rotation matrix, row by row"
     )
