@@ -113,7 +113,8 @@ def test_ticks_out_of_order_are_refused(tap: Path, tmp_path: Path) -> None:
 def test_an_input_that_says_something_else_is_another_run(
     tap: Path, tmp_path: Path, call: Called
 ) -> None:
-    recording, paths = read_recording(tap), []
+    recording = read_recording(tap)
+    paths: list[Path] = []
     for share in (1.0, 2.0, 1.0):
         push = {"event": "input", "tick": 5, "time_ns": len(paths), "writes": [["ctrl", 0, share]]}
         events = [recording.events[0], push, *recording.events[1:]]

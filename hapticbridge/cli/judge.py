@@ -106,7 +106,9 @@ class Audit:
 
     def _audit_many(self, files: list[Path]) -> int:
         if self.plot or self.report or self.what_if:
-            raise RecordingError("--plot, --report and --what-if take one recording at a time")
+            raise RecordingError(
+                "--plot, --report and --what-if take one recording at a time, and make no --table"
+            )
         with progress("auditing") as show:
             table = audit_all(
                 files,

@@ -109,7 +109,7 @@ def export(
     return Exported(files, recording)
 
 
-def _sink(form: str) -> tuple[type[Sink], str]:
+def _sink(form: str) -> tuple[type[Sink], tuple[str, ...]]:
     if form not in FORMATS:
         raise RecordingError(f"format {form!r:.60} is unknown; the formats are {choices(FORMATS)}")
     return FORMATS[form]
