@@ -12,6 +12,7 @@ from hapticbridge.commands import Command, Operator, Record
 from hapticbridge.commands.command import Stop
 from hapticbridge.errors import CommandError, RecordingError
 from hapticbridge.inputs import apply_writes
+from hapticbridge.kernel.counts import Counts
 from hapticbridge.opened import Opened
 from hapticbridge.provenance import (
     MID_RUN,
@@ -138,8 +139,12 @@ class Commanded(Opened):
         return last
 
     def _begin_anew(self) -> None:
-        """Lets a run begin in the state that the scene is in, with tick 0."""
-        scene, method = self.scene, self.method
+        """Lets a run begin in the state that the scene is in, with tick 0.
+
+        Energies count from there, but what the guard holds against the device goes on: else it
+        could be given the energy limit with each recorder that is started.
+        """
+        scene, method, counts = self.scene, self.method, Counts.of(self._binding.state)
         self._earlier_ticks += self._tick
         self._earlier_fault = self._earlier_fault or self.ledger.fault
         self._tick, self.clock = 0, type(self.clock)()
@@ -147,7 +152,7 @@ class Commanded(Opened):
         scene.set_gains(*method.gains(self._operator.used, self.period / self._substeps))
         # as whoever simulates the file again will find it
         restore_state(scene.model, scene.data, start_state(scene.model, scene.data).tobytes())
-        self._bind(self._operator.felt, self.parameters.felt, elastic_energy(scene.data))
+        self._bind(self._operator.felt, self.parameters.felt, elastic_energy(scene.data), counts)
         files = {item.name: item.data for item in attachments(scene, self._reset_state)}
         names = (MODEL_ATTACHMENT, STATE_ATTACHMENT, RESET_ATTACHMENT)
         needed = {name: files[name] for name in names}

@@ -20,6 +20,7 @@ from hapticbridge.guard import refuse_stretched_start, wait_until_still
 from hapticbridge.inputs import Write, input_writes
 from hapticbridge.jit import direct
 from hapticbridge.kernel.after import answer_step
+from hapticbridge.kernel.counts import Counts
 from hapticbridge.kernel.layout import STATE_DTYPE
 from hapticbridge.kernel.publish import finish_tick, publish
 from hapticbridge.kernel.state import Binding
@@ -111,7 +112,13 @@ class Opened(Arrangement):
             self._stream.start(self._description(), attachments(scene))
             self._event("start")
 
-    def _bind(self, coupling: Coupling, felt: Coupling | None, start_elastic: float = 0.0) -> None:
+    def _bind(
+        self,
+        coupling: Coupling,
+        felt: Coupling | None,
+        start_elastic: float = 0.0,
+        counts: Counts | None = None,
+    ) -> None:
         """Lets a run begin in the state in which the scene is."""
         scene = self.scene
         self.parameters = parameters = run_parameters(
@@ -128,6 +135,7 @@ class Opened(Arrangement):
             contact_stiffness=self._contact_stiffness,
             guarding=self._guarding,
             start_elastic=start_elastic,
+            counts=counts,
         )
         self._binding = binding = Binding(scene.model, scene.data, parameters)
         reset = self._reset_state

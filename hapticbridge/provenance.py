@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import HapticBridgeError, RecordingError
+from hapticbridge.kernel.counts import Counts
 from hapticbridge.kernel.guarding import UNGUARDED, Guarding
 from hapticbridge.kernel.scheme import WELD
 from hapticbridge.kernel.state import Binding, RunParameters
@@ -41,7 +42,7 @@ _GAINS = ("stiffness", "damping", "rotational_stiffness", "rotational_damping")
 STARTS = {"handle_start": 7, "tool_start": 7, "start_kinetic": 1, "start_potential": 1}
 """What the ledger counts from, with its count of numbers: poses in m, energies in J."""
 
-_ELASTIC = "start_elastic"
+_ELASTIC, _COUNTS = "start_elastic", "counts"
 _STORED = {"start_kinetic": "kinetic", "start_potential": "potential"}
 _MOST_TICKS = 2**31
 _STATE = mujoco.mjtState.mjSTATE_INTEGRATION
@@ -165,6 +166,8 @@ def describe_run(
         meta[name] = json.dumps(start if count > 1 else start[0])
     if parameters.start_elastic:
         meta[_ELASTIC] = repr(parameters.start_elastic)
+    if parameters.counts is not None:
+        meta[_COUNTS] = parameters.counts.to_json()
     return meta | {
         "period_s": repr(parameters.period),
         "substeps": str(parameters.substeps),
@@ -295,6 +298,7 @@ def parameters_of(meta: Mapping[str, str]) -> RunParameters:
             device_rotational_damping=rotational,
             guarding=Guarding.from_json(meta["guard"]) if "guard" in meta else UNGUARDED,
             start_elastic=meta_float(meta, _ELASTIC) if _ELASTIC in meta else 0.0,
+            counts=Counts.from_json(meta[_COUNTS]) if _COUNTS in meta else None,
         )
     except RecordingError:
         raise

@@ -6,6 +6,7 @@ import hashlib
 import json
 from collections import deque
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import mujoco
@@ -76,19 +77,23 @@ class Rerun:
         # an error inside the C symbol would end the process, so MuJoCo takes its first step in
         # Python
         start = recording.attachments[STATE_ATTACHMENT]
-        method = method_named(recording.meta.get("method", ""))
-        restore_state(model, data, start)
-        method.step(model, data)
-        restore_state(model, data, start)
-        if parameters.start_elastic:
-            _check_elastic(parameters.start_elastic, elastic_energy(data))
-        self._binding = Binding(model, data, parameters)
         reset = recording.attachments.get(RESET_ATTACHMENT, start)
         if len(reset) != len(start):
             raise RecordingError(
                 f"attachment '{RESET_ATTACHMENT}' has {len(reset)} bytes, '{STATE_ATTACHMENT}' "
                 f"{len(start)}"
             )
+        method = method_named(recording.meta.get("method", ""))
+        if parameters.counts is not None:
+            restore_state(model, data, reset)
+            begun = replace(parameters, counts=None, start_elastic=0.0)
+            _check_stored(parameters.counts.stored, Binding(model, data, begun).state)
+        restore_state(model, data, start)
+        method.step(model, data)
+        restore_state(model, data, start)
+        if parameters.start_elastic:
+            _check_elastic(parameters.start_elastic, elastic_energy(data))
+        self._binding = Binding(model, data, parameters)
         self._commands = Repeater(self._binding, model, data, method, parameters, reset)
         _check_start(recording, self._binding.state)
 
@@ -265,6 +270,16 @@ def _check_elastic(claimed: float, present: float) -> None:
         raise RecordingError(
             f"metadata 'start_elastic' is {claimed!r} J, the attached scene's constraints store "
             f"{present!r} J at most"
+        )
+
+
+def _check_stored(claimed: float, state: NDArray[np.void]) -> None:
+    """Refuses counts of the guard that begin with another energy than the whole run began with."""
+    present = float(state["start_energy"][0])
+    if not abs(claimed - present) <= FOREIGN_TOLERANCE * (1.0 + abs(present)):
+        raise RecordingError(
+            f"metadata 'counts' say that the scene stored {claimed!r} J when the run began, the "
+            f"attached scene stores {present!r} J there"
         )
 
 

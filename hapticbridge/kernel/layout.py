@@ -203,6 +203,7 @@ _RUNNING = (
     "kinetic",
     "potential",
     "start_energy",
+    "first_energy",
     "coupling_work",
     "actuator_work",
     "external_work",

@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticbridge.kernel.account import unpaid
 from hapticbridge.kernel.addresses import bind_addresses, gains_of
 from hapticbridge.kernel.direct import balance_contacts, tool_map
 from hapticbridge.kernel.guarding import Guarding
@@ -104,7 +105,7 @@ class Binding:
         refresh_energies(state)
         after = float(state["kinetic"][0] + state["potential"][0])
         state["external_work"] += after - before
-        start, ratio = float(state["start_energy"][0]), state["force_scale"] / state["scale"]
+        start, ratio = float(state["first_energy"][0]), state["force_scale"] / state["scale"]
         state["given"] += ratio * (min(before - start, 0.0) - min(after - start, 0.0))
         forget_dissipation(state)
         state["is_seated_anew"] = 1
@@ -249,5 +250,10 @@ class Binding:
             refresh_energies(state)
         state["start_energy"] = state["kinetic"] + state["potential"] + parameters.start_elastic
         state["own_before"] = -parameters.start_elastic
+        state["first_energy"] = state["start_energy"]
+        if parameters.counts is not None:
+            parameters.counts.put(state)
+            forget_dissipation(state)  # a command, as any other
+            state["kicked"] = unpaid(state)
         if parameters.scheme == LOSSLESS:
             start_twist(state)

@@ -78,7 +78,7 @@ def forget_dissipation(state: NDArray[np.void]) -> None:
     ratio = float(s["force_scale"] / s["scale"])
     stretch = float(np.linalg.norm(s["handle_position"] - s["tool_position"]))
     cosine = abs(float(np.dot(s["handle_quaternion"], s["tool_quaternion"])))
-    kept = max(float(s["kinetic"] + s["potential"] - s["start_energy"]), 0.0)
+    kept = max(float(s["kinetic"] + s["potential"] - s["first_energy"]), 0.0)
     kept += _spring(float(s["stiffness"]), stretch, float(s["force_limit"] / s["force_scale"]))
     twist, most = 2.0 * math.acos(min(cosine, 1.0)), float(s["torque_limit"]) / ratio
     kept += _spring(float(s["rotational_stiffness"]), twist, most)
