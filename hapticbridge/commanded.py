@@ -31,7 +31,7 @@ class Commanded(Opened):
     """A bridge that takes inputs and commands between two ticks, and notes each with its tick."""
 
     _pause: Record | None = None
-    _earlier_ticks = 0
+    _earlier_ticks, _end = 0, -1
     _earlier_fault: tuple[int, str] | None = None
 
     def __enter__(self) -> Self:
@@ -82,8 +82,9 @@ class Commanded(Opened):
         """Returns what the run was so far; energies count from where it last began anew."""
         now = super().summary()
         ticks = now.ticks + self._earlier_ticks
+        duration = now.duration + self._earlier_ticks * self.period
         fault = self._earlier_fault or now.fault
-        return replace(now, ticks=ticks, duration=ticks * self.period, fault=fault)
+        return replace(now, ticks=ticks, duration=duration, fault=fault)
 
     def _take_changes(self) -> bool:
         """Takes in what others want changed: between two ticks, and noted with its tick.
@@ -109,19 +110,11 @@ class Commanded(Opened):
             return ""
         return f"this run is {'already' if record.on else 'not'} being recorded"
 
-    def _obey_in_pause(self, last: int) -> int:
-        """Starts or stops the recorder while nothing is felt.
-
-        Args:
-            last: Tick at which the run ends, or −1.
-
-        Returns:
-            The same, as the ticks are counted from now on.
-        """
+    def _obey_in_pause(self) -> None:
+        """Starts or stops the recorder while nothing is felt."""
         record, self._pause = self._pause, None
         try:
             if record is not None and record.on:
-                last = last if last < 0 else last - self._tick
                 self._begin_anew()
                 self._record()
             else:
@@ -136,7 +129,6 @@ class Commanded(Opened):
             self._event("resume")
         else:
             self._operator.begin(self._repeater, self._guarding.fade_ticks)
-        return last
 
     def _begin_anew(self) -> None:
         """Lets a run begin in the state that the scene is in, with tick 0.
@@ -146,6 +138,7 @@ class Commanded(Opened):
         """
         scene, method, counts = self.scene, self.method, Counts.of(self._binding.state)
         self._earlier_ticks += self._tick
+        self._end -= self._tick if self._end >= 0 else 0
         self._earlier_fault = self._earlier_fault or self.ledger.fault
         self._tick, self.clock = 0, type(self.clock)()
         self._binding.let_go()

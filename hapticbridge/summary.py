@@ -23,7 +23,7 @@ class Summary:
 
     Attributes:
         ticks: Ticks since the bridge was opened.
-        duration: Their number times the period, in s.
+        duration: Time of the run's clock in s: a period for each tick and each skipped deadline.
         overruns: Ticks that started a period or more after their deadline.
         skipped: Deadlines that were skipped for it.
         dropped: Records that the recorder did not get because it was too far behind.
@@ -116,7 +116,7 @@ class Summary:
         conditions = run_conditions(info, parameters, method)
         return cls(
             ticks=ticks,
-            duration=ticks * parameters.period,
+            duration=(ticks + skipped) * parameters.period,
             overruns=overruns,
             skipped=skipped,
             dropped=dropped,

@@ -51,7 +51,9 @@ class Run:
     """'simulated' (in the hand that the scene asks for), 'simulated:damping=5,hand_mass=1',
     'trajectory:FILE' (CSV or recording), or one that 'hapticbridge devices' lists."""
     duration: float | None = None
-    """Seconds to run; by default until the device's motion ends, or until Ctrl-C."""
+    """Seconds to run, by the clock: a deadline that was missed is time that has passed, and makes
+    the ticks one less. By default until the device's motion ends, however long its samples take, or
+    until Ctrl-C."""
     record: Path | None = None
     """File to record to (.mcap)."""
     overwrite: bool = False
