@@ -193,6 +193,11 @@ class Arrangement:
         return self.method.rendered(self.used, self.period / self._substeps)
 
     @property
+    def reach(self) -> float:
+        """Distance of the device in m from the origin of its frame that ends handle and force."""
+        return self._guarding.reach
+
+    @property
     def laws(self) -> int:
         """How often per tick the wrench on the tool is computed."""
         return self.method.laws(self._substeps)

@@ -121,9 +121,10 @@ class Run:
     """Button of the device, from 0, that must be held for any force."""
     stretch_limit: float = USUAL_STRETCH
     """Largest distance between handle and tool in m; beyond it the run is stopped."""
-    reach_limit: float = math.inf
+    reach_limit: float | None = None
     """Farthest in m that the device may be from the middle of its workspace; beyond it moves
-    without the handle and without force. Choose it short of the device's own stops."""
+    without the handle and without force. By default what its driver or profile knows, all of the
+    workspace, else none (inf). To keep force off its stops, choose less."""
     energy_limit: float = USUAL_ENERGY
     """Most energy in J that the device may be given beyond what the hand put in; inf for scenes
     whose motors are meant to push the hand."""

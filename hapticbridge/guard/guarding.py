@@ -111,7 +111,7 @@ def guarding_for(
         dead_man=buttons[1],
         stretch=limits.stretch * scale,
         angle=limits.angle,
-        reach=limits.reach,
+        reach=limits.reach_of(info),
     )
     if info.is_prescribed:
         return common
