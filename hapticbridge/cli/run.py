@@ -103,7 +103,8 @@ class Run:
     torque_limit: float | None = None
     """Largest torque on the device in N m; by default the device's own."""
     ramp: float = 0.5
-    """Seconds over which the force rises at the start."""
+    """Seconds over which the force rises at the start; longer while the coupling is held stretched,
+    because a force that rises behind a hand would be given to it."""
     view: bool = False
     """Show the run in a browser, from a process of its own; needs the extra 'view'."""
     host: str = "127.0.0.1"

@@ -38,7 +38,8 @@ class Limits:
         torque: Largest norm of the torque in N m, > 0.
         rise: Shortest time in s in which force and torque go from zero to their limits, >= 0; 0
             lets them step.
-        ramp: Time in s over which the wrench rises linearly at the start, 0 to 60.
+        ramp: Time in s over which the wrench rises linearly at the start, 0 to 60; it takes longer
+            where the coupling holds much energy meanwhile (``kernel.ramp``).
         stretch: Largest distance between handle and grip in m, over the scale, > 0; beyond it the
             run is stopped. So it is beyond the others:
         angle: Largest angle between them in rad, > 0 and < π, or inf.

@@ -67,7 +67,7 @@ class Binding:
     def resume(self) -> None:
         """Starts the ramp again at the next tick, after a pause in which zero was commanded."""
         self.state["ramp_start"] = self.state["tick"]
-        self.state["rise_ticks"] = self.state["ramp_ticks"]
+        self.state["rise_ticks"], self.state["risen"] = self.state["ramp_ticks"], 0.0
         self.state["wrench_on_device"] = self.state["slewed"] = 0.0
         self.state["has_positions"] = 0  # whoever had the scene meanwhile may have changed it
 
