@@ -276,6 +276,32 @@ def test_force_waits_until_the_device_is_still(monkeypatch: pytest.MonkeyPatch) 
         wait_until_still(restless, np.zeros(1, SAMPLE_DTYPE), 1e-3, RealClock())
 
 
+@pytest.mark.parametrize("is_stopped", [True, False])
+def test_a_run_that_is_told_to_end_does_not_wait_for_rest(
+    monkeypatch: pytest.MonkeyPatch, is_stopped: bool
+) -> None:
+    monkeypatch.setattr(start_module, "PATIENCE", 0.2)
+    device = ScriptedDevice(lambda tick: (2e-3 * tick, 0, 0, 1, 0, 0, 0))
+    device.info = replace(device.info, is_real=True)
+    plain = device.read
+
+    def read(sample: NDArray[np.void]) -> int:
+        if is_stopped and device._tick == 20:
+            os.kill(os.getpid(), signal.SIGINT)
+        return plain(sample)
+
+    device.read = read  # type: ignore[method-assign]
+    with Bridge("point_mass", device, realtime=False) as bridge:
+        if is_stopped:
+            summary = bridge.run(0.01)
+            assert (summary.stopped_by, summary.ticks) == ("signal", 0)
+            assert device._tick < 100
+        else:
+            with pytest.raises(SafetyTrip, match="hold it still"):
+                bridge.run(0.01)
+    assert not np.any(device.writes)
+
+
 @pytest.mark.parametrize(("strays_to", "is_refused"), [(0.004, False), (0.05, True)])
 def test_an_absolute_device_that_strayed_while_rest_was_waited_for_is_refused(
     monkeypatch: pytest.MonkeyPatch, strays_to: float, is_refused: bool
