@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.coupling import Coupling
+from hapticbridge.kernel.names import COUPLING_ACTUATORS
 from hapticbridge.kernel.scheme import LOSSLESS
-from hapticbridge.kernel.state import COUPLING_ACTUATORS
 from hapticbridge.kernel.tree import tree_of_tool
 from hapticbridge.passivity.compensation import IMPLICIT_LAG, felt_damping
 from hapticbridge.rendering import Method

@@ -19,13 +19,13 @@ def _cache_folder() -> str:
     """Returns where machine code is kept: one folder per state of all compiled sources.
 
     numba looks only at the file of the function that it loads, but compiled functions inline each
-    other across files: with one folder for all, a change in one module would leave its old code in
-    the callers. ``NUMBA_CACHE_DIR`` moves the folder.
+    other across files, and the kernel's constants too: with one folder for all, a change in one
+    module would leave its old code in the callers. ``NUMBA_CACHE_DIR`` moves the folder.
     """
     digest = hashlib.sha256()
     for path in sorted(Path(__file__).parent.rglob("*.py")):
         source = path.read_bytes()
-        if b"hapticbridge.jit import" in source:
+        if b"hapticbridge.jit import" in source or path.parent.name == "kernel":
             digest.update(source)
     base = numba.config.CACHE_DIR or platformdirs.user_cache_dir("hapticbridge", appauthor=False)
     return str(Path(base) / digest.hexdigest()[:16])

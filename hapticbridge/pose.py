@@ -10,10 +10,37 @@ from __future__ import annotations
 import math
 from typing import TypeAlias
 
+import numpy as np
+from numpy.typing import NDArray
+
 from hapticbridge.jit import compiled
 
 Vector: TypeAlias = tuple[float, float, float]
 Quaternion: TypeAlias = tuple[float, float, float, float]
+
+
+@compiled
+def vector_of(values: NDArray[np.float64]) -> Vector:
+    """Returns the first three elements as a tuple."""
+    return values[0], values[1], values[2]
+
+
+@compiled
+def quaternion_of(values: NDArray[np.float64]) -> Quaternion:
+    """Returns the first four elements as a tuple."""
+    return values[0], values[1], values[2], values[3]
+
+
+@compiled
+def store_vector(target: NDArray[np.float64], v: Vector) -> None:
+    """Writes a tuple into the first three elements."""
+    target[0], target[1], target[2] = v
+
+
+@compiled
+def store_quaternion(target: NDArray[np.float64], q: Quaternion) -> None:
+    """Writes a tuple into the first four elements."""
+    target[0], target[1], target[2], target[3] = q
 
 
 @compiled

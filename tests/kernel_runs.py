@@ -19,8 +19,11 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from hapticbridge.coupling import Coupling
-from hapticbridge.kernel.state import Binding, RunParameters
-from hapticbridge.kernel.step import OK, after_step, before_step, simulate
+from hapticbridge.kernel.codes import OK
+from hapticbridge.kernel.parameters import RunParameters
+from hapticbridge.kernel.simulation import simulate
+from hapticbridge.kernel.state import Binding
+from hapticbridge.kernel.step import after_step, before_step
 from hapticbridge.ledger import Ledger
 from hapticbridge.rendering import prepare
 from hapticbridge.scene import Scene, load_scene

@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.kernel.parameters import RunParameters
+from hapticbridge.kernel.simulation import simulate
 from hapticbridge.kernel.state import Binding
-from hapticbridge.kernel.step import simulate
 from hapticbridge.ledger import Ledger
 from hapticbridge.rendering import METHODS, prepare
 from hapticbridge.scene import Scene, load_scene

@@ -12,8 +12,9 @@ from scipy.spatial.transform import Rotation
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import AXES, DeviceInfo
 from hapticbridge.guard import Limits
-from hapticbridge.kernel.state import Binding, RunParameters
-from hapticbridge.kernel.step import simulate
+from hapticbridge.kernel.parameters import RunParameters
+from hapticbridge.kernel.simulation import simulate
+from hapticbridge.kernel.state import Binding
 from hapticbridge.rendering import contact_stiffness_of, method_named, prepare
 from hapticbridge.scene import Scene
 from hapticbridge.tick import SAMPLE_DTYPE, TICK_DTYPE

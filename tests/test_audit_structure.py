@@ -10,6 +10,7 @@ from audit_cases import (
     recorded,
     rewritten,
     verdict_of,
+    without_model,
 )
 
 from hapticbridge.audit import audit
@@ -50,6 +51,26 @@ def test_deadlines_must_follow_the_period_and_the_overrun_flag(
     for name in CLOCK_FIELDS:
         late[name][90:] += 500_000
     assert verdict_of(tap, folder, ticks=late).verdict == "invalid"
+
+
+@pytest.mark.parametrize(
+    "flag",
+    [
+        TickFlag.CONTACT,
+        TickFlag.DROPPED_BEFORE,
+        TickFlag.RAMPING,
+        TickFlag.CLUTCH,
+        TickFlag.RESEATED,
+    ],
+)
+def test_a_flag_that_its_record_contradicts_is_found_without_a_simulation(
+    tap: Recording, folder: Path, flag: TickFlag
+) -> None:
+    ticks = tap.ticks.copy()
+    ticks["flags"][80] ^= int(flag)
+    report = verdict_of(without_model(tap), folder, ticks=ticks)
+    assert (report.verdict, report.tick, report.port) == ("invalid", 80, "flags")
+    assert f"flag '{str(flag.name).lower()}' of tick 80" in report.reason
 
 
 def test_cut_file_is_judged_on_what_it_holds_and_says_so(tmp_path: Path) -> None:

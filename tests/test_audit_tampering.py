@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from pathlib import Path
 
@@ -22,6 +23,7 @@ from hapticbridge.audit import audit
 from hapticbridge.provenance import (
     MODEL_ATTACHMENT,
     STATE_ATTACHMENT,
+    compiled_model,
     processor,
     versions,
 )
@@ -181,6 +183,21 @@ def test_changed_scene_is_found_whatever_else_was_made_to_fit(tap: Recording, fo
     assert "bytes" in verdict_of(tap, folder, attachments=short).reason
     cut = {MODEL_ATTACHMENT: tap.attachments[MODEL_ATTACHMENT][:-8]}
     assert "scene_sha256" in verdict_of(tap, folder, attachments=cut).reason
+
+
+def test_a_model_that_is_signed_anew_must_still_fit_the_metadata(
+    tap: Recording, folder: Path
+) -> None:
+    def reason(content: bytes) -> str:
+        meta = {"scene_sha256": hashlib.sha256(content).hexdigest()}
+        return verdict_of(tap, folder, meta=meta, attachments={MODEL_ATTACHMENT: content}).reason
+
+    content = tap.attachments[MODEL_ATTACHMENT]
+    name = b"coupling_force_x"
+    assert "has no 'coupling_force_x'" in reason(content.replace(name, name.upper()))
+    model = mujoco.MjModel.from_binary_path("a.mjb", assets={"a.mjb": content})
+    model.opt.timestep *= 0.5
+    assert "timestep is 0.0005 s" in reason(compiled_model(model))
 
 
 def test_change_without_a_new_digest_is_found_by_the_digest(

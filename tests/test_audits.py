@@ -19,7 +19,7 @@ from hapticbridge.audit import AuditReport, audit
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import RecordingError, StudyError
 from hapticbridge.recording import read_recording
-from hapticbridge.study import workers
+from hapticbridge.study import processes
 from hapticbridge.study.audits import (
     audit_all,
     audit_point,
@@ -136,13 +136,13 @@ def test_jobs_are_processes_at_most(monkeypatch: pytest.MonkeyPatch, runs: Path)
             counts.append(count)
             raise OSError("no processes in this test")
 
-    monkeypatch.setattr(workers, "ProcessPoolExecutor", Counting)
-    monkeypatch.setattr(workers, "cores", lambda: 64)
+    monkeypatch.setattr(processes, "ProcessPoolExecutor", Counting)
+    monkeypatch.setattr(processes, "cores", lambda: 64)
     files = find_recordings([runs])
-    for jobs, processes in ((3, 3), (50, len(files))):
+    for jobs, expected in ((3, 3), (50, len(files))):
         with pytest.raises(OSError, match="no processes"):
             audit_all(files, jobs=jobs)
-        assert counts.pop() == processes
+        assert counts.pop() == expected
     assert len(audit_all(files, jobs=None)) == len(files)  # few: in this process
     assert not counts
     wrong: Any

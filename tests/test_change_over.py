@@ -13,7 +13,9 @@ from lossless_runs import T, bound, led, tapping
 from hapticbridge.coupling import Coupling
 from hapticbridge.device.trajectory.motion import pose_at
 from hapticbridge.device.trajectory.motion_csv import read_motion
-from hapticbridge.kernel.step import OK, after_step, before_step, simulate
+from hapticbridge.kernel.codes import OK
+from hapticbridge.kernel.simulation import simulate
+from hapticbridge.kernel.step import after_step, before_step
 from hapticbridge.ledger import Ledger
 from hapticbridge.rendering import METHODS
 from hapticbridge.scene import load_scene, scene_path

@@ -194,7 +194,7 @@ def test_motion_that_ends_in_nothing_finite_is_an_error() -> None:
     scene = load_scene("point_mass")
     samples = samples_of(Motion([0, 0.2], [(0, 0, 0), (0.01, 0, 0)]), 1e-3)
     samples["position"][100] = np.nan
-    with pytest.raises(SceneError, match="not finite in tick 100"):
+    with pytest.raises(SceneError, match="not finite after tick 100"):
         measure_cost(scene, samples, COUPLING, 1e-3)
 
 

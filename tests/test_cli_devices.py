@@ -65,6 +65,20 @@ class Nothing:
         return []
 
 
+def test_what_a_device_calls_itself_cannot_steer_a_terminal() -> None:
+    plugged = Plugged(
+        family="rawhid",
+        name="a\x1b[31mb\n",
+        serial="\x071\u202e2",
+        path="/dev/hidraw0",
+        vendor=1,
+        product=2,
+        transport="hid",
+        problem=None,
+    )
+    assert (plugged.name, plugged.serial) == ("a\ufffd[31mb\ufffd", "\ufffd1\ufffd2")
+
+
 def test_devices_never_fails_on_a_machine_without_usb(
     call: Called, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

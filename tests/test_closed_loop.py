@@ -21,7 +21,8 @@ from hapticbridge.guard import Limits
 from hapticbridge.passivity import SampledLoop, WorstHand, minimum_damping
 from hapticbridge.rendering import METHODS
 from hapticbridge.scene import load_scene
-from hapticbridge.study.closed_loop import PARTS, ClosedLoop, LoopOutcome, Timing
+from hapticbridge.study.closed_loop import ClosedLoop, LoopOutcome
+from hapticbridge.study.jitter import PARTS, Timing
 from hapticbridge.tick import CLOCK_FIELDS, TICK_DTYPE
 
 T = 1e-3

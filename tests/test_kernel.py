@@ -35,16 +35,11 @@ from scipy.spatial.transform import Rotation
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import HapticBridgeError, SceneError
 from hapticbridge.kernel import native
+from hapticbridge.kernel.codes import BAD_RESULT, BAD_SAMPLE, OK
 from hapticbridge.kernel.handle import handle_pose
 from hapticbridge.kernel.publish import HEAD, TAIL, publish
-from hapticbridge.kernel.step import (
-    BAD_RESULT,
-    BAD_SAMPLE,
-    OK,
-    after_step,
-    before_step,
-    simulate,
-)
+from hapticbridge.kernel.simulation import simulate
+from hapticbridge.kernel.step import after_step, before_step
 from hapticbridge.scene import load_scene
 from hapticbridge.tick import TICK_DTYPE, TickFlag
 

@@ -12,8 +12,9 @@ from lossless_runs import ARM, T, bound, circling, led, scene_of
 from rendering_runs import FREE_MASS
 
 from hapticbridge.coupling import Coupling
+from hapticbridge.kernel.codes import OK
 from hapticbridge.kernel.state import Binding
-from hapticbridge.kernel.step import OK, after_step, before_step
+from hapticbridge.kernel.step import after_step, before_step
 from hapticbridge.scene import Scene
 from hapticbridge.tick import SAMPLE_DTYPE, TICK_DTYPE, TickFlag
 

@@ -18,7 +18,7 @@ from hapticbridge.errors import StudyError
 from hapticbridge.passivity import SampledLoop, WorstHand
 from hapticbridge.rendering import METHODS
 from hapticbridge.scene import Scene, load_scene
-from hapticbridge.study.closed_loop import PARTS, Timing
+from hapticbridge.study.jitter import PARTS, Timing
 from hapticbridge.study.maps.rate import RATE, read
 from hapticbridge.study.maps.rate_runs import (
     DAMPING,

@@ -26,7 +26,7 @@ from hapticbridge.passivity import (
     minimum_mass,
     quantization_limit,
 )
-from hapticbridge.passivity.spectrum import Discretization
+from hapticbridge.passivity.transfer import Discretization
 from hapticbridge.passivity.virtual_mass import FORCE_DELAY, Integrator
 
 T = 1e-3

@@ -19,7 +19,7 @@ from hapticbridge.passivity import (
     z_width,
 )
 from hapticbridge.passivity.grid import MOST_DELAY
-from hapticbridge.passivity.spectrum import Discretization
+from hapticbridge.passivity.transfer import Discretization
 from hapticbridge.passivity.wall import search_grid
 
 T = 1e-3

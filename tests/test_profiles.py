@@ -11,17 +11,13 @@ from hypothesis import strategies as st
 
 from hapticbridge.device import SimulatedDevice
 from hapticbridge.device.forcedimension.models import MODELS
-from hapticbridge.device.profile import (
-    LOWER_END,
+from hapticbridge.device.profile import LOWER_END, UNITS, Profile, Quantity, read_profile
+from hapticbridge.device.profile_search import (
     SHIPPED,
-    UNITS,
-    Profile,
-    Quantity,
     modelled,
     profile_named,
     profile_of,
     profiles,
-    read_profile,
 )
 from hapticbridge.errors import DeviceError
 

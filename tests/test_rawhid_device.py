@@ -14,10 +14,11 @@ from rawhid_cases import PERIOD, opened, paddle
 from scipy.spatial.transform import Rotation
 
 from hapticbridge.device import SimulatedDevice
-from hapticbridge.device.base import AXES
+from hapticbridge.device.data_sheet import AXES
 from hapticbridge.device.plugged import tell_nobody
-from hapticbridge.device.rawhid.driver import LONGEST_SILENCE, RawHidDevice
+from hapticbridge.device.rawhid.driver import RawHidDevice
 from hapticbridge.device.rawhid.finding import open_rawhid
+from hapticbridge.device.silence import SILENCE
 from hapticbridge.errors import DeviceError, DeviceLost
 from hapticbridge.tick import SAMPLE_DTYPE, TickFlag
 
@@ -257,7 +258,7 @@ def test_silence_is_borne_for_50_ms_and_then_the_device_is_lost() -> None:
         model.is_silent = False
         assert read(device, seam)[0] == 0
         model.is_silent = True
-        for _ in range(round(LONGEST_SILENCE / PERIOD) - 1):
+        for _ in range(round(SILENCE / PERIOD) - 1):
             assert read(device, seam)[0] == STALE
     with pytest.raises(DeviceLost, match="has sent nothing for 51 ms"):
         read(device, seam, 2 * PERIOD)
@@ -270,9 +271,9 @@ def test_a_loop_that_skips_ticks_finds_silence_as_soon_as_any_other(step: float)
     model.is_silent = True
     begin = seam.now
     with pytest.raises(DeviceLost, match="has sent nothing"):
-        for _ in range(round(2 * LONGEST_SILENCE / step)):
+        for _ in range(round(2 * SILENCE / step)):
             read(device, seam, step)
-    assert LONGEST_SILENCE < seam.now - begin <= LONGEST_SILENCE + step
+    assert SILENCE < seam.now - begin <= SILENCE + step
 
 
 def test_a_pause_of_the_loop_is_not_the_devices_silence() -> None:
@@ -280,9 +281,9 @@ def test_a_pause_of_the_loop_is_not_the_devices_silence() -> None:
     read(device, seam)
     model.is_silent = True
     assert read(device, seam, 1.0)[0] == STALE
-    assert read(device, seam, 0.9 * LONGEST_SILENCE)[0] == STALE
+    assert read(device, seam, 0.9 * SILENCE)[0] == STALE
     with pytest.raises(DeviceLost, match=r"has sent nothing for 5\d ms"):
-        read(device, seam, 0.2 * LONGEST_SILENCE)
+        read(device, seam, 0.2 * SILENCE)
 
 
 def test_a_slow_loop_finds_a_silent_device_in_its_next_tick() -> None:

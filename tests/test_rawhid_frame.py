@@ -11,7 +11,7 @@ from emulated.rawhid_model import crc
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hapticbridge.device.base import AXES
+from hapticbridge.device.data_sheet import AXES
 from hapticbridge.device.rawhid import driver
 from hapticbridge.device.rawhid.frame import (
     FRAME_BYTES,

@@ -16,7 +16,8 @@ from cli_cases import Called
 
 from hapticbridge.audit import audit
 from hapticbridge.device import DeviceInfo
-from hapticbridge.device.profile import SHIPPED, Profile, profile_named, profiles
+from hapticbridge.device.profile import Profile
+from hapticbridge.device.profile_search import SHIPPED, profile_named, profiles
 from hapticbridge.errors import DeviceError
 from hapticbridge.guard import Limits
 from hapticbridge.recording import read_recording

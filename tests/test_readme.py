@@ -64,7 +64,9 @@ def test_shell_commands_are_valid(workplace: Path) -> None:
             continue
         if words[0] == "hapticbridge":
             is_run = words[1] == "run"
-            assert main(words[1:] + (["--fast", "--duration", "0.2"] if is_run else [])) == 0
+            code = main(words[1:] + (["--fast", "--duration", "0.2"] if is_run else []))
+            # whether a machine holds the rate is its own affair: 1 says that it does not
+            assert code in ((0, 1) if words[1] == "doctor" else (0,)), line
         else:
             script = ROOT / words[0]
             assert script.is_file()

@@ -18,6 +18,7 @@ from recording_cases import EPOCH, FILES, chunk_ends, random_rows, same
 
 from hapticbridge.errors import RecordingError
 from hapticbridge.recording import read_recording
+from hapticbridge.recording.fields import DamageError, Fields
 from hapticbridge.tick import TICK_DTYPE
 
 
@@ -109,6 +110,20 @@ def test_digest_tells_any_change_although_all_checksums_are_right(
     assert recording.problems == ()
     assert recording.digest == read_recording(whole).digest
     assert recording.digest != recording.computed_digest
+
+
+def test_a_map_that_holds_a_key_twice_is_damaged() -> None:
+    def text(word: bytes) -> bytes:
+        return len(word).to_bytes(4, "little") + word
+
+    def read(entries: bytes) -> dict[str, str]:
+        data = text(entries)
+        return Fields(data, 0, len(data)).mapping()
+
+    entry = text(b"key") + text(b"value")
+    assert read(entry) == {"key": "value"}
+    with pytest.raises(DamageError, match="'key' twice"):
+        read(entry + text(b"key") + text(b"other"))
 
 
 def test_record_that_is_not_one_is_a_problem(whole: Path, tmp_path: Path) -> None:

@@ -23,8 +23,10 @@ from hapticbridge.bridge import Bridge
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import DeviceError, HapticBridgeError, SceneError
-from hapticbridge.kernel.state import Binding, RunParameters
-from hapticbridge.kernel.step import OK, after_step, before_step
+from hapticbridge.kernel.codes import OK
+from hapticbridge.kernel.parameters import RunParameters
+from hapticbridge.kernel.state import Binding
+from hapticbridge.kernel.step import after_step, before_step
 from hapticbridge.recording import read_recording
 from hapticbridge.rendering import IMPLICIT, METHODS, method_named, prepare
 

@@ -16,8 +16,10 @@ from rendering_runs import (
 from hapticbridge.bridge import Bridge
 from hapticbridge.clock import SimulatedClock
 from hapticbridge.errors import SceneError
-from hapticbridge.kernel.state import Binding, RunParameters
-from hapticbridge.kernel.step import OK, after_step, before_step
+from hapticbridge.kernel.codes import OK
+from hapticbridge.kernel.parameters import RunParameters
+from hapticbridge.kernel.state import Binding
+from hapticbridge.kernel.step import after_step, before_step
 from hapticbridge.rendering import method_named, prepare
 
 

@@ -25,8 +25,9 @@ from hapticbridge.bridge import Bridge
 from hapticbridge.clock import SimulatedClock
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import SceneError
+from hapticbridge.kernel.codes import OK
 from hapticbridge.kernel.state import Binding
-from hapticbridge.kernel.step import OK, after_step, before_step
+from hapticbridge.kernel.step import after_step, before_step
 from hapticbridge.recording import read_recording
 from hapticbridge.rendering import METHODS, check_prepared, method_named, prepare
 from hapticbridge.scene import load_scene

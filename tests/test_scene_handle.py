@@ -16,7 +16,7 @@ from outside_scenes import (
 )
 from scene_cases import GRIPPED, ticks
 
-from hapticbridge.kernel.state import COUPLING_ACTUATORS
+from hapticbridge.kernel.names import COUPLING_ACTUATORS
 from hapticbridge.scene import load_scene
 
 
@@ -71,10 +71,11 @@ def test_handle_stands_at_the_grip_in_qpos0_and_in_every_keyframe(tmp_path: Path
     assert keyed.data.qpos == pytest.approx([0.1, 0.2, 0.3, 0.5, 0.5, -0.5, 0.5])
     assert handle_pose(keyed.data) == pytest.approx(grip_pose(keyed.data), abs=1e-15)
     # a start that was changed after loading takes the handle along
-    keyed.model.key_qpos[1, :3] = 7.0
+    before = keyed.model.key_qpos[1].copy()
+    keyed.model.key_qpos[1] = [7, 7, 7, 1, 0, 0, 0]
     keyed.reset()
     assert handle_pose(keyed.data) == pytest.approx(grip_pose(keyed.data), abs=1e-15)
-    keyed.model.key_qpos[1, :3] = [0.1, 0.2, 0.3]
+    keyed.model.key_qpos[1] = before
     # whoever opens the compiled model without the package finds the handle there as well
     for key in (None, 0, 1):
         data = mujoco.MjData(keyed.model)

@@ -27,7 +27,7 @@ from hapticbridge.audit.differences import (
 from hapticbridge.audit.interventions import Interventions
 from hapticbridge.audit.law import Motion, wrench_by_law
 from hapticbridge.audit.reached import Reached
-from hapticbridge.kernel.state import RunParameters
+from hapticbridge.kernel.parameters import RunParameters
 
 Array = NDArray[np.float64]
 

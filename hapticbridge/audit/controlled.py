@@ -16,7 +16,7 @@ from hapticbridge.audit.differences import steps, turns
 from hapticbridge.audit.watched import Seen
 from hapticbridge.kernel.account import BOUND, SWINGS, TANK_START, THRESHOLD, WINDOW
 from hapticbridge.kernel.guarding import DAMPER, ENVIRONMENT, TANK
-from hapticbridge.kernel.state import RunParameters
+from hapticbridge.kernel.parameters import RunParameters
 
 Array = NDArray[np.float64]
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.audit.limited import limits_on_tool, spring_energy
-from hapticbridge.kernel.state import RunParameters
+from hapticbridge.kernel.parameters import RunParameters
 
 Array = NDArray[np.float64]
 

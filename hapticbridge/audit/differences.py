@@ -1,4 +1,4 @@
-"""From tick to tick, over whole arrays: steps, turns, sums, and the time since the force rose."""
+"""From tick to tick, over whole arrays: steps, turns and sums."""
 
 from __future__ import annotations
 
@@ -39,11 +39,6 @@ def steps(values: Array, before: Array) -> Array:
 def turns(values: Array, before: Array) -> Array:
     """Returns the rotation vectors from each orientation's predecessor to it."""
     return turn_between(np.concatenate([before[None], values[:-1]]), values)
-
-
-def product_conjugate(values: Array, before: Array) -> Array:
-    """Returns q_k ⊗ q_{k−1}⁻¹ over rows (n, 4), with q_{−1} = before."""
-    return quaternion_product(values, conjugate(np.concatenate([before[None], values[:-1]])))
 
 
 def summed(values: Array, before: float) -> Array:

@@ -18,7 +18,7 @@ from hapticbridge.audit.interventions import Interventions
 from hapticbridge.audit.law import poses_before
 from hapticbridge.audit.limited import chained
 from hapticbridge.audit.watched import Seen, Watch, has_flag
-from hapticbridge.kernel.state import RunParameters
+from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.tick import TickFlag
 
 Array = NDArray[np.float64]

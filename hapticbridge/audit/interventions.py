@@ -18,7 +18,7 @@ from hapticbridge.commands.change import bits_in, coupling_in, tuning_ticks
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import RecordingError
-from hapticbridge.kernel.state import RunParameters
+from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.rendering import Method
 
 Array = NDArray[np.float64]

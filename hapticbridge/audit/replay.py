@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.audit.rerun import FOREIGN_TOLERANCE, Rerun, is_same_processor, obstacle
-from hapticbridge.kernel.state import RunParameters
+from hapticbridge.audit.attached_scene import FOREIGN_TOLERANCE, is_same_processor
+from hapticbridge.audit.rerun import Rerun, obstacle
+from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.recording import RecordingFile
 from hapticbridge.tick import CLOCK_FIELDS, TICK_DTYPE, TickFlag
 

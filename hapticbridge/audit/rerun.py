@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections import deque
 from collections.abc import Mapping
@@ -13,35 +12,33 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticbridge.audit.attached_scene import (
+    attached_model,
+    check_elastic,
+    check_start,
+    check_stored,
+)
 from hapticbridge.commands import CHANGES as COMMANDED
 from hapticbridge.commands import Repeater
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.inputs import apply_writes
-from hapticbridge.kernel.state import COUPLING_ACTUATORS, Binding, RunParameters
-from hapticbridge.kernel.step import simulate_recorded
+from hapticbridge.kernel.parameters import RunParameters
+from hapticbridge.kernel.simulation import simulate_recorded
+from hapticbridge.kernel.state import Binding
 from hapticbridge.provenance import (
     MODEL_ATTACHMENT,
     RESET_ATTACHMENT,
-    STARTS,
     STATE_ATTACHMENT,
     elastic_energy,
-    meta_start,
-    processor,
     restore_state,
-    start_of,
     versions,
 )
 from hapticbridge.recording import RecordingFile
-from hapticbridge.rendering import check_prepared, method_named
+from hapticbridge.rendering import method_named
 from hapticbridge.tick import SAMPLE_DTYPE, TICK_DTYPE, TickFlag
 
 DECISIVE = ("hapticbridge", "mujoco", "numba")
 """Packages whose versions must match for a run to be repeated to the bit."""
-
-FOREIGN_TOLERANCE = 1e-9
-"""Allowed difference, relative to a field's largest value, where the processor differs: other
-vector instructions round differently. Larger would hide tampering, smaller would refuse honest
-recordings."""
 
 _CHANGES = ("input", "resume", *COMMANDED)
 """Events that change what the next ticks compute."""
@@ -72,7 +69,7 @@ class Rerun:
             self.note(event)
         self._changed = self._read_ns = 0
         self.done, self.is_over = 0, False
-        self.model = model = _model(recording, parameters)
+        self.model = model = attached_model(recording, parameters)
         self.data = data = mujoco.MjData(model)
         # an error inside the C symbol would end the process, so MuJoCo takes its first step in
         # Python
@@ -87,15 +84,15 @@ class Rerun:
         if parameters.counts is not None:
             restore_state(model, data, reset)
             begun = replace(parameters, counts=None, start_elastic=0.0)
-            _check_stored(parameters.counts.stored, Binding(model, data, begun).state)
+            check_stored(parameters.counts.stored, Binding(model, data, begun).state)
         restore_state(model, data, start)
         method.step(model, data)
         restore_state(model, data, start)
         if parameters.start_elastic:
-            _check_elastic(parameters.start_elastic, elastic_energy(data))
+            check_elastic(parameters.start_elastic, elastic_energy(data))
         self._binding = Binding(model, data, parameters)
         self._commands = Repeater(self._binding, model, data, method, parameters, reset)
-        _check_start(recording, self._binding.state)
+        check_start(recording, self._binding.state)
 
     def warm_up(self) -> None:
         """Compiles what ``add`` needs, so that the first call takes no longer than others."""
@@ -210,82 +207,3 @@ def obstacle(recording: RecordingFile) -> str:
             return f"recorded with {name} {recorded.get(name, 'unknown')}, here is {present[name]}"
     missing = [n for n in (MODEL_ATTACHMENT, STATE_ATTACHMENT) if n not in recording.attachments]
     return f"the file has no attachment '{missing[0]}'" if missing else ""
-
-
-def _model(recording: RecordingFile, parameters: RunParameters) -> mujoco.MjModel:
-    content = recording.attachments[MODEL_ATTACHMENT]
-    if hashlib.sha256(content).hexdigest() != recording.meta.get("scene_sha256"):
-        raise RecordingError("the attached model is not the one of scene_sha256")
-    try:
-        model = mujoco.MjModel.from_binary_path(
-            MODEL_ATTACHMENT, assets={MODEL_ATTACHMENT: content}
-        )
-    except ValueError as error:
-        raise RecordingError(f"the attached model cannot be loaded: {error}") from None
-    for name in (*COUPLING_ACTUATORS, parameters.grip):
-        kind = mujoco.mjtObj.mjOBJ_SITE if name == parameters.grip else mujoco.mjtObj.mjOBJ_ACTUATOR
-        if mujoco.mj_name2id(model, kind, name) < 0:
-            raise RecordingError(f"the attached model has no '{name}'")
-    method = method_named(recording.meta.get("method", ""))
-    step = parameters.period / parameters.substeps
-    forces, torques = method.gains(parameters.coupling, step)
-    for axis, name in enumerate(COUPLING_ACTUATORS):
-        actuator_id = model.actuator(name).id
-        factor, stiffness, damping = forces if axis < 3 else torques
-        bias = model.actuator_biasprm[actuator_id].tolist()
-        gain = float(model.actuator_gainprm[actuator_id, 0])
-        if (bias[1], bias[2], gain) != (-stiffness, -damping, factor):
-            raise RecordingError(
-                f"the attached model's coupling has K = {-bias[1]!r}, B = {gain!r} in {name}, "
-                f"the metadata say {stiffness!r}, {factor!r}"
-            )
-    try:
-        check_prepared(model, parameters, method)
-    except HapticBridgeError as error:
-        raise RecordingError(f"the attached model does not fit the metadata: {error}") from None
-    if model.opt.timestep != parameters.period / parameters.substeps:
-        raise RecordingError(
-            f"the attached model's timestep is {model.opt.timestep!r} s, the metadata's period "
-            f"{parameters.period!r} s with {parameters.substeps} substeps"
-        )
-    return model
-
-
-def _check_start(recording: RecordingFile, state: NDArray[np.void]) -> None:
-    """Refuses metadata that do not repeat the start of the attached scene."""
-    for name in STARTS:
-        recorded = meta_start(recording.meta, name)
-        present = start_of(state, name)
-        if not np.allclose(recorded, present, rtol=FOREIGN_TOLERANCE, atol=FOREIGN_TOLERANCE) or (
-            is_same_processor(recording) and recorded != present
-        ):
-            raise RecordingError(
-                f"metadata '{name}' is {recorded}, the attached scene starts with {present}"
-            )
-
-
-def _check_elastic(claimed: float, present: float) -> None:
-    """Refuses a start that is said to store more than the attached scene's constraints do."""
-    if not abs(claimed - present) <= FOREIGN_TOLERANCE * (1.0 + present):
-        raise RecordingError(
-            f"metadata 'start_elastic' is {claimed!r} J, the attached scene's constraints store "
-            f"{present!r} J at most"
-        )
-
-
-def _check_stored(claimed: float, state: NDArray[np.void]) -> None:
-    """Refuses counts of the guard that begin with another energy than the whole run began with."""
-    present = float(state["start_energy"][0])
-    if not abs(claimed - present) <= FOREIGN_TOLERANCE * (1.0 + abs(present)):
-        raise RecordingError(
-            f"metadata 'counts' say that the scene stored {claimed!r} J when the run began, the "
-            f"attached scene stores {present!r} J there"
-        )
-
-
-def is_same_processor(recording: RecordingFile) -> bool:
-    """Returns whether a run was recorded on this model of processor, as far as it says."""
-    try:
-        return bool(json.loads(recording.meta["host"])["processor"] == processor())
-    except (KeyError, TypeError, ValueError, RecursionError):
-        return True

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from hapticbridge.audit.interventions import Interventions
 from hapticbridge.audit.watched import Seen, Watch
-from hapticbridge.kernel.state import RunParameters
+from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.watch import DEVICE_BUTTONS
 from hapticbridge.recording import RecordingFile
 from hapticbridge.tick import CLOCK_FIELDS, TICK_DTYPE, TickFlag
@@ -83,8 +83,8 @@ def structure_fault(
         checks = chain(
             _number_faults(ticks, count),
             _time_faults(ticks, before, count, parameters),
-            _flag_faults(ticks, before, seen),
-            _command_faults(ticks, outside),
+            _flag_faults(ticks, before, count, seen),
+            _command_faults(ticks, count, outside),
         )
         for rank, fault in enumerate(checks):
             if fault is not None:
@@ -93,28 +93,38 @@ def structure_fault(
     return found[min(found)] if found else None
 
 
-def _command_faults(ticks: NDArray[np.void], outside: Interventions) -> Iterator[Fault | None]:
+def _first(is_wrong: NDArray[np.bool_], start: int, text: str, port: str) -> Fault | None:
+    """Returns the fault of the first record that is wrong, if one is.
+
+    Args:
+        is_wrong: Per record.
+        start: Tick of the first of them.
+        text: A sentence with ``{}`` for the tick.
+        port: The field at fault.
+    """
+    if not is_wrong.any():
+        return None
+    tick = start + int(np.argmax(is_wrong))
+    return Fault(text.format(tick), tick, port)
+
+
+def _command_faults(
+    ticks: NDArray[np.void], count: int, outside: Interventions
+) -> Iterator[Fault | None]:
     """Holds the bits of commands in the records against the events that set them."""
     wrong = (ticks["buttons"] & ~DEVICE_BUTTONS) != outside.buttons(ticks["tick"])
-    tick = int(ticks["tick"][np.argmax(wrong)])
-    text = f"buttons of tick {tick} do not show what the events commanded"
-    yield Fault(text, tick, "buttons") if wrong.any() else None
+    text = "buttons of tick {} do not show what the events commanded"
+    yield _first(wrong, count, text, "buttons")
 
 
 def _number_faults(ticks: NDArray[np.void], count: int) -> Iterator[Fault | None]:
     for name in TICK_DTYPE.names or ():
         finite = np.isfinite(ticks[name]).reshape(len(ticks), -1).all(axis=1)
-        tick = count + int(np.argmin(finite))
-        yield None if finite.all() else Fault(f"{name} of record {tick} is not finite", tick, name)
+        yield _first(~finite, count, f"{name} of record {{}} is not finite", name)
     for name in ("device_quaternion", "handle_quaternion", "tool_quaternion"):
         off = np.abs(np.linalg.norm(ticks[name], axis=1) - 1) > TOLERANCE
         off |= ticks[name][:, 0] < 0
-        tick = count + int(np.argmax(off))
-        yield (
-            Fault(f"{name} of tick {tick} is not a unit quaternion", tick, name)
-            if (off.any())
-            else None
-        )
+        yield _first(off, count, f"{name} of tick {{}} is not a unit quaternion", name)
 
 
 def _time_faults(
@@ -123,11 +133,8 @@ def _time_faults(
     yield _gap(ticks, before, count)
     yield _wrong_deadline(ticks, before, count, parameters)
     times = np.stack([ticks[name] for name in CLOCK_FIELDS], axis=1)
-    backwards = (np.diff(times, axis=1) < 0).any(axis=1)
-    tick = count + int(np.argmax(backwards))
-    yield (
-        Fault(f"times of tick {tick} run backwards", tick, "wake_ns") if (backwards.any()) else None
-    )
+    backwards = np.asarray(np.diff(times, axis=1).min(axis=1) < 0)
+    yield _first(backwards, count, "times of tick {} run backwards", "wake_ns")
 
 
 def _gap(ticks: NDArray[np.void], before: NDArray[np.void], count: int) -> Fault | None:
@@ -166,10 +173,9 @@ def _wrong_deadline(
 
 
 def _flag_faults(
-    ticks: NDArray[np.void], before: NDArray[np.void], seen: Seen
+    ticks: NDArray[np.void], before: NDArray[np.void], count: int, seen: Seen
 ) -> Iterator[Fault | None]:
     """Holds those flags that other fields repeat against them."""
-    numbers = ticks["tick"]
     expected = {
         TickFlag.DROPPED_BEFORE: np.zeros(len(ticks), bool),  # the ticks are contiguous
         TickFlag.CONTACT: ticks["contacts"] > 0,
@@ -177,20 +183,12 @@ def _flag_faults(
     }
     for flag, is_due in expected.items():
         wrong = ((ticks["flags"] & int(flag)) != 0) != is_due
-        tick = int(numbers[np.argmax(wrong)])
         name = (flag.name or "").lower()
-        yield (
-            Fault(f"flag '{name}' of tick {tick} contradicts the record", tick, "flags")
-            if (wrong.any())
-            else None
-        )
+        text = f"flag '{name}' of tick {{}} contradicts the record"
+        yield _first(wrong, count, text, "flags")
     rows = np.concatenate([before, ticks])
     is_stale = (rows["flags"][1:] & int(TickFlag.STALE_SAMPLE)) != 0
     for field in ("device_position", "device_quaternion"):
         moved = is_stale & (rows[field][1:] != rows[field][:-1]).any(axis=1)
-        if moved.any():
-            tick = int(rows["tick"][1 + np.argmax(moved)])
-            text = f"tick {tick} says that the device had nothing new, and its {field} differs"
-            yield Fault(text, tick, "flags")
-        else:
-            yield None
+        text = f"tick {{}} says that the device had nothing new, and its {field} differs"
+        yield _first(moved, count + 1 - before.size, text, "flags")

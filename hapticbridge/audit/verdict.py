@@ -32,7 +32,7 @@ from hapticbridge.device.lateness import delay_ticks
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.felt import coupling_sentences, was_never_lossless
 from hapticbridge.guard import Limits, limits_for
-from hapticbridge.kernel.state import RunParameters
+from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.provenance import STARTS, meta_home, meta_start, parameters_of
 from hapticbridge.recording import RecordingFile, open_recording
 from hapticbridge.rendering import Method, method_named

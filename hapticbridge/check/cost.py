@@ -11,13 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.check.growth import Growth, Spread, growth_of
-from hapticbridge.check.rehearsal import rehearsal_parameters
+from hapticbridge.check.rehearsal import not_finite, rehearsal_parameters
 from hapticbridge.coupling import Coupling
-from hapticbridge.errors import SceneError
 from hapticbridge.jit import direct
+from hapticbridge.kernel.codes import OK
 from hapticbridge.kernel.publish import publish
 from hapticbridge.kernel.state import Binding
-from hapticbridge.kernel.step import OK, after_step, before_step
+from hapticbridge.kernel.step import after_step, before_step
 from hapticbridge.recording import TAIL, Ring
 from hapticbridge.recording.stream import NOBODY_READS
 from hapticbridge.scene import Scene
@@ -165,7 +165,7 @@ def _time_ticks(
         hand_over(row, records, cursors, begin, begin, begin, begin, 0)
         times[k] = clock() - begin
         if code != OK:
-            raise SceneError(f"scene '{scene.name}' is not finite in tick {k} of its motion")
+            raise not_finite(scene, k, samples.size)
         contacts[k], rows[k] = int(row["contacts"][0]), data.nefc  # what is near is no contact
     ring.close()
     return 1e-9 * times, contacts, rows

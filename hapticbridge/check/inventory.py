@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from hapticbridge.check.observation import ROW_KINDS, Observation
 from hapticbridge.check.places import Place, Places
 from hapticbridge.check.reach import reached_trees
-from hapticbridge.kernel.state import COUPLING_ACTUATORS, HANDLE
+from hapticbridge.kernel.names import COUPLING_ACTUATORS, HANDLE
 from hapticbridge.scene.contact_check import meeting_pairs
 
 VISUAL = "only visual"

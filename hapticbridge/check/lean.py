@@ -33,7 +33,6 @@ from hapticbridge.scene import SceneSource
 Progress = Callable[[int, int, str], None]
 """Called with what is done, what there is to do at most, and what is being tried."""
 
-
 _ARGUMENTS = Arguments(SceneError)
 
 

@@ -10,12 +10,12 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.check.rehearsal import rehearsal_parameters
+from hapticbridge.check.rehearsal import not_finite, rehearsal_parameters
 from hapticbridge.coupling import Coupling
-from hapticbridge.errors import SceneError
 from hapticbridge.jit import direct
+from hapticbridge.kernel.codes import OK
 from hapticbridge.kernel.state import Binding
-from hapticbridge.kernel.step import OK, after_step, before_step
+from hapticbridge.kernel.step import after_step, before_step
 from hapticbridge.ledger import Ledger
 from hapticbridge.scene import Scene
 
@@ -120,10 +120,10 @@ def observe(
     force, full = np.zeros(samples.size), 0
     for k in range(samples.size):
         if before(state, samples[k : k + 1], row, 0, period) != OK:
-            raise _not_finite(scene, k, samples.size)
+            raise not_finite(scene, k, samples.size)
         mujoco.mj_step(model, data)
         if after(state, row, 0) != OK:
-            raise _not_finite(scene, k, samples.size)
+            raise not_finite(scene, k, samples.size)
         if data.nefc:
             counted = np.bincount(data.efc_type)
             types[k, : counted.size] = counted
@@ -208,9 +208,3 @@ def _warnings(data: mujoco.MjData) -> dict[str, int]:
         for kind, warning in enumerate(data.warning)
         if warning.number
     }
-
-
-def _not_finite(scene: Scene, tick: int, ticks: int) -> SceneError:
-    return SceneError(
-        f"scene '{scene.name}' is not finite after tick {tick} of {ticks} of the motion"
-    )

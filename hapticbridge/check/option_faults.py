@@ -10,7 +10,7 @@ from hapticbridge.check.case import Case
 from hapticbridge.check.faults import Fault
 from hapticbridge.errors import choices
 from hapticbridge.scene.checks import check_model
-from hapticbridge.scene.load import START_KEYFRAME
+from hapticbridge.scene.start import START_KEYFRAME
 
 _SAME_STEP = 1e-9  # relative: 0.001 as 1/1000
 

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import SceneError
 from hapticbridge.kernel.parameters import RunParameters
+from hapticbridge.kernel.simulation import simulate
 from hapticbridge.kernel.state import Binding
-from hapticbridge.kernel.step import simulate
 from hapticbridge.ledger import Ledger
 from hapticbridge.rendering import default_method, prepare
 from hapticbridge.scene import Scene
@@ -76,9 +76,7 @@ def rehearse(
     done = simulate(binding.state, samples, binding.row, rows)
     seconds = time.thread_time() - start
     if done < samples.size:
-        raise SceneError(
-            f"scene '{scene.name}' is not finite after tick {done} of {samples.size} of the motion"
-        )
+        raise not_finite(scene, done, samples.size)
     ledger = Ledger.of(binding.state)
     return Rehearsal(
         records=rows,
@@ -87,6 +85,13 @@ def rehearse(
         fault=ledger.fault,
         warnings=sum(int(warning.number) for warning in scene.data.warning),
         seconds=seconds,
+    )
+
+
+def not_finite(scene: Scene, tick: int, ticks: int) -> SceneError:
+    """Returns what is said of a motion that ends before its time."""
+    return SceneError(
+        f"scene '{scene.name}' is not finite after tick {tick} of {ticks} of the motion"
     )
 
 

@@ -13,8 +13,8 @@ from hapticbridge.check.draft import Draft
 from hapticbridge.check.rehearsal import rehearsal_parameters
 from hapticbridge.device import Motion
 from hapticbridge.errors import SceneError
+from hapticbridge.kernel.simulation import simulate
 from hapticbridge.kernel.state import Binding
-from hapticbridge.kernel.step import simulate
 from hapticbridge.tick import TICK_DTYPE
 
 CHUNKS = 40

@@ -12,7 +12,7 @@ from hapticbridge.check.contact_faults import pair_names
 from hapticbridge.check.faults import Fault, length
 from hapticbridge.scene.checks import MAXIMUM_START_PENETRATION
 from hapticbridge.scene.contact_check import settings_among
-from hapticbridge.scene.load import START_KEYFRAME
+from hapticbridge.scene.start import START_KEYFRAME
 
 
 def margin_faults(case: Case) -> Iterator[Fault]:

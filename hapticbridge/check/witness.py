@@ -10,11 +10,10 @@ from numpy.typing import NDArray
 
 from hapticbridge.check.draft import Draft
 from hapticbridge.check.frames import pose_in, rotation_vector
-from hapticbridge.check.rehearsal import rehearsal_parameters
+from hapticbridge.check.rehearsal import not_finite, rehearsal_parameters
 from hapticbridge.device import Motion
-from hapticbridge.errors import SceneError
+from hapticbridge.kernel.simulation import simulate
 from hapticbridge.kernel.state import Binding
-from hapticbridge.kernel.step import simulate
 from hapticbridge.scene.contact_check import meeting_pairs
 from hapticbridge.tick import TICK_DTYPE
 
@@ -86,7 +85,7 @@ def witness(draft: Draft, motion: Motion) -> Witness:
     every = max(1, round(LOOK_EVERY / setting.period))
     for k in range(samples.size):
         if not simulate(binding.state, samples[k : k + 1], binding.row, row):
-            raise SceneError(f"scene '{scene.name}' is not finite after tick {k} of the motion")
+            raise not_finite(scene, k, samples.size)
         seen.solver_iterations = max(seen.solver_iterations, int(row["solver_iterations"][0]))
         if data.ncon:
             touching = [pair for pair in data.contact.geom.tolist() if min(pair) >= 0]

@@ -18,7 +18,8 @@ from hapticbridge.cli.terminal import (
 )
 from hapticbridge.clock import RealClock, SimulatedClock, period_of
 from hapticbridge.device import AXES, open_device
-from hapticbridge.device.profile import Profile, own_folder
+from hapticbridge.device.profile import Profile
+from hapticbridge.device.profile_search import own_folder
 from hapticbridge.errors import HapticBridgeError, choices
 from hapticbridge.identify import identify
 from hapticbridge.identify.identification import (

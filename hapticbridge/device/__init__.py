@@ -1,9 +1,9 @@
 """Haptic devices: real, simulated and replayed, behind one protocol."""
 
-from hapticbridge.device.base import AXES as AXES
-from hapticbridge.device.base import DATA_SHEET_UNITS as DATA_SHEET_UNITS
 from hapticbridge.device.base import Device as Device
-from hapticbridge.device.base import DeviceInfo as DeviceInfo
+from hapticbridge.device.data_sheet import AXES as AXES
+from hapticbridge.device.data_sheet import DATA_SHEET_UNITS as DATA_SHEET_UNITS
+from hapticbridge.device.data_sheet import DeviceInfo as DeviceInfo
 from hapticbridge.device.library import device_for as device_for
 from hapticbridge.device.library import open_device as open_device
 from hapticbridge.device.simulated.driver import SimulatedDevice as SimulatedDevice

@@ -6,7 +6,7 @@ import math
 from typing import Literal
 
 from hapticbridge.coupling import Coupling
-from hapticbridge.device.base import DeviceInfo
+from hapticbridge.device.data_sheet import DeviceInfo
 from hapticbridge.passivity import minimum_damping
 
 _WHOLE = 1e-9  # of a tick: a delay that is this little above whole ticks is as many

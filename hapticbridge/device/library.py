@@ -11,7 +11,7 @@ from typing import Any
 from hapticbridge.device.base import Device
 from hapticbridge.device.families import FAMILIES, family_named
 from hapticbridge.device.plugged import Tell, tell_nobody
-from hapticbridge.device.profile import modelled, profile_named, profile_of
+from hapticbridge.device.profile_search import modelled, profile_named, profile_of
 from hapticbridge.device.simulated.driver import SimulatedDevice
 from hapticbridge.device.simulated.hand import Hand
 from hapticbridge.device.simulated.scene_hand import scene_hand

@@ -10,11 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.jit import compiled
+from hapticbridge.kernel.codes import CONTROLLER_ACTIVE
 from hapticbridge.kernel.guarding import DAMPER, ENVIRONMENT, TANK
 from hapticbridge.pose import Vector, scaled
-
-CONTROLLER_ACTIVE = 32
-"""Of ``TickFlag``: the compiler cannot read an enumeration."""
 
 THRESHOLD = 1e-5
 """In J. The controller acts on a debt above it. Rounding and the first-order error of turning tools
@@ -23,7 +21,6 @@ stay below; a limit cycle that a hand could feel (0.1 mm at 2400 N/m) holds it i
 TANK_START = 5e-3
 """In J: what the tank holds at first. It must lend what a spring gives back before the account has
 seen it: 5 N at 2400 N/m hold 5 mJ. More lets a larger kick pass, less softens contacts."""
-
 
 SWINGS, WINDOW = 4, 8
 """So many reversals of the motion within so many ticks tell that an axis swings from sample to

@@ -14,19 +14,22 @@ from numpy.typing import NDArray
 from hapticbridge.jit import compiled
 from hapticbridge.kernel.ahead import is_sound
 from hapticbridge.kernel.codes import BAD_RESULT, CONTACT, LARGEST_CONTROL, MIDPOINT, OK, TRIP
-from hapticbridge.kernel.handle import (
-    quaternion_of,
-    store_quaternion,
-    store_vector,
-    vector_of,
-)
 from hapticbridge.kernel.lossless import finish_lossless
 from hapticbridge.kernel.meter import add_coupling_work, judge_environment, refresh_energies
 from hapticbridge.kernel.native import has_warned, ints
 from hapticbridge.kernel.ports import meter_ports
 from hapticbridge.kernel.scheme import DIRECT, HELD, LOSSLESS
 from hapticbridge.kernel.wrench import render, wrench_of_step
-from hapticbridge.pose import add, dot, norm, scaled
+from hapticbridge.pose import (
+    add,
+    dot,
+    norm,
+    quaternion_of,
+    scaled,
+    store_quaternion,
+    store_vector,
+    vector_of,
+)
 
 
 @compiled
@@ -52,10 +55,8 @@ def answer_step(state: NDArray[np.void], row: NDArray[np.void], substep: int) ->
         force, torque = scaled(share, force), scaled(share, torque)
         if substep > 0:
             w, m = s.wrench_on_tool, s.motion
-            force = add((w[0], w[1], w[2]), force)
-            torque = add((w[3], w[4], w[5]), torque)
-            moved = add((m[0], m[1], m[2]), moved)
-            turned = add((m[3], m[4], m[5]), turned)
+            force, torque = add(vector_of(w), force), add(vector_of(w[3:6]), torque)
+            moved, turned = add(vector_of(m), moved), add(vector_of(m[3:6]), turned)
     store_vector(s.motion[0:3], moved)
     store_vector(s.motion[3:6], turned)
     store_vector(s.wrench_on_tool[0:3], force)

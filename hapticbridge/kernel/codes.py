@@ -1,4 +1,4 @@
-"""What the kernel's functions return, and the flags they set, as plain integers."""
+"""What the kernel's functions return, the flags they set, and MuJoCo's kinds of constraints."""
 
 from __future__ import annotations
 
@@ -10,8 +10,12 @@ JUMPED, BACKWARDS, STRETCHED, TWISTED, GAVE_ENERGY = 11, 12, 13, 14, 15
 """Why a tick is refused before it is computed (``kernel.watch``): the device's pose jumped, time
 ran backwards, the coupling is too long or turned too far, the device was given too much energy."""
 
-CONTACT, TRIP, MIDPOINT = 64, 512, 1024
+FORCE_LIMITED, SLEW_LIMITED, RAMPING, CONTROLLER_ACTIVE, CONTACT, CLUTCH = 4, 8, 16, 32, 64, 128
+STALE_SAMPLE, TRIP, MIDPOINT, RESEATED = 256, 512, 1024, 2048
 """Bits of ``TickFlag``: the compiler cannot read an enumeration."""
+
+EQUALITY, LIMIT_JOINT, LIMIT_TENDON, CONTACT_PYRAMIDAL = 0, 3, 4, 6
+"""Kinds of constraint rows (``mjtConstraint``), likewise."""
 
 LARGEST_CONTROL = 1e10
 """mjMAXVAL, in N and N m. Beyond it the run has diverged anyway."""

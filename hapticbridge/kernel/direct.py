@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from hapticbridge.jit import compiled
 from hapticbridge.kernel.native import floats, ints, pointer_at
 from hapticbridge.pose import (
-    Quaternion,
     Vector,
     add,
     conjugate,
@@ -25,9 +24,13 @@ from hapticbridge.pose import (
     dot,
     product,
     quaternion_exp,
+    quaternion_of,
     rotated,
     scaled,
+    store_quaternion,
+    store_vector,
     subtract,
+    vector_of,
 )
 
 FREE_TOOL = 7
@@ -66,16 +69,6 @@ def tool_map(model: mujoco.MjModel, site_id: int) -> tuple[NDArray[np.float64], 
 
 
 @compiled
-def _triple(values: NDArray[np.float64], first: int) -> Vector:
-    return values[first], values[first + 1], values[first + 2]
-
-
-@compiled
-def _quadruple(values: NDArray[np.float64], first: int) -> Quaternion:
-    return values[first], values[first + 1], values[first + 2], values[first + 3]
-
-
-@compiled
 def place_tool(state: NDArray[np.void]) -> None:
     """Writes the tool's coordinates so that the grip is at the handle.
 
@@ -83,25 +76,25 @@ def place_tool(state: NDArray[np.void]) -> None:
     hinge, and by the part of its motion along the slides.
     """
     s = state[0]
-    handle = _triple(s.handle_position, 0)
-    orientation = _quadruple(s.handle_quaternion, 0)
+    handle = vector_of(s.handle_position)
+    orientation = quaternion_of(s.handle_quaternion)
     numbers = floats(s.tool_map, s.tool_map_size)
     addresses = ints(s.tool_qpos, 3)
     if s.tool_map_size == FREE_TOOL:
-        body = product(orientation, conjugate(_quadruple(numbers, 3)))
-        position = subtract(handle, rotated(body, _triple(numbers, 0)))
+        body = product(orientation, conjugate(quaternion_of(numbers[3:])))
+        position = subtract(handle, rotated(body, vector_of(numbers)))
         qpos = floats(s.qpos + 8 * addresses[0], 7)
-        qpos[0], qpos[1], qpos[2] = position
-        qpos[3], qpos[4], qpos[5], qpos[6] = body
+        store_vector(qpos, position)
+        store_quaternion(qpos[3:7], body)
         return
-    axis, anchor, grip = _triple(numbers, 6), _triple(numbers, 9), _triple(numbers, 12)
-    turn = product(orientation, conjugate(_quadruple(numbers, 15)))
+    axis, anchor, grip = vector_of(numbers[6:]), vector_of(numbers[9:]), vector_of(numbers[12:])
+    turn = product(orientation, conjugate(quaternion_of(numbers[15:])))
     angle = 2.0 * math.atan2(dot((turn[1], turn[2], turn[3]), axis), turn[0])
     angle = math.atan2(math.sin(angle), math.cos(angle))
     swung = rotated(quaternion_exp(scaled(angle, axis)), subtract(grip, anchor))
     left = subtract(handle, add(anchor, swung))
     for joint in range(2):
-        slide = dot(_triple(numbers, 3 * joint), left)
+        slide = dot(vector_of(numbers[3 * joint :]), left)
         floats(s.qpos + 8 * addresses[joint], 1)[0] = numbers[19 + joint] + slide
     floats(s.qpos + 8 * addresses[2], 1)[0] = numbers[21] + angle
 
@@ -113,7 +106,7 @@ def balance_contacts(state: NDArray[np.void]) -> tuple[Vector, Vector]:
     The energies are those of the springs; a tool without mass has no kinetic one.
     """
     s = state[0]
-    grip = _triple(floats(s.site_xpos + 24 * s.grip_site_id, 3), 0)
+    grip = vector_of(floats(s.site_xpos + 24 * s.grip_site_id, 3))
     is_tool = ints(s.geom_is_tool, s.ngeom)
     force, torque = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
     energy = 0.0
@@ -127,9 +120,9 @@ def balance_contacts(state: NDArray[np.void]) -> tuple[Vector, Vector]:
         if side == 0:
             continue
         # the normal points from the first geom to the second
-        normal = _triple(floats(contact + s.contact_frame, 3), 0)
+        normal = vector_of(floats(contact + s.contact_frame, 3))
         push = scaled(side * s.contact_stiffness * depth, normal)
-        arm = subtract(_triple(floats(contact + s.contact_point, 3), 0), grip)
+        arm = subtract(vector_of(floats(contact + s.contact_point, 3)), grip)
         force, torque = subtract(force, push), subtract(torque, cross(arm, push))
         energy += 0.5 * s.contact_stiffness * depth * depth
     s.kinetic, s.potential = 0.0, energy

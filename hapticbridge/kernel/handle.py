@@ -1,4 +1,4 @@
-"""Where a device's pose puts the handle, and how tuples and arrays become each other."""
+"""Where a device's pose puts the handle, and vectors between the axes of device and scene."""
 
 from __future__ import annotations
 
@@ -13,33 +13,11 @@ from hapticbridge.pose import (
     canonical,
     conjugate,
     product,
+    quaternion_of,
     scaled,
     subtract,
+    vector_of,
 )
-
-
-@compiled
-def vector_of(values: NDArray[np.float64]) -> Vector:
-    """Returns the first three elements as a tuple."""
-    return values[0], values[1], values[2]
-
-
-@compiled
-def quaternion_of(values: NDArray[np.float64]) -> Quaternion:
-    """Returns the first four elements as a tuple."""
-    return values[0], values[1], values[2], values[3]
-
-
-@compiled
-def store_vector(target: NDArray[np.float64], v: Vector) -> None:
-    """Writes a tuple into the first three elements."""
-    target[0], target[1], target[2] = v
-
-
-@compiled
-def store_quaternion(target: NDArray[np.float64], q: Quaternion) -> None:
-    """Writes a tuple into the first four elements."""
-    target[0], target[1], target[2], target[3] = q
 
 
 @compiled
@@ -73,11 +51,10 @@ def handle_pose(
     A is the rotation from the device's axes to the scene's, subscript 0 the pose at the start.
     """
     s = state[0]
-    offset = subtract(position, (s.device_origin[0], s.device_origin[1], s.device_origin[2]))
+    offset = subtract(position, vector_of(s.device_origin))
     moved = scaled(s.scale, scene_from_device(s.axes, offset))
     origin = s.handle_origin
-    start = (s.device_origin[3], s.device_origin[4], s.device_origin[5], s.device_origin[6])
+    start = quaternion_of(s.device_origin[3:7])
     axes = quaternion_of(s.axes_quaternion)
     turn = product(product(axes, product(quaternion, conjugate(start))), conjugate(axes))
-    turned = product(turn, (origin[3], origin[4], origin[5], origin[6]))
-    return add((origin[0], origin[1], origin[2]), moved), canonical(turned)
+    return add(vector_of(origin), moved), canonical(product(turn, quaternion_of(origin[3:7])))

@@ -35,11 +35,10 @@ from hapticbridge.kernel.balanced_velocity import (
     write_external,
     write_half_step,
 )
-from hapticbridge.kernel.handle import quaternion_of, vector_of
-from hapticbridge.kernel.midpoint import twist_in_tool
+from hapticbridge.kernel.midpoint import note_twist
 from hapticbridge.kernel.native import floats, ints, mj_factor_m, mj_passive
 from hapticbridge.kernel.tuning import set_gains
-from hapticbridge.pose import Vector, scaled, subtract
+from hapticbridge.pose import Vector, scaled, subtract, vector_of
 
 HOLD_TICKS = 5
 """Ticks without anything near before the tool is lossless again, no unit. In twelve random hands on
@@ -139,6 +138,4 @@ def finish_lossless(state: NDArray[np.void]) -> None:
         leave(state)
     elif not s.was_midpoint and s.hold == 0:
         _enter(state, force, torque)
-    twist = twist_in_tool(state, quaternion_of(s.tool_quaternion))
-    for i in range(3):
-        s.twist[i] = twist[i]
+    note_twist(state)

@@ -19,7 +19,7 @@ from hapticbridge.kernel.native import (
     mj_kinematics,
     mj_make_m,
 )
-from hapticbridge.pose import dot
+from hapticbridge.pose import dot, vector_of
 
 ENERGY_TOLERANCE = 1e-9
 """An environment is strict while Σ E_k <= 1e-9 J + 1e-9 Σ|f·δx|: rounding of a sum of many small
@@ -75,8 +75,7 @@ def judge_environment(state: NDArray[np.void]) -> None:
     b ‖δp_k‖² over the time between two samples at least, and against what the scene gave up.
     """
     s = state[0]
-    m = s.motion
-    moved, turned = (m[0], m[1], m[2]), (m[3], m[4], m[5])
+    moved, turned = vector_of(s.motion), vector_of(s.motion[3:6])
     s.slack += 0.5 * s.slack_stiffness * dot(moved, moved)
     s.slack += 0.5 * s.slack_rotational_stiffness * dot(turned, turned)
     stored = (s.kinetic + s.potential) - s.start_energy

@@ -13,10 +13,13 @@ from hapticbridge.pose import (
     Vector,
     add,
     conjugate,
+    quaternion_of,
     rotated,
     rotation_between,
     scaled,
+    store_vector,
     subtract,
+    vector_of,
 )
 
 
@@ -41,9 +44,8 @@ def implicit_half(state: NDArray[np.void]) -> tuple[Vector, Vector]:
         change = moment_dot(state, first + axis, s.qacc)
         in_position, in_velocity = 0.5 * h * stiffness, 0.5 * h * (h * stiffness + damping)
         f[axis] = forces[first + axis] - in_position * (end - h * change) - in_velocity * change
-    q = s.handle_quaternion
-    handle = (q[0], q[1], q[2], q[3])
-    return rotated(handle, (f[0], f[1], f[2])), rotated(handle, (f[3], f[4], f[5]))
+    handle = quaternion_of(s.handle_quaternion)
+    return rotated(handle, vector_of(f)), rotated(handle, vector_of(f[3:6]))
 
 
 @compiled
@@ -60,13 +62,12 @@ def midpoint_torque(state: NDArray[np.void], tool: Quaternion, turned: Vector) -
         turned: How it turned, δφ_x.
     """
     s = state[0]
-    q = s.tool_quaternion
-    to_before, to_after = conjugate((q[0], q[1], q[2], q[3])), conjugate(tool)
-    before, after = s.twist, twist_in_tool(state, tool)
-    turn = (s.handle_turn[0], s.handle_turn[1], s.handle_turn[2])
+    to_before, to_after = conjugate(quaternion_of(s.tool_quaternion)), conjugate(tool)
+    before, after = vector_of(s.twist), twist_in_tool(state, tool)
+    turn = vector_of(s.handle_turn)
     handles = scaled(0.5, add(rotated(to_after, turn), rotated(to_before, turn)))
     rate = (s.rotational_damping + 0.5 * s.period * s.rotational_stiffness) / s.period
-    spring = scaled(0.5 * s.rotational_stiffness, add(after, (before[0], before[1], before[2])))
+    spring = scaled(0.5 * s.rotational_stiffness, add(after, before))
     damper = scaled(rate, subtract(handles, rotated(to_after, turned)))
     return rotated(tool, add(spring, damper))
 
@@ -74,14 +75,12 @@ def midpoint_torque(state: NDArray[np.void], tool: Quaternion, turned: Vector) -
 @compiled
 def twist_in_tool(state: NDArray[np.void], tool: Quaternion) -> Vector:
     """Returns φ, the rotation vector from the tool to the handle, in the tool's frame."""
-    q = state[0].handle_quaternion
-    return rotated(conjugate(tool), rotation_between(tool, (q[0], q[1], q[2], q[3])))
+    handle = quaternion_of(state[0].handle_quaternion)
+    return rotated(conjugate(tool), rotation_between(tool, handle))
 
 
 @compiled
-def start_twist(state: NDArray[np.void]) -> None:
-    """Notes φ before the first tick."""
-    q = state[0].tool_quaternion
-    twist = twist_in_tool(state, (q[0], q[1], q[2], q[3]))
-    for i in range(3):
-        state[0].twist[i] = twist[i]
+def note_twist(state: NDArray[np.void]) -> None:
+    """Notes φ as it is: before the first tick, and for the next one."""
+    s = state[0]
+    store_vector(s.twist, twist_in_tool(state, quaternion_of(s.tool_quaternion)))

@@ -6,10 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.jit import compiled
+from hapticbridge.kernel.codes import LIMIT_JOINT, LIMIT_TENDON
 from hapticbridge.kernel.native import ints, pointer_at
-from hapticbridge.kernel.ports import LIMIT_TENDON
-
-LIMIT_JOINT = 3  # mjtConstraint as a plain integer: the compiler reads no enumeration
 
 REACH = 5e-4
 """Distance in m within which a contact counts as near: how far a tool at 0.5 m/s comes in a tick of

@@ -13,7 +13,7 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.errors import HapticBridgeError
 from hapticbridge.kernel.counts import Counts
 from hapticbridge.kernel.guarding import UNGUARDED, Guarding
-from hapticbridge.kernel.scheme import COUPLED, DIRECT, HELD, LOSSLESS, WELD
+from hapticbridge.kernel.scheme import COUPLED, DIRECT, HELD, LOSSLESS, WELD, has_law, laws_per_tick
 
 SLACK_SHARE = 0.5
 """Share of ½‖δx_i‖²_{K + nB/T} that counts as slack where n > 1 laws are computed in a tick; no
@@ -142,20 +142,17 @@ class RunParameters:
             np.allclose(rotation.reshape(3, 3) @ rotation.reshape(3, 3).T, np.eye(3), atol=1e-12)
             and np.linalg.det(rotation.reshape(3, 3)) > 0
         ):
-            raise HapticBridgeError(
-                f"axes is {self.axes!r}; it must be the 9 numbers of a right-handed rotation "
-                "matrix, row by row"
-            )
+            raise _no_rotation(self.axes)
 
     @property
     def laws(self) -> int:
         """How often per tick the wrench on the tool is computed."""
-        return 1 if self.scheme == HELD else self.substeps
+        return laws_per_tick(self.scheme, self.substeps)
 
     @property
     def has_law(self) -> bool:
         """Whether the coupling law gives the wrench."""
-        return self.scheme in (COUPLED, HELD, LOSSLESS)
+        return has_law(self.scheme)
 
     def slack_gains(self) -> tuple[float, float]:
         """Returns gain g in N/m and its rotational counterpart in N m/rad: slack = Σ ½ g ‖δx_k‖².
@@ -180,6 +177,10 @@ class RunParameters:
         )
 
 
+_ROUNDING = 4 * np.finfo(np.float64).eps
+"""How far from a rotation the polar factor may be by rounding; no unit."""
+
+
 def rotation_numbers(matrix: ArrayLike) -> tuple[float, ...]:
     """Returns the 9 numbers, row by row, of the rotation nearest to a matrix.
 
@@ -198,10 +199,16 @@ def rotation_numbers(matrix: ArrayLike) -> tuple[float, ...]:
         given = np.zeros(0)
     if given.size == 9 and np.all(np.isfinite(given)):
         square = given.reshape(3, 3)
-        if np.abs(square @ square.T - np.eye(3)).max() < 1e-5 and np.linalg.det(square) > 0:
+        off = np.abs(square @ square.T - np.eye(3)).max()
+        if off < 1e-5 and np.linalg.det(square) > 0:
+            if off < _ROUNDING:  # once more would turn the last digits of one that was recorded
+                return tuple(square.ravel().tolist())
             left, _, right = np.linalg.svd(square)
             return tuple((left @ right).ravel().tolist())
-    raise HapticBridgeError(
-        f"axes is {matrix!r}; it must be the 9 numbers of a right-handed rotation matrix, "
-        "row by row"
+    raise _no_rotation(matrix)
+
+
+def _no_rotation(axes: object) -> HapticBridgeError:
+    return HapticBridgeError(
+        f"axes is {axes!r}; it must be the 9 numbers of a right-handed rotation matrix, row by row"
     )

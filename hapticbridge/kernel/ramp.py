@@ -22,11 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.jit import compiled
-from hapticbridge.kernel.handle import quaternion_of, vector_of
-from hapticbridge.pose import norm, rotation_between, subtract
-
-RAMPING = 16
-"""Of ``TickFlag``: the compiler cannot read an enumeration."""
+from hapticbridge.kernel.codes import RAMPING
+from hapticbridge.pose import norm, quaternion_of, rotation_between, subtract, vector_of
 
 
 @compiled

@@ -16,27 +16,13 @@ from hapticbridge.kernel.handle import handle_pose
 from hapticbridge.kernel.layout import STATE_DTYPE
 from hapticbridge.kernel.lossless import leave
 from hapticbridge.kernel.meter import refresh_energies
-from hapticbridge.kernel.midpoint import start_twist
+from hapticbridge.kernel.midpoint import note_twist
+from hapticbridge.kernel.names import COUPLING_ACTUATORS, HANDLE, WELD_NAME
 from hapticbridge.kernel.parameters import RunParameters as RunParameters  # noqa: PLC0414
-from hapticbridge.kernel.parameters import rotation_numbers as rotation_numbers  # noqa: PLC0414
 from hapticbridge.kernel.scheme import DIRECT, LOSSLESS, WELD
 from hapticbridge.kernel.tree import has_passive_forces, tree_of_tool
-from hapticbridge.kernel.tuning import TUNED, forget_dissipation, set_gains, tuned_values
+from hapticbridge.kernel.tuning import TUNED, Gains, forget_dissipation, set_gains, tuned_values
 from hapticbridge.tick import TICK_DTYPE
-
-HANDLE = "handle"
-"""Name of the mocap body, and of its site, that the bridge adds to a scene."""
-
-WELD_NAME = "handle_weld"
-"""Name of the equality constraint that joins the grip to the handle, where a method wants one."""
-
-COUPLING_ACTUATORS = tuple(
-    f"coupling_{kind}_{axis}" for kind in ("force", "torque") for axis in ("x", "y", "z")
-)
-"""Names of the six actuators that couple the grip to the handle, in the order of a wrench."""
-
-Gains = tuple[tuple[float, float, float], tuple[float, float, float]]
-"""Factor of the control, stiffness and damping of the actuators that push, and that turn."""
 
 _TRIPS = ("speed", "turn_speed", "stretch", "angle", "energy")
 
@@ -71,7 +57,7 @@ class Binding:
         self.state["wrench_on_device"] = self.state["slewed"] = 0.0
         self.state["has_positions"] = 0  # whoever had the scene meanwhile may have changed it
 
-    def tune(self, parameters: RunParameters, gains: Gains, ticks: int) -> None:
+    def tune(self, parameters: RunParameters, gains: tuple[Gains, Gains], ticks: int) -> None:
         """Lets the coupling become another one from the next tick on; see ``kernel.tuning``.
 
         Args:
@@ -114,7 +100,7 @@ class Binding:
             self._owned["last_written"][: model.nv] = data.qfrc_applied
             self._owned["carried_force"][:] = 0.0
             set_gains(state, 1.0)
-            start_twist(state)
+            note_twist(state)
 
     def let_go(self) -> None:
         """Leaves the scene as one that nobody carries anything over in, its energy unchanged.
@@ -181,14 +167,13 @@ class Binding:
         numbers, addresses = tool_map(model, grip)
         tool = model.body_weldid[model.site_bodyid[grip]]
         is_tool = model.body_weldid[model.geom_bodyid] == tool
-        owned: dict[str, NDArray[np.generic]] = {
-            "tool_map": numbers,
-            "tool_qpos": addresses,
-            "geom_is_tool": np.ascontiguousarray(is_tool, dtype=np.int32),
-        }
-        for name, array in owned.items():
-            self.state[name] = array.ctypes.data
-        self._owned |= owned
+        self._own(
+            {
+                "tool_map": numbers,
+                "tool_qpos": addresses,
+                "geom_is_tool": np.ascontiguousarray(is_tool, dtype=np.int32),
+            }
+        )
         self.state["tool_map_size"] = numbers.size
 
     def _bind_lossless(self, model: mujoco.MjModel) -> None:
@@ -212,14 +197,18 @@ class Binding:
         users[: model.nv] = self._data.qfrc_applied
         owned["qfrc_applied"] = users
         owned["last_written"][:] = users
-        for name, array in owned.items():
-            state[name] = array.ctypes.data
-        self._owned |= owned
+        self._own(owned)
         state["qfrc_written"] = self._data.qfrc_applied.ctypes.data
         state["qfrc_passive"] = self._data.qfrc_passive.ctypes.data
         state["njnt"], state["grip_body_id"] = model.njnt, body
         state["is_never_free"] = tree.is_never_free
         state["has_passive"] = has_passive_forces(model)
+
+    def _own(self, arrays: dict[str, NDArray[np.generic]]) -> None:
+        """Keeps arrays alive as long as the state, which has their addresses under their names."""
+        for name, array in arrays.items():
+            self.state[name] = array.ctypes.data
+        self._owned |= arrays
 
     def _seat(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
         """Takes the tool's pose, and those of the scene's mocap bodies, as they are."""
@@ -256,4 +245,4 @@ class Binding:
             forget_dissipation(state)  # a command, as any other
             state["kicked"] = unpaid(state)
         if parameters.scheme == LOSSLESS:
-            start_twist(state)
+            note_twist(state)

@@ -1,8 +1,8 @@
 """The tick's arithmetic: before MuJoCo's step, and after it.
 
-The live loop calls ``before_step``, MuJoCo through its Python bindings, ``answer_step``, and once
-the wrench is out ``close_tick`` and ``publish.publish``. The re-simulation calls ``simulate``,
-which inlines the same functions around ``advance``, MuJoCo by its C symbol.
+The live loop calls ``before_step``, MuJoCo through its Python bindings, ``after.answer_step``, and
+once the wrench is out ``after.close_tick`` and ``publish.publish``. Compiled loops inline the same
+functions around ``advance``, MuJoCo by its C symbol (``kernel.simulation``).
 """
 
 from __future__ import annotations
@@ -12,25 +12,16 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.jit import compiled, compiled_for_threads
+from hapticbridge.jit import compiled
 from hapticbridge.kernel.account import keep_account
 from hapticbridge.kernel.after import answer_step, close_tick
 from hapticbridge.kernel.ahead import take_handle_in
-from hapticbridge.kernel.codes import BAD_RESULT as BAD_RESULT  # noqa: PLC0414
-from hapticbridge.kernel.codes import BAD_SAMPLE as BAD_SAMPLE  # noqa: PLC0414
-from hapticbridge.kernel.codes import HALF_DONE as HALF_DONE  # noqa: PLC0414
-from hapticbridge.kernel.codes import OK as OK  # noqa: PLC0414
+from hapticbridge.kernel.codes import BAD_SAMPLE, HALF_DONE, OK
 from hapticbridge.kernel.direct import place_tool
-from hapticbridge.kernel.handle import (
-    handle_pose,
-    quaternion_of,
-    store_quaternion,
-    store_vector,
-    vector_of,
-)
+from hapticbridge.kernel.handle import handle_pose
 from hapticbridge.kernel.lossless import apply_carried
+from hapticbridge.kernel.mocap import note_moved_mocap_bodies
 from hapticbridge.kernel.native import floats, mj_fwd_position, mj_step
-from hapticbridge.kernel.ports import note_moved_mocap_bodies
 from hapticbridge.kernel.scheme import DIRECT, HELD, LOSSLESS
 from hapticbridge.kernel.tuning import retune
 from hapticbridge.kernel.watch import DEVICE_BUTTONS, follow, refused
@@ -40,10 +31,14 @@ from hapticbridge.pose import (
     dot,
     product,
     quaternion_exp,
+    quaternion_of,
     rotated,
     rotation_between,
     scaled,
+    store_quaternion,
+    store_vector,
     subtract,
+    vector_of,
 )
 
 
@@ -68,8 +63,8 @@ def _show_handle(state: NDArray[np.void], substep: int) -> None:
     ctrl = floats(s.ctrl + 8 * s.coupling_ctrl_adr, 6)
     if s.scheme == HELD:
         w = s.wrench_on_tool  # of the tick before: held, as a zero-order hold would
-        store_vector(ctrl[0:3], rotated(to_handle, (w[0], w[1], w[2])))
-        store_vector(ctrl[3:6], rotated(to_handle, (w[3], w[4], w[5])))
+        store_vector(ctrl[0:3], rotated(to_handle, vector_of(w)))
+        store_vector(ctrl[3:6], rotated(to_handle, vector_of(w[3:6])))
         return
     if s.scheme == LOSSLESS:
         apply_carried(state)
@@ -131,7 +126,7 @@ def before_step(
         interval = max(elapsed, s.period) + s.since_news
         keep_account(state, moved, turned, interval)
         w = s.wrench_on_device
-        s.device_energy += dot((w[0], w[1], w[2]), moved) + dot((w[3], w[4], w[5]), turned)
+        s.device_energy += dot(vector_of(w), moved) + dot(vector_of(w[3:6]), turned)
         if s.tick > s.ramp_start:
             # before the first tick and in a pause nobody knows how long the device took to move
             s.device_burnt += s.device_damping / interval * dot(moved, moved)
@@ -194,72 +189,3 @@ def after_step(state: NDArray[np.void], row: NDArray[np.void], substep: int) -> 
     if code != OK or substep + 1 != state[0].substeps:
         return code
     return close_tick(state, row, False)
-
-
-@compiled
-def _tick(
-    state: NDArray[np.void], sample: NDArray[np.void], row: NDArray[np.void], elapsed: float
-) -> bool:
-    s = state[0]
-    for substep in range(s.substeps):
-        if before_step(state, sample, row, substep, elapsed) != OK:
-            return False
-        advance(state)
-        if after_step(state, row, substep) != OK:
-            return False
-    return True
-
-
-@compiled_for_threads
-def simulate(
-    state: NDArray[np.void],
-    samples: NDArray[np.void],
-    row: NDArray[np.void],
-    rows: NDArray[np.void],
-) -> int:
-    """Runs one tick per sample without the interpreter, calling MuJoCo by its C symbol.
-
-    An error inside MuJoCo ends the process here, so one step must have succeeded through Python
-    before, and no device may be attached.
-
-    Args:
-        state: The bound state.
-        samples: Device samples, one per tick.
-        row: The bound record.
-        rows: Receives the records; as long as ``samples``.
-
-    Returns:
-        How many ticks were completed; fewer than asked where a sample or a result was not finite.
-    """
-    for k in range(samples.size):
-        if not _tick(state, samples[k : k + 1], row, state[0].period):
-            return k
-        rows[k] = row[0]
-    return int(samples.size)
-
-
-@compiled_for_threads
-def simulate_recorded(
-    state: NDArray[np.void],
-    samples: NDArray[np.void],
-    outside: NDArray[np.int64],
-    elapsed: NDArray[np.float64],
-    row: NDArray[np.void],
-    rows: NDArray[np.void],
-) -> int:
-    """As ``simulate``, of a run that was recorded: with what came from outside the scene.
-
-    Args:
-        state: The bound state.
-        samples: Device samples, one per tick.
-        outside: ``STALE_SAMPLE`` and ``RESEATED`` as the live loop had them, per tick.
-        elapsed: Time between two samples in s, per tick.
-        row: The bound record.
-        rows: Receives the records; as long as ``samples``.
-    """
-    for k in range(samples.size):
-        state[0].outside = outside[k]
-        if not _tick(state, samples[k : k + 1], row, elapsed[k]):
-            return k
-        rows[k] = row[0]
-    return int(samples.size)

@@ -27,7 +27,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.jit import compiled
-from hapticbridge.kernel.handle import quaternion_of, vector_of
 from hapticbridge.kernel.native import floats
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.ramp import held_energy
@@ -36,10 +35,16 @@ from hapticbridge.pose import (
     dot,
     product,
     quaternion_exp,
+    quaternion_of,
     rotation_between,
     scaled,
     subtract,
+    vector_of,
 )
+
+Gains = tuple[float, float, float]
+"""Of a coupling actuator: factor of its control, stiffness in N/m, damping in N s/m (rotation: N m,
+N m/rad and N m s/rad per unit of control)."""
 
 TUNED = (
     "stiffness",

@@ -6,12 +6,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.jit import compiled
-from hapticbridge.kernel.codes import BACKWARDS, GAVE_ENERGY, JUMPED, STRETCHED, TWISTED
-from hapticbridge.kernel.handle import quaternion_of, store_quaternion, store_vector, vector_of
-from hapticbridge.pose import Quaternion, Vector, norm, rotation_between, subtract
-
-CLUTCH, STALE_SAMPLE, RESEATED = 128, 256, 2048
-"""Of ``TickFlag``: the compiler cannot read an enumeration."""
+from hapticbridge.kernel.codes import (
+    BACKWARDS,
+    CLUTCH,
+    GAVE_ENERGY,
+    JUMPED,
+    RESEATED,
+    STALE_SAMPLE,
+    STRETCHED,
+    TWISTED,
+)
+from hapticbridge.pose import (
+    Quaternion,
+    Vector,
+    norm,
+    quaternion_of,
+    rotation_between,
+    store_quaternion,
+    store_vector,
+    subtract,
+    vector_of,
+)
 
 DEVICE_BUTTONS = 2**32 - 1
 """Bits of a record's ``buttons`` that the device's own buttons have; those above are commands."""

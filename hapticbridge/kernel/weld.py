@@ -6,10 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.jit import compiled
+from hapticbridge.kernel.codes import EQUALITY
 from hapticbridge.kernel.native import floats, ints, pointer_at
-from hapticbridge.pose import Vector, conjugate, product
-
-EQUALITY = 0  # mjtConstraint as a plain integer: the compiler reads no enumeration
+from hapticbridge.pose import Vector, conjugate, product, quaternion_of, vector_of
 
 
 @compiled
@@ -31,16 +30,14 @@ def weld_wrench(state: NDArray[np.void]) -> tuple[Vector, Vector]:
     if row + 6 > count:
         return (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
     force = floats(pointer_at(s.efc_force), count)
-    q = floats(s.site_xquat + 32 * s.grip_site_id, 4)
-    grip = (q[0], q[1], q[2], q[3])
-    q = floats(s.site_xquat + 32 * s.handle_site_id, 4)
-    to_handle = conjugate((q[0], q[1], q[2], q[3]))
+    grip = quaternion_of(floats(s.site_xquat + 32 * s.grip_site_id, 4))
+    to_handle = conjugate(quaternion_of(floats(s.site_xquat + 32 * s.handle_site_id, 4)))
     x = product(product(to_handle, (0.0, 1.0, 0.0, 0.0)), grip)
     y = product(product(to_handle, (0.0, 0.0, 1.0, 0.0)), grip)
     z = product(product(to_handle, (0.0, 0.0, 0.0, 1.0)), grip)
     a, b, c = 0.5 * force[row + 3], 0.5 * force[row + 4], 0.5 * force[row + 5]
     return (
-        (force[row], force[row + 1], force[row + 2]),
+        vector_of(force[row : row + 3]),
         (
             a * x[1] + b * x[2] + c * x[3],
             a * y[1] + b * y[2] + c * y[3],

@@ -7,14 +7,9 @@ from numpy.typing import NDArray
 
 from hapticbridge.jit import compiled
 from hapticbridge.kernel.account import control
+from hapticbridge.kernel.codes import FORCE_LIMITED, SLEW_LIMITED
 from hapticbridge.kernel.direct import balance_contacts
-from hapticbridge.kernel.handle import (
-    device_from_scene,
-    quaternion_of,
-    store_quaternion,
-    store_vector,
-    vector_of,
-)
+from hapticbridge.kernel.handle import device_from_scene
 from hapticbridge.kernel.meter import refresh_poses
 from hapticbridge.kernel.midpoint import implicit_half, midpoint_torque
 from hapticbridge.kernel.native import floats
@@ -29,14 +24,15 @@ from hapticbridge.pose import (
     canonical,
     conjugate,
     norm,
+    quaternion_of,
     rotated,
     rotation_between,
     scaled,
+    store_quaternion,
+    store_vector,
     subtract,
+    vector_of,
 )
-
-# TickFlag: the compiler cannot read an enumeration
-FORCE_LIMITED, SLEW_LIMITED = 4, 8
 
 
 @compiled
@@ -81,7 +77,7 @@ def wrench_of_step(
 ) -> tuple[Vector, Vector, Vector, Vector]:
     """Returns the wrench on the tool and the tool's motion since the last time it was asked.
 
-    Brings the tool's pose up to date on the way; ``tick_end`` goes on from what is noted here.
+    Brings the tool's pose up to date on the way; ``close_tick`` goes on from what is noted here.
     """
     s = state[0]
     applied = half = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
@@ -152,11 +148,9 @@ def render(state: NDArray[np.void], force: Vector, torque: Vector) -> None:
     torque_on_device, is_torque_limited = _limited(torque_on_device, s.torque_limit)
     if is_limited or is_torque_limited:
         s.flags |= FORCE_LIMITED
-    last = s.slewed
-    on_device, is_slewed = _slewed(on_device, (last[0], last[1], last[2]), s.force_rise)
-    torque_on_device, is_torque_slewed = _slewed(
-        torque_on_device, (last[3], last[4], last[5]), s.torque_rise
-    )
+    last, last_torque = vector_of(s.slewed), vector_of(s.slewed[3:6])
+    on_device, is_slewed = _slewed(on_device, last, s.force_rise)
+    torque_on_device, is_torque_slewed = _slewed(torque_on_device, last_torque, s.torque_rise)
     if is_slewed or is_torque_slewed:
         s.flags |= SLEW_LIMITED
     store_vector(s.slewed[0:3], on_device)

@@ -117,10 +117,10 @@ def drive_mass(
     f, x, v = (np.empty((len(h), *shape)) for _ in range(3))
     x[0], v[0] = start, velocity
     f[0] = k * (h[0] - x[0])
-    # the force on a mass that would stay where it is, and how much of it each m/s of the step
-    # takes away: f = idle − loss · (x_k − x_{k−1})/T
     # share of the step's end in the spring's mean stretch
     nearest = 0.5 if scheme == "midpoint" else 1.0
+    # idle below is the force on a mass that would stay where it is, loss how much of it each m/s
+    # of the step takes away: f = idle − loss · (x_k − x_{k−1})/T
     loss = b + nearest * k * period
     with np.errstate(over="ignore", invalid="ignore"):
         for i in range(1, len(h)):

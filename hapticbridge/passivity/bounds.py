@@ -17,7 +17,7 @@ from hapticbridge.passivity.grid import (
     scalar,
     together,
 )
-from hapticbridge.passivity.spectrum import Discretization, SampledLaw
+from hapticbridge.passivity.transfer import Discretization, SampledLaw
 from hapticbridge.passivity.wall import wall_supremum
 
 STIFFNESS_MARGIN = 0.8

@@ -13,12 +13,12 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.errors import CouplingError
 from hapticbridge.passivity.grid import delayed_by, one_of, scalar, single, whole
 from hapticbridge.passivity.recursion import run
-from hapticbridge.passivity.spectrum import (
+from hapticbridge.passivity.spectrum import needed_for_fixed_environment
+from hapticbridge.passivity.transfer import (
     DISCRETIZATIONS,
     Discretization,
     angles,
     coupling_transfer,
-    needed_for_fixed_environment,
 )
 from hapticbridge.passivity.virtual_mass import Integrator, force_delay
 from hapticbridge.passivity.worst_hand import WorstHand

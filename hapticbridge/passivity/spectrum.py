@@ -8,7 +8,7 @@ digits at low frequency.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Literal, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,83 +17,16 @@ from scipy import signal
 from hapticbridge.arguments import LARGEST, shown
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import CouplingError
-from hapticbridge.passivity.grid import (
-    Axis,
-    CouplingGrid,
-    delayed_by,
-    frequencies,
-    one_of,
-    plain,
-    scalar,
-    spring_and_damper,
+from hapticbridge.passivity.grid import Axis, CouplingGrid, plain, scalar
+from hapticbridge.passivity.transfer import (
+    Discretization,
+    SampledLaw,
+    angles,
+    coupling_transfer,
 )
-
-Discretization = Literal["backward", "tustin"]
-"""How the damper's velocity is taken from sampled positions."""
-
-DISCRETIZATIONS = ("backward", "tustin")
 
 Transfer = Callable[[NDArray[np.complex128]], Any]
 """A transfer function of z, from the handle's position in m to the force in N."""
-
-_NYQUIST_ROUNDING = 1e-12
-"""Relative distance from π/T that is taken for rounding, without unit: (π/T)·T may differ from π,
-and at Nyquist itself a hand has no reactance."""
-
-
-def angles(frequency: ArrayLike, period: float) -> NDArray[np.float64]:
-    """Returns θ = ωT for frequencies in 0 < ω <= π/T.
-
-    Raises:
-        CouplingError: A frequency is not finite, not positive, or above Nyquist's.
-    """
-    theta = frequencies(frequency) * period
-    if theta.max() > np.pi * (1 + _NYQUIST_ROUNDING):
-        raise CouplingError(
-            f"frequency {theta.max() / period:g} rad/s is above {np.pi / period:g} rad/s, "
-            "half the sampling rate; choose 0 < frequency <= pi / period"
-        )
-    return np.where(theta > np.pi * (1 - _NYQUIST_ROUNDING), np.pi, theta)
-
-
-def coupling_transfer(
-    stiffness: NDArray[np.float64],
-    damping: NDArray[np.float64],
-    period: float,
-    theta: NDArray[np.float64],
-    discretization: Discretization,
-    filter_time: float,
-) -> NDArray[np.complex128]:
-    """Returns C(e^{jθ}) of a spring and a low-passed damper, without delay.
-
-        backward:  C = K + B w / (T + τ w),      w = 1 − z⁻¹
-        tustin:    C = K + B w / (T/2 + τ w),    w = (1 − z⁻¹)/(1 + z⁻¹) = j tan(θ/2)
-
-    Args:
-        stiffness: K in N/m, broadcast against θ.
-        damping: B in N s/m.
-        period: T in s.
-        theta: θ in rad.
-        discretization: Of the damper and its filter alike.
-        filter_time: τ in s of the first-order low-pass behind the damper; 0: none.
-
-    Raises:
-        CouplingError: The discretization is unknown.
-
-    References:
-        Brown & Colgate 1997, eqs. (4) and (5).
-    """
-    if one_of("discretization", discretization, DISCRETIZATIONS) == "backward":
-        # 2 sin²(θ/2) is 1 − cos θ without its cancellation
-        difference = 2 * np.sin(theta / 2) ** 2 + 1j * np.sin(theta)
-        step = period
-    else:
-        difference = 1j * np.tan(theta / 2)
-        step = period / 2
-    transfer: NDArray[np.complex128] = stiffness + damping * (
-        difference / (step + filter_time * difference)
-    )
-    return transfer
 
 
 def needed_for_any_environment(
@@ -124,49 +57,6 @@ def needed_for_fixed_environment(
     """
     needed: NDArray[np.float64] = period / 2 * (transfer.real - transfer.imag / np.tan(theta / 2))
     return needed
-
-
-class SampledLaw(NamedTuple):
-    """What every bound of a coupling is asked about, checked.
-
-    Attributes:
-        stiffness: K in N/m, shaped like the coupling.
-        damping: B in N s/m, likewise.
-        period: T in s.
-        delay: d in samples.
-        filter_time: τ in s.
-        rings: Whether the damper is Tustin's without low-pass: its gain is infinite at Nyquist.
-    """
-
-    stiffness: NDArray[np.float64]
-    damping: NDArray[np.float64]
-    period: float
-    delay: int
-    filter_time: float
-    rings: bool
-
-    @classmethod
-    def of(
-        cls,
-        coupling: Coupling | CouplingGrid,
-        period: float,
-        discretization: Discretization,
-        delay: int,
-        filter_time: float,
-        axis: Axis,
-    ) -> SampledLaw:
-        """Checks what a bound was given.
-
-        Raises:
-            CouplingError: An argument is out of range, or the axis or discretization is unknown.
-        """
-        period = scalar("period", period, "s", positive=True)
-        filter_time = scalar("filter time", filter_time, "s")
-        delay = delayed_by(delay)
-        stiffness, damping = spring_and_damper(coupling, axis)
-        one_of("discretization", discretization, DISCRETIZATIONS)
-        rings = discretization == "tustin" and filter_time == 0
-        return cls(stiffness, damping, period, delay, filter_time, rings)
 
 
 def damping_spectrum(

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hapticbridge.passivity.grid import checked, one_of, plain, scalar, whole
-from hapticbridge.passivity.spectrum import angles
+from hapticbridge.passivity.transfer import angles
 
 Termination = Literal["software", "device"]
 """What ends the line at the device."""

@@ -7,11 +7,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.passivity.spectrum import (
-    Discretization,
-    coupling_transfer,
-    needed_for_fixed_environment,
-)
+from hapticbridge.passivity.spectrum import needed_for_fixed_environment
+from hapticbridge.passivity.transfer import Discretization, coupling_transfer
 
 _Array = NDArray[np.float64]
 

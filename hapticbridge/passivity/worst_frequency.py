@@ -7,12 +7,8 @@ from numpy.typing import NDArray
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.passivity.grid import Axis, CouplingGrid, plain
-from hapticbridge.passivity.spectrum import (
-    Discretization,
-    SampledLaw,
-    coupling_transfer,
-    needed_for_fixed_environment,
-)
+from hapticbridge.passivity.spectrum import needed_for_fixed_environment
+from hapticbridge.passivity.transfer import Discretization, SampledLaw, coupling_transfer
 from hapticbridge.passivity.wall import wall_supremum
 
 SAME = 1e-9

@@ -9,7 +9,7 @@ import numpy as np
 from hapticbridge.arguments import LARGEST, shown
 from hapticbridge.errors import CouplingError
 from hapticbridge.passivity.grid import scalar
-from hapticbridge.passivity.spectrum import angles
+from hapticbridge.passivity.transfer import angles
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""The MCAP container, read defensively: records, chunks, checksums, and what is damaged.
+"""The MCAP container, read defensively: chunks, checksums, and what is damaged.
 
 The MCAP library's reader yields one message at a time (10 µs each) and stops at the first fault;
 here a chunk comes out as one block of bytes, and a fault becomes a sentence.
@@ -18,6 +18,7 @@ import zstandard
 from mcap.opcode import Opcode
 from mcap.writer import MCAP0_MAGIC
 
+from hapticbridge.recording.fields import DamageError, Fields
 from hapticbridge.recording.file_bytes import FileBytes
 
 MAGIC = MCAP0_MAGIC
@@ -33,10 +34,6 @@ _FOOTER_SIZE = _RECORD.size + _FOOTER.size
 _AHEAD = 64
 
 
-class DamageError(Exception):
-    """A record does not hold what its kind holds; never leaves this package."""
-
-
 @dataclass(frozen=True)
 class Block:
     """Schema, channel and message records that belong together: a chunk, or loose ones.
@@ -50,56 +47,6 @@ class Block:
     label: str
     data: bytes
     fault: str = ""
-
-
-class Fields:
-    """Reads the fields of one record in order.
-
-    Args:
-        data: The bytes that hold the record's body.
-        start: Where the body starts.
-        stop: Where it ends.
-    """
-
-    def __init__(self, data: bytes | FileBytes, start: int, stop: int) -> None:
-        self._data, self._position, self._stop = data, start, stop
-
-    @property
-    def is_at_end(self) -> bool:
-        """Whether nothing is left."""
-        return self._position >= self._stop
-
-    def raw(self, size: int) -> bytes:
-        """Returns the next bytes; raises DamageError where the record is shorter."""
-        start = self._position
-        if size > self._stop - start:
-            raise DamageError("it is shorter than its fields")
-        self._position = start + size
-        return self._data[start : start + size]
-
-    def number(self, size: int) -> int:
-        """Returns the next unsigned number of 2, 4 or 8 bytes."""
-        return int.from_bytes(self.raw(size), "little")
-
-    def text(self) -> str:
-        """Returns the next text."""
-        try:
-            return self.raw(self.number(4)).decode()
-        except UnicodeDecodeError as error:
-            raise DamageError("its text is not UTF-8") from error
-
-    def mapping(self) -> dict[str, str]:
-        """Returns the next map of texts."""
-        size = self.number(4)
-        inner = Fields(self._data, self._position, self._position + size)
-        self.raw(size)
-        entries: dict[str, str] = {}
-        while not inner.is_at_end:
-            key = inner.text()
-            if key in entries:
-                raise DamageError(f"it holds '{key}' twice")
-            entries[key] = inner.text()
-        return entries
 
 
 _Item: TypeAlias = Block | tuple[int, Fields]

@@ -12,7 +12,8 @@ from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
 from hapticbridge.recording import format as layout
-from hapticbridge.recording.container import Block, DamageError, Fields
+from hapticbridge.recording.container import Block
+from hapticbridge.recording.fields import DamageError, Fields
 from hapticbridge.recording.format import Attachment
 
 _MESSAGE_DTYPE = np.dtype(

@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 
 from hapticbridge.errors import RecordingError
 from hapticbridge.recording import format as layout
-from hapticbridge.recording.container import MAGIC, Block, Container, DamageError, Fields
+from hapticbridge.recording.container import MAGIC, Block, Container
 from hapticbridge.recording.contents import Contents
+from hapticbridge.recording.fields import DamageError, Fields
 from hapticbridge.recording.file_bytes import FileBytes
 from hapticbridge.recording.format import Attachment
 from hapticbridge.tick import TICK_DTYPE

@@ -8,10 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import mmap
-import os
-import secrets
-import sys
-import tempfile
 import threading
 from pathlib import Path
 
@@ -19,10 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.errors import RecordingError
+from hapticbridge.recording.ring_memory import attached, created, memory_folder
 from hapticbridge.tick import TICK_DTYPE
-
-if sys.platform != "win32":
-    import fcntl
 
 HEAD = 0
 """Index into ``Ring.cursors``: records written since the start; only the producer changes it."""
@@ -34,7 +28,6 @@ _CURSORS = 8
 _MAGIC = int.from_bytes(b"hbring01", "little")
 _HEADER = np.dtype([("magic", "<i8"), ("record_size", "<i8"), ("capacity", "<i8"), ("rest", "V40")])
 _ROWS_OFFSET = _HEADER.itemsize + 8 * _CURSORS
-_PREFIX = "hapticbridge-ring-"
 
 
 class Ring:
@@ -93,14 +86,12 @@ class Ring:
         """
         _check_capacity(capacity)
         size = _ROWS_OFFSET + capacity * TICK_DTYPE.itemsize
-        directory = _directory()
-        _sweep(directory)
-        path = directory / f"{_PREFIX}{os.getpid()}-{secrets.token_hex(6)}"
+        folder = memory_folder()
         try:
-            memory = _create(path, size)
+            memory, path = created(folder, size)
         except OSError as error:
             raise RecordingError(
-                f"no room for a ring of {capacity} records ({size} bytes) in {directory}: "
+                f"no room for a ring of {capacity} records ({size} bytes) in {folder}: "
                 f"{error.strerror}"
             ) from error
         header = np.frombuffer(memory, _HEADER, count=1)
@@ -119,17 +110,7 @@ class Ring:
         Raises:
             RecordingError: There is no such ring, or it is not one of this version.
         """
-        try:
-            file = os.open(name, os.O_RDWR | getattr(os, "O_CLOEXEC", 0))
-        except OSError as error:
-            raise RecordingError(f"no ring at {name}: {error.strerror}") from error
-        try:
-            _lock(file)
-            memory = mmap.mmap(file, 0)
-        except (OSError, ValueError) as error:
-            raise RecordingError(f"{name} cannot be mapped as a ring: {error}") from error
-        finally:
-            os.close(file)
+        memory = attached(name)
         if len(memory) >= _ROWS_OFFSET:
             header = np.frombuffer(memory, _HEADER, count=1)[0]
             capacity = int(header["capacity"])
@@ -234,56 +215,3 @@ class Ring:
 def _check_capacity(capacity: int) -> None:
     if capacity < 1:
         raise RecordingError(f"a ring must hold at least 1 record, not {capacity}")
-
-
-def _directory() -> Path:
-    """Where shared memory lives: the memory file system of Linux, else the temporary folder.
-
-    Not ``multiprocessing.shared_memory``: before Python 3.13 its resource tracker also tracks
-    whoever attaches, removes the memory under its owner, and prints about leaks after a kill.
-    """
-    memory = Path("/dev/shm")
-    usable = memory.is_dir() and os.access(memory, os.W_OK)
-    return memory if usable else Path(tempfile.gettempdir())
-
-
-def _create(path: Path, size: int) -> mmap.mmap:
-    while True:
-        file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600)
-        try:
-            _lock(file)
-            # a sweep may have found the file in the instant before it was locked
-            if os.fstat(file).st_nlink == 0:
-                continue
-            # written out, so that a full file system says so here and not as a bus error in a tick
-            with open(file, "wb", closefd=False) as stream:
-                stream.write(bytes(size))
-            memory = mmap.mmap(file, size)
-        except BaseException:
-            path.unlink(missing_ok=True)
-            raise
-        finally:
-            os.close(file)
-        # every page is touched once, so that the loop meets no page fault
-        np.frombuffer(memory, np.uint8)[:] = 0
-        return memory
-
-
-def _lock(file: int) -> None:
-    """Marks a segment as in use; the mapping keeps the mark until its process ends."""
-    if sys.platform != "win32":
-        fcntl.flock(file, fcntl.LOCK_SH)
-
-
-def _sweep(directory: Path) -> None:
-    """Removes segments that no living process maps: bridge and recorder were both killed."""
-    if sys.platform == "win32":
-        return
-    for path in directory.glob(f"{_PREFIX}*"):
-        with contextlib.suppress(OSError):  # in use, of another user, or gone meanwhile
-            file = os.open(path, os.O_RDONLY)
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                path.unlink()
-            finally:
-                os.close(file)

@@ -6,13 +6,14 @@ import time
 from collections import deque
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.errors import RecordingError
 from hapticbridge.recording.format import Attachment
+from hapticbridge.recording.onlooker import Onlooker
 from hapticbridge.recording.recorder import Recorder
 from hapticbridge.recording.ring import HEAD, TAIL, Ring
 from hapticbridge.recording.salvage import salvage
@@ -33,27 +34,6 @@ KEPT_EVENTS = 4096
 
 _ENDED = "the recorder ended in mid-run; the recording stops there"
 _FULL = "the disk is full; the recording ends here, and is whole"
-
-
-class Onlooker(Protocol):
-    """Looks at a run from another process; the loop neither waits for it nor asks it anything."""
-
-    def start(
-        self, ring: str, metadata: Mapping[str, str], attachments: Sequence[Attachment]
-    ) -> None:
-        """Starts looking.
-
-        Args:
-            ring: Name of the ring, as ``Ring.attach`` takes it; what attaches must free nothing.
-            metadata: Of the run, as a recording has them.
-            attachments: Likewise.
-        """
-
-    def event(self, event: Mapping[str, object]) -> None:
-        """Takes an event; must neither wait nor raise."""
-
-    def close(self) -> None:
-        """Ends looking; must not raise."""
 
 
 class RecordStream:

@@ -17,8 +17,6 @@ from hapticbridge.recording.chunk_index import ChunkIndexFile
 from hapticbridge.recording.format import Attachment
 from hapticbridge.recording.output import Output
 
-__all__ = ["Attachment", "RecordingWriter"]
-
 
 class RecordingWriter:
     """Writes one recording; used by the recorder's process and by ``repair``.

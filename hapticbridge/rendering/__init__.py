@@ -5,7 +5,7 @@ gains its actuators get, whether a weld replaces them, or whether there is a cou
 tick's arithmetic is the kernel's in every method, and so are ledger, records and audit.
 """
 
-from hapticbridge.rendering.method import Gains as Gains
+from hapticbridge.kernel.tuning import Gains as Gains
 from hapticbridge.rendering.method import Method as Method
 from hapticbridge.rendering.method import refuse_unknowing as refuse_unknowing
 from hapticbridge.rendering.methods import COMPENSATED as COMPENSATED

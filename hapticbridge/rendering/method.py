@@ -10,12 +10,9 @@ import mujoco
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import DeviceError
-from hapticbridge.kernel.scheme import COUPLED, DIRECT, HELD, LOSSLESS
+from hapticbridge.kernel.scheme import COUPLED, DIRECT, HELD, LOSSLESS, has_law, laws_per_tick
+from hapticbridge.kernel.tuning import Gains
 from hapticbridge.passivity.compensation import felt_damping, law_damping
-
-Gains = tuple[float, float, float]
-"""Of a coupling actuator: factor of its control, stiffness in N/m, damping in N s/m (rotation: N m,
-N m/rad and N m s/rad per unit of control)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,12 +59,12 @@ class Method:
 
     def laws(self, substeps: int) -> int:
         """Returns how often per tick the wrench on the tool is computed."""
-        return 1 if self.scheme == HELD else substeps
+        return laws_per_tick(self.scheme, substeps)
 
     @property
     def has_law(self) -> bool:
         """Whether the coupling law gives the wrench, so that the device condition proves safety."""
-        return self.scheme in (COUPLED, HELD, LOSSLESS)
+        return has_law(self.scheme)
 
     @property
     def meters_inputs(self) -> bool:

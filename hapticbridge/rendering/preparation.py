@@ -10,10 +10,10 @@ import mujoco
 from hapticbridge.arguments import Arguments
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import SceneError
+from hapticbridge.kernel.names import WELD_NAME
 from hapticbridge.kernel.nearness import REACH
 from hapticbridge.kernel.parameters import RunParameters, checked_substeps
 from hapticbridge.kernel.scheme import COUPLED, DIRECT, LOSSLESS, WELD
-from hapticbridge.kernel.state import WELD_NAME
 from hapticbridge.rendering.method import Method
 from hapticbridge.rendering.methods import IMPLICIT
 from hapticbridge.scene import Scene
@@ -27,7 +27,6 @@ _INTEGRATORS = {
     "implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
     "discrete": mujoco.mjtIntegrator.mjINT_DISCRETE,
 }
-
 
 _ARGUMENTS = Arguments(SceneError)
 

@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 
 from hapticbridge.errors import SceneError, choices
-from hapticbridge.kernel.state import COUPLING_ACTUATORS, HANDLE
+from hapticbridge.kernel.names import COUPLING_ACTUATORS, HANDLE
 
 _PREFIX = "hapticbridge_"
 """Keeps the default class that comes along with the handle apart from the scene's classes."""
@@ -76,26 +76,6 @@ def _add_coupling_actuator(spec: mujoco.MjSpec, name: str, axis: int, grip: str)
     for field in ("nsample", "interp", "group", "ctrlspec"):
         setattr(actuator, field, 0)
     actuator.damping = np.zeros(3)
-
-
-def seat_handle(model: mujoco.MjModel, grip: str) -> None:
-    """Puts the handle at the grip, in ``qpos0`` and in every keyframe of a compiled model.
-
-    Args:
-        model: A scene with the handle; changed in place.
-        grip: Name of the site on the tool.
-    """
-    data = mujoco.MjData(model)
-    body_id, site_id = model.body(HANDLE).id, model.site(grip).id
-    mocap_id = int(model.body_mocapid[body_id])
-    mujoco.mj_kinematics(model, data)
-    model.body_pos[body_id] = data.site_xpos[site_id]
-    model.body_quat[body_id] = data.site_xquat[site_id]
-    for key in range(model.nkey):
-        mujoco.mj_resetDataKeyframe(model, data, key)
-        mujoco.mj_kinematics(model, data)
-        model.key_mpos[key].reshape(-1, 3)[mocap_id] = data.site_xpos[site_id]
-        model.key_mquat[key].reshape(-1, 4)[mocap_id] = data.site_xquat[site_id]
 
 
 def set_options(spec: mujoco.MjSpec) -> None:

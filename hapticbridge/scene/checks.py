@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from hapticbridge.errors import SceneError
-from hapticbridge.kernel.state import COUPLING_ACTUATORS
+from hapticbridge.kernel.names import COUPLING_ACTUATORS
 from hapticbridge.scene.source import SourceFile, read_elements
 
 MAXIMUM_START_PENETRATION = 1e-4

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 
 from hapticbridge.errors import SceneError, choices
-from hapticbridge.kernel.state import COUPLING_ACTUATORS
+from hapticbridge.kernel.names import COUPLING_ACTUATORS
 
 AXES_TOLERANCE = 1e-9
 """How far from orthogonal the axes of a planar tool's joints may be, without unit: rounding of

@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import SceneError
-from hapticbridge.kernel.state import HANDLE, WELD_NAME
+from hapticbridge.kernel.names import HANDLE, WELD_NAME
+from hapticbridge.scene.start import go_to_start
 
 IMPEDANCE = 0.95
 """d of the weld, without unit, the same at every displacement (MuJoCo's default reaches 0.95 at
@@ -59,7 +60,7 @@ def check_weldable(model: mujoco.MjModel, grip: str) -> None:
         SceneError: Says how many directions the joints leave.
     """
     data = mujoco.MjData(model)
-    _seat(model, data, grip)
+    go_to_start(model, data, grip)
     jacobian = np.zeros((6, model.nv))
     mujoco.mj_jacSite(model, data, jacobian[:3], jacobian[3:], model.site(grip).id)
     free = np.linalg.matrix_rank(jacobian)
@@ -124,7 +125,7 @@ def measured_weld(model: mujoco.MjModel, grip: str) -> Coupling:
     stiffness, damping = np.zeros(6), np.zeros(6)
     handle = model.body_mocapid[model.body(HANDLE).id]
     for axis in range(6):
-        _seat(model, data, grip)
+        go_to_start(model, data, grip)
         jacobian = np.zeros((6, model.nv))
         site_id = model.site(grip).id
         mujoco.mj_jacSite(model, data, jacobian[:3], jacobian[3:], site_id)
@@ -144,20 +145,6 @@ def measured_weld(model: mujoco.MjModel, grip: str) -> Coupling:
         rotational_stiffness=max(float(stiffness[3:].max()), 0.0),
         rotational_damping=max(float(damping[3:].max()), 0.0),
     )
-
-
-def _seat(model: mujoco.MjModel, data: mujoco.MjData, grip: str) -> None:
-    key = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_KEY, "home")
-    if key >= 0:
-        mujoco.mj_resetDataKeyframe(model, data, key)
-    else:
-        mujoco.mj_resetData(model, data)
-    data.qvel[:] = 0.0
-    mujoco.mj_kinematics(model, data)
-    handle = model.body_mocapid[model.body(HANDLE).id]
-    data.mocap_pos[handle] = data.site(grip).xpos
-    data.mocap_quat[handle] = data.site_xquat[model.site(grip).id]
-    mujoco.mj_forward(model, data)
 
 
 def _static_force(model: mujoco.MjModel, data: mujoco.MjData, axis: int) -> float:

@@ -22,19 +22,17 @@ from hapticbridge.device.simulated.handheld import STATE_DTYPE as DEVICE_DTYPE
 from hapticbridge.device.simulated.handheld import next_sample
 from hapticbridge.errors import StudyError
 from hapticbridge.jit import compiled_for_threads, direct
+from hapticbridge.kernel.codes import OK
 from hapticbridge.kernel.layout import STATE_DTYPE
 from hapticbridge.kernel.state import Binding
-from hapticbridge.kernel.step import OK, advance, after_step, before_step
+from hapticbridge.kernel.step import advance, after_step, before_step
 from hapticbridge.ledger import Ledger
 from hapticbridge.passivity.stability import decays
 from hapticbridge.rendering import Method, prepare
 from hapticbridge.scene import Scene
+from hapticbridge.study.jitter import PARTS, Timing
 from hapticbridge.tick import SAMPLE_DTYPE, TICK_DTYPE
 from hapticbridge.workspace import run_parameters
-
-PARTS = 16
-"""Parts of a period in which jitter is counted. The device is exact between any two of them; more
-parts resolve jitter finer and cost a device step each."""
 
 LEVER = 0.05
 """Length in m that turns a torque into a force, so that one signal shows both diverge: half the
@@ -48,56 +46,14 @@ FLOOR = 1e-6
 """Signal in N that counts as none: MuJoCo's solver leaves 3e-8 N on a free mass at its default
 tolerance, whatever the motion."""
 
-
 LEAST_TICKS = 50
 """Ticks of a run: a fifth of it is the window in which a decay is looked for, and ten samples are
 the fewest that show one."""
-
 
 MOST_TICKS = 10**9
 """Ticks of a run at most: beyond, its signal alone would not fit into memory."""
 
 _ARGUMENTS = Arguments(StudyError)
-
-
-@dataclass(frozen=True, slots=True)
-class Timing:
-    """When ticks happen, as a share of the period and without unit.
-
-    Attributes:
-        jitter: Every tick is late by a random share in [0, jitter] of the period, 0 <= jitter < 1,
-            in whole sixteenths, of which every one up to jitter is equally likely; below 1/16 no
-            tick is late.
-        drops: Share of ticks that are missed, 0 <= drops < 1: the wrench is held on.
-        seed: Of the random numbers.
-
-    Raises:
-        StudyError: A value is no number or out of range.
-    """
-
-    jitter: float = 0.0
-    drops: float = 0.0
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        for name in ("jitter", "drops"):
-            value = _ARGUMENTS.number(name, getattr(self, name), least=0.0)
-            if not value < 1:
-                raise StudyError(f"{name} is {value!r}; it must be a share, 0 <= {name} < 1")
-            object.__setattr__(self, name, value)
-        _ARGUMENTS.whole("seed", self.seed, least=0, most=2**63 - 1)
-
-    @property
-    def is_even(self) -> bool:
-        """Whether every tick comes on time."""
-        return self.jitter < 1 / PARTS and self.drops == 0
-
-    def intervals(self, ticks: int) -> NDArray[np.int64]:
-        """Returns the time before each tick in sixteenths of the period, shape (ticks,)."""
-        generator = np.random.default_rng(self.seed)
-        late = generator.integers(0, int(self.jitter * PARTS) + 1, ticks)
-        missed = generator.geometric(1 - self.drops, ticks) - 1 if self.drops else 0
-        return np.asarray(PARTS * (1 + missed) + np.diff(late, prepend=0), dtype=np.int64)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

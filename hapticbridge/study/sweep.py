@@ -13,11 +13,12 @@ from typing import Any
 
 from hapticbridge.errors import StudyError
 from hapticbridge.signals import holding_interrupts
+from hapticbridge.study.hiring import hired
 from hapticbridge.study.points import Point, checked_points
 from hapticbridge.study.results import ResultFolder
 from hapticbridge.study.table import Outcome, Table, check_format, table_of
 from hapticbridge.study.task import WORKER_DIED, qualified_name, run_task
-from hapticbridge.study.workers import Workers, cores, hired
+from hapticbridge.study.workers import Workers, cores
 
 Chunk = dict[str, Point]
 """The points of one task, by their keys."""

@@ -19,7 +19,7 @@ from hapticbridge.passivity import (
     worst_frequency,
 )
 from hapticbridge.passivity.compensation import felt_damping
-from hapticbridge.passivity.spectrum import Discretization
+from hapticbridge.passivity.transfer import Discretization
 from hapticbridge.picture import new_figure
 from hapticbridge.rendering import COMPENSATED, IMPLICIT, Method, default_method
 

@@ -71,5 +71,5 @@ def _patience(monkeypatch: pytest.MonkeyPatch) -> None:
     """Bears silent devices for longer on the wall clock: a busy machine stalls their processes."""
     if not IS_TIME_VIRTUAL:
         monkeypatch.setattr("hapticbridge.device.falcon.driver.SILENCE", 5.0)
-        monkeypatch.setattr("hapticbridge.device.rawhid.driver.LONGEST_SILENCE", 5.0)
+        monkeypatch.setattr("hapticbridge.device.silence.SILENCE", 5.0)
         monkeypatch.setattr("hapticbridge.device.transport.hid.LONGEST_WRITE", 5.0)

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.device.base import DeviceInfo, checked_number, checked_period
+from hapticbridge.device.data_sheet import DeviceInfo, checked_number, checked_period
 from hapticbridge.device.falcon.boot import READ_FROM, WRITE_TO, Link, ask, read_firmware
 from hapticbridge.device.falcon.motion import (
     BELIEVED,

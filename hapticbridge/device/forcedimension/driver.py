@@ -23,7 +23,7 @@ from ctypes import byref, c_double, c_ushort
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.device.base import AXES, DeviceInfo, checked_period
+from hapticbridge.device.data_sheet import AXES, DeviceInfo, checked_period
 from hapticbridge.device.forcedimension.library import (
     MOST_WATCHDOG,
     SATURATED,
@@ -33,16 +33,12 @@ from hapticbridge.device.forcedimension.library import (
 )
 from hapticbridge.device.forcedimension.models import MODELS, Model, limits_of, quaternion_of
 from hapticbridge.device.plugged import Tell, tell_nobody
-from hapticbridge.device.silence import SILENCE, SilenceWatch
+from hapticbridge.device.silence import SILENCE, SilenceWatch, watchdog_time
 from hapticbridge.errors import DeviceError, DeviceLost
 from hapticbridge.tick import SAMPLE_DTYPE, TickFlag
 
 SPEED_LIMIT = 5.0
 """In m/s. No figure was found; a hand is not faster."""
-
-SHORTEST_WATCHDOG, WATCHDOG_PERIODS = 0.02, 10
-"""The watchdog asked for is ten periods of the loop, but not less than 20 ms, for an ordinary
-kernel's stalls; the library takes no more than 32 ms."""
 
 MEASURED = (
     "mass", "damping", "rotational_inertia", "rotational_damping", "friction", "resolution",
@@ -154,8 +150,7 @@ class ForceDimensionDevice:
                 f"{self._name}: its watchdog ends {1e3 * longest:.3g} ms after a force, so the "
                 f"rate must be at least {2.0 / longest:.0f} Hz, not {1 / period:g} Hz"
             )
-        watchdog = max(SHORTEST_WATCHDOG, WATCHDOG_PERIODS * period)
-        steps = min(math.ceil(watchdog / WATCHDOG_STEP), MOST_WATCHDOG)
+        steps = min(math.ceil(watchdog_time(period) / WATCHDOG_STEP), MOST_WATCHDOG)
         if not self._dhd.has_watchdog(self._id, steps):
             self._tell(
                 f"{self._name} has no watchdog ({self._dhd.last_error()}): a program that hangs "

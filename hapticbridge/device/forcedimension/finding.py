@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 
-from hapticbridge.device.base import DATA_SHEET_UNITS, checked_number
+from hapticbridge.device.data_sheet import DATA_SHEET_UNITS, checked_number
 from hapticbridge.device.forcedimension.driver import MEASURED, ForceDimensionDevice
 from hapticbridge.device.forcedimension.library import Dhd, located
 from hapticbridge.device.plugged import Family, Plugged, Tell, UsbId, chosen

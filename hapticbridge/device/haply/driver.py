@@ -22,7 +22,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.device.base import DeviceInfo, checked_period
+from hapticbridge.device.data_sheet import DeviceInfo, checked_period
 from hapticbridge.device.haply import messages
 from hapticbridge.device.haply.messages import SERVICE, Listed
 from hapticbridge.device.haply.timing import measured_timing

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from hapticbridge.device.base import DATA_SHEET_UNITS, checked_number
+from hapticbridge.device.data_sheet import DATA_SHEET_UNITS, checked_number
 from hapticbridge.device.haply import messages
 from hapticbridge.device.haply.driver import FIRST_ANSWER, FORCE_LIMIT, HaplyDevice
 from hapticbridge.device.haply.messages import SERVICE, Listed

@@ -34,7 +34,6 @@ GRIPS = ("wireless_verse_grip", "verse_grip")
 BUTTONS = ("a", "b", "c")
 """Bits 0, 1 and 2 of a sample's buttons."""
 
-
 _ID = re.compile(r"[0-9A-Za-z_-]{1,64}")  # it becomes part of a profile's file name
 
 

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.device.base import checked_period
+from hapticbridge.device.data_sheet import checked_period
 from hapticbridge.device.last_word import LastWord, last_word_at
 from hapticbridge.device.pid.effects import Effects
 from hapticbridge.device.pid.reports import PidReports, has_force_feedback

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.device.base import DeviceInfo, checked_number
+from hapticbridge.device.data_sheet import DeviceInfo, checked_number
 from hapticbridge.device.plugged import Tell
-from hapticbridge.device.profile import profile_named, profile_of
+from hapticbridge.device.profile_search import profile_named, profile_of
 from hapticbridge.errors import DeviceError
 
 ASSUMED_NEWTONS = 10.0

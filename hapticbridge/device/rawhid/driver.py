@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.device.base import AXES, checked_period
+from hapticbridge.device.data_sheet import AXES, checked_period
 from hapticbridge.device.last_word import LastWord
 from hapticbridge.device.rawhid.frame import (
     LARGEST,
@@ -21,6 +21,7 @@ from hapticbridge.device.rawhid.frame import (
 )
 from hapticbridge.device.rawhid.sheet import asked, data_sheet, reports
 from hapticbridge.device.rawhid.stream import StateStream
+from hapticbridge.device.silence import SilenceWatch, watchdog_time
 from hapticbridge.device.transport.hid import Link
 from hapticbridge.errors import DeviceError, DeviceLost
 from hapticbridge.pose import canonical, quaternion_exp
@@ -28,14 +29,6 @@ from hapticbridge.tick import SAMPLE_DTYPE, TickFlag
 
 FIRST_STATE_MS = 1000
 """Longest wait in ms for the first state frame."""
-
-LONGEST_SILENCE = 0.05
-"""In s. A device that streams at 200 Hz has missed ten frames by then; longer, and the hand would
-feel the force of a pose that is long gone."""
-
-SHORTEST_WATCHDOG, WATCHDOG_PERIODS = 0.02, 10
-"""The watchdog asked for is ten periods of the loop, but not less than 20 ms: an ordinary kernel
-stalls a loop for some ms now and then, and a force that drops out each time would rattle."""
 
 NO_WRENCH = (0.0,) * 6
 
@@ -78,7 +71,7 @@ class RawHidDevice:
         self.info = data_sheet(name, *asked(link, name), dict(changes or {}))
         self._mask = np.array([float(axis in self.info.axes) for axis in AXES])
         self._sample = np.zeros(1, SAMPLE_DTYPE)
-        self._period = self._heard = self._read = 0.0
+        self._watch = SilenceWatch(now())
         self._watchdog_ms = LONGEST_WATCHDOG_MS
         self._is_open, self._has_begun = True, False
         self.last_word: LastWord | None = None
@@ -96,9 +89,8 @@ class RawHidDevice:
             DeviceError: The period is not, the device sends nothing, must be homed first, or
                 reports a fault.
         """
-        self._period = checked_period(period)
-        watchdog = max(SHORTEST_WATCHDOG, WATCHDOG_PERIODS * period)
-        self._watchdog_ms = min(math.ceil(1e3 * watchdog), LONGEST_WATCHDOG_MS)
+        period = checked_period(period)
+        self._watchdog_ms = min(math.ceil(1e3 * watchdog_time(period)), LONGEST_WATCHDOG_MS)
         self._has_begun = False
         self.states = states = StateStream(self._name)
         self._link.take()
@@ -114,7 +106,7 @@ class RawHidDevice:
             )
         self._refuse_fault(states.newest)
         self._fill(states.newest)
-        self._heard = self._read = self._now()
+        self._watch = SilenceWatch(self._now(), period)
         return self._sample.copy()
 
     def read(self, sample: NDArray[np.void]) -> int:
@@ -127,7 +119,7 @@ class RawHidDevice:
             0, or ``STALE_SAMPLE`` where no valid frame has come since the last read.
 
         Raises:
-            DeviceLost: The device is gone, or silent for longer than ``LONGEST_SILENCE``.
+            DeviceLost: The device is gone, or silent for longer than ``SILENCE``.
             DeviceError: It has not been started, has restarted, reports a fault, or a number that
                 is not finite.
         """
@@ -139,14 +131,10 @@ class RawHidDevice:
             is_new |= states.takes(report)
         if not self._has_begun:  # between the start and the loop nobody took what was sent
             self._has_begun, states.lost = True, 0
-        now = self._now()
-        if is_new or now - self._read > LONGEST_SILENCE + self._period:
-            self._heard = now  # or nobody listened meanwhile: the loop was away, not the device
-        self._read = now
+        if self._watch.is_silent(self._now(), is_new=is_new):
+            silence = 1e3 * self._watch.silence
+            raise DeviceLost(f"{self._name} has sent nothing for {silence:.0f} ms")
         if not is_new:
-            silence = now - self._heard
-            if silence > LONGEST_SILENCE:
-                raise DeviceLost(f"{self._name} has sent nothing for {1e3 * silence:.0f} ms")
             sample[0] = self._sample[0]
             return int(TickFlag.STALE_SAMPLE)
         self._refuse_fault(states.newest)

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hapticbridge.device.base import AXES
+from hapticbridge.device.data_sheet import AXES
 from hapticbridge.device.plugged import printable
 
 FRAME_BYTES = 64

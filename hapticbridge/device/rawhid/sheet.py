@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
-from hapticbridge.device.base import AXES, DeviceInfo
+from hapticbridge.device.data_sheet import AXES, DeviceInfo
 from hapticbridge.device.rawhid.frame import (
     NAME_PAGE,
     NUMBERS_PAGE,

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from hapticbridge.device.base import AXES, DeviceInfo, checked_number, checked_period
+from hapticbridge.device.data_sheet import AXES, DeviceInfo, checked_number, checked_period
 from hapticbridge.device.simulated.hand import DEFAULT_HAND, NO_HAND, Hand
 from hapticbridge.device.simulated.handheld import (
     FREE,

@@ -21,8 +21,11 @@ from hapticbridge.pose import (
     product,
     quaternion_exp,
     quaternion_log,
+    quaternion_of,
     rotation_between,
     scaled,
+    store_quaternion,
+    vector_of,
 )
 
 MAX_DELAY = 100
@@ -92,9 +95,7 @@ def _turn_about(s: Record, i: int, torque: float, angle: float, drift: float) ->
 @compiled
 def _rotate(s: Record, wrench: NDArray[np.float64], target: Quaternion) -> None:
     """Turns the orientation by one period, along the axes of the device's frame."""
-    t = s.target_quaternion
-    old = (t[0], t[1], t[2], t[3])
-    q = (s.quaternion[0], s.quaternion[1], s.quaternion[2], s.quaternion[3])
+    old, q = quaternion_of(s.target_quaternion), quaternion_of(s.quaternion)
     drift = scaled(1.0 / s.period, rotation_between(old, target))
     angle = rotation_between(old, q)
     turn = (
@@ -102,10 +103,8 @@ def _rotate(s: Record, wrench: NDArray[np.float64], target: Quaternion) -> None:
         _turn_about(s, 1, wrench[4], angle[1], drift[1]),
         _turn_about(s, 2, wrench[5], angle[2], drift[2]),
     )
-    turned = canonical(product(quaternion_exp(turn), q))
-    for i in range(4):
-        s.quaternion[i] = turned[i]
-        t[i] = target[i]
+    store_quaternion(s.quaternion, canonical(product(quaternion_exp(turn), q)))
+    store_quaternion(s.target_quaternion, target)
 
 
 @compiled
@@ -123,12 +122,8 @@ def _follow_lines(s: Record, wrench: NDArray[np.float64]) -> None:
         )
     for i in range(6):
         s.held_before[i] = wrench[i]
-    w = s.angular_velocity
-    turn = scaled(s.period, (w[0], w[1], w[2]))
-    q = (s.quaternion[0], s.quaternion[1], s.quaternion[2], s.quaternion[3])
-    turned = canonical(product(quaternion_exp(turn), q))
-    for i in range(4):
-        s.quaternion[i] = turned[i]
+    turn = quaternion_exp(scaled(s.period, vector_of(s.angular_velocity)))
+    store_quaternion(s.quaternion, canonical(product(turn, quaternion_of(s.quaternion))))
 
 
 @compiled
@@ -160,15 +155,14 @@ def next_sample(
     sample.buttons = 0
     for i in range(3):
         sample.position[i] = _rounded(s.position[i], s.resolution)
-    q = (s.quaternion[0], s.quaternion[1], s.quaternion[2], s.quaternion[3])
+    q = quaternion_of(s.quaternion)
     if s.rotational_resolution > 0.0:
         v = quaternion_log(q)
         step = s.rotational_resolution
         q = canonical(
             quaternion_exp((_rounded(v[0], step), _rounded(v[1], step), _rounded(v[2], step)))
         )
-    for i in range(4):
-        sample.quaternion[i] = q[i]
+    store_quaternion(sample.quaternion, q)
 
 
 @compiled

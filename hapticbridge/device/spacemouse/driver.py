@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.device.base import AXES, DeviceInfo, checked_number, checked_period
+from hapticbridge.device.data_sheet import AXES, DeviceInfo, checked_number, checked_period
 from hapticbridge.device.plugged import Family, Tell, chosen
 from hapticbridge.device.spacemouse.ids import IDS
 from hapticbridge.device.spacemouse.reports import (

@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.device.base import AXES, DeviceInfo, checked_period
+from hapticbridge.device.data_sheet import AXES, DeviceInfo, checked_period
 from hapticbridge.device.trajectory.motion import NORM_TOLERANCE, Motion, pose_at
 from hapticbridge.errors import DeviceError
 from hapticbridge.jit import compiled, direct
+from hapticbridge.pose import store_quaternion, store_vector
 from hapticbridge.tick import SAMPLE_DTYPE
 
 _STATE_DTYPE = np.dtype([("tick", "<i8"), ("cursor", "<i8"), ("period", "<f8")])
@@ -25,10 +26,8 @@ def _next_sample(
     sample = samples[0]
     s.cursor, position, quaternion = pose_at(motion, s.tick * s.period, s.cursor)
     s.tick += 1
-    for i in range(3):
-        sample.position[i] = position[i]
-    for i in range(4):
-        sample.quaternion[i] = quaternion[i]
+    store_vector(sample.position, position)
+    store_quaternion(sample.quaternion, quaternion)
     sample.buttons = 0
 
 

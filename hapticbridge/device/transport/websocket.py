@@ -106,7 +106,7 @@ class WebSocketLink:
                 max_queue=None,
             )
             connection = opening.__enter__()  # what newer versions ask for; close() is the exit
-        except Exception as error:
+        except Exception as error:  # what answers there may be anything, and so is what it causes
             own.close()
             raise DeviceError(
                 f"what answers at {host}:{port} is not {name}: {' '.join(str(error).split())}"
@@ -127,7 +127,7 @@ class WebSocketLink:
             self._log.add(">", message.encode())
         try:
             self._connection.send(message)
-        except Exception:
+        except Exception:  # whatever its kind: the loop must command zero, not end in a traceback
             raise self._lost() from None
 
     def take(self) -> list[str]:
@@ -167,7 +167,7 @@ class WebSocketLink:
             message = self._connection.recv(timeout=timeout)
         except TimeoutError:
             return None
-        except Exception:
+        except Exception:  # as in ``send``
             if is_dropped_after:
                 return None
             raise self._lost() from None

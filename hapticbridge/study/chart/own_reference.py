@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from hapticbridge.check.felt import felt_error
 from hapticbridge.errors import HapticBridgeError, StudyError
-from hapticbridge.kernel.step import simulate
+from hapticbridge.kernel.simulation import simulate
 from hapticbridge.rendering import METHODS, Method
 from hapticbridge.study.chart.scene_run import Stage, Stages, Take
 from hapticbridge.study.chart.score import NAN, Score, diverged, score_of

@@ -12,7 +12,7 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.device import Motion
 from hapticbridge.device.trajectory.motion import pose_at
 from hapticbridge.errors import StudyError
-from hapticbridge.kernel.step import simulate
+from hapticbridge.kernel.simulation import simulate
 from hapticbridge.rendering import IMPLICIT
 from hapticbridge.scene import load_scene
 from hapticbridge.study.chart.engine_run import PeerWork

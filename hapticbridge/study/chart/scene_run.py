@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.kernel.scheme import WELD
+from hapticbridge.kernel.simulation import simulate
 from hapticbridge.kernel.state import Binding
-from hapticbridge.kernel.step import simulate
 from hapticbridge.ledger import Ledger
 from hapticbridge.rendering import prepare
 from hapticbridge.scene import Scene

@@ -9,7 +9,7 @@ from hapticbridge.arguments import Array
 from hapticbridge.coupling import Coupling
 from hapticbridge.device.trajectory.motion import Motion
 from hapticbridge.errors import StudyError
-from hapticbridge.kernel.state import COUPLING_ACTUATORS
+from hapticbridge.kernel.names import COUPLING_ACTUATORS
 from hapticbridge.pose import add, canonical, cross, product, rotated, subtract
 from hapticbridge.scene import Scene
 from hapticbridge.study.engines.task import (
@@ -30,7 +30,6 @@ _KINDS: dict[int, Kind] = {
     mujoco.mjtGeom.mjGEOM_CAPSULE: "capsule",
     mujoco.mjtGeom.mjGEOM_MESH: "mesh",
 }
-
 
 _WITHOUT = (
     mujoco.mjtDisableBit.mjDSBL_CONTACT,

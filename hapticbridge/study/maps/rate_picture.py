@@ -39,7 +39,6 @@ AXES = {
 
 MARKERS = dict(zip(HANDS, "os", strict=True))
 
-
 SHOWN = (15.0, 7e4)
 """Range of K in N/m at even ticks: all bounds at b, and room for the names below them."""
 

@@ -18,7 +18,8 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.device import Hand, SimulatedDevice
 from hapticbridge.passivity import SampledLoop, WorstHand, maximum_stiffness, minimum_damping
 from hapticbridge.rendering import METHODS
-from hapticbridge.study.closed_loop import PARTS, LoopOutcome, Timing
+from hapticbridge.study.closed_loop import LoopOutcome
+from hapticbridge.study.jitter import PARTS, Timing
 from hapticbridge.study.maps.bisection import WIDTH, largest_stable
 from hapticbridge.study.maps.rigs import STILL, loop_in, set_tool_mass
 from hapticbridge.study.maps.stability_map import Point

@@ -42,7 +42,6 @@ MEASURED: Mapping[str, Any] = {
     "mfc": "white",
 }
 
-
 Summary = dict[str, Any]
 """What one contact setting came to."""
 

@@ -13,7 +13,7 @@ from hapticbridge.passivity import (
     minimum_damping,
     stability_limit,
 )
-from hapticbridge.passivity.spectrum import coupling_transfer
+from hapticbridge.passivity.transfer import coupling_transfer
 from hapticbridge.study.paper.check import Check
 from hapticbridge.study.paper.drawing import panels
 from hapticbridge.study.paper.section import Curve, Section

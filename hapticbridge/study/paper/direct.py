@@ -7,7 +7,8 @@ from numpy.typing import NDArray
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.passivity import SampledLoop, maximum_stiffness, stability_limit
-from hapticbridge.passivity.spectrum import angles, coupling_transfer, needed_for_fixed_environment
+from hapticbridge.passivity.spectrum import needed_for_fixed_environment
+from hapticbridge.passivity.transfer import angles, coupling_transfer
 from hapticbridge.study.paper.check import Check
 from hapticbridge.study.paper.drawing import panels
 from hapticbridge.study.paper.section import Curve, Section

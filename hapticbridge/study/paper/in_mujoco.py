@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import SceneError
+from hapticbridge.kernel.codes import OK
 from hapticbridge.kernel.state import Binding
-from hapticbridge.kernel.step import OK, after_step, before_step
+from hapticbridge.kernel.step import after_step, before_step
 from hapticbridge.passivity import WorstHand
 from hapticbridge.passivity.stability import threshold
 from hapticbridge.rendering import IMPLICIT, prepare
@@ -40,7 +41,6 @@ step with a free light tool keeps about 3e-8 N alive, which neither grows nor fa
 
 TOLERANCE = 1e-4
 """Relative width at which a bisection ends: less than what ``TICKS`` let one tell."""
-
 
 Hand = Callable[[float], float]
 """Takes the force on the device in N that is held from now on, returns the handle's next step in

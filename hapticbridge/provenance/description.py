@@ -1,4 +1,4 @@
-"""What a recording says about its run, so that it can be judged and simulated again.
+"""What a recording says about its run, and the run's parameters read back from it.
 
 Metadata are strings; numbers in them are written so that they read back to the same double.
 """
@@ -7,29 +7,32 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
 import platform
 from collections.abc import Mapping
 from datetime import UTC, datetime
-from importlib.metadata import version
-
-import mujoco
-import numpy as np
-from numpy.typing import NDArray
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.kernel.counts import Counts
 from hapticbridge.kernel.guarding import UNGUARDED, Guarding
+from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.scheme import WELD
-from hapticbridge.kernel.state import Binding, RunParameters
+from hapticbridge.kernel.state import Binding
+from hapticbridge.provenance.metadata import meta_count, meta_float, meta_numbers
+from hapticbridge.provenance.start import (
+    STARTS,
+    STATE_ATTACHMENT,
+    compiled_model,
+    start_of,
+    start_state,
+)
+from hapticbridge.provenance.versions import processor, versions
 from hapticbridge.recording import Attachment
 from hapticbridge.rendering import Method, method_named
 from hapticbridge.scene import Scene
 
 MODEL_ATTACHMENT = "model.mjb"
-STATE_ATTACHMENT = "start_state.f64"
 RESET_ATTACHMENT = "reset_state.f64"
 SOURCE_PREFIX = "scene/"
 
@@ -39,79 +42,7 @@ MID_RUN = "mid-run"
 _FLOATS = ("scale", "force_scale", "force_limit", "torque_limit", "contact_stiffness")
 _POSES = ("device_origin", "handle_origin", "device_start")
 _GAINS = ("stiffness", "damping", "rotational_stiffness", "rotational_damping")
-STARTS = {"handle_start": 7, "tool_start": 7, "start_kinetic": 1, "start_potential": 1}
-"""What the ledger counts from, with its count of numbers: poses in m, energies in J."""
-
 _ELASTIC, _COUNTS = "start_elastic", "counts"
-_STORED = {"start_kinetic": "kinetic", "start_potential": "potential"}
-_MOST_TICKS = 2**31
-_STATE = mujoco.mjtState.mjSTATE_INTEGRATION
-
-
-def versions() -> dict[str, str]:
-    """Returns the versions that decide whether a run can be repeated to the bit."""
-    packages = ("hapticbridge", "mujoco", "numba", "numpy", "scipy", "mcap")
-    found = {name: version(name) for name in packages}
-    return found | {"python": platform.python_version()}
-
-
-def processor() -> str:
-    """Returns the processor's model, where the system tells it."""
-    try:
-        with open("/proc/cpuinfo", encoding="utf-8") as lines:  # noqa: PTH123 - not a file to keep
-            for line in lines:
-                if line.startswith("model name"):
-                    return line.split(":", 1)[1].strip()
-    except OSError:
-        pass
-    return platform.processor() or platform.machine()
-
-
-def compiled_model(model: mujoco.MjModel) -> bytes:
-    """Returns the bytes of ``mj_saveModel``, the same in every compilation of one scene."""
-    buffer = np.zeros(mujoco.mj_sizeModel(model), dtype=np.uint8)
-    mujoco.mj_saveModel(model, None, buffer)
-    return buffer.tobytes()
-
-
-def start_state(model: mujoco.MjModel, data: mujoco.MjData) -> NDArray[np.float64]:
-    """Returns everything that MuJoCo's next step depends on."""
-    state = np.zeros(mujoco.mj_stateSize(model, _STATE))
-    mujoco.mj_getState(model, data, state, _STATE)
-    return state
-
-
-def restore_state(model: mujoco.MjModel, data: mujoco.MjData, state: bytes) -> None:
-    """Puts data to a start that ``start_state`` returned.
-
-    Raises:
-        RecordingError: The bytes are not a state of this model.
-    """
-    expected = 8 * mujoco.mj_stateSize(model, _STATE)
-    if len(state) != expected:
-        raise RecordingError(
-            f"attachment '{STATE_ATTACHMENT}' has {len(state)} bytes; the attached model needs "
-            f"{expected}"
-        )
-    mujoco.mj_resetData(model, data)
-    mujoco.mj_setState(model, data, np.frombuffer(state, dtype="<f8").astype(np.float64), _STATE)
-    mujoco.mj_forward(model, data)
-    # mj_forward solves once more and would leave another warm start than the run began with
-    mujoco.mj_setState(model, data, np.frombuffer(state, dtype="<f8").astype(np.float64), _STATE)
-
-
-def elastic_energy(data: mujoco.MjData) -> float:
-    """Returns what constraints store at most, Σ |λ_i r_i| in J.
-
-    A spring whose force λ grows with its way r stores ∫ λ dr <= λ r. Rows without a residual
-    (friction) store nothing.
-
-    Args:
-        data: After ``restore_state``, so that it is the same wherever it is computed.
-    """
-    return float(np.sum(np.abs(data.efc_force * np.minimum(data.efc_pos, 0.0)))) + float(
-        np.sum(np.abs(data.efc_force[: data.ne] * np.maximum(data.efc_pos[: data.ne], 0.0)))
-    )
 
 
 def attachments(scene: Scene, reset: bytes | None = None) -> list[Attachment]:
@@ -135,15 +66,6 @@ def attachments(scene: Scene, reset: bytes | None = None) -> list[Attachment]:
     if reset is not None:
         kept.append(Attachment(RESET_ATTACHMENT, "application/octet-stream", reset))
     return kept
-
-
-def start_of(state: NDArray[np.void], name: str) -> list[float]:
-    """Returns one of ``STARTS`` from the kernel's state, as long as no tick has run."""
-    if name in _STORED:
-        return [float(state[_STORED[name]][0])]
-    body = name.removesuffix("_start")
-    pose = (*state[f"{body}_position"][0], *state[f"{body}_quaternion"][0])
-    return [float(value) for value in pose]
 
 
 def describe_run(
@@ -189,75 +111,6 @@ def describe_run(
         ),
         "started": datetime.now(UTC).isoformat(timespec="seconds"),
     }
-
-
-def meta_float(meta: Mapping[str, str], name: str) -> float:
-    """Returns a number of the metadata.
-
-    Raises:
-        RecordingError: It is missing, not a number or not finite.
-    """
-    try:
-        value = float(meta[name])
-    except KeyError:
-        raise RecordingError(f"the recording's metadata lack '{name}'") from None
-    except ValueError:
-        raise RecordingError(f"metadata '{name}' is {meta[name]!r:.80}, not a number") from None
-    if not math.isfinite(value):
-        raise RecordingError(f"metadata '{name}' is {value}; it must be finite")
-    return value
-
-
-def meta_numbers(meta: Mapping[str, str], name: str, count: int) -> tuple[float, ...]:
-    """Returns a list of numbers of the metadata.
-
-    Raises:
-        RecordingError: It is missing, or not ``count`` finite numbers.
-    """
-    text = meta.get(name)
-    if text is None:
-        raise RecordingError(f"the recording's metadata lack '{name}'")
-    try:
-        values = tuple(float(value) for value in json.loads(text))
-    except (ValueError, TypeError, OverflowError, RecursionError):
-        values = ()
-    if len(values) != count or not all(math.isfinite(value) for value in values):
-        raise RecordingError(
-            f"metadata '{name}' is {text!r:.80}; it must be {count} finite numbers"
-        )
-    return values
-
-
-def meta_start(meta: Mapping[str, str], name: str) -> list[float]:
-    """Returns one of ``STARTS`` from the metadata.
-
-    Raises:
-        RecordingError: It is missing, or not as many finite numbers.
-    """
-    if STARTS[name] == 1:
-        return [meta_float(meta, name)]
-    return list(meta_numbers(meta, name, STARTS[name]))
-
-
-def meta_home(meta: Mapping[str, str]) -> list[float]:
-    """Returns the tool pose (7,) to which a reset leads: ``home``, else where the recording starts.
-
-    Raises:
-        RecordingError: It is not as many finite numbers.
-    """
-    return list(meta_numbers(meta, "home", 7)) if "home" in meta else meta_start(meta, "tool_start")
-
-
-def meta_count(meta: Mapping[str, str], name: str) -> int:
-    """Returns a count of the metadata.
-
-    Raises:
-        RecordingError: It is missing, not a whole number, or out of range.
-    """
-    value = meta_float(meta, name)
-    if not value.is_integer() or not 0 <= value < _MOST_TICKS:
-        raise RecordingError(f"metadata '{name}' is {value:g}; it must be a whole number >= 0")
-    return int(value)
 
 
 def _felt(meta: Mapping[str, str], method: Method) -> Coupling | None:

@@ -1,0 +1,73 @@
+"""Where a run starts: MuJoCo's whole state, the compiled model, and what the ledger counts from."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticbridge.errors import RecordingError
+
+STATE_ATTACHMENT = "start_state.f64"
+
+STARTS = {"handle_start": 7, "tool_start": 7, "start_kinetic": 1, "start_potential": 1}
+"""What the ledger counts from, with its count of numbers: poses in m, energies in J."""
+
+_STORED = {"start_kinetic": "kinetic", "start_potential": "potential"}
+_STATE = mujoco.mjtState.mjSTATE_INTEGRATION
+
+
+def compiled_model(model: mujoco.MjModel) -> bytes:
+    """Returns the bytes of ``mj_saveModel``, the same in every compilation of one scene."""
+    buffer = np.zeros(mujoco.mj_sizeModel(model), dtype=np.uint8)
+    mujoco.mj_saveModel(model, None, buffer)
+    return buffer.tobytes()
+
+
+def start_state(model: mujoco.MjModel, data: mujoco.MjData) -> NDArray[np.float64]:
+    """Returns everything that MuJoCo's next step depends on."""
+    state = np.zeros(mujoco.mj_stateSize(model, _STATE))
+    mujoco.mj_getState(model, data, state, _STATE)
+    return state
+
+
+def restore_state(model: mujoco.MjModel, data: mujoco.MjData, state: bytes) -> None:
+    """Puts data to a start that ``start_state`` returned.
+
+    Raises:
+        RecordingError: The bytes are not a state of this model.
+    """
+    expected = 8 * mujoco.mj_stateSize(model, _STATE)
+    if len(state) != expected:
+        raise RecordingError(
+            f"attachment '{STATE_ATTACHMENT}' has {len(state)} bytes; the attached model needs "
+            f"{expected}"
+        )
+    mujoco.mj_resetData(model, data)
+    mujoco.mj_setState(model, data, np.frombuffer(state, dtype="<f8").astype(np.float64), _STATE)
+    mujoco.mj_forward(model, data)
+    # mj_forward solves once more and would leave another warm start than the run began with
+    mujoco.mj_setState(model, data, np.frombuffer(state, dtype="<f8").astype(np.float64), _STATE)
+
+
+def elastic_energy(data: mujoco.MjData) -> float:
+    """Returns what constraints store at most, Σ |λ_i r_i| in J.
+
+    A spring whose force λ grows with its way r stores ∫ λ dr <= λ r. Rows without a residual
+    (friction) store nothing.
+
+    Args:
+        data: After ``restore_state``, so that it is the same wherever it is computed.
+    """
+    return float(np.sum(np.abs(data.efc_force * np.minimum(data.efc_pos, 0.0)))) + float(
+        np.sum(np.abs(data.efc_force[: data.ne] * np.maximum(data.efc_pos[: data.ne], 0.0)))
+    )
+
+
+def start_of(state: NDArray[np.void], name: str) -> list[float]:
+    """Returns one of ``STARTS`` from the kernel's state, as long as no tick has run."""
+    if name in _STORED:
+        return [float(state[_STORED[name]][0])]
+    body = name.removesuffix("_start")
+    pose = (*state[f"{body}_position"][0], *state[f"{body}_quaternion"][0])
+    return [float(value) for value in pose]

@@ -1,0 +1,25 @@
+"""What a run was computed with: versions of programs, and the processor."""
+
+from __future__ import annotations
+
+import platform
+from importlib.metadata import version
+
+
+def versions() -> dict[str, str]:
+    """Returns the versions that decide whether a run can be repeated to the bit."""
+    packages = ("hapticbridge", "mujoco", "numba", "numpy", "scipy", "mcap")
+    found = {name: version(name) for name in packages}
+    return found | {"python": platform.python_version()}
+
+
+def processor() -> str:
+    """Returns the processor's model, where the system tells it."""
+    try:
+        with open("/proc/cpuinfo", encoding="utf-8") as lines:  # noqa: PTH123 - not a file to keep
+            for line in lines:
+                if line.startswith("model name"):
+                    return line.split(":", 1)[1].strip()
+    except OSError:
+        pass
+    return platform.processor() or platform.machine()

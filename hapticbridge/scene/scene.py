@@ -1,0 +1,145 @@
+"""A scene that is compiled, with a handle and a coupling in it: what the loop steps."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from hapticbridge.coupling import Coupling
+from hapticbridge.errors import SceneError
+from hapticbridge.kernel.names import COUPLING_ACTUATORS, WELD_NAME
+from hapticbridge.scene.compiler import compiled
+from hapticbridge.scene.source import SourceFile
+from hapticbridge.scene.start import go_to_start
+from hapticbridge.scene.weld import add_weld, carry_over, set_weld_gains
+
+
+@dataclass(slots=True)
+class Scene:
+    """A compiled scene with its handle, ready to be stepped.
+
+    Attributes:
+        path: The MJCF file.
+        grip: Name of the site on the tool.
+        model: MuJoCo's model, with the bridge's handle and coupling in it.
+        data: Its state.
+        sources: The original bytes of the file, its includes and its assets.
+        parameters: Value of each of the scene's parameters, in the unit that its file names.
+    """
+
+    path: Path
+    grip: str
+    model: mujoco.MjModel
+    data: mujoco.MjData
+    sources: tuple[SourceFile, ...]
+    parameters: dict[str, float] = field(default_factory=dict)
+
+    _spec: mujoco.MjSpec | None = None
+    _is_claimed: bool = False
+    _reach: float = 0.0
+
+    def claim(self) -> None:
+        """Reserves the scene for one bridge: two would move the same tool.
+
+        Raises:
+            SceneError: Another bridge has it.
+        """
+        if self._is_claimed:
+            raise SceneError(f"scene '{self.name}' is in use by another bridge; load it again")
+        self._is_claimed = True
+
+    def release(self) -> None:
+        """Lets another bridge have the scene."""
+        self._is_claimed = False
+
+    @property
+    def name(self) -> str:
+        """The file's name without its ending."""
+        return self.path.stem
+
+    def reset(self) -> None:
+        """Puts the scene to keyframe ``home`` if it has one, else ``qpos0``; handle at the grip."""
+        go_to_start(self.model, self.data, self.grip)
+
+    def grip_pose(self) -> tuple[float, ...]:
+        """Returns the grip's pose (x, y, z, qw, qx, qy, qz) in the world frame, in m."""
+        site_id = self.model.site(self.grip).id
+        position, quaternion = self.data.site_xpos[site_id], self.data.site_xquat[site_id]
+        sign = 1.0 if quaternion[0] >= 0 else -1.0
+        return tuple(float(value) for value in (*position, *(sign * quaternion)))
+
+    def set_timestep(self, period: float, substeps: int = 1) -> None:
+        """Sets MuJoCo's timestep to period / substeps, in s.
+
+        Raises:
+            SceneError: The period is not finite and positive, or there is no whole substep.
+        """
+        if not np.isfinite(period) or period <= 0:
+            raise SceneError(f"period is {period!r} s; it must be finite and > 0")
+        if substeps < 1:
+            raise SceneError(f"substeps is {substeps}; it must be 1 or more")
+        self.model.opt.timestep = period / substeps
+
+    def set_reach(self, distance: float) -> None:
+        """Lets MuJoCo find contacts, without a force, from a distance in m before they touch.
+
+        It is added to the gaps that the scene's file gives.
+        """
+        if distance == self._reach:
+            return
+        more, self._reach = distance - self._reach, distance
+        self.model.geom_gap += more
+        self.model.pair_gap += more
+        self.model.flex_gap += more
+
+    def set_coupling(self, coupling: Coupling) -> None:
+        """Sets the gains of the coupling's actuators; needs no compilation."""
+        self.set_gains(
+            (coupling.damping, coupling.stiffness, coupling.damping),
+            (
+                coupling.rotational_damping,
+                coupling.rotational_stiffness,
+                coupling.rotational_damping,
+            ),
+        )
+
+    def set_gains(
+        self, force: tuple[float, float, float], torque: tuple[float, float, float]
+    ) -> None:
+        """Sets factor of the control, stiffness and damping of the coupling's actuators.
+
+        Args:
+            force: Of the three that push, in SI units per metre and metre per second.
+            torque: Of the three that turn, in SI units per rad and rad per second.
+        """
+        for axis, name in enumerate(COUPLING_ACTUATORS):
+            gain, stiffness, damping = force if axis < 3 else torque  # forces come first
+            actuator_id = self.model.actuator(name).id
+            self.model.actuator_gainprm[actuator_id, 0] = gain
+            self.model.actuator_biasprm[actuator_id, 1] = -stiffness
+            self.model.actuator_biasprm[actuator_id, 2] = -damping
+
+    def set_weld(self, coupling: Coupling | None) -> None:
+        """Welds the grip to the handle with K and B as ``solref``, or (None) takes the weld off.
+
+        A weld changes the model's size, so ``model`` and ``data`` become new ones; what was changed
+        in the old model is carried over. Without a weld before and after, nothing changes.
+
+        Raises:
+            SceneError: The scene was not made by ``load_scene``, or has a constraint of that name.
+        """
+        has_weld = mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_EQUALITY, WELD_NAME) >= 0
+        if has_weld != (coupling is not None):
+            if self._spec is None:
+                raise SceneError("only a scene from load_scene can be welded to its handle")
+            spec = self._spec.copy()
+            if coupling is not None:
+                add_weld(spec, self.grip)
+            model = compiled(spec, self.sources)
+            carry_over(self.model, model)
+            self.model, self.data = model, mujoco.MjData(model)
+        if coupling is not None:
+            set_weld_gains(self.model, coupling)
