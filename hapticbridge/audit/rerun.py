@@ -81,7 +81,7 @@ class Rerun:
                 f"{len(start)}"
             )
         method = method_named(recording.meta.get("method", ""))
-        if parameters.counts is not None:
+        if parameters.counts is not None and RESET_ATTACHMENT in recording.attachments:
             restore_state(model, data, reset)
             begun = replace(parameters, counts=None, start_elastic=0.0)
             check_stored(parameters.counts.stored, Binding(model, data, begun).state)
