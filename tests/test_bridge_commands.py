@@ -378,7 +378,10 @@ def test_a_start_that_claims_more_elastic_energy_than_there_is_is_found(
     _, path, _ = run({200: Record(on=False), 1300: Record(on=True)}, 1.6)
     recording = read_recording(path.with_name("run-2.mcap"))
     claimed = {"start_elastic": repr(float(recording.meta["start_elastic"]) + 1e-3)}
-    report = audit(rewritten(recording, path.with_name("changed.mcap"), meta=claimed))
+    ticks = recording.ticks.copy()
+    ticks["environment_energy"] -= 1e-3  # so that the records agree with the claim
+    changed = rewritten(recording, path.with_name("changed.mcap"), meta=claimed, ticks=ticks)
+    report = audit(changed)
     assert report.verdict == "invalid"
     assert "'start_elastic'" in report.reason
 
