@@ -69,6 +69,7 @@ class Arrangement:
         onlooker: Onlooker | None = None,
         pipelined: bool | None = None,
         realtime: bool | None = None,
+        start_state: bytes | None = None,
     ) -> None:
         """Checks everything that can be checked before the device is started.
 
@@ -111,6 +112,9 @@ class Arrangement:
             realtime: Ask the system for real time while the loop runs (``realtime.real_time``);
                 what it refuses is warned of once, with the command that grants it. None: for a real
                 device.
+            start_state: State of the scene (``provenance.start_state``) in which the run begins,
+                as a recording begun in mid-run carries it; None: the scene's own start, to which a
+                reset leads in any case.
 
         Raises:
             HapticBridgeError: An argument is out of range; the message says which and what is
@@ -166,7 +170,7 @@ class Arrangement:
             refuse_simulated_time(device.info, self.clock)
             self._is_realtime = wants_real_time(realtime, self.clock, is_real=device.info.is_real)
             refused.pop_all()
-        self._contact_stiffness = contact_stiffness
+        self._contact_stiffness, self._start_state = contact_stiffness, start_state
         self._sample = np.zeros(1, SAMPLE_DTYPE)
         self._inputs: deque[list[Write]] = deque()
         allowance = Allowance(

@@ -3,24 +3,23 @@
 from __future__ import annotations
 
 import base64
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
+
+from numpy.typing import ArrayLike
 
 from hapticbridge.clock import RealClock, SimulatedClock
-from hapticbridge.commands import Command, Operator, Record
+from hapticbridge.commands import Command, Operator, Record, Repeat
 from hapticbridge.commands.command import Stop
-from hapticbridge.errors import CommandError, RecordingError
-from hapticbridge.inputs import apply_writes
+from hapticbridge.errors import CommandError, RecordingError, SceneError
+from hapticbridge.inputs import Write, apply_writes, input_writes
 from hapticbridge.opened import Opened
 from hapticbridge.provenance import (
-    MID_RUN,
     MODEL_ATTACHMENT,
     RESET_ATTACHMENT,
     STATE_ATTACHMENT,
-    attachments,
-    elastic_energy,
-    restore_state,
     start_state,
 )
 from hapticbridge.summary import Summary
@@ -40,6 +39,46 @@ class Commanded(Opened):
         self._operator = Operator(self._commands, self._event)
         self._operator.begin(self._repeater, self._guarding.fade_ticks)
         return self
+
+    def set_input(
+        self,
+        *,
+        ctrl: Mapping[str, ArrayLike] | None = None,
+        mocap: Mapping[str, ArrayLike] | None = None,
+        joint_force: Mapping[str, ArrayLike] | None = None,
+        body_wrench: Mapping[str, ArrayLike] | None = None,
+    ) -> None:
+        """Changes inputs of the scene from the next tick on; recorded, so the run can be repeated.
+
+        Move mocap bodies slowly: MuJoCo damps their welds and contacts against rest, so a fast
+        move can create energy, and the environment is then called active.
+
+        Args:
+            ctrl: Control per actuator of the scene.
+            mocap: Pose (x, y, z[, qw, qx, qy, qz]) in m per mocap body of the scene.
+            joint_force: Generalised force per joint, in N or N m per degree of freedom.
+            body_wrench: (force, torque) in N and N m per body, world frame, at its centre of mass.
+
+        Raises:
+            SceneError: A name does not exist or has the wrong count of numbers.
+        """
+        self.repeat_input(
+            input_writes(
+                self.scene.model,
+                ctrl=ctrl,
+                mocap=mocap,
+                joint_force=joint_force,
+                body_wrench=body_wrench,
+            )
+        )
+
+    def repeat_input(self, writes: list[Write]) -> None:
+        """As ``set_input``, with the writes that a recording's event ``input`` holds."""
+        if not self.method.meters_inputs:
+            raise SceneError(
+                f"method '{self.method.name}' cannot meter the work of inputs; use 'implicit'"
+            )
+        self._inputs.append(writes)
 
     def command(self, command: Command, by: str = "caller") -> None:
         """Asks for something while the run goes on; from any thread, or from ``on_tick``.
@@ -68,6 +107,16 @@ class Commanded(Opened):
             if reason := self._needless(command):
                 raise CommandError(reason)
         self._commands.offer(command, by)
+
+    def repeat_commands(self, events: Sequence[Mapping[str, Any]]) -> None:
+        """Does before the next tick what commands did in another run; for ``on_tick``.
+
+        Nothing is asked of the device, and nothing waits for a force to fade: the other run did.
+
+        Args:
+            events: As its recording holds them (``commands.CHANGES``), in their order.
+        """
+        self._commands.waiting.append((Repeat(tuple(events)), ""))
 
     def stop(self, by: str = "caller") -> None:
         """Ends the run after the present tick; may be called from ``on_tick`` or a thread.
@@ -145,24 +194,22 @@ class Commanded(Opened):
         self._tick, self.clock = 0, type(self.clock)()
         self._binding.let_go()
         scene.set_gains(*method.gains(self._operator.used, self.period / self._substeps))
-        # as whoever simulates the file again will find it
-        restore_state(scene.model, scene.data, start_state(scene.model, scene.data).tobytes())
-        self._bind(self._operator.felt, self.parameters.felt, elastic_energy(scene.data))
-        files = {item.name: item.data for item in attachments(scene, self._reset_state)}
+        state = start_state(scene.model, scene.data).tobytes()
+        self._begin_in(state, self._operator.felt, self.parameters.felt)
+        files = {item.name: item.data for item in self._attachments()}
         names = (MODEL_ATTACHMENT, STATE_ATTACHMENT, RESET_ATTACHMENT)
         needed = {name: files[name] for name in names}
         self._stream.tell(
             {
                 "event": "begin",
-                "metadata": self._description() | {"began": MID_RUN, "home": self._home},
+                "metadata": self._description(),
                 "attachments": {n: base64.b64encode(d).decode() for n, d in needed.items()},
             }
         )
 
     def _record(self) -> None:
         path = self._next_path()
-        meta = self._description() | {"began": MID_RUN, "home": self._home}
-        self._stream.record(path, meta, attachments(self.scene, self._reset_state))
+        self._stream.record(path, self._description(), self._attachments())
         self._path = path
         self._event("start")
 

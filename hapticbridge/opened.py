@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from contextlib import ExitStack
 from types import TracebackType
 from typing import Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from hapticbridge.arrangement import Arrangement
 from hapticbridge.certificate import condition_sentences
 from hapticbridge.clock import RealClock
 from hapticbridge.commands import Repeater
 from hapticbridge.coupling import Coupling
-from hapticbridge.errors import DeviceError, HapticBridgeError, SceneError
+from hapticbridge.errors import DeviceError, HapticBridgeError
 from hapticbridge.guard import refuse_stretched_start, wait_until_still
-from hapticbridge.inputs import Write, input_writes
 from hapticbridge.jit import direct
 from hapticbridge.kernel.after import answer_step
 from hapticbridge.kernel.layout import STATE_DTYPE
@@ -25,8 +23,16 @@ from hapticbridge.kernel.publish import finish_tick, publish
 from hapticbridge.kernel.state import Binding
 from hapticbridge.kernel.step import before_step
 from hapticbridge.ledger import Ledger
-from hapticbridge.provenance import attachments, describe_run, start_state
+from hapticbridge.provenance import (
+    MID_RUN,
+    attachments,
+    describe_run,
+    elastic_energy,
+    restore_state,
+    start_state,
+)
 from hapticbridge.realtime import Grant, check_pace, memory_at_rest
+from hapticbridge.recording import Attachment
 from hapticbridge.recording.stream import RecordStream
 from hapticbridge.rendering import prepare
 from hapticbridge.summary import Summary
@@ -48,7 +54,7 @@ class Opened(Arrangement):
 
     _tick = _overruns = _skipped = 0
     _stopped_by = _signal = ""
-    _is_open = False
+    _is_open = _is_mid_run = False
     _grants: tuple[Grant, ...] = ()
 
     def __enter__(self) -> Self:
@@ -106,9 +112,11 @@ class Opened(Arrangement):
         self._reset_state = start_state(scene.model, scene.data).tobytes()
         self._bind(self.coupling, felt)
         self._home = self._description()["tool_start"]
+        if self._start_state is not None:
+            self._begin_in(self._start_state, self.coupling, felt)
         refuse_stretched_start(self._binding.state, self._sample, self._limits)
         if self._stream.is_read:
-            self._stream.start(self._description(), attachments(scene))
+            self._stream.start(self._description(), self._attachments())
             self._event("start")
 
     def _bind(self, coupling: Coupling, felt: Coupling | None, start_elastic: float = 0.0) -> None:
@@ -134,8 +142,19 @@ class Opened(Arrangement):
         repeater = Repeater(binding, scene.model, scene.data, self.method, parameters, reset)
         self._repeater = repeater
 
+    def _begin_in(self, state: bytes, coupling: Coupling, felt: Coupling | None) -> None:
+        """Lets a run begin in mid-motion, as whoever simulates its file again will find it."""
+        scene = self.scene
+        restore_state(scene.model, scene.data, state)
+        self._bind(coupling, felt, elastic_energy(scene.data))
+        self._is_mid_run = True
+
+    def _attachments(self) -> list[Attachment]:
+        return attachments(self.scene, self._reset_state if self._is_mid_run else None)
+
     def _description(self) -> dict[str, str]:
-        return describe_run(
+        began = {"began": MID_RUN, "home": self._home} if self._is_mid_run else {}
+        return began | describe_run(
             self.scene,
             self.parameters,
             self._binding,
@@ -177,46 +196,6 @@ class Opened(Arrangement):
 
     def _event(self, event: str, **details: object) -> None:
         self._stream.event(event, self._tick, self.clock.now(), **details)
-
-    def set_input(
-        self,
-        *,
-        ctrl: Mapping[str, ArrayLike] | None = None,
-        mocap: Mapping[str, ArrayLike] | None = None,
-        joint_force: Mapping[str, ArrayLike] | None = None,
-        body_wrench: Mapping[str, ArrayLike] | None = None,
-    ) -> None:
-        """Changes inputs of the scene from the next tick on; recorded, so the run can be repeated.
-
-        Move mocap bodies slowly: MuJoCo damps their welds and contacts against rest, so a fast
-        move can create energy, and the environment is then called active.
-
-        Args:
-            ctrl: Control per actuator of the scene.
-            mocap: Pose (x, y, z[, qw, qx, qy, qz]) in m per mocap body of the scene.
-            joint_force: Generalised force per joint, in N or N m per degree of freedom.
-            body_wrench: (force, torque) in N and N m per body, world frame, at its centre of mass.
-
-        Raises:
-            SceneError: A name does not exist or has the wrong count of numbers.
-        """
-        self.repeat_input(
-            input_writes(
-                self.scene.model,
-                ctrl=ctrl,
-                mocap=mocap,
-                joint_force=joint_force,
-                body_wrench=body_wrench,
-            )
-        )
-
-    def repeat_input(self, writes: list[Write]) -> None:
-        """As ``set_input``, with the writes that a recording's event ``input`` holds."""
-        if not self.method.meters_inputs:
-            raise SceneError(
-                f"method '{self.method.name}' cannot meter the work of inputs; use 'implicit'"
-            )
-        self._inputs.append(writes)
 
     @property
     def ledger(self) -> Ledger:

@@ -19,11 +19,10 @@ from hapticbridge.clock import SimulatedClock
 from hapticbridge.commands import Command, Couple, Record, Reset, Switch
 from hapticbridge.commands.change import tuning_ticks
 from hapticbridge.coupling import Coupling
-from hapticbridge.errors import CommandError, RecordingError, SafetyTrip
+from hapticbridge.errors import CommandError, SafetyTrip
 from hapticbridge.guard import Limits
 from hapticbridge.provenance import RESET_ATTACHMENT
 from hapticbridge.recording import read_recording
-from hapticbridge.whatif import what_if
 
 T = 1e-3
 STEPS = tuning_ticks(T)
@@ -413,10 +412,3 @@ def test_a_run_that_nobody_else_can_see_cannot_start_a_recorder(tmp_path: Path) 
             bridge.command(Record(on=True))
         bridge.command(Switch(force=False))
         assert bridge.run(0.05).ticks == 50
-
-
-def test_what_if_says_what_it_does_not_repeat(run: Callable[..., Any]) -> None:
-    _, path, _ = run({200: Record(on=False), 1300: Record(on=True)}, 1.6)
-    with pytest.raises(RecordingError, match="begun in mid-run"):
-        what_if(path.with_name("run-2.mcap"), {"damping": 1.5})
-    assert any("commands: 2 changes" in note for note in what_if(path, {"damping": 1.5}).notes)

@@ -28,7 +28,7 @@ from hapticbridge.study.audits import (
     worst_exit_code,
     write_audits,
 )
-from hapticbridge.whatif import changes_from, draw_what_if, what_if
+from hapticbridge.whatif import changes_from, draw_what_if, what_if, write_what_if
 
 SCENE_SIZE = 640, 400
 """Of the scene's picture on a page, in pixels: some 50 kB of a page's megabyte."""
@@ -76,8 +76,8 @@ class Audit:
     """Simulate the recorded hand again with this changed, as often as wanted: stiffness, damping,
     rotational_stiffness, rotational_damping, method, rate, substeps, scale, force_scale,
     contact_stiffness, controller, or a parameter of the scene. Twice: with the recorded motion,
-    and, where the device is known, with a model hand. With --plot both are drawn (one file
-    only)."""
+    and, where the device is known, with a model hand. --plot and --report show all runs side by
+    side (one file only)."""
 
     def execute(self) -> int:
         """Audits; returns the exit code."""
@@ -124,17 +124,20 @@ class Audit:
         return worst_exit_code(table)
 
     def _ask(self, file: Path) -> int:
-        if self.report or self.strict:
-            raise RecordingError("--what-if goes with --plot and --json, not --report or --strict")
         with progress("what if") as show:
-            found = what_if(file, changes_from(self.what_if), progress=show)
+            found = what_if(file, changes_from(self.what_if), strict=self.strict, progress=show)
         if self.as_json:
             out.print_json(found.to_json())
         else:
             print_what_if(found)
         if self.plot is not None:
             draw_what_if(found, self.plot)
-            err.print(f"wrote {plain(str(self.plot))}")
+        if self.report is not None:
+            before = found.runs[0]
+            with err.status("drawing …"):
+                scene = _scene_picture(before.recording, before.report)
+                write_what_if(found, self.report, scene)
+        self._name_written()
         return found.exit_code
 
     def _draw(self, report: AuditReport) -> None:
@@ -144,6 +147,9 @@ class Audit:
                 plot_recording(recording, self.plot)
             if self.report is not None:
                 write_report(recording, report, self.report, _scene_picture(recording, report))
+        self._name_written()
+
+    def _name_written(self) -> None:
         for written in (self.plot, self.report):
             if written is not None:
                 err.print(f"wrote {plain(str(written))}")

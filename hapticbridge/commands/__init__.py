@@ -6,6 +6,7 @@ from hapticbridge.commands.change import Repeater as Repeater
 from hapticbridge.commands.command import Command as Command
 from hapticbridge.commands.command import Couple as Couple
 from hapticbridge.commands.command import Record as Record
+from hapticbridge.commands.command import Repeat as Repeat
 from hapticbridge.commands.command import Reset as Reset
 from hapticbridge.commands.command import Switch as Switch
 from hapticbridge.commands.command import command_of as command_of

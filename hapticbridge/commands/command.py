@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from typing import Any
 
@@ -83,6 +84,17 @@ class Record:
 @dataclass(frozen=True, slots=True)
 class Stop:
     """End the run."""
+
+
+@dataclass(frozen=True, slots=True)
+class Repeat:
+    """Do what events of another run's recording did; not to be asked for over a wire.
+
+    Attributes:
+        events: Of ``change.CHANGES``, in their order; all are done before the same tick.
+    """
+
+    events: tuple[Mapping[str, Any], ...]
 
 
 Command = Couple | Switch | Reset | Record | Stop

@@ -8,7 +8,7 @@ from dataclasses import asdict
 from typing import Any
 
 from hapticbridge.commands.change import Repeater, tuning_ticks
-from hapticbridge.commands.command import Command, Couple, Record, Reset, Switch
+from hapticbridge.commands.command import Command, Couple, Record, Repeat, Reset, Switch
 from hapticbridge.commands.queue import CommandQueue
 from hapticbridge.coupling import Coupling
 
@@ -59,13 +59,13 @@ class Operator:
             What only a pause of the loop can do: a recorder to be started or stopped.
         """
         if self.later:
-            due, command, by = self.later[0]
+            due, postponed, by = self.later[0]
             if tick < due:
                 return None  # in the order that they were given
             self.later.popleft()
-            if isinstance(command, Record):
+            if isinstance(postponed, Record):
                 self._switch(by)
-                return command
+                return postponed
             self._do({"event": "reset", "by": by})
             self._switch(by)
             return None
@@ -84,6 +84,9 @@ class Operator:
         elif isinstance(command, Reset | Record):
             self.later.append((tick + self._fade_ticks + 1, command, by))
             self._switch(by, is_fading=True)
+        elif isinstance(command, Repeat):
+            for event in command.events:
+                self._do({n: v for n, v in event.items() if n not in ("tick", "time_ns")})
         return None
 
     def _switch(self, by: str, *, is_fading: bool = False) -> None:

@@ -8,7 +8,7 @@ from collections import deque
 from collections.abc import Callable
 
 from hapticbridge.commands.allowance import Allowance
-from hapticbridge.commands.command import Command, Couple, Record, Reset
+from hapticbridge.commands.command import Command, Couple, Record, Repeat, Reset
 from hapticbridge.errors import CommandError
 
 MOST_WAITING = 8
@@ -48,7 +48,7 @@ class CommandQueue:
         now: Callable[[], float] = time.monotonic,
     ) -> None:
         self.allowance = allowance
-        self.waiting: deque[tuple[Command, str]] = deque(maxlen=MOST_WAITING)
+        self.waiting: deque[tuple[Command | Repeat, str]] = deque(maxlen=MOST_WAITING)
         self._can_record, self._now = can_record, now
         self._offering = threading.Lock()  # never the loop's
         self._last = self._last_pause = -float("inf")

@@ -174,6 +174,10 @@ class RunParameters:
         )
 
 
+_ROUNDING = 4 * np.finfo(np.float64).eps
+"""How far from a rotation the polar factor may be by rounding; no unit."""
+
+
 def rotation_numbers(matrix: ArrayLike) -> tuple[float, ...]:
     """Returns the 9 numbers, row by row, of the rotation nearest to a matrix.
 
@@ -192,7 +196,10 @@ def rotation_numbers(matrix: ArrayLike) -> tuple[float, ...]:
         given = np.zeros(0)
     if given.size == 9 and np.all(np.isfinite(given)):
         square = given.reshape(3, 3)
-        if np.abs(square @ square.T - np.eye(3)).max() < 1e-5 and np.linalg.det(square) > 0:
+        off = np.abs(square @ square.T - np.eye(3)).max()
+        if off < 1e-5 and np.linalg.det(square) > 0:
+            if off < _ROUNDING:  # once more would turn the last digits of one that was recorded
+                return tuple(square.ravel().tolist())
             left, _, right = np.linalg.svd(square)
             return tuple((left @ right).ravel().tolist())
     raise _no_rotation(matrix)

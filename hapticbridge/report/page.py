@@ -108,14 +108,20 @@ def _drawn(evidence: Evidence, report: AuditReport, recording: Recording) -> dic
         "motion": inline_svg(draw_motion(evidence)),
         "energies": inline_svg(draw_energies(evidence)),
         "timing": inline_svg(draw_timing(evidence)),
-        "moment": _moment(evidence, report, period),
+        "moment": moment_of(evidence, report, period),
         "lateness": [float(np.percentile(lateness, p)) for p in (50, 99, 100)] if is_timed else [],
         "shares": [(name, percent(on)) for name, on in activities(evidence) if on.any()],
     }
 
 
-def _moment(evidence: Evidence, report: AuditReport, period: float) -> dict[str, Any] | None:
-    """Returns when a port became active, by how much then and at most, and why."""
+def moment_of(evidence: Evidence, report: AuditReport, period: float) -> dict[str, Any] | None:
+    """Returns when a port became active, by how much then and at most, and why; None if none did.
+
+    Args:
+        evidence: Of the run.
+        report: The audit's verdict on it.
+        period: T in s.
+    """
     cause = likely_cause(evidence, report)
     if cause is None or report.tick is None:
         return None

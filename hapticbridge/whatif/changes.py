@@ -26,7 +26,8 @@ UNITS = {
 }
 """What may be changed beside the scene's own parameters, with units."""
 
-_GAINS = tuple(field.name for field in fields(Coupling))
+GAINS = tuple(field.name for field in fields(Coupling))
+"""K and B of translation, then of rotation."""
 
 Value = float | int | str
 
@@ -59,7 +60,7 @@ class Settings:
 
     def value(self, name: str) -> Value | None:
         """Returns what a name of ``UNITS`` or of the scene stands for."""
-        if name in _GAINS:
+        if name in GAINS:
             return float(getattr(self.coupling, name))
         if name == "method":
             return self.method.name
@@ -88,7 +89,7 @@ class Settings:
             )
         given = {name: _checked(name, value) for name, value in changes.items()}
         method = method_named(str(given.get("method", self.method.name)))
-        gains = {name: float(given[name]) for name in _GAINS if name in given}
+        gains = {name: float(given[name]) for name in GAINS if name in given}
         scale = float(given.get("scale", self.scale))
         is_equal = self.scale == self.force_scale
         contact = given.get("contact_stiffness", self.contact_stiffness)
@@ -141,8 +142,11 @@ def _checked(name: str, value: Value) -> Value:
         number = float(value)
     except (TypeError, ValueError):
         number = math.nan
+    unit = f" in {UNITS[name]}" if UNITS.get(name) else ""
     if not math.isfinite(number):
-        raise RecordingError(f"{name} is {value!r:.60}; it must be a finite number")
+        raise RecordingError(f"{name} is {value!r:.60}; it must be a finite number{unit}")
+    if name in ("scale", "force_scale") and number <= 0:
+        raise RecordingError(f"{name} is {number!r}; it must be > 0")
     if name == "substeps":
         if not number.is_integer():
             raise RecordingError(f"substeps is {value!r:.60}; it must be a whole number")

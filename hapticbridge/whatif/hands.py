@@ -1,9 +1,7 @@
-"""Who moves the handle when a run is simulated again: the recorded motion, or a model hand.
+"""A model hand that moves the recorded device when a run is simulated again.
 
-A recorded motion is followed whatever the changed bridge does. That is exact, and no hand: a
-stiffer wall would be pressed in as far as the softer one was.
-
-A model hand gives way; what it wants follows from the recording (``intent``).
+It gives way, as the recorded motion (``again``) does not; what it wants follows from the recording
+(``intent``).
 """
 
 from __future__ import annotations
@@ -14,12 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from hapticbridge.device import AXES, DeviceInfo, Hand, Motion
+from hapticbridge.device import AXES, DeviceInfo, Hand
 from hapticbridge.device.lateness import delay_ticks
 from hapticbridge.device.simulated.driver import SimulatedDevice
-from hapticbridge.device.trajectory.driver import ReplayDevice, TrajectoryDevice
-from hapticbridge.tick import SAMPLE_DTYPE
-from hapticbridge.whatif.intent import intended
+from hapticbridge.whatif.again import Outside
+from hapticbridge.whatif.intent import INTENT, intended
 
 Array = NDArray[np.float64]
 
@@ -38,72 +35,6 @@ def missing_for_closed_loop(info: DeviceInfo) -> str:
     return ""
 
 
-class _Buttons:
-    """The recorded buttons at the times of a loop, which may have another rate."""
-
-    def __init__(self, ticks: NDArray[np.void], period: float) -> None:
-        self._pressed, self._recorded = ticks["buttons"].copy(), period
-        self._tick, self._share = 0, 1.0
-
-    def start(self, period: float) -> None:
-        self._tick, self._share = 0, period / self._recorded
-
-    def read(self, sample: NDArray[np.void]) -> None:
-        """Puts those of this tick into a sample; after the last they stay as they are."""
-        row = int(self._tick * self._share + 1e-9)  # a period in decimals is rounded
-        sample["buttons"] = self._pressed[min(row, len(self._pressed) - 1)]
-        self._tick += 1
-
-
-class RecordedMotion(ReplayDevice):
-    """The recorded samples, one a tick, from where the device was before the first one."""
-
-    def __init__(
-        self, ticks: NDArray[np.void], period: float, start: tuple[float, ...], info: DeviceInfo
-    ) -> None:
-        super().__init__(
-            ticks,
-            period,
-            force_limit=info.force_limit,
-            torque_limit=info.torque_limit,
-            speed_limit=info.speed_limit,
-        )
-        self._before = start
-
-    def start(self, period: float) -> NDArray[np.void]:
-        """See ``Device.start``."""
-        return _placed(super().start(period), self._before)
-
-
-class ResampledMotion(TrajectoryDevice):
-    """The recorded motion at another rate, linear between the samples and by slerp."""
-
-    def __init__(
-        self, ticks: NDArray[np.void], period: float, start: tuple[float, ...], info: DeviceInfo
-    ) -> None:
-        times = period * np.arange(len(ticks))
-        motion = Motion(times, ticks["device_position"], ticks["device_quaternion"])
-        super().__init__(
-            motion,
-            force_limit=info.force_limit,
-            torque_limit=info.torque_limit,
-            speed_limit=info.speed_limit,
-        )
-        self._before = start
-        self._buttons = _Buttons(ticks, period)
-
-    def start(self, period: float) -> NDArray[np.void]:
-        """See ``Device.start``."""
-        self._buttons.start(period)
-        return _placed(super().start(period), self._before)
-
-    def read(self, sample: NDArray[np.void]) -> int:
-        """See ``TrajectoryDevice.read``."""
-        flags = super().read(sample)
-        self._buttons.read(sample)
-        return flags
-
-
 class IdentifiedDevice(SimulatedDevice):
     """The recorded device as its data sheet knows it, in a model hand that wants what it wanted.
 
@@ -113,6 +44,8 @@ class IdentifiedDevice(SimulatedDevice):
         ticks: The recorded rows, ``TICK_DTYPE``, at least three.
         period: The recorded loop's in s.
         start: Device pose (7,) before the first tick.
+        is_moving: Whether it moves at the start already, as in a recording begun in mid-run; it is
+            else held still until then.
     """
 
     def __init__(
@@ -122,6 +55,8 @@ class IdentifiedDevice(SimulatedDevice):
         ticks: NDArray[np.void],
         period: float,
         start: tuple[float, ...],
+        *,
+        is_moving: bool = False,
     ) -> None:
         super().__init__(
             mass=info.mass or 0.0,
@@ -132,31 +67,35 @@ class IdentifiedDevice(SimulatedDevice):
             hand=hand,
             resolution=info.resolution or 0.0,
             friction=info.friction or 0.0,
-            delay=delay_ticks(info, period) or 0,
             force_limit=info.force_limit,
             torque_limit=info.torque_limit,
             speed_limit=info.speed_limit,
         )
-        self._motion = intended(info, hand, ticks, period, start)
+        self._motion = intended(info, hand, ticks, period, start, is_moving=is_moving)
+        at_rest = np.zeros(3), np.zeros(3)
+        self._velocity = _first_velocity(ticks, period) if is_moving else at_rest
         self._start = np.array(start)
         self._origin = Rotation.from_quat(self._start[3:], scalar_first=True)
-        self._buttons = _Buttons(ticks, period)
+        self._outside = Outside(ticks, period)
         self._felt = np.array([axis in info.axes for axis in AXES], dtype=np.float64)
         self.info = replace(info, is_real=False, duration=float(self._motion[-1, 0]))
 
     def start(self, period: float, parts: int = 1) -> NDArray[np.void]:
         """See ``SimulatedDevice.start``; the hand may pull from the start on."""
+        self._delay = delay_ticks(self.info, period) or 0  # in ticks of this loop
         sample = super().start(period, parts)
-        self._buttons.start(period)
+        self._outside.start(period)
         state = self._states[0]
         state["target_position"] = self._motion[0, 1:4]
         state["target_quaternion"] = self._motion[0, 4:]
+        state["velocity"], state["angular_velocity"] = self._velocity
         return self._there(sample)
 
     def read(self, sample: NDArray[np.void]) -> int:
         """See ``SimulatedDevice.read``."""
         flags = super().read(sample)
-        self._buttons.read(sample)
+        # buttons alone: this device is never silent
+        self._outside.read(sample)
         self._there(sample)
         return flags
 
@@ -172,8 +111,13 @@ class IdentifiedDevice(SimulatedDevice):
         return sample
 
 
-def _placed(sample: NDArray[np.void], pose: tuple[float, ...]) -> NDArray[np.void]:
-    placed = np.zeros(1, SAMPLE_DTYPE)
-    placed["buttons"] = sample["buttons"]
-    placed["position"][0], placed["quaternion"][0] = pose[:3], pose[3:]
-    return placed
+def _first_velocity(ticks: NDArray[np.void], period: float) -> tuple[Array, Array]:
+    """Returns velocity in m/s and angular velocity in rad/s with which a recorded motion begins.
+
+    The mean over ``INTENT``: one step of a rounded position is as much noise as motion.
+    """
+    last = min(max(round(INTENT / period), 1), len(ticks) - 1)
+    places, turns = ticks["device_position"], ticks["device_quaternion"]
+    first, later = (Rotation.from_quat(turns[row], scalar_first=True) for row in (0, last))
+    time = last * period
+    return (places[last] - places[0]) / time, (later * first.inv()).as_rotvec() / time

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from hapticbridge.audit import AuditReport
 from hapticbridge.jsonable import jsonable
+from hapticbridge.recording import Recording
 from hapticbridge.whatif.changes import Value
 
 RECORDED, PRESCRIBED, CLOSED = "recorded", "prescribed", "closed loop"
@@ -28,7 +29,7 @@ class WhatIfRun:
             handle and tool in m, by name.
         trip: Why the guard stopped it, or nothing.
         period: T in s.
-        ticks: Its records, ``TICK_DTYPE``.
+        recording: Of it; that of a changed run is in memory alone.
     """
 
     name: str
@@ -36,7 +37,12 @@ class WhatIfRun:
     peaks: dict[str, float]
     trip: str
     period: float
-    ticks: NDArray[np.void]
+    recording: Recording
+
+    @property
+    def ticks(self) -> NDArray[np.void]:
+        """Its records, ``TICK_DTYPE``."""
+        return self.recording.ticks
 
 
 @dataclass(frozen=True, slots=True)

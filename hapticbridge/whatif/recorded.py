@@ -4,21 +4,34 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import warnings
-from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
 
 from hapticbridge.certificate import needed_on_axes
+from hapticbridge.clock import period_of
+from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.guard import CONTROLLERS, Limits, guarding_for
 from hapticbridge.kernel.state import RunParameters
-from hapticbridge.provenance import SOURCE_PREFIX, compiled_model, parameters_of
+from hapticbridge.provenance import (
+    MID_RUN,
+    STATE_ATTACHMENT,
+    compiled_model,
+    parameters_of,
+    restore_state,
+)
 from hapticbridge.recording import Recording
 from hapticbridge.rendering import Method, method_named, prepare
 from hapticbridge.scene import Scene, load_scene, scene_parameters
+from hapticbridge.scene.checks import MAXIMUM_START_PENETRATION
 from hapticbridge.tick import TickFlag
 from hapticbridge.whatif.changes import Settings
+from hapticbridge.whatif.exact import that_gives
+from hapticbridge.whatif.unpacked import unpack_scene
 
 _NOWHERE = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
 
@@ -61,10 +74,9 @@ class RecordedRun:
         except (HapticBridgeError, ValueError, TypeError) as error:
             raise RecordingError(f"the metadata do not describe a run: {error}") from None
         settings = Settings(
-            # recorded is the law's damping; what was asked for is what should be felt
-            coupling=method.rendered(parameters.coupling, step),
+            coupling=_asked_for(parameters.coupling, method, step),
             method=method,
-            rate=1.0 / parameters.period,
+            rate=that_gives(parameters.period, period_of, 1.0 / parameters.period),
             substeps=parameters.substeps,
             scale=parameters.scale,
             force_scale=parameters.force_scale,
@@ -72,25 +84,32 @@ class RecordedRun:
             scene={str(name): float(value) for name, value in values.items()},
             controller=_controller(info, parameters, method),
         )
-        return cls(recording, parameters, info, settings, _write_scene(recording, folder))
+        return cls(recording, parameters, info, settings, unpack_scene(recording, folder))
 
     @property
     def is_absolute(self) -> bool:
         """Whether the device's poses were poses in the scene."""
-        return self.parameters.device_origin == self.parameters.handle_origin == _NOWHERE
+        p = self.parameters
+        is_nowhere = p.device_origin == p.handle_origin == _NOWHERE
+        return is_nowhere and not p.guarding.reseats
 
     @property
     def limits(self) -> Limits:
         """Of the run, times in s."""
         p, guarding = self.parameters, self.parameters.guarding
+        most = p.force_limit * p.period
+        rise = 0.0  # where it may step
+        if guarding.force_rise < math.inf:
+            rise = that_gives(guarding.force_rise, lambda s: most / s, most / guarding.force_rise)
         return Limits(
             force=p.force_limit,
             torque=p.torque_limit,
-            rise=p.force_limit * p.period / guarding.force_rise,  # 0 where it may step
+            rise=rise,
             ramp=p.ramp_ticks * p.period,
-            stretch=guarding.stretch / p.scale,
+            stretch=that_gives(guarding.stretch, lambda m: m * p.scale, guarding.stretch / p.scale),
             angle=guarding.angle,
             energy=guarding.energy,
+            reach=guarding.reach,
         )
 
     @property
@@ -104,16 +123,60 @@ class RecordedRun:
         return _button(self.parameters.guarding.dead_man)
 
     @property
-    def start(self) -> tuple[float, ...]:
-        """Device pose (7,) that the handle's counts from when the run begins.
+    def seat(self) -> tuple[float, ...]:
+        """Device pose (7,) that the handle's counts from in the first tick.
 
-        Where the device moved before the first tick, that re-seated the coupling: what it had moved
-        until then is not to be seen in the scene.
+        Where the device moved before it, that re-seated the coupling: what it had moved until then
+        is not to be seen in the scene.
         """
         first = self.recording.ticks[0]
         if not int(first["flags"]) & int(TickFlag.RESEATED):
             return self.parameters.device_start
         return (*first["device_position"].tolist(), *first["device_quaternion"].tolist())
+
+    @property
+    def start_state(self) -> bytes | None:
+        """State of the scene in which a recording of a run begins that was on its way already."""
+        if self.recording.meta.get("began") != MID_RUN:
+            return None
+        return self.recording.attachments.get(STATE_ATTACHMENT)
+
+    @property
+    def trip(self) -> str:
+        """Why the guard stopped the run, or nothing."""
+        trips = [e for e in self.recording.events if e.get("event") == "trip"]
+        return str(trips[0].get("reason", "unknown")) if trips else ""
+
+    def check_start(self, settings: Settings) -> None:
+        """Refuses to begin in mid-run in a scene that has become another there.
+
+        Raises:
+            RecordingError: Its state has other numbers, or something would begin inside another by
+                more than it did, which releases energy that nobody meters.
+        """
+        state = self.start_state
+        if state is None:
+            return
+        was, now = self._depth(self.settings, state), self._depth(settings, state)
+        if now - was > MAXIMUM_START_PENETRATION:
+            raise RecordingError(
+                f"the recording begins in mid-run, where with these changes something would be "
+                f"{1e3 * now:.3g} mm inside another ({1e3 * was:.3g} mm as recorded)"
+            )
+
+    def _depth(self, settings: Settings, state: bytes) -> float:
+        """Returns how deep in m the deepest contact is where the scene is in a state."""
+        scene = self.scene(settings)
+        step = settings.rate, settings.substeps, settings.method
+        prepare(scene, settings.coupling, 1.0 / step[0], *step[1:], warns=False)
+        try:
+            restore_state(scene.model, scene.data, state)
+        except RecordingError:
+            raise RecordingError(
+                "the recording begins in mid-run, in a state that the scene does not have with "
+                f"these changes (method '{settings.method.name}')"
+            ) from None
+        return max(0.0, -float(scene.data.contact.dist.min(initial=0.0)))
 
     def scene(self, settings: Settings) -> Scene:
         """Loads the scene with the parameters of some settings.
@@ -139,6 +202,20 @@ class RecordedRun:
         return found == self.recording.meta.get("scene_sha256")
 
 
+def _asked_for(used: Coupling, method: Method, step: float) -> Coupling:
+    """Returns the coupling of which a method makes this one, to the bit: what should be felt."""
+    felt = method.rendered(used, step)
+
+    def made(name: str, value: float) -> float:
+        return float(getattr(method.used(replace(felt, **{name: value}), step), name))
+
+    asked = {
+        name: that_gives(getattr(used, name), partial(made, name), getattr(felt, name))
+        for name in ("damping", "rotational_damping")
+    }
+    return replace(felt, **asked)
+
+
 def _controller(info: DeviceInfo, parameters: RunParameters, method: Method) -> str | None:
     """Returns the run's passivity controller; None if it is what a bridge chooses by itself."""
     p = parameters
@@ -153,29 +230,3 @@ def _controller(info: DeviceInfo, parameters: RunParameters, method: Method) -> 
 
 def _button(mask: int) -> int | None:
     return mask.bit_length() - 1 if mask else None
-
-
-def _write_scene(recording: Recording, folder: Path) -> Path:
-    """Writes the files of the scene that a recording carries; returns the main one."""
-    main: Path | None = None
-    for name, data in recording.attachments.items():
-        if not name.startswith(SOURCE_PREFIX):
-            continue
-        inner = PurePosixPath(name.removeprefix(SOURCE_PREFIX))
-        # a recording from elsewhere must not write beside the folder
-        if inner.is_absolute() or ".." in inner.parts or "\\" in name or ":" in name:
-            raise RecordingError(
-                f"the attachment {name!r:.80} would lie outside the scene's folder"
-            )
-        path = folder / inner
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_bytes(data)
-        except (OSError, ValueError) as error:
-            raise RecordingError(
-                f"the attachment {name!r:.80} cannot be unpacked: {error}"
-            ) from None
-        main = main or path
-    if main is None:
-        raise RecordingError(f"{recording.path} carries no scene: nothing can be simulated again")
-    return main

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-import warnings
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -12,43 +12,41 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.audit import AuditReport, audit
-from hapticbridge.bridge import Bridge
-from hapticbridge.clock import SimulatedClock
-from hapticbridge.commands import CHANGES as COMMANDED
+from hapticbridge.clock import Clock, SimulatedClock
+from hapticbridge.compare import compare
 from hapticbridge.device import Device
 from hapticbridge.device.simulated.scene_hand import scene_hand
-from hapticbridge.errors import RecordingError, SafetyTrip
-from hapticbridge.provenance import MID_RUN
-from hapticbridge.recording import Recording, read_recording
+from hapticbridge.errors import RecordingError
+from hapticbridge.recording import read_recording
 from hapticbridge.tick import TickFlag
+from hapticbridge.whatif.again import RecordedClock, RecordedMotion, ResampledMotion
 from hapticbridge.whatif.changes import UNITS, Settings, Value
-from hapticbridge.whatif.hands import (
-    IdentifiedDevice,
-    RecordedMotion,
-    ResampledMotion,
-    missing_for_closed_loop,
-)
+from hapticbridge.whatif.hands import IdentifiedDevice, missing_for_closed_loop
 from hapticbridge.whatif.outcome import CLOSED, PRESCRIBED, RECORDED, WhatIf, WhatIfRun
 from hapticbridge.whatif.recorded import RecordedRun
+from hapticbridge.whatif.repeat import Repetition
 
 
 def what_if(
     path: str | Path,
     changes: Mapping[str, Value],
     *,
+    strict: bool = False,
     progress: Callable[[int, int, str], None] | None = None,
 ) -> WhatIf:
     """Simulates a recorded run again with a changed bridge.
 
-    Twice: with the recorded motion of the device, whatever the forces (``prescribed``), and, where
-    the device's mass and damping are known, in a closed loop of that device and a model hand which
-    wants what the recorded hand wanted (``hands``). All runs are judged by the same audit. Memory
-    holds all of them.
+    Twice: with the recorded motion of the device, whatever the forces (``prescribed``, see
+    ``again``), and, where the device's mass and damping are known, in a closed loop of that device
+    and a model hand which wants what the recorded hand wanted (``hands``). Inputs of the scene,
+    buttons, commands and pauses come again at their times; a recording begun in mid-run begins in
+    the state that it carries. All runs are judged by the same audit. Memory holds all of them.
 
     Args:
         path: The recording, neither damaged nor changed; it carries its scene.
         changes: New values by name: ``changes.UNITS``, or the scene's own parameters. None runs the
-            recorded settings again.
+            recorded settings again: prescribed, they give the recorded run in every bit.
+        strict: As for ``audit``, which judges all runs.
         progress: Called with the runs done, all of them, and the one that begins.
 
     Raises:
@@ -57,19 +55,14 @@ def what_if(
     """
     tell = progress or _silent
     tell(0, 4, "auditing what was recorded")
-    report = audit(path)
+    report = audit(path, strict=strict)
     if report.verdict == "invalid":
         raise RecordingError(f"what is invalid cannot be simulated again: {report.reason}")
     recording = read_recording(path)
-    if recording.meta.get("began") == MID_RUN:
-        raise RecordingError(
-            f"'{recording.path}' was begun in mid-run; only what begins at the scene's own start "
-            "can be simulated with changes"
-        )
     with TemporaryDirectory(prefix="hapticbridge-") as name:
         folder = Path(name)
         run = RecordedRun.of(recording, folder / "scene")
-        return _Experiment(run, report, folder, tell).changed(changes)
+        return _Experiment(run, report, folder, tell, strict=strict).changed(changes)
 
 
 class _Experiment:
@@ -81,8 +74,11 @@ class _Experiment:
         report: AuditReport,
         folder: Path,
         tell: Callable[[int, int, str], None],
+        *,
+        strict: bool,
     ) -> None:
         self._run, self._report, self._folder, self._tell = run, report, folder, tell
+        self._strict = strict
         self._ticks, self._period = run.recording.ticks, run.parameters.period
         if len(self._ticks) < 3:
             raise RecordingError(f"'{run.recording.path}' is too short to be simulated again")
@@ -92,6 +88,7 @@ class _Experiment:
         """Returns all runs."""
         run, settings = self._run, self._run.settings
         new = settings.changed(changes)
+        is_changed = new != settings
         notes = []
         if not run.is_scene_as_recorded():
             notes.append(
@@ -100,24 +97,21 @@ class _Experiment:
             )
         runs = [self._as_recorded()]
         self._tell(1, 4, "the recorded motion")
-        runs.append(self._simulated(PRESCRIBED, self._prescribed(new), new))
-        notes.extend(_unrepeated(run.recording))
+        runs.append(self._prescribed(new))
+        if not is_changed:
+            notes.append(self._agreement())
+        notes.extend(_unrepeated(run, Repetition(run, new)))
         if runs[0].trip:
             notes.append("what was recorded ends in a trip: these runs end there, too")
-        if new.rate != settings.rate:
-            notes.append(
-                "the recorded motion is linear between its samples: at another rate its speed "
-                "changes in steps"
-            )
         hand_error = math.nan
         if missing := missing_for_closed_loop(run.info):
             notes.append(f"no closed loop: {missing}")
         else:
             self._tell(2, 4, "the model hand, nothing changed")
-            same = self._simulated(CLOSED, self._identified(settings), settings)
+            same = self._closed(settings)
             hand_error = self._hand_error(same)
             self._tell(3, 4, "the model hand")
-            runs.append(self._simulated(CLOSED, self._identified(new), new))
+            runs.append(self._closed(new) if is_changed else same)
             notes.append(
                 f"with nothing changed the model hand is {1e3 * hand_error:.3g} mm off the "
                 "recorded motion (root mean square); how it gives way to changed forces is assumed"
@@ -128,100 +122,83 @@ class _Experiment:
         return WhatIf(run.recording.path, told, tuple(runs), hand_error, (*notes, *self._concerns))
 
     def _as_recorded(self) -> WhatIfRun:
-        trips = [e for e in self._run.recording.events if e.get("event") == "trip"]
-        trip = str(trips[0].get("reason", "unknown")) if trips else ""
-        peaks = _peaks(self._ticks)
-        return WhatIfRun(RECORDED, self._report, peaks, trip, self._period, self._ticks)
+        recording, peaks = self._run.recording, _peaks(self._ticks)
+        return WhatIfRun(RECORDED, self._report, peaks, self._run.trip, self._period, recording)
 
-    def _prescribed(self, settings: Settings) -> Device:
-        kind = RecordedMotion if settings.rate == self._run.settings.rate else ResampledMotion
-        start = self._run.start
-        return kind(self._ticks, self._period, start, self._run.info)
+    def _prescribed(self, settings: Settings) -> WhatIfRun:
+        run, ticks, period = self._run, self._ticks, self._period
+        start = run.parameters.device_start
+        if settings.rate == run.settings.rate:
+            clock = RecordedClock(ticks, period)
+            motion = RecordedMotion(ticks, clock, period, start, run.info)
+            return self._simulated(PRESCRIBED, motion, clock, settings)
+        resampled = ResampledMotion(ticks, period, start, run.info)
+        return self._simulated(PRESCRIBED, resampled, SimulatedClock(), settings)
 
-    def _identified(self, settings: Settings) -> Device:
-        hand = scene_hand(self._run.scene(settings))
-        start = self._run.start
-        return IdentifiedDevice(self._run.info, hand, self._ticks, self._period, start)
+    def _closed(self, settings: Settings) -> WhatIfRun:
+        run = self._run
+        hand = scene_hand(run.scene(settings))
+        is_moving = run.start_state is not None
+        device = IdentifiedDevice(
+            run.info, hand, self._ticks, self._period, run.seat, is_moving=is_moving
+        )
+        return self._simulated(CLOSED, device, SimulatedClock(), settings)
 
     def _hand_error(self, same: WhatIfRun) -> float:
         count = min(len(same.ticks), len(self._ticks))
         off = same.ticks["device_position"][:count] - self._ticks["device_position"][:count]
         return float(np.sqrt(np.mean(np.sum(off**2, axis=1))))
 
-    def _simulated(self, name: str, device: Device, settings: Settings) -> WhatIfRun:
-        run = self._run
-        path = self._folder / "run.mcap"
-        bridge = Bridge(
-            run.scene(settings),
-            device,
-            settings.coupling,
-            rate=settings.rate,
-            substeps=settings.substeps,
-            method=settings.method.name,
-            contact_stiffness=settings.contact_stiffness,
-            recording=path,
-            clock=SimulatedClock(),
-            scale=settings.scale,
-            force_scale=settings.force_scale,
-            axes=np.array(run.parameters.axes),
-            absolute=run.is_absolute,
-            limits=run.limits,
-            controller=settings.controller,
-            clutch=run.clutch,
-            dead_man=run.dead_man,
+    def _simulated(self, name: str, device: Device, clock: Clock, settings: Settings) -> WhatIfRun:
+        repetition, path = Repetition(self._run, settings), self._path
+        period, trip = repetition.into(path, device, clock)
+        if settings != self._run.settings:
+            self._concerns |= dict.fromkeys(repetition.warned)
+        recording = read_recording(path)
+        report = audit(path, strict=self._strict)
+        return WhatIfRun(name, report, _peaks(recording.ticks), trip, period, recording)
+
+    @property
+    def _path(self) -> Path:
+        return self._folder / "run.mcap"
+
+    def _agreement(self) -> str:
+        """Says whether the run that was just made is the recorded one."""
+        found = compare(self._run.recording.path, self._path)
+        if found.first is None and not any(found.alone):
+            return "with nothing changed the prescribed run is the recorded one in every bit"
+        if found.first is None:
+            return f"with nothing changed the prescribed run has {found.ticks[1]} ticks"
+        first = found.first
+        return (
+            f"with nothing changed the prescribed run parts from the recorded one at tick "
+            f"{first.ticks[0]} in {first.column}, by {first.size:.3g} {first.unit}"
         )
-        trip = ""
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always", UserWarning)
-            with bridge:
-                try:
-                    self._repeat(bridge)
-                except SafetyTrip as error:
-                    trip = str(error)
-        if settings is not run.settings:
-            # where the scene was unpacked to tells nobody anything
-            told = [str(each.message).replace(str(run.scene_file), "") for each in caught]
-            self._concerns |= dict.fromkeys(text.removeprefix("scene '': ") for text in told)
-        ticks = read_recording(path).ticks
-        return WhatIfRun(name, audit(path), _peaks(ticks), trip, bridge.period, ticks)
-
-    def _repeat(self, bridge: Bridge) -> None:
-        """Runs as long as was recorded, with its inputs and its pauses at their times."""
-        per_tick = self._period / bridge.period
-        events = self._run.recording.events
-        inputs = [e for e in events if e.get("event") == "input"]
-        pauses = [e for e in events if e.get("event") == "resume"]
-        due = [math.ceil(int(each["tick"]) * per_tick - 1e-9) for each in inputs]
-
-        def on_tick(tick: int) -> None:
-            while due and due[0] <= tick:
-                due.pop(0)
-                bridge.repeat_input(inputs.pop(0)["writes"])
-
-        ends = [int(each["tick"]) for each in pauses] + [len(self._ticks)]
-        done = 0
-        for end in ends:
-            count = round(end * per_tick) - done
-            if count > 0:
-                bridge.run(count * bridge.period, on_tick)
-                done += count
 
 
-def _unrepeated(recording: Recording) -> Iterator[str]:
+def _unrepeated(run: RecordedRun, repetition: Repetition) -> Iterator[str]:
     """Says what these runs have not of the recorded one."""
-    flags = recording.ticks["flags"]
-    if commands := sum(event.get("event") in COMMANDED for event in recording.events):
+    counts = Counter(event.get("event") for event in run.recording.events)
+    if counts["coupling"] and not repetition.keeps_couplings:
         yield (
-            f"commands: {commands} changes of the coupling, switches or resets when it was "
-            "recorded, none in these runs"
+            f"the coupling was changed {counts['coupling']} times when it was recorded; here it is "
+            "one all the time"
         )
+    if counts["reset"] and not repetition.keeps_resets:
+        yield f"{counts['reset']} resets when it was recorded, none here: there is nothing to reset"
+    flags = run.recording.ticks["flags"]
+    is_resampled = repetition.settings.rate != run.settings.rate
     if missed := int(np.count_nonzero(flags & int(TickFlag.OVERRUN))):
+        here = "none in these runs" if is_resampled else "none in the closed loop"
         yield (
-            f"missed deadlines: {missed} when it was recorded, none in these runs: what the hand "
-            "did meanwhile it does here in one tick"
+            f"missed deadlines: {missed} when it was recorded, {here}: what the hand did "
+            "meanwhile it does there in one tick"
         )
-    if (flags & int(TickFlag.CONTROLLER_ACTIVE)).any():
-        yield "a controller was at work; the prescribed run has none, because nobody feels it"
+    if is_resampled:
+        yield (
+            "the recorded motion is linear between its samples: at another rate its speed changes "
+            "in steps"
+        )
 
 
 def _peaks(ticks: NDArray[np.void]) -> dict[str, float]:

@@ -1,0 +1,65 @@
+"""The page of a what-if: the recorded run and the changed ones, side by side."""
+
+from __future__ import annotations
+
+import base64
+from pathlib import Path
+from typing import Any
+
+from jinja2 import Environment, PackageLoader, select_autoescape
+
+from hapticbridge.errors import RecordingError
+from hapticbridge.picture import inline_svg
+from hapticbridge.quantity import quantity
+from hapticbridge.report.evidence import Evidence
+from hapticbridge.report.page import moment_of
+from hapticbridge.report.panels import BINS
+from hapticbridge.whatif.outcome import WhatIf, WhatIfRun
+from hapticbridge.whatif.picture import figure_of
+from hapticbridge.whatif.side_by_side import changes, rows, sentences
+
+
+def write_what_if(found: WhatIf, path: Path, scene: bytes | None = None) -> None:
+    """Writes one self-contained HTML page, of less than 1 MB however long the run was.
+
+    Args:
+        found: What came of the what-if.
+        path: Where to; an existing file is replaced.
+        scene: A picture of the recorded scene as PNG, if there is one.
+
+    Raises:
+        RecordingError: The page cannot be written.
+    """
+    environment = Environment(
+        loader=PackageLoader("hapticbridge", "templates"), autoescape=select_autoescape()
+    )
+    environment.filters["quantity"] = quantity
+    try:
+        drawn = inline_svg(figure_of(found, BINS))
+    except RecordingError:  # a run of numbers that cannot be drawn still has a verdict
+        drawn = ""
+    page = environment.get_template("what_if.html").render(
+        name=found.path.name,
+        path=str(found.path),
+        changes=list(changes(found)),
+        runs=[_told(run) for run in found.runs],
+        rows=list(rows(found)),
+        notes=found.notes,
+        drawn=drawn,
+        scene=scene and base64.b64encode(scene).decode(),
+    )
+    try:
+        path.write_text(page, encoding="utf-8")
+    except OSError as error:
+        raise RecordingError(f"cannot write '{path}': {error.strerror}") from None
+
+
+def _told(run: WhatIfRun) -> dict[str, Any]:
+    """Returns what the page tells of one run."""
+    evidence, report = Evidence.of(run.recording), run.report
+    return {
+        "name": run.name,
+        "report": report,
+        "sentences": list(sentences(run)),
+        "moment": evidence and moment_of(evidence, report, run.period),
+    }

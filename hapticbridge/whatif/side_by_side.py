@@ -1,0 +1,56 @@
+"""The runs of a what-if as rows of a table: a name, and a text per run."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from hapticbridge.quantity import quantity
+from hapticbridge.whatif.outcome import WhatIf, WhatIfRun
+
+_PEAK_UNITS = {"force": "N", "torque": "N m", "stretch": "m"}
+
+Row = tuple[str, tuple[str, ...]]
+
+
+def rows(found: WhatIf) -> Iterator[Row]:
+    """Yields what is told of all runs, in the order of ``found.runs``."""
+    runs = found.runs
+    yield "verdict", tuple(map(_verdict, runs))
+    for name in runs[0].peaks:
+        unit = _PEAK_UNITS[name.split()[0]]
+        yield f"peak {name}", tuple(quantity(run.peaks[name], unit) for run in runs)
+    for name in runs[0].report.energies:
+        joules = [run.report.energies.get(name, 0.0) for run in runs]
+        if any(joules):
+            yield name.replace("_", " "), tuple(quantity(e, "J") for e in joules)
+    yield "slack used", tuple(f"{run.report.slack_share:.0%}" for run in runs)
+    yield "device bears it", tuple(map(_certified, runs))
+    yield "ran", tuple(f"{run.report.duration:.3f} s" for run in runs)
+
+
+def changes(found: WhatIf) -> Iterator[tuple[str, str, str]]:
+    """Yields what was changed: name, and the value before and after with its unit."""
+    for name, unit, before, after in found.changes:
+        yield name, f"{_told(before)} {unit}".rstrip(), f"{_told(after)} {unit}".rstrip()
+
+
+def sentences(run: WhatIfRun) -> Iterator[str]:
+    """Yields what else is to be said of a run: why it is not passive, and why it was stopped."""
+    if run.report.verdict != "passive":
+        yield run.report.reason
+    if run.trip:
+        yield f"tripped: {run.trip}"
+
+
+def _verdict(run: WhatIfRun) -> str:
+    report = run.report
+    words = f"{report.verdict} ({report.environment})" if report.environment else report.verdict
+    return f"{words}, tripped" if run.trip else words
+
+
+def _certified(run: WhatIfRun) -> str:
+    return {True: "yes", False: "no", None: "not judged"}[run.report.certified]
+
+
+def _told(value: object) -> str:
+    return f"{value:.6g}" if isinstance(value, float) else "none" if value is None else str(value)
