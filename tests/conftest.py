@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +22,10 @@ from outside_scenes import (
     scene_file,
 )
 from recording_cases import random_rows, write
+from report_runs import Made
 from scene_cases import GRIPPED, ticks
 
+from hapticbridge.audit import AuditReport, audit
 from hapticbridge.cli import main
 from hapticbridge.recording import Recording, read_recording
 
@@ -50,6 +53,19 @@ def held(folder: Path) -> Recording:
     tapped(folder)
     recorded(path, device=f"simulated:path={motion}", duration=0.2)
     return read_recording(path)
+
+
+@pytest.fixture(scope="session")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
+    folder, kept = tmp_path_factory.mktemp("golden"), {}
+
+    def make(run: Callable[[Path], Path]) -> tuple[Recording, AuditReport]:
+        if run not in kept:
+            path = run(folder)
+            kept[run] = read_recording(path), audit(path)
+        return kept[run]
+
+    return make
 
 
 @pytest.fixture

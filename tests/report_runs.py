@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from audit_cases import ScriptedDevice, recorded
+from numpy.typing import NDArray
 
+from hapticbridge.audit import AuditReport
+from hapticbridge.bridge import Bridge
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Hand, SimulatedDevice
 from hapticbridge.guard import Limits
+from hapticbridge.recording import Recording
+from hapticbridge.tick import TickFlag
 
 LOOSE = Coupling(stiffness=2000, damping=0.2, rotational_stiffness=2, rotational_damping=5e-4)
 
@@ -101,3 +108,104 @@ def active_by_delay(folder: Path) -> Path:
 def active_by_quantisation(folder: Path) -> Path:
     """A coarse encoder without friction: the spring answers every step of it."""
     return _held_to_an_anvil(folder / "quantisation.mcap", 4500.0, 3.0, resolution=2e-4)
+
+
+def active_by_mocap(folder: Path) -> Path:
+    """A body that is put elsewhere tick by tick and knocks against a tool at rest."""
+    scene, path = folder / "push.xml", folder / "inputs.mcap"
+    scene.write_text(PUSHED)
+    recorded(
+        path, str(scene), ScriptedDevice(_resting), LOOSE, duration=0.05, on_tick=_knock("pusher")
+    )
+    return path
+
+
+def active_beside_a_fan(folder: Path) -> Path:
+    """The hard floor again, while a body that touches nothing is moved far away."""
+    scene, path = folder / "fan.xml", folder / "fan.mcap"
+    fan = '<body name="fan" mocap="true" pos="1 0 0"><geom size="0.02"/></body>'
+    scene.write_text(HARD_FLOOR.replace("<worldbody>", f"<worldbody>{fan}"))
+    recorded(
+        path, str(scene), ScriptedDevice(_tapping), LOOSE, duration=0.06, on_tick=_knock("fan", 1.0)
+    )
+    return path
+
+
+def active_with_a_fine_encoder(folder: Path) -> Path:
+    """As by its rate, with an encoder without friction whose steps of 5 µm are no matter."""
+    return _held_to_an_anvil(folder / "fine.mcap", 10_000.0, 2.0, resolution=5e-6)
+
+
+def active_by_rotation(folder: Path) -> Path:
+    """K_r T/2 = 0.01 N m s/rad on a device of 0.002."""
+    scene, path = folder / "turn.xml", folder / "turn.mcap"
+    scene.write_text(ANVIL)
+    hand = replace(
+        LIGHT_HAND, rotational_inertia=1e-5, rotational_damping=0.0, rotational_stiffness=0.05
+    )
+    device = SimulatedDevice(mass=0.4, damping=2.0, hand=hand)
+    recorded(path, str(scene), device, Coupling(300.0, 0.05, 20.0, 1e-4), duration=0.5, limits=FULL)
+    return path
+
+
+def active_by_repeated_samples(folder: Path) -> Path:
+    """K T/2 + B' = 1.75 N s/m on a device of 2, three of four samples of which get lost."""
+    scene, path = folder / "lossy.xml", folder / "lossy.mcap"
+    scene.write_text(ANVIL)
+    device = LossyDevice(mass=0.4, damping=2.0, hand=LIGHT_HAND)
+    # a device whose delay is known would be certified, and not be watched
+    device.info = replace(device.info, delay=None)
+    recorded(path, str(scene), device, Coupling(3500.0, 0.05, 0.1, 1e-4), duration=2.0, limits=FULL)
+    return path
+
+
+class LossyDevice(SimulatedDevice):
+    """A device of whose samples only every fourth arrives."""
+
+    _reads = 0
+
+    def start(self, period: float, parts: int = 1) -> NDArray[np.void]:
+        self._last = super().start(period, parts)
+        return self._last.copy()
+
+    def read(self, sample: NDArray[np.void]) -> int:
+        super().read(sample)
+        self._reads += 1
+        if self._reads % 4:
+            sample[:] = self._last
+            return int(TickFlag.STALE_SAMPLE)
+        self._last = sample.copy()
+        return 0
+
+
+def _resting(_: int) -> tuple[float, ...]:
+    return (0, 0, 0, 1, 0, 0, 0)
+
+
+def _knock(body: str, place: float = 0.05) -> Callable[[Bridge, int], None]:
+    def move(bridge: Bridge, tick: int) -> None:
+        x = place - 0.012 * (1 - math.cos(0.2 * tick))
+        bridge.set_input(mocap={body: (x, 0, 0, 1, 0, 0, 0)})
+
+    return move
+
+
+PUSHED = """<mujoco model="push">
+  <option timestep="0.001" integrator="discrete" cone="elliptic" gravity="0 0 0">
+    <flag diagexact="enable"/>
+  </option>
+  <worldbody>
+    <body name="pusher" mocap="true" pos="0.05 0 0">
+      <geom name="pusher" size="0.02"/>
+    </body>
+    <body name="ball">
+      <freejoint/>
+      <geom name="ball" size="0.02" mass="0.1"/>
+      <site name="grip"/>
+    </body>
+  </worldbody>
+</mujoco>"""
+
+
+Made = Callable[[Callable[[Path], Path]], tuple[Recording, AuditReport]]
+"""What the fixture ``made`` gives: it makes a golden recording once, and judges it."""

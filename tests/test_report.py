@@ -2,50 +2,36 @@
 
 from __future__ import annotations
 
+import html
 import io
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import report_runs
-from audit_cases import rewritten
 from chromium import browser
+from cli_cases import Called
 from PIL import Image
+from report_runs import Made
 
-from hapticbridge.audit import AuditReport, audit
+from hapticbridge.audit import audit
 from hapticbridge.kernel.guarding import TANK
 from hapticbridge.quantity import quantity
 from hapticbridge.recording import Recording, read_recording
 from hapticbridge.report import write_report
-from hapticbridge.report.cause import likely_cause
 from hapticbridge.report.energies import draw_energies
 from hapticbridge.report.evidence import Evidence
-from hapticbridge.report.facts import MOST_EVENTS, event_rows, guard_facts
+from hapticbridge.report.facts import MOST_EVENTS, MOST_INPUTS, event_rows, guard_facts
+from hapticbridge.report.lead import device_sentence
+from hapticbridge.report.likely import likely_cause
 from hapticbridge.report.motion import draw_motion
-from hapticbridge.report.panels import BINS
+from hapticbridge.report.panels import BINS, LEAST_SPAN, energy_unit
 from hapticbridge.report.timing import activities, draw_timing
 from hapticbridge.tick import TickFlag
 
 pytestmark = pytest.mark.filterwarnings("ignore:scene '.*floor.xml'")
-
-Made = Callable[[Callable[[Path], Path]], tuple[Recording, AuditReport]]
-
-
-@pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
-    """Makes a golden recording once, and judges it."""
-    folder, kept = tmp_path_factory.mktemp("golden"), {}
-
-    def make(run: Callable[[Path], Path]) -> tuple[Recording, AuditReport]:
-        if run not in kept:
-            path = run(folder)
-            kept[run] = read_recording(path), audit(path)
-        return kept[run]
-
-    return make
 
 
 def evidence_of(recording: Recording) -> Evidence:
@@ -54,97 +40,11 @@ def evidence_of(recording: Recording) -> Evidence:
     return evidence
 
 
-@pytest.mark.parametrize(
-    ("run", "port", "kind", "told"),
-    [
-        (report_runs.active_by_method, "environment", "method", "implicitfast"),
-        (report_runs.active_by_contact, "environment", "contact setting", 'solref "-20000 -50"'),
-        (report_runs.active_by_rate, "device", "rate", "at 2500 Hz translation would hold"),
-        (report_runs.active_by_delay, "device", "delay", "2 ticks old"),
-        (report_runs.active_by_quantisation, "device", "quantisation", "0.45 N"),
-    ],
-)
-def test_a_run_is_active_for_the_cause_that_it_was_made_for(
-    run: Callable[[Path], Path], port: str, kind: str, told: str, made: Made, tmp_path: Path
-) -> None:
-    recording, report = made(run)
-    assert (report.verdict, report.port) == ("active", port)
-    evidence = evidence_of(recording)
-    cause = likely_cause(evidence, report)
-    assert cause is not None
-    assert cause.kind == kind
-    assert told in cause.evidence
-    energy, allowed = evidence.judged(report)
-    assert energy[report.tick] - allowed[report.tick] == pytest.approx(report.joules)
-    page = tmp_path / "page.html"
-    write_report(recording, report, page)
-    text = page.read_text(encoding="utf-8")
-    assert f"Likely cause: <strong>{kind}</strong>" in text
-    assert f"<td>{report.tick}, at {report.tick * 1e-3:.3f} s</td>" in text  # type: ignore[operator]
-    assert f"{quantity(report.joules, 'J')} there" in text
-
-
-def test_the_same_run_without_its_cause_is_given_another_one(made: Made, tmp_path: Path) -> None:
-    # the device of the coarse encoder, with enough friction to hold still between its steps
-    recording, report = made(report_runs.active_by_quantisation)
-    sheet = recording.meta["device"].replace('"friction": 0.0', '"friction": 0.5')
-    assert sheet != recording.meta["device"]
-    changed = rewritten(recording, tmp_path / "rubbed.mcap", meta={"device": sheet})
-    evidence = evidence_of(read_recording(changed))
-    cause = likely_cause(evidence, report)
-    assert cause is not None
-    assert cause.kind == "rate"
-
-
-def cause_of(recording: Recording, report: AuditReport, **parts: Any) -> tuple[str, str]:
-    cause = likely_cause(evidence_of(Recording(**{**vars(recording), **parts})), report)
-    assert cause is not None
-    return cause.kind, cause.evidence
-
-
-def test_missed_deadlines_are_the_cause_where_the_device_bears_the_coupling(made: Made) -> None:
-    recording, report = made(report_runs.active_by_rate)
-    assert report.tick is not None
-    sheet = recording.meta["device"].replace('"damping": 2.0', '"damping": 20.0')
-    assert sheet != recording.meta["device"]
-    meta, ticks = recording.meta | {"device": sheet}, recording.ticks.copy()
-    assert cause_of(recording, report, meta=meta)[0] == "unknown"
-    ticks["flags"][[report.tick - 500, report.tick + 1]] |= int(TickFlag.OVERRUN)
-    assert cause_of(recording, report, meta=meta, ticks=ticks)[0] == "unknown"  # not before it
-    ticks["flags"][report.tick - 100 : report.tick - 97] |= int(TickFlag.OVERRUN)
-    kind, told = cause_of(recording, report, meta=meta, ticks=ticks)
-    assert (kind, told[:24]) == ("rate", "3 deadlines were missed ")
-
-
-def test_swings_over_many_steps_of_the_encoder_are_not_its_quantisation(made: Made) -> None:
-    recording, report = made(report_runs.active_by_rate)
-    sheet = recording.meta["device"].replace('"resolution": 0.0', '"resolution": 1e-9')
-    assert sheet != recording.meta["device"]
-    assert cause_of(recording, report, meta=recording.meta | {"device": sheet})[0] == "rate"
-
-
-def test_a_hard_contact_is_the_cause_also_behind_a_method_with_a_hazard(made: Made) -> None:
-    recording, report = made(report_runs.active_by_contact)
-    meta = recording.meta | {"method": "implicitfast"}
-    assert cause_of(recording, report, meta=meta)[0] == "contact setting"
-
-
 def test_asked_for_strictly_the_slack_is_not_allowed(made: Made) -> None:
     recording, report = made(report_runs.active_by_contact)
     evidence = evidence_of(recording)
     assert evidence.judged(report)[1].any()
     assert not evidence.judged(replace(report, environment="within slack"))[1].any()
-
-
-def test_bodies_that_were_moved_are_the_cause_before_any_contact(made: Made) -> None:
-    recording, report = made(report_runs.active_by_contact)
-    assert report.tick is not None
-    moved = {"event": "input", "tick": report.tick - 5, "writes": [["mocap_pos", 0, [0, 0, 1]]]}
-    kind, told = cause_of(recording, report, events=[*recording.events, moved])
-    assert kind == "inputs"
-    assert "moved 1 times" in told
-    later = moved | {"tick": report.tick + 1}
-    assert cause_of(recording, report, events=[*recording.events, later])[0] == "contact setting"
 
 
 def test_a_passive_run_has_no_moment_and_no_cause(run_file: Path, tmp_path: Path) -> None:
@@ -164,6 +64,7 @@ def test_the_bound_is_drawn_beside_what_was_created(made: Made) -> None:
     allowed = np.asarray(lines["allowed at most"].get_ydata())
     above = int(np.argmax(created > allowed + 1e-6))
     assert above == report.tick
+    assert draw_energies(evidence).axes[1].get_ylabel() == "energy (mJ)"
     assert created[above] - allowed[above] == pytest.approx(1e3 * report.joules, rel=1e-5)
 
 
@@ -254,23 +155,88 @@ def test_a_run_in_real_time_shows_how_late_its_ticks_were(run_file: Path) -> Non
 
 
 def test_what_stopped_a_run_is_listed_after_any_number_of_inputs() -> None:
-    inputs = [{"event": "input", "tick": i, "time_ns": i} for i in range(2 * MOST_EVENTS)]
+    inputs = [{"event": "input", "tick": i, "time_ns": i} for i in range(2 * MOST_INPUTS)]
     trip = {"event": "trip", "tick": 400, "time_ns": 400_000_000, "reason": "it jumped"}
     rows = event_rows([{"event": "start", "tick": 0, "time_ns": 0}, *inputs, trip])
-    assert len(rows) == MOST_EVENTS
-    assert [row[0] for row in rows[:2]] == ["start", "input"]
+    assert [row[0] for row in rows] == ["start", *["input"] * MOST_INPUTS, "trip"]
     assert rows[-1] == ("trip", "400", "0.400 s", "reason it jumped")
+    others = [{"event": "resume", "tick": i} for i in range(2 * MOST_EVENTS)]
+    assert len(event_rows([*inputs, *others])) == MOST_EVENTS
 
 
-def test_a_passive_run_of_a_device_that_does_not_bear_its_coupling_says_so(
+@pytest.mark.parametrize(
+    ("run", "port", "lead"),
+    [
+        (report_runs.active_by_method, "environment", "Not safe: the scene gave out up to "),
+        (report_runs.active_by_rate, "device", "Not safe: the device was given up to "),
+    ],
+)
+def test_the_page_says_first_how_much_when_where_why_and_what_to_change(
+    run: Callable[[Path], Path], port: str, lead: str, made: Made, tmp_path: Path
+) -> None:
+    recording, report = made(run)
+    evidence, page = evidence_of(recording), tmp_path / "page.html"
+    energy, allowed = evidence.judged(report)
+    worst = int(np.argmax(energy - allowed))
+    cause = likely_cause(evidence, report)
+    write_report(recording, report, page)
+    text = html.unescape(page.read_text(encoding="utf-8"))
+    first = text[text.index("<section") : text.index("</section>")]
+    most = quantity(float((energy - allowed)[worst]), "J")
+    assert cause is not None
+    assert report.tick is not None
+    for told in (
+        f"{lead}{most} ",
+        f"from {1e-3 * report.tick:.3f} s on (tick {report.tick})",
+        f"most at {1e-3 * worst:.3f} s (tick {worst})",
+        f"<td>{port}: ",
+        f"{quantity(report.joules, 'J')} at first, {most} at most",
+        f"<strong>{cause.kind}</strong>. ",
+        cause.evidence[1:],
+        cause.remedy[1:],
+    ):
+        assert told in first
+
+
+def test_an_energy_is_drawn_in_the_unit_of_its_size(made: Made) -> None:
+    for joules, unit in ((2.0, "J"), (-0.3, "mJ"), (4e-6, "µJ"), (5e-9, "nJ"), (1e-20, "nJ")):
+        size, name = energy_unit(np.array([0.0, joules]), np.zeros(2))
+        assert name == unit
+        assert abs(joules / size) < 1000
+    recording, _ = made(report_runs.active_by_rate)
+    evidence = evidence_of(recording)
+    tiny = replace(evidence, created=1e-20 * evidence.created, allowed=0 * evidence.allowed)
+    low, high = draw_energies(tiny).axes[1].get_ylim()
+    assert high - low >= LEAST_SPAN  # rounding does not fill the panel
+
+
+@pytest.mark.parametrize("name", ["page.mcap", "page.pdf", "page", "nowhere/page.html"])
+def test_a_page_replaces_no_recording_and_no_picture(
+    name: str, call: Called, run_file: Path, tmp_path: Path
+) -> None:
+    target = tmp_path / name
+    if target.parent.exists():
+        target.write_bytes(b"what was there")
+    code, out, err = call("audit", run_file, "--report", target)
+    assert (code, out) == (2, "")  # before anything is computed
+    assert str(target) in err
+    assert not target.exists() or target.read_bytes() == b"what was there"
+
+
+def test_a_passive_page_says_whether_the_device_bears_the_coupling(
     run_file: Path, tmp_path: Path
 ) -> None:
     page, report = tmp_path / "page.html", audit(run_file)
-    for certified in (True, False):
-        judged = replace(report, certified=certified)
-        write_report(read_recording(run_file), judged, page)
-        text = page.read_text(encoding="utf-8")
-        assert ("The device does not bear this coupling" in text) is not certified
+    told = {
+        True: "The device bears this coupling, in any hand.",
+        False: "The device does not bear this coupling",
+        None: "in any hand is not known",
+    }
+    for certified, words in told.items():
+        assert words in device_sentence(replace(report, certified=certified))
+    assert not device_sentence(replace(report, verdict="active"))
+    write_report(read_recording(run_file), replace(report, certified=False), page)
+    assert told[False] in page.read_text(encoding="utf-8")
 
 
 def test_a_browser_shows_the_page_without_a_request_or_a_complaint(
@@ -284,8 +250,14 @@ def test_a_browser_shows_the_page_without_a_request_or_a_complaint(
         shown = tab()
         shown.open(page.as_uri())
         assert shown.value("document.querySelector('h1').innerText").endswith(": active")
+        assert (
+            shown.value("getComputedStyle(document.body).backgroundColor") == "rgb(255, 255, 255)"
+        )
         assert shown.value("document.querySelectorAll('svg').length") == 4
         assert shown.value("document.documentElement.scrollWidth <= innerWidth")
         assert shown.value("document.querySelector('img').naturalWidth") == 64
         assert [each for each in shown.requests if not each.startswith("data:")] == [page.as_uri()]
         assert shown.complaints == []
+        shown.open(page.as_uri(), width=360)  # a telephone: nothing is cut, curves can be pushed
+        assert shown.value("document.documentElement.scrollWidth") <= 360
+        assert shown.value("document.querySelector('svg').getBoundingClientRect().width") > 600

@@ -85,7 +85,8 @@ class Judgement:
                 "slack_share": self.slack_share,
             }
         if unstrict is None:
-            lost = -self.energies["environment_energy"]
+            # within rounding it may be above zero; + 0.0 for zero itself, which has a sign
+            lost = max(-self.energies["environment_energy"], 0.0) + 0.0
             return {
                 "verdict": "passive",
                 "environment": "strict",

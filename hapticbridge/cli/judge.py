@@ -19,7 +19,7 @@ from hapticbridge.film import Shot, still
 from hapticbridge.picture import check_ending
 from hapticbridge.quantity import quantity
 from hapticbridge.recording import Recording, read_recording, repair
-from hapticbridge.report import plot_recording, telling_time, write_report
+from hapticbridge.report import check_page_name, plot_recording, telling_time, write_report
 from hapticbridge.study.audits import (
     audit_all,
     check_table_name,
@@ -61,7 +61,7 @@ class Audit:
     plot: Path | None = None
     """Draw force, position and energies into this picture (.png, .svg or .pdf; one file only)."""
     report: Path | None = None
-    """Write a self-contained HTML page (one file only)."""
+    """Write a self-contained page (.html; one file only): verdict, cause, remedy, curves."""
     table: Path | None = None
     """Write a row per recording to this file: .parquet (extra 'tables'), .csv or .json."""
     jobs: int | None = None
@@ -85,6 +85,8 @@ class Audit:
             raise RecordingError("audit needs at least one recording")
         if self.plot is not None:
             check_ending(self.plot)
+        if self.report is not None:
+            check_page_name(self.report)
         if self.table is not None:
             check_table_name(self.table)
         files = find_recordings(self.files)

@@ -21,7 +21,8 @@ BINS = 1500
 is lost. More makes a page larger without showing more at its width."""
 
 AXES = ("x", "y", "z")
-COLOURS = ("#b3261e", "#2e7d32", "#1a5fb4")
+COLOURS = ("#d55e00", "#009e73", "#0072b2")
+"""Of the axes: vermilion, green and blue that the colour-blind tell apart (Okabe & Ito)."""
 
 DRAWABLE = 1e9
 """Newtons, metres and joules beyond this are no physics; the picture's axes would not bear them."""

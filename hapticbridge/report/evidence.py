@@ -14,6 +14,7 @@ from hapticbridge.audit import AuditReport
 from hapticbridge.audit.balance import Balance
 from hapticbridge.audit.interventions import Interventions
 from hapticbridge.audit.reached import Reached
+from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo
 from hapticbridge.device.lateness import delay_ticks
 from hapticbridge.errors import HapticBridgeError
@@ -35,6 +36,7 @@ class Evidence:
         ticks: The records, ``TICK_DTYPE``, n >= 1.
         events: What happened.
         parameters: The run's.
+        worst: The same with the coupling that asks most of the device, where commands changed it.
         info: The device.
         method: How the tool was rendered.
         time: Of each tick in s, (n,).
@@ -48,6 +50,7 @@ class Evidence:
     ticks: NDArray[np.void]
     events: list[dict[str, Any]]
     parameters: RunParameters
+    worst: RunParameters
     info: DeviceInfo
     method: Method
     time: Array
@@ -55,6 +58,21 @@ class Evidence:
     allowed: Array
     kicked: Array
     model: mujoco.MjModel | None
+
+    @property
+    def asked(self) -> Coupling:
+        """The least coupling that a user asks for to get ``worst``.
+
+        Where the law's B' is 0 a method has taken off all the damping that was asked for, which
+        may have been anything up to what is felt: then it counts as 0.
+        """
+        used, step = self.worst.coupling, self.worst.period / self.worst.substeps
+        asked = self.method.rendered(used, step)
+        return replace(
+            asked,
+            damping=asked.damping if used.damping else 0.0,
+            rotational_damping=asked.rotational_damping if used.rotational_damping else 0.0,
+        )
 
     @property
     def lateness(self) -> Array:
@@ -92,10 +110,13 @@ class Evidence:
             parameters = replace(
                 parameters, device_damping=linear, device_rotational_damping=rotational
             )
+            home = np.array(meta_home(recording.meta))
+            outside = Interventions.of(recording.events, parameters, home)
+            worst = outside.worst(info, method)
             energies = np.concatenate(
                 [
                     (each.environment_energy, each.slack, each.kicked)
-                    for each in _balances(recording, parameters, info)
+                    for each in _balances(recording, parameters, info, outside)
                 ],
                 axis=1,
             )
@@ -105,6 +126,7 @@ class Evidence:
             ticks=ticks,
             events=recording.events,
             parameters=parameters,
+            worst=worst,
             info=info,
             method=method,
             time=ticks["tick"] * parameters.period,
@@ -116,12 +138,10 @@ class Evidence:
 
 
 def _balances(
-    recording: Recording, parameters: RunParameters, info: DeviceInfo
+    recording: Recording, parameters: RunParameters, info: DeviceInfo, outside: Interventions
 ) -> Iterator[Balance]:
     """Yields the balance block by block: of a long run one takes many times the records' room."""
     starts = {name: np.array(meta_start(recording.meta, name)) for name in STARTS}
-    home = np.array(meta_home(recording.meta))
-    outside = Interventions.of(recording.events, parameters, home)
     ticks, late = recording.ticks, delay_ticks(info, parameters.period) or 0
     energy = float(starts["start_kinetic"][0] + starts["start_potential"][0])
     reached = Reached.at_start(parameters, starts["handle_start"], starts["tool_start"], energy)

@@ -21,7 +21,10 @@ from hapticbridge.tick import TickFlag
 Facts = list[tuple[str, str]]
 
 MOST_EVENTS = 200
-"""Events that a page lists; a run with scripted inputs has one per tick."""
+"""Events that a page lists."""
+
+MOST_INPUTS = 10
+"""Of them inputs; a run with scripted inputs has one per tick, which would bury all others."""
 
 _LONGEST = 200
 """Letters of an event that are shown; an input names every number that it wrote."""
@@ -145,7 +148,7 @@ def head_facts(report: AuditReport, meta: Mapping[str, str], evidence: Evidence)
         ("method", f"{evidence.method.name}, {1 / parameters.period:g} Hz"),
         *(("coupling", sentence) for sentence in report.rendered[:1]),
         ("ran", f"{report.duration:.3f} s, {report.ticks} ticks, {in_time}"),
-        ("at most", f"{quantity(force, 'N')}, {quantity(torque, 'N m')} on the device"),
+        ("largest force", f"{quantity(force, 'N')}, {quantity(torque, 'N m')} on the device"),
         ("controller", _controlled(evidence)),
     ]
     borne = {True: "bears the coupling", False: "does not bear it", None: "not judged"}
@@ -175,6 +178,20 @@ def _controlled(evidence: Evidence) -> str:
     return f"{name}, at work in {percent(active)} of the ticks{injected}"
 
 
+def balance_of(report: AuditReport) -> str:
+    """Returns the energies at the end of a run; those of rounding alone are left out."""
+    told = [
+        f"{_spaced(name)} {quantity(energy, 'J')}"
+        for name, energy in report.energies.items()
+        if abs(energy) > ROUNDING
+    ]
+    return ", ".join(told) or "nothing"
+
+
+ROUNDING = 1e-12
+"""J below which an energy is not told: a thousandth of what the verdict allows for rounding."""
+
+
 def percent(is_on: NDArray[np.bool_]) -> str:
     """Returns in which share of the ticks something was on; what happened at all is not 0 %."""
     share = 100 * float(np.mean(is_on))
@@ -182,12 +199,15 @@ def percent(is_on: NDArray[np.bool_]) -> str:
 
 
 def event_rows(events: Sequence[Mapping[str, Any]]) -> list[tuple[str, str, str, str]]:
-    """Returns name, tick, time and the rest of events, at most ``MOST_EVENTS``, in their order.
+    """Returns name, tick, time and the rest of events, in their order.
 
-    Where there are more, inputs are left out first: they are many, and what stopped a run is last.
+    At most ``MOST_EVENTS``, ``MOST_INPUTS`` of them inputs; inputs are left out first: they are
+    many, and what stopped a run is last.
     """
-    ranked = sorted(range(len(events)), key=lambda i: (events[i].get("event") == "input", i))
-    kept = sorted(ranked[:MOST_EVENTS])
+    is_input = [event.get("event") == "input" for event in events]
+    inputs = [index for index, each in enumerate(is_input) if each][:MOST_INPUTS]
+    others = [index for index, each in enumerate(is_input) if not each]
+    kept = sorted((others + inputs)[:MOST_EVENTS])
     return [_event(events[index]) for index in kept]
 
 

@@ -24,7 +24,7 @@ def draw_moment(evidence: Evidence, report: AuditReport) -> Figure:
     tick = report.tick or 0
     around = slice(max(0, tick - ZOOM), tick + ZOOM + 1)
     numbers = evidence.ticks["tick"][around]
-    figure = new_figure(8, 7)
+    figure = new_figure(8, 6)
     energy, force, apart = figure.subplots(3, 1, sharex=True)
     given, allowed = evidence.judged(report)
     label = "given to the device, unpaid" if report.port == "device" else "created in the scene"
@@ -34,8 +34,8 @@ def draw_moment(evidence: Evidence, report: AuditReport) -> Figure:
         sent = evidence.ticks["wrench_on_device"][around, i]
         force.plot(numbers, sent, color=colour, marker=".", ms=3, lw=1, label=axis)
         apart.plot(numbers, 1e3 * stretch[around, i], color=colour, lw=1, label=axis)
-    force.set_ylabel("force on the device (N)")
-    apart.set_ylabel("spring: handle − tool (mm)")
+    force.set_ylabel("force on\nthe device (N)")
+    apart.set_ylabel("spring: handle\n− tool (mm)")
     for axes in (energy, force, apart):
         axes.axvline(tick, color="black", ls="--", lw=1, label=f"tick {tick}")
         finish(axes)

@@ -3,23 +3,19 @@
 from __future__ import annotations
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from hapticbridge.audit.differences import turn_between
 from hapticbridge.picture import new_figure
 from hapticbridge.report.curves import AXES, COLOURS, finish
 from hapticbridge.report.evidence import Evidence
-from hapticbridge.report.panels import curve
-
-_LEAST_SPAN = 1e-3
-"""Of a panel, in its own unit; rounding would otherwise fill it and look like a motion."""
+from hapticbridge.report.panels import curve, widen
 
 
 def draw_motion(evidence: Evidence) -> Figure:
     """Draws force and torque on the tool, and the poses of tool and handle."""
     ticks, time = evidence.ticks, evidence.time
-    figure = new_figure(8, 9)
+    figure = new_figure(8, 7.6)
     force, torque, way, turn = figure.subplots(4, 1, sharex=True)
     start = ticks["tool_position"][0]
     way.plot([], [], color="grey", ls=":", lw=1, label="handle")
@@ -36,20 +32,13 @@ def draw_motion(evidence: Evidence) -> Figure:
         angle = np.linalg.norm(turn_between(first, ticks[f"{name}_quaternion"]), axis=1)
         curve(turn, time, np.degrees(angle), color=colour, ls=style, label=name)
     for axes, label in (
-        (force, "force on the tool (N)"),
-        (torque, "torque on the tool (mN m)"),
-        (way, "way from the start (mm)"),
-        (turn, "turned from the start (°)"),
+        (force, "force on\nthe tool (N)"),
+        (torque, "torque on\nthe tool (mN m)"),
+        (way, "way from\nthe start (mm)"),
+        (turn, "turned from\nthe start (°)"),
     ):
         axes.set_ylabel(label)
-        _widen(axes)
+        widen(axes)
         finish(axes)
     turn.set_xlabel("time (s)")
     return figure
-
-
-def _widen(axes: Axes) -> None:
-    low, high = axes.get_ylim()
-    if high - low < _LEAST_SPAN:
-        middle = 0.5 * (low + high)
-        axes.set_ylim(middle - 0.5 * _LEAST_SPAN, middle + 0.5 * _LEAST_SPAN)

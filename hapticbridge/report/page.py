@@ -16,12 +16,11 @@ from hapticbridge.picture import inline_svg
 from hapticbridge.provenance import meta_float
 from hapticbridge.quantity import quantity
 from hapticbridge.recording import Recording
-from hapticbridge.report.cause import likely_cause
 from hapticbridge.report.curves import draw_recording
 from hapticbridge.report.energies import draw_energies
 from hapticbridge.report.evidence import Evidence
 from hapticbridge.report.facts import (
-    MOST_EVENTS,
+    balance_of,
     device_facts,
     event_rows,
     guard_facts,
@@ -30,25 +29,47 @@ from hapticbridge.report.facts import (
     run_facts,
     software_facts,
 )
+from hapticbridge.report.lead import PLACES, device_sentence, lead_sentence
+from hapticbridge.report.likely import likely_cause
 from hapticbridge.report.moment import draw_moment
 from hapticbridge.report.motion import draw_motion
 from hapticbridge.report.timing import activities, draw_timing
+
+PAGES = (".html", ".htm")
+"""What a page's name may end in; a browser takes another for text, and it is no recording."""
 
 
 def telling_time(recording: Recording, report: AuditReport) -> float:
     """Returns when a picture tells most of a run: at its fault, or at the largest force, in s.
 
     Args:
-        recording: With one tick at least.
+        recording: What was judged.
         report: The audit's verdict on it.
 
     Raises:
-        RecordingError: The recording does not tell its period.
+        RecordingError: The recording holds no tick, or does not tell its period.
     """
     tick = report.tick
     if tick is None:
+        if not len(recording.ticks):
+            raise RecordingError(f"'{recording.path}' holds no tick")
         tick = int(np.argmax(np.linalg.norm(recording.ticks["wrench_on_tool"][:, :3], axis=1)))
     return tick * meta_float(recording.meta, "period_s")
+
+
+def check_page_name(path: Path) -> None:
+    """Checks that a page can be written under its name, before anything is computed for it.
+
+    Args:
+        path: The file to be written.
+
+    Raises:
+        RecordingError: The name does not end like a page, or its folder does not exist.
+    """
+    if path.suffix.lower() not in PAGES:
+        raise RecordingError(f"'{path}' does not end like a page; endings: {', '.join(PAGES)}")
+    if not path.absolute().parent.is_dir():
+        raise RecordingError(f"cannot write '{path}': its folder does not exist")
 
 
 def write_report(
@@ -63,13 +84,17 @@ def write_report(
         scene: A picture of the scene as PNG, if there is one; ``telling_time`` says when.
 
     Raises:
-        RecordingError: The page cannot be written.
+        RecordingError: The page cannot be written, or not under this name.
     """
+    check_page_name(path)
     environment = Environment(
         loader=PackageLoader("hapticbridge", "templates"), autoescape=select_autoescape()
     )
     environment.filters["quantity"] = quantity
     evidence, meta = Evidence.of(recording), recording.meta
+    rows = event_rows(recording.events)
+    run = None if evidence is None else _drawn(evidence, report, recording)
+    moment = None if run is None else run["moment"]
     page = environment.get_template("report.html").render(
         report=asdict(report),
         name=report.path.name,
@@ -79,10 +104,13 @@ def write_report(
             "Guard": [] if evidence is None else guard_facts(evidence),
             "Software": software_facts(meta),
         },
-        events=event_rows(recording.events),
-        more_events=max(len(recording.events) - MOST_EVENTS, 0),
+        events=rows,
+        more_events=len(recording.events) - len(rows),
         scene=scene and base64.b64encode(scene).decode(),
-        run=None if evidence is None else _drawn(evidence, report, recording),
+        run=run,
+        moment=moment,
+        lead=lead_sentence(report, None if moment is None else moment["worst"]),
+        of_device=device_sentence(report),
         curves="" if evidence is not None else _bare_curves(recording),
     )
     try:
@@ -99,7 +127,7 @@ def _bare_curves(recording: Recording) -> str:
         return ""
 
 
-def _drawn(evidence: Evidence, report: AuditReport, recording: Recording) -> dict[str, object]:
+def _drawn(evidence: Evidence, report: AuditReport, recording: Recording) -> dict[str, Any]:
     """Returns what the page tells of a run whose numbers can be drawn."""
     lateness, period = evidence.lateness, evidence.parameters.period
     is_timed = bool(lateness.any())
@@ -108,6 +136,7 @@ def _drawn(evidence: Evidence, report: AuditReport, recording: Recording) -> dic
         "motion": inline_svg(draw_motion(evidence)),
         "energies": inline_svg(draw_energies(evidence)),
         "timing": inline_svg(draw_timing(evidence)),
+        "balance": balance_of(report),
         "moment": moment_of(evidence, report, period),
         "lateness": [float(np.percentile(lateness, p)) for p in (50, 99, 100)] if is_timed else [],
         "shares": [(name, percent(on)) for name, on in activities(evidence) if on.any()],
@@ -130,8 +159,10 @@ def moment_of(evidence: Evidence, report: AuditReport, period: float) -> dict[st
     worst = int(np.argmax(excess))
     return {
         "drawn": inline_svg(draw_moment(evidence, report)),
+        "place": PLACES.get(report.port, report.port),
         "time": report.tick * period,
         "cause": cause,
         "worst": float(excess[worst]),
         "worst_tick": int(evidence.ticks["tick"][worst]),
+        "worst_time": float(evidence.time[worst]),
     }

@@ -52,7 +52,7 @@ def draw_timing(evidence: Evidence) -> Figure:
     kinds = (("injected_damping", "N s/m"), ("injected_rotational_damping", "N m s/rad"))
     injected = [(evidence.ticks[f], unit) for f, unit in kinds if evidence.ticks[f].any()]
     is_timed = bool(evidence.lateness.any())
-    heights = [2.4] * is_timed + [3.2] + [1.8] * len(injected)
+    heights = [2.2] * is_timed + [2.8] + [1.6] * len(injected)
     figure = new_figure(8, sum(heights))
     panels = list(np.atleast_1d(figure.subplots(len(heights), 1, height_ratios=heights)))
     if is_timed:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import warnings
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from functools import cache
 from typing import NamedTuple
 
@@ -47,7 +47,13 @@ def warn_of_contacts(model: mujoco.MjModel, grip: str, scene: object) -> None:
         warnings.warn(f"scene '{scene}': {concern}", UserWarning, stacklevel=3)
 
 
-def check_contacts(model: mujoco.MjModel, grip: str, *, is_thorough: bool = False) -> list[str]:
+def check_contacts(
+    model: mujoco.MjModel,
+    grip: str,
+    *,
+    is_thorough: bool = False,
+    only: Collection[frozenset[int]] | None = None,
+) -> list[str]:
     """Returns what ``contact_concerns`` says about the contacts that the tool can have.
 
     Flexes, and the ``solreffriction`` of pairs, are not looked at.
@@ -58,11 +64,14 @@ def check_contacts(model: mujoco.MjModel, grip: str, *, is_thorough: bool = Fals
         is_thorough: Whether to say too where a contact is soft or solved with the approximate
             diagonal: MuJoCo's defaults, for which nobody asked. Otherwise only what is likely to
             create more energy than the slack allows.
+        only: Pairs of geoms to look at; None: all that the tool can have.
     """
-    option = model.opt
-    where: dict[ContactSetting, list[str]] = {}
-    for first, second, setting in contact_settings(model, grip):
-        names = f"{_geom_name(model, first)} with {_geom_name(model, second)}"
+    option, where = model.opt, dict[ContactSetting, list[str]]()
+    pairs = contact_settings(model, grip) if only is None else settings_among(model)
+    for first, second, setting in pairs:
+        if only is not None and frozenset((first, second)) not in only:
+            continue
+        names = f"{geom_name(model, first)} with {geom_name(model, second)}"
         where.setdefault(setting, []).append(names)
     step = float(option.timestep)
     return [
@@ -236,6 +245,7 @@ def _others(count: int) -> str:
     return f" and {count} more" if count else ""
 
 
-def _geom_name(model: mujoco.MjModel, geom_id: int) -> str:
+def geom_name(model: mujoco.MjModel, geom_id: int) -> str:
+    """Returns what a sentence calls a geom: its name, or its number where it has none."""
     name = model.geom(geom_id).name
     return f"geom '{name}'" if name else f"geom {geom_id}"

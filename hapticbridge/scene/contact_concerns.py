@@ -62,7 +62,8 @@ def contact_concerns(
         SceneError: As ``contact_numbers``.
     """
     numbers = contact_numbers(solref, solimp, timestep, refsafe=refsafe)
-    steps, instead = numbers.relaxation, suggested_solref(timestep)
+    # + 0.0: a negative zero would be printed as one
+    steps, instead = numbers.relaxation + 0.0, suggested_solref(timestep)
     concerns = []
     if numbers.grade == "active" and numbers.is_too_stiff:
         concerns.append(

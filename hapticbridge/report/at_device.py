@@ -1,0 +1,170 @@
+"""Why a device was given energy that nobody put in."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticbridge.certificate import Condition, needed_damping, run_conditions
+from hapticbridge.device.lateness import delay_ticks, felt_period
+from hapticbridge.report.cause import MOST, SAFE_METHOD, Cause
+from hapticbridge.report.evidence import Evidence
+from hapticbridge.report.remedy import what_would_do
+from hapticbridge.tick import TickFlag
+
+COUNTED = 2.0
+"""Resolutions of the device; a step of at most so many between two samples is one of the encoder
+and not of the hand."""
+
+FEWEST_REPEATS = 0.02
+"""Share of samples that must repeat an older one before that is called a cause, no unit: one in
+fifty is jitter between two clocks, which halves no margin."""
+
+
+def cause_at_device(evidence: Evidence, window: slice) -> Cause:
+    """Returns why the device got too much.
+
+    Args:
+        evidence: Of the run.
+        window: The ticks that lead to the moment.
+    """
+    method = evidence.method
+    hazard = Cause("method", f"method '{method.name}': {method.hazard}", SAFE_METHOD)
+    if not method.has_law:
+        return hazard
+    conditions = run_conditions(evidence.info, evidence.worst, method)
+    failing = [condition for condition in conditions if condition.holds is False]
+    if found := _delayed(evidence, failing):
+        return found
+    if not failing and (found := _timing(evidence, window)):
+        return found
+    if counts := _counted(evidence, window):
+        others = f", or {what_would_do(evidence)}" if failing else ""
+        return Cause("quantisation", counts, f"take a finer encoder or more friction{others}")
+    if failing:
+        return _overloaded(evidence, failing)
+    return hazard if method.hazard else _unexplained(evidence)
+
+
+def _told(failing: list[Condition]) -> str:
+    return "; ".join(
+        f"{c.axis}: the device's damping is {c.available:g} {_UNITS[c.axis]}, the coupling needs "
+        f"{c.needed:.4g}"
+        for c in failing
+    )
+
+
+_UNITS = {"translation": "N s/m", "rotation": "N m s/rad"}
+
+
+def _delayed(evidence: Evidence, failing: list[Condition]) -> Cause | None:
+    """Returns that samples are old, where without that the device would bear the coupling."""
+    worst, info = evidence.worst, evidence.info
+    late, own = delay_ticks(info, worst.period) or 0, info.damping or 0.0
+    prompt = worst.scale * worst.force_scale
+    prompt *= needed_damping(worst.coupling, felt_period(info, worst.period), worst.laws)
+    if not late or not failing or own < prompt:
+        return None
+    return Cause(
+        "delay",
+        f"{prompt:.3g} N s/m of damping would bear the coupling without delay, the device has "
+        f"{own:.3g}; its samples are {late} ticks old; {_told(failing)}",
+        f"shorten the delay, or {what_would_do(evidence, is_late=True)}",
+    )
+
+
+def _overloaded(evidence: Evidence, failing: list[Condition]) -> Cause:
+    """Returns that the coupling asks too much: of its spring at this rate, or of its damper."""
+    worst, own = evidence.worst, evidence.info.damping or 0.0
+    damper = worst.scale * worst.force_scale * evidence.asked.damping
+    if failing[0].axis == "translation" and damper >= own:
+        return Cause(
+            "damping",
+            f"{_told(failing)}; its damper alone asks {damper:.4g} at any rate",
+            what_would_do(evidence),
+        )
+    return Cause("rate", f"{_told(failing)}: it is too stiff for its rate", what_would_do(evidence))
+
+
+def _unexplained(evidence: Evidence) -> Cause:
+    if evidence.info.delay is None:
+        return Cause(
+            "unknown",
+            "damping, deadlines and resolution do not explain it; the device's delay is not known",
+            "measure the device with 'hapticbridge identify'",
+        )
+    return Cause(
+        "unknown",
+        "damping, delay, deadlines and resolution do not explain it",
+        "lower the stiffness, and measure the device with 'hapticbridge identify'",
+    )
+
+
+def _timing(evidence: Evidence, window: slice) -> Cause | None:
+    """Returns what missed deadlines or samples explain, where the device bears the coupling."""
+    flags = evidence.ticks["flags"][window]
+    missed = int(np.count_nonzero(flags & int(TickFlag.OVERRUN)))
+    span = len(flags) * evidence.parameters.period
+    if missed:
+        return Cause(
+            "rate",
+            f"{missed} deadlines were missed in the {span:.2g} s before, so that a wrench was held "
+            "for longer than the coupling was chosen for",
+            "lower the rate or the load of the machine ('hapticbridge doctor')",
+        )
+    repeated = float(np.mean((flags & int(TickFlag.STALE_SAMPLE)) != 0))
+    # a device slower than the loop repeats each sample until its next one
+    own = evidence.info.rate
+    expected = max(0.0, 1.0 - own * evidence.parameters.period) if own else 0.0
+    if repeated > expected + FEWEST_REPEATS:
+        return Cause(
+            "delay",
+            f"{repeated:.0%} of the samples in the {span:.2g} s before repeated an older one, "
+            f"{expected:.0%} are to be expected: the force answered where the handle had been",
+            "mend the link to the device, or lower the rate to what it delivers",
+        )
+    return None
+
+
+def _counted(evidence: Evidence, window: slice) -> str:
+    """Says that the device was driven by single steps of its encoder, if that is what happened.
+
+    A coupling that is unstable anyway passes through small steps, too, but its energy comes when
+    the swings have grown: so what counts are the joules from the window to the worst moment.
+    """
+    info, worst = evidence.info, evidence.worst
+    if not info.resolution:
+        return ""
+    rub = (
+        worst.scale
+        * info.resolution
+        * (worst.coupling.stiffness / 2 + worst.coupling.damping / worst.period)
+    )
+    if info.friction is not None and info.friction >= rub:
+        return ""
+    span = slice(window.start, max(window.stop, int(np.argmax(evidence.kicked)) + 1))
+    gained = np.diff(evidence.kicked, prepend=0.0)[span].clip(min=0.0)
+    steps = _largest_steps(evidence.ticks["device_position"], span) / info.resolution
+    total = float(gained.sum())
+    share = float(gained[steps <= COUNTED].sum()) / total if total > 0 else 0.0
+    if share < MOST or not math.isfinite(share):
+        return ""
+    has = "unknown" if info.friction is None else f"{info.friction:g} N"
+    return (
+        f"{share:.0%} of the energy came in ticks whose motion was {COUNTED:g} steps of the "
+        f"device's resolution ({info.resolution:g} m) or less; to hold still between steps takes a "
+        f"friction of K D/2 + B' D/T = {rub:.3g} N, the device's is {has}"
+    )
+
+
+def _largest_steps(position: NDArray[np.float64], span: slice) -> NDArray[np.float64]:
+    """Returns the largest step of an axis into each tick, in m; the one before a run is not known.
+
+    The first tick of a run has none, so that it counts as a small one.
+    """
+    before = position[max(span.start - 1, 0) : span.stop]
+    steps = np.abs(np.diff(before, axis=0)).max(axis=1, initial=0.0)
+    missing = span.stop - span.start - len(steps)
+    return np.concatenate([np.zeros(missing), steps])

@@ -1,0 +1,97 @@
+"""Which stiffness, damping or rate a device would bear, for a run that it did not."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+
+from hapticbridge.certificate import run_conditions
+from hapticbridge.report.evidence import Evidence
+
+HALVINGS = 40
+"""Of an interval in which a limit is sought: the printed three digits need a third of them."""
+
+FASTEST = 20_000.0
+"""Hz; a rate beyond what a loop of this package reaches is no remedy."""
+
+
+def what_would_do(evidence: Evidence, *, is_late: bool = False) -> str:
+    """Says what to change so that the device condition holds, as a user would type it.
+
+    Stiffness and damping are those that are asked for, not the law's B'; each is changed alone.
+    What does not help by itself is left out.
+
+    Args:
+        evidence: Of the run; the device's damping is known.
+        is_late: Whether a delay is the cause: a faster loop does not shorten it.
+    """
+    found = []
+    for axis, units in _UNITS.items():
+        if _holds(evidence, axis, "period", 1.0):
+            continue
+        name = axis.replace(" ", "_")
+        for part, unit in zip(("stiffness", "damping"), units, strict=True):
+            share = _largest(partial(_holds, evidence, axis, part))
+            if share:
+                value = share * getattr(evidence.asked, f"{name}{part}")
+                found.append(f"lower the {axis}{part} to {_down(value)} {unit}")
+    period = evidence.parameters.period
+    slowest = period * FASTEST
+    if not is_late and evidence.info.rate is None and slowest > 1:
+        share = min(_largest(partial(_holds, evidence, axis, "period")) for axis in _UNITS)
+        if share and 1 / share < slowest:
+            found.append(f"raise the rate to {_up(1 / (share * period))} Hz")
+    return ", or ".join(found) or "lower stiffness and damping together"
+
+
+_UNITS = {"": ("N/m", "N s/m"), "rotational ": ("N m/rad", "N m s/rad")}
+_ROUNDING = 1e-9  # of a limit found by halving, which must not cost it a digit
+
+
+def _holds(evidence: Evidence, axis: str, part: str, share: float) -> bool:
+    """Tells whether the condition on a kind of axis holds with a share of what was asked for.
+
+    Args:
+        evidence: Of the run.
+        axis: A key of ``_UNITS``.
+        part: What is changed alone: ``stiffness``, ``damping`` or ``period``.
+        share: Of it.
+    """
+    worst, felt, method = evidence.worst, evidence.asked, evidence.method
+    period = worst.period * (share if part == "period" else 1.0)
+    if part != "period":
+        name = f"{axis.replace(' ', '_')}{part}"
+        felt = replace(felt, **{name: share * getattr(felt, name)})
+    used = method.used(felt, period / worst.substeps)
+    changed = replace(worst, coupling=used, period=period)
+    kind = "rotation" if axis else "translation"
+    conditions = run_conditions(evidence.info, changed, method)
+    return all(c.holds is not False for c in conditions if c.axis == kind)
+
+
+def _largest(holds: Callable[[float], bool]) -> float:
+    """Returns the largest share in (0, 1) that holds, where all smaller ones do; 0 where none."""
+    low, high = 0.0, 1.0
+    if not holds(1e-6):
+        return 0.0
+    for _ in range(HALVINGS):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if holds(middle) else (low, middle)
+    return low
+
+
+def _down(value: float) -> str:
+    """Formats a limit with three digits, never above it."""
+    return _three_digits(value * (1 + _ROUNDING), math.floor)
+
+
+def _up(value: float) -> str:
+    """Formats a limit with three digits, never below it."""
+    return _three_digits(value * (1 - _ROUNDING), math.ceil)
+
+
+def _three_digits(value: float, rounded: Callable[[float], int]) -> str:
+    digit = 10.0 ** (math.floor(math.log10(value)) - 2)
+    return f"{rounded(value / digit) * digit:.6g}"
