@@ -5,7 +5,7 @@ from __future__ import annotations
 import html
 import io
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +18,7 @@ from report_runs import Made
 
 from hapticbridge.audit import audit
 from hapticbridge.errors import RecordingError
-from hapticbridge.kernel.guarding import TANK
+from hapticbridge.kernel.guarding import TANK, Guarding
 from hapticbridge.quantity import quantity
 from hapticbridge.recording import Recording, read_recording
 from hapticbridge.report import write_report
@@ -141,6 +141,17 @@ def test_what_the_guard_did_is_drawn_and_told(run_file: Path, tmp_path: Path) ->
     assert "tank, at work in" in text
     assert "up to 1.5 N s/m injected" in text
     assert "reason it jumped" in text
+
+
+def test_the_page_tells_everything_that_the_guard_was_set_to(run_file: Path) -> None:
+    evidence = evidence_of(read_recording(run_file))
+    names = [field.name for field in fields(Guarding)]
+    guarding = Guarding(**dict.fromkeys(names, 1))  # type: ignore[arg-type] # any number will do
+    told = guard_facts(
+        replace(evidence, parameters=replace(evidence.parameters, guarding=guarding))
+    )
+    said = {name.replace(" ", "_") for name, _ in told}
+    assert said == set(names) - {"reseats"}  # which is what every run of a device does
 
 
 def test_a_run_in_real_time_shows_how_late_its_ticks_were(run_file: Path) -> None:

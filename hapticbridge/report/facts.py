@@ -79,6 +79,8 @@ _GUARD = {
     "speed": "m/s",
     "turn_speed": "rad/s",
     "energy": "J",
+    "reach": "m",
+    "ramp_energy": "J",
     "clutch": "(mask of buttons)",
     "dead_man": "(mask of buttons)",
 }
