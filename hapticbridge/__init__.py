@@ -3,6 +3,11 @@
 with hapticbridge.Bridge("peg_in_hole", "simulated", recording="run.mcap") as bridge:
     summary = bridge.run(duration=10.0)
 report = hapticbridge.audit("run.mcap")
+
+Read ``bridge`` first, the loop, then ``kernel.step``, its arithmetic; ``scene`` and ``device`` are
+what it joins, ``coupling`` and ``passivity`` the law between them and its bounds, ``recording``
+what stays of a run and ``audit`` the second opinion on it. Imports go one way, from ``errors`` to
+``cli``.
 """
 
 from hapticbridge import mechanics as mechanics

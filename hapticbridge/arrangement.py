@@ -16,6 +16,7 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.device import Device, device_for
 from hapticbridge.guard import Limits, guarding_for, limits_for, refuse_simulated_time
 from hapticbridge.inputs import Write
+from hapticbridge.kernel.counts import Counts
 from hapticbridge.kernel.parameters import checked_substeps, refuse_substeps
 from hapticbridge.realtime import wants_real_time
 from hapticbridge.recording.onlooker import Onlooker
@@ -70,6 +71,7 @@ class Arrangement:
         pipelined: bool | None = None,
         realtime: bool | None = None,
         start_state: bytes | None = None,
+        counts: Counts | None = None,
     ) -> None:
         """Checks everything that can be checked before the device is started.
 
@@ -115,6 +117,7 @@ class Arrangement:
             start_state: State of the scene (``provenance.start_state``) in which the run begins,
                 as a recording begun in mid-run carries it; None: the scene's own start, to which a
                 reset leads in any case.
+            counts: What the guard had counted by then, as such a recording carries it.
 
         Raises:
             HapticBridgeError: An argument is out of range; the message says which and what is
@@ -171,6 +174,7 @@ class Arrangement:
             self._is_realtime = wants_real_time(realtime, self.clock, is_real=device.info.is_real)
             refused.pop_all()
         self._contact_stiffness, self._start_state = contact_stiffness, start_state
+        self._start_counts = counts
         self._sample = np.zeros(1, SAMPLE_DTYPE)
         self._inputs: deque[list[Write]] = deque()
         allowance = Allowance(
@@ -195,6 +199,11 @@ class Arrangement:
     def rendered(self) -> Coupling:
         """``coupling``, but for damping below what the method can show; ``Method.rendered``."""
         return self.method.rendered(self.used, self.period / self._substeps)
+
+    @property
+    def reach(self) -> float:
+        """Distance of the device in m from the origin of its frame that ends handle and force."""
+        return self._guarding.reach
 
     @property
     def laws(self) -> int:

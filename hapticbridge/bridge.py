@@ -42,7 +42,7 @@ class Bridge(Commanded):
     leaving commands zero force, closes the device and closes the recording.
     """
 
-    _slept = 0
+    _slept, _is_timed = 0, False
 
     def run(
         self, duration: float | None = None, on_tick: Callable[[int], None] | None = None
@@ -50,8 +50,10 @@ class Bridge(Commanded):
         """Runs the loop. Called again, it goes on: the force rises from zero as at the start.
 
         Args:
-            duration: Time to run in s; None runs until the device's motion ends, or for ever
-                (Ctrl-C, SIGTERM, SIGHUP and Ctrl-Z stop cleanly).
+            duration: Time to run in s of the run's clock: deadlines that were skipped are time that
+                has passed, pauses without ticks are not. None runs until the device's motion ends,
+                which lasts as many ticks as it has samples, or for ever (Ctrl-C, SIGTERM, SIGHUP
+                and Ctrl-Z stop cleanly).
             on_tick: Called with the tick's number before it, for scripted inputs.
 
         Returns:
@@ -62,7 +64,8 @@ class Bridge(Commanded):
                 first, where it still could be.
             HapticBridgeError: The bridge is not open, or the duration is out of range.
         """
-        last, reason = self._last_tick(duration), ""
+        self._end, self._is_timed = self._end_of(duration), duration is not None
+        reason = ""
         self._resume()
         with ExitStack() as stack:
             stack.enter_context(stopping_on_signals(self._stop_on_signal))
@@ -73,10 +76,10 @@ class Bridge(Commanded):
                 while True:
                     self.clock.start(round(self.period * 1e9))
                     self._slept = slept_ns()
-                    reason = self._loop(last, on_tick)
+                    reason = self._loop(on_tick)
                     if self._pause is None or (reason := reason or self._silence()):
                         break
-                    last = self._obey_in_pause(last)
+                    self._obey_in_pause()
             except DeviceError as error:
                 reason = f"tick {self._tick}: {error}"
             finally:
@@ -86,8 +89,8 @@ class Bridge(Commanded):
         self._stopped_by = self._stopped_by or "duration"
         return self.summary()
 
-    def _loop(self, last: int, on_tick: Callable[[int], None] | None) -> str:
-        """The ticks, until the last or a pause; returns why the kernel refused one, or nothing."""
+    def _loop(self, on_tick: Callable[[int], None] | None) -> str:
+        """The ticks, until the end or a pause; returns why the kernel refused one, or nothing."""
         state, row = self._binding.state, self._binding.row
         model, data, substeps = self.scene.model, self.scene.data, range(self._substeps)
         stream, records, cursors = self._stream, self._stream.rows, self._stream.cursors
@@ -109,7 +112,7 @@ class Bridge(Commanded):
         )
         is_ahead = self._is_pipelined and can_split(model, self.method.scheme)
         next_look, looks = self._tick, max(round(RECORDER_LOOK / self.period), 1)
-        while self._tick != last and not self._stopped_by:
+        while self._tick != self._end and not self._stopped_by:
             if self._tick >= next_look:
                 stream.look()
                 next_look += looks
@@ -157,7 +160,8 @@ class Bridge(Commanded):
     def _stop_on_signal(self, name: str) -> None:
         self._stopped_by, self._signal = "signal", name
 
-    def _last_tick(self, duration: float | None) -> int:
+    def _end_of(self, duration: float | None) -> int:
+        """Returns the tick before which a run ends that misses no deadline; −1: none."""
         if duration is None:
             length = self.device.info.duration
             return -1 if length is None else max(self._tick, round(length / self.period) + 1)
@@ -176,9 +180,15 @@ class Bridge(Commanded):
         self._signal = ""
 
     def _overrun(self, skipped: int) -> int:
-        """Counts a missed deadline, and ends the run where the machine was asleep meanwhile."""
+        """Counts a missed deadline, and ends the run where the machine was asleep meanwhile.
+
+        A run of so many seconds has so many ticks less; the one that was late is its last if it
+        came behind the end.
+        """
         self._overruns += 1
         self._skipped += skipped
+        if self._is_timed:
+            self._end = max(self._end - skipped, self._tick + 1)
         asleep = slept_ns() - self._slept
         if asleep > SUSPENDED_NS:
             self._slept += asleep

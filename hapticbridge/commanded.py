@@ -15,6 +15,7 @@ from hapticbridge.commands import Command, Operator, Record, Repeat
 from hapticbridge.commands.command import Stop
 from hapticbridge.errors import CommandError, RecordingError, SceneError
 from hapticbridge.inputs import Write, apply_writes, input_writes
+from hapticbridge.kernel.counts import Counts
 from hapticbridge.opened import Opened
 from hapticbridge.provenance import (
     MODEL_ATTACHMENT,
@@ -29,7 +30,7 @@ class Commanded(Opened):
     """A bridge that takes inputs and commands between two ticks, and notes each with its tick."""
 
     _pause: Record | None = None
-    _earlier_ticks = 0
+    _earlier_ticks, _end = 0, -1
     _earlier_fault: tuple[int, str] | None = None
 
     def __enter__(self) -> Self:
@@ -130,8 +131,9 @@ class Commanded(Opened):
         """Returns what the run was so far; energies count from where it last began anew."""
         now = super().summary()
         ticks = now.ticks + self._earlier_ticks
+        duration = now.duration + self._earlier_ticks * self.period
         fault = self._earlier_fault or now.fault
-        return replace(now, ticks=ticks, duration=ticks * self.period, fault=fault)
+        return replace(now, ticks=ticks, duration=duration, fault=fault)
 
     def _take_changes(self) -> bool:
         """Takes in what others want changed: between two ticks, and noted with its tick.
@@ -157,19 +159,11 @@ class Commanded(Opened):
             return ""
         return f"this run is {'already' if record.on else 'not'} being recorded"
 
-    def _obey_in_pause(self, last: int) -> int:
-        """Starts or stops the recorder while nothing is felt.
-
-        Args:
-            last: Tick at which the run ends, or −1.
-
-        Returns:
-            The same, as the ticks are counted from now on.
-        """
+    def _obey_in_pause(self) -> None:
+        """Starts or stops the recorder while nothing is felt."""
         record, self._pause = self._pause, None
         try:
             if record is not None and record.on:
-                last = last if last < 0 else last - self._tick
                 self._begin_anew()
                 self._record()
             else:
@@ -184,18 +178,22 @@ class Commanded(Opened):
             self._event("resume")
         else:
             self._operator.begin(self._repeater, self._guarding.fade_ticks)
-        return last
 
     def _begin_anew(self) -> None:
-        """Lets a run begin in the state that the scene is in, with tick 0."""
-        scene, method = self.scene, self.method
+        """Lets a run begin in the state that the scene is in, with tick 0.
+
+        Energies count from there, but what the guard holds against the device goes on: else it
+        could be given the energy limit with each recorder that is started.
+        """
+        scene, method, counts = self.scene, self.method, Counts.of(self._binding.state)
         self._earlier_ticks += self._tick
+        self._end -= self._tick if self._end >= 0 else 0
         self._earlier_fault = self._earlier_fault or self.ledger.fault
         self._tick, self.clock = 0, type(self.clock)()
         self._binding.let_go()
         scene.set_gains(*method.gains(self._operator.used, self.period / self._substeps))
         state = start_state(scene.model, scene.data).tobytes()
-        self._begin_in(state, self._operator.felt, self.parameters.felt)
+        self._begin_in(state, self._operator.felt, self.parameters.felt, counts)
         files = {item.name: item.data for item in self._attachments()}
         names = (MODEL_ATTACHMENT, STATE_ATTACHMENT, RESET_ATTACHMENT)
         needed = {name: files[name] for name in names}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import ExitStack
+from dataclasses import replace
 from types import TracebackType
 from typing import Self
 
@@ -18,6 +19,7 @@ from hapticbridge.errors import DeviceError, HapticBridgeError
 from hapticbridge.guard import refuse_stretched_start, wait_until_still
 from hapticbridge.jit import direct
 from hapticbridge.kernel.after import answer_step
+from hapticbridge.kernel.counts import Counts
 from hapticbridge.kernel.layout import STATE_DTYPE
 from hapticbridge.kernel.publish import finish_tick, publish
 from hapticbridge.kernel.state import Binding
@@ -113,13 +115,23 @@ class Opened(Arrangement):
         self._bind(self.coupling, felt)
         self._home = self._description()["tool_start"]
         if self._start_state is not None:
-            self._begin_in(self._start_state, self.coupling, felt)
+            counts = self._start_counts
+            if counts is not None:  # what a scene stores at its start is this scene's to say
+                stored = Counts.of(self._binding.state).stored
+                counts = replace(counts, stored=stored)
+            self._begin_in(self._start_state, self.coupling, felt, counts)
         refuse_stretched_start(self._binding.state, self._sample, self._limits)
         if self._stream.is_read:
             self._stream.start(self._description(), self._attachments())
             self._event("start")
 
-    def _bind(self, coupling: Coupling, felt: Coupling | None, start_elastic: float = 0.0) -> None:
+    def _bind(
+        self,
+        coupling: Coupling,
+        felt: Coupling | None,
+        start_elastic: float = 0.0,
+        counts: Counts | None = None,
+    ) -> None:
         """Lets a run begin in the state in which the scene is."""
         scene = self.scene
         self.parameters = parameters = run_parameters(
@@ -136,17 +148,20 @@ class Opened(Arrangement):
             contact_stiffness=self._contact_stiffness,
             guarding=self._guarding,
             start_elastic=start_elastic,
+            counts=counts,
         )
         self._binding = binding = Binding(scene.model, scene.data, parameters)
         reset = self._reset_state
         repeater = Repeater(binding, scene.model, scene.data, self.method, parameters, reset)
         self._repeater = repeater
 
-    def _begin_in(self, state: bytes, coupling: Coupling, felt: Coupling | None) -> None:
+    def _begin_in(
+        self, state: bytes, coupling: Coupling, felt: Coupling | None, counts: Counts | None
+    ) -> None:
         """Lets a run begin in mid-motion, as whoever simulates its file again will find it."""
         scene = self.scene
         restore_state(scene.model, scene.data, state)
-        self._bind(coupling, felt, elastic_energy(scene.data))
+        self._bind(coupling, felt, elastic_energy(scene.data), counts)
         self._is_mid_run = True
 
     def _attachments(self) -> list[Attachment]:
@@ -169,7 +184,9 @@ class Opened(Arrangement):
         Raises:
             DeviceError: It moves on, or a hand has meanwhile moved an absolute one too far.
         """
-        wait_until_still(self.device, self._sample, self.period, self.clock)
+        wait_until_still(
+            self.device, self._sample, self.period, self.clock, lambda: self._stopped_by
+        )
         if not self._tick and self._workspace.is_absolute:
             refuse_stretched_start(self._binding.state, self._sample, self._limits)
 

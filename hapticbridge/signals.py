@@ -10,17 +10,19 @@ from types import FrameType
 
 STOP_SIGNALS = tuple(
     getattr(signal, name)
-    for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGTSTP")
+    for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGTSTP", "SIGQUIT", "SIGXCPU")
     if hasattr(signal, name)
 )
-"""What ends a run. Ctrl-Z (SIGTSTP) among them: a process that is suspended leaves the force on."""
+"""What ends a run. Ctrl-Z (SIGTSTP) among them: a process that is suspended leaves the force on; so
+does one that Ctrl-\\ (SIGQUIT) or a limit on its processor time (SIGXCPU) ends at once."""
 
 
 @contextmanager
 def stopping_on_signals(stop: Callable[[str], None]) -> Iterator[None]:
     """Calls ``stop`` with the signal's name; only the main thread may, others run as they are.
 
-    A signal that is ignored stays so: ``nohup`` sees to that for SIGHUP.
+    A signal that is ignored stays so: ``nohup`` sees to that for SIGHUP. One that a library handles
+    in C stays with it: Python could not give it back.
 
     A ``KeyboardInterrupt`` in the middle of a tick could fall between a computed wrench and its
     being sent; a wish that is looked at once a tick cannot.
@@ -32,7 +34,8 @@ def stopping_on_signals(stop: Callable[[str], None]) -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    heeded = [number for number in STOP_SIGNALS if signal.getsignal(number) != signal.SIG_IGN]
+    others = (signal.SIG_IGN, None)
+    heeded = [number for number in STOP_SIGNALS if signal.getsignal(number) not in others]
     previous = {number: signal.signal(number, handle) for number in heeded}
     try:
         yield

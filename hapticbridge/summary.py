@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,7 +24,7 @@ class Summary:
 
     Attributes:
         ticks: Ticks since the bridge was opened.
-        duration: Their number times the period, in s.
+        duration: Time of the run's clock in s: a period for each tick and each skipped deadline.
         overruns: Ticks that started a period or more after their deadline.
         skipped: Deadlines that were skipped for it.
         dropped: Records that the recorder did not get because it was too far behind.
@@ -51,6 +52,8 @@ class Summary:
             makes that condition enough.
         stopped_by: ``duration``, ``signal``, ``caller``, or who else called ``Bridge.stop``.
         recording: The file, if one was written.
+        reach: Distance of the device in m from the origin of its frame beyond which it moved
+            without the handle and without force; None without such a limit.
     """
 
     ticks: int
@@ -75,6 +78,7 @@ class Summary:
     is_certified: bool | None
     stopped_by: str
     recording: Path | None
+    reach: float | None
 
     @property
     def verdict(self) -> str:
@@ -116,7 +120,7 @@ class Summary:
         conditions = run_conditions(info, parameters, method)
         return cls(
             ticks=ticks,
-            duration=ticks * parameters.period,
+            duration=(ticks + skipped) * parameters.period,
             overruns=overruns,
             skipped=skipped,
             dropped=dropped,
@@ -143,4 +147,5 @@ class Summary:
             is_certified=is_run_certified(conditions, method),
             stopped_by=stopped_by,
             recording=recording,
+            reach=parameters.guarding.reach if parameters.guarding.reach < math.inf else None,
         )

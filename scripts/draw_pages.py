@@ -42,9 +42,9 @@ def save(tab: Tab, target: Path) -> None:
         image = Image.open(io.BytesIO((Path(folder) / "page.png").read_bytes())).convert("RGB")
     height = round(image.height * WIDTH / image.width)
     image = image.resize((WIDTH, height), Image.Resampling.LANCZOS)
-    image.quantize(256, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE).save(
-        target, optimize=True
-    )
+    # the median cut would make one colour of two curves, which have few pixels
+    cover = Image.Quantize.MAXCOVERAGE
+    image.quantize(256, method=cover, dither=Image.Dither.NONE).save(target, optimize=True)
 
 
 def draw_view(tab: Tab, file: Path, target: Path) -> None:

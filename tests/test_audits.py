@@ -5,6 +5,8 @@ from __future__ import annotations
 import csv
 import importlib
 import json
+import os
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from shutil import copyfile
@@ -24,10 +26,10 @@ from hapticbridge.study.audits import (
     audit_all,
     audit_point,
     check_table_name,
-    find_recordings,
     reports_of,
     worst_exit_code,
 )
+from hapticbridge.study.findings import find_recordings
 
 WEAK = Coupling(stiffness=1000, damping=0.9, rotational_stiffness=1, rotational_damping=9e-4)
 STIFF = Coupling(stiffness=6000, damping=0.5, rotational_stiffness=1, rotational_damping=9e-4)
@@ -77,6 +79,47 @@ def test_a_word_that_names_no_recording_is_refused(runs: Path, tmp_path: Path) -
         find_recordings([tmp_path])
     with pytest.raises(RecordingError, match="no recording fits"):
         find_recordings([f"{runs}/x*.mcap"])
+    with pytest.raises(RecordingError, match=r"/\*\*x' is no pattern"):
+        find_recordings([f"{runs}/**x"])
+
+
+def test_links_lead_to_files_and_in_no_circle(runs: Path, tmp_path: Path) -> None:
+    for name in ("one", "two"):  # two circles: 2^40 ways for who follows them
+        (tmp_path / name).symlink_to(tmp_path, target_is_directory=True)
+    (tmp_path / "day 1").mkdir()
+    for name in ("day 1/b.mcap", "day 1/C.MCAP"):
+        copyfile(runs / "stiff.mcap", tmp_path / name)
+    (tmp_path / "a.mcap").symlink_to(tmp_path / "day 1" / "b.mcap")
+    (tmp_path / "gone.mcap").symlink_to(tmp_path / "nowhere")
+    (tmp_path / "folder.mcap").mkdir()
+    names = [path.relative_to(tmp_path).as_posix() for path in find_recordings([tmp_path])]
+    assert names == ["day 1/C.MCAP", "day 1/b.mcap", "gone.mcap"]
+    assert find_recordings([f"{tmp_path}/**/b*"]) == [tmp_path / "day 1" / "b.mcap"]
+    # a folder that fits a pattern stands for what is in it
+    names = [path.name for path in find_recordings([f"{tmp_path}/day*"])]
+    assert names == ["C.MCAP", "b.mcap"]
+    table = audit_all(find_recordings([tmp_path]), jobs=1)
+    assert table.texts("verdict")[0] == "unreadable"
+    assert "gone.mcap: No such file" in table.texts("reason")[0]
+
+
+def test_a_folder_that_cannot_be_read_is_named(
+    runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    copyfile(runs / "stiff.mcap", tmp_path / "a.mcap")
+    (tmp_path / "locked").mkdir()
+    found, walk, access = find_recordings([tmp_path]), os.walk, os.access
+
+    def refused(folder: Path, onerror: Callable[[OSError], None]) -> Iterator[Any]:
+        yield from walk(folder)
+        onerror(PermissionError(13, "Permission denied", str(tmp_path / "locked")))
+
+    monkeypatch.setattr(os, "walk", refused)
+    monkeypatch.setattr(os, "access", lambda p, mode: "locked" not in str(p) and access(p, mode))
+    assert find_recordings([tmp_path]) == [*found, tmp_path / "locked"]
+    table = audit_all(find_recordings([tmp_path]), jobs=1)
+    assert "locked: it is a folder that cannot be read" in table.texts("reason")[0]
+    assert worst_exit_code(table) == 2
 
 
 def test_the_margin_is_the_least_share_left() -> None:
@@ -218,7 +261,12 @@ def test_tables_are_written_as_parquet_and_json(
     if ending == "json":
         rows = json.loads(target.read_text())
     else:
-        rows = importlib.import_module("pyarrow.parquet").read_table(target).to_pylist()
+        read = importlib.import_module("pyarrow.parquet").read_table(target)
+        rows = read.to_pylist()
+        units = {f.name: f.metadata[b"unit"].decode() for f in read.schema if f.metadata}
+        numbers = {n for n, v in rows[0].items() if isinstance(v, float) or n == "ticks"}
+        assert units.keys() == numbers  # each of them, and nothing else
+        assert (units["duration"], units["margin"], units["slack"]) == ("s", "1", "J")
     assert [row["file"] for row in rows] == [str(file) for file in files]
     assert [row["certified"] for row in rows] == ["no", "no"]
     assert "report" not in rows[0]

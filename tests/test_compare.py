@@ -94,6 +94,50 @@ def test_clock_and_recorder_make_no_difference(tap: Path, tmp_path: Path) -> Non
     assert not compare(tap, changed(tap, tmp_path, stale)).is_same
 
 
+def test_ticks_out_of_order_are_refused(tap: Path, tmp_path: Path) -> None:
+    """Matched by number alone, a run written backwards would be the same run."""
+
+    def backwards(rows: NDArray[np.void]) -> None:
+        rows[:] = rows[::-1].copy()
+
+    def twice(rows: NDArray[np.void]) -> None:
+        rows["tick"][100:] = rows["tick"][99:-1].copy()
+
+    last = len(read_recording(tap).ticks) - 1
+    with pytest.raises(RecordingError, match=rf"tick {last} is followed by tick {last - 1};"):
+        compare(tap, changed(tap, tmp_path, backwards))
+    with pytest.raises(RecordingError, match=r"tick 99 is followed by tick 99; what is out of"):
+        compare(changed(tap, tmp_path, twice), tap)
+
+
+def test_an_input_that_says_something_else_is_another_run(
+    tap: Path, tmp_path: Path, call: Called
+) -> None:
+    recording = read_recording(tap)
+    paths: list[Path] = []
+    for share in (1.0, 2.0, 1.0):
+        push = {"event": "input", "tick": 5, "time_ns": len(paths), "writes": [["ctrl", 0, share]]}
+        events = [recording.events[0], push, *recording.events[1:]]
+        paths.append(rewritten(recording, tmp_path / f"{len(paths)}.mcap", events=events))
+    assert compare(paths[0], paths[2]).is_same  # at another time of the clock
+    found = compare(*paths[:2])
+    assert (found.events, found.is_same) == ({"input": (1, 1)}, False)
+    assert "events 'input': 1 and 1, which say other things" in call("compare", *paths[:2])[1]
+
+
+@pytest.mark.parametrize(
+    ("value", "told"), [(np.nan, "no number"), (np.inf, "infinitely"), (-0.0, "the sign of zero")]
+)
+def test_what_has_no_size_is_told_in_words(
+    value: float, told: str, tap: Path, tmp_path: Path, call: Called
+) -> None:
+    def change(rows: NDArray[np.void]) -> None:
+        rows["actuator_work"][9] = value
+
+    _, out, _ = call("compare", tap, changed(tap, tmp_path, change))
+    assert f"in actuator_work, by {told}" in out
+
+
 def test_a_gap_shifts_nothing(tap: Path, tmp_path: Path) -> None:
     recording = read_recording(tap)
     rows = np.delete(recording.ticks, slice(40, 45))

@@ -17,7 +17,8 @@ from recording_cases import EPOCH, META, random_rows, write
 from hapticbridge.errors import RecordingError
 from hapticbridge.export import export
 from hapticbridge.export.csv_file import sidecar_of
-from hapticbridge.recording import reader
+from hapticbridge.export.hdf5 import Hdf5Sink
+from hapticbridge.recording import open_recording, reader
 from hapticbridge.tick import TICK_DTYPE
 
 pq: Any = importlib.import_module("pyarrow.parquet")
@@ -161,6 +162,40 @@ def test_a_file_that_exists_is_kept_unless_it_may_be_replaced(
     assert code == 0
     assert f"{COUNT} ticks, 3 events" in out
     assert len(target.read_text().splitlines()) == COUNT + 1
+
+
+def test_hdf5_keeps_no_more_chunks_than_it_writes(recording: Path, tmp_path: Path) -> None:
+    """Its own cache of 8 MB a column takes half a gigabyte before memory stays constant."""
+    pytest.importorskip("h5py")
+    sink = Hdf5Sink(tmp_path / "a.h5", open_recording(recording))
+    caches = [data.id.get_access_plist().get_chunk_cache()[1] for _, data in sink._columns]
+    sink.close()
+    assert len(caches) == TICK_DTYPE.itemsize // 8
+    assert sum(caches) < 10e6
+
+
+def test_a_recording_is_never_replaced_by_its_export(recording: Path, call: Called) -> None:
+    before = recording.read_bytes()
+    for name in ("run.mcap", "run.parquet", "run"):
+        target = recording.with_name(name)
+        code, _, err = call("export", recording, "--to", "csv", "--out", target, "--overwrite")
+        assert (code, "does not end like csv; its endings: .csv" in " ".join(err.split())) == (
+            2,
+            True,
+        )
+    # whatever it is called, and whichever way leads to it
+    odd, link = recording.with_name("odd.CSV"), recording.with_name("link.h5")
+    odd.write_bytes(before)
+    link.symlink_to(odd)
+    for form, target in (("csv", odd), ("hdf5", link)):
+        with pytest.raises(RecordingError, match="is the recording itself"):
+            export(odd, form, target, overwrite=True)
+    beside = recording.with_name("run.csv.json")
+    beside.write_bytes(before)
+    with pytest.raises(RecordingError, match="is the recording itself"):
+        export(beside, "csv", recording.with_name("run.csv"), overwrite=True)
+    assert recording.read_bytes() == odd.read_bytes() == beside.read_bytes() == before
+    assert export(recording, "parquet", recording.with_name("run.pq")).files[0].exists()
 
 
 def test_what_cannot_be_written_or_read_is_said(recording: Path, tmp_path: Path) -> None:

@@ -19,6 +19,7 @@ from PIL import Image
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.film import Shot, draw, still
 from hapticbridge.film.artist import film_ticks
+from hapticbridge.film.encoder import Encoder
 from hapticbridge.film.stage import Stage, force_colour
 from hapticbridge.film.studio import RENDERERS
 from hapticbridge.recording import read_recording
@@ -28,6 +29,7 @@ import json, sys
 sys.path.insert(0, sys.argv[1])
 import mujoco, numpy as np
 from hapticbridge.film.artist import Camera
+from hapticbridge.film.encoder import Encoder
 from hapticbridge.film.stage import Stage
 stage = Stage(sys.argv[2])
 camera = Camera(stage, 320, 240)
@@ -127,6 +129,85 @@ def test_picture_shows_the_moment_asked_for(sway: Path, call: Called, tmp_path: 
     assert (code, "exists" in err) == (2, True)
 
 
+def stopped(done: int, _: int) -> None:
+    if done == 20:
+        raise KeyboardInterrupt
+
+
+EAGER = """#!/bin/sh
+for last; do :; done
+echo half a film > "$last"
+cat > /dev/null
+"""
+"""An ffmpeg that writes where it is told to as soon as it starts."""
+
+
+def test_an_interrupted_film_leaves_what_was_there_and_nothing_else(
+    sway: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("imageio_ffmpeg", reason="a film needs the extra 'view'")
+    program, folder = tmp_path / "ffmpeg", tmp_path / "films"
+    program.write_text(EAGER)
+    program.chmod(0o755)
+    monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(program))
+    folder.mkdir()
+    film = folder / "sway.mp4"
+    film.write_bytes(b"an older film")
+    with pytest.raises(KeyboardInterrupt):
+        drawn_or_skip(sway, film, Shot(width=64, height=48, fps=120), stopped)
+    assert film.read_bytes() == b"an older film"
+    assert list(folder.iterdir()) == [film]
+
+
+@pytest.mark.parametrize(
+    ("script", "told"),
+    [
+        ("", "no ffmpeg starts here, so there is no film"),
+        ("#!/bin/sh\ncat > /dev/null; echo 'No space left on device' >&2; exit 3", "No space left"),
+        ("#!/bin/sh\necho 'Unknown encoder' >&2; exit 1", "Unknown encoder"),
+    ],
+)
+def test_an_ffmpeg_that_fails_is_told_in_its_words(
+    script: str, told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("imageio_ffmpeg", reason="a film needs the extra 'view'")
+    program, frame = tmp_path / "ffmpeg", np.zeros((48, 64, 3), dtype=np.uint8)
+    if script:
+        program.write_text(script)
+        program.chmod(0o755)
+    monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(program))
+    with (
+        pytest.raises(HapticBridgeError, match=told),
+        Encoder(str(tmp_path / "film.mp4"), 64, 48, 30) as encoder,
+    ):
+        for _ in range(50):  # more than a pipe holds
+            encoder.add(frame)
+
+
+def test_a_part_of_a_run_is_filmed_as_slowly_as_asked_for(sway: Path) -> None:
+    stage = Stage(sway)
+    ticks = list(film_ticks(stage, 30, start=0.1, stop=0.2, speed=0.1))
+    assert len(ticks) == 30  # a tenth of a second in a whole one
+    assert (ticks[0], ticks[3], ticks[-1]) == (100, 110, 197)
+    with pytest.raises(RecordingError, match=r"lasts from 0 to 0\.3"):
+        next(film_ticks(stage, 30, stop=0.4))
+
+
+def test_a_camera_of_the_scene_is_looked_through(sway: Path, tmp_path: Path) -> None:
+    above = '<camera name="above" pos="0 0 0.5"/>'
+    (tmp_path / "scene.xml").write_text(SCENE.replace("<worldbody>", f"<worldbody>{above}"))
+    path, picture = tmp_path / "run.mcap", tmp_path / "run.png"
+    recorded(path, str(tmp_path / "scene.xml"), f"trajectory:{sway.parent / 'hand.csv'}")
+    drawn_or_skip(path, picture, Shot(camera="above", at=0.0, width=160, height=120))
+    pixels = np.asarray(Image.open(picture).convert("RGB"), dtype=int)
+    rows, columns = np.nonzero(pixels[..., 2] > 2 * pixels[..., 0] + 20)
+    # the ball lies at the origin, straight below this camera
+    assert (rows.mean(), columns.mean()) == pytest.approx((60, 80), abs=3)
+    with pytest.raises(RecordingError, match="no camera 'below'; it has cameras: 'above'"):
+        draw(path, picture, Shot(camera="below"))
+    assert picture.stat().st_size > 0  # the one drawn before
+
+
 # imageio-ffmpeg leaves its pipes to the garbage collector
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 def test_film_has_a_frame_for_every_thirtieth_of_a_second(sway: Path, tmp_path: Path) -> None:
@@ -176,10 +257,10 @@ def test_coupling_is_drawn_from_tool_to_handle_in_the_colour_of_its_force(sway: 
     assert arrow.mat[:, 2] @ force == pytest.approx(-strength, rel=1e-5)
 
 
-def test_spring_is_green_at_rest_and_red_from_the_reference_on() -> None:
+def test_spring_is_pale_at_rest_and_dark_red_from_the_reference_on() -> None:
     rest, full = force_colour(0.0, 2.0), force_colour(2.0, 2.0)
-    assert rest[1] > rest[0]
-    assert full[0] > full[1]
+    assert full[0] > 3 * full[1:].max()  # red
+    assert rest.sum() > 2 * full.sum()  # lighter, whatever colours one sees
     assert np.array_equal(force_colour(9.0, 2.0), full)
 
 
@@ -213,7 +294,10 @@ def test_where_no_renderer_works_a_sentence_says_what_to_install(
     [
         (("a.gif",), "neither a picture nor a film"),
         (("nowhere/a.png",), "folder does not exist"),
-        (("a.mp4", "--at", "0.1"), "a film shows the whole run"),
+        (("a.mp4", "--at", "0.1"), "a time goes with a picture"),
+        (("a.png", "--speed", "0.1"), "go with a film"),
+        (("a.mp4", "--speed", "0"), "speed is 0"),
+        (("a.mp4", "--start", "2", "--stop", "1"), "stop is 1 s, not after 2 s"),
         (("a.png", "--at", "-1"), "time is -1 s"),
         (("a.png", "--width", "17"), "even number"),
         (("a.png", "--height", "0"), "height is 0"),

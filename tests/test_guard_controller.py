@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from audit_cases import ScriptedDevice, recorded, tapped, verdict_of
+from bridge_runs import fast
 from faults.catalogue import HEAVY, NO_TRIPS, stiff
 from faults.rig import CAUSE, Outcome, Rig
 from numpy.typing import NDArray
@@ -16,6 +17,7 @@ from test_bridge_commands import FLOOR
 
 from hapticbridge.audit import audit
 from hapticbridge.audit.controlled import capped_sum
+from hapticbridge.bridge import Bridge
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import SimulatedDevice
 from hapticbridge.guard import guarding_for, limits_for
@@ -203,6 +205,29 @@ def test_a_device_with_too_little_damping_is_credited_with_half_of_it() -> None:
     slight = guarding_for(SimulatedDevice(rotational_inertia=1e-6).info, limits, T)
     assert slight.most_rotational_damping == pytest.approx(1e-3)
     assert slight.most_damping == 2.0
+
+
+@pytest.mark.parametrize("is_turning", [False, True])
+def test_a_device_that_does_not_turn_is_not_damped_for_the_rounding_of_its_turn(
+    tmp_path: Path, is_turning: bool
+) -> None:
+    """Most orientations times their own inverse are 1e-17 off none: a speed, divided by which."""
+    angles = np.array([0.3, 0.5, -0.7])
+
+    def tilted(tick: int) -> tuple[float, ...]:
+        turn = Rotation.from_rotvec(angles * (1.0 + 1e-4 * tick * is_turning)).as_quat()
+        return (0, 0, 0, turn[3], *turn[:3])
+
+    def owing(bridge: Bridge, _: int) -> None:
+        state = bridge._binding.state
+        state["account"] = state["axis_account"] = 1e-3
+
+    path, device = tmp_path / "run.mcap", ScriptedDevice(tilted, damping=0.5)
+    with fast("point_mass", device, recording=path, controller="damper") as bridge:
+        bridge.run(0.1, lambda k: owing(bridge, k))
+    injected = read_recording(path).ticks["injected_rotational_damping"][1:]
+    assert (injected > 0).all() == is_turning
+    assert injected.any() == is_turning
 
 
 @pytest.mark.parametrize("axis", range(6))

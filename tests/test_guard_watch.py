@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import signal
 import subprocess
 import sys
@@ -275,6 +276,32 @@ def test_force_waits_until_the_device_is_still(monkeypatch: pytest.MonkeyPatch) 
         wait_until_still(restless, np.zeros(1, SAMPLE_DTYPE), 1e-3, RealClock())
 
 
+@pytest.mark.parametrize("is_stopped", [True, False])
+def test_a_run_that_is_told_to_end_does_not_wait_for_rest(
+    monkeypatch: pytest.MonkeyPatch, is_stopped: bool
+) -> None:
+    monkeypatch.setattr(start_module, "PATIENCE", 0.2)
+    device = ScriptedDevice(lambda tick: (2e-3 * tick, 0, 0, 1, 0, 0, 0))
+    device.info = replace(device.info, is_real=True)
+    plain = device.read
+
+    def read(sample: NDArray[np.void]) -> int:
+        if is_stopped and device._tick == 20:
+            os.kill(os.getpid(), signal.SIGINT)
+        return plain(sample)
+
+    device.read = read  # type: ignore[method-assign]
+    with Bridge("point_mass", device, realtime=False) as bridge:
+        if is_stopped:
+            summary = bridge.run(0.01)
+            assert (summary.stopped_by, summary.ticks) == ("signal", 0)
+            assert device._tick < 100
+        else:
+            with pytest.raises(SafetyTrip, match="hold it still"):
+                bridge.run(0.01)
+    assert not np.any(device.writes)
+
+
 @pytest.mark.parametrize(("strays_to", "is_refused"), [(0.004, False), (0.05, True)])
 def test_an_absolute_device_that_strayed_while_rest_was_waited_for_is_refused(
     monkeypatch: pytest.MonkeyPatch, strays_to: float, is_refused: bool
@@ -330,30 +357,41 @@ def test_a_guard_reads_back_as_it_was_written() -> None:
 
 
 KILLED = """
-import sys, time
+import os, sys, time
 from hapticbridge.device.last_word import LastWord
 word = LastWord(sys.argv[1], b"\\0zero", b"\\1off")
-print("ready", flush=True)
+if sys.argv[2:] and (holder := os.fork()) == 0:
+    time.sleep(60)  # as a worker of multiprocessing: it holds all that the bridge had open
+    os._exit(0)
+print("ready", holder if sys.argv[2:] else 0, flush=True)
 time.sleep(60)
 """
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="needs POSIX processes")
-def test_a_killed_process_still_says_zero_and_one_that_closed_does_not(tmp_path: Path) -> None:
+@pytest.mark.parametrize("has_forked", [False, True])
+def test_a_killed_process_still_says_zero_and_one_that_closed_does_not(
+    tmp_path: Path, has_forked: bool
+) -> None:
     node, quiet = tmp_path / "hidraw", tmp_path / "closed"
     node.touch()
     quiet.touch()
     process = subprocess.Popen(
-        [sys.executable, "-c", KILLED, str(node)], stdout=subprocess.PIPE, text=True
+        [sys.executable, "-c", KILLED, str(node), *["fork"] * has_forked],
+        stdout=subprocess.PIPE,
+        text=True,
     )
     assert process.stdout is not None
-    assert process.stdout.readline() == "ready\n"
+    ready, holder = process.stdout.readline().split()
+    assert ready == "ready"
     assert node.read_bytes() == b""
     process.send_signal(signal.SIGKILL)
     process.wait()
     limit = time.monotonic() + 20.0
     while node.read_bytes() != 3 * b"\0zero\1off":
         assert time.monotonic() < limit, "nobody said zero"
+    if has_forked:
+        os.kill(int(holder), signal.SIGKILL)
     process.stdout.close()
     word = LastWord(str(quiet), b"\0zero")
     word.close()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 from pathlib import Path
 
 import pytest
@@ -82,3 +83,19 @@ def test_the_audit_never_imports_the_bridge() -> None:
 
 def test_every_concept_has_its_place() -> None:
     assert {concept(path) for path in FILES} == set(RANK)
+
+
+GUIDES = [
+    path.parent
+    for path in PACKAGE.rglob("__init__.py")
+    if path.parent.name != "engines"  # its table names engines
+]
+
+
+@pytest.mark.parametrize("folder", GUIDES, ids=lambda folder: str(folder.relative_to(PACKAGE)))
+def test_a_package_sends_its_reader_to_modules_that_exist(folder: Path) -> None:
+    guide = ast.get_docstring(ast.parse((folder / "__init__.py").read_text(encoding="utf-8"))) or ""
+    assert guide
+    for name in re.findall(r"``([a-z_.0-9]+)``", guide):
+        place = folder.joinpath(*name.split("."))
+        assert place.is_dir() or place.with_suffix(".py").is_file(), name

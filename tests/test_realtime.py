@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import errno
 import gc
 import os
 import resource
@@ -29,6 +30,7 @@ from hapticbridge.realtime import (
     pace,
     real_time,
     wants_real_time,
+    warn_of_refusals,
 )
 from hapticbridge.realtime import grants as asked
 from hapticbridge.realtime.pace import BESIDE_THE_STEP, SPARE, rate_for
@@ -213,6 +215,35 @@ def test_a_core_that_is_not_there_is_said() -> None:
     with real_time(core=4095) as grants:
         assert not named(grants, "core").is_granted
         assert "4095" in named(grants, "core").sentence
+        assert named(grants, "core").remedy.startswith("choose a core from 0 to ")
+
+
+@pytest.mark.parametrize(
+    ("code", "words"),
+    [
+        (errno.EINVAL, ("--cpuset-cpus=", "AllowedCPUs=")),
+        (errno.EPERM, ("--cap-add=SYS_NICE", "sched_setaffinity")),
+        (None, ()),
+    ],
+)
+def test_a_core_that_is_refused_is_said_with_what_gives_it(
+    monkeypatch: pytest.MonkeyPatch, code: int | None, words: tuple[str, ...]
+) -> None:
+    def refuse(_process: int, _cores: set[int]) -> None:
+        if code is not None:
+            raise OSError(code, os.strerror(code))
+
+    monkeypatch.setattr(os, "sched_setaffinity", refuse)
+    with real_time() as grants:
+        core = named(grants, "core")
+    assert core.is_granted == (code is None)
+    assert bool(core.remedy) == (code is not None)
+    for word in words:
+        assert word in core.remedy
+    if code is not None:
+        assert os.strerror(code) in core.sentence
+        with pytest.warns(UserWarning, match=rf"core \d+ .*to grant it: .*{words[0]}"):
+            warn_of_refusals((core,))
 
 
 def test_who_wants_real_time() -> None:

@@ -17,6 +17,7 @@ from PIL import Image
 from report_runs import Made
 
 from hapticbridge.audit import audit
+from hapticbridge.errors import RecordingError
 from hapticbridge.kernel.guarding import TANK
 from hapticbridge.quantity import quantity
 from hapticbridge.recording import Recording, read_recording
@@ -24,7 +25,7 @@ from hapticbridge.report import write_report
 from hapticbridge.report.energies import draw_energies
 from hapticbridge.report.evidence import Evidence
 from hapticbridge.report.facts import MOST_EVENTS, MOST_INPUTS, event_rows, guard_facts
-from hapticbridge.report.lead import device_sentence
+from hapticbridge.report.lead import is_warned, notes
 from hapticbridge.report.likely import likely_cause
 from hapticbridge.report.motion import draw_motion
 from hapticbridge.report.panels import BINS, LEAST_SPAN, energy_unit
@@ -220,6 +221,8 @@ def test_a_page_replaces_no_recording_and_no_picture(
     code, out, err = call("audit", run_file, "--report", target)
     assert (code, out) == (2, "")  # before anything is computed
     assert str(target) in err
+    with pytest.raises(RecordingError, match="page"):
+        write_report(read_recording(run_file), audit(run_file), target)
     assert not target.exists() or target.read_bytes() == b"what was there"
 
 
@@ -233,10 +236,24 @@ def test_a_passive_page_says_whether_the_device_bears_the_coupling(
         None: "in any hand is not known",
     }
     for certified, words in told.items():
-        assert words in device_sentence(replace(report, certified=certified))
-    assert not device_sentence(replace(report, verdict="active"))
+        judged = replace(report, certified=certified)
+        assert words in notes(judged)[-1]
+        assert is_warned(judged) is (certified is False)
+    assert not notes(replace(report, verdict="active"))
     write_report(read_recording(run_file), replace(report, certified=False), page)
     assert told[False] in page.read_text(encoding="utf-8")
+
+
+def test_a_passive_run_that_the_guard_stopped_does_not_look_like_any_other(
+    run_file: Path, tmp_path: Path
+) -> None:
+    page, report = tmp_path / "page.html", audit(run_file)
+    stopped = replace(report, reason=f"{report.reason}; the guard tripped", events={"trip": 1})
+    for judged, look in ((report, "passive"), (stopped, "warned")):
+        write_report(read_recording(run_file), judged, page)
+        text = page.read_text(encoding="utf-8")
+        assert f'<section class="verdict {look}">' in text
+        assert ("<p>The guard tripped.</p>" in text) is (judged is stopped)
 
 
 def test_a_browser_shows_the_page_without_a_request_or_a_complaint(

@@ -25,6 +25,8 @@ from hapticbridge.scene import load_scene
 from hapticbridge.tick import TICK_DTYPE
 from hapticbridge.whatif import WhatIf, WhatIfRun, changes_from, what_if
 from hapticbridge.whatif.intent import intended
+from hapticbridge.whatif.recorded import RecordedRun
+from hapticbridge.whatif.repeat import Repetition
 
 DURATION = 0.4
 
@@ -126,8 +128,10 @@ def test_commands_are_done_again(tmp_path: Path) -> None:
     changes = [e for e in slow if e["event"] == "coupling"]
     assert [(e["tick"], e["ticks"]) for e in changes] == [(50, 250)]
     assert changes[0]["damping"] == pytest.approx(max(1.0 - 1500 * 0.002 / 2, 0.0))
-    massless = what_if(path, {"method": "direct"}).notes
-    assert any(note.startswith("1 resets when it was recorded, none here") for note in massless)
+    run = RecordedRun.of(read_recording(path), tmp_path / "scene")
+    for method, kept in (("direct", False), ("weld", True)):
+        again = Repetition(run, run.settings.changed({"method": method}))
+        assert (again.keeps_resets, again.keeps_couplings) == (kept, False)
 
 
 @pytest.fixture(scope="module")

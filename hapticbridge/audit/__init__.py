@@ -1,4 +1,13 @@
-"""The verdict on a recording, from the recording alone. Never imports the bridge."""
+"""The verdict on a recording, from the recording alone. Never imports the bridge.
+
+Read ``verdict`` first. It asks three things: is the file whole (``structure``), do its numbers
+agree with their second computation in plain NumPy (``balance``, held against them in ``physics``
+and judged in ``judgement``), and does the scene do the same again (``replay``, ``rerun``,
+``attached_scene``). The second computation goes block by block (``reached``): ``law`` is the
+coupling's, ``watched``, ``controlled``, ``limited`` and ``guarded`` are the guard's,
+``device_port`` what the device was given. ``interventions`` and ``ending`` read the events;
+``report`` is what comes out.
+"""
 
 from hapticbridge.audit.report import AuditReport as AuditReport
 from hapticbridge.audit.verdict import audit as audit

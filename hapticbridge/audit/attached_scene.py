@@ -96,6 +96,24 @@ def check_elastic(claimed: float, present: float) -> None:
         )
 
 
+def check_stored(claimed: float, state: NDArray[np.void]) -> None:
+    """Refuses counts of the guard that begin with another energy than the whole run began with.
+
+    Args:
+        claimed: What the counts say that the scene stored, in J.
+        state: The kernel's, as the whole run began.
+
+    Raises:
+        RecordingError: They do.
+    """
+    present = float(state["start_energy"][0])
+    if not abs(claimed - present) <= FOREIGN_TOLERANCE * (1.0 + abs(present)):
+        raise RecordingError(
+            f"metadata 'counts' say that the scene stored {claimed!r} J when the run began, the "
+            f"attached scene stores {present!r} J there"
+        )
+
+
 def is_same_processor(recording: RecordingFile) -> bool:
     """Returns whether a run was recorded on this model of processor, as far as it says."""
     try:

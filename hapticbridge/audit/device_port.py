@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticbridge.audit.limited import limits_on_tool, spring_energy
 from hapticbridge.kernel.parameters import RunParameters
 
 Array = NDArray[np.float64]
@@ -105,10 +106,10 @@ def kept_behind_a_law(
     rise = np.where(since_start == 0, share, np.diff(share, prepend=share_before))
     summed, held = np.zeros(len(share)), np.zeros(len(share))
     for column, limit, e, de, w, c in zip(
-        (0, 2), _limits(parameters), stretch, stretched, work, passed, strict=True
+        (0, 2), limits_on_tool(parameters), stretch, stretched, work, passed, strict=True
     ):
         k, b = gains[1][:, column], gains[1][:, column + 1]
-        spring = _spring_energy(k, np.linalg.norm(e, axis=1), limit)
+        spring = spring_energy(k, np.linalg.norm(e, axis=1), limit)
         found = spring + 0.5 * b / parameters.period * np.sum(de**2, axis=1)
         taken = np.where(since_start > 0, c * w, 0.0)
         summed += taken - rise * found
@@ -132,24 +133,9 @@ def work_of_commands(
         share_before: The share of the wrench that was let through in the tick before each, (n,).
     """
     work = np.zeros(len(share_before))
-    for column, limit, p in zip((0, 2), _limits(parameters), pulled, strict=True):
+    for column, limit, p in zip((0, 2), limits_on_tool(parameters), pulled, strict=True):
         k_before, k = gains[0][:, column], gains[1][:, column]
         if np.any(k != k_before):
             length = np.linalg.norm(p, axis=1)
-            work += _spring_energy(k, length, limit) - _spring_energy(k_before, length, limit)
+            work += spring_energy(k, length, limit) - spring_energy(k_before, length, limit)
     return share_before * work
-
-
-def _limits(parameters: RunParameters) -> tuple[float, float]:
-    """Returns force and torque on the tool at which no more reaches the device, N and N m."""
-    return (
-        parameters.force_limit / parameters.force_scale,
-        parameters.torque_limit * parameters.scale / parameters.force_scale,
-    )
-
-
-def _spring_energy(stiffness: Array, length: Array, limit: float) -> Array:
-    """Returns ∫ min(K e, limit) de, in J; for each K and length, (n,) each."""
-    at_limit = np.divide(limit, stiffness, out=np.full_like(length, np.inf), where=stiffness > 0)
-    elastic = np.minimum(length, at_limit)
-    return np.asarray(0.5 * stiffness * elastic**2 + limit * (length - elastic))

@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticbridge.kernel.state import RunParameters
+
 Array = NDArray[np.float64]
 
 
@@ -50,3 +52,18 @@ def chained(
             if np.array_equal(sent[k], plain):
                 break
     return sent
+
+
+def limits_on_tool(parameters: RunParameters) -> tuple[float, float]:
+    """Returns force and torque on the tool at which no more reaches the device, N and N m."""
+    return (
+        parameters.force_limit / parameters.force_scale,
+        parameters.torque_limit * parameters.scale / parameters.force_scale,
+    )
+
+
+def spring_energy(stiffness: Array, length: Array, limit: float) -> Array:
+    """Returns ∫ min(K e, limit) de, in J; for each K and length, (n,) each."""
+    at_limit = np.divide(limit, stiffness, out=np.full_like(length, np.inf), where=stiffness > 0)
+    elastic = np.minimum(length, at_limit)
+    return np.asarray(0.5 * stiffness * elastic**2 + limit * (length - elastic))

@@ -30,7 +30,8 @@ class AuditReport:
             re-simulated: …``.
         is_cut: The file lacks its end; the verdict is on what it holds.
         ticks: Number of records.
-        duration: Their number times the period, in s.
+        duration: Time of the run's clock at the last of them in s, missed deadlines among it; where
+            their times cannot be, their number times the period.
         conditions: The device condition per kind of axis, as sentences.
         rendered: What was felt away from contact, or everywhere if the tool was never let go, and
             what was used, as sentences.

@@ -5,13 +5,19 @@ from __future__ import annotations
 import json
 from collections import deque
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.audit.attached_scene import attached_model, check_elastic, check_start
+from hapticbridge.audit.attached_scene import (
+    attached_model,
+    check_elastic,
+    check_start,
+    check_stored,
+)
 from hapticbridge.commands import CHANGES as COMMANDED
 from hapticbridge.commands import Repeater
 from hapticbridge.errors import HapticBridgeError, RecordingError
@@ -69,19 +75,23 @@ class Rerun:
         # an error inside the C symbol would end the process, so MuJoCo takes its first step in
         # Python
         self._start = start = recording.attachments[STATE_ATTACHMENT]
-        method = method_named(recording.meta.get("method", ""))
-        restore_state(model, data, start)
-        method.step(model, data)
-        restore_state(model, data, start)
-        if parameters.start_elastic:
-            check_elastic(parameters.start_elastic, elastic_energy(data))
-        self.binding = Binding(model, data, parameters)
         reset = recording.attachments.get(RESET_ATTACHMENT, start)
         if len(reset) != len(start):
             raise RecordingError(
                 f"attachment '{RESET_ATTACHMENT}' has {len(reset)} bytes, '{STATE_ATTACHMENT}' "
                 f"{len(start)}"
             )
+        method = method_named(recording.meta.get("method", ""))
+        if parameters.counts is not None and RESET_ATTACHMENT in recording.attachments:
+            restore_state(model, data, reset)
+            begun = replace(parameters, counts=None, start_elastic=0.0)
+            check_stored(parameters.counts.stored, Binding(model, data, begun).state)
+        restore_state(model, data, start)
+        method.step(model, data)
+        restore_state(model, data, start)
+        if parameters.start_elastic:
+            check_elastic(parameters.start_elastic, elastic_energy(data))
+        self.binding = Binding(model, data, parameters)
         self._commands = Repeater(self.binding, model, data, method, parameters, reset)
         check_start(recording, self.binding.state)
 

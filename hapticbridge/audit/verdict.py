@@ -88,7 +88,7 @@ def audit(path: str | Path, *, strict: bool = False) -> AuditReport:
     passed = _Passed(recording, parameters, is_watched=facts["certified"] is not True)
     try:
         fault = passed.by(outside, delay_ticks(info, parameters.period) or 0)
-        facts["energies"] = passed.judgement.energies
+        facts["energies"], facts["duration"] = passed.judgement.energies, passed.duration
         facts["rendered"] = rendered + outside.sentences(passed.judgement.commanded)
         if fault:
             return _invalid(facts, fault)
@@ -189,7 +189,7 @@ class _Passed:
         self, recording: RecordingFile, parameters: RunParameters, *, is_watched: bool
     ) -> None:
         self._recording, self._parameters = recording, parameters
-        self.judgement = Judgement(is_watched)
+        self.judgement, self.duration = Judgement(is_watched), 0.0
         # the complaint of the re-simulation waits until the records themselves have been judged
         self._error: RecordingError | None = None
         try:
@@ -217,6 +217,7 @@ class _Passed:
             balance = Balance.of(ticks, self._parameters, reached, outside, late, following)
             reached = balance.reached
             self.judgement.add(ticks, balance)
+            self.duration = 1e-9 * float(ticks["deadline_ns"][-1])
             fault = fault or physics_fault(ticks, balance)
             if fault is None and self._error is None:
                 try:

@@ -11,14 +11,18 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.audit.differences import steps, turns
+from hapticbridge.audit.differences import steps, turn_between, turns
 from hapticbridge.audit.interventions import Interventions
+from hapticbridge.audit.limited import limits_on_tool, spring_energy
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.watch import CLUTCHED, FORCE_OFF, STILL, STILL_TURN
 from hapticbridge.tick import TickFlag
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
+
+_ROUNDING = 1e-6
+"""In ticks of a ramp: by how much two sums of parts of them may differ."""
 
 
 def has_flag(ticks: NDArray[np.void], flag: TickFlag) -> Flags:
@@ -74,6 +78,7 @@ class Watch:
         is_released: Whether the handle did not follow.
         start: The tick at which the wrench began to rise.
         is_soon: Whether it then rose soon.
+        risen: How far it has risen by now, in ticks of a ramp.
     """
 
     parameters: RunParameters
@@ -85,6 +90,7 @@ class Watch:
     is_released: bool = False
     start: int = 0
     is_soon: bool = False
+    risen: float = 0.0
 
     @classmethod
     def at_start(cls, parameters: RunParameters) -> Watch:
@@ -131,17 +137,19 @@ class Watch:
         is_seated = ~is_released & (was_released | has_news | has_stalled | has_strayed | is_reset)
 
         begins = first | is_seated
+        pace = self._pace(ticks, outside, begins)
         last = np.maximum.accumulate(np.where(begins, index, -1))
         start = np.where(last >= 0, ticks["tick"][last], self.start)
         is_soon = np.where(last >= 0, (is_seated & ~first)[last], self.is_soon)
         since_start = (ticks["tick"] - start).astype(np.float64)
         ramp = np.where(is_soon, guarding.fade_ticks, self.parameters.ramp_ticks)
-        rising = np.minimum((since_start + 1.0) / (ramp + 1.0), 1.0)
+        risen = self._risen(pace, last, ramp + 1.0)
+        rising = risen / (ramp + 1.0)
         fading = np.maximum(1.0 - silence / guarding.fade_ticks, 0.0)
         flags = {
             TickFlag.CLUTCH: is_released,
             TickFlag.RESEATED: is_seated,
-            TickFlag.RAMPING: since_start < ramp,
+            TickFlag.RAMPING: _ramps(ticks, risen, ramp + 1.0),
         }
         seen = Seen(first, interval, since_start, ramp, silence, flags, rising * fading)
         then = copy.copy(self)
@@ -151,5 +159,46 @@ class Watch:
         then.stale, then.silent = int(stale[-1]), int(silence[-1])
         then.since_news = float(interval[-1]) if is_stale[-1] else 0.0
         then.is_released = bool(is_released[-1])
+        then.risen = float(risen[-1])
         then.start, then.is_soon = int(start[-1]), bool(is_soon[-1])
         return seen, then
+
+    def _risen(self, pace: Array, last: NDArray[np.int64], full: Array) -> Array:
+        """Returns how far the wrench has risen, in ticks of a ramp.
+
+        Args:
+            pace: How far it may rise in each tick, (n,).
+            last: Row in which it began, -1 for before these.
+            full: How far it can, (n,).
+        """
+        gone = np.cumsum(pace)
+        before = np.where(last >= 0, gone[last] - pace[last], -self.risen)
+        return np.minimum(gone - before, full)
+
+    def _pace(self, ticks: NDArray[np.void], outside: Interventions, begins: Flags) -> Array:
+        """Returns how far the wrench may rise in each tick, in ticks of a ramp, (n,).
+
+        min(1, V_0/V) where the coupling holds V, as the records have handle and tool.
+        """
+        parameters, pace = self.parameters, np.ones(len(ticks))
+        most = parameters.guarding.ramp_energy
+        full = (parameters.guarding.fade_ticks if self.is_soon else parameters.ramp_ticks) + 1.0
+        has_risen = self.risen >= full and not begins.any()
+        if not parameters.has_law or not np.isfinite(most) or has_risen:
+            return pace
+        gains = outside.laws(ticks["tick"])
+        stretch = ticks["handle_position"] - ticks["tool_position"]
+        twist = turn_between(ticks["tool_quaternion"], ticks["handle_quaternion"])
+        held = np.zeros(len(ticks))
+        for column, limit, e in zip(
+            (0, 2), limits_on_tool(parameters), (stretch, twist), strict=True
+        ):
+            held += spring_energy(gains[:, column], np.linalg.norm(e, axis=1), limit)
+        held *= parameters.force_scale / parameters.scale
+        return np.divide(most, held, out=pace, where=held > most)
+
+
+def _ramps(ticks: NDArray[np.void], risen: Array, full: Array) -> Flags:
+    """Returns where the flag must be set; where rounding decides, what the record says."""
+    is_close = (np.abs(risen - full) < _ROUNDING) & (risen != np.rint(risen))
+    return np.where(is_close, has_flag(ticks, TickFlag.RAMPING), risen < full)

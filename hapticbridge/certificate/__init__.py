@@ -1,4 +1,8 @@
-"""Whether a device bears a coupling, and which coupling it bears by default."""
+"""Whether a device bears a coupling, and which coupling it bears by default.
+
+``damping`` is how much a coupling asks for with substeps, a rate and a delay; ``conditions`` holds
+that against what the device has; ``default`` chooses the stiffest coupling that leaves a margin.
+"""
 
 from hapticbridge.certificate.conditions import Condition as Condition
 from hapticbridge.certificate.conditions import condition_sentences as condition_sentences

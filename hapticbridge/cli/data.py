@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -110,7 +111,8 @@ def _print(found: Comparison) -> None:
     for name, pair in found.decisive.items():
         out.print(f"  {name}: {_told(pair[0])} and {_told(pair[1])}")
     for name, counts in found.events.items():
-        out.print(f"  events '{plain(name)}': {counts[0]} and {counts[1]}")
+        other = ", which say other things" if counts[0] == counts[1] else ""
+        out.print(f"  events '{plain(name)}': {counts[0]} and {counts[1]}{other}")
     if found.largest:
         out.print("largest difference per field:")
         for each in found.largest:
@@ -125,6 +127,10 @@ def _ticks(difference: Difference) -> str:
 
 
 def _size(difference: Difference) -> str:
+    if difference.size == 0.0:
+        return "the sign of zero"
+    if not math.isfinite(difference.size):
+        return "no number" if any(map(math.isnan, difference.values)) else "infinitely much"
     if difference.unit == "1":
         return f"{difference.size:.3g}"
     return quantity(difference.size, difference.unit)

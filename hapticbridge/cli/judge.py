@@ -23,15 +23,15 @@ from hapticbridge.report import check_page_name, plot_recording, telling_time, w
 from hapticbridge.study.audits import (
     audit_all,
     check_table_name,
-    find_recordings,
     reports_of,
     worst_exit_code,
     write_audits,
 )
+from hapticbridge.study.findings import find_recordings
 from hapticbridge.whatif import changes_from, draw_what_if, what_if, write_what_if
 
 SCENE_SIZE = 640, 400
-"""Of the scene's picture on a page, in pixels: some 50 kB of a page's megabyte."""
+"""Of the scene's picture on a page, in pixels: some 150 kB of a page's megabyte."""
 
 _USUAL_EVENTS = ("start", "stop", "input")
 _COLOURS = {"passive": "green", "active": "red", "invalid": "magenta"}
@@ -106,7 +106,9 @@ class Audit:
 
     def _audit_many(self, files: list[Path]) -> int:
         if self.plot or self.report or self.what_if:
-            raise RecordingError("--plot, --report and --what-if take one recording at a time")
+            raise RecordingError(
+                "--plot, --report and --what-if take one recording at a time, and make no --table"
+            )
         with progress("auditing") as show:
             table = audit_all(
                 files,

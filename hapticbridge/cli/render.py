@@ -21,6 +21,7 @@ class Render:
 
         hapticbridge render run.mcap run.png --at 2.5
         hapticbridge render run.mcap run.mp4
+        hapticbridge render run.mcap slow.mp4 --start 2 --stop 3 --speed 0.1
     """
 
     file: tyro.conf.Positional[Path]
@@ -28,7 +29,15 @@ class Render:
     output: tyro.conf.Positional[Path]
     """The picture (.png), or the film (.mp4, extra 'view')."""
     at: float | None = None
-    """Seconds from the start; by default the last tick. For pictures only."""
+    """Of a picture: seconds from the start; by default the last tick."""
+    start: float = 0.0
+    """Of a film: where in the run it begins, in seconds."""
+    stop: float | None = None
+    """Of a film: where in the run it ends; by default with the run."""
+    speed: float = 1.0
+    """Of a film: 0.1 shows a second of the run in ten."""
+    camera: str | None = None
+    """A camera of the scene, by name; by default the free one, as the scene's file sets it."""
     width: int = 800
     """In pixels, even."""
     height: int = 600
@@ -42,7 +51,16 @@ class Render:
         """Draws; returns the exit code."""
         if self.output.exists() and not self.overwrite:
             raise RecordingError(f"'{self.output}' exists; choose another file or add --overwrite")
-        shot = Shot(at=self.at, width=self.width, height=self.height, fps=self.fps)
+        shot = Shot(
+            at=self.at,
+            start=self.start,
+            stop=self.stop,
+            speed=self.speed,
+            camera=self.camera,
+            width=self.width,
+            height=self.height,
+            fps=self.fps,
+        )
         with err.status("drawing …"), progress("drawing") as show:
             renderer = draw(self.file, self.output, shot, show)
         out.print(f"wrote {plain(str(self.output))} (drawn with {renderer})")

@@ -51,7 +51,9 @@ class Run:
     """'simulated' (in the hand that the scene asks for), 'simulated:damping=5,hand_mass=1',
     'trajectory:FILE' (CSV or recording), or one that 'hapticbridge devices' lists."""
     duration: float | None = None
-    """Seconds to run; by default until the device's motion ends, or until Ctrl-C."""
+    """Seconds to run, by the clock: a deadline that was missed is time that has passed, and makes
+    the ticks one less. By default until the device's motion ends, however long its samples take, or
+    until Ctrl-C."""
     record: Path | None = None
     """File to record to (.mcap)."""
     overwrite: bool = False
@@ -101,7 +103,8 @@ class Run:
     torque_limit: float | None = None
     """Largest torque on the device in N m; by default the device's own."""
     ramp: float = 0.5
-    """Seconds over which the force rises at the start."""
+    """Seconds over which the force rises at the start; longer while the coupling is held stretched,
+    because a force that rises behind a hand would be given to it."""
     view: bool = False
     """Show the run in a browser, from a process of its own; needs the extra 'view'."""
     host: str = "127.0.0.1"
@@ -119,9 +122,10 @@ class Run:
     """Button of the device, from 0, that must be held for any force."""
     stretch_limit: float = USUAL_STRETCH
     """Largest distance between handle and tool in m; beyond it the run is stopped."""
-    reach_limit: float = math.inf
+    reach_limit: float | None = None
     """Farthest in m that the device may be from the middle of its workspace; beyond it moves
-    without the handle and without force. Choose it short of the device's own stops."""
+    without the handle and without force. By default what its driver or profile knows, all of the
+    workspace, else none (inf). To keep force off its stops, choose less."""
     energy_limit: float = USUAL_ENERGY
     """Most energy in J that the device may be given beyond what the hand put in; inf for scenes
     whose motors are meant to push the hand."""

@@ -63,6 +63,11 @@ def announce(
             f"{coupling.rotational_damping:g} N m s/rad: less than method {method.name} can show "
             "at this stiffness and rate; lower the stiffness or raise the rate"
         )
+    if bridge.reach < math.inf:
+        err.print(
+            f"  {quantity(bridge.reach, 'm')} from its middle the device is at the end of its "
+            "reach: beyond, it moves without the handle and without force"
+        )
     if not method.has_law:
         return  # told when the scene is prepared and the weld measured: ``announce_measured``
     conditions = device_conditions(
@@ -108,6 +113,8 @@ def print_summary(summary: Summary, laws: int, *, is_felt: bool = True) -> None:
     table.add_row(
         "peak", f"{quantity(summary.peak_force, 'N')}, {quantity(summary.peak_torque, 'N m')}"
     )
+    if summary.reach is not None:
+        table.add_row("reach", f"{quantity(summary.reach, 'm')}; beyond, no handle and no force")
     for name, joules in summary.energies.items():
         if joules:  # a scene without motors or springs has no news of them
             table.add_row(name.replace("_", " "), quantity(joules, "J"))

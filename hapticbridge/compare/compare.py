@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticbridge.commands import CHANGES as COMMANDED
 from hapticbridge.compare.comparison import Comparison, Difference
 from hapticbridge.errors import RecordingError
 from hapticbridge.provenance import meta_float
@@ -48,6 +50,9 @@ DECISIVE = (
 _BESIDE = ("versions", "host", "clock")
 """Metadata that may explain why two runs differ, but make no difference by themselves."""
 
+_CHANGES = ("input", *COMMANDED)
+"""Events that decide what a run computes: what they say counts, not only how many there are."""
+
 _UNHELD = int(TickFlag.OVERRUN | TickFlag.DROPPED_BEFORE)
 """Flags that clock and recorder set; like times, they differ between any two real runs."""
 
@@ -71,7 +76,8 @@ def compare(first: str | Path, second: str | Path) -> Comparison:
         second: Another one.
 
     Raises:
-        RecordingError: One of them cannot be read, or does not say its period.
+        RecordingError: One of them cannot be read, does not say its period, or its ticks are out of
+            order.
     """
     files = open_recording(first), open_recording(second)
     periods = _period(files[0]), _period(files[1])
@@ -129,7 +135,15 @@ class _Found:
         self, files: tuple[RecordingFile, RecordingFile], side: int
     ) -> Iterator[tuple[NDArray[np.void], NDArray[np.int64]]]:
         """Yields the records of one file with the times in ns at which they were due."""
+        last = -1
         for ticks in files[side].blocks():
+            numbers = np.concatenate([[last], ticks["tick"]])
+            if (back := np.flatnonzero(np.diff(numbers) <= 0)).size:
+                raise RecordingError(
+                    f"{files[side].path}: tick {numbers[back[0]]} is followed by tick "
+                    f"{numbers[back[0] + 1]}; what is out of order cannot be compared"
+                )
+            last = int(numbers[-1])
             due = ticks["tick"] * self._steps[side]
             self.shared[side] += int(np.count_nonzero(due % self._steps[1 - side] == 0))
             yield ticks, due
@@ -195,7 +209,17 @@ def _event_differences(
     lists = [[str(event.get("event", "unnamed")) for event in file.events] for file in files]
     names = dict.fromkeys(lists[0] + lists[1])
     counts = {name: (lists[0].count(name), lists[1].count(name)) for name in names}
-    return {name: pair for name, pair in counts.items() if pair[0] != pair[1]}
+    other = {name for name in _CHANGES if _said(files[0], name) != _said(files[1], name)}
+    return {name: pair for name, pair in counts.items() if pair[0] != pair[1] or name in other}
+
+
+def _said(file: RecordingFile, name: str) -> list[dict[str, Any]]:
+    """Returns the events of a name, without when the clock said they were and who asked."""
+    return [
+        {key: value for key, value in event.items() if key not in ("time_ns", "by")}
+        for event in file.events
+        if event.get("event") == name
+    ]
 
 
 def _notes(file: RecordingFile) -> Iterator[str]:

@@ -52,7 +52,8 @@ class Comparison:
         largest: Per column that differs anywhere, where it differs most.
         decisive: Metadata that decide what a run computes and differ: name, and either value.
         beside: Metadata that may explain a difference.
-        events: Names of events whose counts differ, and either count.
+        events: Names of events whose counts differ, or of inputs and commands that say other
+            things, and either count.
         notes: What is wrong with a file as a whole, a sentence each.
     """
 

@@ -1,4 +1,12 @@
-"""Haptic devices: real, simulated and replayed, behind one protocol."""
+"""Haptic devices: real, simulated and replayed, behind one protocol.
+
+Read ``base`` (four calls) and ``data_sheet`` (what is known of a device) first, then ``simulated``
+and ``trajectory``, which need no hardware, then a real driver; ``rawhid`` is the plainest. Real
+ones stand on ``transport``, which carries their bytes and finds them. ``families`` lists them,
+``plugged`` says what of them is there; ``library`` opens one by its ``specification`` and fills in
+its sheet from a ``profile`` (``profile_search``). What all share is in ``lateness``, ``silence``
+and ``last_word``.
+"""
 
 from hapticbridge.device.base import Device as Device
 from hapticbridge.device.data_sheet import AXES as AXES

@@ -55,6 +55,7 @@ DATA_SHEET_UNITS = {
     "rate": "Hz",
     "delay": "s",
     "duration": "s",
+    "reach": "m",
 }
 """SI units of the numbers in a device's data sheet."""
 
@@ -62,7 +63,7 @@ AXES = ("x", "y", "z", "rx", "ry", "rz")
 """Axes that a device may move along (x, y, z) and turn about (rx, ry, rz), in its own frame."""
 
 _NEVER_UNKNOWN = ("force_limit", "torque_limit", "speed_limit")
-_POSITIVE = ("mass", "rotational_inertia", "rate")
+_POSITIVE = ("mass", "rotational_inertia", "rate", "reach")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -90,6 +91,8 @@ class DeviceInfo:
         is_real: Whether it moves a motor in somebody's hand.
         duration: Time in s after which its motion ends by itself, >= 0; None where it does not.
         serial: The unit's serial number; empty where it has none.
+        reach: Distance in m from the origin of its frame, > 0, beyond which it has no place to be
+            but at its stops; None where unknown.
 
     Raises:
         DeviceError: A value is of the wrong type, not finite, or out of range.
@@ -112,6 +115,7 @@ class DeviceInfo:
     is_real: bool
     duration: float | None
     serial: str = ""
+    reach: float | None = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not self.name:
@@ -173,8 +177,8 @@ class DeviceInfo:
         """Reads what ``to_json`` wrote.
 
         Raises:
-            DeviceError: The text is not a JSON object with these keys (``serial`` may be missing),
-                or a value is invalid.
+            DeviceError: The text is not a JSON object with these keys (``serial`` and ``reach`` may
+                be missing), or a value is invalid.
         """
         try:
             values = json.loads(text)

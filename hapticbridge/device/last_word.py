@@ -1,9 +1,10 @@
 """A process of its own that says zero to a device when the bridge can no longer.
 
 A bridge that is killed (SIGKILL), or whose interpreter crashes, runs no line of its own any more. A
-child that holds a second handle to the same device node sees its end of a pipe close, and then
-writes the reports it was given. It is possible where two processes may hold one device: hidraw. USB
-interfaces belong to the one that claimed them; there the device's own watchdog is all there is.
+child that holds a second handle to the same device node sees its end of a pipe close, or that it
+has another parent, and then writes the reports it was given. It is possible where two processes may
+hold one device: hidraw. USB interfaces belong to the one that claimed them; there the device's own
+watchdog is all there is.
 """
 
 from __future__ import annotations
@@ -15,12 +16,15 @@ import sys
 from typing import IO, cast
 
 _CHILD = """
-import os, signal, sys, time
-for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGTSTP"):
+import os, select, signal, sys, time
+for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGTSTP", "SIGQUIT"):
     signal.signal(getattr(signal, name), signal.SIG_IGN)
-device, reports = int(sys.argv[1]), [bytes.fromhex(text) for text in sys.argv[2:]]
+device, bridge, pause = int(sys.argv[1]), int(sys.argv[2]), float(sys.argv[3])
+reports = [bytes.fromhex(text) for text in sys.argv[4:]]
 os.write(1, b"r")
-if not os.read(0, 1):
+while not (is_told := select.select([0], [], [], pause)[0]) and os.getppid() == bridge:
+    pass
+if not is_told or not os.read(0, 1):
     for _ in range(3):
         for report in reports:
             try:
@@ -30,6 +34,11 @@ if not os.read(0, 1):
         time.sleep(0.002)
 """
 # three times, because a report of the dead bridge may still be on its way behind the first
+
+POLL = 0.01
+"""In s: how often the child looks whether the bridge is still its parent. The end of the pipe comes
+at once, but not where a process that the bridge forked holds the pipe open after it; then the force
+stays for so long. Each look takes some microseconds, on another core."""
 
 PATIENCE = 5.0
 """In s: how long the child may take to end; it needs a millisecond."""
@@ -48,9 +57,10 @@ class LastWord:
 
     def __init__(self, path: str, *reports: bytes) -> None:
         node = os.open(path, os.O_WRONLY | os.O_NOCTTY)
+        given = str(node), str(os.getpid()), str(POLL)
         try:
             self._process = subprocess.Popen(
-                [sys.executable, "-I", "-S", "-c", _CHILD, str(node), *(r.hex() for r in reports)],
+                [sys.executable, "-I", "-S", "-c", _CHILD, *given, *(r.hex() for r in reports)],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 pass_fds=(node,),

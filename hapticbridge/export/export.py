@@ -13,12 +13,12 @@ from hapticbridge.export.parquet import ParquetSink
 from hapticbridge.export.sink import Sink
 from hapticbridge.recording import RecordingFile, open_recording
 
-FORMATS: dict[str, tuple[type[Sink], str]] = {
-    "parquet": (ParquetSink, ".parquet"),
-    "csv": (CsvSink, ".csv"),
-    "hdf5": (Hdf5Sink, ".h5"),
+FORMATS: dict[str, tuple[type[Sink], tuple[str, ...]]] = {
+    "parquet": (ParquetSink, (".parquet", ".pq")),
+    "csv": (CsvSink, (".csv",)),
+    "hdf5": (Hdf5Sink, (".h5", ".hdf5")),
 }
-"""What writes each format, and the ending of its files."""
+"""What writes each format, and the endings of its files, the usual one first."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +48,7 @@ def target_for(path: str | Path, form: str) -> Path:
     Raises:
         RecordingError: The format is unknown.
     """
-    return Path(path).with_suffix(_sink(form)[1])
+    return Path(path).with_suffix(_sink(form)[1][0])
 
 
 def export(
@@ -64,18 +64,26 @@ def export(
     Args:
         path: The recording.
         form: One of ``FORMATS``.
-        target: The file; None: the recording's name with the format's ending.
+        target: The file, with an ending of the format; None: the recording's name with the usual
+            one.
         overwrite: Replace files that exist.
 
     Raises:
         RecordingError: The recording cannot be read, the format is unknown or needs a package that
-            is not installed, or the target exists or cannot be written.
+            is not installed, or the target exists, is the recording, ends otherwise or cannot be
+            written.
     """
-    sink_type, _ = _sink(form)
+    sink_type, endings = _sink(form)
     recording = open_recording(path)
     target = target_for(path, form) if target is None else Path(target)
+    if target.suffix.lower() not in endings:
+        raise RecordingError(
+            f"'{target}' does not end like {form}; its endings: {', '.join(endings)}"
+        )
     files = (target, sidecar_of(target)) if form == "csv" else (target,)
     for file in files:
+        if file.exists() and file.samefile(recording.path):
+            raise RecordingError(f"'{file}' is the recording itself; choose another file")
         if file.exists() and not overwrite:
             raise RecordingError(f"'{file}' exists; choose another file or add --overwrite")
     draft = target.with_name(f".{target.name}.draft")
@@ -101,7 +109,7 @@ def export(
     return Exported(files, recording)
 
 
-def _sink(form: str) -> tuple[type[Sink], str]:
+def _sink(form: str) -> tuple[type[Sink], tuple[str, ...]]:
     if form not in FORMATS:
         raise RecordingError(f"format {form!r:.60} is unknown; the formats are {choices(FORMATS)}")
     return FORMATS[form]

@@ -27,13 +27,14 @@ LEAST_REFERENCE = 0.1
 CONTACT_SIZE = 0.4
 """Of MuJoCo's default size of a contact's disc, which would hide a tool that touches often."""
 
-_GREEN, _RED = np.array([0.18, 0.49, 0.20]), np.array([0.70, 0.15, 0.12])
+_PALE, _RED = np.array([0.75, 0.87, 0.98]), np.array([0.70, 0.15, 0.12])
+# pale to dark as well, which the colour-blind see
 _GHOST = (0.1, 0.37, 0.71, 0.45)
 _HAND = (0.90, 0.38, 0.0, 1.0)
 
 
 def force_colour(force: float, reference: float) -> NDArray[np.float64]:
-    """Returns the colour of a spring that pulls: green at rest, red from a reference force on.
+    """Returns the colour of a spring that pulls: pale blue at rest, red from a reference force on.
 
     Args:
         force: Its size in N.
@@ -43,7 +44,7 @@ def force_colour(force: float, reference: float) -> NDArray[np.float64]:
         Red, green and blue from 0 to 1, (3,).
     """
     share = min(abs(force) / reference, 1.0)
-    return np.asarray((1.0 - share) * _GREEN + share * _RED)
+    return np.asarray((1.0 - share) * _PALE + share * _RED)
 
 
 class Stage:

@@ -10,7 +10,7 @@ import sys
 import tempfile
 import threading
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import IO, Any, cast
 
@@ -53,7 +53,11 @@ class Shot:
     """What to draw.
 
     Attributes:
-        at: Time in s from the start of the run; None: the last tick, or the whole run as a film.
+        at: Of a picture: time in s from the start of the run; None: the last tick.
+        start: Of a film: where in the run it begins, in s.
+        stop: Where it ends; None: with the run.
+        speed: How fast it shows the run, 0.001 to 1000: at 0.1 a second takes ten.
+        camera: Name of a camera of the scene; None: the free one, as the scene's file sets it.
         width: In pixels, 16 to 4096 and even.
         height: Likewise.
         fps: Frames per second of a film, 1 to 120.
@@ -63,6 +67,10 @@ class Shot:
     """
 
     at: float | None = None
+    start: float = 0.0
+    stop: float | None = None
+    speed: float = 1.0
+    camera: str | None = None
     width: int = 800
     height: int = 600
     fps: int = 30
@@ -76,6 +84,17 @@ class Shot:
         check.whole("fps", self.fps, least=1, most=120)
         if self.at is not None:
             check.number("time", self.at, "s", least=0.0)
+        check.number("start", self.start, "s", least=0.0)
+        if self.stop is not None:
+            check.number("stop", self.stop, "s", least=0.0)
+            if self.stop <= self.start:
+                raise HapticBridgeError(f"stop is {self.stop:g} s, not after {self.start:g} s")
+        check.number("speed", self.speed, "", least=0.001, most=1000.0)
+
+    @property
+    def is_of_film(self) -> bool:
+        """Whether it says what only a film has."""
+        return bool(self.start) or self.stop is not None or self.speed != 1.0
 
 
 def draw(
@@ -105,9 +124,23 @@ def draw(
     """
     shot, target = shot or Shot(), Path(out)
     _check_target(target, shot)
+    job = {"recording": str(recording), "name": str(target), **asdict(shot)}
+    # what is half done, or interrupted, must neither stand there nor replace what did
+    try:
+        with tempfile.TemporaryDirectory(
+            prefix=".drawing-", dir=target.absolute().parent, ignore_cleanup_errors=True
+        ) as folder:
+            drawn = Path(folder) / f"drawn{target.suffix.lower()}"
+            renderer = _draw_with_any(job | {"out": str(drawn)}, progress)
+            drawn.replace(target)
+    except OSError as error:
+        raise RecordingError(f"cannot write '{target}': {error.strerror or error}") from None
+    return renderer
+
+
+def _draw_with_any(job: dict[str, Any], progress: Progress | None) -> str:
+    """Draws with the renderer that was asked for, or the first that works; returns its name."""
     asked = os.environ.get("MUJOCO_GL")
-    job = {"recording": str(recording), "out": str(target), "at": shot.at}
-    job |= {"width": shot.width, "height": shot.height, "fps": shot.fps}
     for renderer in [asked] if asked else RENDERERS:
         if _draw_with(renderer, job, progress):
             return renderer
@@ -136,8 +169,12 @@ def _check_target(target: Path, shot: Shot) -> None:
         )
     if not target.absolute().parent.is_dir():
         raise HapticBridgeError(f"cannot write '{target}': its folder does not exist")
+    if target.exists() and not target.is_file():
+        raise HapticBridgeError(f"cannot write '{target}': it is there, and no file")
     if ending == ".mp4" and shot.at is not None:
-        raise HapticBridgeError("a film shows the whole run; a time goes with a picture (.png)")
+        raise HapticBridgeError("a time goes with a picture (.png); a film has start and stop")
+    if ending == ".png" and shot.is_of_film:
+        raise HapticBridgeError("start, stop and speed go with a film (.mp4); a picture has a time")
     if ending == ".mp4" and importlib.util.find_spec("imageio_ffmpeg") is None:
         raise HapticBridgeError("a film needs the extra 'view': pip install 'hapticbridge[view]'")
 
@@ -173,6 +210,7 @@ def _draw_with(renderer: str, job: dict[str, Any], progress: Progress | None) ->
     finally:
         watch.cancel()
         process.kill()
+        process.wait()  # Popen does not where it was left by Ctrl-C
 
 
 def _answers(lines: IO[str]) -> Iterator[dict[str, Any]]:

@@ -35,6 +35,11 @@ LONGEST_STALL, STALL_PERIODS = 0.05, 5
 """A loop that stood still for longer than 50 ms, or five periods where they are longer, knows no
 more where the hand is: 20 mm away at 0.4 m/s."""
 
+RAMP_ENERGY = 0.01
+"""In J: what the coupling may hold while the wrench rises at full pace, 7 N at 2400 N/m; and what a
+start may give to the hand at most in the time of its ramp. A quarter of the energy limit, so that
+no start alone ends a run; less makes the force of a heavy tool rise slowly."""
+
 JUMP_MARGIN = 2.0
 """How much faster than its data sheet says a device may seem to move: a sample that is read late
 and the next one in time show up to two periods of motion in one."""
@@ -111,7 +116,7 @@ def guarding_for(
         dead_man=buttons[1],
         stretch=limits.stretch * scale,
         angle=limits.angle,
-        reach=limits.reach,
+        reach=limits.reach_of(info),
     )
     if info.is_prescribed:
         return common
@@ -139,4 +144,5 @@ def guarding_for(
         speed=JUMP_MARGIN * info.speed_limit if info.speed_limit > 0 else math.inf,
         turn_speed=FASTEST_TURN,
         energy=limits.energy,
+        ramp_energy=RAMP_ENERGY,
     )

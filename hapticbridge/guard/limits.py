@@ -38,14 +38,15 @@ class Limits:
         torque: Largest norm of the torque in N m, > 0.
         rise: Shortest time in s in which force and torque go from zero to their limits, >= 0; 0
             lets them step.
-        ramp: Time in s over which the wrench rises linearly at the start, 0 to 60.
+        ramp: Time in s over which the wrench rises linearly at the start, 0 to 60; it takes longer
+            where the coupling holds much energy meanwhile (``kernel.ramp``).
         stretch: Largest distance between handle and grip in m, over the scale, > 0; beyond it the
             run is stopped. So it is beyond the others:
         angle: Largest angle between them in rad, > 0 and < π, or inf.
         energy: Most energy in J that the device may be given beyond what the hand put in, > 0.
         reach: Farthest in m that the device may be from the middle of its workspace, the origin of
-            its frame, > 0. It is not stopped there: beyond, it moves without the handle and
-            without force, as with a clutch.
+            its frame, > 0; inf: no limit; None: the device's own, where it knows it. It is not
+            stopped there: beyond, it moves without the handle and without force, as with a clutch.
 
     Raises:
         DeviceError: A value is not finite or out of range.
@@ -58,7 +59,7 @@ class Limits:
     stretch: float = USUAL_STRETCH
     angle: float = USUAL_ANGLE
     energy: float = USUAL_ENERGY
-    reach: float = math.inf
+    reach: float | None = None
 
     def __post_init__(self) -> None:
         for name, unit in (("force", "N"), ("torque", "N m")):
@@ -71,12 +72,17 @@ class Limits:
             raise DeviceError(f"rise is {self.rise!r} s; it must be 0 to {LONGEST_RAMP:g}")
         for name, unit in (("stretch", "m"), ("energy", "J"), ("reach", "m")):
             value = getattr(self, name)
-            if not value > 0:
+            if value is not None and not value > 0:
                 raise DeviceError(f"{name} limit is {value!r} {unit}; it must be > 0, inf for none")
         if not (0 < self.angle < math.pi or self.angle == math.inf):
             raise DeviceError(
                 f"angle limit is {self.angle!r} rad; it must be > 0 and < pi, inf for none"
             )
+
+    def reach_of(self, info: DeviceInfo) -> float:
+        """Returns the reach in m: the one asked for, else the device's own, else inf."""
+        own = math.inf if info.reach is None else info.reach
+        return own if self.reach is None else self.reach
 
     def ramp_ticks(self, period: float) -> int:
         """Returns the length of the ramp in ticks of ``period`` seconds."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -24,7 +26,13 @@ STILL_DISTANCE = 1e-3
 _NO_FORCE = np.zeros(6)
 
 
-def wait_until_still(device: Device, sample: NDArray[np.void], period: float, clock: Clock) -> None:
+def wait_until_still(
+    device: Device,
+    sample: NDArray[np.void],
+    period: float,
+    clock: Clock,
+    is_over: Callable[[], object] = lambda: False,
+) -> None:
     """Waits until a device with motors is still; returns at once for any other.
 
     It is commanded zero force in every period: a Falcon says where it is only when it is told what
@@ -36,6 +44,7 @@ def wait_until_still(device: Device, sample: NDArray[np.void], period: float, cl
         period: T in s, at which it is read.
         clock: The run's. Only real time is waited for; a clock that somebody drives also drives
             what the device does, which must not begin before the run.
+        is_over: Tells whether the run was told to end meanwhile; then nothing is waited for.
 
     Raises:
         DeviceError: It moves on.
@@ -46,7 +55,7 @@ def wait_until_still(device: Device, sample: NDArray[np.void], period: float, cl
     clock.start(round(1e9 * period))
     anchor = np.zeros(1, SAMPLE_DTYPE)
     since = begun = None
-    while True:
+    while not is_over():
         clock.wait()
         device.read(sample)
         device.write(_NO_FORCE)

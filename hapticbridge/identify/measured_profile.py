@@ -52,6 +52,8 @@ def measured_profile(
     quantities["delay"] = _quantity(max(late, key=lambda delay: delay.most), source)
     for name in ("force_limit", "torque_limit", "speed_limit"):
         quantities[name] = Quantity(float(getattr(info, name)), "the driver's, not measured")
+    if info.reach is not None:
+        quantities["reach"] = Quantity(info.reach, "as known before, not measured")
     if workspace is not None:
         quantities["workspace"] = Quantity(workspace, "stated or assumed when it was identified")
     return Profile(

@@ -32,6 +32,20 @@ for ever; at 1.6 a swing loses 40 % from tick to tick. Less makes walls soft for
 
 
 @compiled
+def unpaid(state: NDArray[np.void]) -> float:
+    """Returns in J what the device was given beyond what the hand put in, by the last count.
+
+        given + r min(S − S_0, 0),   r = force_scale/scale
+
+    ``given`` is w·δp − b δp²/t summed; S_0 is what the scene stored when the whole run began, be it
+    recorded from there or not: what it has given up of that has paid.
+    """
+    s = state[0]
+    lost = min(s.kinetic + s.potential - s.first_energy, 0.0)
+    return float(s.given + (s.force_scale / s.scale) * lost)
+
+
+@compiled
 def keep_account(state: NDArray[np.void], moved: Vector, turned: Vector, interval: float) -> None:
     """Adds what the last tick gave to the device, burnt there and took up in the scene.
 
@@ -46,9 +60,8 @@ def keep_account(state: NDArray[np.void], moved: Vector, turned: Vector, interva
     ``excess`` is what the environment's port owes alone, Σ E_k − Σ ½‖δx_k‖²_{K+B/T}, with its own
     surplus capped in the same way.
 
-    ``kicked`` is what the device was given beyond what the hand put in, w·δp − b δp²/t summed, less
-    what the scene has given up of what it stored at the start. Motors of the scene pay for nothing
-    there.
+    ``kicked`` is what the device was given beyond what the hand put in (``unpaid``). Motors of the
+    scene pay for nothing there.
 
     Args:
         state: The bound state, as the tick before left it.
@@ -76,7 +89,7 @@ def keep_account(state: NDArray[np.void], moved: Vector, turned: Vector, interva
         given += linear + angular
     s.account = max(s.account + given + gained, -s.surplus)
     s.given += given
-    s.kicked = s.given + (s.force_scale / s.scale) * min(stored, 0.0)
+    s.kicked = unpaid(state)
     for i in range(6):
         u = rate * (moved[i] if i < 3 else turned[i - 3])
         has_reversed = 1 if u * s.device_velocity[i] < 0.0 else 0

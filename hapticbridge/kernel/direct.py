@@ -34,8 +34,7 @@ from hapticbridge.pose import (
 )
 
 FREE_TOOL = 7
-PLANAR_TOOL = 22
-"""How many numbers ``tool_map`` returns for a tool of either kind."""
+"""How many numbers ``tool_map`` returns for a tool on a free joint; for a planar one it is 22."""
 
 
 def tool_map(model: mujoco.MjModel, site_id: int) -> tuple[NDArray[np.float64], NDArray[np.int32]]:

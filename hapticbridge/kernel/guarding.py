@@ -16,7 +16,7 @@ scales the wrench; damping for what the environment's port owes alone."""
 MOST_BUTTONS = 32
 """Buttons that a mask may name; no handle has more."""
 
-LATER = frozenset({"reach"})
+LATER = frozenset({"reach", "ramp_energy"})
 """What came after the first recordings with a guard, which do without."""
 
 _POSITIVE = ("force_rise", "torque_rise", "longest_stall")
@@ -56,6 +56,8 @@ class Guarding:
         energy: Energy in J given to the device beyond what the hand put in, likewise.
         reach: Distance in m of the device from the origin of its frame beyond which it moves
             without the handle and without force.
+        ramp_energy: Energy in J that the coupling may hold while the wrench rises at full pace; see
+            ``kernel.ramp``.
 
     Raises:
         HapticBridgeError: A value is out of range.
@@ -81,6 +83,7 @@ class Guarding:
     angle: float = math.inf
     energy: float = math.inf
     reach: float = math.inf
+    ramp_energy: float = math.inf
 
     def __post_init__(self) -> None:
         if self.controller not in (OFF, DAMPER, TANK, ENVIRONMENT):
@@ -89,7 +92,7 @@ class Guarding:
             value = getattr(self, name)
             if not _is_number(value) or not 0 <= value < math.inf:
                 raise HapticBridgeError(f"guard: {name} is {value!r}; it must be finite and >= 0")
-        for name in (*_POSITIVE, *_TRIPS, "reach"):
+        for name in (*_POSITIVE, *_TRIPS, *LATER):
             value = getattr(self, name)
             if not _is_number(value) or not value > 0:
                 raise HapticBridgeError(f"guard: {name} is {value!r}; it must be > 0")

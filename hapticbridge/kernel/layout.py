@@ -151,6 +151,7 @@ _GUARD_PARAMETERS = (
     "most_angle",
     "most_energy",
     "reach",
+    "ramp_energy",
 )
 
 _GUARD_RUNNING_COUNTS = (
@@ -167,6 +168,7 @@ _GUARD_RUNNING_COUNTS = (
 
 _GUARD_RUNNING = (
     "since_news",
+    "risen",
     "account",
     "own_before",
     "passed",
@@ -203,6 +205,7 @@ _RUNNING = (
     "kinetic",
     "potential",
     "start_energy",
+    "first_energy",
     "coupling_work",
     "actuator_work",
     "external_work",

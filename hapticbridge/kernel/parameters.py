@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from hapticbridge.arguments import Arguments
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import HapticBridgeError
+from hapticbridge.kernel.counts import Counts
 from hapticbridge.kernel.guarding import UNGUARDED, Guarding
 from hapticbridge.kernel.scheme import COUPLED, DIRECT, HELD, LOSSLESS, WELD, has_law, laws_per_tick
 
@@ -76,6 +77,7 @@ class RunParameters:
         start_elastic: What contacts, limits and equality constraints store at most at the start, in
             J: it may come out again, and MuJoCo's energies do not have it. Zero for runs that begin
             at a scene's own start, which presses on nothing.
+        counts: What the guard had counted where the run begins in mid-motion; None where at rest.
 
     Raises:
         HapticBridgeError: A value is out of range.
@@ -101,6 +103,7 @@ class RunParameters:
     device_rotational_damping: float | None = None
     guarding: Guarding = UNGUARDED
     start_elastic: float = 0.0
+    counts: Counts | None = None
 
     def __post_init__(self) -> None:
         checked_substeps(self.substeps)

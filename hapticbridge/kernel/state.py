@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticbridge.kernel.account import unpaid
 from hapticbridge.kernel.addresses import bind_addresses, gains_of
 from hapticbridge.kernel.direct import balance_contacts, tool_map
 from hapticbridge.kernel.guarding import Guarding
@@ -52,7 +53,7 @@ class Binding:
     def resume(self) -> None:
         """Starts the ramp again at the next tick, after a pause in which zero was commanded."""
         self.state["ramp_start"] = self.state["tick"]
-        self.state["rise_ticks"] = self.state["ramp_ticks"]
+        self.state["rise_ticks"], self.state["risen"] = self.state["ramp_ticks"], 0.0
         self.state["wrench_on_device"] = self.state["slewed"] = 0.0
         self.state["has_positions"] = 0  # whoever had the scene meanwhile may have changed it
 
@@ -90,7 +91,7 @@ class Binding:
         refresh_energies(state)
         after = float(state["kinetic"][0] + state["potential"][0])
         state["external_work"] += after - before
-        start, ratio = float(state["start_energy"][0]), state["force_scale"] / state["scale"]
+        start, ratio = float(state["first_energy"][0]), state["force_scale"] / state["scale"]
         state["given"] += ratio * (min(before - start, 0.0) - min(after - start, 0.0))
         forget_dissipation(state)
         state["is_seated_anew"] = 1
@@ -238,5 +239,10 @@ class Binding:
             refresh_energies(state)
         state["start_energy"] = state["kinetic"] + state["potential"] + parameters.start_elastic
         state["own_before"] = -parameters.start_elastic
+        state["first_energy"] = state["start_energy"]
+        if parameters.counts is not None:
+            parameters.counts.put(state)
+            forget_dissipation(state)  # a command, as any other
+            state["kicked"] = unpaid(state)
         if parameters.scheme == LOSSLESS:
             note_twist(state)

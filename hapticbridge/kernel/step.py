@@ -115,7 +115,10 @@ def before_step(
         quaternion = canonical(given)
 
         moved = subtract(position, vector_of(s.device_position))
-        turned = rotation_between(quaternion_of(s.device_quaternion), quaternion)
+        # exactly none where it did not turn: rounding would be a speed that the controller damps
+        turned, last = (0.0, 0.0, 0.0), quaternion_of(s.device_quaternion)
+        if quaternion != last:
+            turned = rotation_between(last, quaternion)
         code = refused(state, moved, turned, elapsed)
         if code != OK:
             return code

@@ -23,14 +23,13 @@ what a command does, each command caps what the hand has saved up by then
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.jit import compiled
 from hapticbridge.kernel.native import floats
 from hapticbridge.kernel.parameters import RunParameters
+from hapticbridge.kernel.ramp import held_energy
 from hapticbridge.kernel.scheme import LOSSLESS
 from hapticbridge.pose import (
     dot,
@@ -81,18 +80,8 @@ def forget_dissipation(state: NDArray[np.void]) -> None:
     """
     s = state[0]
     ratio = float(s["force_scale"] / s["scale"])
-    stretch = float(np.linalg.norm(s["handle_position"] - s["tool_position"]))
-    cosine = abs(float(np.dot(s["handle_quaternion"], s["tool_quaternion"])))
-    kept = max(float(s["kinetic"] + s["potential"] - s["start_energy"]), 0.0)
-    kept += _spring(float(s["stiffness"]), stretch, float(s["force_limit"] / s["force_scale"]))
-    twist, most = 2.0 * math.acos(min(cosine, 1.0)), float(s["torque_limit"]) / ratio
-    kept += _spring(float(s["rotational_stiffness"]), twist, most)
-    s["given"] = max(float(s["given"]), -(float(s["surplus"]) + ratio * kept))
-
-
-def _spring(stiffness: float, length: float, limit: float) -> float:
-    elastic = min(length, limit / stiffness) if stiffness > 0.0 else 0.0
-    return 0.5 * stiffness * elastic**2 + min(stiffness * length, limit) * (length - elastic)
+    kept = max(float(s["kinetic"] + s["potential"] - s["first_energy"]), 0.0)
+    s["given"] = max(float(s["given"]), -(float(s["surplus"]) + held_energy(state) + ratio * kept))
 
 
 @compiled

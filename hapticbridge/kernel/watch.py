@@ -135,7 +135,7 @@ def follow(
         store_quaternion(s.handle_origin[3:7], quaternion_of(s.tool_quaternion))
         if not is_first:
             s.rise_ticks = s.fade_ticks
-        s.ramp_start = s.tick
+        s.ramp_start, s.risen = s.tick, 0.0
         for i in range(6):
             s.slewed[i] = 0.0
     return True

@@ -7,13 +7,14 @@ from numpy.typing import NDArray
 
 from hapticbridge.jit import compiled
 from hapticbridge.kernel.account import control
-from hapticbridge.kernel.codes import FORCE_LIMITED, RAMPING, SLEW_LIMITED
+from hapticbridge.kernel.codes import FORCE_LIMITED, SLEW_LIMITED
 from hapticbridge.kernel.direct import balance_contacts
 from hapticbridge.kernel.handle import device_from_scene
 from hapticbridge.kernel.meter import refresh_poses
 from hapticbridge.kernel.midpoint import implicit_half, midpoint_torque
 from hapticbridge.kernel.native import floats
 from hapticbridge.kernel.nearness import is_near
+from hapticbridge.kernel.ramp import rise
 from hapticbridge.kernel.scheme import DIRECT, LOSSLESS, WELD
 from hapticbridge.kernel.weld import weld_wrench
 from hapticbridge.pose import (
@@ -154,11 +155,7 @@ def render(state: NDArray[np.void], force: Vector, torque: Vector) -> None:
         s.flags |= SLEW_LIMITED
     store_vector(s.slewed[0:3], on_device)
     store_vector(s.slewed[3:6], torque_on_device)
-    share = 1.0
-    since_start = s.tick - s.ramp_start
-    if since_start < s.rise_ticks:
-        s.flags |= RAMPING
-        share = (since_start + 1.0) / (s.rise_ticks + 1.0)
+    share = rise(state)
     if s.silent_ticks > 0:
         share *= max(0.0, 1.0 - s.silent_ticks / s.fade_ticks)
     if share != 1.0:

@@ -1,4 +1,12 @@
-"""Theory of passive haptic display: what device damping a coupling needs, and what it allows."""
+"""Theory of passive haptic display: what device damping a coupling needs, and what it allows.
+
+No MuJoCo here. Read ``transfer`` (the coupling, sampled), ``spectrum`` (the damping needed at each
+frequency) and ``bounds`` (its supremum) first, then ``worst_hand`` and ``sampled_loop``, which find
+the same limit in the time domain (``recursion``, ``stability``). ``wall``, ``worst_frequency`` and
+``delay`` treat delays, ``virtual_mass`` the tool's integrator, ``matrix`` several dimensions,
+``compensation`` the damping that is felt, ``transmission_line`` another law. ``quantization``,
+``free_device`` and ``passive_line`` are the limits of a ``z_width``. ``grid`` checks all arguments.
+"""
 
 from hapticbridge.passivity.bounds import maximum_stiffness as maximum_stiffness
 from hapticbridge.passivity.bounds import minimum_damping as minimum_damping

@@ -14,6 +14,7 @@ from datetime import UTC, datetime
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import HapticBridgeError, RecordingError
+from hapticbridge.kernel.counts import Counts
 from hapticbridge.kernel.guarding import UNGUARDED, Guarding
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.scheme import WELD
@@ -41,7 +42,7 @@ MID_RUN = "mid-run"
 _FLOATS = ("scale", "force_scale", "force_limit", "torque_limit", "contact_stiffness")
 _POSES = ("device_origin", "handle_origin", "device_start")
 _GAINS = ("stiffness", "damping", "rotational_stiffness", "rotational_damping")
-_ELASTIC = "start_elastic"
+_ELASTIC, _COUNTS = "start_elastic", "counts"
 
 
 def attachments(scene: Scene, reset: bytes | None = None) -> list[Attachment]:
@@ -87,6 +88,8 @@ def describe_run(
         meta[name] = json.dumps(start if count > 1 else start[0])
     if parameters.start_elastic:
         meta[_ELASTIC] = repr(parameters.start_elastic)
+    if parameters.counts is not None:
+        meta[_COUNTS] = parameters.counts.to_json()
     return meta | {
         "period_s": repr(parameters.period),
         "substeps": str(parameters.substeps),
@@ -148,6 +151,7 @@ def parameters_of(meta: Mapping[str, str]) -> RunParameters:
             device_rotational_damping=rotational,
             guarding=Guarding.from_json(meta["guard"]) if "guard" in meta else UNGUARDED,
             start_elastic=meta_float(meta, _ELASTIC) if _ELASTIC in meta else 0.0,
+            counts=Counts.from_json(meta[_COUNTS]) if _COUNTS in meta else None,
         )
     except RecordingError:
         raise

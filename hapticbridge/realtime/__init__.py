@@ -1,4 +1,8 @@
-"""What the loop asks of the system, and how late it wakes."""
+"""What the loop asks of the system, and how late it wakes.
+
+``grants`` asks and gives back, ``remedies`` names the commands that grant what was refused,
+``pace`` checks that a scene's step fits into the period, ``lateness`` and ``host`` measure.
+"""
 
 from hapticbridge.realtime.grants import Grant as Grant
 from hapticbridge.realtime.grants import current_priority as current_priority

@@ -19,7 +19,7 @@ from pathlib import Path
 
 from hapticbridge.clock import Clock, RealClock
 from hapticbridge.errors import HapticBridgeError
-from hapticbridge.realtime.remedies import PRIORITY, way_to_grant
+from hapticbridge.realtime.remedies import PRIORITY, way_to_grant, way_to_pin
 
 if sys.platform != "win32":
     import resource
@@ -206,7 +206,11 @@ def _core(restore: ExitStack, core: int | None) -> Grant:
     try:
         os.sched_setaffinity(0, {chosen})
     except (OSError, ValueError, OverflowError) as error:
-        return Grant(name, False, f"the loop could not be pinned to core {chosen} ({error})")
+        reason = getattr(error, "strerror", None) or error
+        sentence = (
+            f"the loop could not be pinned to core {chosen} ({reason}): moves make ticks late"
+        )
+        return Grant(name, False, sentence, way_to_pin(chosen, getattr(error, "errno", None)))
     restore.callback(os.sched_setaffinity, 0, allowed)
     kind = "isolated core" if chosen in isolated else "core"
     return Grant(name, True, f"pinned to {kind} {chosen} of {len(allowed | isolated)}")

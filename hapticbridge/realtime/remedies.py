@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import sys
 from pathlib import Path
@@ -25,6 +26,31 @@ CAPABILITIES = f"sudo setcap cap_sys_nice,cap_ipc_lock+ep {Path(sys.executable).
 
 CONTAINER = f"docker run --cap-add=SYS_NICE --cap-add=IPC_LOCK --ulimit rtprio={PRIORITY} …"
 """For a container, whose administrator has no more rights than it was given."""
+
+
+CORES = (
+    "a control group that holds it: 'docker run --cpuset-cpus=…', or 'AllowedCPUs=…' in the "
+    "systemd unit that this was started from"
+)
+"""For a core that is there but not among those of the process's control group."""
+
+FILTER = (
+    "docker run --cap-add=SYS_NICE …; outside a container start it where no filter of system calls "
+    "(seccomp, systemd's SystemCallFilter=) keeps sched_setaffinity back"
+)
+"""For a process that may not say where it runs: by itself Linux lets every one."""
+
+
+def way_to_pin(core: int, reason: int | None) -> str:
+    """Returns what gives the loop a core that was refused.
+
+    Args:
+        core: Its number.
+        reason: ``errno`` of the refusal; None where the number is none.
+    """
+    if not 0 <= core < (os.cpu_count() or 1):
+        return f"choose a core from 0 to {(os.cpu_count() or 1) - 1}"
+    return CORES if reason == errno.EINVAL else FILTER
 
 
 def is_administrator() -> bool:

@@ -1,4 +1,11 @@
-"""Recordings: the file, the process that writes it, and the ring before it."""
+"""Recordings: the file, the process that writes it, and the ring before it.
+
+Read ``format`` first: it says what a recording is. Records leave the loop through ``ring``
+(``ring_memory``), events through a pipe; ``stream`` is the loop's end of both, ``recorder`` and
+``recorder_process`` are the other, and an ``onlooker`` may look on. ``writer`` writes a file on top
+of ``output`` and ``chunk_index``; ``reader`` reads one, whole or damaged, through ``file_bytes``,
+``container``, ``fields`` and ``contents``; ``recovery`` and ``salvage`` mend what was cut.
+"""
 
 from hapticbridge.recording.format import Attachment as Attachment
 from hapticbridge.recording.reader import Recording as Recording

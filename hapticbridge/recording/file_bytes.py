@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import threading
 import zlib
 from pathlib import Path
@@ -33,6 +34,8 @@ class FileBytes:
         try:
             if path.exists() and not path.is_file():
                 kind = "a folder" if path.is_dir() else "not a regular file"
+                if path.is_dir() and not os.access(path, os.R_OK | os.X_OK):
+                    kind = "a folder that cannot be read"
                 raise RecordingError(f"cannot read the recording {path}: it is {kind}")
             self._size = path.stat().st_size
             self._file = path.open("rb", buffering=0)

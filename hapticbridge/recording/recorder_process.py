@@ -146,7 +146,7 @@ def _configuration(stream: IO[bytes]) -> tuple[dict[str, Any], list[Attachment]]
 
 def _calm() -> None:
     """Gives up what the process must not share with the loop: its signals and its priority."""
-    for name in ("SIGINT", "SIGTERM", "SIGHUP"):
+    for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT"):
         if hasattr(signal, name):
             signal.signal(getattr(signal, name), signal.SIG_IGN)
     if sys.platform == "linux":

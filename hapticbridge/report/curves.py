@@ -28,16 +28,16 @@ DRAWABLE = 1e9
 """Newtons, metres and joules beyond this are no physics; the picture's axes would not bear them."""
 
 _ENERGIES = (
-    ("coupling_work", "work of the coupling"),
-    ("environment_energy", "created (+) or dissipated (−)"),
-    ("device_energy", "given to the device"),
-    ("kinetic", "kinetic"),
+    ("coupling_work", "work of the coupling", "#0072b2", "-"),
+    ("environment_energy", "created (+) or dissipated (−)", "#009e73", "-"),
+    ("device_energy", "given to the device", "#e69f00", "-"),
+    ("kinetic", "kinetic", "#555555", "--"),
 )
 _DRAWN = (
     "wrench_on_tool",
     "tool_position",
     "handle_position",
-    *(name for name, _ in _ENERGIES),
+    *(name for name, *_ in _ENERGIES),
 )
 
 
@@ -89,8 +89,9 @@ def draw_recording(recording: Recording) -> Figure:
         handle = 1e3 * (ticks["handle_position"][:, i] - start)
         position_axes.plot(*decimated(time, tool), color=colour, label=f"tool {axis}")
         position_axes.plot(*decimated(time, handle), color=colour, ls=":", lw=1)
-    for name, label in _ENERGIES:
-        energy_axes.plot(*decimated(time, 1e3 * ticks[name]), label=label)
+    for name, label, colour, style in _ENERGIES:
+        drawn = decimated(time, 1e3 * ticks[name])
+        energy_axes.plot(*drawn, color=colour, ls=style, label=label)
     force_axes.set_ylabel("force on the tool (N)")
     position_axes.set_ylabel("way from the start (mm)")
     energy_axes.set_ylabel("energy (mJ)")

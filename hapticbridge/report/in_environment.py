@@ -31,7 +31,7 @@ def cause_in_environment(evidence: Evidence, report: AuditReport, window: slice)
     gained = np.diff(evidence.created, prepend=0.0)[window].clip(min=0.0)
     touches = (evidence.ticks["contacts"] > 0)[window]
     share = float(gained[touches].sum() / gained.sum()) if gained.sum() > 0 else 0.0
-    where = f"{share:.0%} of the energy created before it came in ticks with contact"
+    where = f"{share:.0%} of the energy created until then came in ticks with contact"
     pairs = touched_pairs(evidence, report, window, gained) if share >= MOST else None
     if pairs:
         where += _named(evidence, pairs)

@@ -22,10 +22,8 @@ def lead_sentence(report: AuditReport, worst: float | None) -> str:
     if report.verdict == "invalid":
         return f"This recording proves nothing: {report.reason}"
     if report.verdict == "active" and worst is not None:
-        # what stopped the run, and what was not checked, follow the first clause
-        rest = report.reason.partition("; ")[2]
-        return _too_much(report, quantity(worst, "J")) + (f"; {rest}" if rest else "")
-    return report.reason
+        return _too_much(report, quantity(worst, "J"))
+    return report.reason.partition("; ")[0]
 
 
 def _too_much(report: AuditReport, joules: str) -> str:
@@ -35,15 +33,32 @@ def _too_much(report: AuditReport, joules: str) -> str:
     return f"Not safe: the scene gave out up to {joules} more than {limit}"
 
 
-def device_sentence(report: AuditReport) -> str:
-    """Returns what is to be said of the device in a run that was passive; nothing in another."""
+def notes(report: AuditReport) -> list[str]:
+    """Returns what goes with the verdict: what stopped the run, what was not checked, the device.
+
+    Args:
+        report: The audit's verdict on a run.
+    """
+    if report.verdict == "invalid":
+        return []
+    told = report.reason.partition("; ")[2]
+    # a run that was passive only because its force was taken away should not look like any other
+    return [*([f"{told[:1].upper()}{told[1:]}."] if told else []), *_of_the_device(report)]
+
+
+def is_warned(report: AuditReport) -> bool:
+    """Tells whether a passive run was stopped by the guard, or proves nothing for another hand."""
+    return report.verdict == "passive" and (report.certified is False or "trip" in report.events)
+
+
+def _of_the_device(report: AuditReport) -> list[str]:
     if report.verdict != "passive":
-        return ""
+        return []
     if report.certified:
-        return "The device bears this coupling, in any hand."
+        return ["The device bears this coupling, in any hand."]
     if report.certified is None:
-        return "Whether the device bears this coupling in any hand is not known."
-    return (
+        return ["Whether the device bears this coupling in any hand is not known."]
+    return [
         f"The device does not bear this coupling: {'; '.join(report.conditions)}. This run stayed "
         "passive; another one need not."
-    )
+    ]

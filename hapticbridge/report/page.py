@@ -29,7 +29,7 @@ from hapticbridge.report.facts import (
     run_facts,
     software_facts,
 )
-from hapticbridge.report.lead import PLACES, device_sentence, lead_sentence
+from hapticbridge.report.lead import PLACES, is_warned, lead_sentence, notes
 from hapticbridge.report.likely import likely_cause
 from hapticbridge.report.moment import draw_moment
 from hapticbridge.report.motion import draw_motion
@@ -110,7 +110,8 @@ def write_report(
         run=run,
         moment=moment,
         lead=lead_sentence(report, None if moment is None else moment["worst"]),
-        of_device=device_sentence(report),
+        notes=notes(report),
+        is_warned=is_warned(report),
         curves="" if evidence is not None else _bare_curves(recording),
     )
     try:

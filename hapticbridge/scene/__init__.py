@@ -1,4 +1,13 @@
-"""MJCF scenes put behind a haptic device: loading, the handle and its coupling, checks."""
+"""MJCF scenes put behind a haptic device: loading, the handle and its coupling, checks.
+
+Read ``load`` first: it reads a scene, puts the handle and its coupling into it (``attach``,
+``start``), compiles it (``compiler``) and refuses what no hand should feel (``checks``). What comes
+out is ``scene.Scene``, which a bridge steps. ``source`` keeps the files' bytes for the recording;
+``parameter_file`` and ``parameters`` are what a user may set, ``custom`` what the file says of
+itself, ``library`` the scenes that are shipped. ``contact_rule``, with ``contact_check`` and
+``contact_concerns``, is what was measured of contacts that create energy. ``methods`` and ``weld``
+serve the methods that exist to be compared.
+"""
 
 from hapticbridge.scene.custom import custom_numbers as custom_numbers
 from hapticbridge.scene.custom import custom_text as custom_text

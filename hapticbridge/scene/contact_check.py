@@ -69,10 +69,9 @@ def check_contacts(
     option, where = model.opt, dict[ContactSetting, list[str]]()
     pairs = contact_settings(model, grip) if only is None else settings_among(model)
     for first, second, setting in pairs:
-        if only is not None and frozenset((first, second)) not in only:
-            continue
-        names = f"{geom_name(model, first)} with {geom_name(model, second)}"
-        where.setdefault(setting, []).append(names)
+        if only is None or frozenset((first, second)) in only:
+            names = f"{geom_name(model, first)} with {geom_name(model, second)}"
+            where.setdefault(setting, []).append(names)
     step = float(option.timestep)
     return [
         f"the contact of {names[0]}{_others(len(names) - 1)} (solref {_words(setting.solref)}, "

@@ -1,4 +1,11 @@
-"""Studies: theory and runs, swept, drawn and written down."""
+"""Studies: theory and runs, swept, drawn and written down.
+
+Read ``sweep`` first: it applies a function to ``points``, in tasks (``task``) on any ``workers``
+(``hiring``: own ``processes``, a ``cluster``), and gives a ``table``; ``results`` keeps what is
+done. ``closed_loop``, with ``jitter``, is the run that most sweeps make. On these stand ``maps``
+(where methods fail), ``chart`` (speed against accuracy, beside other ``engines``), ``paper`` (Brown
+& Colgate, equation by equation), ``theory`` (its pictures) and ``audits`` (many recordings).
+"""
 
 from hapticbridge.study.points import grid as grid
 from hapticbridge.study.sweep import sweep as sweep

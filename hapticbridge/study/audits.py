@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import glob
 import json
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
 from functools import partial
@@ -21,9 +20,6 @@ from hapticbridge.study.sweep import sweep
 from hapticbridge.study.table import Table, check_format
 from hapticbridge.study.workers import InThisProcess
 
-ENDING = ".mcap"
-"""What recordings in a folder are known by."""
-
 FEW = 8
 """Recordings below which no processes are started: each takes 3 s to start, as long as the audit
 of two minutes at 1 kHz."""
@@ -34,35 +30,27 @@ UNREADABLE = "unreadable"
 _LONGEST_REASON = 1000
 """Letters of a reason that are kept; a damaged file may have a problem in each of its chunks."""
 
+_UNITS = {
+    "margin": "1",
+    "slack_share": "1",
+    "damping_margin": "1",
+    "ticks": "1",
+    "tick": "1",
+    "duration": "s",
+    "joules": "J",
+    "kinetic": "J",
+    "potential": "J",
+    "coupling_work": "J",
+    "actuator_work": "J",
+    "external_work": "J",
+    "environment_energy": "J",
+    "device_energy": "J",
+    "slack": "J",
+}
+"""Units of what is measured in a table of audits."""
+
 _REPORT = "report"
 """Column that holds the whole report as JSON text."""
-
-
-def find_recordings(words: Iterable[str | Path]) -> list[Path]:
-    """Returns the recordings that files, folders and patterns name, each once.
-
-    A folder stands for all files below it that end in ``.mcap``, in the order of their names. A
-    word that is no file and holds ``*``, ``?`` or ``[`` is a pattern, in which ``**`` stands for
-    any folders. A file that does not exist is kept: the audit says so.
-
-    Raises:
-        RecordingError: There is no recording in a folder, or none that fits a pattern.
-    """
-    found: dict[Path, Path] = {}
-    for word in words:
-        path = Path(word)
-        files = [path]
-        if path.is_dir():
-            files = sorted(file for file in path.rglob(f"*{ENDING}") if file.is_file())
-            if not files:
-                raise RecordingError(f"there is no recording (*{ENDING}) in the folder '{path}'")
-        elif glob.has_magic(str(path)) and not path.exists():
-            files = sorted(map(Path, glob.glob(str(path), recursive=True)))  # noqa: PTH207
-            if not files:
-                raise RecordingError(f"no recording fits '{path}'")
-        for file in files:
-            found.setdefault(file.resolve(), file)
-    return list(found.values())
 
 
 def audit_all(
@@ -174,6 +162,8 @@ def check_table_name(path: Path) -> None:
 def write_audits(table: Table, path: Path) -> None:
     """Writes a table of audits as Parquet, CSV or JSON (a list of rows), by the name's end.
 
+    In Parquet a column of numbers has its unit in its metadata, as in an export.
+
     Raises:
         StudyError: See ``check_table_name``, or the file cannot be written.
     """
@@ -182,7 +172,7 @@ def write_audits(table: Table, path: Path) -> None:
     if path.suffix != ".json":
         kept = {**columns, "error": table["error"]}
         results = tuple(name for name in table.results if name in columns)
-        Table(kept, table.parameters, results).write(path)
+        Table(kept, table.parameters, results).write(path, units=_UNITS)
         return
     values = {name: column.tolist() for name, column in columns.items()}
     rows = [dict(zip(values, row, strict=True)) for row in zip(*values.values(), strict=True)]

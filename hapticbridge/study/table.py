@@ -95,10 +95,14 @@ class Table:
             _same(column, other.columns[name]) for name, column in self.columns.items()
         )
 
-    def write(self, path: str | os.PathLike[str]) -> None:
+    def write(self, path: str | os.PathLike[str], units: Mapping[str, str] | None = None) -> None:
         """Writes the table to one file, CSV or Parquet by the name's end.
 
         Numbers in CSV have as many digits as bring back the same double.
+
+        Args:
+            path: The file.
+            units: By name of a column; Parquet keeps them as its metadata ``unit``.
 
         Raises:
             StudyError: The name ends otherwise, pyarrow is missing, or the file cannot be written.
@@ -107,7 +111,7 @@ class Table:
         columns = {name: column.tolist() for name, column in self.columns.items()}
         check_format(form := path.suffix.removeprefix("."))
         try:
-            path.write_bytes(csv_bytes(columns) if form == "csv" else parquet_bytes(columns))
+            path.write_bytes(csv_bytes(columns) if form == "csv" else parquet_bytes(columns, units))
         except OSError as error:
             raise StudyError(f"{path}: cannot be written ({error.strerror})") from None
 
@@ -158,8 +162,14 @@ def csv_bytes(columns: Mapping[str, Sequence[Value | None]]) -> bytes:
     return buffer.getvalue().encode()
 
 
-def parquet_bytes(columns: Mapping[str, Sequence[Value | None]]) -> bytes:
+def parquet_bytes(
+    columns: Mapping[str, Sequence[Value | None]], units: Mapping[str, str] | None = None
+) -> bytes:
     """Returns columns as Parquet; a column of several types becomes text.
+
+    Args:
+        columns: Values by name.
+        units: By name of a column, for its metadata.
 
     Raises:
         StudyError: pyarrow is not installed.
@@ -171,8 +181,13 @@ def parquet_bytes(columns: Mapping[str, Sequence[Value | None]]) -> bytes:
             arrays[name] = arrow.array([None if v is None else str(v) for v in values])
         else:
             arrays[name] = arrow.array(values, from_pandas=False)
+    fields = [
+        arrow.field(name, array.type, metadata={"unit": unit} if unit else None)
+        for name, array in arrays.items()
+        for unit in [(units or {}).get(name)]
+    ]
     buffer = io.BytesIO()
-    parquet.write_table(arrow.table(arrays), buffer)
+    parquet.write_table(arrow.table(list(arrays.values()), schema=arrow.schema(fields)), buffer)
     return buffer.getvalue()
 
 

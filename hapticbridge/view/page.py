@@ -26,7 +26,7 @@ _SMALL = {"font": "11px sans-serif", "ticks": {"size": 4}, "gap": 2}
 _AXES: tuple[dict[str, Any], ...] = ({"size": 22, **_SMALL}, {"size": 52, **_SMALL})
 
 _COLOURS_MEAN = (
-    "Blue ghost: the handle. Spring: the coupling, {length}, green at rest, red at the largest "
+    "Blue ghost: the handle. Spring: the coupling, {length}, pale at rest, red at the largest "
     "force. Orange arrow: the force on the hand, the longest is {longest} N. Turquoise: contacts "
     "and their forces, the longest is {strongest} N."
 )

@@ -74,6 +74,7 @@ class Repetition:
             clutch=run.clutch,
             dead_man=run.dead_man,
             start_state=run.start_state,
+            counts=run.parameters.counts,
         )
         self._per_tick = run.parameters.period / bridge.period
         trip = ""

@@ -468,6 +468,7 @@ FAULTS = (
     Fault("Ctrl-C", acting(_signal(signal.SIGINT)), "stops", "SIGINT"),
     Fault("SIGTERM", acting(_signal(signal.SIGTERM)), "stops", "SIGTERM"),
     Fault("SIGHUP", acting(_signal(signal.SIGHUP)), "stops", "SIGHUP"),
+    Fault("Ctrl-\\", acting(_signal(signal.SIGQUIT)), "stops", "SIGQUIT"),
     Fault("Ctrl-Z", acting(_signal(signal.SIGTSTP)), "stops", "SIGTSTP"),
     Fault("time of day set back", _wall_clock, "goes on"),
 )

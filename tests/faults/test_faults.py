@@ -133,6 +133,21 @@ def test_a_signal_that_is_ignored_stays_ignored() -> None:
     assert summary.stopped_by == "duration"
 
 
+def test_a_signal_that_a_library_handles_stays_with_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Python says None of it, and cannot put it back: a run must not fail at its end for that."""
+    seen, before = signal.getsignal, signal.getsignal(signal.SIGHUP)
+
+    def told(number: int) -> Any:
+        return None if number == signal.SIGHUP else seen(number)
+
+    monkeypatch.setattr(signal, "getsignal", told)
+    with fast("point_mass", ScriptedDevice(sway)) as bridge:
+        heeded: list[Any] = []
+        bridge.run(0.02, lambda _: heeded.append(seen(signal.SIGHUP)))
+    assert heeded[-1] is before
+    assert seen(signal.SIGHUP) is before
+
+
 def test_a_killed_recorders_last_records_are_written_by_the_bridge(tmp_path: Path) -> None:
     fault: Any = next(fault for fault in FAULTS if fault.name == "recorder killed")
     outcome = fault.run(tmp_path)

@@ -47,9 +47,6 @@ class Effects:
         reports: Its reports.
         interval: Time in s that a report to it takes, None where unknown.
 
-    Attributes:
-        reports_sent: Reports that the loop has sent.
-
     Raises:
         DeviceError: The device has no room for two effects, or refuses them.
         DeviceLost: It is gone.
@@ -73,7 +70,6 @@ class Effects:
         self._starts = [reports.operate(index, START) for index in self._indices]
         self._sent: list[int | None] = [None] * count
         self._ticks = self._every = 0
-        self.reports_sent = 0
 
     def start(self, period: float) -> None:
         """Gives the effects their direction and their life, and starts them without force.
@@ -106,12 +102,12 @@ class Effects:
             counts = round(min(max(share, -1.0), 1.0) * magnitude.full)
             # sent again with a restart, in case the one before was lost
             if is_due or counts != self._sent[axis]:
-                self._write(magnitude.report(counts), axis)
+                self._link.write(magnitude.report(counts), axis)
                 self._sent[axis] = counts
         if is_due:
             self._ticks = 0
             for axis, start in enumerate(self._starts):
-                self._write(start, len(ANGLES) + axis)
+                self._link.write(start, len(ANGLES) + axis)
 
     def farewell(self) -> tuple[bytes, ...]:
         """Returns what takes the force away, the effects too, and switches the motors off."""
@@ -128,10 +124,6 @@ class Effects:
         """Sends the ``farewell``."""
         for report in self.farewell():
             self._send(report)
-
-    def _write(self, report: bytes, slot: int) -> None:
-        self._link.write(report, slot)
-        self.reports_sent += 1
 
     def _send(self, report: bytes | None) -> None:
         if report is not None:

@@ -1,1 +1,5 @@
-"""A simulated device in a simulated hand."""
+"""A simulated device in a simulated hand.
+
+``driver`` is the device, ``handheld`` its compiled step, ``sampled_axis`` the exact solution of one
+axis; ``hand`` and ``scene_hand`` say who holds it.
+"""

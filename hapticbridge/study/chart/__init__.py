@@ -1,4 +1,11 @@
-"""Speed against accuracy: every way to simulate a scene on one picture."""
+"""Speed against accuracy: every way to simulate a scene on one picture.
+
+Read ``setting`` (how a point is simulated), ``workload`` (what) and ``chart`` (every point judged
+by its ``score``, then all timed, ``timing``) first. Workloads are in ``catalogue``; most are
+``staged`` on a ``scene_run``, and other engines do the same work in an ``engine_run``.
+``recommendation`` says what to use; ``files`` writes it all, by ``drawing`` and ``page``.
+``work`` is another question: how a tick's time grows with what is in a scene.
+"""
 
 from hapticbridge.study.chart.catalogue import Extent as Extent
 from hapticbridge.study.chart.catalogue import open_workload as open_workload

@@ -8,7 +8,6 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
-from scipy.integrate import solve_ivp
 
 from hapticbridge.check.felt import FORCE_FLOOR, LEVER, tool_angles
 from hapticbridge.coupling import Coupling
@@ -82,28 +81,6 @@ def exact_orientations(grid: float, count: int) -> NDArray[np.float64]:
     motion = integrate_rotation(INERTIA, SPIN, FINE_STEP, every * count, "midpoint")
     found = motion.orientation[every::every]
     return np.where(found[:, :1] < 0, -found, found)
-
-
-def orientations_by_dop853(grid: float, count: int) -> NDArray[np.float64]:
-    """Returns the same by SciPy's explicit Runge–Kutta method of order 8: another route.
-
-    Euler's equations and q' = ½ q ⊗ ω, to a relative tolerance of 1e-12.
-    """
-    moments = np.array(INERTIA)
-
-    def rate(_time: float, state: NDArray[np.float64]) -> NDArray[np.float64]:
-        w, u, omega = state[0], state[1:4], state[4:]
-        turning = -np.cross(omega, moments * omega) / moments
-        return np.concatenate([[-0.5 * u @ omega], 0.5 * (w * omega + np.cross(u, omega)), turning])
-
-    times = grid * np.arange(1, count + 1)
-    start = np.array([1.0, 0.0, 0.0, 0.0, *SPIN])
-    found = (
-        solve_ivp(rate, (0.0, times[-1]), start, "DOP853", t_eval=times, rtol=1e-12, atol=1e-13)
-        .y[:4]
-        .T
-    )
-    return np.asarray(np.where(found[:, :1] < 0, -found, found))
 
 
 class SpinningBody(Staged):

@@ -1,4 +1,9 @@
-"""Where methods fail: stability maps, theory drawn over measurement."""
+"""Where methods fail: stability maps, theory drawn over measurement.
+
+Read ``stability_map`` first, then one map with what belongs to it, as ``coupling``,
+``coupling_runs`` and ``coupling_picture``: its points and words, what happens at each, how that is
+drawn. ``rigs``, ``bisection``, ``verdicts`` and ``palette`` are what maps share.
+"""
 
 from hapticbridge.study.maps.contact import CONTACT
 from hapticbridge.study.maps.coupling import COUPLING
