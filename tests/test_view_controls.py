@@ -163,12 +163,15 @@ def test_why_a_recorder_did_not_start_stays_on_the_page(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with running(tmp_path) as (bridge, window), hand(window.url) as page:
-        page.send("stop recording", value=True)
+        said(page, "recording to")
+        # one button, which says what it would do at the time when the page was opened
+        button = next(label for label in page.elements if label.endswith(" recording"))
+        page.send(button, value=True)
         said(page, "not recording")
         until(lambda: not bridge._stream.is_recording)
         monkeypatch.setattr(bridge, "_next_path", lambda: tmp_path / "no folder" / "run.mcap")
         time.sleep(1.0)  # the least time between two pauses
-        page.send("stop recording", value=True)  # the same button, which has another label now
+        page.send(button, value=True)
         reason = said(page, "refused")
         assert "no folder" in reason
         assert "not recording" in reason
