@@ -11,6 +11,7 @@ import signal
 import socket
 import sys
 import threading
+import time
 import types
 from collections.abc import Iterator
 from functools import partial
@@ -42,7 +43,7 @@ from hapticbridge.view.window import Window
 pytest.importorskip("viser", reason="needs the extra 'view'")
 
 import websockets.exceptions
-from page_client import hand, said
+from page_client import PATIENCE, hand, said
 from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 
@@ -393,6 +394,43 @@ def test_whatever_a_browser_sends_for_the_time_the_replay_goes_on(
         page.send("time (s)", value=1.2)
         assert said(page, "**1.2").startswith("**1.200 s**")
     assert "Traceback" not in capfd.readouterr().err
+
+
+def test_of_two_times_that_are_asked_for_at_once_the_newer_stays(
+    replay: Replay, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with served(replay, Address("127.0.0.1", 0)) as (theatre, _), hand(theatre.url) as page:
+        draw, is_drawing = theatre._page.show, threading.Event()
+
+        def slow_at_first(sight: Sight) -> None:
+            if sight.time < 1.0:
+                is_drawing.set()
+                time.sleep(0.3)  # in which the newer would be drawn, if it did not wait
+            draw(sight)
+
+        monkeypatch.setattr(theatre._page, "show", slow_at_first)
+        page.send("time (s)", value=0.4)
+        assert is_drawing.wait(PATIENCE)
+        page.send("time (s)", value=1.2)
+        said(page, "**1.200 s**")
+        time.sleep(0.5)
+        assert theatre._page.status.content.startswith("**1.200 s**")
+
+
+def test_a_replay_that_plays_moves_on_and_begins_again_at_its_end(replay: Replay) -> None:
+    is_over = threading.Event()
+    with served(replay, Address("127.0.0.1", 0)) as (theatre, _), hand(theatre.url) as page:
+        player = threading.Thread(target=theatre.play, args=(is_over,))
+        player.start()
+        try:
+            page.send("time (s)", value=1.2)
+            page.send("play", value=True)
+            said(page, "**1.4")
+            said(page, "**0.")
+        finally:
+            is_over.set()
+            player.join(PATIENCE)
+    assert not player.is_alive()
 
 
 def test_a_killed_view_and_ten_deaf_browsers_do_not_touch_the_run(

@@ -82,6 +82,8 @@ class Theatre:
 
     def __init__(self, replay: Replay, address: Address) -> None:
         self._replay = replay
+        # viser calls from as many threads as it likes: an older time must not be drawn last
+        self._turn = threading.Lock()
         self._server: viser.ViserServer = serve(address)
         self.url = address.url(self._server.get_port())
         stage = replay.stage
@@ -103,7 +105,7 @@ class Theatre:
         if len(replay.trace) > 1:
             self._page.plot(*replay.trace.curves())
         self.show(0.0)
-        self.slider.on_update(lambda _: self.show(self.slider.value))
+        self.slider.on_update(lambda _: self._follow())
 
     def show(self, moment: float) -> None:
         """Shows the instant nearest to a time in s."""
@@ -118,9 +120,12 @@ class Theatre:
             now, last = time.monotonic(), self._replay.sights[-1].time
             if self._playing.value:
                 following = self.slider.value + now - before
-                self.slider.value = following if 0.0 <= following <= last else 0.0
-                self.show(self.slider.value)
+                self.slider.value = following if 0.0 <= following <= last else 0.0  # shows it
             before = now
+
+    def _follow(self) -> None:
+        with self._turn:
+            self.show(self.slider.value)
 
     def close(self) -> None:
         """Ends serving."""
