@@ -31,7 +31,7 @@ def print_audits(table: Table) -> None:
             out.print(f"{'':>10}{_why(verdict, reason, str(table.texts('certified')[row]))}")
     counts = Counter(verdicts)
     told = ", ".join(f"{counts[verdict]} {verdict}" for verdict in _COLOURS if counts[verdict])
-    out.print(f"{len(table)} recordings: {told}")
+    out.print(f"{len(table)} recording{'s' if len(table) > 1 else ''}: {told}")
 
 
 def print_unreadable(table: Table) -> None:
