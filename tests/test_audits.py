@@ -141,6 +141,17 @@ def vars_of(report: AuditReport) -> dict[str, Any]:
     return {name: getattr(report, name) for name in AuditReport.__dataclass_fields__}
 
 
+def test_the_words_of_a_verdict_name_no_more_than_it_says() -> None:
+    for verdict, environment, port, words in (
+        ("passive", "within slack", "", "passive (within slack)"),
+        ("active", "active", "environment", "active (environment)"),
+        ("active", "strict", "device", "active (device)"),  # strict is what the other port was
+        ("invalid", None, "tool_position", "invalid"),
+    ):
+        values: dict[str, Any] = {"verdict": verdict, "environment": environment, "port": port}
+        assert AuditReport(Path("a"), certified=None, reason="", **values).words == words
+
+
 def test_the_damping_margin_is_that_of_the_condition(runs: Path) -> None:
     # lossless adds K T/2 to what is used, so B' = 0.9 − 0.5: 1 − (0.5 + 0.4)/2
     assert audit(runs / "a/b/weak.mcap").margin == pytest.approx(0.55)

@@ -98,7 +98,7 @@ def test_numbers_that_cannot_be_drawn_leave_the_table(made_active: WhatIf, tmp_p
     write_what_if(replace(made_active, runs=(*made_active.runs[:2], broken)), page)
     text = text_of(page)
     assert "Side by side" not in text
-    assert "<td>verdict</td><td>passive (strict)</td><td>active (active)</td>" in text
+    assert "<td>verdict</td><td>passive (strict)</td><td>active (environment)</td>" in text
     with pytest.raises(RecordingError, match="cannot write"):
         write_what_if(made_active, tmp_path)
 

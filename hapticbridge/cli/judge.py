@@ -181,8 +181,7 @@ def _scene_picture(recording: Recording, report: AuditReport) -> bytes | None:
 
 def _print_report(report: AuditReport) -> None:
     colour = _COLOURS[report.verdict]
-    environment = f" ({report.environment})" if report.environment else ""
-    out.print(f"{plain(str(report.path))}: [bold {colour}]{report.verdict}[/]{environment}")
+    out.print(f"{plain(str(report.path))}: [bold {colour}]{report.words}[/]")
     out.print(f"  {plain(report.reason)}")
     if report.resimulation.startswith("not"):
         out.print(f"  [yellow]{plain(report.resimulation)}[/]")
