@@ -220,9 +220,9 @@ class Repair:
         hapticbridge repair cut.mcap whole.mcap
     """
 
-    file: tyro.conf.Positional[Path]
+    file: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FILE")]
     """The cut recording; it is not changed."""
-    output: tyro.conf.Positional[Path]
+    output: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="OUTPUT")]
     """The file to write; it must not exist."""
 
     def execute(self) -> int:
