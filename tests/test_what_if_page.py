@@ -99,8 +99,16 @@ def test_numbers_that_cannot_be_drawn_leave_the_table(made_active: WhatIf, tmp_p
     text = text_of(page)
     assert "Side by side" not in text
     assert "<td>verdict</td><td>passive (strict)</td><td>active (environment)</td>" in text
+
+
+def test_a_page_goes_under_the_name_of_a_page_alone(made_active: WhatIf, tmp_path: Path) -> None:
+    before = made_active.path.read_bytes()
+    with pytest.raises(RecordingError, match="does not end like a page"):
+        write_what_if(made_active, made_active.path)
+    assert made_active.path.read_bytes() == before
+    (tmp_path / "folder.html").mkdir()
     with pytest.raises(RecordingError, match="cannot write"):
-        write_what_if(made_active, tmp_path)
+        write_what_if(made_active, tmp_path / "folder.html")
 
 
 def test_a_browser_shows_it_without_a_request_or_a_complaint(
