@@ -56,7 +56,7 @@ LIGHT_HAND = Hand(mass=0.01, damping=0.0, stiffness=60.0)
 FULL = Limits(force=10.0, torque=0.5, ramp=0.05)
 
 
-def _circling(tick: int) -> tuple[float, ...]:
+def circling(tick: int) -> tuple[float, ...]:
     angle = 2 * np.pi * 3e-3 * tick
     return (0.02 * np.sin(angle), 0.01 * (1 - np.cos(angle)), 0, 1, 0, 0, 0)
 
@@ -68,7 +68,7 @@ def _tapping(tick: int) -> tuple[float, ...]:
 def active_by_method(folder: Path) -> Path:
     """A light tool under an integrator that creates energy in free motion."""
     path = folder / "method.mcap"
-    device = ScriptedDevice(_circling)
+    device = ScriptedDevice(circling)
     recorded(path, "point_mass", device, LOOSE, duration=0.3, method="implicitfast")
     return path
 

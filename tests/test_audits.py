@@ -141,6 +141,17 @@ def vars_of(report: AuditReport) -> dict[str, Any]:
     return {name: getattr(report, name) for name in AuditReport.__dataclass_fields__}
 
 
+def test_the_words_of_a_verdict_name_no_more_than_it_says() -> None:
+    for verdict, environment, port, words in (
+        ("passive", "within slack", "", "passive (within slack)"),
+        ("active", "active", "environment", "active (environment)"),
+        ("active", "strict", "device", "active (device)"),  # strict is what the other port was
+        ("invalid", None, "tool_position", "invalid"),
+    ):
+        values: dict[str, Any] = {"verdict": verdict, "environment": environment, "port": port}
+        assert AuditReport(Path("a"), certified=None, reason="", **values).words == words
+
+
 def test_the_damping_margin_is_that_of_the_condition(runs: Path) -> None:
     # lossless adds K T/2 to what is used, so B' = 0.9 − 0.5: 1 − (0.5 + 0.4)/2
     assert audit(runs / "a/b/weak.mcap").margin == pytest.approx(0.55)
@@ -242,11 +253,34 @@ def test_the_command_prints_a_line_each_and_the_worst_exit_code(
     assert float(rows[2]["margin"]) == pytest.approx(-0.5)
     code, out, _ = call("audit", f"{runs}/a/b/*.mcap")
     assert code == 0
-    assert "1 recordings: 1 passive" in out
+    assert "1 recording: 1 passive" in out
     code, out, err = call("audit", runs, "--json", "--jobs", 1)
     assert (code, len(json.loads(out)), err.count("error:")) == (2, 5, 1)
     code, _, err = call("audit", runs, "--what-if", "rate=500")
     assert (code, "one recording at a time" in err) == (2, True)
+
+
+def test_ctrl_c_leaves_the_table_of_what_was_judged(
+    runs: Path, call: Called, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(path: str, *, strict: bool) -> AuditReport:
+        if path.endswith("stiff.mcap"):  # the last of six
+            raise KeyboardInterrupt
+        return audit(path, strict=strict)
+
+    monkeypatch.setattr("hapticbridge.study.audits.audit", interrupted)
+    target = tmp_path / "all.json"
+    code, out, err = call("audit", runs, "--jobs", 1, "--table", target)
+    assert code == 130
+    assert "5 recordings: 3 passive, 1 invalid, 1 unreadable" in out
+    assert "incomplete: 1 of 6 recordings were not judged" in err
+    assert err.rstrip().endswith("interrupted")
+    rows = json.loads(target.read_text())
+    assert [Path(row["file"]).name for row in rows[:2]] == ["foreign.mcap", "changed.mcap"]
+    assert len(rows) == 5
+    # before anything was judged there is nothing to tell
+    code, out, err = call("audit", runs / "stiff.mcap", runs / "cut.mcap", "--jobs", 1)
+    assert (code, out, err.strip()) == (130, "", "interrupted")
 
 
 @pytest.mark.parametrize("ending", ["parquet", "json"])

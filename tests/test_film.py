@@ -29,7 +29,6 @@ import json, sys
 sys.path.insert(0, sys.argv[1])
 import mujoco, numpy as np
 from hapticbridge.film.artist import Camera
-from hapticbridge.film.encoder import Encoder
 from hapticbridge.film.stage import Stage
 stage = Stage(sys.argv[2])
 camera = Camera(stage, 320, 240)

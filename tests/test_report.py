@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import report_runs
+from audit_cases import ScriptedDevice, SlowClock, recorded
 from chromium import browser
 from cli_cases import Called
 from PIL import Image
@@ -24,7 +25,13 @@ from hapticbridge.recording import Recording, read_recording
 from hapticbridge.report import write_report
 from hapticbridge.report.energies import draw_energies
 from hapticbridge.report.evidence import Evidence
-from hapticbridge.report.facts import MOST_EVENTS, MOST_INPUTS, event_rows, guard_facts
+from hapticbridge.report.facts import (
+    MOST_EVENTS,
+    MOST_INPUTS,
+    event_rows,
+    guard_facts,
+    head_facts,
+)
 from hapticbridge.report.lead import is_warned, notes
 from hapticbridge.report.likely import likely_cause
 from hapticbridge.report.motion import draw_motion
@@ -164,6 +171,20 @@ def test_a_run_in_real_time_shows_how_late_its_ticks_were(run_file: Path) -> Non
     counts = [bar.get_height() for bar in histogram.patches]  # type: ignore[attr-defined]
     assert sum(counts) == len(ticks)
     assert histogram.get_xlim()[1] > len(ticks) - 2
+
+
+def test_a_page_says_which_time_its_curves_leave_out(run_file: Path, tmp_path: Path) -> None:
+    path, device = tmp_path / "late.mcap", ScriptedDevice(report_runs.circling)
+    recorded(path, "point_mass", device, duration=0.05, clock=SlowClock({20: 3, 30: 1}))
+    for file, told in (
+        (path, "0.050 s, 46 ticks, deadlines missed: 4, at 2 of them; times below leave those out"),
+        (run_file, "0.201 s, 201 ticks, in simulated time"),
+    ):
+        recording, report = read_recording(file), audit(file)
+        assert dict(head_facts(report, evidence_of(recording)))["ran"] == told
+        live = replace(recording, meta=recording.meta | {"clock": "monotonic"})
+        ran = dict(head_facts(report, evidence_of(live)))["ran"]
+        assert ("no deadline missed" in ran) is (file == run_file)
 
 
 def test_what_stopped_a_run_is_listed_after_any_number_of_inputs() -> None:

@@ -15,6 +15,7 @@ from concurrent.futures import BrokenExecutor, Future
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import sweep_functions as functions
 from sweep_runs import computed, parts, serial
@@ -22,7 +23,7 @@ from sweep_runs import computed, parts, serial
 from hapticbridge.signals import holding_interrupts
 from hapticbridge.study.points import Point, grid, point_key
 from hapticbridge.study.sweep import Chunk, _Shift, sweep
-from hapticbridge.study.table import Outcome
+from hapticbridge.study.table import Interrupted, Outcome
 from hapticbridge.study.task import WORKER_DIED
 from hapticbridge.study.workers import InThisProcess, Workers
 
@@ -177,10 +178,12 @@ def test_ctrl_c_keeps_what_is_done(scratch: Path) -> None:
         executor=InThisProcess(),
         chunk=2,
     )
-    with pytest.raises(KeyboardInterrupt):
+    with pytest.raises(Interrupted) as stop:
         again()
     assert len(parts(folder)) == 3
-    assert again().equals(serial(functions.counted, functions.COUNTED))
+    whole = serial(functions.counted, functions.COUNTED)
+    assert stop.value.table.equals(whole.select(np.arange(6)))
+    assert again().equals(whole)
     assert computed(scratch)[5] == 2  # once in the folder, once in the serial run
 
 

@@ -182,7 +182,7 @@ def test_missed_deadlines_come_back_where_the_motion_is_prescribed(tmp_path: Pat
         # a stall of 80 ms re-seats the coupling, in both
         assert (before["flags"] & int(TickFlag.RESEATED)).any() == (missed > 0)
         assert before.tobytes() == after.tobytes()
-        told = [note for note in found.notes if note.startswith("missed deadlines: 1")]
+        told = [note for note in found.notes if note.startswith("late ticks: 1")]
         assert [("none in the closed loop" in note) for note in told] == [True] * (missed > 0)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import io
 import re
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from audit_cases import ScriptedDevice, recorded
 from chromium import browser
 from cli_cases import Called
 from PIL import Image
+from report_runs import Made
 
 from hapticbridge.errors import RecordingError
 from hapticbridge.tick import TICK_DTYPE
@@ -26,7 +28,7 @@ def made_active(tmp_path_factory: pytest.TempPathFactory) -> WhatIf:
     """A passive run that another method makes active, prescribed and in a hand."""
     folder = tmp_path_factory.mktemp("page")
     path = folder / "run.mcap"
-    device = ScriptedDevice(report_runs._circling)
+    device = ScriptedDevice(report_runs.circling)
     recorded(path, "point_mass", device, report_runs.LOOSE, duration=0.3)
     return what_if(path, {"method": "implicitfast", "stiffness": 2500})
 
@@ -51,6 +53,24 @@ def test_the_page_shows_both_verdicts_and_why(made_active: WhatIf, tmp_path: Pat
     assert text.count("[svg]") == 3
     for note in made_active.notes:
         assert note[1:40] in text
+
+
+@pytest.mark.filterwarnings("ignore:scene '.*fan.xml'")
+def test_a_fault_of_a_changed_run_is_laid_to_the_geoms_that_touched_in_it(
+    made: Made, tmp_path: Path
+) -> None:
+    """A body that is moved far away is the cause only where nobody knows what touched."""
+    recording, _ = made(report_runs.active_beside_a_fan)
+    with warnings.catch_warnings():  # of the scene the user was warned when it was recorded
+        warnings.simplefilter("error")
+        found = what_if(recording.path, {"stiffness": 2100})
+    page = tmp_path / "page.html"
+    write_what_if(found, page, scene=b"a picture")
+    text = text_of(page)
+    assert [run.report.verdict for run in found.runs] == ["active"] * 3
+    assert text.count("Likely cause: <strong>contact setting</strong>") == 3
+    assert text.count("while geom 0 touched geom") == 3
+    assert "As recorded, at the moment of the fault" in text
 
 
 def test_a_long_what_if_has_a_page_of_less_than_a_megabyte(
@@ -78,9 +98,17 @@ def test_numbers_that_cannot_be_drawn_leave_the_table(made_active: WhatIf, tmp_p
     write_what_if(replace(made_active, runs=(*made_active.runs[:2], broken)), page)
     text = text_of(page)
     assert "Side by side" not in text
-    assert "<td>verdict</td><td>passive (strict)</td><td>active (active)</td>" in text
+    assert "<td>verdict</td><td>passive (strict)</td><td>active (environment)</td>" in text
+
+
+def test_a_page_goes_under_the_name_of_a_page_alone(made_active: WhatIf, tmp_path: Path) -> None:
+    before = made_active.path.read_bytes()
+    with pytest.raises(RecordingError, match="does not end like a page"):
+        write_what_if(made_active, made_active.path)
+    assert made_active.path.read_bytes() == before
+    (tmp_path / "folder.html").mkdir()
     with pytest.raises(RecordingError, match="cannot write"):
-        write_what_if(made_active, tmp_path)
+        write_what_if(made_active, tmp_path / "folder.html")
 
 
 def test_a_browser_shows_it_without_a_request_or_a_complaint(
@@ -115,3 +143,4 @@ def test_the_command_writes_the_page_and_judges_strictly(
     text = text_of(page)
     assert "The device does not bear the changed coupling" in text
     assert f"data:image/png;base64,{base64.b64encode(b'a picture').decode()}" in text
+    assert "As recorded, when the force was largest" in text

@@ -10,4 +10,5 @@ coupling's, ``watched``, ``controlled``, ``limited`` and ``guarded`` are the gua
 """
 
 from hapticbridge.audit.report import AuditReport as AuditReport
+from hapticbridge.audit.report import verdict_words as verdict_words
 from hapticbridge.audit.verdict import audit as audit

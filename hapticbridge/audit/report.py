@@ -64,6 +64,11 @@ class AuditReport:
     energies: dict[str, float] = field(default_factory=dict)
     events: dict[str, int] = field(default_factory=dict)
 
+    @property
+    def words(self) -> str:
+        """The verdict in a few words; see ``verdict_words``."""
+        return verdict_words(self.verdict, self.environment or "", self.port)
+
     def to_json(self) -> str:
         """Returns the report as one JSON object; a number that is not finite becomes null."""
         values = asdict(self) | {"path": str(self.path), "margin": self.margin}
@@ -90,3 +95,15 @@ class AuditReport:
         if self.verdict == "active":
             parts.append(0.0)
         return min(parts)
+
+
+def verdict_words(verdict: str, environment: str, port: str) -> str:
+    """Returns a verdict with what goes beside it: how passive a run was, or where it was active.
+
+    Args:
+        verdict: As ``AuditReport`` has it; so are the others.
+        environment: Nothing where it is not known.
+        port: Likewise.
+    """
+    beside = {"passive": environment, "active": port}.get(verdict)
+    return f"{verdict} ({beside})" if beside else verdict

@@ -27,7 +27,7 @@ class Export:
         hapticbridge export run.mcap --to parquet
     """
 
-    file: tyro.conf.Positional[Path]
+    file: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FILE")]
     """The recording."""
     to: Literal["parquet", "csv", "hdf5"]
     """The format; parquet needs the extra 'tables', hdf5 the extra 'hdf5'."""
@@ -67,9 +67,9 @@ class Compare:
         hapticbridge compare before.mcap after.mcap
     """
 
-    first: tyro.conf.Positional[Path]
+    first: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="A")]
     """A recording."""
-    second: tyro.conf.Positional[Path]
+    second: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="B")]
     """Another one."""
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
     """Print the comparison as JSON."""

@@ -28,6 +28,7 @@ from hapticbridge.study.audits import (
     write_audits,
 )
 from hapticbridge.study.findings import find_recordings
+from hapticbridge.study.table import Interrupted, Table
 from hapticbridge.whatif import changes_from, draw_what_if, what_if, write_what_if
 
 SCENE_SIZE = 640, 400
@@ -43,9 +44,9 @@ class Audit:
 
     Several recordings, a folder (searched through and through) or a pattern give a table, sorted by
     the margin: the least share left, of the slack and of the device's damping; negative beyond the
-    limit. What is no recording is named and passed over. Exit code 0 if all are passive and no
-    device lacks damping, 1 if not, 2 if a file is no recording; with --what-if it is that of the
-    changed runs. Examples:
+    limit. What is no recording is named and passed over; Ctrl-C ends with the table of what was
+    judged by then. Exit code 0 if all are passive and no device lacks damping, 1 if not, 2 if a
+    file is no recording; with --what-if it is that of the changed runs. Examples:
 
         hapticbridge audit run.mcap --plot run.png
         hapticbridge audit runs/ --jobs 4 --table runs.parquet
@@ -109,14 +110,24 @@ class Audit:
             raise RecordingError(
                 "--plot, --report and --what-if take one recording at a time, and make no --table"
             )
-        with progress("auditing") as show:
-            table = audit_all(
-                files,
-                strict=self.strict,
-                jobs=self.jobs,
-                scheduler=self.scheduler,
-                progress=show,
-            )
+        try:
+            with progress("auditing") as show:
+                table = audit_all(
+                    files,
+                    strict=self.strict,
+                    jobs=self.jobs,
+                    scheduler=self.scheduler,
+                    progress=show,
+                )
+        except Interrupted as stop:
+            self._tell(stop.table)
+            missing = f"{len(files) - len(stop.table)} of {len(files)} recordings were not judged"
+            err.print(f"[yellow]warning:[/yellow] incomplete: {missing}")
+            raise
+        self._tell(table)
+        return worst_exit_code(table)
+
+    def _tell(self, table: Table) -> None:
         if self.as_json:
             out.print_json(json.dumps(reports_of(table)))
             print_unreadable(table)
@@ -125,7 +136,6 @@ class Audit:
         if self.table is not None:
             write_audits(table, self.table)
             err.print(f"wrote {plain(str(self.table))}")
-        return worst_exit_code(table)
 
     def _ask(self, file: Path) -> int:
         with progress("what if") as show:
@@ -171,8 +181,7 @@ def _scene_picture(recording: Recording, report: AuditReport) -> bytes | None:
 
 def _print_report(report: AuditReport) -> None:
     colour = _COLOURS[report.verdict]
-    environment = f" ({report.environment})" if report.environment else ""
-    out.print(f"{plain(str(report.path))}: [bold {colour}]{report.verdict}[/]{environment}")
+    out.print(f"{plain(str(report.path))}: [bold {colour}]{report.words}[/]")
     out.print(f"  {plain(report.reason)}")
     if report.resimulation.startswith("not"):
         out.print(f"  [yellow]{plain(report.resimulation)}[/]")
@@ -211,9 +220,9 @@ class Repair:
         hapticbridge repair cut.mcap whole.mcap
     """
 
-    file: tyro.conf.Positional[Path]
+    file: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FILE")]
     """The cut recording; it is not changed."""
-    output: tyro.conf.Positional[Path]
+    output: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="OUTPUT")]
     """The file to write; it must not exist."""
 
     def execute(self) -> int:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import tyro
 
@@ -24,9 +25,9 @@ class Render:
         hapticbridge render run.mcap slow.mp4 --start 2 --stop 3 --speed 0.1
     """
 
-    file: tyro.conf.Positional[Path]
+    file: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FILE")]
     """The recording (.mcap)."""
-    output: tyro.conf.Positional[Path]
+    output: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="OUTPUT")]
     """The picture (.png), or the film (.mp4, extra 'view')."""
     at: float | None = None
     """Of a picture: seconds from the start; by default the last tick."""

@@ -6,6 +6,7 @@ import contextlib
 import threading
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import tyro
 
@@ -23,7 +24,7 @@ class View:
         hapticbridge view run.mcap
     """
 
-    file: tyro.conf.Positional[Path]
+    file: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FILE")]
     """The recording (.mcap)."""
     host: str = "127.0.0.1"
     """Address to serve the page on; another than this machine's own needs the token that is

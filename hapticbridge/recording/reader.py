@@ -217,12 +217,13 @@ def _add_described(contents: Contents, opcode: int, fields: Fields) -> None:
 
 
 def _joined(runs: list[NDArray[np.void]]) -> NDArray[np.void]:
-    """Returns runs as one array."""
+    """Returns runs as one array; the list is emptied, so that memory never holds both."""
     gathered = np.empty(sum(run.size for run in runs), TICK_DTYPE)
-    position = 0
-    for run in runs:
-        gathered[position : position + run.size] = run
-        position += run.size
+    stop = gathered.size
+    while runs:
+        run = runs.pop()
+        gathered[stop - run.size : stop] = run
+        stop -= run.size
     return gathered
 
 

@@ -110,8 +110,8 @@ def _timing(evidence: Evidence, window: slice) -> Cause | None:
     if missed:
         return Cause(
             "rate",
-            f"{missed} deadlines were missed in the {span:.2g} s before, so that a wrench was held "
-            "for longer than the coupling was chosen for",
+            f"ticks late by a period or more in the {span:.2g} s before: {missed}, so that a "
+            "wrench was held for longer than the coupling was chosen for",
             "lower the rate or the load of the machine ('hapticbridge doctor')",
         )
     repeated = float(np.mean((flags & int(TickFlag.STALE_SAMPLE)) != 0))

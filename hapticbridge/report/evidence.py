@@ -33,8 +33,7 @@ class Evidence:
     """A run that can be drawn: n ticks, and per tick what each port has given and may give.
 
     Attributes:
-        ticks: The records, ``TICK_DTYPE``, n >= 1.
-        events: What happened.
+        recording: As it was read, with n >= 1 ticks.
         parameters: The run's.
         worst: The same with the coupling that asks most of the device, where commands changed it.
         info: The device.
@@ -47,8 +46,7 @@ class Evidence:
         model: The compiled scene; None if the file lacks it or this MuJoCo cannot load it.
     """
 
-    ticks: NDArray[np.void]
-    events: list[dict[str, Any]]
+    recording: Recording
     parameters: RunParameters
     worst: RunParameters
     info: DeviceInfo
@@ -58,6 +56,16 @@ class Evidence:
     allowed: Array
     kicked: Array
     model: mujoco.MjModel | None
+
+    @property
+    def ticks(self) -> NDArray[np.void]:
+        """The records, ``TICK_DTYPE``, (n,)."""
+        return self.recording.ticks
+
+    @property
+    def events(self) -> list[dict[str, Any]]:
+        """What happened."""
+        return self.recording.events
 
     @property
     def asked(self) -> Coupling:
@@ -123,8 +131,7 @@ class Evidence:
         except HapticBridgeError:
             return None
         return cls(
-            ticks=ticks,
-            events=recording.events,
+            recording=recording,
             parameters=parameters,
             worst=worst,
             info=info,

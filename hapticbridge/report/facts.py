@@ -137,13 +137,16 @@ def controller_of(evidence: Evidence) -> str:
     return names[evidence.parameters.guarding.controller]
 
 
-def head_facts(report: AuditReport, meta: Mapping[str, str], evidence: Evidence) -> Facts:
+def head_facts(report: AuditReport, evidence: Evidence) -> Facts:
     """Returns what is to be known first: what was run, how it went, and what was checked."""
-    parameters, flags = evidence.parameters, evidence.ticks["flags"]
+    parameters, meta = evidence.parameters, evidence.recording.meta
+    flags = evidence.ticks["flags"]
     ports = evidence.ticks["wrench_on_device"]
     force, torque = (float(np.linalg.norm(ports[:, p], axis=1).max()) for p in _PARTS)
-    missed = int(np.count_nonzero(flags & int(TickFlag.OVERRUN)))
-    in_time = "in simulated time" if meta.get("clock") == "simulated" else f"{missed} missed"
+    in_time = "in simulated time" if meta.get("clock") == "simulated" else "no deadline missed"
+    if late := int(np.count_nonzero(flags & int(TickFlag.OVERRUN))):
+        missed = round(report.duration / parameters.period) - report.ticks
+        in_time = f"deadlines missed: {missed}, at {late} of them; times below leave those out"
     told = [
         ("scene", meta.get("scene", "")),
         ("device", f"{evidence.info.name}, {len(evidence.info.axes)} axes"),

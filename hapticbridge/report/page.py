@@ -8,13 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jinja2 import Environment, PackageLoader, select_autoescape
 
 from hapticbridge.audit import AuditReport
 from hapticbridge.errors import RecordingError
 from hapticbridge.picture import inline_svg
 from hapticbridge.provenance import meta_float
-from hapticbridge.quantity import quantity
 from hapticbridge.recording import Recording
 from hapticbridge.report.curves import draw_recording
 from hapticbridge.report.energies import draw_energies
@@ -29,14 +27,12 @@ from hapticbridge.report.facts import (
     run_facts,
     software_facts,
 )
+from hapticbridge.report.html import write_page
 from hapticbridge.report.lead import PLACES, is_warned, lead_sentence, notes
 from hapticbridge.report.likely import likely_cause
 from hapticbridge.report.moment import draw_moment
 from hapticbridge.report.motion import draw_motion
 from hapticbridge.report.timing import activities, draw_timing
-
-PAGES = (".html", ".htm")
-"""What a page's name may end in; a browser takes another for text, and it is no recording."""
 
 
 def telling_time(recording: Recording, report: AuditReport) -> float:
@@ -57,21 +53,6 @@ def telling_time(recording: Recording, report: AuditReport) -> float:
     return tick * meta_float(recording.meta, "period_s")
 
 
-def check_page_name(path: Path) -> None:
-    """Checks that a page can be written under its name, before anything is computed for it.
-
-    Args:
-        path: The file to be written.
-
-    Raises:
-        RecordingError: The name does not end like a page, or its folder does not exist.
-    """
-    if path.suffix.lower() not in PAGES:
-        raise RecordingError(f"'{path}' does not end like a page; endings: {', '.join(PAGES)}")
-    if not path.absolute().parent.is_dir():
-        raise RecordingError(f"cannot write '{path}': its folder does not exist")
-
-
 def write_report(
     recording: Recording, report: AuditReport, path: Path, scene: bytes | None = None
 ) -> None:
@@ -86,16 +67,13 @@ def write_report(
     Raises:
         RecordingError: The page cannot be written, or not under this name.
     """
-    check_page_name(path)
-    environment = Environment(
-        loader=PackageLoader("hapticbridge", "templates"), autoescape=select_autoescape()
-    )
-    environment.filters["quantity"] = quantity
     evidence, meta = Evidence.of(recording), recording.meta
     rows = event_rows(recording.events)
-    run = None if evidence is None else _drawn(evidence, report, recording)
+    run = None if evidence is None else _drawn(evidence, report)
     moment = None if run is None else run["moment"]
-    page = environment.get_template("report.html").render(
+    write_page(
+        path,
+        "report.html",
         report=asdict(report),
         name=report.path.name,
         details={
@@ -114,10 +92,6 @@ def write_report(
         is_warned=is_warned(report),
         curves="" if evidence is not None else _bare_curves(recording),
     )
-    try:
-        path.write_text(page, encoding="utf-8")
-    except OSError as error:
-        raise RecordingError(f"cannot write '{path}': {error.strerror}") from None
 
 
 def _bare_curves(recording: Recording) -> str:
@@ -128,29 +102,28 @@ def _bare_curves(recording: Recording) -> str:
         return ""
 
 
-def _drawn(evidence: Evidence, report: AuditReport, recording: Recording) -> dict[str, Any]:
+def _drawn(evidence: Evidence, report: AuditReport) -> dict[str, Any]:
     """Returns what the page tells of a run whose numbers can be drawn."""
-    lateness, period = evidence.lateness, evidence.parameters.period
+    lateness = evidence.lateness
     is_timed = bool(lateness.any())
     return {
-        "head": head_facts(report, recording.meta, evidence),
+        "head": head_facts(report, evidence),
         "motion": inline_svg(draw_motion(evidence)),
         "energies": inline_svg(draw_energies(evidence)),
         "timing": inline_svg(draw_timing(evidence)),
         "balance": balance_of(report),
-        "moment": moment_of(evidence, report, period),
+        "moment": moment_of(evidence, report),
         "lateness": [float(np.percentile(lateness, p)) for p in (50, 99, 100)] if is_timed else [],
         "shares": [(name, percent(on)) for name, on in activities(evidence) if on.any()],
     }
 
 
-def moment_of(evidence: Evidence, report: AuditReport, period: float) -> dict[str, Any] | None:
+def moment_of(evidence: Evidence, report: AuditReport) -> dict[str, Any] | None:
     """Returns when a port became active, by how much then and at most, and why; None if none did.
 
     Args:
         evidence: Of the run.
         report: The audit's verdict on it.
-        period: T in s.
     """
     cause = likely_cause(evidence, report)
     if cause is None or report.tick is None:
@@ -161,7 +134,7 @@ def moment_of(evidence: Evidence, report: AuditReport, period: float) -> dict[st
     return {
         "drawn": inline_svg(draw_moment(evidence, report)),
         "place": PLACES.get(report.port, report.port),
-        "time": report.tick * period,
+        "time": report.tick * evidence.parameters.period,
         "cause": cause,
         "worst": float(excess[worst]),
         "worst_tick": int(evidence.ticks["tick"][worst]),

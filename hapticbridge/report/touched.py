@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from hapticbridge.audit import AuditReport
 from hapticbridge.audit.rerun import Rerun
 from hapticbridge.errors import RecordingError
-from hapticbridge.recording import open_recording
 from hapticbridge.recording.reader import BLOCK
 from hapticbridge.report.evidence import Evidence
 
@@ -36,7 +35,7 @@ def touched_pairs(
     ticks, total = evidence.ticks, float(gained.sum())
     found: defaultdict[frozenset[int], float] = defaultdict(float)
     try:
-        run = Rerun(open_recording(report.path), evidence.parameters)
+        run = Rerun(evidence.recording, evidence.parameters)
         for begin in range(0, window.start, BLOCK):
             run.add(ticks[begin : min(begin + BLOCK, window.start)])
         for tick, energy in zip(range(window.start, window.stop), gained.tolist(), strict=True):

@@ -9,4 +9,5 @@ done. ``closed_loop``, with ``jitter``, is the run that most sweeps make. On the
 
 from hapticbridge.study.points import grid as grid
 from hapticbridge.study.sweep import sweep as sweep
+from hapticbridge.study.table import Interrupted as Interrupted
 from hapticbridge.study.table import Table as Table

@@ -17,7 +17,7 @@ from hapticbridge.errors import RecordingError, StudyError, choices
 from hapticbridge.jsonable import jsonable
 from hapticbridge.study.points import Value
 from hapticbridge.study.sweep import sweep
-from hapticbridge.study.table import Table, check_format
+from hapticbridge.study.table import Interrupted, Table, check_format
 from hapticbridge.study.workers import InThisProcess
 
 FEW = 8
@@ -85,21 +85,25 @@ def audit_all(
     Raises:
         StudyError: The workers cannot be had.
         RecordingError: There is no recording.
+        Interrupted: Ctrl-C; it has the rows of what was judged by then, sorted likewise.
     """
     if not paths:
         raise RecordingError("audit needs at least one recording")
     is_alone = jobs == 1 or (jobs is None and len(paths) < FEW)
     if is_alone and executor is None and scheduler is None:
         executor = InThisProcess()
-    table = sweep(
-        partial(audit_point, strict=strict),
-        [{"file": str(path.absolute() if scheduler else path)} for path in paths],
-        chunk=1,
-        executor=executor,
-        scheduler=scheduler,
-        jobs=jobs,
-        progress=progress,
-    )
+    try:
+        table = sweep(
+            partial(audit_point, strict=strict),
+            [{"file": str(path.absolute() if scheduler else path)} for path in paths],
+            chunk=1,
+            executor=executor,
+            scheduler=scheduler,
+            jobs=jobs,
+            progress=progress,
+        )
+    except Interrupted as stop:
+        raise Interrupted(_sorted(_with_failures(stop.table))) from None
     return _sorted(_with_failures(table))
 
 

@@ -16,7 +16,7 @@ from hapticbridge.signals import holding_interrupts
 from hapticbridge.study.hiring import hired
 from hapticbridge.study.points import Point, checked_points
 from hapticbridge.study.results import ResultFolder
-from hapticbridge.study.table import Outcome, Table, check_format, table_of
+from hapticbridge.study.table import Interrupted, Outcome, Table, check_format, table_of
 from hapticbridge.study.task import WORKER_DIED, qualified_name, run_task
 from hapticbridge.study.workers import Workers, cores
 
@@ -60,9 +60,9 @@ def sweep(
 
     What goes wrong: a point whose function raises gets a row with the ``error``. So does a point
     that ends its worker process twice; the others of its task are computed again. Ctrl-C keeps
-    what is done, cancels what waits, and raises KeyboardInterrupt. In a terminal it ends this
-    sweep's own processes with it; where it reaches this process alone, tasks that were handed to
-    them, two a core at most, are waited for and kept.
+    what is done, cancels what waits, and raises ``Interrupted`` with those rows, or, without any,
+    KeyboardInterrupt. In a terminal it ends this sweep's own processes with it; where it reaches
+    this process alone, tasks that were handed to them, two a core at most, are waited for and kept.
 
     Args:
         function: Takes a point (a dict of parameters) and returns a mapping of results: numbers
@@ -116,12 +116,21 @@ def sweep(
         done.update(zip(chunk, outcomes, strict=True))
         report(len(done), len(wanted))
 
+    def rows() -> Table:
+        keys = [key for key in wanted if key in done]
+        return table_of([wanted[key] for key in keys], [done[key] for key in keys])
+
     missing = {key: point for key, point in wanted.items() if key not in done}
     if missing:
         chunks = deque(_cut(missing, chunk or _usual_chunk(len(missing))))
-        with hired(function, executor, scheduler, len(chunks), jobs) as workers:
-            _Shift(workers, function, batched, keep).work(chunks)
-    table = table_of(list(wanted.values()), [done[key] for key in wanted])
+        try:
+            with hired(function, executor, scheduler, len(chunks), jobs) as workers:
+                _Shift(workers, function, batched, keep).work(chunks)
+        except KeyboardInterrupt:
+            if done:
+                raise Interrupted(rows()) from None
+            raise
+    table = rows()
     if kept is not None:
         kept.describe(parameters, table.results, len(wanted))
     return table

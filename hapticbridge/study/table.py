@@ -116,6 +116,18 @@ class Table:
             raise StudyError(f"{path}: cannot be written ({error.strerror})") from None
 
 
+class Interrupted(KeyboardInterrupt):
+    """Ctrl-C in the middle of a sweep, with what was done by then.
+
+    Attributes:
+        table: A row for each point that was done, at least one, in the order of the points.
+    """
+
+    def __init__(self, table: Table) -> None:
+        super().__init__()
+        self.table = table
+
+
 def table_of(points: Sequence[Point], outcomes: Sequence[Outcome]) -> Table:
     """Returns the table of points and what became of them, in their order."""
     parameters = tuple(points[0])

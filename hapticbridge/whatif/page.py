@@ -6,12 +6,10 @@ import base64
 from pathlib import Path
 from typing import Any
 
-from jinja2 import Environment, PackageLoader, select_autoescape
-
 from hapticbridge.errors import RecordingError
 from hapticbridge.picture import inline_svg
-from hapticbridge.quantity import quantity
 from hapticbridge.report.evidence import Evidence
+from hapticbridge.report.html import write_page
 from hapticbridge.report.page import moment_of
 from hapticbridge.report.panels import BINS
 from hapticbridge.whatif.outcome import WhatIf, WhatIfRun
@@ -28,19 +26,17 @@ def write_what_if(found: WhatIf, path: Path, scene: bytes | None = None) -> None
         scene: A picture of the recorded scene as PNG, if there is one.
 
     Raises:
-        RecordingError: The page cannot be written.
+        RecordingError: The page cannot be written, or not under this name.
     """
-    environment = Environment(
-        loader=PackageLoader("hapticbridge", "templates"), autoescape=select_autoescape()
-    )
-    environment.filters["quantity"] = quantity
     try:
         drawn = inline_svg(figure_of(found, BINS))
     except RecordingError:  # a run of numbers that cannot be drawn still has a verdict
         drawn = ""
-    page = environment.get_template("what_if.html").render(
+    write_page(
+        path,
+        "what_if.html",
         name=found.path.name,
-        path=str(found.path),
+        recording=str(found.path),
         changes=list(changes(found)),
         runs=[_told(run) for run in found.runs],
         rows=list(rows(found)),
@@ -48,10 +44,6 @@ def write_what_if(found: WhatIf, path: Path, scene: bytes | None = None) -> None
         drawn=drawn,
         scene=scene and base64.b64encode(scene).decode(),
     )
-    try:
-        path.write_text(page, encoding="utf-8")
-    except OSError as error:
-        raise RecordingError(f"cannot write '{path}': {error.strerror}") from None
 
 
 def _told(run: WhatIfRun) -> dict[str, Any]:
@@ -61,5 +53,5 @@ def _told(run: WhatIfRun) -> dict[str, Any]:
         "name": run.name,
         "report": report,
         "sentences": list(sentences(run)),
-        "moment": evidence and moment_of(evidence, report, run.period),
+        "moment": evidence and moment_of(evidence, report),
     }

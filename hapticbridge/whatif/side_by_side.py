@@ -15,7 +15,7 @@ Row = tuple[str, tuple[str, ...]]
 def rows(found: WhatIf) -> Iterator[Row]:
     """Yields what is told of all runs, in the order of ``found.runs``."""
     runs = found.runs
-    yield "verdict", tuple(map(_verdict, runs))
+    yield "verdict", tuple(f"{r.report.words}, tripped" if r.trip else r.report.words for r in runs)
     for name in runs[0].peaks:
         unit = _PEAK_UNITS[name.split()[0]]
         yield f"peak {name}", tuple(quantity(run.peaks[name], unit) for run in runs)
@@ -40,12 +40,6 @@ def sentences(run: WhatIfRun) -> Iterator[str]:
         yield run.report.reason
     if run.trip:
         yield f"tripped: {run.trip}"
-
-
-def _verdict(run: WhatIfRun) -> str:
-    report = run.report
-    words = f"{report.verdict} ({report.environment})" if report.environment else report.verdict
-    return f"{words}, tripped" if run.trip else words
 
 
 def _certified(run: WhatIfRun) -> str:

@@ -191,7 +191,7 @@ def _unrepeated(run: RecordedRun, repetition: Repetition) -> Iterator[str]:
     if missed := int(np.count_nonzero(flags & int(TickFlag.OVERRUN))):
         here = "none in these runs" if is_resampled else "none in the closed loop"
         yield (
-            f"missed deadlines: {missed} when it was recorded, {here}: what the hand did "
+            f"late ticks: {missed} when it was recorded, {here}: what the hand did "
             "meanwhile it does there in one tick"
         )
     if is_resampled:

@@ -1,0 +1,51 @@
+"""Self-contained pages, written from templates."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from jinja2 import Environment, PackageLoader, select_autoescape
+
+from hapticbridge.errors import RecordingError
+from hapticbridge.quantity import quantity
+
+PAGES = (".html", ".htm")
+"""What a page's name may end in; a browser takes another for text, and it is no recording."""
+
+
+def check_page_name(path: Path) -> None:
+    """Checks that a page can be written under its name, before anything is computed for it.
+
+    Args:
+        path: The file to be written.
+
+    Raises:
+        RecordingError: The name does not end like a page, or its folder does not exist.
+    """
+    if path.suffix.lower() not in PAGES:
+        raise RecordingError(f"'{path}' does not end like a page; endings: {', '.join(PAGES)}")
+    if not path.absolute().parent.is_dir():
+        raise RecordingError(f"cannot write '{path}': its folder does not exist")
+
+
+def write_page(path: Path, template: str, **told: object) -> None:
+    """Writes a page.
+
+    Args:
+        path: Where to; an existing file is replaced.
+        template: Name of a file in ``hapticbridge/templates``.
+        told: What it says, by the names that it has there.
+
+    Raises:
+        RecordingError: The page cannot be written, or not under this name.
+    """
+    check_page_name(path)
+    environment = Environment(
+        loader=PackageLoader("hapticbridge", "templates"), autoescape=select_autoescape()
+    )
+    environment.filters["quantity"] = quantity
+    page = environment.get_template(template).render(told)
+    try:
+        path.write_text(page, encoding="utf-8")
+    except OSError as error:
+        raise RecordingError(f"cannot write '{path}': {error.strerror}") from None
