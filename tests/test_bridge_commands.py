@@ -129,6 +129,8 @@ def test_each_command_lands_in_an_event_with_its_tick(run: Callable[..., Any]) -
         ("stop", 1400),
     ]
     assert {e["by"] for e in recording.events if "by" in e} == {"test"}
+    # whoever shows the switches must not take a reset for a force that was turned off
+    assert [e["tick"] for e in recording.events if e.get("fading")] == [1140]
 
 
 def stretched(tick: int) -> tuple[float, ...]:

@@ -118,8 +118,8 @@ class Theatre:
             now, last = time.monotonic(), self._replay.sights[-1].time
             if self._playing.value:
                 following = self.slider.value + now - before
+                # which shows it, as if a hand had done it
                 self.slider.value = following if 0.0 <= following <= last else 0.0
-                self.show(self.slider.value)
             before = now
 
     def close(self) -> None:
