@@ -245,6 +245,32 @@ def test_what_a_hand_rubbed_away_pays_for_no_command(run: Callable[..., Any]) ->
         run(pump, 4.0, **options)
 
 
+def rubbed_and_turned(tick: int) -> tuple[float, ...]:
+    """Turned to and fro until 2 s, then by half a radian and back."""
+    if tick < 2000:
+        swing = min(max((tick - 100) / 200, 0.0), (2000 - tick) / 200, 1.0)
+        angle = 0.3 * swing * math.sin(0.04 * tick)
+    else:
+        angle = 0.5 * min(max((tick - 2500) / 400, 0.0), 1.0, max((3800 - tick) / 400, 0.0))
+    return (0, 0, 0, math.cos(angle / 2), 0, math.sin(angle / 2), 0)
+
+
+@pytest.mark.parametrize("is_forgotten", [True, False])
+def test_what_a_hand_rubbed_away_by_turning_pays_for_no_command_either(
+    run: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, is_forgotten: bool
+) -> None:
+    options = {"scene": ANVIL, "pose": rubbed_and_turned, "limits": GUARDED, "controller": None}
+    options |= {"method": "implicit", "coupling": Coupling(2000.0, 0.5, 2.0, 9e-4)}
+    # turned in at 0.2 N m/rad, let out at 3 N m/rad and 0.5 N m at most: 0.18 J
+    pump = {1900: Couple(2000.0, 0.5, 0.2, 0.0), 2900: Couple(2000.0, 0.5, 3.0, 0.0)}
+    if is_forgotten:
+        with pytest.raises(SafetyTrip, match=r"tick 3[4-7].*more energy beyond what the hand"):
+            run(pump, 4.0, **options)
+    else:
+        monkeypatch.setattr("hapticbridge.kernel.state.forget_dissipation", lambda _state: None)
+        assert run(pump, 4.0, **options)[0].stopped_by == "duration"
+
+
 def test_what_a_spring_still_holds_is_given_back_after_a_command(run: Callable[..., Any]) -> None:
     options = {"scene": ANVIL, "pose": rubbed_and_pressed, "limits": GUARDED, "controller": None}
     options |= {"method": "implicit", "coupling": Coupling(2000.0, 0.9, 2.0, 5e-4)}
