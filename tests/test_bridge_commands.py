@@ -271,6 +271,67 @@ def test_what_a_hand_rubbed_away_by_turning_pays_for_no_command_either(
         assert run(pump, 4.0, **options)[0].stopped_by == "duration"
 
 
+SPRING = """<mujoco>
+  <option timestep="0.001" integrator="discrete" gravity="0 0 0"/>
+  <worldbody>
+    <body name="tool">
+      <joint name="rail" type="slide" axis="1 0 0" stiffness="250"/>
+      <geom size="0.01" mass="0.05"/>
+      <site name="grip"/>
+    </body>
+  </worldbody>
+</mujoco>"""
+
+
+def rubbed_and_pushed(tick: int) -> tuple[float, ...]:
+    """Moved to and fro until 2 s, then 40 mm into the spring and back."""
+    if tick < 2000:
+        swing = min(max((tick - 100) / 200, 0.0), (2000 - tick) / 200, 1.0)
+        way = 0.02 * swing * math.sin(0.04 * tick)
+    else:
+        way = 0.04 * min(max((tick - 2200) / 300, 0.0), 1.0, max((3800 - tick) / 600, 0.0))
+    return (way, 0, 0, 1, 0, 0, 0)
+
+
+PUSHED = {"scene": SPRING, "pose": rubbed_and_pushed, "limits": GUARDED, "controller": None}
+
+
+@pytest.mark.parametrize("recorder", [{}, {900: Record(on=False), 2550: Record(on=True)}])
+def test_what_a_scene_took_up_unfelt_is_not_given_to_the_hand(
+    run: Callable[..., Any], recorder: dict[int, Command]
+) -> None:
+    # ½ 250 (40 mm)² = 0.2 J go in while nothing is felt, and would come out with up to 10 N; what
+    # is rubbed away meanwhile does not pay for it
+    commands = {1000: Switch(force=False), 2700: Switch(force=True)} | recorder
+    with pytest.raises(SafetyTrip, match="more energy beyond what the hand put in"):
+        run(commands, 5.0, **PUSHED)
+
+
+def test_a_stretch_that_was_not_felt_saves_nothing(run: Callable[..., Any]) -> None:
+    script = Script({1000: Switch(force=False), 2900: Switch(force=True)})
+    given: list[float] = []
+
+    def on_tick(bridge: Bridge, tick: int) -> None:
+        script(bridge, tick)
+        given.append(float(bridge._binding.state["given"][0]))
+
+    run({}, 3.0, ANVIL, rubbed_and_pressed, on_tick=on_tick, limits=GUARDED)
+    # 40 mm at 2000 N/m and 10 N would be 0.375 J, but the coupling is re-seated
+    assert given[2900] < -0.5
+    assert given[2901] == pytest.approx(-0.05, abs=0.01)
+
+
+def test_what_a_hand_put_into_a_scene_comes_back_after_a_switch(run: Callable[..., Any]) -> None:
+    commands = {2600: Switch(force=False), 2700: Switch(force=True)}
+    summary, path, _ = run(commands, 4.0, **PUSHED)
+    assert summary.stopped_by == "duration"
+    report = audit(path)
+    assert (report.verdict, report.resimulation) == ("passive", "bit for bit")
+    # but for what damper and pause took away
+    work = read_recording(path).ticks["device_energy"]
+    assert work[-1] - work[2720] > 0.1
+
+
 def test_what_a_spring_still_holds_is_given_back_after_a_command(run: Callable[..., Any]) -> None:
     options = {"scene": ANVIL, "pose": rubbed_and_pressed, "limits": GUARDED, "controller": None}
     options |= {"method": "implicit", "coupling": Coupling(2000.0, 0.9, 2.0, 5e-4)}

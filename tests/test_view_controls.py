@@ -15,11 +15,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from audit_cases import ScriptedDevice, recorded
+from audit_cases import COUPLING, ScriptedDevice, recorded
 from chromium import Tab, browser
 from report_runs import LOOSE
 from test_bridge_commands import FLOOR, STEPS, Script, swaying
-from test_commands import COUPLING, allowance
+from test_commands import allowance
 
 from hapticbridge.audit import audit
 from hapticbridge.bridge import Bridge
@@ -197,9 +197,9 @@ def test_what_others_ask_for_is_shown_and_not_asked_for_again() -> None:
 def test_a_slider_that_is_moved_back_is_asked_for_too() -> None:
     began = COUPLING.stiffness
     with controls() as (shown, page, asked):
-        for stiffness in (1500.0, began):
+        for number, stiffness in enumerate((1500.0, began), start=1):
             page.send(K, value=stiffness)
-            until(lambda value=stiffness: asked and asked[-1].stiffness == value)
+            until(partial(lambda count: len(asked) == count, number))
             shown.note(coupled(stiffness=stiffness))
         assert [command.stiffness for command in asked] == [1500.0, began]
 

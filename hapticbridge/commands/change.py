@@ -17,8 +17,8 @@ import mujoco
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import HapticBridgeError, RecordingError
+from hapticbridge.kernel.codes import CLUTCHED, FORCE_OFF
 from hapticbridge.kernel.state import Binding, RunParameters
-from hapticbridge.kernel.watch import CLUTCHED, FORCE_OFF
 from hapticbridge.provenance import restore_state
 from hapticbridge.rendering import Method
 
