@@ -1,4 +1,9 @@
-"""What may be asked of a run while it goes on, and how it is done so that it can be repeated."""
+"""What may be asked of a run while it goes on, and how it is done so that it can be repeated.
+
+Read ``command`` first, then its way: ``queue`` checks it, ``allowance`` and ``span`` against what
+the device bears, ``operator`` does it between two ticks, and ``change`` is what it was, as an event
+that the audit repeats.
+"""
 
 from hapticbridge.commands.allowance import Allowance as Allowance
 from hapticbridge.commands.change import CHANGES as CHANGES

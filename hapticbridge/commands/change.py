@@ -18,7 +18,8 @@ import mujoco
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.kernel.codes import CLUTCHED, FORCE_OFF
-from hapticbridge.kernel.state import Binding, RunParameters
+from hapticbridge.kernel.parameters import RunParameters
+from hapticbridge.kernel.state import Binding
 from hapticbridge.provenance import restore_state
 from hapticbridge.rendering import Method
 

@@ -1,4 +1,7 @@
-"""Where two recorded runs part."""
+"""Where two recorded runs part.
+
+Read ``compare`` first; what it finds is a ``comparison``.
+"""
 
 from hapticbridge.compare.compare import compare as compare
 from hapticbridge.compare.comparison import Comparison as Comparison

@@ -1,4 +1,7 @@
-"""A recording as a table for other programs: Parquet, CSV or HDF5."""
+"""A recording as a table for other programs: Parquet, CSV or HDF5.
+
+Read ``export`` first; it pours a recording into a ``sink``: ``parquet``, ``csv_file`` or ``hdf5``.
+"""
 
 from hapticbridge.export.export import FORMATS as FORMATS
 from hapticbridge.export.export import Exported as Exported

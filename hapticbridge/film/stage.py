@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from hapticbridge.audit.rerun import Rerun, obstacle
 from hapticbridge.errors import RecordingError
-from hapticbridge.kernel.state import RunParameters
+from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.provenance import parameters_of
 from hapticbridge.recording import RecordingFile, open_recording
 

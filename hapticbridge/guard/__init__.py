@@ -1,4 +1,8 @@
-"""What stands between a computed wrench and a motor in somebody's hand."""
+"""What stands between a computed wrench and a motor in somebody's hand.
+
+Read ``limits`` first, what may be asked for, then ``guarding``, what the kernel is told; ``start``
+is before force, ``trip`` after it. The arithmetic is the kernel's.
+"""
 
 from hapticbridge.guard.guarding import CONTROLLERS as CONTROLLERS
 from hapticbridge.guard.guarding import guarding_for as guarding_for

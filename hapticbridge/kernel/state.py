@@ -18,7 +18,7 @@ from hapticbridge.kernel.lossless import leave
 from hapticbridge.kernel.meter import refresh_energies
 from hapticbridge.kernel.midpoint import note_twist
 from hapticbridge.kernel.names import COUPLING_ACTUATORS, HANDLE, WELD_NAME
-from hapticbridge.kernel.parameters import RunParameters as RunParameters  # noqa: PLC0414
+from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.scheme import DIRECT, LOSSLESS, WELD
 from hapticbridge.kernel.tree import has_passive_forces, tree_of_tool
 from hapticbridge.kernel.tuning import TUNED, Gains, forget_dissipation, set_gains, tuned_values

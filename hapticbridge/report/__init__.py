@@ -1,4 +1,11 @@
-"""Pictures and pages of a recorded run."""
+"""Pictures and pages of a recorded run.
+
+Read ``page`` first: what stands on a page, all of it from ``evidence``. Words come from ``lead``,
+the verdict in a sentence, and ``facts``; pictures from ``energies``, ``motion``, ``timing`` and
+``moment``, which share ``panels``, and ``curves`` for a picture alone. ``likely`` finds the
+``cause`` of an active run: ``at_device``, with a ``remedy`` in numbers, or ``in_environment``, with
+what ``touched``.
+"""
 
 from hapticbridge.report.curves import DRAWABLE as DRAWABLE
 from hapticbridge.report.curves import decimated as decimated

@@ -18,7 +18,7 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo
 from hapticbridge.device.lateness import delay_ticks
 from hapticbridge.errors import HapticBridgeError
-from hapticbridge.kernel.state import RunParameters
+from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.provenance import MODEL_ATTACHMENT, STARTS, meta_home, meta_start, parameters_of
 from hapticbridge.recording import Recording
 from hapticbridge.recording.reader import BLOCK

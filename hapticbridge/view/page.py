@@ -11,7 +11,7 @@ import viser
 from numpy.typing import NDArray
 
 from hapticbridge.felt import coupling_sentences, is_always_held
-from hapticbridge.kernel.state import RunParameters
+from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.rendering import method_named
 from hapticbridge.view.ghost import LONGEST_ARROW, Ghost, linear
 from hapticbridge.view.props import props_of

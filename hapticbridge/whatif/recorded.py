@@ -16,7 +16,7 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.guard import CONTROLLERS, Limits, guarding_for
-from hapticbridge.kernel.state import RunParameters
+from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.provenance import (
     MID_RUN,
     STATE_ATTACHMENT,

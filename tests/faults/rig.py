@@ -197,7 +197,6 @@ class Outcome:
         largest_force: Of all that was written, in N.
         is_finite: Whether all of it was.
         energy: Largest energy given to the hand beyond what it had put in, in J.
-        energy_after: The same, counted from the cause on.
         zero_after: Ticks from the cause to the first zero wrench; None where none came.
         last_is_zero: Whether the last write was zero.
         error: What was raised, or nothing.
@@ -211,7 +210,6 @@ class Outcome:
     largest_force: float
     is_finite: bool
     energy: float
-    energy_after: float
     zero_after: int | None
     last_is_zero: bool
     error: str
@@ -232,13 +230,11 @@ class Outcome:
         forces = np.linalg.norm(wrenches[:, :3], axis=1)
         zero = ticks_of[(ticks_of >= cause - 1) & (wrenches == 0).all(axis=1)]
         given = np.array(device.to_the_hand)
-        before = min(cause, len(given) - 1)
         recording = read_recording(path)
         return cls(
             largest_force=float(np.max(forces)),
             is_finite=bool(np.isfinite(wrenches).all()),
             energy=float(given.max()),
-            energy_after=float((given[before:] - given[before]).max()),
             zero_after=max(int(zero[0]) - cause, 0) if zero.size else None,
             last_is_zero=not wrenches[-1].any(),
             error=error,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from typing import Any
 
 import hidraw
@@ -37,17 +38,19 @@ def echo(plug_usb: Plug) -> Iterator[Echo]:
     usb.util.dispose_resources(device)
 
 
+def _opened(serial: str) -> Any:
+    """Returns the report echo; None where it is not there yet, or its node is not."""
+    for one in hidraw.enumerate(VENDOR, EchoHid.product):
+        if one["serial_number"] == serial:
+            device = hidraw.device()
+            with suppress(OSError):  # the kernel lists a device a moment before it makes its node
+                device.open_path(one["path"])
+                return device
+    return None
+
+
 def _hid(serial: str = "E2") -> Any:
-    found = wait_for(
-        lambda: [
-            one
-            for one in hidraw.enumerate(VENDOR, EchoHid.product)
-            if one["serial_number"] == serial
-        ]
-    )
-    device = hidraw.device()
-    device.open_path(found[0]["path"])
-    return device
+    return wait_for(lambda: _opened(serial))
 
 
 def _measure(trip: Callable[[int], None], record: Callable[[str, object], None]) -> None:
