@@ -129,6 +129,8 @@ def test_each_command_lands_in_an_event_with_its_tick(run: Callable[..., Any]) -
         ("stop", 1400),
     ]
     assert {e["by"] for e in recording.events if "by" in e} == {"test"}
+    # whoever shows the switches must not take a reset for a force that was turned off
+    assert [e["tick"] for e in recording.events if e.get("fading")] == [1140]
 
 
 def stretched(tick: int) -> tuple[float, ...]:
@@ -241,6 +243,93 @@ def test_what_a_hand_rubbed_away_pays_for_no_command(run: Callable[..., Any]) ->
     pump = {1900: Couple(200.0, 0.0), 2900: Couple(3000.0, 0.0)}
     with pytest.raises(SafetyTrip, match=r"tick 36.*more energy beyond what the hand put in"):
         run(pump, 4.0, **options)
+
+
+def rubbed_and_turned(tick: int) -> tuple[float, ...]:
+    """Turned to and fro until 2 s, then by half a radian and back."""
+    if tick < 2000:
+        swing = min(max((tick - 100) / 200, 0.0), (2000 - tick) / 200, 1.0)
+        angle = 0.3 * swing * math.sin(0.04 * tick)
+    else:
+        angle = 0.5 * min(max((tick - 2500) / 400, 0.0), 1.0, max((3800 - tick) / 400, 0.0))
+    return (0, 0, 0, math.cos(angle / 2), 0, math.sin(angle / 2), 0)
+
+
+@pytest.mark.parametrize("is_forgotten", [True, False])
+def test_what_a_hand_rubbed_away_by_turning_pays_for_no_command_either(
+    run: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, is_forgotten: bool
+) -> None:
+    options = {"scene": ANVIL, "pose": rubbed_and_turned, "limits": GUARDED, "controller": None}
+    options |= {"method": "implicit", "coupling": Coupling(2000.0, 0.5, 2.0, 9e-4)}
+    # turned in at 0.2 N m/rad, let out at 3 N m/rad and 0.5 N m at most: 0.18 J
+    pump = {1900: Couple(2000.0, 0.5, 0.2, 0.0), 2900: Couple(2000.0, 0.5, 3.0, 0.0)}
+    if is_forgotten:
+        with pytest.raises(SafetyTrip, match=r"tick 3[4-7].*more energy beyond what the hand"):
+            run(pump, 4.0, **options)
+    else:
+        monkeypatch.setattr("hapticbridge.kernel.state.forget_dissipation", lambda _state: None)
+        assert run(pump, 4.0, **options)[0].stopped_by == "duration"
+
+
+SPRING = """<mujoco>
+  <option timestep="0.001" integrator="discrete" gravity="0 0 0"/>
+  <worldbody>
+    <body name="tool">
+      <joint name="rail" type="slide" axis="1 0 0" stiffness="250"/>
+      <geom size="0.01" mass="0.05"/>
+      <site name="grip"/>
+    </body>
+  </worldbody>
+</mujoco>"""
+
+
+def rubbed_and_pushed(tick: int) -> tuple[float, ...]:
+    """Moved to and fro until 2 s, then 40 mm into the spring and back."""
+    if tick < 2000:
+        swing = min(max((tick - 100) / 200, 0.0), (2000 - tick) / 200, 1.0)
+        way = 0.02 * swing * math.sin(0.04 * tick)
+    else:
+        way = 0.04 * min(max((tick - 2200) / 300, 0.0), 1.0, max((3800 - tick) / 600, 0.0))
+    return (way, 0, 0, 1, 0, 0, 0)
+
+
+PUSHED = {"scene": SPRING, "pose": rubbed_and_pushed, "limits": GUARDED, "controller": None}
+
+
+@pytest.mark.parametrize("recorder", [{}, {900: Record(on=False), 2550: Record(on=True)}])
+def test_what_a_scene_took_up_unfelt_is_not_given_to_the_hand(
+    run: Callable[..., Any], recorder: dict[int, Command]
+) -> None:
+    # ½ 250 (40 mm)² = 0.2 J go in while nothing is felt, and would come out with up to 10 N; what
+    # is rubbed away meanwhile does not pay for it
+    commands = {1000: Switch(force=False), 2700: Switch(force=True)} | recorder
+    with pytest.raises(SafetyTrip, match="more energy beyond what the hand put in"):
+        run(commands, 5.0, **PUSHED)
+
+
+def test_a_stretch_that_was_not_felt_saves_nothing(run: Callable[..., Any]) -> None:
+    script = Script({1000: Switch(force=False), 2900: Switch(force=True)})
+    given: list[float] = []
+
+    def on_tick(bridge: Bridge, tick: int) -> None:
+        script(bridge, tick)
+        given.append(float(bridge._binding.state["given"][0]))
+
+    run({}, 3.0, ANVIL, rubbed_and_pressed, on_tick=on_tick, limits=GUARDED)
+    # 40 mm at 2000 N/m and 10 N would be 0.375 J, but the coupling is re-seated
+    assert given[2900] < -0.5
+    assert given[2901] == pytest.approx(-0.05, abs=0.01)
+
+
+def test_what_a_hand_put_into_a_scene_comes_back_after_a_switch(run: Callable[..., Any]) -> None:
+    commands = {2600: Switch(force=False), 2700: Switch(force=True)}
+    summary, path, _ = run(commands, 4.0, **PUSHED)
+    assert summary.stopped_by == "duration"
+    report = audit(path)
+    assert (report.verdict, report.resimulation) == ("passive", "bit for bit")
+    # but for what damper and pause took away
+    work = read_recording(path).ticks["device_energy"]
+    assert work[-1] - work[2720] > 0.1
 
 
 def test_what_a_spring_still_holds_is_given_back_after_a_command(run: Callable[..., Any]) -> None:

@@ -17,6 +17,7 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.errors import HapticBridgeError, SafetyTrip
 from hapticbridge.guard import USUAL_ENERGY, Limits
 from hapticbridge.kernel.counts import Counts
+from hapticbridge.kernel.layout import STATE_DTYPE
 from hapticbridge.recording import read_recording
 
 T = 1e-3
@@ -145,8 +146,17 @@ def test_counts_that_were_changed_are_found(
         assert audit(rewritten(whole, changed, meta=told)).verdict == "invalid", lie
 
 
+COUNTS = Counts(given=0.1, stored=-0.2, account=1e-3, axes=(1e-3,) * 6, excess=-1e-4, unfelt=0.3)
+
+
+def test_all_that_was_counted_is_put_and_read_again() -> None:
+    state = np.zeros(1, STATE_DTYPE)
+    COUNTS.put(state)
+    assert Counts.of(state) == COUNTS
+
+
 def test_what_are_no_counts_is_refused() -> None:
-    counts = Counts(given=0.1, stored=-0.2, account=1e-3, axes=(1e-3,) * 6, excess=0.0)
+    counts = COUNTS
     assert Counts.from_json(counts.to_json()) == counts
     plain = json.loads(counts.to_json())
     wrong = [{"given": "x"}, {"axes": [0.0] * 5}, {"excess": None}, {"account": True}, {"new": 0}]

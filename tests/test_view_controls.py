@@ -8,16 +8,18 @@ import os
 import threading
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from audit_cases import ScriptedDevice, recorded
+from audit_cases import COUPLING, ScriptedDevice, recorded
 from chromium import Tab, browser
 from report_runs import LOOSE
-from test_bridge_commands import FLOOR, Script, swaying
+from test_bridge_commands import FLOOR, STEPS, Script, swaying
+from test_commands import allowance
 
 from hapticbridge.audit import audit
 from hapticbridge.bridge import Bridge
@@ -33,9 +35,10 @@ from hapticbridge.view.window import Window
 
 pytest.importorskip("viser", reason="needs the extra 'view'")
 
-from page_client import hand, said
+from page_client import Hand, hand, said
 
-from hapticbridge.view.controls import Outlet, allowance_of
+from hapticbridge.view.controls import Controls, Outlet, allowance_of
+from hapticbridge.view.server import serve, stop
 from hapticbridge.view.show import Show
 
 # viser's threads and sockets end with the process
@@ -157,6 +160,72 @@ def test_nothing_that_is_sent_by_hand_exceeds_a_limit(tmp_path: Path) -> None:
     assert recording.ticks.size
     report = audit(tmp_path / "run.mcap")
     assert (report.verdict, report.resimulation) == ("passive", "bit for bit")
+
+
+@contextlib.contextmanager
+def controls() -> Iterator[tuple[Controls, Hand, list[Any]]]:
+    """Controls without a run, a hand on them, and what they asked for."""
+    address, asked = Address("127.0.0.1", 0), list[Any]()
+    server = serve(address)
+    try:
+        shown = Controls(server, allowance(), asked.append)
+        with hand(address.url(server.get_port())) as page:
+            page.find(K)
+            yield shown, page, asked
+    finally:
+        stop(server)
+
+
+def coupled(**gains: float) -> dict[str, Any]:
+    law = allowance().used(replace(COUPLING, **gains))
+    return {"event": "coupling", "tick": 1, "by": "caller", "ticks": STEPS, **asdict(law)}
+
+
+def switched(**bits: bool) -> dict[str, Any]:
+    return {"event": "switch", "tick": 1, "by": "caller", "force": True, "clutch": False} | bits
+
+
+def test_what_others_ask_for_is_shown_and_not_asked_for_again() -> None:
+    with controls() as (shown, _, asked):
+        shown.note(coupled(stiffness=1234.567, damping=0.77))
+        shown.note(switched(force=False, clutch=True))
+        assert shown._sliders[0].value == pytest.approx((1235.0, 0.77))
+        assert (shown._force.value, shown._clutch.value) == (False, True)
+        assert asked == []
+
+
+def test_a_slider_that_is_moved_back_is_asked_for_too() -> None:
+    began = COUPLING.stiffness
+    with controls() as (shown, page, asked):
+        for number, stiffness in enumerate((1500.0, began), start=1):
+            page.send(K, value=stiffness)
+            until(partial(lambda count: len(asked) == count, number))
+            shown.note(coupled(stiffness=stiffness))
+        assert [command.stiffness for command in asked] == [1500.0, began]
+
+
+def test_what_was_refused_is_shown_as_the_run_has_it() -> None:
+    with controls() as (shown, page, asked):
+        shown.note(coupled(stiffness=1500.0))
+        page.send(K, value=1800.0)
+        page.send("force", value=False)
+        until(lambda: len(asked) == 2)
+        shown.note({"event": "refused", "reason": "too soon"})
+        assert shown._sliders[0].value[0] == 1500.0
+        assert shown._force.value is True
+        assert len(asked) == 2
+        # what was on its way all the same is shown, however soon it comes
+        shown.note(coupled(stiffness=1800.0))
+        assert shown._sliders[0].value[0] == 1800.0
+
+
+def test_a_force_that_fades_for_a_moment_leaves_its_box_to_the_hand() -> None:
+    with controls() as (shown, _, _):
+        shown.note(switched(force=False, fading=True))
+        assert shown._force.value is True
+        assert "the force is off" in shown.answer.content
+        shown.note(switched())
+        assert "the force is off" not in shown.answer.content
 
 
 def test_why_a_recorder_did_not_start_stays_on_the_page(

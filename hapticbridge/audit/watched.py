@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from hapticbridge.audit.differences import steps, turn_between, turns
 from hapticbridge.audit.interventions import Interventions
 from hapticbridge.audit.limited import limits_on_tool, spring_energy
+from hapticbridge.kernel.codes import CLUTCHED, FORCE_OFF
 from hapticbridge.kernel.parameters import RunParameters
-from hapticbridge.kernel.watch import CLUTCHED, FORCE_OFF, STILL, STILL_TURN
+from hapticbridge.kernel.watch import STILL, STILL_TURN
 from hapticbridge.tick import TickFlag
 
 Array = NDArray[np.float64]

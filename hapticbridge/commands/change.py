@@ -1,7 +1,7 @@
 """What a command changes in a run, as the event that a recording keeps and a re-simulation repeats.
 
     coupling   stiffness, damping, rotational_stiffness, rotational_damping of the law; ticks
-    switch     force, clutch
+    switch     force, clutch; fading where the force comes back after a reset or a recorder
     reset      (nothing: the scene goes back to where the run began, recorded or not)
 
 The loop applies the very event that it then records, so both ways are one.
@@ -17,9 +17,9 @@ import mujoco
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import HapticBridgeError, RecordingError
+from hapticbridge.kernel.codes import CLUTCHED, FORCE_OFF
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.state import Binding
-from hapticbridge.kernel.watch import CLUTCHED, FORCE_OFF
 from hapticbridge.provenance import restore_state
 from hapticbridge.rendering import Method
 

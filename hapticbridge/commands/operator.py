@@ -91,7 +91,9 @@ class Operator:
 
     def _switch(self, by: str, *, is_fading: bool = False) -> None:
         force = self._has_force and not is_fading
-        self._do({"event": "switch", "force": force, "clutch": self._is_clutched, "by": by})
+        event = {"event": "switch", "force": force, "clutch": self._is_clutched, "by": by}
+        # of a force that is only away for a moment; nobody asked for it to be off
+        self._do(event | ({"fading": True} if is_fading else {}))
 
     def _do(self, event: dict[str, Any]) -> None:
         if self._repeater is not None:

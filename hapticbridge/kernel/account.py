@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.jit import compiled
-from hapticbridge.kernel.codes import CONTROLLER_ACTIVE
+from hapticbridge.kernel.codes import CONTROLLER_ACTIVE, FORCE_OFF
 from hapticbridge.kernel.guarding import DAMPER, ENVIRONMENT, TANK
 from hapticbridge.pose import Vector, scaled
 
@@ -63,6 +63,9 @@ def keep_account(state: NDArray[np.void], moved: Vector, turned: Vector, interva
     ``kicked`` is what the device was given beyond what the hand put in (``unpaid``). Motors of the
     scene pay for nothing there.
 
+    ``unfelt`` is what the scene took up of a handle that moved it while the force was off by
+    command, and still has: no hand has put that in (``kernel.tuning.forget_dissipation``).
+
     Args:
         state: The bound state, as the tick before left it.
         moved: δp in m, in the device's frame.
@@ -76,6 +79,9 @@ def keep_account(state: NDArray[np.void], moved: Vector, turned: Vector, interva
     s.excess_before = over
     own = stored - s.actuator_work - s.external_work
     gained = (s.force_scale / s.scale) * s.passed * (own - s.own_before)
+    kept = max(s.kinetic + s.potential - s.first_energy, 0.0)
+    taken = own - s.own_before if s.commanded & FORCE_OFF else 0.0
+    s.unfelt = min(max(s.unfelt + taken, 0.0), kept)
     s.own_before = own
     # before the first tick and in a pause nobody knows how long the device took to move
     rate = 1.0 / interval if s.tick > s.ramp_start else 0.0

@@ -14,6 +14,10 @@ FORCE_LIMITED, SLEW_LIMITED, RAMPING, CONTROLLER_ACTIVE, CONTACT, CLUTCH = 4, 8,
 STALE_SAMPLE, TRIP, MIDPOINT, RESEATED = 256, 512, 1024, 2048
 """Bits of ``TickFlag``: the compiler cannot read an enumeration."""
 
+FORCE_OFF, CLUTCHED = 1 << 40, 1 << 41
+"""Commands that hold as long as their bit is set in ``commanded``: no force, though the handle
+follows the device; or a clutch, as if a button for it were held."""
+
 EQUALITY, LIMIT_JOINT, LIMIT_TENDON, CONTACT_PYRAMIDAL = 0, 3, 4, 6
 """Kinds of constraint rows (``mjtConstraint``), likewise."""
 

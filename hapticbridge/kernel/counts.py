@@ -30,6 +30,7 @@ class Counts:
         account: What the energy account of both ports owes; below zero: what it has saved.
         axes: Likewise of each axis (6).
         excess: What the environment created beyond its slack.
+        unfelt: What the scene took up while the force was off by command, and still has.
 
     Raises:
         HapticBridgeError: A value is not finite, or the axes are not six.
@@ -40,6 +41,7 @@ class Counts:
     account: float
     axes: tuple[float, ...]
     excess: float
+    unfelt: float = 0.0
 
     def __post_init__(self) -> None:
         if not isinstance(self.axes, tuple) or len(self.axes) != _AXES:
@@ -62,13 +64,14 @@ class Counts:
             account=float(s["account"]),
             axes=tuple(s["axis_account"].tolist()),
             excess=float(s["excess"]),
+            unfelt=float(s["unfelt"]),
         )
 
     def put(self, state: NDArray[np.void]) -> None:
         """Writes them into the kernel's state, before its first tick."""
         state["given"], state["first_energy"] = self.given, self.stored
         state["account"], state["axis_account"] = self.account, self.axes
-        state["excess"] = self.excess
+        state["excess"], state["unfelt"] = self.excess, self.unfelt
 
     def to_json(self) -> str:
         """Returns them as a recording keeps them; each number reads back to the same double."""

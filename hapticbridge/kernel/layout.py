@@ -173,6 +173,7 @@ _GUARD_RUNNING = (
     "own_before",
     "passed",
     "given",
+    "unfelt",
     "kicked",
     "excess",
     "excess_before",

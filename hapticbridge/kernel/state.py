@@ -70,7 +70,8 @@ class Binding:
         self.state["tuning_ticks"] = ticks
 
     def command(self, bits: int) -> None:
-        """Sets which of ``watch.FORCE_OFF`` and ``watch.CLUTCHED`` hold from the next tick on."""
+        """Sets which of ``codes.FORCE_OFF`` and ``codes.CLUTCHED`` hold from the next tick on."""
+        forget_dissipation(self.state)
         self.state["commanded"] = bits
 
     def take_reset(self) -> None:

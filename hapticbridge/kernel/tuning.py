@@ -27,6 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.jit import compiled
+from hapticbridge.kernel.codes import FORCE_OFF
 from hapticbridge.kernel.native import floats
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.ramp import held_energy
@@ -69,19 +70,22 @@ def tuned_values(parameters: RunParameters) -> tuple[float, ...]:
 def forget_dissipation(state: NDArray[np.void]) -> None:
     """Caps what the hand may have put in before a command, for the guard's energy limit.
 
-        given ← max(given, −(surplus + r V + r max(S − S_0, 0))),   r = force_scale/scale
+        given ← max(given, −(surplus + r V + r max(S − S_0 − U, 0))),   r = force_scale/scale
 
     V is the energy of coupling springs whose wrench stops growing at the limits, S − S_0 what the
-    scene has taken up: both may come back to the hand. What is gone for good may not: else a hand
-    that has rubbed away 1 J could be given as much by a slider that is moved at the right moments.
+    scene has taken up: both may come back to the hand. Not so U, what the scene took up while the
+    force was off by command, nor V then, for the coupling is re-seated before it is felt again.
+    What is gone for good may not either: else a hand that has rubbed away 1 J could be given as
+    much by a slider that is moved, or a force that is turned off and on, at the right moments.
 
     Args:
         state: The bound state, between two ticks.
     """
     s = state[0]
     ratio = float(s["force_scale"] / s["scale"])
-    kept = max(float(s["kinetic"] + s["potential"] - s["first_energy"]), 0.0)
-    s["given"] = max(float(s["given"]), -(float(s["surplus"]) + held_energy(state) + ratio * kept))
+    kept = max(float(s["kinetic"] + s["potential"] - s["first_energy"] - s["unfelt"]), 0.0)
+    held = 0.0 if s["commanded"] & FORCE_OFF else held_energy(state)
+    s["given"] = max(float(s["given"]), -(float(s["surplus"]) + held + ratio * kept))
 
 
 @compiled

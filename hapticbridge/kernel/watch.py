@@ -9,6 +9,8 @@ from hapticbridge.jit import compiled
 from hapticbridge.kernel.codes import (
     BACKWARDS,
     CLUTCH,
+    CLUTCHED,
+    FORCE_OFF,
     GAVE_ENERGY,
     JUMPED,
     RESEATED,
@@ -30,10 +32,6 @@ from hapticbridge.pose import (
 
 DEVICE_BUTTONS = 2**32 - 1
 """Bits of a record's ``buttons`` that the device's own buttons have; those above are commands."""
-
-FORCE_OFF, CLUTCHED = 1 << 40, 1 << 41
-"""Commands that hold as long as their bit is set: no force, though the handle follows the device;
-or a clutch, as if a button for it were held."""
 
 STILL = 1e-4
 """In m. A device that moved by more between its start and the first tick is re-seated; less is what

@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import os
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import fields
 from typing import Any
 
@@ -27,7 +28,7 @@ from hapticbridge.errors import CommandError
 from hapticbridge.guard import Limits
 from hapticbridge.provenance import parameters_of
 from hapticbridge.rendering import method_named
-from hapticbridge.view.sliders import SYMBOLS, Sliders
+from hapticbridge.view.sliders import SYMBOLS, Sliders, by_hand
 
 SHARED = "**Anyone with this address can watch this run, stop it, and move the device.**"
 
@@ -123,34 +124,29 @@ class Controls:
             if allowance.method.has_law:
                 self._sliders = tuple(Sliders(gui, s, self._want) for s in allowance.spans)
                 self._bounds = gui.add_markdown(self._ends())
-            force = gui.add_checkbox("force", initial_value=True)
-            clutch = gui.add_checkbox("clutch (the hand moves alone)", initial_value=False)
+            self._force = gui.add_checkbox("force", initial_value=True)
+            self._clutch = gui.add_checkbox("clutch (the hand moves alone)", initial_value=False)
             reset = gui.add_button("back to the start")
             self._record = gui.add_button("start recording")
             self.answer = gui.add_markdown("")
-        self._coupling = self._shown()
-        self._is_recording = False
-        force.on_update(lambda _: ask(Switch(force=bool(force.value))))
-        clutch.on_update(lambda _: ask(Switch(clutch=bool(clutch.value))))
+        # how the run is, or soon will be
+        self._gains = [sliders.span.gains(allowance.start) for sliders in self._sliders]
+        self._is_forced, self._is_clutched, self._is_recording = True, False, False
+        self._force.on_update(by_hand(lambda: ask(Switch(force=bool(self._force.value)))))
+        self._clutch.on_update(by_hand(lambda: ask(Switch(clutch=bool(self._clutch.value)))))
         reset.on_click(lambda _: ask(Reset()))
         self._record.on_click(lambda _: ask(Record(not self._is_recording)))
         stop.on_click(lambda _: ask(Stop()))
-
-    def _shown(self) -> tuple[float, ...]:
-        return tuple(value for sliders in self._sliders for value in sliders.value)
 
     def _ends(self) -> str:
         ends = "; ".join(sliders.ends() for sliders in self._sliders)
         return f"{ends}. {self._allowance.reason()}"
 
     def _want(self) -> None:
-        """Asks for what the sliders show, unless the run has it already."""
-        asked = self._shown()
-        if asked == self._coupling:
-            return
+        """Asks for what the sliders show."""
         self._touched = time.monotonic()
         try:
-            self._ask(Couple(*asked))
+            self._ask(Couple(*(value for sliders in self._sliders for value in sliders.value)))
         except CommandError as error:
             self._refuse(str(error))
 
@@ -161,6 +157,9 @@ class Controls:
             self._take_coupling(event)
         elif kind == "switch":
             self._say("force", "" if event.get("force") else "the force is off")
+            if not event.get("fading"):
+                self._is_forced, self._is_clutched = bool(event["force"]), bool(event["clutch"])
+                self._show_switches()
         elif kind == "reset":
             self._say("answer", "the scene is back at its start")
         elif kind == "recording":
@@ -175,36 +174,34 @@ class Controls:
         method, allowance = self._allowance.method, self._allowance
         law = {field.name: float(event[field.name]) for field in fields(Coupling)}
         felt = method.rendered(Coupling(**law), allowance.period / allowance.substeps)
-        gains = [sliders.span.gains(felt) for sliders in self._sliders]
-        if time.monotonic() - self._touched > STILL:
-            self._show([value for pair in gains for value in pair])
-        else:
-            for sliders, pair in zip(self._sliders, gains, strict=True):
-                sliders.bound(*pair)
-            self._bounds.content = self._ends()
+        self._gains = [sliders.span.gains(felt) for sliders in self._sliders]
+        is_still = time.monotonic() - self._touched > STILL
+        for sliders, pair in zip(self._sliders, self._gains, strict=True):
+            (sliders.show if is_still else sliders.bound)(*pair)
+        self._bounds.content = self._ends()
         told = "; ".join(
             f"{symbol[0]} goes to {pair[0]:.4g} {unit[0]}, {symbol[1]} to {pair[1]:.3g} {unit[1]}"
             for symbol, unit, pair in (
                 (SYMBOLS[sliders.span.axis], UNITS[sliders.span.axis], pair)
-                for sliders, pair in zip(self._sliders, gains, strict=True)
+                for sliders, pair in zip(self._sliders, self._gains, strict=True)
             )
         )
         self._say("answer", told)
 
     def _refuse(self, reason: str) -> None:
+        """Says why, and takes back what was touched: what the run has is shown again."""
         self._say("answer", f"**refused:** {json.dumps(reason, ensure_ascii=False)[1:-1]}")
-        self._show(self._coupling)
+        self._touched = -math.inf
+        self._show_switches()
+        if self._sliders:
+            for sliders, pair in zip(self._sliders, self._gains, strict=True):
+                sliders.show(*pair)
+            self._bounds.content = self._ends()
 
     def _say(self, what: str, words: str) -> None:
         """Says one thing without taking back the others."""
         self._said[what] = words
         self.answer.content = "  \n".join(words for words in self._said.values() if words)
 
-    def _show(self, values: Sequence[float]) -> None:
-        """Puts the sliders to a coupling."""
-        if not self._sliders:
-            return
-        pairs = zip(values[::2], values[1::2], strict=True)
-        shown = [sliders.show(*pair) for sliders, pair in zip(self._sliders, pairs, strict=True)]
-        self._coupling = tuple(value for pair in shown for value in pair)
-        self._bounds.content = self._ends()
+    def _show_switches(self) -> None:
+        self._force.value, self._clutch.value = self._is_forced, self._is_clutched

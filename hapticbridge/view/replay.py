@@ -120,7 +120,8 @@ class Theatre:
             now, last = time.monotonic(), self._replay.sights[-1].time
             if self._playing.value:
                 following = self.slider.value + now - before
-                self.slider.value = following if 0.0 <= following <= last else 0.0  # shows it
+                # which shows it, as if a hand had done it
+                self.slider.value = following if 0.0 <= following <= last else 0.0
             before = now
 
     def _follow(self) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import viser
 
@@ -52,21 +53,20 @@ class Sliders:
         shown = self._shown(stiffness, damping, (least, 0.0), most)
         self._stiffness = gui.add_slider(labels[0], least, most[0], self._steps[0], shown[0])
         self._damping = gui.add_slider(labels[1], 0.0, most[1], self._steps[1], shown[1])
-        self._stiffness.on_update(lambda _: want())
-        self._damping.on_update(lambda _: want())
+        self._stiffness.on_update(by_hand(want))
+        self._damping.on_update(by_hand(want))
 
     @property
     def value(self) -> tuple[float, float]:
         """What they show; whatever a browser has sent."""
         return self._stiffness.value, self._damping.value
 
-    def show(self, stiffness: float, damping: float) -> tuple[float, float]:
-        """Puts them to a stiffness and damping; returns what they then show."""
+    def show(self, stiffness: float, damping: float) -> None:
+        """Puts them to a stiffness and damping."""
         self.bound(stiffness, damping)
         most = self._stiffness.max, self._damping.max
         shown = self._shown(stiffness, damping, (self._stiffness.min, 0.0), most)
         self._stiffness.value, self._damping.value = shown
-        return shown
 
     def bound(self, stiffness: float, damping: float) -> None:
         """Puts the end of each to where the other one lets it go."""
@@ -97,6 +97,19 @@ class Sliders:
             max(_down(span.most_stiffness(damping), steps[0]), least + steps[0]),
             max(_down(span.most_damping(stiffness), steps[1]), steps[1]),
         )
+
+
+def by_hand(act: Callable[[], None]) -> Callable[[viser.GuiEvent[Any]], None]:
+    """Returns a callback that acts on what a browser changed, and not on what this process did.
+
+    viser tells of both; what a run was given by others would come back to it as a wish.
+    """
+
+    def acts(event: viser.GuiEvent[Any]) -> None:
+        if event.client_id is not None:
+            act()
+
+    return acts
 
 
 def _step(most: float) -> float:
