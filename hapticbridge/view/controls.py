@@ -116,6 +116,8 @@ class Controls:
     ) -> None:
         self._allowance, self._ask = allowance, ask
         self._touched = 0.0
+        # viser calls from as many threads as it likes: an older value must not be asked for last
+        self._turn = threading.Lock()
         self._sliders: tuple[Sliders, ...] = ()
         self._said = {"recording": "", "force": "", "answer": ""}
         gui = server.gui
@@ -132,8 +134,8 @@ class Controls:
         # how the run is, or soon will be
         self._gains = [sliders.span.gains(allowance.start) for sliders in self._sliders]
         self._is_forced, self._is_clutched, self._is_recording = True, False, False
-        self._force.on_update(by_hand(lambda: ask(Switch(force=bool(self._force.value)))))
-        self._clutch.on_update(by_hand(lambda: ask(Switch(clutch=bool(self._clutch.value)))))
+        self._force.on_update(by_hand(self._switch_force))
+        self._clutch.on_update(by_hand(self._switch_clutch))
         reset.on_click(lambda _: ask(Reset()))
         self._record.on_click(lambda _: ask(Record(not self._is_recording)))
         stop.on_click(lambda _: ask(Stop()))
@@ -144,11 +146,20 @@ class Controls:
 
     def _want(self) -> None:
         """Asks for what the sliders show."""
-        self._touched = time.monotonic()
-        try:
-            self._ask(Couple(*(value for sliders in self._sliders for value in sliders.value)))
-        except CommandError as error:
-            self._refuse(str(error))
+        with self._turn:
+            self._touched = time.monotonic()
+            try:
+                self._ask(Couple(*(value for sliders in self._sliders for value in sliders.value)))
+            except CommandError as error:
+                self._refuse(str(error))
+
+    def _switch_force(self) -> None:
+        with self._turn:
+            self._ask(Switch(force=bool(self._force.value)))
+
+    def _switch_clutch(self) -> None:
+        with self._turn:
+            self._ask(Switch(clutch=bool(self._clutch.value)))
 
     def note(self, event: Mapping[str, Any]) -> None:
         """Takes an event of the run; the controls then show how it is, not what was asked for."""
