@@ -36,15 +36,14 @@ SETTLED = 15.0
 
 
 def save(tab: Tab, target: Path) -> None:
-    """Writes what a tab shows, in 256 colours."""
+    """Writes what a tab shows."""
     with tempfile.TemporaryDirectory() as folder:
         tab.picture(Path(folder) / "page.png")
         image = Image.open(io.BytesIO((Path(folder) / "page.png").read_bytes())).convert("RGB")
     height = round(image.height * WIDTH / image.width)
     image = image.resize((WIDTH, height), Image.Resampling.LANCZOS)
-    # the median cut would make one colour of two curves, which have few pixels
-    cover = Image.Quantize.MAXCOVERAGE
-    image.quantize(256, method=cover, dither=Image.Dither.NONE).save(target, optimize=True)
+    # in 256 colours a floor has steps, or thin curves another colour
+    image.save(target, optimize=True)
 
 
 def draw_view(tab: Tab, file: Path, target: Path) -> None:
