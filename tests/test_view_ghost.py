@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from types import SimpleNamespace
 from typing import Any
 
@@ -21,11 +22,11 @@ from hapticbridge.view.ghost import (
     MOST_TIMES,
     SHELL,
     Ghost,
+    Surfaces,
     coil,
     enlargement,
     linear,
     shell,
-    way_out,
 )
 from hapticbridge.view.sight import Sight
 
@@ -128,10 +129,20 @@ def test_the_way_out_is_to_the_last_surface() -> None:
     balls = [trimesh.creation.icosphere(subdivisions=4, radius=radius) for radius in (0.5, 1.0)]
     balls[1].apply_translation((0, 0, 3.0))
     triangles = np.concatenate([ball.triangles for ball in balls])
-    assert way_out(triangles, np.array([0.0, 0, 1])) == pytest.approx(4.0, rel=1e-3)
+    both = Surfaces(triangles)
+    assert both.way_out(np.array([0.0, 0, 1])) == pytest.approx(4.0, rel=1e-3)
     for along in ((1, 0, 0), (0, 0, -1), (0.6, 0.0, -0.8)):
-        assert way_out(triangles, np.array(along, float)) == pytest.approx(0.5, rel=5e-3)
-    assert way_out(balls[1].triangles, np.array([1.0, 0, 0])) == 0.0
+        assert both.way_out(np.array(along, float)) == pytest.approx(0.5, rel=5e-3)
+    assert Surfaces(balls[1].triangles).way_out(np.array([1.0, 0, 0])) == 0.0
+
+
+def test_a_surface_seen_edge_on_or_without_area_is_not_in_the_way() -> None:
+    edge_on = [[0.0, 0, 1], [0, 0, 2], [0, 1, 2]]
+    no_area = [[0.0, 0, 1], [0, 0, 1], [1, 0, 1]]
+    found = Surfaces(np.array([edge_on, no_area]))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert found.way_out(np.array([0.0, 0, 1])) == 0.0
 
 
 @given(st.floats(1e-9, 10.0), st.floats(0.0, 10.0))

@@ -61,7 +61,7 @@ class Ghost:
         self._handle = scene.add_frame("/handle", show_axes=False)
         faces = np.asarray(self._shell.faces)
         corners = np.asarray(self._shell.vertices)
-        self._triangles = corners[faces]
+        self._surfaces = Surfaces(corners[faces])
         scene.add_mesh_simple("/handle/shell", corners, faces, color=_BLUE, opacity=0.3)
         nothing = np.zeros((POINTS, 2, 3), dtype=np.float32)
         self._spring = scene.add_line_segments(
@@ -100,7 +100,7 @@ class Ghost:
             turn = np.zeros(9)
             mujoco.mju_quat2Mat(turn, sight.handle_turn)
             along = way / stretch
-            aside = way_out(self._triangles, turn.reshape(3, 3).T @ along)
+            aside = self._surfaces.way_out(turn.reshape(3, 3).T @ along)
             start = start + aside * along
         end = start + self.times * way
         self._spring.points = coil(start, end, 0.02 * self._extent).astype(np.float32)
@@ -153,28 +153,37 @@ def shell(model: mujoco.MjModel, grip: str) -> trimesh.Trimesh:
     return trimesh.util.concatenate(parts)
 
 
-def way_out(triangles: Array, along: Array) -> float:
-    """Returns how far it is from the origin to the last surface in a direction, in m, or 0.
+class Surfaces:
+    """Surfaces around the origin, and how far it is out of them.
 
     Args:
         triangles: Of the surfaces, (m, 3, 3) in m.
-        along: A unit vector.
 
     References:
-        Möller & Trumbore, "Fast, minimum storage ray–triangle intersection", 1997.
+        Möller & Trumbore, "Fast, minimum storage ray–triangle intersection", 1997; their triple
+        products are turned so that all but the direction is known beforehand.
     """
-    first, second = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
-    across = np.cross(along, second)
-    volume = np.einsum("ij,ij->i", first, across)
-    meets = np.abs(volume) > 1e-30
-    first, second, across = first[meets], second[meets], across[meets]
-    back, volume = -triangles[meets, 0], volume[meets]
-    u = np.einsum("ij,ij->i", back, across) / volume
-    other = np.cross(back, first)
-    v = other @ along / volume
-    far = np.einsum("ij,ij->i", second, other) / volume
-    is_hit = (u >= -1e-9) & (v >= -1e-9) & (u + v <= 1.0 + 1e-9) & (far > 0.0)
-    return float(far[is_hit].max(initial=0.0))
+
+    def __init__(self, triangles: Array) -> None:
+        first, second = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
+        back = -triangles[:, 0]
+        other = np.cross(back, first)
+        # what each gives along a direction: the volume, and it times u and v
+        self._products = np.stack([np.cross(second, first), np.cross(second, back), other])
+        self._far = np.einsum("ij,ij->i", second, other)
+
+    def way_out(self, along: Array) -> float:
+        """Returns how far it is from the origin to the last surface in a direction, in m, or 0.
+
+        Args:
+            along: A unit vector.
+        """
+        volume, u, v = self._products @ along
+        with np.errstate(all="ignore"):  # edge on or without area: it hits nothing
+            u, v, far = u / volume, v / volume, self._far / volume
+        is_hit = (u >= -1e-9) & (v >= -1e-9) & (u + v <= 1.0 + 1e-9) & (far > 0.0)
+        is_hit &= np.abs(volume) > 1e-30
+        return float(far[is_hit].max(initial=0.0))
 
 
 def enlargement(room: float, stretch: float) -> int:

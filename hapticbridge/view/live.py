@@ -104,10 +104,11 @@ def _follow(
             warning = f"  \n**{show.warning}**" if show.warning else ""
             force = float(np.linalg.norm(sight.force))
             page.status.content = f"**{sight.time:.1f} s**, {force:.2f} N{warning}"
-        curves = show.curves()
-        if curves is not None and began - plotted >= REPLOT:
-            plotted = began
-            page.plot(*curves)
+        if began - plotted >= REPLOT:
+            curves = show.curves()
+            if curves is not None:
+                plotted = began
+                page.plot(*curves)
 
 
 def run() -> None:
