@@ -179,10 +179,9 @@ class Surfaces:
             along: A unit vector.
         """
         volume, u, v = self._products @ along
-        with np.errstate(all="ignore"):  # edge on or without area: it hits nothing
-            u, v, far = u / volume, v / volume, self._far / volume
+        volume[np.abs(volume) < 1e-30] = np.nan  # edge on or without area: nothing meets it
+        u, v, far = u / volume, v / volume, self._far / volume
         is_hit = (u >= -1e-9) & (v >= -1e-9) & (u + v <= 1.0 + 1e-9) & (far > 0.0)
-        is_hit &= np.abs(volume) > 1e-30
         return float(far[is_hit].max(initial=0.0))
 
 
