@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from numbers import Real
 
@@ -62,8 +63,30 @@ DATA_SHEET_UNITS = {
 AXES = ("x", "y", "z", "rx", "ry", "rz")
 """Axes that a device may move along (x, y, z) and turn about (rx, ry, rz), in its own frame."""
 
+USUAL_FORCE_LIMIT, USUAL_TORQUE_LIMIT, USUAL_SPEED_LIMIT = 10.0, 0.5, 5.0
+"""In N, N m and m/s, for the sheets of devices that have no figure of their own: what a desktop
+device gives, and a speed that no hand reaches, but a fault does. Where there is no motor, a limit
+of force or torque limits only what is recorded."""
+
 _NEVER_UNKNOWN = ("force_limit", "torque_limit", "speed_limit")
 _POSITIVE = ("mass", "rotational_inertia", "rate", "reach")
+
+
+def stated_numbers(options: Mapping[str, object], names: Iterable[str]) -> dict[str, float]:
+    """Returns those numbers of the data sheet that a device's options state.
+
+    Args:
+        options: By name; None stands for one that is not stated.
+        names: Of ``DATA_SHEET_UNITS``, which of them are looked for.
+
+    Raises:
+        DeviceError: A number is out of range.
+    """
+    return {name: _checked(name, options[name]) for name in names if options.get(name) is not None}
+
+
+def _checked(name: str, value: object) -> float:
+    return checked_number(name, value, DATA_SHEET_UNITS[name], is_positive=name in _POSITIVE)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -133,12 +156,10 @@ class DeviceInfo:
         for name in ("is_prescribed", "is_real"):
             if not isinstance(getattr(self, name), bool):
                 raise DeviceError(f"{name} = {getattr(self, name)!r}: must be true or false")
-        for name, unit in DATA_SHEET_UNITS.items():
+        for name in DATA_SHEET_UNITS:
             value = getattr(self, name)
-            if value is None and name not in _NEVER_UNKNOWN:
-                continue
-            number = checked_number(name, value, unit, is_positive=name in _POSITIVE)
-            object.__setattr__(self, name, number)
+            if value is not None or name in _NEVER_UNKNOWN:
+                object.__setattr__(self, name, _checked(name, value))
 
     @property
     def degrees_of_freedom(self) -> int:

@@ -21,7 +21,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.device.data_sheet import DeviceInfo, checked_number, checked_period
+from hapticbridge.device.data_sheet import (
+    USUAL_TORQUE_LIMIT,
+    DeviceInfo,
+    checked_period,
+    stated_numbers,
+)
 from hapticbridge.device.falcon.boot import READ_FROM, WRITE_TO, Link, ask, read_firmware
 from hapticbridge.device.falcon.motion import (
     BELIEVED,
@@ -29,7 +34,6 @@ from hapticbridge.device.falcon.motion import (
     MOTION_DTYPE,
     PLACE,
     SPEED_LIMIT,
-    UNFELT_TORQUE_LIMIT,
     believe,
     command,
     resolution,
@@ -95,7 +99,7 @@ class FalconDevice:
                 friction=friction,
                 resolution=resolution(),
                 force_limit=FORCE_LIMIT,
-                torque_limit=UNFELT_TORQUE_LIMIT,
+                torque_limit=USUAL_TORQUE_LIMIT,
                 speed_limit=SPEED_LIMIT,
                 rate=rate,
                 delay=delay,
@@ -218,17 +222,12 @@ def open_falcon(options: Mapping[str, object], tell: Tell, backend: Any = None) 
     Raises:
         DeviceError: There is none, it cannot be opened, is lost, or an option is not valid.
     """
-    numbers = {
-        name: checked_number(name, options[name], unit, is_positive=name == "mass")
-        for name, unit in _NUMBERS.items()
-        if options.get(name) is not None
-    }
-    files = {name: str(options[name]) for name in ("firmware", "log") if options.get(name)}
-    firmware = files.get("firmware")
-    if firmware:
+    numbers = stated_numbers(options, _NUMBERS)
+    firmware = str(options["firmware"]) if options.get("firmware") else None
+    if firmware is not None:
         read_firmware(firmware)  # a wrong name is said before anything moves
     plugged = chosen(FAMILY, find(FAMILY, backend), options.get("serial"))
-    log = HexLog(files.get("log"))
+    log = HexLog.asked(options)
     link = UsbLink.open(
         plugged, FAMILY, read_from=READ_FROM, write_to=WRITE_TO, backend=backend, log=log
     )
@@ -237,7 +236,7 @@ def open_falcon(options: Mapping[str, object], tell: Tell, backend: Any = None) 
     return device
 
 
-_NUMBERS = {"mass": "kg", "damping": "N s/m", "friction": "N"}
+_NUMBERS = ("mass", "damping", "friction")
 
 FAMILY = Family(
     name="falcon",
@@ -247,6 +246,6 @@ FAMILY = Family(
     axes="x, y, z",
     force="8 N",
     rate="1 kHz",
-    options=("serial", "firmware", "mass", "damping", "friction", "log"),
+    options=("serial", "firmware", *_NUMBERS, "log"),
     open=open_falcon,
 )

@@ -36,10 +36,6 @@ MOTOR_LIMIT = 4096.0
 FORCE_LIMIT = 8.0
 """In N: what CHAI3D lets applications ask of a Falcon; the maker's figure is above 8.9 N."""
 
-UNFELT_TORQUE_LIMIT = 0.5
-"""In N m, that of the simulated device: no motor turns the grip, and only what is recorded is
-limited."""
-
 SPEED_LIMIT = 3.0
 """In m/s: faster motion is not believed. No figure was found; a hand that crosses the 0.1 m of the
 workspace in 33 ms is at its end."""

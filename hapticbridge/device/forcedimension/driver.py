@@ -23,7 +23,7 @@ from ctypes import byref, c_double, c_ushort
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.device.data_sheet import AXES, DeviceInfo, checked_period
+from hapticbridge.device.data_sheet import AXES, USUAL_SPEED_LIMIT, DeviceInfo, checked_period
 from hapticbridge.device.forcedimension.library import (
     MOST_WATCHDOG,
     SATURATED,
@@ -36,9 +36,6 @@ from hapticbridge.device.plugged import Tell, tell_nobody
 from hapticbridge.device.silence import SILENCE, SilenceWatch, watchdog_time
 from hapticbridge.errors import DeviceError, DeviceLost
 from hapticbridge.tick import SAMPLE_DTYPE, TickFlag
-
-SPEED_LIMIT = 5.0
-"""In m/s. No figure was found; a hand is not faster."""
 
 MEASURED = (
     "mass", "damping", "rotational_inertia", "rotational_damping", "friction", "resolution",
@@ -112,7 +109,7 @@ class ForceDimensionDevice:
                 **{name: known.get(name) for name in MEASURED},
                 force_limit=limits[0],
                 torque_limit=limits[1],
-                speed_limit=SPEED_LIMIT,
+                speed_limit=USUAL_SPEED_LIMIT,
                 rate=rate,
                 delay=delay,
                 is_prescribed=False,

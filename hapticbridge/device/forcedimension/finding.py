@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 
-from hapticbridge.device.data_sheet import DATA_SHEET_UNITS, checked_number
+from hapticbridge.device.data_sheet import stated_numbers
 from hapticbridge.device.forcedimension.driver import MEASURED, ForceDimensionDevice
 from hapticbridge.device.forcedimension.library import Dhd, located
 from hapticbridge.device.plugged import Family, Plugged, Tell, UsbId, chosen
@@ -27,16 +27,7 @@ def open_forcedimension(options: Mapping[str, object], tell: Tell) -> ForceDimen
         DeviceError: There is no library or no device, or an option is not valid.
         DeviceLost: It is gone.
     """
-    numbers = {
-        name: checked_number(
-            name,
-            options[name],
-            DATA_SHEET_UNITS[name],
-            is_positive=name in ("mass", "rotational_inertia"),
-        )
-        for name in _NUMBERS
-        if options.get(name) is not None
-    }
+    numbers = stated_numbers(options, _NUMBERS)
     gravity = options.get("gravity", 1.0)
     if gravity not in (0, 1):
         raise DeviceError(f"gravity = {gravity!r}: must be 1 (compensated) or 0")

@@ -8,13 +8,12 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
+from hapticbridge.device.data_sheet import USUAL_TORQUE_LIMIT
 from hapticbridge.errors import DeviceError
 from hapticbridge.pose import Quaternion, canonical
 
 ROTATION_ERROR = 1e-3
 """Of R Rᵀ, without unit: more is no rotation, whatever rounded it."""
-
-_NOTHING_RECORDED = 0.5  # N m, of torques that are recorded and have no motor: the usual limit
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +67,7 @@ def limits_of(
     Raises:
         DeviceError: Nobody knows.
     """
-    limits = {"force": 0.0, "torque": _NOTHING_RECORDED}
+    limits = {"force": 0.0, "torque": USUAL_TORQUE_LIMIT}
     usual = {"force": model.force, "torque": model.torque}
     for name, said in zip(limits, told, strict=True):
         if name == "torque" and not model.turns:

@@ -22,7 +22,12 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.device.data_sheet import DeviceInfo, checked_period
+from hapticbridge.device.data_sheet import (
+    USUAL_SPEED_LIMIT,
+    USUAL_TORQUE_LIMIT,
+    DeviceInfo,
+    checked_period,
+)
 from hapticbridge.device.haply import messages
 from hapticbridge.device.haply.messages import SERVICE, Listed
 from hapticbridge.device.haply.timing import measured_timing
@@ -36,9 +41,6 @@ FORCE_LIMIT = 2.0
 """In N: what Isaac Lab's driver limits itself to. The maker publishes no continuous force; more is
 to be asked for with the option ``force_limit``."""
 
-SPEED_LIMIT = 5.0
-"""In m/s. No figure was found; a hand is not faster."""
-
 FIRST_ANSWER = 1.0
 """In s: longest wait for the list of devices and for the first state."""
 
@@ -47,8 +49,6 @@ LONGEST_PERIOD = 0.02
 
 MOST_UNDER_WAY = 2
 """Messages without an answer yet. One would leave the service idle while its answer travels."""
-
-_NOTHING_RECORDED = 0.5  # N m, of torques that are recorded and have no motor: the usual limit
 
 
 class HaplyDevice:
@@ -103,8 +103,8 @@ class HaplyDevice:
                 axes=("x", "y", "z"),
                 rotational_inertia=None,
                 rotational_damping=None,
-                torque_limit=_NOTHING_RECORDED,
-                speed_limit=SPEED_LIMIT,
+                torque_limit=USUAL_TORQUE_LIMIT,
+                speed_limit=USUAL_SPEED_LIMIT,
                 rate=rate,
                 delay=delay,
                 is_prescribed=False,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from hapticbridge.device.data_sheet import DATA_SHEET_UNITS, checked_number
+from hapticbridge.device.data_sheet import checked_number, stated_numbers
 from hapticbridge.device.haply import messages
 from hapticbridge.device.haply.driver import FIRST_ANSWER, FORCE_LIMIT, HaplyDevice
 from hapticbridge.device.haply.messages import SERVICE, Listed
@@ -32,21 +32,14 @@ def open_haply(options: Mapping[str, object], tell: Tell) -> HaplyDevice:
         DeviceLost: It is gone.
     """
     host, port = _place(options.get("service"))
-    log = options.get("log")
-    link = WebSocketLink.open(host, port, SERVICE, HexLog(None if log is None else str(log)))
+    link = WebSocketLink.open(host, port, SERVICE, HexLog.asked(options))
     return opened(link, options, tell)
 
 
 def opened(link: Link, options: Mapping[str, object], tell: Tell) -> HaplyDevice:
     """Opens a device of a service that is connected; see ``open_haply``."""
     try:
-        numbers = {
-            name: checked_number(
-                name, options[name], DATA_SHEET_UNITS[name], is_positive=name == "mass"
-            )
-            for name in _NUMBERS
-            if options.get(name) is not None
-        }
+        numbers = stated_numbers(options, _NUMBERS)
         force_gate = checked_number("force_gate", options.get("force_gate", 0.0), "")
         devices = _devices(link)
         serial = chosen(FAMILY, [_plugged(d) for d in devices], options.get("serial")).serial

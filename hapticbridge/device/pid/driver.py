@@ -203,13 +203,8 @@ def open_pid(options: Mapping[str, object], tell: Tell, api: HidApi | None = Non
     """
     plugged = chosen(FAMILY, find(FAMILY, api), options.get("serial"))
     scale, known = scale_of(options, plugged.serial, str(plugged), tell)
-    log = options.get("log")
     link = HidLink.open(
-        plugged,
-        api,
-        is_overlapped=api is None,
-        log=HexLog(None if log is None else str(log)),
-        slots=SLOTS,
+        plugged, api, is_overlapped=api is None, log=HexLog.asked(options), slots=SLOTS
     )
     try:
         device = PidDevice(

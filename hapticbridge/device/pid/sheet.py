@@ -9,7 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.device.data_sheet import DeviceInfo, checked_number
+from hapticbridge.device.data_sheet import (
+    USUAL_SPEED_LIMIT,
+    USUAL_TORQUE_LIMIT,
+    DeviceInfo,
+    checked_number,
+)
 from hapticbridge.device.plugged import Tell
 from hapticbridge.device.profile_search import profile_named, profile_of
 from hapticbridge.errors import DeviceError
@@ -21,12 +26,6 @@ what is asked for comes out weaker. A stronger one exists; only a force gauge te
 ASSUMED_TRAVEL = 0.1
 """In m from stop to stop, likewise: a grip some 12 cm above its pivot that turns by 24° to each
 side."""
-
-SPEED_LIMIT = 5.0
-"""In m/s, the simulated device's: no hand moves a stick faster, a fault does."""
-
-UNFELT_TORQUE_LIMIT = 0.5
-"""In N m, the simulated device's: only what is recorded of the torque is limited."""
 
 CHANGES = ("mass", "damping", "friction")
 """Numbers of the data sheet that the user may know."""
@@ -152,8 +151,8 @@ def data_sheet(
         rotational_damping=None,
         resolution=0.5 * scale.travel * max(step),
         force_limit=scale.newtons,
-        torque_limit=UNFELT_TORQUE_LIMIT,
-        speed_limit=SPEED_LIMIT,
+        torque_limit=USUAL_TORQUE_LIMIT,
+        speed_limit=USUAL_SPEED_LIMIT,
         rate=None if period is None else 1.0 / period,
         delay=None,
         is_prescribed=False,

@@ -33,10 +33,7 @@ def open_rawhid(
         DeviceError: There is none, or it cannot be opened or does not speak the protocol.
     """
     plugged = chosen(FAMILY, find(FAMILY, api), options.get("serial"))
-    log = options.get("log")
-    link = HidLink.open(
-        plugged, api, is_overlapped=api is None, log=HexLog(None if log is None else str(log))
-    )
+    link = HidLink.open(plugged, api, is_overlapped=api is None, log=HexLog.asked(options))
     changes = {key: value for key, value in options.items() if key in CHANGES}
     try:
         device = RawHidDevice(link, str(plugged), changes, now)

@@ -5,7 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
-from hapticbridge.device.data_sheet import AXES, DeviceInfo
+from hapticbridge.device.data_sheet import (
+    AXES,
+    USUAL_FORCE_LIMIT,
+    USUAL_TORQUE_LIMIT,
+    DeviceInfo,
+)
 from hapticbridge.device.rawhid.frame import (
     NAME_PAGE,
     NUMBERS_PAGE,
@@ -24,10 +29,6 @@ for, in ms: a device that still boots has a second for each."""
 
 POLLING = 1e-3
 """In s: a full-speed device is asked once a millisecond, in each direction."""
-
-UNFELT_FORCE_LIMIT, UNFELT_TORQUE_LIMIT = 10.0, 0.5
-"""In N and N m, those of the simulated device: for a device that does not move, or does not turn.
-It feels no such wrench; only what is recorded is limited."""
 
 _MUST_SAY = ("rate", "speed_limit")
 CHANGES = (
@@ -103,9 +104,9 @@ def data_sheet(name: str, numbers: Numbers, title: str, changes: dict[str, Any])
     axes = numbers.axis_names
     moves, turns = (any(axis in axes for axis in kind) for kind in (AXES[:3], AXES[3:]))
     if not moves:
-        known["force_limit"] = UNFELT_FORCE_LIMIT
+        known["force_limit"] = USUAL_FORCE_LIMIT
     if not turns:
-        known["torque_limit"] = UNFELT_TORQUE_LIMIT
+        known["torque_limit"] = USUAL_TORQUE_LIMIT
     known |= changes
     must = [*_MUST_SAY, *["force_limit"] * moves, *["torque_limit"] * turns]
     if missing := [field for field in must if known[field] is None]:

@@ -10,7 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from hapticbridge.device.data_sheet import AXES, DeviceInfo, checked_number, checked_period
+from hapticbridge.device.data_sheet import (
+    AXES,
+    USUAL_FORCE_LIMIT,
+    USUAL_SPEED_LIMIT,
+    USUAL_TORQUE_LIMIT,
+    DeviceInfo,
+    checked_number,
+    checked_period,
+)
 from hapticbridge.device.simulated.hand import DEFAULT_HAND, NO_HAND, Hand
 from hapticbridge.device.simulated.handheld import (
     FREE,
@@ -95,9 +103,9 @@ class SimulatedDevice:
         rotational_resolution: float = 0.0,
         friction: float = 0.0,
         delay: int = 0,
-        force_limit: float = 10.0,
-        torque_limit: float = 0.5,
-        speed_limit: float = 5.0,
+        force_limit: float = USUAL_FORCE_LIMIT,
+        torque_limit: float = USUAL_TORQUE_LIMIT,
+        speed_limit: float = USUAL_SPEED_LIMIT,
     ) -> None:
         if isinstance(delay, bool) or not isinstance(delay, int) or not 0 <= delay <= MAX_DELAY:
             raise DeviceError(f"delay = {delay!r}: must be 0 to {MAX_DELAY} whole samples")

@@ -10,7 +10,14 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.device.data_sheet import AXES, DeviceInfo, checked_number, checked_period
+from hapticbridge.device.data_sheet import (
+    AXES,
+    USUAL_FORCE_LIMIT,
+    USUAL_TORQUE_LIMIT,
+    DeviceInfo,
+    checked_number,
+    checked_period,
+)
 from hapticbridge.device.plugged import Family, Tell, chosen
 from hapticbridge.device.spacemouse.ids import IDS
 from hapticbridge.device.spacemouse.reports import (
@@ -76,8 +83,8 @@ class SpaceMouseDevice:
         speed: float = SPEED,
         turn: float = TURN,
         dead_band: float = DEAD_BAND,
-        force_limit: float = 10.0,
-        torque_limit: float = 0.5,
+        force_limit: float = USUAL_FORCE_LIMIT,
+        torque_limit: float = USUAL_TORQUE_LIMIT,
     ) -> None:
         self._link, self._name = link, name
         speed = checked_number("speed", speed, "m/s", is_positive=True)
@@ -209,11 +216,8 @@ def open_spacemouse(
         DeviceError: There is none, it cannot be opened, or a number is out of range.
     """
     plugged = chosen(FAMILY, find(FAMILY, api), options.get("serial"))
-    log = options.get("log")
     # not overlapped: it is written to only before the loop and after it
-    link = HidLink.open(
-        plugged, api, is_overlapped=False, log=HexLog(None if log is None else str(log))
-    )
+    link = HidLink.open(plugged, api, is_overlapped=False, log=HexLog.asked(options))
     numbers: dict[str, float] = {
         key: value  # type: ignore[misc] # checked by the device
         for key, value in options.items()

@@ -5,7 +5,14 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.device.data_sheet import AXES, DeviceInfo, checked_period
+from hapticbridge.device.data_sheet import (
+    AXES,
+    USUAL_FORCE_LIMIT,
+    USUAL_SPEED_LIMIT,
+    USUAL_TORQUE_LIMIT,
+    DeviceInfo,
+    checked_period,
+)
 from hapticbridge.device.trajectory.motion import NORM_TOLERANCE, Motion, pose_at
 from hapticbridge.errors import DeviceError
 from hapticbridge.jit import compiled, direct
@@ -81,9 +88,9 @@ class TrajectoryDevice:
         self,
         motion: Motion,
         *,
-        force_limit: float = 10.0,
-        torque_limit: float = 0.5,
-        speed_limit: float = 5.0,
+        force_limit: float = USUAL_FORCE_LIMIT,
+        torque_limit: float = USUAL_TORQUE_LIMIT,
+        speed_limit: float = USUAL_SPEED_LIMIT,
     ) -> None:
         self.info = _prescribed(
             duration=motion.duration,
@@ -161,9 +168,9 @@ class ReplayDevice:
         period: float,
         *,
         name: str = "recording",
-        force_limit: float = 10.0,
-        torque_limit: float = 0.5,
-        speed_limit: float = 5.0,
+        force_limit: float = USUAL_FORCE_LIMIT,
+        torque_limit: float = USUAL_TORQUE_LIMIT,
+        speed_limit: float = USUAL_SPEED_LIMIT,
     ) -> None:
         if len(ticks) < 2:
             raise DeviceError(f"{name}: holds {len(ticks)} of at least two ticks")

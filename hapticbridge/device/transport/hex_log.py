@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TextIO
@@ -42,6 +42,16 @@ class HexLog:
         if self._path is not None:
             with _appending(self._path):
                 pass
+
+    @classmethod
+    def asked(cls, options: Mapping[str, object]) -> HexLog:
+        """Returns the log that a device's option ``log`` names, or else the variable.
+
+        Raises:
+            DeviceError: The file cannot be written.
+        """
+        named = options.get("log")
+        return cls(None if named is None else str(named))
 
     @property
     def is_on(self) -> bool:
