@@ -28,14 +28,15 @@ from hapticbridge.study.maps.device_runs import (
     QUANTUM,
     RESOLUTION,
     STIFFNESS,
+    WALL_MASS,
     friction_needed,
     friction_to_rest,
-    make_heavy,
     pressed_device,
     region_of,
     settle,
     shaken,
 )
+from hapticbridge.study.maps.rigs import set_tool_mass
 from hapticbridge.study.maps.stability_map import Point, run_map
 
 
@@ -161,7 +162,7 @@ def test_the_audit_names_the_device_that_has_too_little_damping(
     beta: float, verdict: str, port: str, tmp_path: Path
 ) -> None:
     scene = load_scene("virtual_wall")
-    make_heavy(scene.model)
+    set_tool_mass(scene.model, "tool", WALL_MASS)
     mujoco.mj_setConst(scene.model, scene.data)
     knock = np.array([LARGE * RESOLUTION, 0.0, 0.0, 0.0, 0.0, 0.0])
     device = pressed_device(beta, 0.7, NEVER)

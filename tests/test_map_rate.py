@@ -30,13 +30,14 @@ from hapticbridge.study.maps.rate_runs import (
     SEEDS,
     TICKS,
     UNEVEN_PERIOD,
+    WALL_MASS,
     evaluate,
     finite_hand,
-    make_heavy,
     unevenness,
     wall_limit,
     worst_hand,
 )
+from hapticbridge.study.maps.rigs import set_tool_mass
 from hapticbridge.study.maps.stability_map import Point, run_map
 
 
@@ -168,7 +169,7 @@ def test_below_the_bound_at_the_longest_interval_nothing_fails(hand: str, timing
 
 def wall() -> Scene:
     scene = load_scene("virtual_wall")
-    make_heavy(scene.model)
+    set_tool_mass(scene.model, "tool", WALL_MASS)
     mujoco.mj_setConst(scene.model, scene.data)
     return scene
 

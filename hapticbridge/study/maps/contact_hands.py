@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from hapticbridge.device import Hand, Motion
 from hapticbridge.device.trajectory.motion_csv import read_motion
 from hapticbridge.scene import scene_path
+from hapticbridge.study.maps.rigs import swinging
 
 RECORDED = (3.5, 6.0)
 """Part of the recorded hand in s: into the hole and to the bottom, pressing to the sides."""
@@ -22,22 +23,16 @@ def tapping(frequency: float) -> Motion:
 
     It wants to go 6 mm behind the wall's face.
     """
-    time = np.linspace(0.0, 1.0, 301)
-    path = np.zeros((time.size, 3))
-    path[:, 0] = 0.008 * (1 - np.cos(2 * np.pi * frequency * time))
-    return Motion(time, path)
+    return swinging(0.008, frequency, duration=1.0, count=301)
 
 
 @cache
 def random_taps(seed: int) -> tuple[Motion, Hand]:
     """Returns a random hand that taps: 1 to 6 Hz, 0 to 6 mm behind the wall's face, 1 s."""
     random = np.random.default_rng(seed)
-    time = np.linspace(0.0, 1.0, 301)
-    path = np.zeros((time.size, 3))
     size, frequency = random.uniform(5e-3, 8e-3), random.uniform(1.0, 6.0)
-    path[:, 0] = size * (1 - np.cos(2 * np.pi * frequency * time))
     hand = Hand(stiffness=random.uniform(800, 3000), damping=random.uniform(5, 30))
-    return Motion(time, path), hand
+    return swinging(size, frequency, duration=1.0, count=301), hand
 
 
 @cache

@@ -4,23 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.coupling import Coupling
-from hapticbridge.device import Motion, SimulatedDevice
+from hapticbridge.device import SimulatedDevice
 from hapticbridge.passivity import WorstHand
 from hapticbridge.rendering import METHODS
 from hapticbridge.study.closed_loop import ClosedLoop, LoopOutcome
 from hapticbridge.study.maps.bisection import largest_stable
 from hapticbridge.study.maps.free_tool import felt, worst_angle
-from hapticbridge.study.maps.rigs import free_tool_and_wall, loop_in, set_tool_mass
+from hapticbridge.study.maps.rigs import free_tool_and_wall, loop_in, swinging, wall_loop
 from hapticbridge.study.maps.stability_map import Point
 from hapticbridge.study.maps.verdicts import verdict_numbers
 from hapticbridge.study.table import Table
 
 PERIOD = 1e-3
+"""T in s."""
+
 DEVICE_DAMPING = 2.0
 """b in N s/m, that of the default simulated device."""
 
@@ -64,15 +65,8 @@ SEARCHED = (1.0, 200_000.0)
 and the same for every B."""
 
 
-def _touching() -> Motion:
-    """Returns the path of a hand that goes 5 mm deep into the wall three times in 2 s."""
-    time = np.linspace(0.0, 2.0, 201)
-    path = np.zeros((time.size, 3))
-    path[:, 0] = 0.0075 * (1 - np.cos(3 * np.pi * time))
-    return Motion(time, path)
-
-
-PATH = _touching()
+PATH = swinging(0.0075, 1.5, duration=2.0, count=201)
+"""Of a hand that goes 5 mm deep into the wall three times in 2 s."""
 
 
 def points(count: int) -> Sequence[Point]:
@@ -165,11 +159,7 @@ def _tool() -> ClosedLoop:
 
 
 def _wall() -> ClosedLoop:
-    return loop_in(free_tool_and_wall, "heavy", _make_heavy)
-
-
-def _make_heavy(model: mujoco.MjModel) -> None:
-    set_tool_mass(model, "tool", WALL_MASS)
+    return wall_loop(WALL_MASS, free_tool_and_wall)
 
 
 def _limit_on_wall(name: str, damping: float) -> float:

@@ -6,7 +6,6 @@ Against a wall a method is the law that it uses: K beside B' = B − a K T, at l
 
 from __future__ import annotations
 
-import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,7 +15,7 @@ from hapticbridge.rendering import METHODS
 from hapticbridge.study.closed_loop import LoopOutcome
 from hapticbridge.study.maps.bisection import largest_stable
 from hapticbridge.study.maps.bound_of_method import used_damping
-from hapticbridge.study.maps.rigs import loop_in, set_tool_mass
+from hapticbridge.study.maps.rigs import wall_loop
 
 RANGE = (0.1, 2.0)
 """Of β and of σ, even in their logarithms."""
@@ -31,6 +30,8 @@ below which ``lossless`` and ``compensated`` use none, are 1 and 2."""
 REGIONS = ("passive", "locally stable", "bounded limit cycle", "unstable")
 
 PERIOD = 1e-3
+"""T in s."""
+
 STIFFNESS = 2000.0
 """K in N/m. Only β = b/(K T) and σ = f_c/(K Δ) count, and the mass a little."""
 
@@ -167,7 +168,7 @@ def pressed_device(beta: float, sigma: float, limit: float = 10.0) -> SimulatedD
 def _wall(
     name: str, device: SimulatedDevice, damping: float, ticks: int, knock: NDArray[np.float64]
 ) -> LoopOutcome:
-    return loop_in("virtual_wall", "heavy for device", make_heavy).run(
+    return wall_loop(WALL_MASS).run(
         device,
         Coupling(STIFFNESS, damping, 0.0, 0.0),
         METHODS[name],
@@ -176,11 +177,6 @@ def _wall(
         knock=knock,
         keep_records=True,
     )
-
-
-def make_heavy(model: mujoco.MjModel) -> None:
-    """Makes the tool a wall: so heavy that no hand moves it."""
-    set_tool_mass(model, "tool", WALL_MASS)
 
 
 def friction_needed(name: str, damping: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -21,7 +20,7 @@ from hapticbridge.rendering import METHODS
 from hapticbridge.study.closed_loop import LoopOutcome
 from hapticbridge.study.jitter import PARTS, Timing
 from hapticbridge.study.maps.bisection import WIDTH, largest_stable
-from hapticbridge.study.maps.rigs import STILL, loop_in, set_tool_mass
+from hapticbridge.study.maps.rigs import STILL, wall_loop
 from hapticbridge.study.maps.stability_map import Point
 
 THEORY_WIDTH = WIDTH / 100
@@ -192,7 +191,7 @@ def _run(
     ticks: int = TICKS,
     timing: Timing | None = None,
 ) -> LoopOutcome:
-    return loop_in("virtual_wall", "heavy for rate", make_heavy).run(
+    return wall_loop(WALL_MASS).run(
         device,
         coupling,
         METHODS[name],
@@ -201,11 +200,6 @@ def _run(
         knock=KNOCK,
         timing=timing,
     )
-
-
-def make_heavy(model: mujoco.MjModel) -> None:
-    """Makes the tool a wall: so heavy that no hand moves it."""
-    set_tool_mass(model, "tool", WALL_MASS)
 
 
 def wall_limit(name: str, period: float, delay: int) -> float:

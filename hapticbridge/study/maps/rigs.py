@@ -1,4 +1,4 @@
-"""What maps have in common: hands that stand still, and a scene in every thread."""
+"""What maps have in common: hands that stand still or swing, and a scene in every thread."""
 
 from __future__ import annotations
 
@@ -19,6 +19,22 @@ from hapticbridge.study.closed_loop import ClosedLoop
 
 STILL = Motion([0.0, 1.0], np.zeros((2, 3)))
 """The path of a hand that wants to stay where it is."""
+
+
+def swinging(amplitude: float, frequency: float, duration: float, count: int) -> Motion:
+    """Returns the path of a hand that swings along x and turns nothing: A (1 − cos 2πft).
+
+    Args:
+        amplitude: A in m; it goes 2A far and back.
+        frequency: f in Hz.
+        duration: In s.
+        count: Rows, evenly over the duration; between them the path is straight.
+    """
+    time = np.linspace(0.0, duration, count)
+    path = np.zeros((count, 3))
+    path[:, 0] = amplitude * (1 - np.cos(2 * np.pi * frequency * time))
+    return Motion(time, path)
+
 
 _of_this_thread = threading.local()
 
@@ -81,6 +97,16 @@ def loop_in(
             mujoco.mj_setConst(loop.scene.model, loop.scene.data)
         loops[scene, key] = loop
     return loops[scene, key]
+
+
+def wall_loop(mass: float, scene: str | Callable[[], Scene] = "virtual_wall") -> ClosedLoop:
+    """Returns a closed loop whose tool is a wall: so heavy that no hand moves it.
+
+    Args:
+        mass: Of the tool in kg.
+        scene: As for ``loop_in``, its tool called ``tool``.
+    """
+    return loop_in(scene, ("wall", mass), lambda model: set_tool_mass(model, "tool", mass))
 
 
 def set_tool_mass(model: mujoco.MjModel, body: str, mass: float) -> None:

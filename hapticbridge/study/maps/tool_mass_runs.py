@@ -9,18 +9,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.coupling import Coupling
-from hapticbridge.device import Motion, SimulatedDevice
+from hapticbridge.device import SimulatedDevice
 from hapticbridge.passivity import WorstHand
 from hapticbridge.rendering import METHODS
 from hapticbridge.study.closed_loop import LoopOutcome
 from hapticbridge.study.maps.bisection import WIDTH, largest_stable
 from hapticbridge.study.maps.bound_of_method import used_damping
 from hapticbridge.study.maps.free_tool import felt, worst_angle
-from hapticbridge.study.maps.rigs import loop_in, set_tool_mass
+from hapticbridge.study.maps.rigs import loop_in, set_tool_mass, swinging
 from hapticbridge.study.maps.stability_map import Point
 from hapticbridge.study.table import Table
 
 PERIOD = 1e-3
+"""T in s."""
+
 DEVICE_DAMPING = 20.0
 """b in N s/m: a well damped device, so that stiff couplings are in play. The loop is linear: with a
 tenth of b, B and K everything here happens at a tenth of the tool's mass."""
@@ -45,16 +47,8 @@ KNOCK = np.array([1e-4, 0.0, 0.0, 0.0, 0.0, 0.0])
 HELD_STILL = 1e9
 """Mass in kg of a device that nobody moves: the handle is held still to 1e-12 m."""
 
-
-def _swinging() -> Motion:
-    """Returns the path of a hand that swings the tool by 5 mm at 3 Hz, and turns nothing."""
-    time = np.linspace(0.0, 2.0, 401)
-    path = np.zeros((time.size, 3))
-    path[:, 0] = 0.0025 * (1 - np.cos(6 * np.pi * time))
-    return Motion(time, path)
-
-
-PATH = _swinging()
+PATH = swinging(0.0025, 3.0, duration=2.0, count=401)
+"""Of a hand that swings the tool by 5 mm at 3 Hz, and turns nothing."""
 
 THEORIES: Mapping[str, str] = {
     "implicit": "implicit",
