@@ -13,6 +13,7 @@ PACKAGE = Path(__file__).parents[1] / "hapticbridge"
 ORDER = (
     (
         "errors",
+        "extras",
         "arguments",
         "jit",
         "tick",

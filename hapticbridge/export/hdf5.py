@@ -8,7 +8,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.export.sink import column_values, needed
+from hapticbridge.errors import RecordingError
+from hapticbridge.export.sink import column_values
+from hapticbridge.extras import optional_module
 from hapticbridge.recording import RecordingFile
 from hapticbridge.tick import COLUMNS, TICK_DTYPE
 
@@ -32,7 +34,7 @@ class Hdf5Sink:
     """
 
     def __init__(self, path: Path, recording: RecordingFile) -> None:
-        h5py = needed("h5py", "h5py", "HDF5", "hdf5")
+        h5py = optional_module("h5py", "HDF5", "hdf5", RecordingError)
         self._file = h5py.File(path, "w", rdcc_nbytes=_CACHE)
         text = h5py.string_dtype()
         meta = self._file.create_group("meta")

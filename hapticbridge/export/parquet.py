@@ -8,7 +8,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.export.sink import column_values, needed
+from hapticbridge.errors import RecordingError
+from hapticbridge.export.sink import column_values
+from hapticbridge.extras import optional_module
 from hapticbridge.recording import RecordingFile
 from hapticbridge.tick import COLUMNS, TICK_DTYPE
 
@@ -24,8 +26,8 @@ class ParquetSink:
     """
 
     def __init__(self, path: Path, recording: RecordingFile) -> None:
-        self._arrow = needed("pyarrow", "pyarrow", "Parquet", "tables")
-        parquet = needed("pyarrow.parquet", "pyarrow", "Parquet", "tables")
+        self._arrow = optional_module("pyarrow", "Parquet", "tables", RecordingError)
+        parquet = optional_module("pyarrow.parquet", "Parquet", "tables", RecordingError)
         kinds = {"i": self._arrow.int64(), "f": self._arrow.float64()}
         fields = [
             self._arrow.field(

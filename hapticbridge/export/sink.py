@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import importlib
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.errors import RecordingError
 from hapticbridge.recording import RecordingFile
 from hapticbridge.tick import Column
 
@@ -35,17 +33,3 @@ def column_values(ticks: NDArray[np.void], column: Column) -> NDArray[Any]:
     """Returns one column of records, contiguous, int64 or float64, to the bit."""
     field = ticks[column.field]
     return np.ascontiguousarray(field if column.part is None else field[:, column.part])
-
-
-def needed(module: str, package: str, form: str, extra: str) -> Any:
-    """Returns a module of an optional package.
-
-    Raises:
-        RecordingError: It is not installed.
-    """
-    try:
-        return importlib.import_module(module)
-    except ImportError:
-        raise RecordingError(
-            f"{form} needs {package}, which is not installed: pip install 'hapticbridge[{extra}]'"
-        ) from None

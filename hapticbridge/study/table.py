@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import importlib
 import io
 import math
 import os
@@ -16,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.errors import StudyError, choices
+from hapticbridge.extras import optional_module
 from hapticbridge.study.points import Point, Value
 
 FORMATS = ("csv", "parquet")
@@ -156,12 +156,7 @@ def pyarrow(module: str = "pyarrow") -> Any:
     Raises:
         StudyError: It is not installed.
     """
-    try:
-        return importlib.import_module(module)
-    except ImportError:
-        raise StudyError(
-            "Parquet needs pyarrow, which is not installed: pip install 'hapticbridge[tables]'"
-        ) from None
+    return optional_module(module, "Parquet", "tables", StudyError)
 
 
 def csv_bytes(columns: Mapping[str, Sequence[Value | None]]) -> bytes:
