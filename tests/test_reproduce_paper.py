@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 
 from hapticbridge.errors import HapticBridgeError
 from hapticbridge.passivity import stability_limit
+from hapticbridge.study.folder import prepared_folder
 from hapticbridge.study.paper import (
     damper,
     direct,
@@ -30,7 +31,7 @@ from hapticbridge.study.paper import (
     worst_hand,
 )
 from hapticbridge.study.paper.check import Check, Relation
-from hapticbridge.study.paper.page import PAGE, number, prepared_folder
+from hapticbridge.study.paper.page import PAGE, number
 from hapticbridge.study.paper.walk import STEPS
 
 SCRIPT = Path(__file__).parents[1] / "scripts" / "reproduce_paper"
@@ -190,7 +191,7 @@ def test_a_folder_without_permission_is_refused(
         raise PermissionError(13, "Permission denied")
 
     # permissions do not hold for root, who runs tests in containers
-    monkeypatch.setattr("hapticbridge.study.paper.page.tempfile.TemporaryFile", refuse)
+    monkeypatch.setattr("hapticbridge.study.folder.tempfile.TemporaryFile", refuse)
     with pytest.raises(HapticBridgeError, match=r"cannot write into .*: Permission denied"):
         prepared_folder(tmp_path)
 

@@ -5,6 +5,7 @@ Read ``sweep`` first: it applies a function to ``points``, in tasks (``task``) o
 done. ``closed_loop``, with ``jitter``, is the run that most sweeps make. On these stand ``maps``
 (where methods fail), ``chart`` (speed against accuracy, beside other ``engines``), ``paper`` (Brown
 & Colgate, equation by equation), ``theory`` (its pictures) and ``audits`` (many recordings).
+Charts and the paper's walk prove their ``folder`` before they compute.
 """
 
 from hapticbridge.study.points import grid as grid

@@ -20,6 +20,7 @@ from hapticbridge.study.chart.chart import Chart
 from hapticbridge.study.chart.drawing import draw_chart
 from hapticbridge.study.chart.page import chart_page
 from hapticbridge.study.chart.recommendation import recommendation
+from hapticbridge.study.folder import prepared_folder
 
 PICTURES = ("png", "svg")
 ENDINGS = (*PICTURES, "csv", "json", "html")
@@ -54,21 +55,9 @@ def prepared_files(folder: Path, name: str, endings: Sequence[str] = ENDINGS) ->
             f"'{folder}' holds the scene {name}.xml, and its hand path {name}.csv would be "
             "overwritten; name another folder"
         )
-    paths = {ending: folder / f"{name}.{ending}" for ending in endings}
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        for path in paths.values():
-            is_new = not path.exists()
-            with path.open("ab"):
-                pass
-            if is_new:
-                path.unlink()
-    except FileExistsError:
-        raise StudyError(f"'{folder}' is a file; name a folder to write into") from None
-    except (OSError, ValueError) as error:
-        reason = error.strerror if isinstance(error, OSError) else str(error)
-        raise StudyError(f"cannot write into '{folder}': {reason}") from None
-    return paths
+    files = {ending: f"{name}.{ending}" for ending in endings}
+    prepared_folder(folder, files.values())
+    return {ending: folder / file for ending, file in files.items()}
 
 
 def write_chart(chart: Chart, paths: Mapping[str, Path]) -> ChartFiles:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -16,23 +15,6 @@ from hapticbridge.study.paper.section import Section
 
 PAGE = "brown_colgate_1997.html"
 """Name of the page; the figures lie beside it as PNG."""
-
-
-def prepared_folder(path: Path) -> Path:
-    """Makes a folder, if there is none, and proves that it can be written to.
-
-    Raises:
-        HapticBridgeError: The path is a file, or cannot be made or written to.
-    """
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-        tempfile.TemporaryFile(dir=path).close()
-    except FileExistsError:
-        raise HapticBridgeError(f"'{path}' is a file; name a folder to write into") from None
-    except (OSError, ValueError) as error:
-        reason = error.strerror if isinstance(error, OSError) else str(error)
-        raise HapticBridgeError(f"cannot write into '{path}': {reason}") from None
-    return path
 
 
 def number(value: float) -> str:
