@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hapticbridge.arguments import Array
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import MechanicsError
 from hapticbridge.mechanics.arguments import (
@@ -19,41 +17,21 @@ from hapticbridge.mechanics.arguments import (
     spring_and_damper,
     step,
 )
+from hapticbridge.mechanics.particle import ParticleMotion
 
 CoupledScheme = Literal["held", "implicit", "compensated", "midpoint"]
 COUPLED_SCHEMES = ("held", "implicit", "compensated", "midpoint")
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class CoupledMotion:
+class CoupledMotion(ParticleMotion):
     """Motion of a mass behind a coupling at the samples 0 … N.
 
-    Attributes:
-        mass: m in kg, shape (...).
-        force: f_k on the mass in N, shape (N + 1, ...); the device receives −f_k. f_0 acts in no
-            step except under ``held``.
-        position: x_k in m, shape (N + 1, ...).
-        velocity: v_k in m/s, shape (N + 1, ...).
+    ``force`` is the coupling's on the mass; the device receives −f_k, and f_0 acts in no step
+    except under ``held``. Its ``energy_gain`` is 0 under ``midpoint``, and −½ m (v_k − v_{k−1})²
+    under ``implicit`` and ``compensated``.
     """
 
-    mass: Array
-    force: Array
-    position: Array
-    velocity: Array
-
-    @property
-    def energy_gain(self) -> Array:
-        """E_k = S_k − S_{k−1} − f_k (x_k − x_{k−1}) in J at the samples 1 … N, shape (N, ...).
-
-        Under ``midpoint`` it is 0, under ``implicit`` and ``compensated`` −½ m (v_k − v_{k−1})².
-
-        References:
-            Brown & Colgate 1997, eqs. (11), (16).
-        """
-        # a held force that diverges ends in inf and nan, as the motion itself
-        with np.errstate(over="ignore", invalid="ignore"):
-            kinetic = 0.5 * self.mass * self.velocity**2
-            return np.diff(kinetic, axis=0) - self.force[1:] * np.diff(self.position, axis=0)
+    __slots__ = ()
 
 
 def drive_mass(

@@ -51,13 +51,15 @@ class ParticleMotion:
             midpoint        0
 
         The second counts the kinetic energy once the force of the sample has acted; the storages
-        so counted differ from S by one step, so their sums differ by bounded terms only.
+        so counted differ from S by one step, so their sums differ by bounded terms only. Where the
+        motion itself has overflowed to inf or nan, so has what it gained.
 
         References:
             Brown & Colgate 1997, eqs. (11), (13), (16), (18).
         """
-        work = self.force[1:] * np.diff(self.position, axis=0)
-        return np.diff(self.kinetic_energy, axis=0) - work
+        with np.errstate(over="ignore", invalid="ignore"):
+            work = self.force[1:] * np.diff(self.position, axis=0)
+            return np.diff(self.kinetic_energy, axis=0) - work
 
 
 def integrate_particle(

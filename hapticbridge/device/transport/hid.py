@@ -9,7 +9,7 @@ from typing import Protocol
 
 from hapticbridge.device.plugged import Plugged
 from hapticbridge.device.transport.hex_log import HexLog
-from hapticbridge.device.transport.hid_requests import HidRequests
+from hapticbridge.device.transport.hid_requests import HidRequests, is_taken
 from hapticbridge.device.transport.hid_search import HidApi, HidHandle, hid_api
 from hapticbridge.errors import DeviceError, DeviceLost
 
@@ -201,12 +201,7 @@ class HidLink:
         return report
 
     def _is_sent(self, report: bytes) -> bool:
-        if self._log.is_on:
-            self._log.add(">", report)
-        try:
-            return self._handle.write(report) >= 0
-        except (OSError, ValueError):
-            return False
+        return is_taken(self._handle.write, report, self._log)
 
     def _send_newest(self) -> None:
         """Runs in the writer's thread until the link is closed or the device lost."""

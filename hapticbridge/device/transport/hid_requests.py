@@ -8,6 +8,22 @@ from hapticbridge.device.transport.hex_log import HexLog
 from hapticbridge.device.transport.hid_search import HidHandle, descriptor_of
 
 
+def is_taken(send: Callable[[bytes], int], report: bytes, log: HexLog) -> bool:
+    """Hands a report to one of hidapi's calls; returns whether the device took it.
+
+    Args:
+        send: The call: ``write``, or ``send_feature_report``.
+        report: Its number first, 0 where the device's reports have none.
+        log: Keeps it.
+    """
+    if log.is_on:
+        log.add(">", report)
+    try:
+        return send(report) >= 0
+    except (OSError, ValueError):
+        return False
+
+
 class HidRequests:
     """Requests that wait for their answer, some ms on USB; nothing for a loop.
 
@@ -23,12 +39,7 @@ class HidRequests:
 
     def set_feature(self, report: bytes) -> bool:
         """Sends a feature report, its number first; returns whether the device took it."""
-        if self._log.is_on:
-            self._log.add(">", report)
-        try:
-            return self._handle.send_feature_report(report) >= 0
-        except (OSError, ValueError):
-            return False
+        return is_taken(self._handle.send_feature_report, report, self._log)
 
     def feature(self, number: int, length: int) -> bytes:
         """Asks for a feature report; returns it, its number first, or nothing."""
