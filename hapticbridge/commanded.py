@@ -74,7 +74,11 @@ class Commanded(Opened):
         )
 
     def repeat_input(self, writes: list[Write]) -> None:
-        """As ``set_input``, with the writes that a recording's event ``input`` holds."""
+        """As ``set_input``, with the writes that a recording's event ``input`` holds.
+
+        Raises:
+            SceneError: The method cannot meter the work of inputs.
+        """
         if not self.method.meters_inputs:
             raise SceneError(
                 f"method '{self.method.name}' cannot meter the work of inputs; use 'implicit'"

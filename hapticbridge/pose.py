@@ -18,6 +18,10 @@ from hapticbridge.jit import compiled
 Vector: TypeAlias = tuple[float, float, float]
 Quaternion: TypeAlias = tuple[float, float, float, float]
 
+ZERO_VECTOR: Vector = (0.0, 0.0, 0.0)
+IDENTITY_POSE = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
+"""A place in m and an orientation (w, x, y, z), both the frame's own."""
+
 
 @compiled
 def vector_of(values: NDArray[np.float64]) -> Vector:

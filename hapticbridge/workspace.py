@@ -21,10 +21,9 @@ from hapticbridge.kernel.parameters import (
     checked_substeps,
     rotation_numbers,
 )
+from hapticbridge.pose import IDENTITY_POSE
 from hapticbridge.rendering import Method, contact_stiffness_of
 from hapticbridge.scene import Scene
-
-_SAME_PLACE = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -128,8 +127,8 @@ def run_parameters(
         force_limit=limits.force,
         torque_limit=limits.torque,
         ramp_ticks=limits.ramp_ticks(period),
-        device_origin=_SAME_PLACE if workspace.is_absolute else start,
-        handle_origin=_SAME_PLACE if workspace.is_absolute else scene.grip_pose(),
+        device_origin=IDENTITY_POSE if workspace.is_absolute else start,
+        handle_origin=IDENTITY_POSE if workspace.is_absolute else scene.grip_pose(),
         device_start=start,
         scheme=method.scheme,
         felt=felt,

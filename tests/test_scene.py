@@ -208,7 +208,7 @@ def test_gains_are_set_without_compiling_and_give_the_coupling_law(tmp_path: Pat
     offset, turn = np.array([2e-3, -1e-3, 3e-3]), np.array([0.01, 0.02, -0.005])
     quaternion = Rotation.from_rotvec(turn).as_quat(scalar_first=True)
     for stiffness, rotational in ((100.0, 0.3), (2500.0, 4.0)):
-        scene.set_coupling(hb.Coupling(stiffness, 0.5, rotational, 1e-3))
+        scene.set_gains((0.5, stiffness, 0.5), (1e-3, rotational, 1e-3))
         scene.reset()
         data.mocap_pos[-1] += offset
         data.mocap_quat[-1] = quaternion

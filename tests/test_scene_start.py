@@ -89,7 +89,7 @@ def test_control_so_large_that_mujoco_ignores_all_controls_is_refused(tmp_path: 
     body = HINGE_TOOL.format(joint="")
     text = mjcf("<actuator><motor name='m' joint='elbow'/></actuator>", body=body)
     scene = load_scene(scene_file(tmp_path, text))
-    scene.set_coupling(hb.Coupling(1000.0, 2.0, 1.0, 1e-3))
+    scene.set_gains((2.0, 1000.0, 2.0), (1e-3, 1.0, 1e-3))
     scene.data.ctrl[1] = 0.5  # a handle that moves with 0.5 m/s
     for value, force in ((1e10, 1.0), (1.01e10, 0.0)):
         scene.data.ctrl[0] = value

@@ -19,14 +19,13 @@ from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.simulation import simulate
 from hapticbridge.kernel.state import Binding
 from hapticbridge.ledger import Ledger
+from hapticbridge.pose import IDENTITY_POSE
 from hapticbridge.rendering import default_method, prepare
 from hapticbridge.scene import Scene
 from hapticbridge.tick import TICK_DTYPE
 
 _UNLIMITED = 1e30
 """Force in N and torque in N m that are cut: none, because the force itself is compared."""
-
-_IDENTITY = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -118,8 +117,8 @@ def rehearsal_parameters(
         force_limit=_UNLIMITED,
         torque_limit=_UNLIMITED,
         ramp_ticks=0,
-        device_origin=_IDENTITY,
+        device_origin=IDENTITY_POSE,
         handle_origin=scene.grip_pose(),
-        device_start=_IDENTITY,
+        device_start=IDENTITY_POSE,
         scheme=method.scheme,
     )

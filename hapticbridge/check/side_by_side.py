@@ -78,7 +78,11 @@ class Stage:
         self._binding = Binding(self._scene.model, self._scene.data, parameters)
 
     def run(self, chunk: int) -> float:
-        """Runs one stretch; returns its processor time in s."""
+        """Runs one stretch; returns its processor time in s.
+
+        Raises:
+            SceneError: The scene does not stay finite.
+        """
         binding, part = self._binding, slice(self._edges[chunk], self._edges[chunk + 1])
         rows = self.rows[part]
         start = time.thread_time()

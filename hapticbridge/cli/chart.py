@@ -22,6 +22,7 @@ from hapticbridge.study.chart import (
     settings_for,
     write_chart,
 )
+from hapticbridge.study.chart.timing import LEAST_REPEATS, REPEATS
 from hapticbridge.study.chart.work import measure_work
 from hapticbridge.study.chart.work_files import WORK_ENDINGS, write_work
 from hapticbridge.study.engines.library import available_engines, open_engine
@@ -32,8 +33,6 @@ ALL = "all"
 WORK = "work"
 QUICK_SIZE = 30
 """Largest scene of a quick chart of work."""
-
-QUICK_REPEATS, REPEATS = 3, 7
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +82,7 @@ class ChartCommand:
             chart = measure_chart(
                 workload,
                 settings,
-                repeats=QUICK_REPEATS if self.quick else REPEATS,
+                repeats=LEAST_REPEATS if self.quick else REPEATS,
                 progress=show,
             )
         files = write_chart(chart, paths)

@@ -31,6 +31,7 @@ UNITS = {
 _PREFIX = {"translation": "", "rotation": "rotational "}
 
 _HALVINGS = 60
+"""Of a search for a limit: beyond the 53 bits of a double there is nothing left to halve."""
 
 _POINTS, _HIGHEST = 40, 1e3
 """Of the table of needs: points, and the largest ratio B'/(K T)."""

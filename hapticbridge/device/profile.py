@@ -32,6 +32,7 @@ from hapticbridge.device.data_sheet import AXES, DATA_SHEET_UNITS, DeviceInfo, c
 from hapticbridge.errors import DeviceError, choices
 
 FORMAT = 1
+"""Version of the file's layout that is read and written."""
 
 UNITS = {name: unit for name, unit in DATA_SHEET_UNITS.items() if name != "duration"} | {
     "workspace": "m",

@@ -19,6 +19,8 @@ _LONGEST_US = 50_000
 """Width of the histogram in µs; later wake-ups are counted at the maximum."""
 
 _TRIAL_NS = 1_000_000
+"""Period of the one wake-up that shows whether it runs at all."""
+
 _PATIENCE = 5.0
 """Time in s beyond twice what its wake-ups take, after which it is given up."""
 

@@ -36,6 +36,7 @@ SPEED_MARGIN = 1.5
 """Multiple of the device's own top speed that counts as a fault."""
 
 _TOLD_PER_SECOND = 10
+"""How often progress is told."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -43,6 +43,8 @@ MOST_DELAY = 0.02
 """In s. A device later than this cannot be felt through."""
 
 _ROUNDS = 12
+"""Of the search for the delay at most; each solves anew at the delay that the last one found."""
+
 _MASS, _DAMPING, _FRICTION, _OFFSET, _DELAY = range(5)
 
 

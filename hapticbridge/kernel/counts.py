@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from hapticbridge.errors import HapticBridgeError
 
 _AXES = 6
+"""Three of translation, three of rotation."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -32,6 +32,7 @@ _CHUNK = struct.Struct("<QQQI")
 _FOOTER = struct.Struct("<QQI")
 _FOOTER_SIZE = _RECORD.size + _FOOTER.size
 _AHEAD = 64
+"""Chunks that are unpacked before they are asked for: some 8 MB of records at 128 kB each."""
 
 
 @dataclass(frozen=True)

@@ -63,7 +63,11 @@ class Contents:
         return layout.TICK_TOPIC in self._topics.values()
 
     def add_metadata(self, fields: Fields) -> None:
-        """Adds a metadata record."""
+        """Adds a metadata record.
+
+        Raises:
+            DamageError: There is one of this name already, or it is shorter than its fields.
+        """
         name, entries = fields.text(), fields.mapping()
         if name == layout.METADATA_NAME:
             if self.meta is not None:
@@ -75,7 +79,11 @@ class Contents:
             self.digest = entries.get(layout.DIGEST_KEY, "")
 
     def add_attachment(self, fields: Fields) -> None:
-        """Adds an attachment."""
+        """Adds an attachment.
+
+        Raises:
+            DamageError: There is one of this name already, or it is shorter than its fields.
+        """
         fields.raw(16)
         name, media_type = fields.text(), fields.text()
         data = fields.raw(fields.number(8))

@@ -27,7 +27,11 @@ class Fields:
         return self._position >= self._stop
 
     def raw(self, size: int) -> bytes:
-        """Returns the next bytes; raises DamageError where the record is shorter."""
+        """Returns the next bytes.
+
+        Raises:
+            DamageError: The record is shorter. So it is with all that is read of it.
+        """
         start = self._position
         if size > self._stop - start:
             raise DamageError("it is shorter than its fields")
@@ -39,14 +43,22 @@ class Fields:
         return int.from_bytes(self.raw(size), "little")
 
     def text(self) -> str:
-        """Returns the next text."""
+        """Returns the next text.
+
+        Raises:
+            DamageError: It is not UTF-8, or cut.
+        """
         try:
             return self.raw(self.number(4)).decode()
         except UnicodeDecodeError as error:
             raise DamageError("its text is not UTF-8") from error
 
     def mapping(self) -> dict[str, str]:
-        """Returns the next map of texts."""
+        """Returns the next map of texts.
+
+        Raises:
+            DamageError: A key is there twice, a text is not UTF-8, or it is cut.
+        """
         size = self.number(4)
         inner = Fields(self._data, self._position, self._position + size)
         self.raw(size)

@@ -95,17 +95,6 @@ class Scene:
         self.model.pair_gap += more
         self.model.flex_gap += more
 
-    def set_coupling(self, coupling: Coupling) -> None:
-        """Sets the gains of the coupling's actuators; needs no compilation."""
-        self.set_gains(
-            (coupling.damping, coupling.stiffness, coupling.damping),
-            (
-                coupling.rotational_damping,
-                coupling.rotational_stiffness,
-                coupling.rotational_damping,
-            ),
-        )
-
     def set_gains(
         self, force: tuple[float, float, float], torque: tuple[float, float, float]
     ) -> None:

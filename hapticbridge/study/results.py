@@ -31,6 +31,7 @@ from hapticbridge.study.table import Outcome, csv_bytes, parquet_bytes, pyarrow
 
 MANIFEST = "sweep.json"
 _LAYOUT = 1
+"""Version of the folder's layout: results of another are refused."""
 _DRAFT = ".draft-"
 _PART = re.compile(r"part-([0-9a-f]{32})\.(csv|parquet)")
 

@@ -32,6 +32,7 @@ _COLOURS_MEAN = (
 )
 
 _CONTACT = (77, 208, 225)
+"""Colour of contacts, red, green and blue of 255."""
 
 
 class Page:

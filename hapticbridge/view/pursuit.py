@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from hapticbridge.audit.rerun import Rerun
 from hapticbridge.errors import HapticBridgeError
-from hapticbridge.pose import quaternion_exp, rotation_between, scaled
+from hapticbridge.pose import IDENTITY_POSE, quaternion_exp, rotation_between, scaled
 from hapticbridge.tick import TICK_DTYPE
 
 LEAD_SPEED, LEAD_TURN_SPEED = 0.5, 5.0
@@ -160,7 +160,7 @@ class Pursuit:
         state["scale"] = state["force_scale"] = 1.0
         state["axes"], state["axes_quaternion"] = np.eye(3).ravel(), (1.0, 0.0, 0.0, 0.0)
         for name in ("device", "handle"):
-            state[f"{name}_origin"] = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
+            state[f"{name}_origin"] = IDENTITY_POSE
         state["device_position"] = state["handle_position"]
         state["device_quaternion"] = state["handle_quaternion"]
 

@@ -17,6 +17,7 @@ from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.guard import CONTROLLERS, Limits, guarding_for
 from hapticbridge.kernel.parameters import RunParameters
+from hapticbridge.pose import IDENTITY_POSE
 from hapticbridge.provenance import (
     MID_RUN,
     STATE_ATTACHMENT,
@@ -32,8 +33,6 @@ from hapticbridge.tick import TickFlag
 from hapticbridge.whatif.changes import Settings
 from hapticbridge.whatif.exact import that_gives
 from hapticbridge.whatif.unpacked import unpack_scene
-
-_NOWHERE = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,7 +89,7 @@ class RecordedRun:
     def is_absolute(self) -> bool:
         """Whether the device's poses were poses in the scene."""
         p = self.parameters
-        is_nowhere = p.device_origin == p.handle_origin == _NOWHERE
+        is_nowhere = p.device_origin == p.handle_origin == IDENTITY_POSE
         return is_nowhere and not p.guarding.reseats
 
     @property

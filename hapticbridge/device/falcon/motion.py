@@ -48,6 +48,7 @@ FLAGS = int(Request.GREEN)
 """The light while the loop runs."""
 
 BELIEVED, OUT_OF_REACH, JUMP = 0, 1, 2
+"""What ``believe`` makes of a reply."""
 
 
 @compiled

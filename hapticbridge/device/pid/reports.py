@@ -47,6 +47,7 @@ _MILLI = -3
 """Power of ten, in s, of durations whose unit the device does not name: all drivers take ms."""
 
 _FULL_TURN = 360.0
+"""In degrees, the unit of directions in the standard."""
 
 
 @dataclass(frozen=True, slots=True)

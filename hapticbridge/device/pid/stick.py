@@ -24,6 +24,7 @@ MOST_BUTTONS = 63
 
 _CONTROLLERS = {page << 16 | usage for page, usage in CONTROLLERS}
 _BUTTON_PAGE = 9
+"""Usage page of buttons."""
 
 
 class Stick:

@@ -17,6 +17,7 @@ FRAME_BYTES = 64
 """What a full-speed interrupt transfer carries, and Teensy's raw HID report holds."""
 
 MAGIC, VERSION = 0x48, 1
+"""First two bytes of every frame."""
 
 LONGEST_WATCHDOG_MS = 1000
 """A device obeys no longer time: a second is what a hand can still hold against."""
@@ -65,6 +66,7 @@ ENABLE = 1
 """Byte 3 of a force frame: the motors may act."""
 
 NUMBERS_PAGE, NAME_PAGE = 0, 1
+"""Pages of the sheet, byte 3 of a frame that asks for one or holds one."""
 
 NAME_BYTES = 54
 

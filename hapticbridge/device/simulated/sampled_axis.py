@@ -31,7 +31,11 @@ Record: TypeAlias = Any
 LEVELS = 41
 """Friction looks for events in dyadic parts of the period, from T to T/2^40: 1e-15 s at 1 kHz."""
 _COARSEST_LEVEL = 6
+"""Finest first part with friction, T/2^6: an axis that swings faster would need more phases than
+are allowed."""
+
 _MOST_PHASES = 64
+"""Of slipping and sticking within a period; the bound is there so that the loop ends."""
 
 AXIS_DTYPE = np.dtype(
     [
@@ -220,7 +224,6 @@ def moved_with_friction(
     units_left = 1 << (LEVELS - 1)
     if not math.isfinite(force + stretch + velocity + drift):
         return math.nan, math.nan
-    # more phases than a few cannot be within one period; the bound is there so that the loop ends
     for _ in range(_MOST_PHASES):
         if units_left == 0:
             return travel, velocity

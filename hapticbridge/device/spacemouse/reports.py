@@ -15,6 +15,7 @@ LED_ON, LED_OFF = bytes([4, 1]), bytes([4, 0])
 """Output report 4: the light in the base."""
 
 _TRANSLATION, _ROTATION, _BUTTONS = 1, 2, 3
+"""Numbers of the input reports."""
 _THREE, _SIX = struct.Struct("<3h"), struct.Struct("<6h")
 
 

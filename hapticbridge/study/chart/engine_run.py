@@ -79,6 +79,9 @@ class EngineRun:
     What is timed is every step of the run through the engine's Python interface, with the
     coupling's law: a user pays that too. Compare engines with the engine ``mujoco``, which is
     called the same way, and not with the compiled loop of the bridge.
+
+    Raises:
+        StudyError: The setting has substeps.
     """
 
     def __init__(self, engine: Engine, work: PeerWork, setting: Setting) -> None:

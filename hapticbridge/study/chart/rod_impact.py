@@ -36,6 +36,7 @@ APPROACH, SLIDE = 0.3, 0.2
 """Speed in m/s at which the rod falls and slides, without turning; a brisk tap."""
 
 FRICTION = 0.3
+"""Coulomb's μ, without unit."""
 
 ANGLES = (0.5, 0.8, 1.1, 1.4)
 """Of the rod above the floor in rad, a fall each."""

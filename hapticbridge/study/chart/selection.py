@@ -13,6 +13,7 @@ PERIODS_MS = (4.0, 2.0, 1.0, 0.5, 0.25, 0.125)
 """T in ms where nobody chooses: 250 Hz to 8 kHz."""
 
 QUICK_PERIODS_MS = (4.0, 1.0, 0.25)
+"""Likewise, of a quick chart."""
 
 USUAL_MS = 1.0
 """T in ms at which everything but the time step is varied."""

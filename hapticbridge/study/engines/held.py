@@ -6,6 +6,7 @@ from abc import ABC, abstractmethod
 
 from hapticbridge.jit import compiled
 from hapticbridge.pose import (
+    ZERO_VECTOR,
     Quaternion,
     Vector,
     add,
@@ -30,8 +31,7 @@ from hapticbridge.study.engines.task import (
 Frame = tuple[Vector, Quaternion]
 """Position in m and orientation, as the compiler takes them."""
 
-_NOTHING: Vector = (0.0, 0.0, 0.0)
-_AT_ORIGIN = (_NOTHING, (1.0, 0.0, 0.0, 0.0))
+_AT_ORIGIN = (ZERO_VECTOR, (1.0, 0.0, 0.0, 0.0))
 
 
 class HeldSimulation(ABC):
@@ -73,7 +73,7 @@ class HeldSimulation(ABC):
         self._centre = task.body.inertia_frame.position
         self._handle: Frame = _AT_ORIGIN
         self._tool: Frame = _AT_ORIGIN
-        self._wrench = self._at_centre = (_NOTHING, _NOTHING)
+        self._wrench = self._at_centre = (ZERO_VECTOR, ZERO_VECTOR)
 
     def _begin(self, task: Task) -> None:
         """Computes the wrench of step 0."""

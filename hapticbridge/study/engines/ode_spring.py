@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from hapticbridge.pose import Vector, add, rotation_between, scaled, subtract
+from hapticbridge.pose import ZERO_VECTOR, Vector, add, rotation_between, scaled, subtract
 from hapticbridge.study.engines import ode_native as native
 from hapticbridge.study.engines.base import Engine, Setting
 from hapticbridge.study.engines.held import Frame
@@ -15,8 +15,6 @@ from hapticbridge.study.engines.task import Task
 _LOW, _HIGH, _CFM, _STOP_ERP, _STOP_CFM, _ERP = 0, 1, 8, 9, 10, 13
 _GROUP = 0x100
 """Between the parameters of an angular motor's axes."""
-
-_NOTHING: Vector = (0.0, 0.0, 0.0)
 
 
 class OdeSpringEngine(OdeEngine):
@@ -90,7 +88,7 @@ class OdeSpringSimulation(OdeSimulation):
                 angles = _offset(rotational_stiffness, rotational_damping, twist, turned)
                 for axis, angle in enumerate(angles):
                     self._ode.dJointSetAMotorAngle(self._motor, axis, -angle)
-        self.advance(_NOTHING, _NOTHING)
+        self.advance(ZERO_VECTOR, ZERO_VECTOR)
 
 
 def _offset(stiffness: float, damping: float, stretch: Vector, moved: Vector) -> Vector:

@@ -23,6 +23,7 @@ with warnings.catch_warnings():
 
 
 from hapticbridge.pose import (
+    ZERO_VECTOR,
     Quaternion,
     Vector,
     product,
@@ -55,7 +56,6 @@ SLERP = 4.0
 """A slerp drive is a quarter as stiff as it is told, without unit: it acts on half the angle
 (measured under a torque: 4.00)."""
 
-_NOTHING: Vector = (0.0, 0.0, 0.0)
 _X_TO_Z: Quaternion = (math.sqrt(0.5), 0.0, -math.sqrt(0.5), 0.0)
 """A capsule lies along x in PhysX."""
 
@@ -218,7 +218,7 @@ class SapienSpringSimulation(SapienSimulation):
             turned = scaled(rate, rotation_between(self._handle[1], handle[1]))
             self._drive.set_drive_target(sapien.Pose(*handle))
             self._drive.set_drive_velocity_target(moved, turned)
-        self.advance(_NOTHING, _NOTHING)
+        self.advance(ZERO_VECTOR, ZERO_VECTOR)
 
 
 @cache

@@ -15,6 +15,8 @@ from hapticbridge.study.closed_loop import LoopOutcome
 from hapticbridge.study.maps.rigs import loop_in
 
 PERIOD = 1e-3
+"""T in s."""
+
 DEVICE_DAMPING = 2e-3
 """b_θ in N m s/rad, that of the default simulated device."""
 

@@ -30,6 +30,8 @@ from hapticbridge.study.table import Table
 RESTITUTION_LAWS: tuple[Law, ...] = ("newton", "poisson", "stronge")
 
 FRICTIONS = (0.0, 0.25, 0.5, 0.75, 1.0)
+"""Coulomb's μ, without unit."""
+
 LEAD = 0.2
 """Share by which a law must be nearer to MuJoCo than the second to be named the nearest, without
 unit; with less, laws that a soft contact cannot tell apart would be named by chance."""

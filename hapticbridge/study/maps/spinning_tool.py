@@ -17,6 +17,7 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.kernel.simulation import simulate
 from hapticbridge.kernel.state import Binding
 from hapticbridge.ledger import Ledger
+from hapticbridge.pose import IDENTITY_POSE
 from hapticbridge.rendering import METHODS, prepare
 from hapticbridge.scene import Scene
 from hapticbridge.study.maps.bisection import largest_stable
@@ -101,7 +102,7 @@ def spin(
     first["quaternion"] = quaternions[0]
     parameters = run_parameters(scene, coupling, chosen, first, period=PERIOD, felt=felt)
     # the grip is where the device would be without the angle, not where it starts
-    parameters = replace(parameters, device_origin=(0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0))
+    parameters = replace(parameters, device_origin=IDENTITY_POSE)
     binding = Binding(scene.model, scene.data, parameters)
     records = np.zeros(TICKS, TICK_DTYPE)
     done = _run(binding, samples, records)

@@ -10,6 +10,8 @@ INERTIA = np.array([1.5e-3, 3.63e-3, 4.53e-3])
 and near those of a hand tool with a long handle."""
 
 PERIOD = 1e-3
+"""T in s."""
+
 TICKS = 1000
 
 OBLIQUE = np.array([0.1, 1.0, 0.1])

@@ -19,6 +19,8 @@ from hapticbridge.study.paper.drawing import panels
 from hapticbridge.study.paper.section import Curve, Section
 
 PERIOD = 1e-3
+"""T in s."""
+
 COUPLING = Coupling(stiffness=1000.0, damping=2.0, rotational_stiffness=0.0, rotational_damping=0.0)
 K, B = COUPLING.stiffness, COUPLING.damping
 TAU = 2e-3

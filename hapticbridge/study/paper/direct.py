@@ -14,6 +14,8 @@ from hapticbridge.study.paper.drawing import panels
 from hapticbridge.study.paper.section import Curve, Section
 
 PERIOD = 1e-3
+"""T in s."""
+
 CONTACT = 1e4
 """K_c in N/m: a stiff contact, so that a peg of a few centimetres is at the limit."""
 DEVICE = 2e-3

@@ -12,6 +12,8 @@ from hapticbridge.study.paper.drawing import panels
 from hapticbridge.study.paper.section import Curve, Section
 
 PERIOD = 1e-3
+"""T in s."""
+
 MASS = 0.05
 """Of the particle in kg."""
 

@@ -14,7 +14,9 @@ from hapticbridge.study.paper.section import Curve, Section, Table
 ROD = ImpactBody(1.0, 1 / 12, np.array([-0.5, -0.5]) / np.sqrt(2))
 """A uniform rod of 1 kg and 1 m at 45°, hit at its lower tip."""
 VELOCITY = np.array([0.8, -1.0])
+"""Of the tip before the impact, tangential and normal, in m/s."""
 FRICTION, RESTITUTION = 0.75, 0.9
+"""μ and e, without unit."""
 
 KNOWN: dict[Law, tuple[float, float, float]] = {
     "newton": (0.8875, 0.2125, 0.040625),
@@ -24,6 +26,7 @@ KNOWN: dict[Law, tuple[float, float, float]] = {
 """P_n and P_t in N s, change of kinetic energy in J."""
 
 IMPACTS = 200_000
+"""Random rods that are drawn and judged per law."""
 GAINING = 0.01088
 """Share of random rods that gain energy under Newton's law, of 5 million drawn like those here from
 25 other seeds."""

@@ -20,13 +20,18 @@ from hapticbridge.study.paper.drawing import panels
 from hapticbridge.study.paper.section import Curve, Section, Table
 
 PERIOD = 1e-3
+"""T in s."""
+
 IMPEDANCE = 2.0
 """Z in N s/m: as much as the simulated device's damping."""
 BESIDE = 0.5
 """B in N s/m of the spring and damper that are drawn beside the line."""
 ROUND_TRIPS = (1, 2, 4)
+"""Samples that a wave takes there and back."""
 THETA = np.linspace(1e-3, np.pi, 2000)
 SAMPLES = 6000
+"""Length of a run, 6 s: growth shows between its last two thirds."""
+
 DIVERGED = 1e6
 """Force in N at which a run has grown beyond doubt: a billion times what starts it."""
 TURN = 2.0

@@ -16,11 +16,16 @@ from hapticbridge.study.paper.in_mujoco import HEAVY, ImplicitMass, decays, hold
 from hapticbridge.study.paper.section import Curve, Section
 
 PERIOD = 1e-3
+"""T in s."""
+
 COUPLING = Coupling(1000.0, 2.0, 0.0, 0.0)
 PERIODS = (5e-4, 1e-3, 2e-3)
 DELAYS = (0, 1)
 FILTER_TIMES = (0.0, 2e-3)
+"""Grid of the checks: T in s, samples of delay, time constant of the low-pass in s."""
+
 TICKS = 3000
+"""Of a run with MuJoCo in the loop: 3 s, in which a force that decays is gone."""
 
 
 def _in_mujoco(share: float) -> NDArray[np.float64]:
