@@ -11,13 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.audit import AuditReport, audit
+from hapticbridge.audit.balance import Balance
+from hapticbridge.audit.interventions import Interventions
+from hapticbridge.audit.reached import Reached
 from hapticbridge.bridge import Bridge
 from hapticbridge.clock import SimulatedClock
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import AXES, Device, DeviceInfo
 from hapticbridge.guard import Limits
 from hapticbridge.kernel.guarding import UNGUARDED
-from hapticbridge.provenance import MODEL_ATTACHMENT
+from hapticbridge.kernel.parameters import RunParameters
+from hapticbridge.provenance import MODEL_ATTACHMENT, STARTS, meta_start
 from hapticbridge.recording import Attachment, Recording, RecordingWriter
 from hapticbridge.scene import Scene
 from hapticbridge.summary import Summary
@@ -44,6 +48,23 @@ TAP = """t,x,y,z,qw,qx,qy,qz
 0.20,0.0014,0.0003,-0.0130,0.9998,0,0.0141,0.0141
 """
 """A hand that taps the mouth of the hole in every direction, off centre and tilted."""
+
+
+def balance_of(recording: Recording, parameters: RunParameters) -> Balance:
+    """Returns the balance of a whole recording from where its metadata says that it began."""
+    starts = {name: meta_start(recording.meta, name) for name in STARTS}
+    home = np.array(starts["tool_start"])
+    return Balance.of(
+        recording.ticks,
+        parameters,
+        Reached.at_start(
+            parameters,
+            np.array(starts["handle_start"]),
+            home,
+            starts["start_kinetic"][0] + starts["start_potential"][0],
+        ),
+        Interventions.of(recording.events, parameters, home),
+    )
 
 
 def recorded(

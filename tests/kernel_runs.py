@@ -129,17 +129,15 @@ def turns(quaternions: Array, start: Array) -> Array:
     return np.asarray((rotation(quaternions) * rotation(before).inv()).as_rotvec())
 
 
-def bind(
+def unlimited(
     scene: Scene,
-    coupling: Coupling = DEFAULT,
-    *,
+    coupling: Coupling,
     period: float = T,
     substeps: int = 1,
     device_start: tuple[float, ...] = IDENTITY,
     **changes: Any,
-) -> tuple[Binding, RunParameters]:
-    """Prepares a scene for ``implicit`` and binds the kernel to it, without force limits."""
-    prepare(scene, coupling, period, substeps)
+) -> RunParameters:
+    """Returns the parameters of a run from where the scene stands, without force limits or ramp."""
     parameters = RunParameters(
         grip=scene.grip,
         period=period,
@@ -152,7 +150,21 @@ def bind(
         handle_origin=scene.grip_pose(),
         device_start=device_start,
     )
-    parameters = replace(parameters, **changes)
+    return replace(parameters, **changes)
+
+
+def bind(
+    scene: Scene,
+    coupling: Coupling = DEFAULT,
+    *,
+    period: float = T,
+    substeps: int = 1,
+    device_start: tuple[float, ...] = IDENTITY,
+    **changes: Any,
+) -> tuple[Binding, RunParameters]:
+    """Prepares a scene for ``implicit`` and binds the kernel to it, without force limits."""
+    prepare(scene, coupling, period, substeps)
+    parameters = unlimited(scene, coupling, period, substeps, device_start, **changes)
     return Binding(scene.model, scene.data, parameters), parameters
 
 

@@ -5,11 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from kernel_runs import IDENTITY, Array
+from kernel_runs import Array, unlimited
 from scipy.spatial.transform import Rotation
 
 from hapticbridge.coupling import Coupling
-from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.simulation import simulate
 from hapticbridge.kernel.state import Binding
 from hapticbridge.ledger import Ledger
@@ -60,19 +59,7 @@ def bound(scene: Scene, method: str, asked: Coupling, period: float) -> Binding:
     """Returns a kernel bound to a scene at its start, rendering what is asked for."""
     used = METHODS[method].used(asked, period)
     prepare(scene, asked, period, 1, METHODS[method], warns=False)
-    parameters = RunParameters(
-        grip=scene.grip,
-        period=period,
-        substeps=1,
-        coupling=used,
-        force_limit=1e30,
-        torque_limit=1e30,
-        ramp_ticks=0,
-        device_origin=IDENTITY,
-        handle_origin=scene.grip_pose(),
-        device_start=IDENTITY,
-        scheme=METHODS[method].scheme,
-    )
+    parameters = unlimited(scene, used, period, scheme=METHODS[method].scheme)
     return Binding(scene.model, scene.data, parameters)
 
 

@@ -5,14 +5,13 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from kernel_runs import IDENTITY, Array, Run, T, load, run_of, samples_of, sines
+from kernel_runs import Array, Run, T, load, run_of, samples_of, sines, unlimited
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import AXES, DeviceInfo
 from hapticbridge.guard import Limits
-from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.simulation import simulate
 from hapticbridge.kernel.state import Binding
 from hapticbridge.rendering import contact_stiffness_of, method_named, prepare
@@ -66,17 +65,10 @@ def rendered(
     scene = load(scene) if isinstance(scene, str) else scene
     chosen = method_named(method)
     felt = prepare(scene, coupling, T, substeps, chosen)
-    parameters = RunParameters(
-        grip=scene.grip,
-        period=T,
+    parameters = unlimited(
+        scene,
+        coupling,
         substeps=substeps,
-        coupling=coupling,
-        force_limit=1e9,
-        torque_limit=1e9,
-        ramp_ticks=0,
-        device_origin=IDENTITY,
-        handle_origin=scene.grip_pose(),
-        device_start=IDENTITY,
         scheme=chosen.scheme,
         felt=felt,
         contact_stiffness=contact_stiffness_of(chosen, coupling, contact_stiffness),

@@ -9,25 +9,17 @@ from typing import Any
 
 import numpy as np
 import pytest
-from audit_cases import (
-    ScriptedDevice,
-    recorded,
-)
+from audit_cases import ScriptedDevice, balance_of, recorded
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from hapticbridge.audit import audit
-from hapticbridge.audit.balance import Balance
 from hapticbridge.audit.differences import turn_between
-from hapticbridge.audit.interventions import Interventions
-from hapticbridge.audit.reached import Reached
 from hapticbridge.bridge import Bridge
 from hapticbridge.clock import SimulatedClock
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import SafetyTrip
 from hapticbridge.provenance import (
-    STARTS,
-    meta_start,
     parameters_of,
 )
 from hapticbridge.recording import Recording, read_recording
@@ -86,19 +78,7 @@ def test_shipped_scenes_are_passive_on_the_simulated_device(scene: str, tmp_path
 
 def test_balance_agrees_with_the_kernel_and_with_a_sum_by_hand(held: Recording) -> None:
     ticks = held.ticks
-    starts = {name: meta_start(held.meta, name) for name in STARTS}
-    parameters = parameters_of(held.meta)
-    balance = Balance.of(
-        ticks,
-        parameters,
-        Reached.at_start(
-            parameters,
-            np.array(starts["handle_start"]),
-            np.array(starts["tool_start"]),
-            starts["start_kinetic"][0] + starts["start_potential"][0],
-        ),
-        Interventions(parameters, np.array(starts["tool_start"])),
-    )
+    balance = balance_of(held, parameters_of(held.meta))
     # rounding of 200 summed works of 1e-3 J
     for name in ("coupling_work", "device_energy", "environment_energy"):
         np.testing.assert_allclose(getattr(balance, name), ticks[name], rtol=0, atol=1e-14)

@@ -8,19 +8,17 @@ from typing import Any
 
 import numpy as np
 import pytest
-from audit_cases import ScriptedDevice, recorded
+from audit_cases import ScriptedDevice, balance_of, recorded
 from random_hands import random_motion
 
 from hapticbridge.audit import audit
 from hapticbridge.audit.balance import Balance
 from hapticbridge.audit.device_port import kept_behind_a_law
-from hapticbridge.audit.interventions import Interventions
-from hapticbridge.audit.reached import Reached
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import SimulatedDevice
 from hapticbridge.guard import Limits
 from hapticbridge.kernel.parameters import RunParameters
-from hapticbridge.provenance import STARTS, meta_start, parameters_of
+from hapticbridge.provenance import parameters_of
 from hapticbridge.recording import read_recording
 
 T = 1e-3
@@ -152,19 +150,7 @@ def balance(path: Path, damping: float | None = None, rotational: float = 1.0) -
     parameters = replace(
         parameters_of(recording.meta), device_damping=damping, device_rotational_damping=rotational
     )
-    starts = {name: meta_start(recording.meta, name) for name in STARTS}
-    home = np.array(starts["tool_start"])
-    return Balance.of(
-        recording.ticks,
-        parameters,
-        Reached.at_start(
-            parameters,
-            np.array(starts["handle_start"]),
-            np.array(starts["tool_start"]),
-            starts["start_kinetic"][0] + starts["start_potential"][0],
-        ),
-        Interventions.of(recording.events, parameters, home),
-    )
+    return balance_of(recording, parameters)
 
 
 def kicked(path: Path, damping: float | None = None, rotational: float = 1.0) -> np.ndarray:

@@ -7,25 +7,13 @@ from pathlib import Path
 
 import numpy as np
 from falcon_cases import Bench
+from report_runs import ANVIL
 
 from hapticbridge.audit import AuditReport, audit
 from hapticbridge.bridge import Bridge
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Hand, SimulatedDevice
 from hapticbridge.recording import read_recording
-
-ANVIL = """<mujoco model="anvil">
-  <option timestep="0.001" integrator="discrete" cone="elliptic" gravity="0 0 0">
-    <flag diagexact="enable"/>
-  </option>
-  <worldbody>
-    <body name="anvil">
-      <freejoint/>
-      <geom type="sphere" size="0.02" mass="20000" contype="0" conaffinity="0"/>
-      <site name="grip"/>
-    </body>
-  </worldbody>
-</mujoco>"""
 
 RETREAT = """t,x,y,z,qw,qx,qy,qz
 0,0,0,0,1,0,0,0

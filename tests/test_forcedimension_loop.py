@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from emulated.dhd_stub import OMEGA3, SIGMA7, Stub
 from emulated.hid_seam import DrivingClock
+from loop_claims import peg_went_in_a_tick_late, runs_are_the_same
 
 import hapticbridge as hb
 from hapticbridge.device import Motion
 from hapticbridge.errors import SafetyTrip
 from hapticbridge.identify import identify
-from hapticbridge.tick import CLOCK_FIELDS, TickFlag
 
 PERIOD = 1e-3
 NUMBERS = {"damping": 1.5, "rotational_damping": 4e-3}
@@ -43,27 +43,13 @@ def test_the_peg_goes_in_behind_the_library_and_the_audit_finds_it_passive(
 ) -> None:
     recording = tmp_path / "run.mcap"
     stub = guided(kind)
-    summary = run(stub, 4.0, recording)
-    report = hb.audit(recording)
-    assert (report.verdict, report.resimulation) == ("passive", "bit for bit")
-    # a delay of calls that is no whole tick counts as one: then a bound is known for walls only
-    assert report.certified is None
-    assert "behind a delay of 1 ticks" in report.conditions[0]
-    ticks = hb.read_recording(recording).ticks
-    assert summary.ticks == len(ticks) == 4000
-    assert (ticks["flags"] & int(TickFlag.CONTACT)).any()
-    assert summary.peak_force > 0.05
-    assert ticks["tool_position"][-1, 2] < 0.0  # its tip is below the hole's edge
+    # a delay of calls that is no whole tick counts as one
+    peg_went_in_a_tick_late(run(stub, 4.0, recording), recording)
     assert not stub.force().any()
 
 
 def test_the_loop_is_the_same_in_every_run(tmp_path: Path) -> None:
-    rows = []
-    for name in ("a", "b"):
-        run(guided(), 0.2, tmp_path / f"{name}.mcap")
-        rows.append(hb.read_recording(tmp_path / f"{name}.mcap").ticks)
-    for field in set(rows[0].dtype.names or ()) - set(CLOCK_FIELDS):
-        assert rows[0][field].tobytes() == rows[1][field].tobytes(), field
+    runs_are_the_same(lambda path: run(guided(), 0.2, path), tmp_path)
 
 
 @pytest.mark.parametrize(

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from emulated.hid_seam import DrivingClock
 from haply_cases import PERIOD, Bench
+from loop_claims import peg_went_in_a_tick_late, runs_are_the_same
 
 import hapticbridge as hb
 from hapticbridge.device import SimulatedDevice
 from hapticbridge.errors import SafetyTrip
 from hapticbridge.identify import identify
 from hapticbridge.scene import scene_path
-from hapticbridge.tick import CLOCK_FIELDS, TickFlag
 
 
 def guided() -> Bench:
@@ -34,17 +34,7 @@ def run(bench: Bench, seconds: float, recording: Path) -> hb.Summary:
 def test_the_peg_goes_in_behind_the_service_and_the_audit_finds_it_passive(tmp_path: Path) -> None:
     recording = tmp_path / "run.mcap"
     bench = guided()
-    summary = run(bench, 4.0, recording)
-    report = hb.audit(recording)
-    assert (report.verdict, report.resimulation) == ("passive", "bit for bit")
-    # where a force acts a tick late, a bound is known for walls only
-    assert report.certified is None
-    assert "behind a delay of 1 ticks" in report.conditions[0]
-    ticks = hb.read_recording(recording).ticks
-    assert summary.ticks == len(ticks) == 4000
-    assert (ticks["flags"] & int(TickFlag.CONTACT)).any()
-    assert summary.peak_force > 0.05
-    assert ticks["tool_position"][-1, 2] < 0.0  # its tip is below the hole's edge
+    ticks = peg_went_in_a_tick_late(run(bench, 4.0, recording), recording)
     sent = np.array(bench.service.forces)
     commanded = ticks["wrench_on_device"][:, :3]
     after = range(1, 6)  # zero forces of the end, after the last tick's
@@ -54,12 +44,7 @@ def test_the_peg_goes_in_behind_the_service_and_the_audit_finds_it_passive(tmp_p
 
 
 def test_the_loop_is_the_same_in_every_run(tmp_path: Path) -> None:
-    rows = []
-    for name in ("a", "b"):
-        run(guided(), 0.2, tmp_path / f"{name}.mcap")
-        rows.append(hb.read_recording(tmp_path / f"{name}.mcap").ticks)
-    for field in set(rows[0].dtype.names or ()) - set(CLOCK_FIELDS):
-        assert rows[0][field].tobytes() == rows[1][field].tobytes(), field
+    runs_are_the_same(lambda path: run(guided(), 0.2, path), tmp_path)
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from kernel_runs import T, load, samples_of
+from kernel_runs import T, load, samples_of, unlimited
 from rendering_runs import (
     COUPLING,
     SERVO,
@@ -17,7 +17,6 @@ from hapticbridge.bridge import Bridge
 from hapticbridge.clock import SimulatedClock
 from hapticbridge.errors import SceneError
 from hapticbridge.kernel.codes import OK
-from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.state import Binding
 from hapticbridge.kernel.step import after_step, before_step
 from hapticbridge.rendering import method_named, prepare
@@ -56,19 +55,7 @@ def test_ports_of_a_separate_arm_close_to_its_dissipation(method: str) -> None:
     scene = load(SERVO.format(gravcomp=0, mocap="false", actuator='<motor name="m" joint="arm"/>'))
     chosen = method_named(method)
     prepare(scene, COUPLING, T, 1, chosen)
-    parameters = RunParameters(
-        grip="grip",
-        period=T,
-        substeps=1,
-        coupling=COUPLING,
-        force_limit=1e9,
-        torque_limit=1e9,
-        ramp_ticks=0,
-        device_origin=(0, 0, 0, 1, 0, 0, 0),
-        handle_origin=scene.grip_pose(),
-        device_start=(0, 0, 0, 1, 0, 0, 0),
-        scheme=chosen.scheme,
-    )
+    parameters = unlimited(scene, COUPLING, scheme=chosen.scheme)
     binding = Binding(scene.model, scene.data, parameters)
     still, left, speed = samples_of(np.zeros((1, 3))), 0.0, 0.0
     for k in range(200):

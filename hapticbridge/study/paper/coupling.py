@@ -81,8 +81,7 @@ def any_coupling() -> Section:
         ),
         paragraphs=(
             "C is the transfer function from the distance of handle and tool to the force. The "
-            "real "
-            "part must be positive. The condition holds for every passive hand and every "
+            "real part must be positive. The condition holds for every passive hand and every "
             "discrete-time passive environment, so nothing of the scene enters.",
             "It takes any C. A low-pass behind the damper lowers the need at high frequency. One "
             "sample of delay makes the real part negative above some frequency: no device damping "
@@ -183,8 +182,7 @@ def discretizations() -> Section:
         ),
         paragraphs=(
             "The backward difference (4) stays finite, K + 2B/T at Nyquist. Tustin's rule (5) "
-            "keeps "
-            "the phase of a spring and damper up to Nyquist, where it has a pole.",
+            "keeps the phase of a spring and damper up to Nyquist, where it has a pole.",
         ),
         curves=(Curve("discretisations", "Size and phase of the two couplings.", figure),),
         checks=(

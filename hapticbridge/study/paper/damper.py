@@ -77,11 +77,10 @@ def backward_difference() -> Section:
         paragraphs=(
             "Put (4) into (2): the need rises with frequency and is largest at Nyquist. The worst "
             "hand there holds nothing: the device's own damper alone must keep the loop stable.",
-            "(6) is not only necessary. An exact identity of the sampled energies shows that it is "
-            "sufficient for any passive hand, also a nonlinear one, and in several dimensions as "
-            "the "
-            "matrix inequality b ⪰ KT/2 + B. The identity is evaluated here on random motion in "
-            "three dimensions.",
+            "(6) is not only necessary. An exact identity of the sampled energies shows that it "
+            "is sufficient for any passive hand, also a nonlinear one, and in several dimensions "
+            "as the matrix inequality b ⪰ KT/2 + B. The identity is evaluated here on random "
+            "motion in three dimensions.",
             "With MuJoCo in the loop the same hand holds a heavy free body through the coupling "
             "actuators under the <code>discrete</code> integrator: the limit is the paper's.",
         ),

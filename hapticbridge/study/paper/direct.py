@@ -84,16 +84,13 @@ def section() -> Section:
         ),
         paragraphs=(
             "A massless rigid peg tracks the handle in a grounded hole. Each of two contacts on "
-            "opposite walls has the stiffness K<sub>c</sub>; they lie a distance L apart, with the "
-            "handle midway. The rotational entry ½ K<sub>c</sub> L² is that of the paper's "
-            "erratum. "
-            "The first lateral contact alone gives K<sub>c</sub>.",
+            "opposite walls has the stiffness K<sub>c</sub>; they lie a distance L apart, with "
+            "the handle midway. The rotational entry ½ K<sub>c</sub> L² is that of the paper's "
+            "erratum. The first lateral contact alone gives K<sub>c</sub>.",
             "A device with rotational damping b<sub>θ</sub> bears the stiffness 2 "
-            "b<sub>θ</sub>/T, so "
-            f"a contact of {CONTACT:g} N/m at {PERIOD * 1e3:g} ms and {DEVICE:g} N m s/rad allows "
-            f"{1e3 * limit:.2f} mm. A longer tool is unstable. Behind a coupling the need levels "
-            "off "
-            "at the coupling's own bound, whatever L is.",
+            f"b<sub>θ</sub>/T, so a contact of {CONTACT:g} N/m at {PERIOD * 1e3:g} ms and "
+            f"{DEVICE:g} N m s/rad allows {1e3 * limit:.2f} mm. A longer tool is unstable. Behind "
+            "a coupling the need levels off at the coupling's own bound, whatever L is.",
         ),
         curves=(
             Curve(

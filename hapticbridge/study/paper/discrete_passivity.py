@@ -83,8 +83,7 @@ def section() -> Section:
         ),
         paragraphs=(
             "E<sub>k</sub> is what a step creates: storage gained beyond the work that the port "
-            "put "
-            "in. A discrete-time passive simulation never gives out more than it held at the "
+            "put in. A discrete-time passive simulation never gives out more than it held at the "
             "start.",
             f"Here a mass of {MASS:g} kg with 0.3 m/s is stopped and turned 20 times a second by a "
             "sinusoidal force, so that its whole kinetic energy is asked for again and again.",

@@ -81,10 +81,9 @@ def section() -> Section:
             "The position answers a force after two samples. (18) has no sign: whoever chooses the "
             "force takes energy out. The implicit midpoint rule, which the paper does not have, "
             "neither creates nor loses.",
-            "The same four rules on a body that tumbles freely (no force, T = 1 ms, 10 rad/s about "
-            "the middle axis): explicit rules gain, implicit Euler loses, midpoint keeps energy "
-            "and "
-            "momentum.",
+            "The same four rules on a body that tumbles freely (no force, T = 1 ms, 10 rad/s "
+            "about the middle axis): explicit rules gain, implicit Euler loses, midpoint keeps "
+            "energy and momentum.",
         ),
         curves=(
             Curve(

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from hapticbridge.mechanics import ImpactBody, resolve_impact
+from hapticbridge.mechanics import Impact, ImpactBody, resolve_impact
 from hapticbridge.mechanics.impact import Law
 from hapticbridge.study.paper.check import Check
 from hapticbridge.study.paper.drawing import panels
@@ -85,21 +86,15 @@ def _random_gains() -> dict[Law, _Array]:
     }
 
 
-def section() -> Section:
-    """Walks through the impact argument."""
-    gains = _random_gains()
-    # rounding of two joules that cancel
-    share = {law: float(np.mean(gain > 1e-12)) for law, gain in gains.items()}
-
+def _drawn(impacts: dict[Law, Impact], gains: dict[Law, _Array], share: dict[Law, float]) -> Figure:
+    """Draws the rod's impulses by law, and what random rods gain."""
     figure, (path, histogram) = panels(1, height=4.2, columns=2)
     normal, tangential = _path()
     path.plot(normal, tangential, color="k", lw=1, label="Routh's path")
     path.plot(normal, -FRICTION * normal, color="grey", ls=":", lw=1, label="cone, P_t = −μ P_n")
-    checks, rows = [], []
-    for law, (p_n, p_t, energy) in KNOWN.items():
-        impact = resolve_impact(ROD, VELOCITY, FRICTION, RESTITUTION, law)
-        got = float(impact.energy_change)
-        path.plot(*impact.impulse[::-1], "o", color=COLOURS[law], label=f"{law}, {got:+.4f} J")
+    for law, impact in impacts.items():
+        label = f"{law}, {float(impact.energy_change):+.4f} J"
+        path.plot(*impact.impulse[::-1], "o", color=COLOURS[law], label=label)
         histogram.hist(
             100 * gains[law],
             bins=[float(edge) for edge in range(-100, 41, 4)],
@@ -107,56 +102,6 @@ def section() -> Section:
             histtype="step",
             color=COLOURS[law],
             label=f"{law}: gains in {100 * share[law]:.2g} %",
-        )
-        stepped = _stepped(law)
-        rows.append(
-            (
-                law,
-                f"{impact.impulse[1]:.6f}",
-                f"{impact.impulse[0]:.6f}",
-                f"{got:+.6f}",
-                f"{stepped:+.6f}",
-            )
-        )
-        rational = law != "stronge"
-        for quantity, expected, value, unit in (
-            ("P_n", p_n, float(impact.impulse[1]), "N s"),
-            ("P_t", p_t, float(impact.impulse[0]), "N s"),
-            ("change of kinetic energy", energy, got, "J"),
-        ):
-            checks.append(
-                Check(
-                    equation="§4",
-                    quantity=f"rod, {law}: {quantity}",
-                    route="closed form, against "
-                    + ("the exact decimals" if rational else "six decimals"),
-                    expected=expected,
-                    got=value,
-                    unit=unit,
-                    tolerance=1e-12 if rational else 1e-5,
-                )
-            )
-        checks.append(
-            Check(
-                equation="§4",
-                quantity=f"rod, {law}: change of kinetic energy",
-                route="Coulomb's law in 20 000 steps of impulse",
-                expected=got,
-                got=stepped,
-                unit="J",
-                tolerance=2e-3,
-            )
-        )
-        checks.append(
-            Check(
-                equation="§4",
-                quantity=f"rod, {law}: change of kinetic energy",
-                route="velocities of the body before and after",
-                expected=got,
-                got=_by_velocities(impact.impulse),
-                unit="J",
-                tolerance=1e-9,
-            )
         )
     path.axvline(0.325, color="grey", lw=0.8, ls="--", label="end of compression")
     path.set_xlabel("normal impulse P_n (N s)")
@@ -168,8 +113,55 @@ def section() -> Section:
     histogram.set_xlabel("change of energy over ½ m v² (%)")
     histogram.set_ylabel("share of random impacts (%)")
     histogram.legend(fontsize="x-small", loc="upper left")
+    return figure
 
-    checks.extend(
+
+def _checks_of_rod(law: Law, impact: Impact, stepped: float) -> list[Check]:
+    """Holds a law's impact of the rod against kept numbers and two other routes.
+
+    Args:
+        law: Which.
+        impact: By the closed form.
+        stepped: Change of kinetic energy in J by Coulomb's law in small steps.
+    """
+    got = float(impact.energy_change)
+    is_rational = law != "stronge"
+    names = ("P_n", "N s"), ("P_t", "N s"), ("change of kinetic energy", "J")
+    found = float(impact.impulse[1]), float(impact.impulse[0]), got
+    kept = [
+        Check(
+            equation="§4",
+            quantity=f"rod, {law}: {quantity}",
+            route="closed form, against "
+            + ("the exact decimals" if is_rational else "six decimals"),
+            expected=expected,
+            got=value,
+            unit=unit,
+            tolerance=1e-12 if is_rational else 1e-5,
+        )
+        for (quantity, unit), expected, value in zip(names, KNOWN[law], found, strict=True)
+    ]
+    routes = (
+        ("Coulomb's law in 20 000 steps of impulse", stepped, 2e-3),
+        ("velocities of the body before and after", _by_velocities(impact.impulse), 1e-9),
+    )
+    return kept + [
+        Check(
+            equation="§4",
+            quantity=f"rod, {law}: change of kinetic energy",
+            route=route,
+            expected=got,
+            got=value,
+            unit="J",
+            tolerance=tolerance,
+        )
+        for route, value, tolerance in routes
+    ]
+
+
+def _checks_of_random_rods(share: dict[Law, float]) -> list[Check]:
+    """Holds the shares of random rods that gain energy against 0, and Newton's against its own."""
+    checks = [
         Check(
             equation="§4",
             quantity=f"random rods, {law}: share that gains energy",
@@ -180,7 +172,7 @@ def section() -> Section:
         )
         for law in KNOWN
         if law != "newton"
-    )
+    ]
     checks.append(
         Check(
             equation="§4",
@@ -192,6 +184,19 @@ def section() -> Section:
             tolerance=5 * float(np.sqrt((1 - GAINING) / GAINING / IMPACTS)),
         )
     )
+    return checks
+
+
+def section() -> Section:
+    """Walks through the impact argument."""
+    gains = _random_gains()
+    # rounding of two joules that cancel
+    share = {law: float(np.mean(gain > 1e-12)) for law, gain in gains.items()}
+    impacts = {law: resolve_impact(ROD, VELOCITY, FRICTION, RESTITUTION, law) for law in KNOWN}
+    stepped = {law: _stepped(law) for law in KNOWN}
+    checks = [
+        check for law in KNOWN for check in _checks_of_rod(law, impacts[law], stepped[law])
+    ] + _checks_of_random_rods(share)
     return Section(
         equation="§4",
         title="Impact: Newton's restitution can create energy",
@@ -216,7 +221,7 @@ def section() -> Section:
                 "impact",
                 "Left: the rod's impulses and where each law ends. Right: change of energy of "
                 f"{IMPACTS // 1000} 000 random rods; v is the velocity of the tip.",
-                figure,
+                _drawn(impacts, gains, share),
             ),
         ),
         checks=tuple(checks),
@@ -228,7 +233,16 @@ def section() -> Section:
                 "change of kinetic energy (J)",
                 "the same in small steps (J)",
             ),
-            tuple(rows),
+            tuple(
+                (
+                    law,
+                    f"{impact.impulse[1]:.6f}",
+                    f"{impact.impulse[0]:.6f}",
+                    f"{float(impact.energy_change):+.6f}",
+                    f"{stepped[law]:+.6f}",
+                )
+                for law, impact in impacts.items()
+            ),
         ),
     )
 

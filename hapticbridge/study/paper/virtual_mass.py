@@ -194,18 +194,16 @@ def section() -> Section:
             "j counts the samples from the force to the position of the mass.",
             "An implicit mass may be as light as one likes. With a force before the step the need "
             "grows without limit as the mass falls to (T/2)(KT/2 + B). With explicit Euler the "
-            "mass "
-            "must exceed B² T/(B − KT), and for B ≤ KT no mass is heavy enough.",
+            "mass must exceed B² T/(B − KT), and for B ≤ KT no mass is heavy enough.",
         ),
         curves=(
             Curve(
                 "virtual_mass",
                 f"Left: damping needed over the mass, K = {K:g} N/m, B = {B:g} N s/m, T = 1 ms. "
-                "Where "
-                "the "
-                "blue and the red curve both exist they fall together, but for the last percents "
-                "before the explicit mass is unstable by itself. Right: the mass above which the "
-                "tool is stable by itself; under explicit Euler there is none for B ≤ KT.",
+                "Where the blue and the red curve both exist they fall together, but for the last "
+                "percents before the explicit mass is unstable by itself. Right: the mass above "
+                "which the tool is stable by itself; under explicit Euler there is none for B ≤ "
+                "KT.",
                 figure,
             ),
         ),
