@@ -46,8 +46,7 @@ ENABLE, DISABLE, STOP_ALL, RESET = _P | 0x97, _P | 0x98, _P | 0x99, _P | 0x9A
 _MILLI = -3
 """Power of ten, in s, of durations whose unit the device does not name: all drivers take ms."""
 
-_FULL_TURN = 360.0
-"""In degrees, the unit of directions in the standard."""
+_FULL_TURN = 360.0  # degrees, the standard's unit of directions
 
 
 @dataclass(frozen=True, slots=True)

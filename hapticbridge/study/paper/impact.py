@@ -117,13 +117,7 @@ def _drawn(impacts: dict[Law, Impact], gains: dict[Law, _Array], share: dict[Law
 
 
 def _checks_of_rod(law: Law, impact: Impact, stepped: float) -> list[Check]:
-    """Holds a law's impact of the rod against kept numbers and two other routes.
-
-    Args:
-        law: Which.
-        impact: By the closed form.
-        stepped: Change of kinetic energy in J by Coulomb's law in small steps.
-    """
+    """Holds a law's impact of the rod against kept numbers, small steps (J) and velocities."""
     got = float(impact.energy_change)
     is_rational = law != "stronge"
     names = ("P_n", "N s"), ("P_t", "N s"), ("change of kinetic energy", "J")
