@@ -23,6 +23,7 @@ from hapticbridge.kernel.guarding import TANK, Guarding
 from hapticbridge.quantity import quantity
 from hapticbridge.recording import Recording, read_recording
 from hapticbridge.report import write_report
+from hapticbridge.report.curves import decimated
 from hapticbridge.report.energies import draw_energies
 from hapticbridge.report.evidence import Evidence
 from hapticbridge.report.facts import (
@@ -99,6 +100,19 @@ def test_a_long_page_stays_small_and_keeps_its_peaks(run_file: Path, tmp_path: P
     assert np.asarray(line.get_ydata()).max() == 77.0
     write_report(recording, audit(run_file), page)
     assert 100_000 < page.stat().st_size < 1_000_000  # curves are of constant length
+
+
+def test_no_peak_of_a_curve_is_lost_wherever_it_stands() -> None:
+    bins = 30
+    for count in (100, 103, 899, 900, 901):
+        time = np.arange(count, dtype=np.float64)
+        for at in range(count):
+            values = np.zeros(count)
+            values[at] = -1.0 if at % 2 else 1.0
+            drawn_at, drawn = decimated(time, values, bins)
+            assert len(drawn) <= 2 * bins + 1
+            assert (np.diff(drawn_at) >= 0).all()
+            assert set(drawn_at[drawn != 0.0]) == {float(at)}
 
 
 def test_what_was_at_work_is_drawn_when_it_was(run_file: Path) -> None:
