@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import html
 import io
+import sys
 from collections.abc import Callable
 from dataclasses import fields, replace
 from pathlib import Path
@@ -18,11 +19,11 @@ from PIL import Image
 from report_runs import Made
 
 from hapticbridge.audit import audit
-from hapticbridge.errors import RecordingError
+from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.kernel.guarding import TANK, Guarding
 from hapticbridge.quantity import quantity
 from hapticbridge.recording import Recording, read_recording
-from hapticbridge.report import write_report
+from hapticbridge.report import plot_recording, write_report
 from hapticbridge.report.curves import decimated
 from hapticbridge.report.energies import draw_energies
 from hapticbridge.report.evidence import Evidence
@@ -270,6 +271,34 @@ def test_a_page_replaces_no_recording_and_no_picture(
     with pytest.raises(RecordingError, match="page"):
         write_report(read_recording(run_file), audit(run_file), target)
     assert not target.exists() or target.read_bytes() == b"what was there"
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs a limit on a file's size")
+def test_a_page_and_a_picture_that_the_disk_does_not_take_leave_what_was_there(
+    run_file: Path, tmp_path: Path
+) -> None:
+    import resource
+
+    page, picture = tmp_path / "page.html", tmp_path / "run.svg"
+    link = tmp_path / "link.html"
+    link.symlink_to(page)
+    for target in (page, picture):
+        target.write_bytes(b"what was there")
+    recording, report = read_recording(run_file), audit(run_file)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4096, limits[1]))
+    try:
+        with pytest.raises(RecordingError, match="cannot write"):
+            write_report(recording, report, link)
+        with pytest.raises(HapticBridgeError, match="cannot write"):
+            plot_recording(recording, picture)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert {page.read_bytes(), picture.read_bytes()} == {b"what was there"}
+    assert sorted(tmp_path.iterdir()) == sorted((page, picture, link))
+    write_report(recording, report, link)
+    assert link.is_symlink()
+    assert "verdict" in page.read_text(encoding="utf-8")
 
 
 def test_a_passive_page_says_whether_the_device_bears_the_coupling(
