@@ -15,12 +15,16 @@ def whole_file(path: Path) -> Iterator[Path]:
     what did.
 
     Args:
-        path: Where the file is to stand; where it is a link, what it leads to.
+        path: Where the file is to stand; where it is a link, what it leads to. What is there and no
+            file, like a pipe or /dev/stdout, is written to at once.
 
     Raises:
         OSError: The file cannot take its place.
     """
     target = path.resolve()
+    if path.exists() and not path.is_file():
+        yield path
+        return
     draft = target.with_name(f".draft-{target.name}")
     try:
         yield draft
