@@ -23,6 +23,7 @@ ORDER = (
         "picture",
         "jsonable",
         "quantity",
+        "whole_file",
     ),
     ("coupling", "kernel", "mechanics", "passivity"),
     ("scene",),
