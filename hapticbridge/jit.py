@@ -15,7 +15,7 @@ _Function = TypeVar("_Function", bound=Callable[..., object])
 
 
 @cache
-def _cache_folder() -> str:
+def cache_folder() -> str:
     """Returns where machine code is kept: one folder per state of all compiled sources.
 
     numba looks only at the file of the function that it loads, but compiled functions inline each
@@ -33,7 +33,7 @@ def _cache_folder() -> str:
 
 def _compiled(function: _Function, *, nogil: bool) -> _Function:
     outside = numba.config.CACHE_DIR
-    numba.config.CACHE_DIR = _cache_folder()
+    numba.config.CACHE_DIR = cache_folder()
     try:
         decorate = numba.njit(cache=True, nogil=nogil, error_model="numpy")
         return cast(_Function, decorate(function))

@@ -15,6 +15,7 @@ from hapticbridge.cli import devices as command
 from hapticbridge.device.families import FAMILIES, RULES_FILE, plugged_devices, udev_rules
 from hapticbridge.device.forcedimension.library import VARIABLE
 from hapticbridge.device.haply import finding as haply
+from hapticbridge.device.pid import effects
 from hapticbridge.device.plugged import (
     RULES_COMMAND,
     Family,
@@ -22,6 +23,7 @@ from hapticbridge.device.plugged import (
     access_problem,
     permission_problem,
 )
+from hapticbridge.device.silence import watchdog_time
 from hapticbridge.device.transport import hid_search, usb_bus, usb_search
 from hapticbridge.errors import DeviceError
 
@@ -99,6 +101,23 @@ def test_devices_runs_on_this_machine_whatever_it_has(call: Called) -> None:
     assert code == 0
     assert [family["name"] for family in facts["supported"]] == [f.name for f in FAMILIES]
     assert facts["plugged"] == json.loads(json.dumps([vars_of(d) for d in plugged_devices()]))
+
+
+def test_who_stands_still_reads_what_becomes_of_each_devices_force(call: Called) -> None:
+    code, out, _ = call("devices")
+    assert code == 0
+    told = {family.name: family.on_stall for family in FAMILIES}
+    assert [name for name, words in told.items() if not words] == ["spacemouse"]  # has no force
+    shown = " ".join(out.split())
+    for words in filter(None, told.values()):
+        assert f"if this machine stands still: {words}" in shown
+    # the times are those that are asked for
+    asked = f"after {1e3 * watchdog_time(1e-3):g} ms"
+    assert asked in told["rawhid"] and asked in told["forcedimension"]
+    slow = effects.LIFE * effects.RESTART_REPORTS * len(effects.ANGLES) * effects.SLOWEST_INTERVAL
+    for life in (effects.LIFE * effects.RESTART, slow):
+        assert f"{life:g} s" in told["pid"]
+    assert "stays on" in told["falcon"]
 
 
 def vars_of(device: Plugged) -> dict[str, object]:

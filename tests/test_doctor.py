@@ -247,6 +247,16 @@ def test_the_verdict_says_whose_delays_they_are_and_what_to_do() -> None:
     assert "nothing is to be done" in judged(alone | {"bridge": good}, (), 1000.0)[1]
 
 
+@pytest.mark.parametrize(("worst", "is_told"), [(0.019, False), (0.021, True)])
+def test_a_stall_longer_than_a_devices_watchdog_is_told_with_what_it_means_for_the_hand(
+    worst: float, is_told: bool
+) -> None:
+    stalled = {name: lateness(1e-5, 1e-5, worst, missed=200) for name in ("bridge", "bare sleep")}
+    sentence = judged(stalled, (), 1000.0)[1]
+    assert ("stood still for 21 ms: for so long a device goes on" in sentence) == is_told
+    assert ("'hapticbridge devices'" in sentence) == is_told
+
+
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, int, int]]:
     """Turns that take no time: the bridge's loop is 10 µs late, the bare one 60 µs."""

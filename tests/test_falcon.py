@@ -14,6 +14,7 @@ from hapticbridge.audit import audit
 from hapticbridge.bridge import Bridge
 from hapticbridge.device import SimulatedDevice, device_for
 from hapticbridge.device.falcon.driver import FalconDevice
+from hapticbridge.device.trajectory.motion import Motion
 from hapticbridge.errors import DeviceError, DeviceLost, SafetyTrip
 from hapticbridge.recording import read_recording
 from hapticbridge.scene import load_scene
@@ -204,6 +205,38 @@ def test_a_pause_of_the_loop_is_not_the_devices_silence() -> None:
     bench.time.until(bench.time.now + 1.0)
     _, flags, _ = looped(bench, device, 20)
     assert (flags[3:] == 0).all()
+
+
+@pytest.mark.parametrize(("stall", "is_asked_anew"), [(0.04, False), (0.2, True)])
+def test_after_a_stall_the_force_is_gone_and_the_pose_is_the_present_one_before_the_tick_goes_on(
+    stall: float, is_asked_anew: bool
+) -> None:
+    path = Motion([0.0, 5.0], [(-0.02, 0.0, 0.0), (0.18, 0.0, 0.0)])  # 40 mm/s
+    bench = Bench(SimulatedDevice(mass=0.4, damping=2.0, path=path))
+    device = bench.opened()
+    device.start(PERIOD)
+    looped(bench, device, 300, (-0.5, 0.0, 0.0))
+    before = bench.time.now
+    bench.time.until(before + stall)
+    assert any(bench.model.motors)  # nothing takes it away while the host stands still
+    sample = np.zeros(1, SAMPLE_DTYPE)
+    assert device.read(sample) == 0
+    error = np.linalg.norm(sample["position"][0] - bench.model.handle.pose()[0])
+    assert (error < 0.2e-3) == is_asked_anew
+    assert (bench.model.motors == (0, 0, 0)) == is_asked_anew
+    waited = bench.time.now - before - stall
+    assert 0.0 < waited < 5e-3 if is_asked_anew else waited == pytest.approx(0.0, abs=1e-9)
+
+
+def test_a_falcon_that_answers_nothing_after_a_stall_is_lost() -> None:
+    bench = Bench()
+    device = bench.opened()
+    device.start(PERIOD)
+    looped(bench, device, 20)
+    bench.model.halted = {0x02}
+    bench.time.until(bench.time.now + 0.2)
+    with pytest.raises(DeviceLost):
+        device.read(np.zeros(1, SAMPLE_DTYPE))
 
 
 def test_an_unplugged_or_halted_falcon_is_lost_in_the_same_tick() -> None:

@@ -18,6 +18,7 @@ from hapticbridge.device import SimulatedDevice, open_device, silence
 from hapticbridge.device.haply import finding as haply
 from hapticbridge.device.haply import messages
 from hapticbridge.device.haply.driver import FORCE_LIMIT, MOST_UNDER_WAY, HaplyDevice
+from hapticbridge.device.trajectory.motion import Motion
 from hapticbridge.device.transport import websocket as transport
 from hapticbridge.errors import DeviceError, DeviceLost
 from hapticbridge.tick import SAMPLE_DTYPE, TickFlag
@@ -186,7 +187,38 @@ def test_a_loop_that_was_away_finds_the_service_alive() -> None:
     assert ticks(bench, device, 5) == [0] * 5
     device.start(PERIOD)
     bench.time.advance(bench.time.now + 0.5)  # before the loop's first question
-    assert ticks(bench, device, 5) == [int(TickFlag.STALE_SAMPLE), 0, 0, 0, 0]
+    assert ticks(bench, device, 5) == [0] * 5
+
+
+def drifting() -> Bench:
+    """A device in a hand that carries it along x at 0.2 m/s."""
+    path = Motion([0.0, 2.0], [(0.0, 0.0, 0.0), (0.4, 0.0, 0.0)])
+    return Bench(SimulatedDevice(path=path), work=3e-3)  # slower than the loop: a force waits
+
+
+@pytest.mark.parametrize(("stall", "is_asked_anew"), [(0.04, False), (0.2, True)])
+def test_after_a_stall_the_pose_is_the_present_one_and_no_force_of_before_is_sent(
+    stall: float, is_asked_anew: bool
+) -> None:
+    bench = drifting()
+    device = bench.opened()
+    device.start(PERIOD)
+    ticks(bench, device, 300)
+    obeyed = len(bench.service.forces)
+    before = bench.time.now
+    bench.time.advance(before + stall)
+    late = len(bench.service.forces)
+    sample = np.zeros(1, SAMPLE_DTYPE)
+    assert device.read(sample) == 0
+    here = CENTRE + bench.service.devices["049D"].handle.pose()[0]
+    error = float(np.linalg.norm(sample["position"][0] - here))
+    assert (error < 2e-3) == is_asked_anew
+    if is_asked_anew:
+        assert bench.service.forces[late:] == [[0.0, 0.0, 0.0]]
+        assert bench.time.now - before - stall < 0.01
+    else:  # it waits for nothing
+        assert bench.time.now == pytest.approx(before + stall, abs=1e-9)
+    assert late >= obeyed
 
 
 @pytest.mark.parametrize(

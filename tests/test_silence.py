@@ -29,3 +29,15 @@ def test_a_loop_that_was_away_does_not_take_the_device_for_silent() -> None:
     # and the count goes on from there
     assert not watch.is_silent(0.04 + 2.9 * SILENCE, is_new=False)
     assert watch.is_silent(0.04 + 3.1 * SILENCE, is_new=False)
+
+
+@pytest.mark.parametrize("period", [PERIOD, 0.02])
+def test_a_loop_was_away_when_it_came_later_than_its_period_by_more_than_the_silence(
+    period: float,
+) -> None:
+    watch = SilenceWatch(0.0, period)
+    watch.is_silent(1.0, is_new=True)
+    assert not watch.was_away(1.0 + period + 0.99 * SILENCE)
+    assert watch.was_away(1.0 + period + 1.01 * SILENCE)
+    watch.is_silent(2.0, is_new=False)
+    assert not watch.was_away(2.0 + period)

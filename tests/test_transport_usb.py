@@ -19,7 +19,8 @@ from emulated.pyusb_backend import PyusbBackend
 
 from hapticbridge.device import SimulatedDevice
 from hapticbridge.device.falcon.boot import READ_FROM, WRITE_TO, enter_run_mode
-from hapticbridge.device.falcon.driver import FAMILY, FalconDevice, open_falcon
+from hapticbridge.device.falcon.driver import FalconDevice
+from hapticbridge.device.falcon.finding import FAMILY, open_falcon
 from hapticbridge.device.falcon.packets import SIZE, encode
 from hapticbridge.device.plugged import tell_nobody
 from hapticbridge.device.transport.hex_log import HexLog

@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
-from emulated.guest import NO_KERNEL, has_pidff, kernel, run_in_guest
+from emulated.compile_ahead import snapshot_of_compiled_code
+from emulated.guest import NO_KERNEL, GuestRun, has_pidff, kernel, run_in_guest
+from emulated.parting import MOST_NAMED, parting, repeated
 from emulated.tiers import JOBS, Claim, Job, claims_of, main
+
+from hapticbridge.recording.writer import RecordingWriter
+from hapticbridge.tick import COLUMNS, TICK_DTYPE
 
 
 @pytest.mark.parametrize("job", JOBS, ids=lambda job: job.name)
@@ -73,6 +80,116 @@ def test_a_report_is_read_claim_by_claim_and_a_missing_one_is_a_failure(tmp_path
         Claim("it breaks", is_true=False, note="how"),
         Claim("it cannot", is_true=None, note="no such kernel"),
     ]
+
+
+def _records(count: int = 5) -> np.ndarray:
+    """Records that differ from each other in number and time alone."""
+    ticks = np.zeros(count, TICK_DTYPE)
+    ticks["tick"] = np.arange(count)
+    ticks["wake_ns"] = 1_000_000 * np.arange(count)
+    return ticks
+
+
+def test_runs_that_are_one_to_the_bit_do_not_part_and_a_nan_is_like_itself() -> None:
+    first, second = _records(), _records()
+    for ticks in (first, second):
+        ticks["wrench_on_tool"][2, 1] = np.nan
+    assert parting(first, second) is None
+
+
+@pytest.mark.parametrize(
+    ("field", "part", "values", "named"),
+    [
+        ("wake_ns", None, (3_000_256, 3_000_000), "wake_ns 3000256 and 3000000 ns"),
+        ("wrench_on_device", 4, (0.25, 0.5), "wrench_on_device_ty 0.25 and 0.5 N m"),
+        ("kinetic", None, (0.0, -0.0), "kinetic 0.0 and -0.0 J"),
+    ],
+)
+def test_where_two_runs_part_is_told_with_tick_field_both_values_and_unit(
+    field: str, part: int | None, values: tuple[float, float], named: str
+) -> None:
+    runs = _records(), _records()
+    for ticks, value in zip(runs, values, strict=True):
+        ticks[field][3 if part is None else (3, part)] = value
+    told = str(parting(*runs))
+    assert told.startswith(f"record 3 (ticks 3 and 3) is the first that differs: {named}. ")
+    assert "1 of 5 records and 1 of 51 columns differ; 5 and 5 records" in told
+
+
+def test_a_run_that_is_shorter_or_differs_in_everything_is_told_in_few_words() -> None:
+    assert parting(_records(5), _records(4)) == (
+        "5 and 4 records; the 4 that both have are the same to the bit"
+    )
+    other = np.frombuffer(np.arange(1, 1 + 5 * len(COLUMNS)).tobytes(), TICK_DTYPE)
+    told = str(parting(_records(), other))
+    assert f"; {len(COLUMNS) - MOST_NAMED} other numbers. 5 of 5 records and 51 of 51" in told
+
+
+def _recorded_as(path: Path, ticks: np.ndarray) -> Path:
+    writer = RecordingWriter(path, {}, [], epoch_ns=0)
+    writer.write_ticks(ticks)
+    writer.close()
+    return path
+
+
+@pytest.mark.parametrize(
+    ("late", "status", "is_same", "told"),
+    [
+        (0, 0, True, "5 ticks, "),
+        (
+            256,
+            0,
+            False,
+            "runs 1 and 3: record 4 (ticks 4 and 4) is the first that differs: wake_ns",
+        ),
+        (0, 3, False, "run 3 of 3 ended with status 3 after 1.5 s of this machine's time"),
+    ],
+)
+def test_of_repeated_runs_the_one_that_differs_or_fails_is_told_with_what_its_guest_said(
+    tmp_path: Path, late: int, status: int, is_same: bool, told: str
+) -> None:
+    def run(number: int) -> tuple[GuestRun, Path]:
+        ticks = _records()
+        ticks["wake_ns"][4] += late if number == 3 else 0
+        file = _recorded_as(tmp_path / f"{number}.mcap", ticks)
+        said = f"guest {number} says so"
+        return GuestRun(status if number == 3 else 0, said, 1.5, "its kernel too"), file
+
+    verdict, note = repeated(run, 3)
+    assert verdict == is_same
+    assert note.startswith(told)
+    for said in ("guest 3 says so", "its kernel too"):
+        assert (said in note) == (not is_same)
+    assert ("guest 1 says so" in note) == bool(late)
+
+
+def test_a_snapshot_of_compiled_code_holds_what_is_whole_and_nothing_of_other_checkouts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cache = tmp_path / "cache" / "0123"
+    for name in ("kernel/step.nbi", "kernel/step.1.nbc", "kernel/step.nbi.tmp.77", "../4567/x.nbi"):
+        (cache / name).parent.mkdir(parents=True, exist_ok=True)
+        (cache / name).write_text(name)
+    monkeypatch.setattr("emulated.compile_ahead.cache_folder", lambda: str(cache))
+    folder = snapshot_of_compiled_code(tmp_path / "mine")
+    found = sorted(str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file())
+    assert found == ["0123/kernel/step.1.nbc", "0123/kernel/step.nbi"]
+
+
+@pytest.mark.skipif(kernel() is None, reason=NO_KERNEL)
+def test_in_virtual_time_a_program_that_reads_the_clock_oftener_is_later(tmp_path: Path) -> None:
+    """Why runs that are to be the same must find the same compiled code."""
+    told = []
+    for number, readings in enumerate((0, 0, 1000)):
+        reads = f"import time; [time.monotonic() for _ in range({readings})]"
+        program = f"{reads}; print(time.monotonic_ns())"
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        command = [sys.executable, "-I", "-S", "-c", program]
+        ended = run_in_guest(command, folder, environment={}, is_virtual=True)
+        told.append(int(ended.output))
+    assert told[1] == told[0]
+    assert told[2] - told[0] == pytest.approx(1000 * 256, rel=0.01)
 
 
 @pytest.mark.skipif(kernel() is None, reason=NO_KERNEL)

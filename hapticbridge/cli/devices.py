@@ -45,6 +45,8 @@ class Devices:
         for family in FAMILIES:
             out.print(f"{family.name}: {plain(family.about)}")
             out.print(f"  axes {family.axes}; force {family.force}; rate {family.rate}")
+            if family.on_stall:
+                out.print(f"  if this machine stands still: {plain(family.on_stall)}")
             if family.medium is not None:
                 out.print(f"  {plain(family.medium())}")
         out.print("[bold]plugged in[/bold]")
@@ -84,6 +86,7 @@ def _facts(plugged: list[Plugged], unseen: list[str]) -> dict[str, Any]:
                 "axes": family.axes,
                 "force": family.force,
                 "rate": family.rate,
+                "on_stall": family.on_stall,
                 "options": list(family.options),
                 "medium": None if family.medium is None else family.medium(),
                 "ids": [{"id": str(usb_id), "model": usb_id.model} for usb_id in family.ids],

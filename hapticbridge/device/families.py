@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from hapticbridge.device.falcon.driver import FAMILY as FALCON
+from hapticbridge.device.falcon.finding import FAMILY as FALCON
 from hapticbridge.device.forcedimension.finding import FAMILY as FORCE_DIMENSION
 from hapticbridge.device.haply.finding import FAMILY as HAPLY
 from hapticbridge.device.pid.driver import FAMILY as PID

@@ -53,6 +53,8 @@ class Family:
         axes: Which axes it has, in words, because it may differ from unit to unit.
         force: What force it can show, in words.
         rate: How often it reports, in words.
+        on_stall: What becomes of its force while this machine stands still, in words; empty where
+            it gives none. Nothing in this program can act then: only what runs in the device.
         options: Names that ``open`` understands.
         open: Finds the device and opens it; takes the options and whom to tell.
         usage: Usage page and usage of the HID collection that speaks the protocol, where a product
@@ -73,6 +75,7 @@ class Family:
     rate: str
     options: tuple[str, ...]
     open: Callable[[Mapping[str, object], Tell], Device]
+    on_stall: str = ""
     usage: tuple[int, int] | None = None
     find: Callable[[], list[Plugged]] | None = None
     medium: Callable[[], str] | None = None

@@ -39,12 +39,23 @@ class SilenceWatch:
             now: Time in s on the same clock.
             is_new: Whether this reading brought something new.
         """
-        was_away = now - self._read > SILENCE + self._period
+        was_away = self.was_away(now)
         self._read = now
         if is_new or was_away:
             self._heard = now
         self.silence = now - self._heard
         return self.silence > SILENCE
+
+    def was_away(self, now: float) -> bool:
+        """Returns whether the loop has not read for so long that nobody asked the device.
+
+        What a device that answers questions has said since is then as old as the last question: a
+        loop that goes by it finds the hand where it was, and two ticks later somewhere else.
+
+        Args:
+            now: Time in s on the same clock, before the reading is noted.
+        """
+        return now - self._read > SILENCE + self._period
 
 
 def watchdog_time(period: float) -> float:

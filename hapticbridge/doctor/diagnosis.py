@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from hapticbridge.clock import period_of
+from hapticbridge.device.silence import SHORTEST_WATCHDOG
 from hapticbridge.doctor import cyclictest
 from hapticbridge.doctor.machine import Finding, System, findings
 from hapticbridge.doctor.wakeups import Wakeups, bare_turn, clock_turn
@@ -142,7 +143,17 @@ def judged(
         verdict, words = "fair", f"fair for {held}"
     else:
         verdict, words = "unfit", f"unfit for {held}"
-    return verdict, f"{words}: {numbers}; {_cause(lateness, allowed, advice)}"
+    return verdict, f"{words}: {numbers}; {_cause(lateness, allowed, advice)}{_held(mine)}"
+
+
+def _held(mine: Lateness) -> str:
+    """Says what a stall means for the hand, where one was long enough to."""
+    if mine.worst <= SHORTEST_WATCHDOG:
+        return ""
+    return (
+        f"; it stood still for {1e3 * mine.worst:.0f} ms: for so long a device goes on with its "
+        "last force, but for those that let go by themselves (see 'hapticbridge devices')"
+    )
 
 
 def _cause(lateness: dict[str, Lateness], allowed: float, advice: str) -> str:

@@ -1,14 +1,23 @@
-"""Compiles on this machine what guests will call: in a User-Mode Linux that takes minutes."""
+"""Compiles on this machine what guests will call: in a User-Mode Linux that takes minutes.
+
+Byte code too, which a guest cannot write, so that none appears beside a guest where the guest
+before it found none: in virtual time that alone makes two runs differ (``guest.run_in_guest``).
+"""
 
 from __future__ import annotations
 
+import compileall
+import shutil
 from functools import cache
+from pathlib import Path
 
 from usb_tiers.benches import DAMPING, FRICTION, MASS, falcon
 
+from emulated.guest import CHECKOUT
 from emulated.virtual_usb import VirtualClock, VirtualLink, VirtualTime
 from hapticbridge.bridge import Bridge
 from hapticbridge.device.falcon.driver import FalconDevice
+from hapticbridge.jit import cache_folder
 
 _LONG_ENOUGH = 0.01
 """In s of simulated time: ten ticks call everything that there is to compile."""
@@ -17,7 +26,31 @@ _LONG_ENOUGH = 0.01
 @cache
 def compile_ahead() -> None:
     """Runs the loop for some ticks on a Falcon in this process, and so fills the cache of code."""
+    for folder in ("hapticbridge", "tests/emulated", "tests/usb_tiers"):
+        # quiet where it may not write: nobody else may then
+        compileall.compile_dir(CHECKOUT / folder, quiet=2)
     time = VirtualTime(falcon())
     device = FalconDevice(VirtualLink(time), mass=MASS, damping=DAMPING, friction=FRICTION)
     with Bridge("peg_in_hole", device, clock=VirtualClock(time)) as bridge:
         bridge.run(_LONG_ENOUGH)
+
+
+def snapshot_of_compiled_code(folder: Path) -> Path:
+    """Copies this checkout's compiled functions as they are now, whoever compiles beside it.
+
+    What is being written is left out, and so is anything that goes away meanwhile: whoever runs
+    with a copy compiles what it lacks.
+
+    Args:
+        folder: Made; what a guest takes for its folder of compiled functions.
+    """
+    source = Path(cache_folder())
+    folder.mkdir(parents=True)
+    for path in source.rglob("*.nb[ci]"):
+        place = folder / source.name / path.relative_to(source)
+        place.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            shutil.copy(path, place)
+        except FileNotFoundError:
+            continue
+    return folder

@@ -74,11 +74,22 @@ class GuestRun:
         output: What it printed, and what the guest's kernel said where there is no status, or where
             that kernel killed the command.
         seconds: Of this machine's time, boot included.
+        console: What the guest's kernel said, and why it was stopped if it was.
     """
 
     status: int | None
     output: str
     seconds: float
+    console: str = ""
+
+    def __str__(self) -> str:
+        """Tells all of it: for whoever must find out what went wrong in there."""
+        ending = "without a status" if self.status is None else f"with status {self.status}"
+        said = [f"ended {ending} after {self.seconds:.1f} s of this machine's time; it printed:"]
+        said.append(self.output.strip() or "nothing")
+        if self.console.strip() not in self.output:
+            said.append(f"and its kernel said:\n{self.console.strip()}")
+        return "\n".join(said)
 
 
 def run_in_guest(
@@ -89,8 +100,13 @@ def run_in_guest(
     is_virtual: bool,
     timeout: float = 120.0,
     patience: float | None = None,
+    compiled: Path | None = None,
 ) -> GuestRun:
     """Runs a command as the only job of a freshly booted guest.
+
+    Virtual time passes by 256 ns with each reading of the clock too, or who waits for it by reading
+    would wait for ever. So what a program does before shifts what it does after: two runs are the
+    same only if they also find the same byte code and machine code, or both find none.
 
     Args:
         command: The command and its arguments.
@@ -100,6 +116,8 @@ def run_in_guest(
             this machine's speed.
         timeout: In s of this machine's time.
         patience: Likewise: for how long it may print nothing; None: for as long as it likes.
+        compiled: Folder of compiled functions, to which it may write; None: this machine's, shared
+            with whoever compiles meanwhile.
     """
     program = kernel()
     if program is None:
@@ -120,7 +138,7 @@ def run_in_guest(
         "ssl=null",
         f"init={CHECKOUT / 'tests/uml/init'}",
         f"job={folder}",
-        f"compiled={_compiled_code()}",
+        f"compiled={compiled or _compiled_code()}",
         *(["time-travel=inf-cpu"] if is_virtual else []),
     ]
     start = time.monotonic()
@@ -140,9 +158,9 @@ def run_in_guest(
     seconds = time.monotonic() - start
     said = output.read_text(errors="replace") if output.is_file() else ""
     if not status.is_file():
-        return GuestRun(None, said + console, seconds)
+        return GuestRun(None, said + console, seconds, console)
     code = int(status.read_text())
-    return GuestRun(code, said + console if code == _KILLED else said, seconds)
+    return GuestRun(code, said + console if code == _KILLED else said, seconds, console)
 
 
 def _console(

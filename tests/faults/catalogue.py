@@ -123,10 +123,10 @@ def _every(share: float) -> Callable[[Rig], None]:
 def _stall(rig: Rig) -> None:
     """The loop stands still for 0.2 s, in which the hand goes 20 mm deeper."""
     rig.points = (*PRESS[:3], (1.5, 0.0804), (1.7, 0.1004), (1.9, 0.0804), (9.0, 0.0804))
-    rig.device.corrupt = _passing(rig, CAUSE, 0.2)
+    rig.device.corrupt = passing(rig, CAUSE, 0.2)
 
 
-def _passing(rig: Rig, at: int, seconds: float) -> Callable[[int, NDArray[np.void]], int]:
+def passing(rig: Rig, at: int, seconds: float) -> Callable[[int, NDArray[np.void]], int]:
     """The loop learns at a tick that time has passed, and the device moved on."""
 
     def corrupt(tick: int, sample: NDArray[np.void]) -> int:
@@ -141,7 +141,7 @@ def _passing(rig: Rig, at: int, seconds: float) -> Callable[[int, NDArray[np.voi
 
 
 def _read_blocks(rig: Rig) -> None:
-    rig.device.corrupt = _passing(rig, CAUSE, 1.0)
+    rig.device.corrupt = passing(rig, CAUSE, 1.0)
 
 
 def _write_blocks(rig: Rig) -> None:
@@ -372,7 +372,7 @@ def _suspended(rig: Rig) -> None:
             asleep = 5_000_000_000
         return pass_time(tick, sample)
 
-    pass_time = _passing(rig, CAUSE, 5.0)
+    pass_time = passing(rig, CAUSE, 5.0)
     rig.around, rig.device.corrupt = around, corrupt
 
 

@@ -14,20 +14,12 @@ real Falcon has moved under this code yet.
 from __future__ import annotations
 
 import array
-from collections.abc import Mapping
-from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.device.data_sheet import (
-    USUAL_TORQUE_LIMIT,
-    DeviceInfo,
-    checked_period,
-    stated_numbers,
-)
-from hapticbridge.device.falcon.boot import READ_FROM, WRITE_TO, Link, ask, read_firmware
+from hapticbridge.device.data_sheet import USUAL_TORQUE_LIMIT, DeviceInfo, checked_period
+from hapticbridge.device.falcon.boot import Link, ask
 from hapticbridge.device.falcon.motion import (
     BELIEVED,
     FORCE_LIMIT,
@@ -39,13 +31,17 @@ from hapticbridge.device.falcon.motion import (
     resolution,
 )
 from hapticbridge.device.falcon.packets import SIZE, ReplyStream, Request
-from hapticbridge.device.falcon.start import LONGEST_PERIOD, bring_up, home, insist, silent
+from hapticbridge.device.falcon.start import (
+    LONGEST_PERIOD,
+    ask_anew,
+    bring_up,
+    home,
+    insist,
+    silent,
+)
 from hapticbridge.device.falcon.timing import measured_timing
-from hapticbridge.device.plugged import Family, Tell, UsbId, chosen, tell_nobody
+from hapticbridge.device.plugged import Tell, tell_nobody
 from hapticbridge.device.silence import SILENCE, SilenceWatch
-from hapticbridge.device.transport.hex_log import HexLog
-from hapticbridge.device.transport.usb import UsbLink
-from hapticbridge.device.transport.usb_search import find
 from hapticbridge.errors import DeviceError, DeviceLost
 from hapticbridge.jit import direct
 from hapticbridge.tick import SAMPLE_DTYPE, TickFlag
@@ -153,7 +149,7 @@ class FalconDevice:
         """Reports the newest reply's pose and buttons (1 right, 2 forward, 4 centre, 8 left).
 
         What cannot be is not believed and counts as nothing new: encoders that no grip position
-        has, or a jump faster than 3 m/s.
+        has, or a jump faster than 3 m/s. Waits only after the loop stood still (``ask_anew``).
 
         Args:
             sample: Shape (1,), ``SAMPLE_DTYPE``, filled in place.
@@ -169,6 +165,9 @@ class FalconDevice:
         found = 0
         for packet in self._link.take():
             found += self._stream.feed(packet)
+        if self._watch.was_away(self._link.now()):
+            self._asked = self._asked_before = ask_anew(self._link, self._stream, self._name)
+            found = 1
         now = self._link.now()
         is_believed = False
         if found:
@@ -209,43 +208,3 @@ class FalconDevice:
             pass  # whoever pulled the plug also took the force away
         finally:
             self._link.close()
-
-
-def open_falcon(options: Mapping[str, object], tell: Tell, backend: Any = None) -> FalconDevice:
-    """Finds a Falcon and opens it.
-
-    Args:
-        options: Those of ``FAMILY``: names of files and numbers in SI units.
-        tell: Told what the user should know or do.
-        backend: A pyusb backend; None takes libusb.
-
-    Raises:
-        DeviceError: There is none, it cannot be opened, is lost, or an option is not valid.
-    """
-    numbers = stated_numbers(options, _NUMBERS)
-    firmware = str(options["firmware"]) if options.get("firmware") else None
-    if firmware is not None:
-        read_firmware(firmware)  # a wrong name is said before anything moves
-    plugged = chosen(FAMILY, find(FAMILY, backend), options.get("serial"))
-    log = HexLog.asked(options)
-    link = UsbLink.open(
-        plugged, FAMILY, read_from=READ_FROM, write_to=WRITE_TO, backend=backend, log=log
-    )
-    device = FalconDevice(link, name=str(plugged), firmware=firmware, tell=tell, **numbers)
-    device.info = replace(device.info, serial=plugged.serial)
-    return device
-
-
-_NUMBERS = ("mass", "damping", "friction")
-
-FAMILY = Family(
-    name="falcon",
-    about="Novint Falcon",
-    ids=(UsbId(0x0403, 0xCB48, "Novint Falcon"),),
-    transport="usb",
-    axes="x, y, z",
-    force="8 N",
-    rate="1 kHz",
-    options=("serial", "firmware", *_NUMBERS, "log"),
-    open=open_falcon,
-)

@@ -1,4 +1,7 @@
-"""A Falcon from plugged in to ready: its program, and the zeros of its encoders."""
+"""A Falcon from plugged in to ready: its program, and the zeros of its encoders.
+
+And what is said to it outside the ticks: no force.
+"""
 
 from __future__ import annotations
 
@@ -48,6 +51,31 @@ def insist(link: Link, packet: array.array[int], name: str) -> None:
     """
     if not any(link.write(packet) for _ in range(ZERO_TRIES)):
         raise DeviceLost(f"{name}: does not take that it is to give no force")
+
+
+def ask_anew(link: Link, stream: ReplyStream, name: str) -> float:
+    """Takes the force away and asks where the grip is now, after the loop stood still.
+
+    Nothing takes the force of a Falcon away while its host stands still. The reply that waits is to
+    a question from before that; a coupling that is re-seated by it is stretched, as soon as the
+    next reply comes, by all that the hand has moved since.
+
+    Args:
+        link: To a Falcon that speaks.
+        stream: Takes its replies; the newest is then to a question asked here.
+        name: What errors call it.
+
+    Returns:
+        When it was first asked, in s: the pose is no older.
+
+    Raises:
+        DeviceLost: It is gone, or silent.
+    """
+    asked = link.now()
+    for _ in range(2):  # the first reply may be to a question of the loop's
+        if not ask(link, stream, Request.GREEN, SILENCE):
+            raise silent(name)
+    return asked
 
 
 def bring_up(link: Link, stream: ReplyStream, name: str, firmware: str | None, tell: Tell) -> None:

@@ -9,6 +9,7 @@ from hapticbridge.device.data_sheet import stated_numbers
 from hapticbridge.device.forcedimension.driver import MEASURED, ForceDimensionDevice
 from hapticbridge.device.forcedimension.library import Dhd, located
 from hapticbridge.device.plugged import Family, Plugged, Tell, UsbId, chosen
+from hapticbridge.device.silence import SHORTEST_WATCHDOG
 from hapticbridge.device.transport import usb_search
 from hapticbridge.errors import DeviceError
 
@@ -78,6 +79,8 @@ FAMILY = Family(
     axes="x, y, z; with rx, ry, rz where the wrist has motors",
     force="what the library says, else 12 N (omega, sigma, lambda) or 20 N (delta)",
     rate="4 kHz, as the maker says",
+    on_stall=f"its watchdog takes the force away after {1e3 * SHORTEST_WATCHDOG:g} ms; one that "
+    "has none is named when it is started",
     options=("library", "serial", "gravity", *_NUMBERS),
     open=open_forcedimension,
     find=find,

@@ -143,7 +143,9 @@ class HaplyDevice:
         return self._sample.copy()
 
     def read(self, sample: NDArray[np.void]) -> int:
-        """Reports the newest state that has come; waits for none.
+        """Reports the newest state that has come.
+
+        Waits for none, but for the answer to a new question after the loop stood still.
 
         Args:
             sample: Shape (1,), ``SAMPLE_DTYPE``, filled in place.
@@ -158,7 +160,8 @@ class HaplyDevice:
         """
         if not self._is_started:
             raise DeviceError(f"{self._name} is read before it was started")
-        newest = self._take()
+        is_late = self._watch.was_away(self._link.now())
+        newest = self._asked_anew() if is_late else self._take()
         if newest is not None:
             self._fill(newest)
         if self._watch.is_silent(self._link.now(), is_new=newest is not None):
@@ -205,6 +208,23 @@ class HaplyDevice:
         if answers and self._pending is not None:
             self._send_pending()
         return answers[-1] if answers else None
+
+    def _asked_anew(self) -> str | None:
+        """Asks for the state without force, after the loop stood still; returns the answer.
+
+        What waits to be read answers a question from before that, and a force that still waits to
+        be sent is as old.
+        """
+        self._pending = None
+        self._take()
+        self._link.send(messages.force_message(self._listed, (0.0, 0.0, 0.0)))
+        answer = None
+        for _ in range(self._under_way + 1):
+            if (newer := self._link.wait(SILENCE)) is None:
+                break
+            answer = newer
+        self._under_way = 0
+        return answer
 
     def _send_pending(self) -> None:
         if self._pending is None or self._under_way >= MOST_UNDER_WAY:

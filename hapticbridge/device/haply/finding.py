@@ -117,6 +117,7 @@ FAMILY = Family(
     axes="x, y, z",
     force=f"{FORCE_LIMIT:g} N unless force_limit says more",
     rate="1 kHz",
+    on_stall="the maker's service lets it idle; after how long is not documented",
     options=("service", "serial", "force_gate", *_NUMBERS, "log"),
     open=open_haply,
     find=find,

@@ -231,6 +231,7 @@ FAMILY = Family(
     axes="2",
     force="a share of full scale; newtons= says what that is",
     rate="125 Hz to 1 kHz, one axis at a time",
+    on_stall="its effects end by themselves after 0.1 s, on a slow bus after up to 0.4 s",
     options=("serial", "log", "newtons", "travel", "reverse", "profile", *CHANGES),
     open=open_pid,
     recognises=has_force_feedback,

@@ -11,6 +11,7 @@ from hapticbridge.device.plugged import Family, Tell, UsbId, chosen
 from hapticbridge.device.rawhid.driver import NO_WRENCH, RawHidDevice
 from hapticbridge.device.rawhid.frame import force_frame
 from hapticbridge.device.rawhid.sheet import CHANGES
+from hapticbridge.device.silence import SHORTEST_WATCHDOG
 from hapticbridge.device.transport.hex_log import HexLog
 from hapticbridge.device.transport.hid import HidLink
 from hapticbridge.device.transport.hid_search import HidApi, find
@@ -57,6 +58,8 @@ FAMILY = Family(
     rate="to 1 kHz, as built",
     options=("serial", "log", *CHANGES),
     open=open_rawhid,
+    on_stall=f"its watchdog takes the force away after {1e3 * SHORTEST_WATCHDOG:g} ms, if it was "
+    "built as the protocol says",
     usage=(0xFFAB, 0x0200),
 )
 """Teensy's raw HID interface; its second interface (usage page FFC9) is an emulated serial port."""
