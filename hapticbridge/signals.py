@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import threading
 from collections.abc import Callable, Iterator
@@ -70,3 +71,24 @@ def holding_interrupts() -> Iterator[None]:
             signal.signal(signal.SIGINT, before)
         if noted:
             signal.raise_signal(signal.SIGINT)
+
+
+@contextmanager
+def leaving_on_interrupt(code: int) -> Iterator[None]:
+    """Lets Ctrl-C end the process at once and without a word, where there is nothing to lose.
+
+    For imports: a ``KeyboardInterrupt`` in them is lost where it falls into one of the importer's
+    callbacks, which only print it. Whoever has set SIGINT to something else keeps it.
+
+    Args:
+        code: The exit code.
+    """
+    is_usual = signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    if not is_usual or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    signal.signal(signal.SIGINT, lambda _number, _frame: os._exit(code))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)

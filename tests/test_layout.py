@@ -22,6 +22,7 @@ ORDER = (
         "picture",
         "jsonable",
         "quantity",
+        "on_demand",
     ),
     ("coupling", "kernel", "mechanics", "passivity"),
     ("scene",),
