@@ -46,6 +46,24 @@ def stopping_on_signals(stop: Callable[[str], None]) -> Iterator[None]:
 
 
 @contextmanager
+def interrupting_on_signals() -> Iterator[list[Callable[[str], None]]]:
+    """Lets every signal that ends a run end a program as Ctrl-C does, with all that is then closed.
+
+    Yields a list, at first empty: once somebody stands in it who takes a signal's name, the last
+    one is told instead, and nothing is interrupted any more.
+    """
+    told: list[Callable[[str], None]] = []
+
+    def heed(name: str) -> None:
+        if not told:
+            raise KeyboardInterrupt
+        told[-1](name)
+
+    with stopping_on_signals(heed):
+        yield told
+
+
+@contextmanager
 def holding_interrupts() -> Iterator[None]:
     """Holds Ctrl-C back from the main thread, and from processes that this thread starts meanwhile.
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
@@ -25,6 +26,7 @@ from hapticbridge.guard import USUAL_ENERGY, USUAL_STRETCH, Limits, refuse_simul
 from hapticbridge.kernel.parameters import checked_substeps
 from hapticbridge.rendering import Method, default_method, method_named
 from hapticbridge.scene import Scene, load_scene, settings_from
+from hapticbridge.signals import interrupting_on_signals
 from hapticbridge.view import Address, Window
 from hapticbridge.view.window import BY
 
@@ -143,12 +145,19 @@ class Run:
         window = Window(Address(self.host, self.port)) if self.view else None
         scene = load_scene(self.scene, self.grip, **settings_from(self.settings))
         with ExitStack() as stack:
+            told = stack.enter_context(interrupting_on_signals())
             device = device_for(scene, self.device, tell)
             stack.callback(device.close)  # what is refused from here on must not leave it claimed
-            return self._feel(scene, device, clock, stack, window)
+            return self._feel(scene, device, clock, stack, window, told)
 
     def _feel(
-        self, scene: Scene, device: Device, clock: Clock, stack: ExitStack, window: Window | None
+        self,
+        scene: Scene,
+        device: Device,
+        clock: Clock,
+        stack: ExitStack,
+        window: Window | None,
+        told: list[Callable[[str], None]],
     ) -> int:
         """Runs the bridge on a device that is open; returns the exit code."""
         scales = self.scale, self.scale if self.force_scale is None else self.force_scale
@@ -190,6 +199,7 @@ class Run:
             announce(bridge, scales, self.substeps, is_method_asked=self.method is not None)
         with err.status("preparing (the first run on a machine compiles for about 20 s) …"):
             stack.enter_context(bridge)
+        told.append(bridge.stop_on_signal)  # also while it closes, which must not be cut short
         if window is not None:
             tell_address(window.address, window.url, "watch the run, stop it and move the device")
         if not self.as_json:

@@ -27,6 +27,7 @@ from hapticbridge.identify.measured_width import MeasuredWidth, measure_width, m
 from hapticbridge.passivity import ZWidth, z_width
 from hapticbridge.picture import check_ending
 from hapticbridge.rendering import default_method
+from hapticbridge.signals import interrupting_on_signals
 from hapticbridge.study.theory import draw_z_width, recommended
 
 DEFAULT_RATE = 1000.0
@@ -86,7 +87,7 @@ class Zwidth:
             measured = None
             if device is not None:
                 clock = RealClock() if device.info.is_real else SimulatedClock()
-                with progress("measuring") as show:
+                with interrupting_on_signals(), progress("measuring") as show:
                     measured = measure_width(device, clock, z, axis=self.axis, progress=show)
         finally:
             if device is not None:
