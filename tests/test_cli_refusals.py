@@ -141,6 +141,35 @@ def test_picture_of_several_recordings_is_refused(call: Called, run_file: Path) 
 
 
 @pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("run", "point_mass", "--overwrite"), "--overwrite goes with --record"),
+        (("run", "point_mass", "--port", 8080), "--port without --view"),
+        (("run", "point_mass", "--host", "::1", "--port", 0), "--host and --port without --view"),
+        (("check", "point_mass", "--budget", 1.0), "--budget goes with --lean"),
+        (("check", "point_mass", "--lean", "--overwrite"), "--overwrite goes with --write"),
+        (("zwidth", "--damping", 2, "--axis", "x"), "--axis goes with --measure"),
+        (("devices", "--udev-rules", "--json"), "leave --json out"),
+        (("audit", "x", "--jobs", 2, "--scheduler", "tcp://x"), "exclude each other"),
+    ],
+)
+def test_an_option_that_would_have_no_effect_is_refused(
+    arguments: tuple[object, ...], message: str, call: Called
+) -> None:
+    code, out, err = call(*arguments)
+    assert (code, out) == (2, "")
+    assert message in one_sentence(err)
+
+
+def test_jobs_for_one_recording_are_said_to_have_no_effect(call: Called, run_file: Path) -> None:
+    """Not refused: a pattern that the shell resolves may fit one file today, and many tomorrow."""
+    code, out, err = call("audit", run_file, "--jobs", 2)
+    assert (code, "passive" in out) == (0, True)
+    assert "--jobs and --scheduler are for several recordings" in err
+    assert "--jobs" not in call("audit", run_file)[2]
+
+
+@pytest.mark.parametrize(
     "arguments",
     [(), ("frobnicate",), ("run",), ("run", "point_mass", "--bogus"), ("audit", "x", "--bogus")],
 )
