@@ -88,6 +88,21 @@ def test_existing_recording_is_kept_unless_overwriting_is_asked_for(
     assert audit(path).verdict == "passive"
 
 
+def test_a_name_that_is_too_long_for_the_system_is_refused(call: Called) -> None:
+    for command in (("run", "point_mass", "--fast", "--record"), ("repair", "x.mcap")):
+        code, _, err = call(*command, "x" * 300 + ".mcap")
+        assert code == 2
+        one_sentence(err)
+
+
+def test_results_that_nobody_has_room_for_are_one_sentence() -> None:
+    command = [sys.executable, "-m", "hapticbridge", "bound", "--stiffness", "100"]
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+    assert done.returncode == 2
+    assert one_sentence(done.stderr) == "error: cannot write: No space left on device"
+
+
 @pytest.mark.parametrize("kind", ["folder", "empty", "text", "missing"])
 def test_what_is_no_recording_is_refused_in_one_sentence(
     kind: str, call: Called, tmp_path: Path

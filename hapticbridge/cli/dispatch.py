@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import sys
 import warnings
@@ -53,6 +54,9 @@ Command = (
 
 SAFETY_TRIP = 3
 
+_FULL = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT)
+"""What the system says where no more can be written."""
+
 
 def dispatch(arguments: Sequence[str] | None) -> int:
     """Runs a command; returns the exit code, as ``main`` documents it."""
@@ -80,8 +84,21 @@ def dispatch(arguments: Sequence[str] | None) -> int:
         print_error(error)
         return USAGE_ERROR
     except BrokenPipeError:  # 'hapticbridge --help | head': nobody reads any more
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is left goes nowhere
+        _forget_output()
         return 1
+    except OSError as error:  # a name that is too long, a full disk: the system says it best
+        if error.filename is None and error.errno not in _FULL:
+            raise
+        if error.filename is None:
+            _forget_output()
+        where = "cannot write" if error.filename is None else f"'{error.filename}'"
+        print_error(HapticBridgeError(f"{where}: {error.strerror}"))
+        return USAGE_ERROR
+
+
+def _forget_output() -> None:
+    """Lets what is left to print go nowhere; Python would try again at its end, and fail."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 @contextmanager
