@@ -23,6 +23,7 @@ ORDER = (
         "jsonable",
         "quantity",
         "on_demand",
+        "whole_file",
     ),
     ("coupling", "kernel", "mechanics", "passivity"),
     ("scene",),
