@@ -10,25 +10,58 @@ what stays of a run and ``audit`` the second opinion on it. Imports go one way, 
 ``cli``.
 """
 
-from hapticbridge import mechanics as mechanics
-from hapticbridge import passivity as passivity
-from hapticbridge.audit import AuditReport as AuditReport
-from hapticbridge.audit import audit as audit
-from hapticbridge.bridge import Bridge as Bridge
-from hapticbridge.clock import RealClock as RealClock
-from hapticbridge.clock import SimulatedClock as SimulatedClock
-from hapticbridge.coupling import Coupling as Coupling
-from hapticbridge.device import open_device as open_device
-from hapticbridge.errors import CouplingError as CouplingError
-from hapticbridge.errors import DeviceError as DeviceError
-from hapticbridge.errors import HapticBridgeError as HapticBridgeError
-from hapticbridge.errors import RecordingError as RecordingError
-from hapticbridge.errors import SafetyTrip as SafetyTrip
-from hapticbridge.errors import SceneError as SceneError
-from hapticbridge.guard import Limits as Limits
-from hapticbridge.recording import read_recording as read_recording
-from hapticbridge.recording import repair as repair
-from hapticbridge.scene import Scene as Scene
-from hapticbridge.scene import load_scene as load_scene
-from hapticbridge.scene import scene_names as scene_names
-from hapticbridge.summary import Summary as Summary
+from typing import TYPE_CHECKING
+
+from hapticbridge.audit import audit as audit  # beside it stands the package of that name
+from hapticbridge.on_demand import on_demand
+
+if TYPE_CHECKING:
+    from hapticbridge import mechanics as mechanics
+    from hapticbridge import passivity as passivity
+    from hapticbridge.audit import AuditReport as AuditReport
+    from hapticbridge.bridge import Bridge as Bridge
+    from hapticbridge.clock import RealClock as RealClock
+    from hapticbridge.clock import SimulatedClock as SimulatedClock
+    from hapticbridge.coupling import Coupling as Coupling
+    from hapticbridge.device import open_device as open_device
+    from hapticbridge.errors import CouplingError as CouplingError
+    from hapticbridge.errors import DeviceError as DeviceError
+    from hapticbridge.errors import HapticBridgeError as HapticBridgeError
+    from hapticbridge.errors import RecordingError as RecordingError
+    from hapticbridge.errors import SafetyTrip as SafetyTrip
+    from hapticbridge.errors import SceneError as SceneError
+    from hapticbridge.guard import Limits as Limits
+    from hapticbridge.recording import read_recording as read_recording
+    from hapticbridge.recording import repair as repair
+    from hapticbridge.scene import Scene as Scene
+    from hapticbridge.scene import load_scene as load_scene
+    from hapticbridge.scene import scene_names as scene_names
+    from hapticbridge.summary import Summary as Summary
+else:
+    __getattr__, __dir__, __all__ = on_demand(
+        __name__,
+        {
+            "mechanics": "hapticbridge.mechanics",
+            "passivity": "hapticbridge.passivity",
+            "AuditReport": "hapticbridge.audit",
+            "Bridge": "hapticbridge.bridge",
+            "RealClock": "hapticbridge.clock",
+            "SimulatedClock": "hapticbridge.clock",
+            "Coupling": "hapticbridge.coupling",
+            "open_device": "hapticbridge.device",
+            "CouplingError": "hapticbridge.errors",
+            "DeviceError": "hapticbridge.errors",
+            "HapticBridgeError": "hapticbridge.errors",
+            "RecordingError": "hapticbridge.errors",
+            "SafetyTrip": "hapticbridge.errors",
+            "SceneError": "hapticbridge.errors",
+            "Limits": "hapticbridge.guard",
+            "read_recording": "hapticbridge.recording",
+            "repair": "hapticbridge.recording",
+            "Scene": "hapticbridge.scene",
+            "load_scene": "hapticbridge.scene",
+            "scene_names": "hapticbridge.scene",
+            "Summary": "hapticbridge.summary",
+        },
+        present=("audit",),
+    )

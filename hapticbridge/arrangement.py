@@ -177,6 +177,8 @@ class Arrangement:
         self._start_counts = counts
         self._sample = np.zeros(1, SAMPLE_DTYPE)
         self._inputs: deque[list[Write]] = deque()
+        # who wants the run to end, and the signal's name if one does; other threads append
+        self._stops: deque[tuple[str, str]] = deque()
         allowance = Allowance(
             info=self.device.info,
             method=self.method,

@@ -49,6 +49,9 @@ class Bridge(Commanded):
     ) -> Summary:
         """Runs the loop. Called again, it goes on: the force rises from zero as at the start.
 
+        What is to ``stop`` a run and comes before it ends it before its first tick. Signals are
+        heeded while it runs; before and after, they do what they do in any program of Python's.
+
         Args:
             duration: Time to run in s of the run's clock: deadlines that were skipped are time that
                 has passed, pauses without ticks are not. None runs until the device's motion ends,
@@ -68,7 +71,8 @@ class Bridge(Commanded):
         reason = ""
         self._resume()
         with ExitStack() as stack:
-            stack.enter_context(stopping_on_signals(self._stop_on_signal))
+            stack.callback(self._heed_stops)
+            stack.enter_context(stopping_on_signals(self.stop_on_signal))
             if self._is_realtime:
                 self._note_grants(stack.enter_context(real_time()))
             try:
@@ -111,8 +115,9 @@ class Bridge(Commanded):
             mujoco.mj_fwdPosition,
         )
         is_ahead = self._is_pipelined and can_split(model, self.method.scheme)
+        stops = self._stops
         next_look, looks = self._tick, max(round(RECORDER_LOOK / self.period), 1)
-        while self._tick != self._end and not self._stopped_by:
+        while self._tick != self._end and not stops:
             if self._tick >= next_look:
                 stream.look()
                 next_look += looks
@@ -144,7 +149,7 @@ class Bridge(Commanded):
             )
             if code == BAD_RESULT:
                 return trip_reason(code, self._tick)
-            while code == RING_FULL and stream.makes_room(may_wait=not self._stopped_by):
+            while code == RING_FULL and stream.makes_room(may_wait=not stops):
                 is_taken = hand_over(row, records, cursors, deadline, wake, read, write, flags)
                 code = OK if is_taken else RING_FULL
             self._tick += 1
@@ -156,9 +161,6 @@ class Bridge(Commanded):
             warn_of_refusals(self._grants + grants)
         answers = {grant.name: grant.sentence for grant in self._grants + grants}
         self._event("real_time", **answers)
-
-    def _stop_on_signal(self, name: str) -> None:
-        self._stopped_by, self._signal = "signal", name
 
     def _end_of(self, duration: float | None) -> int:
         """Returns the tick before which a run ends that misses no deadline; −1: none."""
@@ -173,11 +175,10 @@ class Bridge(Commanded):
         """Starts the ramp; between two runs zero was commanded and the device may have moved."""
         if not self._is_open:
             raise HapticBridgeError("the bridge is not open; use 'with Bridge(...) as bridge:'")
-        before, self._stopped_by = self._stopped_by, ""
         if self._tick:
             self._binding.resume()
-            self._event("resume", reason=before, **self._named_signal())
-        self._signal = ""
+            self._event("resume", reason=self._stopped_by, **self._named_signal())
+        self._stopped_by = self._signal = ""
 
     def _overrun(self, skipped: int) -> int:
         """Counts a missed deadline, and ends the run where the machine was asleep meanwhile.

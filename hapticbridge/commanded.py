@@ -126,10 +126,26 @@ class Commanded(Opened):
     def stop(self, by: str = "caller") -> None:
         """Ends the run after the present tick; may be called from ``on_tick`` or a thread.
 
+        Where none is running it ends the next one before its first tick: whoever wants the force
+        off need not know whether it is on yet.
+
         Args:
             by: Who wants it, for the summary and the recording's event ``stop``; not empty.
         """
-        self._stopped_by = by or "caller"
+        self._stops.append((by or "caller", ""))
+
+    def stop_on_signal(self, name: str) -> None:
+        """As ``stop``, for a signal: what a program does with those that come before ``run``.
+
+        Args:
+            name: The signal's, for the recording.
+        """
+        self._stops.append(("signal", name))
+
+    def _heed_stops(self) -> None:
+        """Notes at the end of a run who ended it; what comes later is for the next one."""
+        while self._stops:
+            self._stopped_by, self._signal = self._stops.popleft()
 
     def summary(self) -> Summary:
         """Returns what the run was so far; energies count from where it last began anew."""

@@ -184,10 +184,9 @@ class Opened(Arrangement):
         Raises:
             DeviceError: It moves on, or a hand has meanwhile moved an absolute one too far.
         """
-        wait_until_still(
-            self.device, self._sample, self.period, self.clock, lambda: self._stopped_by
-        )
-        if not self._tick and self._workspace.is_absolute:
+        stops = self._stops
+        wait_until_still(self.device, self._sample, self.period, self.clock, lambda: stops)
+        if not self._tick and not stops and self._workspace.is_absolute:
             refuse_stretched_start(self._binding.state, self._sample, self._limits)
 
     def _compile(self) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import threading
 from collections.abc import Callable, Iterator
@@ -45,6 +46,24 @@ def stopping_on_signals(stop: Callable[[str], None]) -> Iterator[None]:
 
 
 @contextmanager
+def interrupting_on_signals() -> Iterator[list[Callable[[str], None]]]:
+    """Lets every signal that ends a run end a program as Ctrl-C does, with all that is then closed.
+
+    Yields a list, at first empty: once somebody stands in it who takes a signal's name, the last
+    one is told instead, and nothing is interrupted any more.
+    """
+    told: list[Callable[[str], None]] = []
+
+    def heed(name: str) -> None:
+        if not told:
+            raise KeyboardInterrupt
+        told[-1](name)
+
+    with stopping_on_signals(heed):
+        yield told
+
+
+@contextmanager
 def holding_interrupts() -> Iterator[None]:
     """Holds Ctrl-C back from the main thread, and from processes that this thread starts meanwhile.
 
@@ -70,3 +89,24 @@ def holding_interrupts() -> Iterator[None]:
             signal.signal(signal.SIGINT, before)
         if noted:
             signal.raise_signal(signal.SIGINT)
+
+
+@contextmanager
+def leaving_on_interrupt(code: int) -> Iterator[None]:
+    """Lets Ctrl-C end the process at once and without a word, where there is nothing to lose.
+
+    For imports: a ``KeyboardInterrupt`` in them is lost where it falls into one of the importer's
+    callbacks, which only print it. Whoever has set SIGINT to something else keeps it.
+
+    Args:
+        code: The exit code.
+    """
+    is_usual = signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    if not is_usual or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    signal.signal(signal.SIGINT, lambda _number, _frame: os._exit(code))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -131,6 +131,36 @@ def test_caller_can_stop(tmp_path: Path) -> None:
     assert read_recording(path).events[-1]["reason"] == "caller"
 
 
+def test_a_stop_that_is_said_before_a_run_ends_it_before_its_first_tick(tmp_path: Path) -> None:
+    path, device = tmp_path / "run.mcap", ScriptedDevice(still)
+    with fast("point_mass", device, recording=path) as bridge:
+        bridge.stop("page")
+        first = bridge.run(0.02)
+        assert (first.ticks, first.stopped_by) == (0, "page")
+        second = bridge.run(0.02)  # one stop ends one run
+        assert (second.ticks, second.stopped_by) == (20, "duration")
+        bridge.stop()
+        bridge.stop_on_signal("SIGTERM")
+        third = bridge.run(0.02)
+        assert (third.ticks, third.stopped_by) == (20, "signal")
+    stop = read_recording(path).events[-1]
+    assert (stop["tick"], stop["reason"], stop["signal"]) == (20, "signal", "SIGTERM")
+    assert not np.any(device.writes)
+
+
+def test_a_stop_in_a_run_that_fails_is_not_for_the_next_one() -> None:
+    def fail(tick: int) -> None:
+        if tick == 5:
+            bridge.stop()
+            raise ZeroDivisionError
+
+    with fast("point_mass", ScriptedDevice(still)) as bridge:
+        with pytest.raises(ZeroDivisionError):
+            bridge.run(0.02, fail)
+        summary = bridge.run(0.02)
+    assert (summary.ticks, summary.stopped_by) == (25, "duration")
+
+
 def test_default_coupling_is_that_of_the_rule() -> None:
     used = Coupling(
         stiffness=2400.0, damping=0.5, rotational_stiffness=2.4, rotational_damping=5e-4

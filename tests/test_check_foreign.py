@@ -17,8 +17,9 @@ from hapticbridge.check.places import Place
 from hapticbridge.check.simplifications import OTHER_MOTIONS, Simplification
 from hapticbridge.check.trial import MAY_GO
 from hapticbridge.check.witness import witness
+from hapticbridge.cli import main
 from hapticbridge.cli.check_words import MOST_NAMED, print_faults
-from hapticbridge.cli.main import USAGE_ERROR, main
+from hapticbridge.cli.main import USAGE_ERROR
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Motion
 from hapticbridge.errors import SceneError

@@ -31,7 +31,7 @@ from hapticbridge.check.side_by_side import CHUNKS, Stage, one_pass, processor_c
 from hapticbridge.check.simplifications import contact_simplifications
 from hapticbridge.check.trial import IS_FELT, MAY_GO, Judge
 from hapticbridge.check.witness import witness
-from hapticbridge.cli.main import main
+from hapticbridge.cli import main
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Motion
 from hapticbridge.errors import SceneError

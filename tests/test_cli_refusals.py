@@ -88,6 +88,21 @@ def test_existing_recording_is_kept_unless_overwriting_is_asked_for(
     assert audit(path).verdict == "passive"
 
 
+def test_a_name_that_is_too_long_for_the_system_is_refused(call: Called) -> None:
+    for command in (("run", "point_mass", "--fast", "--record"), ("repair", "x.mcap")):
+        code, _, err = call(*command, "x" * 300 + ".mcap")
+        assert code == 2
+        one_sentence(err)
+
+
+def test_results_that_nobody_has_room_for_are_one_sentence() -> None:
+    command = [sys.executable, "-m", "hapticbridge", "bound", "--stiffness", "100"]
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+    assert done.returncode == 2
+    assert one_sentence(done.stderr) == "error: cannot write: No space left on device"
+
+
 @pytest.mark.parametrize("kind", ["folder", "empty", "text", "missing"])
 def test_what_is_no_recording_is_refused_in_one_sentence(
     kind: str, call: Called, tmp_path: Path
@@ -138,6 +153,35 @@ def test_picture_of_several_recordings_is_refused(call: Called, run_file: Path) 
     code, _, err = call("audit", run_file, run_file, "--plot", "x.png")
     assert code == 2
     assert "one recording" in one_sentence(err)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("run", "point_mass", "--overwrite"), "--overwrite goes with --record"),
+        (("run", "point_mass", "--port", 8080), "--port without --view"),
+        (("run", "point_mass", "--host", "::1", "--port", 0), "--host and --port without --view"),
+        (("check", "point_mass", "--budget", 1.0), "--budget goes with --lean"),
+        (("check", "point_mass", "--lean", "--overwrite"), "--overwrite goes with --write"),
+        (("zwidth", "--damping", 2, "--axis", "x"), "--axis goes with --measure"),
+        (("devices", "--udev-rules", "--json"), "leave --json out"),
+        (("audit", "x", "--jobs", 2, "--scheduler", "tcp://x"), "exclude each other"),
+    ],
+)
+def test_an_option_that_would_have_no_effect_is_refused(
+    arguments: tuple[object, ...], message: str, call: Called
+) -> None:
+    code, out, err = call(*arguments)
+    assert (code, out) == (2, "")
+    assert message in one_sentence(err)
+
+
+def test_jobs_for_one_recording_are_said_to_have_no_effect(call: Called, run_file: Path) -> None:
+    """Not refused: a pattern that the shell resolves may fit one file today, and many tomorrow."""
+    code, out, err = call("audit", run_file, "--jobs", 2)
+    assert (code, "passive" in out) == (0, True)
+    assert "--jobs and --scheduler are for several recordings" in err
+    assert "--jobs" not in call("audit", run_file)[2]
 
 
 @pytest.mark.parametrize(

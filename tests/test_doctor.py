@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hapticbridge.cli.main import main
+from hapticbridge.cli import main
 from hapticbridge.device.plugged import Plugged
 from hapticbridge.doctor import cyclictest, diagnosis, machine
 from hapticbridge.doctor.diagnosis import diagnose, judged

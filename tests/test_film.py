@@ -295,6 +295,7 @@ def test_where_no_renderer_works_a_sentence_says_what_to_install(
         (("nowhere/a.png",), "folder does not exist"),
         (("a.mp4", "--at", "0.1"), "a time goes with a picture"),
         (("a.png", "--speed", "0.1"), "go with a film"),
+        (("a.png", "--fps", "60"), "go with a film"),
         (("a.mp4", "--speed", "0"), "speed is 0"),
         (("a.mp4", "--start", "2", "--stop", "1"), "stop is 1 s, not after 2 s"),
         (("a.png", "--at", "-1"), "time is -1 s"),

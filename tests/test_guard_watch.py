@@ -319,6 +319,22 @@ def test_an_absolute_device_that_strayed_while_rest_was_waited_for_is_refused(
     assert not np.any(device.writes)
 
 
+def test_a_run_that_is_told_to_end_while_an_absolute_device_strays_is_no_trip() -> None:
+    """Where it strayed to would refuse the start; but nothing starts any more."""
+
+    def stray(tick: int) -> tuple[float, ...]:
+        if tick:
+            os.kill(os.getpid(), signal.SIGINT)
+        return (0.05 if tick else 0.0, 0, 0, 1, 0, 0, 0)
+
+    device = ScriptedDevice(stray)
+    device.info = replace(device.info, is_real=True)
+    with Bridge("point_mass", device, absolute=True, realtime=False) as bridge:
+        summary = bridge.run(0.01)
+    assert (summary.stopped_by, summary.ticks) == ("signal", 0)
+    assert not np.any(device.writes)
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [

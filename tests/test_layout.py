@@ -23,6 +23,7 @@ ORDER = (
         "picture",
         "jsonable",
         "quantity",
+        "on_demand",
         "whole_file",
     ),
     ("coupling", "kernel", "mechanics", "passivity"),

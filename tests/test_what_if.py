@@ -228,13 +228,14 @@ def test_the_closed_loop_is_what_a_live_run_with_that_setting_does(
     changes: dict[str, Any], live: dict[str, Any], wall: Path, softer: WhatIf, tmp_path: Path
 ) -> None:
     """The same simulated hand, asked directly; the what-if knows only what it did elsewhere."""
-    scene = load_scene("virtual_wall", **live.pop("scene", {}))
-    stiffness, damping = live.pop("coupling", (2400.0, 1.7))
+    scene = load_scene("virtual_wall", **live.get("scene", {}))
+    stiffness, damping = live.get("coupling", (2400.0, 1.7))
     coupling = Coupling(
         stiffness=stiffness, damping=damping, rotational_stiffness=2.4, rotational_damping=1.7e-3
     )
     path, hand = tmp_path / "live.mcap", wall.with_name("hand.csv")
-    recorded(path, scene, f"simulated:path={hand}", coupling, duration=DURATION, **live)
+    rate, specification = live.get("rate", 1000), f"simulated:path={hand}"
+    recorded(path, scene, specification, coupling, duration=DURATION, rate=rate)
     truth, before = read_recording(path).ticks, softer.runs[0].ticks
     found = softer if "stiffness" in changes else what_if(wall, changes)
     guess = run_of(found, "closed loop").ticks

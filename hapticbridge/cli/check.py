@@ -70,14 +70,14 @@ class Check:
     against felt error of everything that was tried."""
     lean: bool = False
     """Try what could go without being felt: each simplification alone, then greedily together."""
-    budget: float = 1.0
-    """Felt error in just noticeable differences that --lean allows."""
+    budget: float | None = None
+    """Felt error in just noticeable differences that --lean allows; by default 1."""
     write: Path | None = None
     """Write the leanest scene to this file (.xml), read it back, judge it again; implies --lean."""
     table: Path | None = None
     """Write all that --lean tried as a table (.csv); implies --lean."""
     overwrite: bool = False
-    """Replace the written scene if the file exists."""
+    """Replace the scene of --write if the file exists."""
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
     """Print everything as JSON."""
 
@@ -85,7 +85,12 @@ class Check:
         """Checks and prints; returns the exit code."""
         if self.plot is not None:
             check_ending(self.plot)
-        checked_budget(self.budget)
+        is_lean_asked = self.lean or self.write is not None or self.table is not None
+        if self.budget is not None and not is_lean_asked:
+            raise SceneError("--budget goes with --lean")
+        if self.overwrite and self.write is None:
+            raise SceneError("--overwrite goes with --write FILE; nothing else is replaced")
+        budget = checked_budget(1.0 if self.budget is None else self.budget)
         source = read_scene(self.scene, **settings_from(self.settings))
         if self.write is not None:
             check_target(source, self.write, overwrite=self.overwrite)
@@ -117,22 +122,24 @@ class Check:
             print_inventory(inventory)
             print_cost(cost)
             print_faults(faults)
-        is_lean_asked = self.lean or self.write is not None or self.table is not None
-        lean = self._looked_for(case) if is_lean_asked else None
+        lean = self._looked_for(case, budget) if is_lean_asked else None
         written = None if lean is None else self._told(lean)
         if self.as_json:
             facts = _facts(case, inventory, faults, cost)
             print_json(facts if lean is None else facts | {"lean": lean_facts(lean, written)})
-        if self.plot is not None and (figure := _picture(case, cost, lean)) is not None:
-            write_picture(figure, self.plot)
-            err.print(f"wrote {plain(str(self.plot))}")
+        if self.plot is not None:
+            figure = _picture(case, cost, lean)
+            if figure is not None:
+                write_picture(figure, self.plot)
+            told = "wrote" if figure is not None else "there is nothing to draw in"
+            err.print(f"{told} {plain(str(self.plot))}")
         is_worse = written is not None and written.verdict not in (MAY_GO, SAVES_NOTHING)
         return 1 if faults or is_worse or (is_lean_asked and lean is None) else 0
 
-    def _looked_for(self, case: Case) -> Lean | None:
+    def _looked_for(self, case: Case, budget: float) -> Lean | None:
         """Looks for what could go; None, and a sentence, where the scene must be mended first."""
         try:
-            return look_for_lean(case, self.budget)
+            return look_for_lean(case, budget)
         except SceneError as error:
             err.print(f"what could go cannot be said: {plain(str(error))}")
             return None

@@ -16,6 +16,7 @@ from hapticbridge.device.families import (
     udev_rules,
 )
 from hapticbridge.device.plugged import RULES_COMMAND, Plugged
+from hapticbridge.errors import HapticBridgeError
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,6 +35,8 @@ class Devices:
 
     def execute(self) -> int:
         """Prints the lists; returns the exit code, 0 also where nothing is plugged in."""
+        if self.udev_rules and self.as_json:
+            raise HapticBridgeError("--udev-rules are no JSON; leave --json out")
         if self.udev_rules:
             out.out(udev_rules(), end="")
             return 0

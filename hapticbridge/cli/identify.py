@@ -30,6 +30,7 @@ from hapticbridge.identify.identification import (
 from hapticbridge.identify.measured_profile import measured_profile
 from hapticbridge.identify.picture import draw_identification
 from hapticbridge.picture import check_ending
+from hapticbridge.signals import interrupting_on_signals
 from hapticbridge.study.theory import draw_z_width
 
 
@@ -82,7 +83,7 @@ class Identify:
         try:
             axes = self._axes(device.info.axes)
             clock = RealClock() if device.info.is_real else SimulatedClock()
-            with progress("identifying") as show:
+            with interrupting_on_signals(), progress("identifying") as show:
                 result = identify(
                     device,
                     clock,

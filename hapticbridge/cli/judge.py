@@ -66,10 +66,10 @@ class Audit:
     table: Path | None = None
     """Write a row per recording to this file: .parquet (extra 'tables'), .csv or .json."""
     jobs: int | None = None
-    """Processes for many recordings; by default as many as there are cores, 1: none but this."""
+    """Processes for several recordings; by default as many as there are cores, 1: none but this."""
     scheduler: str | None = None
-    """Address of a dask.distributed scheduler to audit on (extra 'cluster'); its workers must see
-    the files under the same names."""
+    """Address of a dask.distributed scheduler to audit several on (extra 'cluster'), in place of
+    --jobs; its workers must see the files under the same names."""
 
     what_if: Annotated[
         tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="NAME=VALUE")
@@ -90,9 +90,13 @@ class Audit:
             check_page_name(self.report)
         if self.table is not None:
             check_table_name(self.table)
+        if self.jobs is not None and self.scheduler is not None:
+            raise RecordingError("--jobs and --scheduler exclude each other")
         files = find_recordings(self.files)
         if files != list(self.files) or len(files) > 1 or self.table is not None:
             return self._audit_many(files)
+        if self.jobs is not None or self.scheduler is not None:
+            err.print("note: --jobs and --scheduler are for several recordings; here is one")
         if self.what_if:
             return self._ask(files[0])
         with err.status(f"auditing {plain(str(files[0]))} …"):

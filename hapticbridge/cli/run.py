@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 
@@ -25,6 +26,7 @@ from hapticbridge.guard import USUAL_ENERGY, USUAL_STRETCH, Limits, refuse_simul
 from hapticbridge.kernel.parameters import checked_substeps
 from hapticbridge.rendering import Method, default_method, method_named
 from hapticbridge.scene import Scene, load_scene, settings_from
+from hapticbridge.signals import interrupting_on_signals
 from hapticbridge.view import Address, Window
 from hapticbridge.view.window import BY
 
@@ -57,7 +59,7 @@ class Run:
     record: Path | None = None
     """File to record to (.mcap)."""
     overwrite: bool = False
-    """Replace the recording if the file exists."""
+    """Replace the recording of --record if the file exists."""
     method: str | None = None
     """How the tool is rendered: 'lossless' (half of the coupling inside MuJoCo's implicit step,
     half carried over: second order away from contact; the default), 'implicit' (all of it inside
@@ -107,11 +109,11 @@ class Run:
     because a force that rises behind a hand would be given to it."""
     view: bool = False
     """Show the run in a browser, from a process of its own; needs the extra 'view'."""
-    host: str = "127.0.0.1"
-    """Address to serve the view on; another than this machine's own needs the token that is
-    printed."""
-    port: int = 8080
-    """Port to serve the view on; 0: any that is free."""
+    host: str | None = None
+    """Address to serve the view on, by default 127.0.0.1; another than this machine's own needs the
+    token that is printed."""
+    port: int | None = None
+    """Port to serve the view on, by default 8080; 0: any that is free."""
     controller: Literal["damper", "environment", "tank", "off"] | None = None
     """Passivity controller: what is done when the device was given more than its damping burns and
     the scene gives up, or, 'environment', when the scene created more than the coupling's slack; by
@@ -136,19 +138,34 @@ class Run:
         """Runs the bridge; returns the exit code."""
         if self.duration is not None and not 0 < self.duration < math.inf:
             raise HapticBridgeError(f"duration is {self.duration!r} s; it must be finite and > 0")
+        if self.overwrite and self.record is None:
+            raise HapticBridgeError(
+                "--overwrite goes with --record FILE; nothing would be recorded"
+            )
         if self.record is not None and self.record.exists() and not self.overwrite:
             raise RecordingError(f"'{self.record}' exists; choose another file or add --overwrite")
         clock = SimulatedClock() if self.fast else RealClock()
         refuse_simulated_time(self.device, clock)  # before anybody is asked to home it
-        window = Window(Address(self.host, self.port)) if self.view else None
+        asked = {"host": self.host, "port": self.port}
+        place: dict[str, Any] = {name: at for name, at in asked.items() if at is not None}
+        if place and not self.view:
+            raise HapticBridgeError(f"--{' and --'.join(place)} without --view has no effect")
+        window = Window(Address(**place)) if self.view else None
         scene = load_scene(self.scene, self.grip, **settings_from(self.settings))
         with ExitStack() as stack:
+            told = stack.enter_context(interrupting_on_signals())
             device = device_for(scene, self.device, tell)
             stack.callback(device.close)  # what is refused from here on must not leave it claimed
-            return self._feel(scene, device, clock, stack, window)
+            return self._feel(scene, device, clock, stack, window, told)
 
     def _feel(
-        self, scene: Scene, device: Device, clock: Clock, stack: ExitStack, window: Window | None
+        self,
+        scene: Scene,
+        device: Device,
+        clock: Clock,
+        stack: ExitStack,
+        window: Window | None,
+        told: list[Callable[[str], None]],
     ) -> int:
         """Runs the bridge on a device that is open; returns the exit code."""
         scales = self.scale, self.scale if self.force_scale is None else self.force_scale
@@ -190,6 +207,7 @@ class Run:
             announce(bridge, scales, self.substeps, is_method_asked=self.method is not None)
         with err.status("preparing (the first run on a machine compiles for about 20 s) …"):
             stack.enter_context(bridge)
+        told.append(bridge.stop_on_signal)  # also while it closes, which must not be cut short
         if window is not None:
             tell_address(window.address, window.url, "watch the run, stop it and move the device")
         if not self.as_json:

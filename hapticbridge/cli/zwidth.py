@@ -27,6 +27,7 @@ from hapticbridge.identify.measured_width import MeasuredWidth, measure_width, m
 from hapticbridge.passivity import ZWidth, z_width
 from hapticbridge.picture import check_ending
 from hapticbridge.rendering import default_method
+from hapticbridge.signals import interrupting_on_signals
 from hapticbridge.study.theory import draw_z_width, recommended
 
 DEFAULT_RATE = 1000.0
@@ -55,8 +56,8 @@ class Zwidth:
     measure: str | None = None
     """Try walls of rising stiffness on this device, as 'run --device' takes it, until its swing no
     longer dies down. Hold it as in use, or not at all; it is pushed with up to half its force."""
-    axis: str = "x"
-    """Which axis --measure shakes: x, y or z."""
+    axis: str | None = None
+    """Which axis --measure shakes: x, y or z; by default x."""
     mass: float | None = None
     """Mass of the device in kg; with it the line of a device that nobody holds is drawn too."""
     friction: float | None = None
@@ -78,16 +79,18 @@ class Zwidth:
         """Computes and prints; returns the exit code."""
         if self.plot is not None:
             check_ending(self.plot)
-        period = period_of(self.rate)
-        device = None if self.measure is None else self._opened(self.measure)
+        if self.axis is not None and self.measure is None:
+            raise HapticBridgeError("--axis goes with --measure DEVICE")
+        period, axis = period_of(self.rate), self.axis or "x"
+        device = None if self.measure is None else self._opened(self.measure, axis)
         try:
             with err.status("computing …"):
                 z = self._computed(period, None if device is None else device.info)
             measured = None
             if device is not None:
                 clock = RealClock() if device.info.is_real else SimulatedClock()
-                with progress("measuring") as show:
-                    measured = measure_width(device, clock, z, axis=self.axis, progress=show)
+                with interrupting_on_signals(), progress("measuring") as show:
+                    measured = measure_width(device, clock, z, axis=axis, progress=show)
         finally:
             if device is not None:
                 device.close()
@@ -106,18 +109,18 @@ class Zwidth:
             write_figure(draw_z_width(z, points), self.plot)
         return 0
 
-    def _opened(self, spec: str) -> Device:
+    def _opened(self, spec: str, axis: str) -> Device:
         if self.filter_time or self.delay:
             raise HapticBridgeError(
                 "--measure tries walls without low-pass or further delay: leave --filter-time and "
                 "--delay out"
             )
         device = open_device(spec, tell=tell)
-        here = [axis for axis in AXES[:3] if axis in device.info.axes]
-        if device.info.is_prescribed or self.axis not in here:
+        here = [name for name in AXES[:3] if name in device.info.axes]
+        if device.info.is_prescribed or axis not in here:
             device.close()
             raise HapticBridgeError(
-                f"--axis {self.axis}: the device moves by force along "
+                f"--axis {axis}: the device moves by force along "
                 f"{choices([] if device.info.is_prescribed else here)}"
             )
         return device

@@ -94,7 +94,8 @@ class Shot:
     @property
     def is_of_film(self) -> bool:
         """Whether it says what only a film has."""
-        return bool(self.start) or self.stop is not None or self.speed != 1.0
+        is_timed = bool(self.start) or self.stop is not None or self.speed != 1.0
+        return is_timed or self.fps != Shot().fps
 
 
 def draw(
@@ -174,7 +175,9 @@ def _check_target(target: Path, shot: Shot) -> None:
     if ending == ".mp4" and shot.at is not None:
         raise HapticBridgeError("a time goes with a picture (.png); a film has start and stop")
     if ending == ".png" and shot.is_of_film:
-        raise HapticBridgeError("start, stop and speed go with a film (.mp4); a picture has a time")
+        raise HapticBridgeError(
+            "start, stop, speed and fps go with a film (.mp4); a picture has a time"
+        )
     if ending == ".mp4" and importlib.util.find_spec("imageio_ffmpeg") is None:
         raise HapticBridgeError("a film needs the extra 'view': pip install 'hapticbridge[view]'")
 
