@@ -130,6 +130,8 @@ class Stage:
         mujoco.mj_kinematics(self.model, self.data)
         mujoco.mj_comPos(self.model, self.data)
         mujoco.mj_camlight(self.model, self.data)
+        mujoco.mj_flex(self.model, self.data)
+        mujoco.mj_tendon(self.model, self.data)
 
     def _refuse_another_run(self, recorded: NDArray[np.void], again: NDArray[np.void]) -> None:
         off = np.abs(recorded["tool_position"][: len(again)] - again["tool_position"]).max(axis=1)

@@ -19,6 +19,7 @@ from hapticbridge.recording.ring import HEAD
 from hapticbridge.tick import TICK_DTYPE
 from hapticbridge.view.pursuit import STRAY, Pursuit
 from hapticbridge.view.sight import Sight
+from hapticbridge.view.tendons import Tendons
 from hapticbridge.view.trace import Trace
 
 TRACE = 600
@@ -54,6 +55,7 @@ class Show:
         self._run, self._skipped = Rerun(run, self.parameters), ""
         self._pursuit: Pursuit | None = None
         self.model, self._trace = self._run.model, Trace(TRACE)
+        self._tendons = Tendons(self.model)
 
     def note(self, event: dict[str, Any]) -> None:
         """Takes an event of the run; one that began anew is simulated from there on."""
@@ -85,9 +87,10 @@ class Show:
         for part in np.split(rows, 1 + np.flatnonzero(np.diff(rows["tick"]) != 1)):
             self._follow(part)
         mujoco.mj_copyData(self._shown, self.model, self._run.data)
-        sight = Sight.of(self.model, self._shown, rows[-1:], self.parameters.period)
+        period = self.parameters.period
+        sight = Sight.of(self.model, self._shown, rows[-1:], period, self._tendons)
         slack = self._run.slack if self._pursuit is None else self._pursuit.slack
-        self._trace.add(rows, slack, self.parameters.period)
+        self._trace.add(rows, slack, period)
         self.reference = max(self.reference, float(np.linalg.norm(sight.force)))
         return sight
 

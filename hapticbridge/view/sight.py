@@ -8,6 +8,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticbridge.view.tendons import Tendons
+
 Array = NDArray[np.float64]
 
 MOST_CONTACTS = 32
@@ -28,6 +30,7 @@ class Sight:
         force: On the tool, (3,) in N; the hand feels the opposite.
         contact_places: Shape (n, 3), n <= ``MOST_CONTACTS``, in m.
         contact_forces: In the world frame, (n, 3) in N.
+        tendons: The straight pieces of each that is shown, (m, 2, 3) in m.
     """
 
     time: float
@@ -39,10 +42,16 @@ class Sight:
     force: Array
     contact_places: Array
     contact_forces: Array
+    tendons: tuple[NDArray[np.float32], ...] = ()
 
     @classmethod
     def of(
-        cls, model: mujoco.MjModel, data: mujoco.MjData, row: NDArray[np.void], period: float
+        cls,
+        model: mujoco.MjModel,
+        data: mujoco.MjData,
+        row: NDArray[np.void],
+        period: float,
+        tendons: Tendons,
     ) -> Sight:
         """Looks at a scene.
 
@@ -51,6 +60,7 @@ class Sight:
             data: After the tick; a copy whose body poses may be refreshed here.
             row: Of the tick, one element of ``TICK_DTYPE``.
             period: T in s.
+            tendons: The scene's.
         """
         # contacts stay as the tick solved them; only what is drawn is brought to its end
         mujoco.mj_kinematics(model, data)
@@ -70,4 +80,5 @@ class Sight:
             force=row["wrench_on_tool"][0, :3].copy(),
             contact_places=np.array(data.contact.pos[:count]).reshape(count, 3),
             contact_forces=forces,
+            tendons=tendons.pieces(data),
         )
