@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 pytest.importorskip("viser", reason="needs the extra 'view'")
 
-from hapticbridge.scene.attach import HANDLE
+from hapticbridge.kernel.names import HANDLE
 from hapticbridge.view.absent import left_out
 from hapticbridge.view.props import Prop, props_of
 from hapticbridge.view.tendons import Tendons
@@ -161,13 +161,13 @@ def test_tendons_run_where_mujoco_measures_them() -> None:
     for lift in (0.0, -0.05):
         data.qpos[0] = lift
         mujoco.mj_kinematics(model, data)
-        straight, around, halves = tendons.pieces(data)
-        ends = [[0, 0, 1], [0.6, 0, 0.5 + lift]]
-        np.testing.assert_allclose(straight, [ends], atol=1e-6)
-        np.testing.assert_allclose(halves, [ends, ends[::-1]], atol=1e-6)
+        straight, around, halves = (np.array(each, float) for each in tendons.pieces(data))
+        ends = np.array([[0, 0, 1], [0.6, 0, 0.5 + lift]])
+        np.testing.assert_allclose(straight, ends[None], atol=1e-6)
+        np.testing.assert_allclose(halves, np.stack([ends, ends[::-1]]), atol=1e-6)
         # joined, from site to site, along the wheel and never inside of it
         np.testing.assert_allclose(around[1:, 0], around[:-1, 1], atol=1e-6)
-        np.testing.assert_allclose((around[0, 0], around[-1, 1]), ends, atol=1e-6)
+        np.testing.assert_allclose(np.stack([around[0, 0], around[-1, 1]]), ends, atol=1e-6)
         from_axis = np.hypot(around[..., 0] - 0.3, around[..., 2] - 0.8)
         assert from_axis.min() == pytest.approx(0.1, abs=2e-3)
         mujoco.mj_forward(model, data)

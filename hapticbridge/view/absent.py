@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.scene.attach import HANDLE
+from hapticbridge.kernel.names import HANDLE
 from hapticbridge.view.props import SHOWN_GROUPS
 from hapticbridge.view.terrain import stride_of
 

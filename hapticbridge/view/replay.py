@@ -52,11 +52,11 @@ class Replay:
         self.sights: list[Sight] = []
         self.trace = Trace()
         count = max(1, int(stage.duration / self.step) + 1)
-        period, tendons = stage.parameters.period, Tendons(stage.model)
+        tendons = Tendons(stage.model)
         for number in range(count):
             stage.show(stage.tick_at(min(number * self.step, stage.duration)))
-            self.sights.append(Sight.of(stage.model, stage.data, stage.row, period, tendons))
-            self.trace.add(stage.passed, stage.slack, period)
+            self.sights.append(Sight.of(stage.model, stage.data, stage.row, tendons))
+            self.trace.add(stage.passed, stage.slack)
             if progress is not None:
                 progress(number + 1, count)
 

@@ -87,10 +87,9 @@ class Show:
         for part in np.split(rows, 1 + np.flatnonzero(np.diff(rows["tick"]) != 1)):
             self._follow(part)
         mujoco.mj_copyData(self._shown, self.model, self._run.data)
-        period = self.parameters.period
-        sight = Sight.of(self.model, self._shown, rows[-1:], period, self._tendons)
+        sight = Sight.of(self.model, self._shown, rows[-1:], self._tendons)
         slack = self._run.slack if self._pursuit is None else self._pursuit.slack
-        self._trace.add(rows, slack, period)
+        self._trace.add(rows, slack)
         self.reference = max(self.reference, float(np.linalg.norm(sight.force)))
         return sight
 
@@ -123,11 +122,11 @@ class Show:
             except HapticBridgeError:
                 missing = -1
         if missing:
-            period = self.parameters.period
-            self._skipped = f"lost the run at {first * period:.1f} s"
+            at = f"{1e-9 * float(rows['deadline_ns'][0]):.1f} s"
+            self._skipped = f"lost the run at {at}"
             if missing > 0:
-                last = f"last at {first * period:.1f} s"
-                self._skipped = f"fell behind and skipped {missing * period:.2g} s, {last}"
+                gone = missing * self.parameters.period
+                self._skipped = f"fell behind and skipped {gone:.2g} s, last at {at}"
         if self._pursuit is None:
             self._pursuit = Pursuit(run, self.parameters.period)
         self._pursuit.add(rows)

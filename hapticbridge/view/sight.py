@@ -21,7 +21,7 @@ class Sight:
     """One instant of a run.
 
     Attributes:
-        time: Since the start of the run in s.
+        time: Of the run's clock in s, when the tick was due.
         places: Where each body is, (nbody, 3) in m.
         turns: How each is turned, quaternions (nbody, 4).
         handle: Where the handle is, (3,) in m.
@@ -50,7 +50,6 @@ class Sight:
         model: mujoco.MjModel,
         data: mujoco.MjData,
         row: NDArray[np.void],
-        period: float,
         tendons: Tendons,
     ) -> Sight:
         """Looks at a scene.
@@ -59,7 +58,6 @@ class Sight:
             model: The scene.
             data: After the tick; a copy whose body poses may be refreshed here.
             row: Of the tick, one element of ``TICK_DTYPE``.
-            period: T in s.
             tendons: The scene's.
         """
         # contacts stay as the tick solved them; only what is drawn is brought to its end
@@ -71,7 +69,7 @@ class Sight:
             mujoco.mj_contactForce(model, data, index, wrench)
             forces[index] = data.contact.frame[index].reshape(3, 3).T @ wrench[:3]
         return cls(
-            time=float(row["tick"][0]) * period,
+            time=1e-9 * float(row["deadline_ns"][0]),
             places=data.xpos.copy(),
             turns=data.xquat.copy(),
             handle=row["handle_position"][0].copy(),
