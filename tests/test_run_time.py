@@ -99,7 +99,7 @@ def test_a_picture_stands_where_the_clock_says(late: Recording) -> None:
 
 def test_the_slider_moves_on_the_clock(late: Recording, tmp_path: Path) -> None:
     pytest.importorskip("viser", reason="needs the extra 'view'")
-    from hapticbridge.view.replay import Replay  # noqa: PLC0415 - of an extra
+    from hapticbridge.view.replay import Replay
 
     replay = Replay(late.path)
     assert [sight.time for sight in replay.sights] == pytest.approx([0.001, 0.02, 0.067, 0.1])

@@ -31,7 +31,6 @@ from test_view_address import OUTSIDE, outside
 from hapticbridge.audit import audit
 from hapticbridge.audit.rerun import Rerun
 from hapticbridge.bridge import Bridge
-from hapticbridge.clock import SimulatedClock
 from hapticbridge.commands import Command, Couple, Switch
 from hapticbridge.commands.command import Stop, line_of
 from hapticbridge.errors import HapticBridgeError
