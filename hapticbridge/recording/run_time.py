@@ -47,13 +47,15 @@ class Timeline:
         rows, times = list[int](), list[float]()
         before, count = np.zeros(0, TICK_DTYPE), 0
         for block in blocks:
+            if not len(block):
+                continue
             part = np.concatenate([before, block])
             due, first = due_times(part, period), count - len(before)
             # both sides of every step that is not a period, and the ends; the rest is straight
             gaps = np.flatnonzero(np.abs(np.diff(due) - period) > 0.5 * period)
-            kept = np.unique([0, *gaps, *(gaps + 1), len(part) - 1]) if len(part) else []
-            rows += [first + int(row) for row in kept]
-            times += [float(due[row]) for row in kept]
+            kept = sorted({0, *gaps.tolist(), *(gaps + 1).tolist(), len(part) - 1})
+            rows += [first + row for row in kept]
+            times += due[kept].tolist()
             count += len(block)
             before = part[-1:]
         self._rows, self._times = np.array(rows, np.float64), np.array(times)
