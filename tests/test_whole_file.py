@@ -19,7 +19,7 @@ def test_what_was_not_finished_replaces_nothing(tmp_path: Path, error: type[Base
         draft.write_text("ne")
         raise error
     assert path.read_text() == "old"
-    assert os.listdir(tmp_path) == ["page.html"]
+    assert [path] == list(tmp_path.iterdir())
 
 
 def test_what_was_finished_stands_alone_and_where_a_link_leads(tmp_path: Path) -> None:
@@ -29,7 +29,7 @@ def test_what_was_finished_stands_alone_and_where_a_link_leads(tmp_path: Path) -
     with whole_file(path) as draft:
         draft.write_text("new")
     assert path.is_symlink()
-    assert os.listdir(tmp_path / "there") == ["true.html"]
+    assert [path.resolve()] == list((tmp_path / "there").iterdir())
     assert path.read_text() == "new"
 
 
