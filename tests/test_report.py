@@ -127,7 +127,7 @@ def test_what_was_at_work_is_drawn_when_it_was(run_file: Path) -> None:
     bars = [b.get_paths() for b in draw_timing(evidence).axes[-1].collections]
     assert [len(paths) for paths in bars] == [int(i == row) for i in range(len(names))]
     extent = bars[row][0].get_extents()
-    assert (extent.x0, extent.x1) == pytest.approx((0.040, 0.060), abs=1e-9)
+    assert (extent.x0, extent.x1) == pytest.approx((0.041, 0.061), abs=1e-9)
 
 
 def test_what_the_guard_did_is_drawn_and_told(run_file: Path, tmp_path: Path) -> None:
@@ -235,8 +235,8 @@ def test_the_page_says_first_how_much_when_where_why_and_what_to_change(
     assert report.tick is not None
     for told in (
         f"{lead}{most} ",
-        f"from {1e-3 * report.tick:.3f} s on (tick {report.tick})",
-        f"most at {1e-3 * worst:.3f} s (tick {worst})",
+        f"from {1e-3 * (report.tick + 1):.3f} s on (tick {report.tick})",
+        f"most at {1e-3 * (worst + 1):.3f} s (tick {worst})",
         f"<td>{port}: ",
         f"{quantity(report.joules, 'J')} at first, {most} at most",
         f"<strong>{cause.kind}</strong>. ",
