@@ -47,6 +47,8 @@ SCENE = """<mujoco>
   <asset>
     <texture name="flat" type="2d" file="flat.png"/>
     <texture name="cube" type="cube" file="cube.png" gridsize="6 1" gridlayout="RLUDFB"/>
+    <hfield name="hills" nrow="5" ncol="4" size=".1 .05 .06 .03"
+      elevation="0 1 2 0  3 5 4 1  2 6 5 3  0 1 4 2  1 0 2 1"/>
     <mesh name="wedge" vertex="0 0 0  .2 0 0  0 .2 0  0 0 .2  .2 .2 .1"/>
     <mesh name="own" vertex="-.1 -.1 0  .1 -.1 0  -.1 .1 0  .05 0 .1"
       texcoord="0 0 .9 0 0 .8 .5 .5" face="0 2 1  0 1 3  1 2 3  2 0 3"/>
@@ -64,6 +66,7 @@ SHAPES = {
     "cylinder": 'type="cylinder" size=".08 .06"',
     "capsule": 'type="capsule" size=".06 .05"',
     "mesh": 'type="mesh" mesh="wedge"',
+    "height field": 'type="hfield" hfield="hills"',
     "mesh with its own": 'type="mesh" mesh="own"',
 }
 

@@ -12,7 +12,7 @@ from hapticbridge.audit.rerun import Rerun, obstacle
 from hapticbridge.errors import RecordingError
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.provenance import parameters_of
-from hapticbridge.recording import RecordingFile, open_recording
+from hapticbridge.recording import RecordingFile, Timeline, open_recording
 
 PLACE = 1e-4
 """How far in m the tool of the run simulated again may be from where the record says: less than a
@@ -84,12 +84,13 @@ class Stage:
         forces = (block["wrench_on_tool"][:, :3] for block in self.recording.blocks())
         largest = (float(np.linalg.norm(force, axis=1).max()) for force in forces)
         self.reference = max(LEAST_REFERENCE, *largest)
+        self._line = Timeline(self.recording.blocks(), self.parameters.period)
         self._scale_contact_forces()
 
     @property
     def duration(self) -> float:
-        """Of the run in s."""
-        return self.recording.count * self.parameters.period
+        """Of the run in s of its clock, missed deadlines among it."""
+        return self._line.duration
 
     @property
     def slack(self) -> float:
@@ -97,7 +98,7 @@ class Stage:
         return self._run.slack
 
     def tick_at(self, time: float) -> int:
-        """Returns the tick that is shown at a time in s from the start.
+        """Returns the tick that is shown at a time in s from the start: the one due nearest to it.
 
         Raises:
             RecordingError: The run does not last so long.
@@ -106,7 +107,7 @@ class Stage:
             raise RecordingError(
                 f"there is nothing at {time!r} s; the recording lasts from 0 to {self.duration:g} s"
             )
-        return min(round(time / self.parameters.period), self.recording.count - 1)
+        return self._line.row_at(time)
 
     def show(self, tick: int) -> None:
         """Simulates up to a tick, the present one or a later one.
@@ -130,6 +131,8 @@ class Stage:
         mujoco.mj_kinematics(self.model, self.data)
         mujoco.mj_comPos(self.model, self.data)
         mujoco.mj_camlight(self.model, self.data)
+        mujoco.mj_flex(self.model, self.data)
+        mujoco.mj_tendon(self.model, self.data)
 
     def _refuse_another_run(self, recorded: NDArray[np.void], again: NDArray[np.void]) -> None:
         off = np.abs(recorded["tool_position"][: len(again)] - again["tool_position"]).max(axis=1)

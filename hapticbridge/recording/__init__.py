@@ -4,7 +4,8 @@ Read ``format`` first: it says what a recording is. Records leave the loop throu
 (``ring_memory``), events through a pipe; ``stream`` is the loop's end of both, ``recorder`` and
 ``recorder_process`` are the other, and an ``onlooker`` may look on. ``writer`` writes a file on top
 of ``output`` and ``chunk_index``; ``reader`` reads one, whole or damaged, through ``file_bytes``,
-``container``, ``fields`` and ``contents``; ``recovery`` and ``salvage`` mend what was cut.
+``container``, ``fields`` and ``contents``; ``recovery`` and ``salvage`` mend what was cut;
+``run_time`` says when ticks were due.
 """
 
 from hapticbridge.recording.format import Attachment as Attachment
@@ -17,4 +18,6 @@ from hapticbridge.recording.recovery import repair as repair
 from hapticbridge.recording.ring import HEAD as HEAD
 from hapticbridge.recording.ring import TAIL as TAIL
 from hapticbridge.recording.ring import Ring as Ring
+from hapticbridge.recording.run_time import Timeline as Timeline
+from hapticbridge.recording.run_time import due_times as due_times
 from hapticbridge.recording.writer import RecordingWriter as RecordingWriter

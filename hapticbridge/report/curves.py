@@ -13,7 +13,7 @@ from hapticbridge.errors import RecordingError
 from hapticbridge.felt import coupling_sentences, was_always_held
 from hapticbridge.picture import new_figure, write_picture
 from hapticbridge.provenance import parameters_of
-from hapticbridge.recording import Recording
+from hapticbridge.recording import Recording, due_times
 from hapticbridge.rendering import method_named
 
 BINS = 1500
@@ -81,7 +81,7 @@ def draw_recording(recording: Recording) -> Figure:
     parameters = parameters_of(meta)
     if not all((np.abs(ticks[name]) < DRAWABLE).all() for name in _DRAWN):
         raise RecordingError(f"'{recording.path}' holds numbers that cannot be drawn")
-    time = ticks["tick"] * parameters.period
+    time = due_times(ticks, parameters.period)
     figure = new_figure(8, 8)
     force_axes, position_axes, energy_axes = figure.subplots(3, 1, sharex=True)
     position_axes.plot([], [], color="grey", ls=":", lw=1, label="handle")

@@ -20,7 +20,7 @@ from hapticbridge.device.lateness import delay_ticks
 from hapticbridge.errors import HapticBridgeError
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.provenance import MODEL_ATTACHMENT, STARTS, meta_home, meta_start, parameters_of
-from hapticbridge.recording import Recording
+from hapticbridge.recording import Recording, due_times
 from hapticbridge.recording.reader import BLOCK
 from hapticbridge.rendering import Method, method_named
 from hapticbridge.report.curves import DRAWABLE
@@ -38,7 +38,7 @@ class Evidence:
         worst: The same with the coupling that asks most of the device, where commands changed it.
         info: The device.
         method: How the tool was rendered.
-        time: Of each tick in s, (n,).
+        time: When each tick was due, in s of the clock that the events tell, (n,).
         created: What the environment has created so far, (n,) in J.
         allowed: Its slack: what it may have created so far, (n,) in J.
         kicked: What the device was given beyond what is paid for, (n,) in J; zero throughout where
@@ -136,7 +136,7 @@ class Evidence:
             worst=worst,
             info=info,
             method=method,
-            time=ticks["tick"] * parameters.period,
+            time=due_times(ticks, parameters.period),
             created=energies[0],
             allowed=energies[1],
             kicked=energies[2],

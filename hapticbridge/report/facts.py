@@ -146,7 +146,7 @@ def head_facts(report: AuditReport, evidence: Evidence) -> Facts:
     in_time = "in simulated time" if meta.get("clock") == "simulated" else "no deadline missed"
     if late := int(np.count_nonzero(flags & int(TickFlag.OVERRUN))):
         missed = round(report.duration / parameters.period) - report.ticks
-        in_time = f"deadlines missed: {missed}, at {late} of them; times below leave those out"
+        in_time = f"deadlines missed: {missed}, at {late} of them"
     told = [
         ("scene", meta.get("scene", "")),
         ("device", f"{evidence.info.name}, {len(evidence.info.axes)} axes"),

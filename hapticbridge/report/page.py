@@ -13,7 +13,7 @@ from hapticbridge.audit import AuditReport
 from hapticbridge.errors import RecordingError
 from hapticbridge.picture import inline_svg
 from hapticbridge.provenance import meta_float
-from hapticbridge.recording import Recording
+from hapticbridge.recording import Recording, due_times
 from hapticbridge.report.curves import draw_recording
 from hapticbridge.report.energies import draw_energies
 from hapticbridge.report.evidence import Evidence
@@ -45,12 +45,13 @@ def telling_time(recording: Recording, report: AuditReport) -> float:
     Raises:
         RecordingError: The recording holds no tick, or does not tell its period.
     """
+    if not len(recording.ticks):
+        raise RecordingError(f"'{recording.path}' holds no tick")
     tick = report.tick
     if tick is None:
-        if not len(recording.ticks):
-            raise RecordingError(f"'{recording.path}' holds no tick")
         tick = int(np.argmax(np.linalg.norm(recording.ticks["wrench_on_tool"][:, :3], axis=1)))
-    return tick * meta_float(recording.meta, "period_s")
+    due = due_times(recording.ticks, meta_float(recording.meta, "period_s"))
+    return float(due[min(tick, len(due) - 1)])
 
 
 def write_report(
@@ -134,7 +135,7 @@ def moment_of(evidence: Evidence, report: AuditReport) -> dict[str, Any] | None:
     return {
         "drawn": inline_svg(draw_moment(evidence, report)),
         "place": PLACES.get(report.port, report.port),
-        "time": report.tick * evidence.parameters.period,
+        "time": float(evidence.time[report.tick]),
         "cause": cause,
         "worst": float(excess[worst]),
         "worst_tick": int(evidence.ticks["tick"][worst]),

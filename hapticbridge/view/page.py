@@ -13,9 +13,11 @@ from numpy.typing import NDArray
 from hapticbridge.felt import coupling_sentences, is_always_held
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.rendering import method_named
+from hapticbridge.view.absent import left_out
 from hapticbridge.view.ghost import LONGEST_ARROW, Ghost, linear
 from hapticbridge.view.props import props_of
 from hapticbridge.view.sight import Sight
+from hapticbridge.view.tendons import Tendons
 from hapticbridge.view.trace import PLOTS
 
 Array = NDArray[np.float64]
@@ -114,6 +116,10 @@ class Page:
                     frame.position = place
                 if not np.array_equal(frame.wxyz, turn):
                     frame.wxyz = turn
+            for line, pieces in zip(self._tendons, sight.tendons, strict=True):
+                line.visible = bool(len(pieces))
+                if line.visible and not np.array_equal(line.points, pieces):
+                    line.points = pieces
             self._ghost.show(sight, self.reference)
             self._show_contacts(sight)
         if self._plots:
@@ -144,6 +150,15 @@ class Page:
                 wxyz=prop.turn,
             )
         nothing = np.zeros((1, 2, 3), dtype=np.float32)
+        tendons = Tendons(model)
+        self._tendons = [
+            scene.add_line_segments(
+                f"/tendon{index}", nothing, linear(255.0 * colour[:3]), thickness=width
+            )
+            for index, (width, colour) in enumerate(
+                zip(tendons.widths.tolist(), tendons.colours, strict=True)
+            )
+        ]
         thin = {
             "shaft_radius": 0.006 * extent,
             "head_radius": 0.016 * extent,
@@ -193,4 +208,5 @@ def _told(model: mujoco.MjModel, parameters: RunParameters, facts: dict[str, str
         is_always_held=is_always_held(model, parameters.grip),
     )
     lines = [f"Method **{method.name}**, {1 / parameters.period:g} Hz", *sentences]
+    lines += left_out(model, parameters.grip)
     return "  \n".join(lines)

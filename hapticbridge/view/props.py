@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from hapticbridge.view.skin import Skin, is_around, skin_of
+from hapticbridge.view.terrain import stride_of, terrain
 
 SHOWN_GROUPS = 3
 """Geoms of the groups below are shown, as MuJoCo does: the others are for collision alone."""
@@ -69,12 +70,12 @@ class Prop:
 
 
 def props_of(model: mujoco.MjModel) -> list[Prop]:
-    """Returns what is seen of a scene; height fields and signed distance fields are left out."""
+    """Returns the geoms that are seen of a scene."""
     props = []
     for geom in range(model.ngeom):
-        shape = _shape(model, geom)
-        if shape is None or model.geom_group[geom] >= SHOWN_GROUPS:
+        if model.geom_group[geom] >= SHOWN_GROUPS:
             continue
+        shape = _shape(model, geom)
         corners, faces = np.asarray(shape[0], np.float64), np.asarray(shape[1], np.int64)
         triangles = corners[faces]
         normals = _normals(faces, triangles)
@@ -122,11 +123,15 @@ def _normals(faces: NDArray[np.int64], triangles: NDArray[np.float64]) -> NDArra
     return np.asarray(summed / np.maximum(length, 1e-30)).reshape(triangles.shape)
 
 
-def _shape(
-    model: mujoco.MjModel, geom: int
-) -> tuple[NDArray[np.float64], NDArray[np.int64]] | None:
+def _shape(model: mujoco.MjModel, geom: int) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     kind, size = mujoco.mjtGeom(int(model.geom_type[geom])), model.geom_size[geom]
-    if kind == mujoco.mjtGeom.mjGEOM_MESH:
+    if kind == mujoco.mjtGeom.mjGEOM_HFIELD:
+        field = int(model.geom_dataid[geom])
+        corners = terrain(model, field, stride_of(model, field)).reshape(-1, 3)
+        # every triangle by itself: the tool feels its facets, too
+        return corners, np.arange(len(corners)).reshape(-1, 3)
+    if kind in (mujoco.mjtGeom.mjGEOM_MESH, mujoco.mjtGeom.mjGEOM_SDF):
+        # a signed distance field's is what MuJoCo found where the distance is 0
         mesh = int(model.geom_dataid[geom])
         first, count = int(model.mesh_vertadr[mesh]), int(model.mesh_vertnum[mesh])
         start, faces = int(model.mesh_faceadr[mesh]), int(model.mesh_facenum[mesh])
@@ -138,10 +143,10 @@ def _shape(
             [[0, 1, 2], [0, 2, 3]]
         )
     made = _primitive(kind, size)
-    return None if made is None else (np.asarray(made.vertices), np.asarray(made.faces))
+    return np.asarray(made.vertices), np.asarray(made.faces)
 
 
-def _primitive(kind: mujoco.mjtGeom, size: NDArray[np.float64]) -> trimesh.Trimesh | None:
+def _primitive(kind: mujoco.mjtGeom, size: NDArray[np.float64]) -> trimesh.Trimesh:
     if kind == mujoco.mjtGeom.mjGEOM_BOX:
         return trimesh.creation.box(extents=2 * size)
     if kind in (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_ELLIPSOID):
@@ -152,6 +157,4 @@ def _primitive(kind: mujoco.mjtGeom, size: NDArray[np.float64]) -> trimesh.Trime
         capsule = trimesh.creation.capsule(height=2 * size[1], radius=size[0], count=(32, 32))
         capsule.apply_translation(-capsule.bounds.mean(axis=0))
         return capsule
-    if kind == mujoco.mjtGeom.mjGEOM_CYLINDER:
-        return trimesh.creation.cylinder(radius=size[0], height=2 * size[1], sections=32)
-    return None
+    return trimesh.creation.cylinder(radius=size[0], height=2 * size[1], sections=32)

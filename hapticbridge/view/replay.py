@@ -16,6 +16,7 @@ from hapticbridge.view.address import Address
 from hapticbridge.view.page import Page
 from hapticbridge.view.server import serve, stop
 from hapticbridge.view.sight import Sight
+from hapticbridge.view.tendons import Tendons
 from hapticbridge.view.trace import Trace
 
 FRAME = 1 / 30
@@ -51,11 +52,11 @@ class Replay:
         self.sights: list[Sight] = []
         self.trace = Trace()
         count = max(1, int(stage.duration / self.step) + 1)
-        period = stage.parameters.period
+        tendons = Tendons(stage.model)
         for number in range(count):
             stage.show(stage.tick_at(min(number * self.step, stage.duration)))
-            self.sights.append(Sight.of(stage.model, stage.data, stage.row, period))
-            self.trace.add(stage.passed, stage.slack, period)
+            self.sights.append(Sight.of(stage.model, stage.data, stage.row, tendons))
+            self.trace.add(stage.passed, stage.slack)
             if progress is not None:
                 progress(number + 1, count)
 

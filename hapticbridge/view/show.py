@@ -19,6 +19,7 @@ from hapticbridge.recording.ring import HEAD
 from hapticbridge.tick import TICK_DTYPE
 from hapticbridge.view.pursuit import STRAY, Pursuit
 from hapticbridge.view.sight import Sight
+from hapticbridge.view.tendons import Tendons
 from hapticbridge.view.trace import Trace
 
 TRACE = 600
@@ -54,6 +55,7 @@ class Show:
         self._run, self._skipped = Rerun(run, self.parameters), ""
         self._pursuit: Pursuit | None = None
         self.model, self._trace = self._run.model, Trace(TRACE)
+        self._tendons = Tendons(self.model)
 
     def note(self, event: dict[str, Any]) -> None:
         """Takes an event of the run; one that began anew is simulated from there on."""
@@ -85,9 +87,9 @@ class Show:
         for part in np.split(rows, 1 + np.flatnonzero(np.diff(rows["tick"]) != 1)):
             self._follow(part)
         mujoco.mj_copyData(self._shown, self.model, self._run.data)
-        sight = Sight.of(self.model, self._shown, rows[-1:], self.parameters.period)
+        sight = Sight.of(self.model, self._shown, rows[-1:], self._tendons)
         slack = self._run.slack if self._pursuit is None else self._pursuit.slack
-        self._trace.add(rows, slack, self.parameters.period)
+        self._trace.add(rows, slack)
         self.reference = max(self.reference, float(np.linalg.norm(sight.force)))
         return sight
 
@@ -120,11 +122,11 @@ class Show:
             except HapticBridgeError:
                 missing = -1
         if missing:
-            period = self.parameters.period
-            self._skipped = f"lost the run at {first * period:.1f} s"
+            at = f"{1e-9 * float(rows['deadline_ns'][0]):.1f} s"
+            self._skipped = f"lost the run at {at}"
             if missing > 0:
-                last = f"last at {first * period:.1f} s"
-                self._skipped = f"fell behind and skipped {missing * period:.2g} s, {last}"
+                gone = missing * self.parameters.period
+                self._skipped = f"fell behind and skipped {gone:.2g} s, last at {at}"
         if self._pursuit is None:
             self._pursuit = Pursuit(run, self.parameters.period)
         self._pursuit.add(rows)

@@ -8,6 +8,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticbridge.view.tendons import Tendons
+
 Array = NDArray[np.float64]
 
 MOST_CONTACTS = 32
@@ -19,7 +21,7 @@ class Sight:
     """One instant of a run.
 
     Attributes:
-        time: Since the start of the run in s.
+        time: Of the run's clock in s, when the tick was due.
         places: Where each body is, (nbody, 3) in m.
         turns: How each is turned, quaternions (nbody, 4).
         handle: Where the handle is, (3,) in m.
@@ -28,6 +30,7 @@ class Sight:
         force: On the tool, (3,) in N; the hand feels the opposite.
         contact_places: Shape (n, 3), n <= ``MOST_CONTACTS``, in m.
         contact_forces: In the world frame, (n, 3) in N.
+        tendons: The straight pieces of each that is shown, (m, 2, 3) in m.
     """
 
     time: float
@@ -39,10 +42,15 @@ class Sight:
     force: Array
     contact_places: Array
     contact_forces: Array
+    tendons: tuple[NDArray[np.float32], ...] = ()
 
     @classmethod
     def of(
-        cls, model: mujoco.MjModel, data: mujoco.MjData, row: NDArray[np.void], period: float
+        cls,
+        model: mujoco.MjModel,
+        data: mujoco.MjData,
+        row: NDArray[np.void],
+        tendons: Tendons,
     ) -> Sight:
         """Looks at a scene.
 
@@ -50,7 +58,7 @@ class Sight:
             model: The scene.
             data: After the tick; a copy whose body poses may be refreshed here.
             row: Of the tick, one element of ``TICK_DTYPE``.
-            period: T in s.
+            tendons: The scene's.
         """
         # contacts stay as the tick solved them; only what is drawn is brought to its end
         mujoco.mj_kinematics(model, data)
@@ -61,7 +69,7 @@ class Sight:
             mujoco.mj_contactForce(model, data, index, wrench)
             forces[index] = data.contact.frame[index].reshape(3, 3).T @ wrench[:3]
         return cls(
-            time=float(row["tick"][0]) * period,
+            time=1e-9 * float(row["deadline_ns"][0]),
             places=data.xpos.copy(),
             turns=data.xquat.copy(),
             handle=row["handle_position"][0].copy(),
@@ -70,4 +78,5 @@ class Sight:
             force=row["wrench_on_tool"][0, :3].copy(),
             contact_places=np.array(data.contact.pos[:count]).reshape(count, 3),
             contact_forces=forces,
+            tendons=tendons.pieces(data),
         )

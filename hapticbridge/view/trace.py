@@ -34,20 +34,19 @@ class Trace:
     def __init__(self, length: int | None = None) -> None:
         self._points: deque[tuple[float, ...]] = deque(maxlen=length)
 
-    def add(self, rows: NDArray[np.void], slack: float, period: float) -> None:
+    def add(self, rows: NDArray[np.void], slack: float) -> None:
         """Adds a point.
 
         Args:
             rows: Records since the last look, at least one.
             slack: What the environment may have created by now, in J; NaN where unknown.
-            period: T in s.
         """
         last = rows[-1]
         created = float(last["environment_energy"])
         late = rows["wake_ns"] - rows["deadline_ns"]
         self._points.append(
             (
-                float(last["tick"]) * period,
+                1e-9 * float(last["deadline_ns"]),
                 float(np.linalg.norm(rows["wrench_on_tool"][:, :3], axis=1).max()),
                 1e3 * float(last["coupling_work"]),
                 1e3 * float(last["device_energy"]),

@@ -10,10 +10,11 @@ of the geom, too. With p a point in the geom's frame and q = p / half sizes:
     cylinder     side: u as a sphere's, v = ½(1 − q_z); ends: u = ½(1 + q_x), v = ½(1 + q_y)
     capsule      side likewise; ends: u as a sphere's, v = 2/π times the angle to the axis, so that
                  the picture is there three times
-    mesh         as it brings along; else u = ½(q_x − 1), v = −½(q_y + 1), so also a plane without
-                 end, in m
+    mesh         as it brings along; else u = ½(q_x − 1), v = −½(q_y + 1), so also a height field, a
+                 signed distance field and, in m, a plane without end
 
-A cube texture is seen from the middle of the geom in the direction q (``texuniform``: p). Each
+A cube texture is seen from the middle of the geom in the direction q, on a mesh or a field in the
+direction p (``texuniform``: p, on a mesh or a field p times the half sizes in m). Each
 triangle takes the side that its middle sees: exact on a box, off by less than a triangle at the
 edges of the cube elsewhere.
 
@@ -43,6 +44,13 @@ _CUBE = (
     (2, -1.0, (0, -1.0), (1, -1.0)),
 )
 
+_AS_IT_IS = (
+    int(mujoco.mjtGeom.mjGEOM_MESH),
+    int(mujoco.mjtGeom.mjGEOM_SDF),
+    int(mujoco.mjtGeom.mjGEOM_HFIELD),
+)
+"""Kinds of geoms that bring their size along, where others are one shape that is scaled."""
+
 _BOX = ((1, 2), (0, 2), (0, 1))
 """The axes along a box's side, by the axis that it faces."""
 
@@ -65,9 +73,9 @@ def flat_places(model: mujoco.MjModel, geom: int, triangles: Array) -> Array:
     repeat = np.asarray(model.mat_texrepeat[material], dtype=np.float64)
     is_endless = kind == mujoco.mjtGeom.mjGEOM_PLANE and not size[:2].all()
     is_by_length = bool(model.mat_texuniform[material])
-    if kind == mujoco.mjtGeom.mjGEOM_MESH or is_endless:
+    if int(kind) in _AS_IT_IS or is_endless:
         mesh = int(model.geom_dataid[geom])
-        if not is_endless and model.mesh_texcoordadr[mesh] >= 0:
+        if kind == mujoco.mjtGeom.mjGEOM_MESH and model.mesh_texcoordadr[mesh] >= 0:
             return (repeat * size[:2] if is_by_length else repeat) * _brought_along(model, mesh)
         scale = repeat if is_by_length or is_endless else repeat / size[:2]
         return np.asarray(0.5 * scale * (1.0, -1.0) * triangles[..., :2] - 0.5)
@@ -83,8 +91,7 @@ def around_places(model: mujoco.MjModel, geom: int, triangles: Array) -> Array:
     """Returns where the corners of triangles lie on a cube texture; see ``flat_places``."""
     material = int(model.geom_matid[geom])
     size = np.maximum(half_sizes(model, geom), 1e-15)
-    is_mesh = model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_MESH
-    seen = triangles if is_mesh else triangles / size
+    seen = triangles if int(model.geom_type[geom]) in _AS_IT_IS else triangles / size
     if model.mat_texuniform[material]:
         seen = seen * size
     middle = seen.mean(axis=1)

@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 
 from hapticbridge.errors import RecordingError
 from hapticbridge.picture import new_figure, write_picture
+from hapticbridge.recording import due_times
 from hapticbridge.report import DRAWABLE, decimated
 from hapticbridge.report.curves import BINS
 from hapticbridge.whatif.outcome import WhatIf
@@ -35,7 +36,7 @@ def figure_of(found: WhatIf, bins: int = BINS) -> Figure:
         ticks = run.ticks
         if not len(ticks):
             continue
-        time = ticks["tick"] * run.period
+        time = due_times(ticks, run.period)
         drawn = (
             np.linalg.norm(ticks["wrench_on_device"][:, :3], axis=1),
             1e3 * np.linalg.norm(ticks["handle_position"] - origin, axis=1),

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from audit_cases import ScriptedDevice
+from audit_cases import ScriptedDevice, recorded
 from report_runs import LOOSE
 from test_bridge_commands import FLOOR, swaying
 
@@ -121,7 +121,7 @@ def test_a_page_that_slept_too_long_says_what_it_skipped_and_goes_on(tmp_path: P
     window = Window(Address("127.0.0.1", 0))
     told: list[str] = []
 
-    def disturb(tick: int) -> None:
+    def disturb(_: Bridge, tick: int) -> None:
         if tick == 300:
             time.sleep(0.5)  # it has seen the beginning
             os.kill(_process(window), signal.SIGSTOP)
@@ -130,15 +130,10 @@ def test_a_page_that_slept_too_long_says_what_it_skipped_and_goes_on(tmp_path: P
             with hand(window.url) as page:
                 told.append(said(page, "skipped"))
 
-    with Bridge(
-        str(scene),
-        ScriptedDevice(swaying),
-        LOOSE,
-        recording=path,
-        clock=SimulatedClock(),
-        onlooker=window,
-    ) as bridge:
-        summary = bridge.run(9.1, disturb)
+    device = ScriptedDevice(swaying)
+    summary = recorded(
+        path, str(scene), device, LOOSE, duration=9.1, on_tick=disturb, onlooker=window
+    )
     assert (summary.ticks, summary.dropped) == (9100, 0)
     assert "may stand elsewhere" in told[0]
     assert audit(path).resimulation == "bit for bit"
