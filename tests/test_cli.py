@@ -395,6 +395,23 @@ def test_one_scene_is_shown_with_its_size_its_file_and_what_to_type_next(call: C
     assert call(*command.split(), "--fast", "--duration", "0.1")[0] == 0
 
 
+def test_a_scene_of_one_s_own_is_shown_whatever_its_grip_is_called(
+    call: Called, tmp_path: Path
+) -> None:
+    """Nobody holds it here, so no grip is needed; what cannot be compiled is refused as ever."""
+    path = tmp_path / "chisel.xml"
+    text = "<mujoco><worldbody><body><freejoint/><geom size='.01'{}/>{}</body></worldbody></mujoco>"
+    for site in ("<site name='hand'/>", ""):
+        path.write_text(text.format("", site))
+        code, out, err = call("scenes", path)
+        assert (code, err) == (0, "")
+        assert "1 moving body, 6 degrees of freedom" in out
+    path.write_text(text.format(" mass='0'", ""))
+    code, _, err = call("scenes", path)
+    assert code == 2
+    assert "error: cannot compile scene" in err
+
+
 def test_calling_the_command_line_leaves_warnings_as_they_were(call: Called) -> None:
     import warnings
 
