@@ -11,6 +11,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from hapticbridge.errors import HapticBridgeError
+from hapticbridge.whole_file import whole_file
 
 ENDINGS = (".pdf", ".png", ".svg")
 """What a picture's name may end in."""
@@ -68,7 +69,8 @@ def write_picture(figure: Figure, path: Path) -> None:
     """
     check_ending(path)
     try:
-        _save(figure, path, dpi=DOTS_PER_INCH)
+        with whole_file(path) as draft:
+            _save(figure, draft, dpi=DOTS_PER_INCH)
     except OSError as error:
         raise HapticBridgeError(f"cannot write '{path}': {error.strerror}") from None
 

@@ -22,6 +22,7 @@ ORDER = (
         "picture",
         "jsonable",
         "quantity",
+        "whole_file",
     ),
     ("coupling", "kernel", "mechanics", "passivity"),
     ("scene",),

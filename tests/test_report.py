@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import html
 import io
+import sys
 from collections.abc import Callable
 from dataclasses import fields, replace
 from pathlib import Path
@@ -18,11 +19,12 @@ from PIL import Image
 from report_runs import Made
 
 from hapticbridge.audit import audit
-from hapticbridge.errors import RecordingError
+from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.kernel.guarding import TANK, Guarding
 from hapticbridge.quantity import quantity
 from hapticbridge.recording import Recording, read_recording
-from hapticbridge.report import write_report
+from hapticbridge.report import plot_recording, write_report
+from hapticbridge.report.curves import decimated
 from hapticbridge.report.energies import draw_energies
 from hapticbridge.report.evidence import Evidence
 from hapticbridge.report.facts import (
@@ -99,6 +101,19 @@ def test_a_long_page_stays_small_and_keeps_its_peaks(run_file: Path, tmp_path: P
     assert np.asarray(line.get_ydata()).max() == 77.0
     write_report(recording, audit(run_file), page)
     assert 100_000 < page.stat().st_size < 1_000_000  # curves are of constant length
+
+
+def test_no_peak_of_a_curve_is_lost_wherever_it_stands() -> None:
+    bins = 30
+    for count in (100, 103, 899, 900, 901):
+        time = np.arange(count, dtype=np.float64)
+        for at in range(count):
+            values = np.zeros(count)
+            values[at] = -1.0 if at % 2 else 1.0
+            drawn_at, drawn = decimated(time, values, bins)
+            assert len(drawn) <= 2 * bins + 1
+            assert (np.diff(drawn_at) >= 0).all()
+            assert set(drawn_at[drawn != 0.0]) == {float(at)}
 
 
 def test_what_was_at_work_is_drawn_when_it_was(run_file: Path) -> None:
@@ -256,6 +271,34 @@ def test_a_page_replaces_no_recording_and_no_picture(
     with pytest.raises(RecordingError, match="page"):
         write_report(read_recording(run_file), audit(run_file), target)
     assert not target.exists() or target.read_bytes() == b"what was there"
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs a limit on a file's size")
+def test_a_page_and_a_picture_that_the_disk_does_not_take_leave_what_was_there(
+    run_file: Path, tmp_path: Path
+) -> None:
+    import resource
+
+    page, picture = tmp_path / "page.html", tmp_path / "run.svg"
+    link = tmp_path / "link.html"
+    link.symlink_to(page)
+    for target in (page, picture):
+        target.write_bytes(b"what was there")
+    recording, report = read_recording(run_file), audit(run_file)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4096, limits[1]))
+    try:
+        with pytest.raises(RecordingError, match="cannot write"):
+            write_report(recording, report, link)
+        with pytest.raises(HapticBridgeError, match="cannot write"):
+            plot_recording(recording, picture)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert {page.read_bytes(), picture.read_bytes()} == {b"what was there"}
+    assert sorted(tmp_path.iterdir()) == sorted((page, picture, link))
+    write_report(recording, report, link)
+    assert link.is_symlink()
+    assert "verdict" in page.read_text(encoding="utf-8")
 
 
 def test_a_passive_page_says_whether_the_device_bears_the_coupling(

@@ -204,6 +204,20 @@ def test_a_slider_that_is_moved_back_is_asked_for_too() -> None:
         assert [command.stiffness for command in asked] == [1500.0, began]
 
 
+def test_a_browser_changes_the_value_of_an_element_and_nothing_else_of_it() -> None:
+    with controls() as (shown, page, asked):
+        page.send("stop the run", removed=True)
+        page.send(K, update_cb=[])
+        page.send(K, value=1500.0, update_cb=[])
+        page.send(K, props=None)
+        page.send(K, value=2000.0)
+        page.send("stop the run", value=True)
+        until(lambda: Stop() in asked and len(asked) > 1)
+        assert [each.stiffness for each in asked if isinstance(each, Couple)] == [2000.0]
+        shown.note(coupled(stiffness=1234.567))  # which bounds the sliders, if they are still some
+        assert "K goes to 1235 N/m" in shown.answer.content
+
+
 def test_what_was_refused_is_shown_as_the_run_has_it() -> None:
     with controls() as (shown, page, asked):
         shown.note(coupled(stiffness=1500.0))

@@ -61,6 +61,9 @@ def decimated(
     blocks = values[: count * size].reshape(count, size)
     picks = np.sort(np.stack([blocks.argmin(1), blocks.argmax(1)], axis=1), axis=1)
     index = (picks + size * np.arange(count)[:, None]).ravel()
+    if rest := len(values) - count * size:  # the end of a run is where it went wrong
+        last = values[-rest:]
+        index = np.append(index, count * size + np.sort([last.argmin(), last.argmax()]))
     index = np.append(index, len(values) - 1)
     return time[index], values[index]
 

@@ -8,6 +8,7 @@ from jinja2 import Environment, PackageLoader, select_autoescape
 
 from hapticbridge.errors import RecordingError
 from hapticbridge.quantity import quantity
+from hapticbridge.whole_file import whole_file
 
 PAGES = (".html", ".htm")
 """What a page's name may end in; a browser takes another for text, and it is no recording."""
@@ -46,6 +47,7 @@ def write_page(path: Path, template: str, **told: object) -> None:
     environment.filters["quantity"] = quantity
     page = environment.get_template(template).render(told)
     try:
-        path.write_text(page, encoding="utf-8")
+        with whole_file(path) as draft:
+            draft.write_text(page, encoding="utf-8")
     except OSError as error:
         raise RecordingError(f"cannot write '{path}': {error.strerror}") from None

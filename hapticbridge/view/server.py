@@ -47,6 +47,7 @@ def serve(address: Address) -> viser.ViserServer:
     # and keep files that a browser sends
     for name in ("ShareUrlRequest", "ShareUrlDisconnect", "FileTransferStartUpload"):
         server._websock_server.unregister_handler(getattr(viser._messages, name))
+    _take_values_alone(server)
     server.gui.configure_theme(
         control_width="large",
         show_logo=False,
@@ -60,6 +61,22 @@ def stop(server: viser.ViserServer) -> None:
     """Stops serving."""
     with contextlib.redirect_stdout(io.StringIO()):  # viser says so, in the middle of our answers
         server.stop()
+
+
+def _take_values_alone(server: viser.ViserServer) -> None:
+    """Lets a browser change the value of an element, and nothing else of it.
+
+    viser sets whatever attribute of its own handle a message names: ``removed`` would take the
+    button that stops a run away from everybody, ``props`` would end this process.
+    """
+    kind, take = viser._messages.GuiUpdateMessage, server.gui._handle_gui_updates
+
+    async def take_value(client_id: Any, message: Any) -> None:
+        if list(message.updates) == ["value"]:
+            await take(client_id, message)
+
+    server._websock_server.unregister_handler(kind)
+    server._websock_server.register_handler(kind, take_value)
 
 
 def _is_guarded(port: int, address: Address) -> bool:
