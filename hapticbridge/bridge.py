@@ -18,7 +18,7 @@ import numpy as np
 from hapticbridge.clock import slept_ns
 from hapticbridge.commanded import Commanded
 from hapticbridge.errors import DeviceError, HapticBridgeError, SafetyTrip
-from hapticbridge.guard import trip_reason, with_remedy
+from hapticbridge.guard import trip_reason
 from hapticbridge.kernel.ahead import can_split
 from hapticbridge.kernel.codes import BAD_RESULT, HALF_DONE, OK, RING_FULL
 from hapticbridge.realtime import Grant, real_time, warn_of_refusals
@@ -199,4 +199,4 @@ class Bridge(Commanded):
     def _trip(self, reason: str) -> None:
         self._stopped_by = "trip"
         self._event("trip", reason=reason)
-        raise SafetyTrip(with_remedy(reason), self._stream.latest(round(1.0 / self.period)))
+        raise SafetyTrip(reason, self._stream.latest(round(1.0 / self.period)))

@@ -294,6 +294,14 @@ def test_trip_is_exit_code_3(call: Called, monkeypatch: pytest.MonkeyPatch) -> N
     assert "safety trip: tick 7: [/b]" in err
 
 
+def test_trip_is_told_with_what_to_do_about_it(call: Called, tmp_path: Path) -> None:
+    path = tmp_path / "millimetres.csv"
+    path.write_text("t,x,y,z\n0,0,0,0\n0.1,50,0,0\n")
+    code, _, err = call("run", "point_mass", "--fast", "--device", f"trajectory:{path}")
+    assert code == 3
+    assert "than the stretch limit; check the motion's unit (m)" in err
+
+
 @pytest.mark.parametrize("where", ["tyro.cli", "hapticbridge.cli.stability.run_map"])
 def test_ctrl_c_is_one_word_and_exit_code_130(
     where: str, call: Called, monkeypatch: pytest.MonkeyPatch

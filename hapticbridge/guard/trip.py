@@ -39,7 +39,7 @@ def trip_reason(code: int, tick: int) -> str:
 def with_remedy(reason: str) -> str:
     """Returns a reason with what to do about it, for whoever sees the run stop.
 
-    A recording keeps the reason alone: what it says is compared when the run is done again.
+    Error and recording keep the reason alone: it is compared when the run is done again.
 
     Args:
         reason: What ``trip_reason`` returned, or another cause of a trip, which stays as it is.
