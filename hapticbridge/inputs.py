@@ -42,6 +42,12 @@ def input_writes(
     Raises:
         SceneError: A name does not exist, is the bridge's own, or has the wrong count of numbers.
     """
+    given = {"ctrl": ctrl, "mocap": mocap, "joint_force": joint_force, "body_wrench": body_wrench}
+    for kind, values in given.items():
+        if values is not None and not isinstance(values, Mapping):
+            raise SceneError(
+                f"{kind} is {values!r:.80}; it must be values by name: {kind}={{'NAME': …}}"
+            )
     writes: list[Write] = []
     actuators = [model.actuator(i).name for i in range(model.nactuator)]
     own = [name for name in actuators if name not in COUPLING_ACTUATORS]
@@ -86,7 +92,10 @@ def _index(kind: str, name: str, valid: list[str], everything: list[str]) -> int
 
 
 def _numbers(what: str, value: ArrayLike, counts: tuple[int, ...]) -> list[float]:
-    array = np.atleast_1d(np.asarray(value, dtype=np.float64)).ravel()
+    try:
+        array = np.atleast_1d(np.asarray(value, dtype=np.float64)).ravel()
+    except (TypeError, ValueError):
+        raise SceneError(f"{what} is {value!r:.80}; it must be numbers") from None
     # MuJoCo takes a larger control for a failure and ignores all, the coupling's included
     if array.size not in counts or not np.all(np.abs(array) <= mujoco.mjMAXVAL):
         expected = " or ".join(str(count) for count in counts)

@@ -92,6 +92,8 @@ def test_inputs_act_are_recorded_and_repeat_bit_for_bit(inputs_scene: Path, tmp_
         ({"body_wrench": {"handle": [0] * 6}}, "'arm', 'plate', 'tool'"),
         ({"body_wrench": {"world": [0] * 6}}, "'arm', 'plate', 'tool'"),
         ({"body_wrench": {"arm": [0] * 5}}, "6 finite"),
+        ({"ctrl": {"lift": "fast"}}, "'fast'; it must be numbers"),
+        ({"ctrl": [1.0]}, r"ctrl is \[1.0\]; it must be values by name"),
     ],
 )
 def test_bad_inputs_are_refused_and_change_nothing(

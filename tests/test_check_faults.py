@@ -52,6 +52,19 @@ def test_planted_fault_alone_is_named_with_file_and_line(tmp_path: Path, plant: 
     assert fault.change
 
 
+def test_an_inertia_that_no_body_has_is_not_called_missing_and_its_stand_in_is_told(
+    tmp_path: Path,
+) -> None:
+    box = 'size="0.01 0.01 0.01" mass="0.1"/>'
+    inertial = '<inertial pos="0 0 0" mass="0.1" diaginertia="1 1 9"/>'
+    plant = Plant("impossible inertia", box, box + inertial, file="parts.xml")
+    found = faults_of(bench(tmp_path / "scene", plant))
+    (fault,) = (each for each in found if "inertia" in each.kind)
+    assert fault.kind == plant.kind
+    assert "judged with 0.01 kg and 1e-06 kg m²" in fault.sentence
+    assert 'balanceinertia="true"' in fault.change
+
+
 def test_all_planted_faults_are_named_together(tmp_path: Path) -> None:
     scene = bench(tmp_path / "scene", *PLANTS)
     found = {(fault.kind, fault.place.file, fault.place.line) for fault in faults_of(scene)}

@@ -294,6 +294,14 @@ def test_trip_is_exit_code_3(call: Called, monkeypatch: pytest.MonkeyPatch) -> N
     assert "safety trip: tick 7: [/b]" in err
 
 
+def test_trip_is_told_with_what_to_do_about_it(call: Called, tmp_path: Path) -> None:
+    path = tmp_path / "millimetres.csv"
+    path.write_text("t,x,y,z\n0,0,0,0\n0.1,50,0,0\n")
+    code, _, err = call("run", "point_mass", "--fast", "--device", f"trajectory:{path}")
+    assert code == 3
+    assert "than the stretch limit; check the motion's unit (m)" in err
+
+
 @pytest.mark.parametrize("where", ["tyro.cli", "hapticbridge.cli.stability.run_map"])
 def test_ctrl_c_is_one_word_and_exit_code_130(
     where: str, call: Called, monkeypatch: pytest.MonkeyPatch
@@ -393,6 +401,23 @@ def test_one_scene_is_shown_with_its_size_its_file_and_what_to_type_next(call: C
     assert call("scenes", "virtual_wall")[1].count("1 degree of freedom;") == 1
     command = out.splitlines()[-1].removeprefix("next: hapticbridge ")
     assert call(*command.split(), "--fast", "--duration", "0.1")[0] == 0
+
+
+def test_a_scene_of_one_s_own_is_shown_whatever_its_grip_is_called(
+    call: Called, tmp_path: Path
+) -> None:
+    """Nobody holds it here, so no grip is needed; what cannot be compiled is refused as ever."""
+    path = tmp_path / "chisel.xml"
+    text = "<mujoco><worldbody><body><freejoint/><geom size='.01'{}/>{}</body></worldbody></mujoco>"
+    for site in ("<site name='hand'/>", ""):
+        path.write_text(text.format("", site))
+        code, out, err = call("scenes", path)
+        assert (code, err) == (0, "")
+        assert "1 moving body, 6 degrees of freedom" in out
+    path.write_text(text.format(" mass='0'", ""))
+    code, _, err = call("scenes", path)
+    assert code == 2
+    assert "error: cannot compile scene" in err
 
 
 def test_calling_the_command_line_leaves_warnings_as_they_were(call: Called) -> None:

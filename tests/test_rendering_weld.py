@@ -112,6 +112,15 @@ def test_weld_carries_over_what_was_changed_in_the_scenes_own_constraints() -> N
             assert scene.model.equality("handle_weld").solref.tolist() == [-2000, -2]
 
 
+@pytest.mark.parametrize("flag", ["constraint", "equality"])
+def test_a_weld_is_refused_where_the_scene_disables_what_it_is_made_of(flag: str) -> None:
+    option = f'<option><flag {flag}="disable"/></option>'
+    scene = load(FREE_MASS.format(mass=0.05).replace("</mujoco>", option + "</mujoco>"))
+    with pytest.raises(SceneError, match=f"disables flag {flag}, and a weld is an equality"):
+        prepare(scene, COUPLING, T, 1, method_named("weld"))
+    prepare(scene, COUPLING, T, 1, method_named("implicit"))
+
+
 def test_a_device_that_bears_a_weld_is_still_not_called_certified() -> None:
     """Nothing proves b >= KT/2 + B enough for it; where that fails, it is refuted."""
     text = FREE_MASS.format(mass=0.01)

@@ -83,7 +83,10 @@ def test_urdf_is_refused_because_it_can_have_no_site(tmp_path: Path) -> None:
 def test_grip_that_does_not_exist_is_refused_with_the_sites_that_do(tmp_path: Path) -> None:
     body = "<body><freejoint/><geom size='.01'/><site name='tip'/><site/><site name='heel'/></body>"
     message = refusal_of(tmp_path, mjcf(body=body))
-    assert message.endswith("no site 'grip' to grip the tool by; sites: 'heel', 'tip'")
+    assert "no site 'grip' to grip the tool by; sites: 'heel', 'tip'; name one of them" in message
+    assert "--grip" in message
+    none = refusal_of(tmp_path, mjcf(body=body.replace("site name", "geom size='.01' name")))
+    assert none.endswith('sites: none exist; put <site name="grip"/> into the tool\'s body')
     path = scene_file(tmp_path, mjcf(body=body))
     assert load_scene(path, grip="heel").grip == "heel"
     assert "no site ''" in refusal(path, "")
@@ -94,6 +97,11 @@ def test_grip_that_does_not_exist_is_refused_with_the_sites_that_do(tmp_path: Pa
     [
         ("<body name='handle'/>", "", "body 'handle'"),
         ("<site name='handle'/>", "", "site 'handle'"),
+        (
+            "",
+            "<equality><weld name='handle_weld' body1='arm'/></equality>",
+            "equality constraint 'handle_weld'",
+        ),
         *[
             ("", f"<actuator><motor name='{name}' joint='elbow'/></actuator>", f"actuator '{name}'")
             for name in COUPLING_ACTUATORS

@@ -36,7 +36,8 @@ DEFAULT_SECONDS = 5.0
 
 _DEFAULT_STEP = 0.01  # s; the motion's fastest part has 0.41 Hz
 _REFUSED = re.compile(r"(mass and inertia of|inertia must satisfy).*?, id (\d+)")
-_STAND_IN_MASS, _STAND_IN_INERTIA = 0.01, 1e-6  # kg, kg m²: of something that a finger carries
+STAND_IN_MASS, STAND_IN_INERTIA = 0.01, 1e-6
+"""In kg and kg m²: of something that a finger carries, for a body whose own MuJoCo refuses."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -168,8 +169,8 @@ def _compiled(source: SceneSource, grip: str) -> tuple[Scene, dict[int, str]]:
         spec = source.spec.copy()
         for each in refused:
             body = spec.bodies[each]
-            body.explicitinertial, body.mass = True, _STAND_IN_MASS
-            body.inertia, body.fullinertia = np.full(3, _STAND_IN_INERTIA), np.full(6, np.nan)
+            body.explicitinertial, body.mass = True, STAND_IN_MASS
+            body.inertia, body.fullinertia = np.full(3, STAND_IN_INERTIA), np.full(6, np.nan)
         source = replace(source, spec=spec)
 
 

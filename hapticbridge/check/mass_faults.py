@@ -8,7 +8,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from hapticbridge.check.case import Case
+from hapticbridge.check.case import STAND_IN_INERTIA, STAND_IN_MASS, Case
 from hapticbridge.check.faults import Fault, length, number, others, weight
 from hapticbridge.check.inertia import body_inertia
 
@@ -31,12 +31,16 @@ def mass_faults(case: Case) -> Iterator[Fault]:
     """
     for body, refusal in case.refused.items():
         place = case.places.body(body)
-        what = "a mass and inertia > 0" if "mass and" in refusal else "inertias with A + B >= C"
+        is_none = "mass and" in refusal
+        what = "a mass and inertia > 0" if is_none else "inertias with A + B >= C"
+        mend = 'mass="…" in one of its geoms, or <inertial pos="0 0 0" mass="…" diaginertia="…"/>'
+        stand_in = f"{STAND_IN_MASS:g} kg and {STAND_IN_INERTIA:g} kg m²"
         yield Fault(
-            "missing inertia",
+            "missing inertia" if is_none else "impossible inertia",
             place,
-            f"{place.element} moves, and MuJoCo refuses its inertia: it needs {what}",
-            'mass="…" in one of its geoms, or <inertial pos="0 0 0" mass="…" diaginertia="…"/>',
+            f"{place.element} moves, and MuJoCo refuses its inertia: it needs {what}; here it is "
+            f"judged with {stand_in} instead",
+            mend if is_none else 'the right diaginertia, or balanceinertia="true" in <compiler>',
         )
     yield from _of_water(case)
     yield from _contact_ratios(case)

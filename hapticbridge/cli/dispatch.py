@@ -32,6 +32,7 @@ from hapticbridge.cli.terminal import err, out, print_error
 from hapticbridge.cli.view import View
 from hapticbridge.cli.zwidth import Zwidth
 from hapticbridge.errors import HapticBridgeError, SafetyTrip
+from hapticbridge.guard import with_remedy
 
 Command = (
     Annotated[Run, tyro.conf.subcommand("run")]
@@ -78,7 +79,7 @@ def dispatch(arguments: Sequence[str] | None) -> int:
         with _warnings_in_a_sentence():
             return int(command.execute())
     except SafetyTrip as trip:
-        err.print(f"[red]safety trip:[/red] {escape(str(trip))}")
+        err.print(f"[red]safety trip:[/red] {escape(with_remedy(str(trip)))}")
         return SAFETY_TRIP
     except HapticBridgeError as error:
         print_error(error)

@@ -9,7 +9,15 @@ from rich.table import Table
 
 from hapticbridge.cli.terminal import out, plain
 from hapticbridge.device import DEFAULT_HAND, scene_hand
-from hapticbridge.scene import custom_text, load_scene, scene_names, scene_parameters, scene_path
+from hapticbridge.scene import (
+    custom_text,
+    load_scene,
+    plain_model,
+    read_scene,
+    scene_names,
+    scene_parameters,
+    scene_path,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,8 +49,9 @@ class Scenes:
 def _show(scene: str) -> int:
     """Prints what one scene is and what can be set in it."""
     path = scene_path(scene)
-    loaded, parameters = load_scene(path), scene_parameters(path)
-    model, hand = loaded.model, scene_hand(loaded)
+    # a scene of the user's own may call its grip as it likes: nobody holds it here
+    model, parameters = plain_model(read_scene(path)), scene_parameters(path)
+    hand = scene_hand(model, path)
     sentence, moving = custom_text(model, "about"), int((model.body_dofnum > 0).sum())
     out.print(f"[bold]{plain(path.stem)}[/bold]" + (f": {plain(sentence)}" if sentence else ""))
     bodies = "body" if moving == 1 else "bodies"

@@ -110,7 +110,7 @@ def device_for(scene: Scene, spec: str, tell: Tell = tell_nobody) -> Device:
         return open_device(spec, tell=tell)
     options: dict[str, object] = {}
     if "hand" not in parsed(name, rest, _SIMULATED_OPTIONS):
-        hand = asdict(scene_hand(scene))
+        hand = asdict(scene_hand(scene.model, scene.path))
         options |= {_HAND_PREFIX + field: value for field, value in hand.items()}
     path = scene.path.with_suffix(".csv")
     if path.is_file():

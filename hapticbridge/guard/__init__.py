@@ -15,3 +15,4 @@ from hapticbridge.guard.start import refuse_simulated_time as refuse_simulated_t
 from hapticbridge.guard.start import refuse_stretched_start as refuse_stretched_start
 from hapticbridge.guard.start import wait_until_still as wait_until_still
 from hapticbridge.guard.trip import trip_reason as trip_reason
+from hapticbridge.guard.trip import with_remedy as with_remedy

@@ -12,6 +12,14 @@ _REASONS = {
     TWISTED: "the tool is turned from the handle by more than the angle limit",
     GAVE_ENERGY: "the device was given more energy beyond what the hand put in than the limit",
 }
+_REMEDIES = {
+    JUMPED: "check the motion's unit (m) and its times (s)",
+    STRETCHED: "check the motion's unit (m) and speed, and the tool's mass; with another reach in "
+    "mind raise --stretch-limit",
+    TWISTED: "turn more slowly, or raise --rotational-stiffness if the device bears it",
+    GAVE_ENERGY: "lower --stiffness; if the scene's motors are meant to push the hand, raise "
+    "--energy-limit",
+}
 _DIVERGED = (
     "the simulation is no longer finite (force, pose or energy); the scene diverged, so lower the "
     "stiffness or the period"
@@ -26,3 +34,17 @@ def trip_reason(code: int, tick: int) -> str:
         tick: The tick's number.
     """
     return f"tick {tick}: {_REASONS.get(code, _DIVERGED)}"
+
+
+def with_remedy(reason: str) -> str:
+    """Returns a reason with what to do about it, for whoever sees the run stop.
+
+    Error and recording keep the reason alone: it is compared when the run is done again.
+
+    Args:
+        reason: What ``trip_reason`` returned, or another cause of a trip, which stays as it is.
+    """
+    for code, remedy in _REMEDIES.items():
+        if reason.endswith(_REASONS[code]):
+            return f"{reason}; {remedy}"
+    return reason

@@ -16,6 +16,7 @@ from hapticbridge.scene.library import scene_path as scene_path
 from hapticbridge.scene.load import SceneSource as SceneSource
 from hapticbridge.scene.load import compile_scene as compile_scene
 from hapticbridge.scene.load import load_scene as load_scene
+from hapticbridge.scene.load import plain_model as plain_model
 from hapticbridge.scene.load import read_scene as read_scene
 from hapticbridge.scene.parameter_file import Parameter as Parameter
 from hapticbridge.scene.parameter_file import scene_parameters as scene_parameters

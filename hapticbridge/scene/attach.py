@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 
 from hapticbridge.errors import SceneError, choices
-from hapticbridge.kernel.names import COUPLING_ACTUATORS, HANDLE
+from hapticbridge.kernel.names import COUPLING_ACTUATORS, HANDLE, WELD_NAME
 
 _PREFIX = "hapticbridge_"
 """Keeps the default class that comes along with the handle apart from the scene's classes."""
@@ -30,13 +30,20 @@ def attach_handle(spec: mujoco.MjSpec, grip: str) -> None:
     """
     sites = [site.name for site in spec.sites if site.name]
     if grip not in sites:
+        remedy = (
+            "name one of them (--grip, or grip= in Python)"
+            if sites
+            else f'put <site name="{grip or "grip"}"/> into the tool\'s body'
+        )
         raise SceneError(
-            f"the scene has no site '{grip}' to grip the tool by; sites: {choices(sites)}"
+            f"the scene has no site '{grip}' to grip the tool by; sites: {choices(sites)}; {remedy}"
         )
     _refuse_taken("body", HANDLE, [body.name for body in spec.bodies])
     _refuse_taken("site", HANDLE, sites)
     for name in COUPLING_ACTUATORS:
         _refuse_taken("actuator", name, [actuator.name for actuator in spec.actuators])
+    # a weld comes later, if at all, and is then known by its name alone
+    _refuse_taken("equality constraint", WELD_NAME, [each.name for each in spec.equalities])
 
     # made apart: a <default> of the scene would turn its site, boundmass would give it weight
     apart = mujoco.MjSpec()

@@ -41,7 +41,10 @@ _WORDING: tuple[tuple[str, str | Callable[[re.Match[str]], str]], ...] = (
     (r",? Element name '(.*?)', id (\d+)(, line \d+)?", r" (element '\1', id \2\3)"),
     (r" Element '(.*?)', line 0", r" (element '\1' of an included file)"),
     (r" Element '(.*?)', line (\d+)", r" (element '\1', line \2)"),
-    (r"could not find decoder.*", "its name must end in .xml"),
+    (
+        r"could not find decoder.*",
+        "its name must end in .xml and it must hold MJCF (of a compiled .mjb, the file behind it)",
+    ),
     (r"(engine error: Could not allocate memory)", r"\1; ask for less in <size>"),
 )
 """How MuJoCo words an error, and how that reads behind a colon."""

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -83,6 +85,16 @@ def read_scene(path_or_name: str | Path, **parameters: float) -> SceneSource:
     return SceneSource(path, spec, sources, values, tuple(concerns))
 
 
+def plain_model(source: SceneSource) -> mujoco.MjModel:
+    """Compiles a scene as its files say, without handle and coupling, so that it needs no grip.
+
+    Raises:
+        SceneError: The scene cannot be compiled; says why.
+    """
+    with _refused(source.path):
+        return compiled(source.spec.copy(), source.sources)
+
+
 def compile_scene(
     source: SceneSource,
     grip: str = "grip",
@@ -111,18 +123,25 @@ def compile_scene(
     path, spec = source.path, source.spec.copy()
     attach_handle(spec, grip)
     set_options(spec)
-    try:
+    with _refused(path):
         model = compiled(spec, source.sources)
         concerns = [*source.concerns, *check_model(model, grip)]
         seat_handle(model, grip)
         data, values = mujoco.MjData(model), dict(source.parameters)
         scene = Scene(path, grip, model, data, source.sources, values, spec)
         scene.reset()
-    except (ValueError, OSError, MemoryError, mujoco.FatalError) as error:
-        raise SceneError(f"cannot compile scene '{path}': {clause(error)}") from None
     if checks_start:
         check_start(model, scene.data, grip)
     if warns:
         for concern in concerns:
             warnings.warn(f"scene '{path}': {concern}", UserWarning, stacklevel=stacklevel)
     return scene
+
+
+@contextmanager
+def _refused(path: Path) -> Iterator[None]:
+    """Turns what MuJoCo says while it compiles into a sentence that names the scene."""
+    try:
+        yield
+    except (ValueError, OSError, MemoryError, mujoco.FatalError) as error:
+        raise SceneError(f"cannot compile scene '{path}': {clause(error)}") from None

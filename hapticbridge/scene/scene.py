@@ -118,7 +118,7 @@ class Scene:
         in the old model is carried over. Without a weld before and after, nothing changes.
 
         Raises:
-            SceneError: The scene was not made by ``load_scene``, or has a constraint of that name.
+            SceneError: The scene was not made by ``load_scene``.
         """
         has_weld = mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_EQUALITY, WELD_NAME) >= 0
         if has_weld != (coupling is not None):

@@ -19,20 +19,16 @@ PROBE = 1e-6
 """Displacement in m, angle in rad and velocity in m/s and rad/s by which the weld is measured: the
 constraint is linear in them as long as the angle's sine is the angle."""
 
+_FLAGS = {
+    "constraint": mujoco.mjtDisableBit.mjDSBL_CONSTRAINT,
+    "equality": mujoco.mjtDisableBit.mjDSBL_EQUALITY,
+}
+
 _NOT_CARRIED = ("name", "text", "tuple", "paths")
 
 
 def add_weld(spec: mujoco.MjSpec, grip: str) -> None:
-    """Adds the equality constraint between the sites of grip and handle.
-
-    Raises:
-        SceneError: The scene has one of that name.
-    """
-    if WELD_NAME in [equality.name for equality in spec.equalities]:
-        raise SceneError(
-            f"the scene already has equality constraint '{WELD_NAME}', a name that the bridge "
-            "adds; rename yours"
-        )
+    """Adds the equality constraint between the sites of grip and handle."""
     equality = spec.add_equality(name=WELD_NAME)
     equality.type = mujoco.mjtEq.mjEQ_WELD
     equality.objtype = mujoco.mjtObj.mjOBJ_SITE
@@ -51,14 +47,20 @@ def set_weld_gains(model: mujoco.MjModel, coupling: Coupling) -> None:
 
 
 def check_weldable(model: mujoco.MjModel, grip: str) -> None:
-    """Refuses a tool that cannot move along and about all axes.
+    """Refuses a scene without equality constraints, or a tool that cannot move about all axes.
 
     A row of the weld whose axis the joints block has no inertia to give way: MuJoCo makes it rigid
     (1e18 N/m), and its force, which moves nothing, would be what the hand feels.
 
     Raises:
-        SceneError: Says how many directions the joints leave.
+        SceneError: Names the flag, or says how many directions the joints leave.
     """
+    for flag, bit in _FLAGS.items():
+        if model.opt.disableflags & bit:
+            raise SceneError(
+                f"the scene disables flag {flag}, and a weld is an equality constraint; enable it, "
+                "or choose another method"
+            )
     data = mujoco.MjData(model)
     go_to_start(model, data, grip)
     jacobian = np.zeros((6, model.nv))

@@ -137,7 +137,8 @@ class _Experiment:
 
     def _closed(self, settings: Settings) -> WhatIfRun:
         run = self._run
-        hand = scene_hand(run.scene(settings))
+        scene = run.scene(settings)
+        hand = scene_hand(scene.model, scene.path)
         is_moving = run.start_state is not None
         device = IdentifiedDevice(
             run.info, hand, self._ticks, self._period, run.seat, is_moving=is_moving

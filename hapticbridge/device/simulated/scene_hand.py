@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
+
+import mujoco
 
 from hapticbridge.device.simulated.hand import DEFAULT_HAND, Hand
 from hapticbridge.errors import DeviceError, SceneError
-from hapticbridge.scene import Scene, custom_numbers
+from hapticbridge.scene import custom_numbers
 
 SCENE_HAND = "simulated_hand"
 """Name of the custom numbers in a scene's file."""
@@ -14,7 +17,7 @@ SCENE_HAND = "simulated_hand"
 _FIELDS = ("stiffness", "damping", "rotational_stiffness", "rotational_damping")
 
 
-def scene_hand(scene: Scene) -> Hand:
+def scene_hand(model: mujoco.MjModel, path: Path) -> Hand:
     """Returns the hand that performs a scene's path; ``DEFAULT_HAND`` where it asks for none.
 
     A relaxed arm (135 N/m) follows a path only where little holds it back; somebody who drives a
@@ -27,16 +30,17 @@ def scene_hand(scene: Scene) -> Hand:
     of the default hand.
 
     Args:
-        scene: The scene.
+        model: The compiled scene.
+        path: Its file, for the error.
 
     Raises:
         SceneError: The numbers are not two or four, or one is not finite or negative.
     """
-    numbers = custom_numbers(scene.model, SCENE_HAND)
+    numbers = custom_numbers(model, SCENE_HAND)
     if not numbers:
         return DEFAULT_HAND
     words = " ".join(f"{number:g}" for number in numbers)
-    where = f"scene '{scene.path}': its custom numbers '{SCENE_HAND}' are '{words}'"
+    where = f"scene '{path}': its custom numbers '{SCENE_HAND}' are '{words}'"
     if len(numbers) not in (2, 4):
         raise SceneError(
             f"{where}; they must be stiffness in N/m and damping in N s/m of the hand, or these "
