@@ -114,7 +114,7 @@ def test_curves_keep_every_peak_of_a_long_run(run_file: Path) -> None:
     values = np.asarray(line.get_ydata())
     assert len(values) < 5000
     assert (values.max(), values.min()) == (7.0, -3.0)
-    assert np.asarray(line.get_xdata())[values.argmax()] == pytest.approx(12.345)
+    assert np.asarray(line.get_xdata())[values.argmax()] == pytest.approx(12.346)
     for axes, unit in ((force, "(N)"), (position, "(mm)"), (energy, "(mJ)")):
         assert unit in axes.get_ylabel()
 
