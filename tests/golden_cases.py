@@ -1,0 +1,677 @@
+"""Runs, recordings and help texts whose outcome is frozen in ``tests/golden``.
+
+``scripts/freeze`` writes the outcome anew, ``test_determinism`` holds today's code to it. All that
+is used here is public: ``hb.Bridge``, ``hb.audit``, the command line.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import math
+import os
+import platform
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import redirect_stdout, suppress
+from dataclasses import dataclass, field, replace
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import numpy as np
+from audit_cases import rewritten
+from numpy.typing import NDArray
+
+import hapticbridge as hb
+from hapticbridge.cli import main
+from hapticbridge.commands import Command, Couple, Reset, Switch
+from hapticbridge.errors import CommandError
+from hapticbridge.recording import Recording
+
+GOLDEN = Path(__file__).parent / "golden"
+RUNS, AUDITS, MACHINE = (GOLDEN / f"{name}.json" for name in ("runs", "audits", "machine"))
+
+Pose = tuple[float, ...]
+Json = dict[str, Any]
+
+STALE_SAMPLE = 256
+"""Bit of a record's ``flags``, and what a device's ``read`` returns without a new sample."""
+
+DIGITS = 12
+"""Hexadecimal digits of a digest: 48 bits. Two of some thousand differing columns collide with a
+probability below 1e-8."""
+
+WORKSHOP = """
+<mujoco model="workshop">
+  <option cone="elliptic"/>
+  <default><geom solref="0.002 1" solimp="0.9 0.95 0.001"/></default>
+  <worldbody>
+    <geom type="plane" size="1 1 0.1"/>
+    <body name="tool" pos="0 0 0.012" gravcomp="1"><freejoint/>
+      <geom type="sphere" size="0.01" mass="0.1"/><site name="grip"/></body>
+    <body name="lever" pos="0.03 0 0.02"><joint name="lever" type="hinge" axis="0 1 0"
+        stiffness="0.1" damping="0.001"/>
+      <geom type="capsule" size="0.004" fromto="0 0 0 0 0 0.05" mass="0.05"/></body>
+    <body name="load" pos="-0.1 0 0.05"><freejoint/>
+      <geom type="box" size="0.01 0.01 0.01" mass="0.05"/></body>
+    <body name="lift" mocap="true" pos="-0.1 0 0.03">
+      <geom type="box" size="0.02 0.02 0.008"/></body>
+  </worldbody>
+  <actuator><position name="servo" joint="lever" kp="0.5" kv="0.01"/></actuator>
+  <sensor>
+    <framepos objtype="site" objname="grip"/><jointpos joint="lever"/>
+    <touch name="touch" site="grip"/>
+  </sensor>
+</mujoco>"""
+"""A tool above a floor, a servo, a spring, and a load on a platform that is moved."""
+
+LIGHT = """
+<mujoco model="light">
+  <option timestep="0.001" gravity="0 0 0"/>
+  <worldbody>
+    <body name="tool"><freejoint/>
+      <geom type="sphere" size="0.01" mass="0.05"/><site name="grip"/></body>
+  </worldbody>
+</mujoco>"""
+"""A tool of 50 g, which a method that is not passive drives."""
+
+
+def digest(column: NDArray[Any]) -> str:
+    """Returns a digest of every bit of a column, or ``zero`` where no bit is set."""
+    content = np.ascontiguousarray(column).tobytes()
+    return hashlib.sha256(content).hexdigest()[:DIGITS] if any(content) else "zero"
+
+
+def machine() -> dict[str, str]:
+    """Returns what may change a digest although the code is the same."""
+    found = {name: version(name) for name in ("mujoco", "numba", "numpy", "scipy", "tyro", "rich")}
+    return found | {
+        "python": ".".join(platform.python_version_tuple()[:2]),
+        "system": platform.system(),
+        "architecture": platform.machine(),
+        "processor": _processor(),
+    }
+
+
+def _processor() -> str:
+    """Returns the processor's model with its numbers: a virtual machine may hide its name."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return platform.processor()
+    told = dict(line.split(":", 1) for line in reversed(lines) if ":" in line)
+    kept = {name.strip(): value.strip() for name, value in told.items()}
+    return ", ".join(kept[n] for n in ("model name", "cpu family", "model") if n in kept)
+
+
+def json_text(content: Json) -> str:
+    """Returns a golden file: an entry a line, so that two branches merge line by line."""
+    return json.dumps(content, indent=1, ensure_ascii=False) + "\n"
+
+
+def differing(one: Any, other: Any, where: str = "") -> list[str]:
+    """Returns the places in which two JSON values differ, with both values."""
+    if isinstance(one, dict) and isinstance(other, dict):
+        names = [*one, *(name for name in other if name not in one)]
+        return [
+            line
+            for name in names
+            for line in differing(
+                one.get(name, "missing"),
+                other.get(name, "missing"),
+                f"{where} / {name}".lstrip(" /"),
+            )
+        ]
+    return [] if one == other else [f"{where}: {one!r:.200} -> {other!r:.200}"]
+
+
+def sway(tick: int) -> Pose:
+    """A hand that sways by 10 mm, turns by 0.2 rad and presses down by 12 mm."""
+    angle = 0.1 * math.sin(0.02 * tick)
+    down = -0.012 * math.sin(0.01 * tick) ** 2
+    return (
+        0.01 * math.sin(0.03 * tick),
+        0.004 * math.sin(0.05 * tick),
+        down,
+        math.cos(angle),
+        0.6 * math.sin(angle),
+        0.8 * math.sin(angle),
+        0.0,
+    )
+
+
+def leave(tick: int) -> Pose:
+    """A hand that goes away at 1.4 m/s."""
+    return (8e-4 * tick, 8e-4 * tick, 8e-4 * tick, 1.0, 0.0, 0.0, 0.0)
+
+
+def turn(tick: int) -> Pose:
+    """A hand that turns about y at 12 rad/s."""
+    return (0.0, 0.0, 0.0, math.cos(6e-3 * tick), 0.0, math.sin(6e-3 * tick), 0.0)
+
+
+def jump(tick: int) -> Pose:
+    """As ``sway``, with a leap of 60 mm in tick 150: faster than any device."""
+    x, *rest = sway(tick)
+    return (x + (0.06 if tick >= 150 else 0.0), *rest)
+
+
+def broken(tick: int) -> Pose:
+    """As ``sway``, until a position is not a number."""
+    x, *rest = sway(tick)
+    return (x if tick < 150 else math.nan, *rest)
+
+
+class Scripted:
+    """A device whose poses, buttons and gaps come from its tick.
+
+    Args:
+        pose: Position in m and quaternion (w, x, y, z) by tick.
+        buttons: Button bits by tick.
+        stale: Whether a tick has no new sample.
+        lost: Tick from which the device is gone; None for never.
+        changes: Fields of the data sheet that differ from the simulated device's.
+    """
+
+    def __init__(
+        self,
+        pose: Callable[[int], Pose] = sway,
+        *,
+        buttons: Callable[[int], int] = lambda _: 0,
+        stale: Callable[[int], bool] = lambda _: False,
+        lost: int | None = None,
+        **changes: Any,
+    ) -> None:
+        self._inner = hb.open_device("simulated")
+        self.info = replace(self._inner.info, name="scripted", duration=None, **changes)
+        self._pose, self._buttons, self._stale, self._lost = pose, buttons, stale, lost
+        self._tick = 0
+        self.writes: list[NDArray[np.float64]] = []
+
+    def start(self, period: float) -> NDArray[np.void]:
+        sample = self._inner.start(period)
+        self._report(sample, 0)
+        return sample
+
+    def read(self, sample: NDArray[np.void]) -> int:
+        tick = self._tick
+        self._tick += 1
+        if self._lost is not None and tick >= self._lost:
+            raise hb.DeviceError("the device is gone")
+        if self._stale(tick):
+            return STALE_SAMPLE
+        self._report(sample, tick)
+        return 0
+
+    def write(self, wrench: NDArray[np.float64]) -> None:
+        self.writes.append(wrench.copy())
+
+    def close(self) -> None:
+        self._inner.close()
+
+    def _report(self, sample: NDArray[np.void], tick: int) -> None:
+        pose = self._pose(tick)
+        sample["position"][0] = pose[:3]
+        sample["quaternion"][0] = pose[3:]
+        sample["buttons"] = self._buttons(tick)
+
+
+class StallingClock(hb.SimulatedClock):
+    """Simulated time that skips deadlines before certain ticks."""
+
+    def __init__(self, stalls: Mapping[int, int]) -> None:
+        super().__init__()
+        self._stalls, self._count, self._step = stalls, 0, 0
+        self._late = 0
+
+    def start(self, period_ns: int) -> None:
+        super().start(period_ns)
+        self._step = period_ns
+
+    def wait(self) -> tuple[int, int, int]:
+        deadline, _, _ = super().wait()
+        skipped = self._stalls.get(self._count, 0)
+        self._count += 1
+        self._late += skipped * self._step
+        return deadline + self._late, self.now(), skipped
+
+    def now(self) -> int:
+        return super().now() + self._late
+
+
+def command(bridge: hb.Bridge, asked: Command) -> None:
+    """Gives a command; waits out the real time that must lie between two."""
+    while True:
+        try:
+            return bridge.command(asked, by="script")
+        except CommandError as error:
+            if "too recent" not in str(error):
+                raise
+            time.sleep(0.005)
+
+
+Act = Callable[[hb.Bridge, int], None]
+
+
+def commands(table: Mapping[int, Command]) -> Act:
+    """Returns what gives commands at their ticks."""
+
+    def act(bridge: hb.Bridge, tick: int) -> None:
+        if tick in table:
+            command(bridge, table[tick])
+
+    return act
+
+
+def inputs(bridge: hb.Bridge, tick: int) -> None:
+    """Moves the workshop's servo, platform, load and lever."""
+    if tick % 50 == 10:
+        bridge.set_input(ctrl={"servo": 0.3 * math.sin(tick)})
+    if 100 <= tick < 200:
+        bridge.set_input(mocap={"lift": (-0.1, 0, 0.03 + 2e-5 * (tick - 100))})
+    if tick == 250:
+        bridge.set_input(body_wrench={"load": (0.01, 0, 0, 0, 0, 1e-5)})
+    if tick == 280:
+        bridge.set_input(joint_force={"lever": 1e-3})
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run of the bridge on a simulated clock.
+
+    Attributes:
+        scene: Name, or MJCF as text.
+        device: Makes the device; or a specification to whose end the scene's own path is added,
+            eight times as fast.
+        options: Of the bridge; ``limits`` holds changes to limits that are fit for short runs, and
+            ``clock`` makes the clock.
+        seconds: How long it runs.
+        parts: How many times ``run`` is called for that.
+        act: Called before each tick.
+    """
+
+    scene: str
+    device: Callable[[], Any] | str = "simulated:path="
+    options: Mapping[str, Any] = field(default_factory=dict)
+    seconds: float = 0.4
+    parts: int = 1
+    act: Act | None = None
+
+    def open(self, folder: Path, **more: Any) -> hb.Bridge:
+        options = {**self.options, **more}
+        clock = options.pop("clock", hb.SimulatedClock)
+        changes: Mapping[str, float] = options.pop("limits", {})
+        limits = hb.Limits(**{"force": 10.0, "torque": 0.5, "ramp": 0.05, **changes})
+        scene = self.scene
+        if scene.lstrip().startswith("<"):
+            path = folder / "scene.xml"
+            path.write_text(scene)
+            scene = str(path)
+        if isinstance(self.device, str):
+            device = self.device + str(_hurried(scene, folder))
+        else:
+            device = self.device()
+        return hb.Bridge(scene, device, clock=clock(), limits=limits, **options)
+
+    def go(self, bridge: hb.Bridge) -> NDArray[np.void]:
+        """Runs an entered bridge; returns its records."""
+        act = self.act
+        try:
+            for _ in range(self.parts):
+                bridge.run(self.seconds / self.parts, act and (lambda tick: act(bridge, tick)))
+        except hb.SafetyTrip:
+            pass
+        return bridge.latest_records(round(self.seconds / bridge.period))
+
+    def digests(self, folder: Path) -> dict[str, str]:
+        """Returns a digest per field of the records, and of what the device was sent."""
+        with self.open(folder) as bridge:
+            rows = self.go(bridge)
+            ended = bridge.summary().stopped_by
+        found = {"(length and end)": f"{len(rows)} ticks, {ended}"}
+        found |= {name: digest(rows[name]) for name in sorted(rows.dtype.names or ())}
+        if isinstance(bridge.device, Scripted):
+            found["(written to the device)"] = digest(np.array(bridge.device.writes))
+        return found
+
+
+def _hurried(scene: str, folder: Path) -> Path:
+    """Writes the path that comes with a scene, eight times as fast."""
+    source = hb.load_scene(scene).path.with_suffix(".csv")
+    header, *lines = source.read_text(encoding="utf-8").splitlines()
+    rows = [line.split(",", 1) for line in lines]
+    path = folder / "path.csv"
+    path.write_text("\n".join([header, *(f"{float(t) / 8!r},{rest}" for t, rest in rows)]) + "\n")
+    return path
+
+
+METHODS = ("lossless", "implicit", "compensated")
+"""The methods for users. The scene of each has one degree of freedom to ten."""
+
+COMPARED = (
+    "implicitfast",
+    "implicitfast:compensated",
+    "explicit",
+    "explicit:implicitfast",
+    "explicit:rk4",
+    "weld",
+    "direct",
+)
+"""The methods that exist only to be compared."""
+
+COUPLING = hb.Coupling(2400.0, 0.5, 2.4, 5e-4)
+
+STIFF = hb.Coupling(8000.0, 0.5, 8.0, 5e-4)
+"""Twice what the simulated device bears."""
+
+CHANGES: dict[int, Command] = {
+    40: Couple(1000.0, 0.5),
+    160: Couple(3000.0, 0.4, 2.0, 4e-4),
+    300: Switch(force=False),
+    340: Switch(force=True),
+    400: Switch(clutch=True),
+    440: Switch(clutch=False),
+    480: Reset(),
+}
+"""Every command that changes what a run computes, by tick."""
+
+PEG, WALL, MASS = "peg_in_hole", "virtual_wall", "point_mass"
+
+
+def _held(first: int, last: int, button: int = 0) -> Callable[[int], int]:
+    """Returns buttons of which one is held in the ticks from ``first`` to before ``last``."""
+    return lambda tick: (first <= tick < last) << button
+
+
+def _guard_runs() -> Iterator[tuple[str, Run]]:
+    """Yields the cases of the guard and of the bridge's options, by name."""
+    yield "force limit", Run(PEG, Scripted, {"limits": {"force": 1.0, "torque": 0.02}})
+    yield "slew limit", Run(PEG, Scripted, {"limits": {"rise": 0.2}})
+    yield "long ramp", Run(PEG, Scripted, {"limits": {"ramp": 0.3}})
+    yield "no ramp", Run(PEG, Scripted, {"limits": {"ramp": 0.0, "rise": 0.0}})
+    yield "clutch", Run(PEG, lambda: Scripted(buttons=_held(100, 200)), {"clutch": 0})
+    yield "dead man", Run(PEG, lambda: Scripted(buttons=_held(50, 250, 1)), {"dead_man": 1})
+    yield "reach", Run(PEG, Scripted, {"limits": {"reach": 0.012}})
+    yield "stale samples", Run(PEG, lambda: Scripted(stale=lambda tick: tick % 7 in (2, 3)))
+    yield "silence", Run(PEG, lambda: Scripted(stale=lambda tick: 100 <= tick < 250))
+    yield "leap of the device", Run(PEG, lambda: Scripted(jump))
+    yield "trip: stretch", Run(WALL, lambda: Scripted(leave), {"limits": {"stretch": 0.05}})
+    yield "trip: angle", Run("drawer", lambda: Scripted(turn), {"limits": {"angle": 1.0}})
+    yield (
+        "trip: energy",
+        Run(
+            LIGHT,
+            lambda: Scripted(damping=0.1, rotational_damping=1e-4),
+            {"method": "implicitfast", "coupling": COUPLING, "limits": {"energy": 1e-5}},
+        ),
+    )
+    yield "trip: not a number", Run(PEG, lambda: Scripted(broken))
+    yield "trip: device lost", Run(PEG, lambda: Scripted(lost=150))
+    yield (
+        "skipped deadlines",
+        Run(PEG, Scripted, {"clock": lambda: StallingClock({60: 1, 120: 3, 200: 80})}),
+    )
+    for method in METHODS:
+        for is_ahead in (False, True):
+            name = f"commands, {method}" + (", pipelined" if is_ahead else "")
+            options = {"method": method, "pipelined": is_ahead, "coupling": COUPLING}
+            yield name, Run(PEG, Scripted, options, 0.6, act=commands(CHANGES))
+    for controller in ("damper", "environment", "tank", "off"):
+        yield (
+            f"stiff coupling, controller {controller}",
+            Run(
+                WALL,
+                "simulated:damping=0.1,hand_stiffness=1000,path=",
+                {"coupling": STIFF, "controller": controller},
+            ),
+        )
+        yield (
+            f"active environment, controller {controller}",
+            Run(
+                LIGHT,
+                Scripted,
+                {"coupling": COUPLING, "controller": controller, "method": "implicitfast"},
+            ),
+        )
+    for method, substeps in (("implicit", 3), ("compensated", 2), ("explicit", 2)):
+        for is_ahead in (False, True):
+            name = f"{substeps} substeps, {method}" + (", pipelined" if is_ahead else "")
+            more = {"method": method, "substeps": substeps, "pipelined": is_ahead}
+            yield name, Run(PEG, Scripted, more)
+    for method in ("lossless", "implicit", "explicit"):
+        for is_ahead in (False, True):
+            name = f"inputs, {method}" + (", pipelined" if is_ahead else "")
+            options = {"method": method, "pipelined": is_ahead}
+            yield name, Run(WORKSHOP, Scripted, options, act=inputs)
+    yield "scaled up", Run(PEG, Scripted, {"scale": 2.0})
+    yield "force scaled down", Run(PEG, Scripted, {"scale": 1.5, "force_scale": 0.5})
+    yield "turned axes", Run(PEG, Scripted, {"axes": [[0, 1, 0], [-1, 0, 0], [0, 0, 1]]})
+    yield "absolute poses", Run(MASS, Scripted, {"absolute": True})
+    yield "500 Hz", Run(MASS, Scripted, {"rate": 500.0})
+    yield "4 kHz", Run(PEG, Scripted, {"rate": 4000.0})
+    yield "three runs of one bridge", Run(PEG, Scripted, seconds=0.45, parts=3)
+    yield "device of 3 axes", Run(PEG, lambda: Scripted(axes=("x", "y", "z")))
+    yield "device in the plane", Run("planar_peg", lambda: Scripted(axes=("x", "z", "ry")))
+    yield (
+        "device with friction, steps and delay",
+        Run(WALL, "simulated:friction=0.2,resolution=1e-5,delay=2,path="),
+    )
+    yield "device that no force moves", Run(WALL, "trajectory:")
+    yield (
+        "direct, contact stiffness",
+        Run(PEG, Scripted, {"method": "direct", "contact_stiffness": 1500.0}),
+    )
+
+
+def runs() -> dict[str, Run]:
+    """Returns every frozen run by name."""
+    found = {
+        f"{scene}, {method}": Run(scene, options={"method": method}, seconds=1.0)
+        for scene in hb.scene_names()
+        for method in METHODS
+    }
+    for method in COMPARED:
+        for is_ahead in (False, True):
+            name = f"{PEG}, {method}" + (", pipelined" if is_ahead else "")
+            found[name] = Run(PEG, Scripted, {"method": method, "pipelined": is_ahead})
+    for method in METHODS:
+        name = f"{PEG}, {method}, pipelined"
+        found[name] = Run(PEG, Scripted, {"method": method, "pipelined": True})
+    return found | dict(_guard_runs())
+
+
+VOLATILE = ("versions", "host", "started", "epoch_ns")
+"""Metadata of a recording that tell of the machine and the day, not of the run."""
+
+RECORDED = (
+    f"{PEG}, lossless",
+    f"{PEG}, direct",
+    f"{PEG}, weld",
+    "2 substeps, compensated",
+    "commands, lossless",
+    "inputs, implicit",
+    "skipped deadlines",
+    "device with friction, steps and delay",
+    "stiff coupling, controller damper",
+    "active environment, controller tank",
+    "trip: energy",
+)
+"""Runs whose recordings are judged."""
+
+TAMPERED = "commands, lossless"
+"""The run whose recording is changed in every way; it has contacts, and events of every kind."""
+
+TICK = 120
+"""The record that is changed."""
+
+NUMBERS = (
+    "stiffness",
+    "damping",
+    "rotational_stiffness",
+    "rotational_damping",
+    "period_s",
+    "scale",
+    "force_scale",
+    "force_limit",
+    "torque_limit",
+    "substeps",
+    "ramp_ticks",
+    "start_kinetic",
+    "start_potential",
+)
+"""Metadata that are a number."""
+
+LISTS = ("axes", "device_origin", "handle_origin", "device_start", "handle_start", "tool_start")
+"""Metadata that are a list of numbers."""
+
+TEXTS = {"method": "implicit", "grip": "elsewhere", "scene_sha256": "0", "damping": "nan"}
+"""Other metadata, and to what they are changed."""
+
+
+def recordings(folder: Path) -> dict[str, Recording]:
+    """Records the runs that are judged."""
+    table, found = runs(), {}
+    for number, name in enumerate(RECORDED):
+        path = folder / f"{number}.mcap"
+        with table[name].open(folder, recording=path) as bridge:
+            table[name].go(bridge)
+        found[name] = hb.read_recording(path)
+    return found
+
+
+def judged(path: Path) -> Json:
+    """Returns the audit's report on a file, without its path."""
+    report = json.loads(hb.audit(path).to_json())
+    del report["path"]
+    return dict(report)
+
+
+def described(recording: Recording) -> Json:
+    """Returns what a recording says of its run beside its ticks, and how it is judged."""
+    meta = {name: text for name, text in sorted(recording.meta.items()) if name not in VOLATILE}
+    files = {
+        name: hashlib.sha256(data).hexdigest()[:DIGITS]
+        for name, data in sorted(recording.attachments.items())
+    }
+    report = judged(recording.path)
+    return {"meta": meta, "attachments": files, "events": recording.events, "report": report}
+
+
+def tampered(recording: Recording, folder: Path) -> Iterator[tuple[str, Path]]:
+    """Yields files with something changed and signed anew, each with what was changed."""
+    path = folder / "tampered.mcap"
+    meta, events = recording.meta, recording.events
+    for name in recording.ticks.dtype.names or ():
+        ticks = recording.ticks.copy()
+        row = ticks[name].reshape(len(ticks), -1)[TICK]
+        row[0] += 1 if row.dtype.kind == "i" else 1e-7
+        yield f"tick field {name}", rewritten(recording, path, ticks=ticks)
+    ticks = recording.ticks.copy()
+    ticks["wrench_on_device"][TICK, 2] = np.nan
+    yield "wrench that is not a number", rewritten(recording, path, ticks=ticks)
+    ticks = recording.ticks
+    yield "record left out", rewritten(recording, path, ticks=np.delete(ticks, TICK))
+    yield "record twice", rewritten(recording, path, ticks=np.insert(ticks, TICK, ticks[TICK]))
+    yield "records after the end left out", rewritten(recording, path, ticks=ticks[:400])
+    yield "no record at all", rewritten(recording, path, ticks=ticks[:0])
+    for name in NUMBERS:
+        value = float(meta[name])
+        text = str(int(value) + 1) if meta[name].isdecimal() else repr(value * (1 + 1e-9) + 1e-12)
+        yield f"metadata {name}", rewritten(recording, path, meta={name: text})
+    for name in LISTS:
+        numbers = json.loads(meta[name])
+        numbers[0] += 1e-9
+        yield f"metadata {name}", rewritten(recording, path, meta={name: json.dumps(numbers)})
+    for name, number in json.loads(meta["guard"]).items():
+        changed = json.loads(meta["guard"]) | {name: (number or 0.0) + 1}
+        yield f"guard {name}", rewritten(recording, path, meta={"guard": json.dumps(changed)})
+    for name, text in TEXTS.items():
+        yield f"metadata {name} {text!r}", rewritten(recording, path, meta={name: text})
+    device = json.loads(meta["device"])
+    for name, value in (("damping", 0.1), ("is_prescribed", True), ("force_limit", 5.0)):
+        text = json.dumps(device | {name: value})
+        yield f"device {name} {value}", rewritten(recording, path, meta={"device": text})
+    old = json.dumps(json.loads(meta["versions"]) | {"mujoco": "3.0"})
+    yield "another MuJoCo", rewritten(recording, path, meta={"versions": old})
+    ticks = recording.ticks.copy()
+    ticks["kinetic"][TICK] += 1e-6
+    yield (
+        "another MuJoCo, and tick field kinetic",
+        rewritten(recording, path, meta={"versions": old}, ticks=ticks),
+    )
+    for number, event in enumerate(events):
+        rest = [*events[:number], *events[number + 1 :]]
+        name = f"event {number}, {event['event']},"
+        yield f"{name} left out", rewritten(recording, path, events=rest)
+        late = [*events[:number], {**event, "tick": event["tick"] + 1}, *events[number + 1 :]]
+        yield f"{name} a tick later", rewritten(recording, path, events=late)
+    for name, data in recording.attachments.items():
+        short = {name: data[:-8]}
+        yield f"attachment {name} cut", rewritten(recording, path, attachments=short)
+    content = recording.path.read_bytes()
+    path.write_bytes(content[: len(content) // 2])
+    yield "file cut in the middle", path
+    path.write_bytes(content[:-100])
+    yield "file without its end", path
+    middle = len(content) // 2
+    path.write_bytes(content[:middle] + bytes([content[middle] ^ 1]) + content[middle + 1 :])
+    yield "one bit of the file", path
+
+
+def differences(one: Json, other: Json) -> Json:
+    """Returns the entries of ``other`` that ``one`` has not, or has otherwise."""
+    return {name: value for name, value in other.items() if one.get(name) != value}
+
+
+def audits(folder: Path) -> Json:
+    """Returns what recordings hold and how they are judged: untouched, and tampered with.
+
+    Of a tampered file's report those entries are kept in which it differs from the untouched one's.
+    """
+    kept = recordings(folder)
+    whole = kept[TAMPERED]
+    base = judged(whole.path)
+    return {
+        "recordings": {name: described(recording) for name, recording in kept.items()},
+        "tampered": {
+            name: differences(base, judged(path)) for name, path in tampered(whole, folder)
+        },
+    }
+
+
+COMMANDS = (
+    "",
+    "run",
+    "audit",
+    "render",
+    "view",
+    "scenes",
+    "devices",
+    "check",
+    "stability",
+    "chart",
+    "doctor",
+    "export",
+    "compare",
+    "repair",
+    "zwidth",
+    "bound",
+    "identify",
+)
+"""Commands whose help is frozen; the empty one is the program itself."""
+
+
+def help_file(name: str) -> Path:
+    """Returns the file of a command's help."""
+    return GOLDEN / "help" / f"{name or 'hapticbridge'}.txt"
+
+
+def help_text(name: str) -> str:
+    """Returns what ``hapticbridge NAME --help`` prints in 100 columns, without colour."""
+    words, plain = io.StringIO(), {"COLUMNS": "100", "NO_COLOR": "1", "TERM": "dumb"}
+    with patch.dict(os.environ, plain), redirect_stdout(words), suppress(SystemExit):
+        main([name, "--help"] if name else ["--help"])
+    return "\n".join(line.rstrip() for line in words.getvalue().splitlines()) + "\n"
