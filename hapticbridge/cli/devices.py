@@ -21,10 +21,11 @@ from hapticbridge.errors import HapticBridgeError
 
 @dataclass(frozen=True, slots=True)
 class Devices:
-    """List the haptic devices that are plugged in, and those that are supported.
+    """List the haptic devices plugged in and supported.
 
-    Says of each that cannot be opened what is missing. Moves no motor. Example:
+    For a device that cannot be opened, says what is missing. Moves no motor.
 
+    Example:
         hapticbridge devices --udev-rules | sudo tee /etc/udev/rules.d/70-hapticbridge.rules
     """
 
