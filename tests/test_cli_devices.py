@@ -12,7 +12,8 @@ from emulated.pid_model import PidStick
 
 from hapticbridge import Bridge, SimulatedClock
 from hapticbridge.cli import devices as command
-from hapticbridge.device.families import FAMILIES, RULES_FILE, plugged_devices, udev_rules
+from hapticbridge.device.discovery import RULES_FILE, plugged_devices, udev_rules
+from hapticbridge.device.families import DRIVERS, all_families
 from hapticbridge.device.forcedimension.library import VARIABLE
 from hapticbridge.device.haply import finding as haply
 from hapticbridge.device.pid import effects
@@ -89,7 +90,7 @@ def test_devices_never_fails_on_a_machine_without_usb(
     monkeypatch.setattr(hid_search, "hid_api", lambda: None)
     code, out, err = call("devices")
     assert (code, err) == (0, "")
-    for family in FAMILIES:
+    for family in all_families():
         assert f"{family.name}: {family.about}" in out
     assert "none; 'simulated' and 'trajectory:FILE' need none" in out
     assert "hidapi cannot be loaded, so HID devices are not seen" in out
@@ -99,14 +100,14 @@ def test_devices_runs_on_this_machine_whatever_it_has(call: Called) -> None:
     code, out, _ = call("devices", "--json")
     facts = json.loads(out)
     assert code == 0
-    assert [family["name"] for family in facts["supported"]] == [f.name for f in FAMILIES]
+    assert [family["name"] for family in facts["supported"]] == list(DRIVERS)
     assert facts["plugged"] == json.loads(json.dumps([vars_of(d) for d in plugged_devices()]))
 
 
 def test_who_stands_still_reads_what_becomes_of_each_devices_force(call: Called) -> None:
     code, out, _ = call("devices")
     assert code == 0
-    told = {family.name: family.on_stall for family in FAMILIES}
+    told = {family.name: family.on_stall for family in all_families()}
     assert [name for name, words in told.items() if not words] == ["spacemouse"]  # has no force
     shown = " ".join(out.split())
     for words in filter(None, told.values()):
@@ -174,9 +175,9 @@ def test_the_rules_name_every_product_once_and_sort_before_the_seat(call: Called
     code, out, _ = call("devices", "--udev-rules")
     assert (code, out) == (0, udev_rules())
     rules = [line for line in out.splitlines() if line and not line.startswith("#")]
-    assert len(rules) == len(set(rules)) == sum(len(family.ids) for family in FAMILIES)
+    assert len(rules) == len(set(rules)) == sum(len(family.ids) for family in all_families())
     assert all(rule.endswith('TAG+="uaccess"') for rule in rules)
-    for family in FAMILIES:
+    for family in all_families():
         for usb_id in family.ids:
             if family.transport == "hid":
                 match = f'SUBSYSTEM=="hidraw", KERNELS=="*:{str(usb_id).upper()}.*"'
@@ -246,7 +247,7 @@ def test_the_bus_is_read_without_opening_anything(bus: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "family", [f for f in FAMILIES if f.find is None], ids=lambda family: family.name
+    "family", [f for f in all_families() if f.find is None], ids=lambda family: family.name
 )
 def test_running_on_a_device_that_is_not_there_is_one_sentence_that_helps(
     call: Called, family: Family, bus: Path
@@ -328,7 +329,7 @@ def test_how_often_a_device_is_asked_is_read_where_the_kernel_shows_it(
     assert hid_search.polling("/dev/hidraw4") == (None, None)
 
 
-@pytest.mark.parametrize("family", FAMILIES, ids=lambda family: family.name)
+@pytest.mark.parametrize("family", all_families(), ids=lambda family: family.name)
 def test_hardware_and_fast_are_refused_together_before_anything_is_opened(
     call: Called, monkeypatch: pytest.MonkeyPatch, family: Family
 ) -> None:

@@ -11,7 +11,7 @@ from hapticbridge import arrangement
 from hapticbridge.bridge import Bridge
 from hapticbridge.cli import run
 from hapticbridge.device import SimulatedDevice, library
-from hapticbridge.device.families import FAMILIES
+from hapticbridge.device.falcon.finding import FAMILY
 from hapticbridge.errors import DeviceError
 from hapticbridge.guard import Limits
 
@@ -54,7 +54,7 @@ def test_a_bridge_that_is_refused_lets_go_of_what_it_opened_and_of_nothing_else(
 
 def test_a_device_whose_profile_is_broken_is_let_go(monkeypatch: pytest.MonkeyPatch) -> None:
     device = Counted()
-    family = replace(FAMILIES[0], open=lambda *_: device)
+    family = replace(FAMILY, open=lambda *_: device)
     monkeypatch.setattr(library, "family_named", lambda _: family)
 
     def broken(*_: str) -> None:

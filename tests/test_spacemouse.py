@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 import hapticbridge as hb
-from hapticbridge.device import families
+from hapticbridge.device import library
 from hapticbridge.device.plugged import Tell, tell_nobody
 from hapticbridge.device.spacemouse.driver import FAMILY, HELD, SpaceMouseDevice, open_spacemouse
 from hapticbridge.device.spacemouse.reports import Buttons, Deflection, decoded, share
@@ -266,7 +266,7 @@ def test_the_command_line_says_that_there_is_nothing_to_certify(
         return open_spacemouse(options, tell, seam)
 
     family = replace(FAMILY, open=open_it)
-    monkeypatch.setattr(families, "FAMILIES", (family,))
+    monkeypatch.setattr(library, "family_named", lambda _: family)
     code, out, _ = call("run", "peg_in_hole", "--device", "spacemouse:speed=0.2", "--duration", 0.1)
     assert code == 0
     assert "the device feels no force: there is nothing to certify" in out

@@ -1,9 +1,8 @@
-"""The command line: parses, calls, prints.
+"""Command line: parses options, calls the library, prints results.
 
-Read ``main`` first, which is in charge before anything heavy is imported, then ``dispatch``, then
-``run``: a module per command, a dataclass whose fields are its flags.
-``terminal`` is the one way to print; what a command says at length stands beside it (``run_words``,
-``check_words``, ``judge_many`` …).
+Read ``main`` first, the table of commands, then ``run``: one module per job, one dataclass per
+command, whose fields are its options. ``terminal`` holds the consoles that all output goes through.
+Long texts stand beside their command (``run_words``, ``check_words``, ``judge_many`` …).
 """
 
 from hapticbridge.cli.main import main as main

@@ -27,11 +27,12 @@ from hapticbridge.study.theory import (
 
 @dataclass(frozen=True, slots=True)
 class Bound:
-    """The damping that a device needs to show a coupling, and what each alternative would need.
+    """Compute the device damping that a coupling needs.
 
-    K and B are what is felt: the default method uses B' = B - KT/2 of it, 0 at least. Exit code 1
-    if --device-damping is given and does not suffice. Example:
+    Alternative laws are listed beside it. K and B are what is felt: the default method uses B' = B
+    - KT/2 of it, 0 at least. Exit code 1 if --device-damping is given and does not suffice.
 
+    Example:
         hapticbridge bound --stiffness 2000 --damping 1 --rate 1000
     """
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import tyro
 from matplotlib.figure import Figure
@@ -35,15 +35,29 @@ from hapticbridge.scene import read_scene, settings_from
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """What a scene models, what is wrong with it, and what it costs.
+    """Find what is wrong with a scene, and what a tick of it costs.
 
     Leads the scene through its hand's motion and names every fault with the line to change. Exit
-    code 0 if nothing is wrong, 1 if something is, 2 if the scene cannot be read. Example:
+    code 0 if nothing is wrong, 1 if something is, 2 if the scene cannot be read.
 
+    Example:
         hapticbridge check my_tool.xml --lean --plot lean.png --write lean.xml
     """
 
-    scene: tyro.conf.Positional[str]
+    FIRST_OPTIONS: ClassVar = (
+        "scene",
+        "settings",
+        "grip",
+        "motion",
+        "workspace",
+        "plot",
+        "lean",
+        "budget",
+        "write",
+        "as_json",
+    )
+
+    scene: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="SCENE")]
     """An MJCF file, or a scene's name (see 'hapticbridge scenes')."""
     settings: Annotated[
         tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(name="set", metavar="NAME=VALUE")

@@ -18,12 +18,13 @@ from hapticbridge.quantity import quantity
 
 @dataclass(frozen=True, slots=True)
 class Export:
-    """Write a recording as a table for other programs: a row per tick, units in the metadata.
+    """Write a recording as Parquet, CSV or HDF5.
 
-    Parquet keeps units in the columns' metadata, CSV in a file .json beside it, HDF5 in attributes;
-    metadata and events go along. Exit code 1 if the recording is damaged: what can be read is
-    written. Example:
+    The table has a row per tick. Parquet keeps units in the columns' metadata, CSV in a file .json
+    beside it, HDF5 in attributes; metadata and events go along. Exit code 1 if the recording is
+    damaged: what can be read is written.
 
+    Example:
         hapticbridge export run.mcap --to parquet
     """
 
@@ -59,11 +60,12 @@ class Export:
 
 @dataclass(frozen=True, slots=True)
 class Compare:
-    """Say where two recorded runs part: first tick, field and size.
+    """Find the first tick and field where two runs differ.
 
     Ticks are compared bit by bit, without the times of the clock; runs at different rates where
-    their ticks coincide. Exit code 0 if both are the same run, 1 if not. Example:
+    their ticks coincide. Exit code 0 if both are the same run, 1 if not.
 
+    Example:
         hapticbridge compare before.mcap after.mcap
     """
 

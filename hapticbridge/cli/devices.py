@@ -8,23 +8,19 @@ from typing import Annotated, Any
 import tyro
 
 from hapticbridge.cli.terminal import out, plain, print_json
-from hapticbridge.device.families import (
-    FAMILIES,
-    RULES_FILE,
-    blind_spots,
-    plugged_devices,
-    udev_rules,
-)
+from hapticbridge.device.discovery import RULES_FILE, blind_spots, plugged_devices, udev_rules
+from hapticbridge.device.families import all_families
 from hapticbridge.device.plugged import RULES_COMMAND, Plugged
 from hapticbridge.errors import HapticBridgeError
 
 
 @dataclass(frozen=True, slots=True)
 class Devices:
-    """List the haptic devices that are plugged in, and those that are supported.
+    """List the haptic devices plugged in and supported.
 
-    Says of each that cannot be opened what is missing. Moves no motor. Example:
+    For a device that cannot be opened, says what is missing. Moves no motor.
 
+    Example:
         hapticbridge devices --udev-rules | sudo tee /etc/udev/rules.d/70-hapticbridge.rules
     """
 
@@ -45,7 +41,7 @@ class Devices:
             print_json(_facts(plugged, unseen))
             return 0
         out.print("[bold]supported[/bold]")
-        for family in FAMILIES:
+        for family in all_families():
             out.print(f"{family.name}: {plain(family.about)}")
             out.print(f"  axes {family.axes}; force {family.force}; rate {family.rate}")
             if family.on_stall:
@@ -94,7 +90,7 @@ def _facts(plugged: list[Plugged], unseen: list[str]) -> dict[str, Any]:
                 "medium": None if family.medium is None else family.medium(),
                 "ids": [{"id": str(usb_id), "model": usb_id.model} for usb_id in family.ids],
             }
-            for family in FAMILIES
+            for family in all_families()
         ],
         "plugged": [asdict(device) for device in plugged],
         "warnings": unseen,

@@ -17,10 +17,12 @@ _MARKS = {True: "[green]good[/green]", False: "[yellow]mend[/yellow]", None: "no
 
 @dataclass(frozen=True, slots=True)
 class Doctor:
-    """Measure whether this machine holds the loop's rate, and say what stands in the way.
+    """Measure whether this machine holds the loop's rate.
 
-    Needs no device and moves no motor. The exit code is 1 where the verdict is 'unfit'. Example:
+    Says what stands in the way. Needs no device and moves no motor. The exit code is 1 where the
+    verdict is 'unfit'.
 
+    Example:
         hapticbridge doctor --rate 2000 --duration 60
     """
 

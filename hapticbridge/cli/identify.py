@@ -36,12 +36,14 @@ from hapticbridge.study.theory import draw_z_width
 
 @dataclass(frozen=True, slots=True)
 class Identify:
-    """Measure a device's mass, damping, friction, resolution and delay: let go of it first.
+    """Measure a device's mass, damping, friction, resolution and delay.
 
-    Each axis moves by itself for some seconds, with little force and travel; Ctrl-C leaves no
-    force. A hand that moves or holds is refused; one that only damps cannot be told from the
-    device, and makes its damping too large. The result is a profile, which 'run' takes by itself
-    for the same unit. Example:
+    Let go of the device first. Each axis moves by itself for some seconds, with little force and
+    travel; Ctrl-C leaves no force. A hand that moves or holds is refused; one that only damps
+    cannot be told from the device, and makes its damping too large. The result is a profile, which
+    'run' takes by itself for the same unit.
+
+    Example:
         hapticbridge identify simulated:hand=none,damping=1.5,friction=0.1 --plot fit.png
     """
 

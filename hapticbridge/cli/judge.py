@@ -46,8 +46,9 @@ class Audit:
     the margin: the least share left, of the slack and of the device's damping; negative beyond the
     limit. What is no recording is named and passed over; Ctrl-C ends with the table of what was
     judged by then. Exit code 0 if all are passive and no device lacks damping, 1 if not, 2 if a
-    file is no recording; with --what-if it is that of the changed runs. Examples:
+    file is no recording; with --what-if it is that of the changed runs.
 
+    Examples:
         hapticbridge audit run.mcap --plot run.png
         hapticbridge audit runs/ --jobs 4 --table runs.parquet
         hapticbridge audit run.mcap --what-if stiffness=3000 --what-if rate=500
@@ -217,10 +218,11 @@ def _print_report(report: AuditReport) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Repair:
-    """Make a whole file of a recording that was cut by a crash.
+    """Make a whole file of a recording that a crash cut.
 
-    All whole chunks are kept, and an event says what was done. Example:
+    All whole chunks are kept, and an event says what was done.
 
+    Example:
         hapticbridge repair cut.mcap whole.mcap
     """
 

@@ -1,43 +1,218 @@
-"""The entry point: in charge before the rest is imported, which takes seconds."""
+"""Entry point of the command line: table of commands, their help, exit codes and error messages.
+
+Commands import seconds' worth of libraries. ``main`` therefore imports a command's module when that
+command is called, and none for ``--version`` and ``--help``.
+"""
 
 from __future__ import annotations
 
+import errno
+import importlib
 import os
 import sys
 from collections.abc import Sequence
+from typing import Any, NamedTuple
 
-from hapticbridge.signals import leaving_on_interrupt
+from hapticbridge.errors import HapticBridgeError, SafetyTrip
 
-USAGE_ERROR, INTERRUPTED = 2, 130
+DONE, READER_GONE, USAGE_ERROR, SAFETY_TRIP, INTERRUPTED = 0, 1, 2, 3, 130
 
-_RENDERERS = {
-    "linux": "'egl', 'osmesa', 'glfw', 'glx'",
-    "darwin": "'cgl', 'glfw'",
-    "win32": "'wgl', 'glfw'",
+
+class Entry(NamedTuple):
+    """One command: its class has the command's name with a capital.
+
+    Attributes:
+        group: Heading in the top-level help.
+        module: Module in ``hapticbridge.cli`` that holds the command's class.
+        summary: First line of the class's docstring, without importing it.
+    """
+
+    group: str
+    module: str
+    summary: str
+
+
+COMMANDS = {
+    "run": Entry("Scenes", "run", "Put a scene behind a haptic device and feel it."),
+    "scenes": Entry("Scenes", "scenes", "List the scenes, or the parameters of one."),
+    "check": Entry(
+        "Scenes", "check", "Find what is wrong with a scene, and what a tick of it costs."
+    ),
+    "audit": Entry(
+        "Recordings", "judge", "Judge recorded runs offline: passive, active or invalid, and why."
+    ),
+    "view": Entry("Recordings", "view", "Show a recorded run in a browser."),
+    "render": Entry("Recordings", "render", "Draw a recorded run: a picture, or a film of it."),
+    "compare": Entry("Recordings", "data", "Find the first tick and field where two runs differ."),
+    "export": Entry("Recordings", "data", "Write a recording as Parquet, CSV or HDF5."),
+    "repair": Entry("Recordings", "judge", "Make a whole file of a recording that a crash cut."),
+    "devices": Entry("Devices", "devices", "List the haptic devices plugged in and supported."),
+    "identify": Entry(
+        "Devices", "identify", "Measure a device's mass, damping, friction, resolution and delay."
+    ),
+    "doctor": Entry("Devices", "doctor", "Measure whether this machine holds the loop's rate."),
+    "bound": Entry("Theory", "bound", "Compute the device damping that a coupling needs."),
+    "zwidth": Entry(
+        "Theory", "zwidth", "Compute the stiffness and damping that a device can show."
+    ),
+    "stability": Entry(
+        "Theory", "stability", "Map where ways to render a tool lose passivity or stability."
+    ),
+    "chart": Entry(
+        "Theory", "chart", "Chart the cost of ways to simulate a scene against their error."
+    ),
 }
-"""What MuJoCo takes as ``MUJOCO_GL`` per system, beside 'disable'."""
+"""Commands by name, in the order of the top-level help."""
+
+_FULL = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT)
+"""Errors of a full disk, a file over its limit, a user over quota. They name no file."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs ``hapticbridge``; returns the exit code.
 
     0 done, 1 done with a negative verdict, 2 bad input or usage, 3 safety trip, 130 interrupted.
+
+    Args:
+        arguments: Words after the program's name; None takes those of the process.
     """
+    words = list(sys.argv[1:] if arguments is None else arguments)
     try:
-        try:
-            with leaving_on_interrupt(INTERRUPTED):
-                from hapticbridge.cli.dispatch import dispatch  # noqa: PLC0415 - takes seconds
-        except RuntimeError as error:
-            if "MUJOCO_GL" not in str(error):
-                raise
-            asked, valid = os.environ.get("MUJOCO_GL"), _RENDERERS.get(sys.platform, "'glfw'")
-            print(
-                f"error: the environment variable MUJOCO_GL is {asked!r}, which MuJoCo does not "
-                f"know; unset it, or set it to {valid} or 'disable'",
-                file=sys.stderr,
-            )
-            return USAGE_ERROR
-        return dispatch(arguments)
+        if words[:1] == ["--version"]:
+            code = _print_version()
+        elif not words or words[0] in {"-h", "--help", "--help-all"}:
+            print(_top_level_help(), file=sys.stdout if words else sys.stderr, flush=True)
+            code = DONE if words else USAGE_ERROR
+        elif words[0] not in COMMANDS:
+            code = _refuse(words[0])
+        else:
+            code = _execute(words[0], words[1:])
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
-        return INTERRUPTED
+        code = INTERRUPTED
+    except SafetyTrip as trip:
+        from hapticbridge.guard import with_remedy  # noqa: PLC0415 - imports numba
+
+        code = _say("safety trip", with_remedy(str(trip)), SAFETY_TRIP)
+    except HapticBridgeError as error:
+        code = _say("error", error)
+    except BrokenPipeError:  # as in 'hapticbridge --help | head'
+        _discard_output()
+        code = READER_GONE
+    except OSError as error:
+        if error.filename is None and error.errno not in _FULL:
+            raise
+        if error.filename is None:
+            _discard_output()
+        where = "cannot write" if error.filename is None else f"'{error.filename}'"
+        code = _say("error", f"{where}: {error.strerror}")
+    return code
+
+
+def _execute(name: str, words: list[str]) -> int:
+    command = _parsed(_command_class(name), name, words)
+    from hapticbridge.cli.terminal import warnings_in_a_sentence  # noqa: PLC0415 - imports rich
+
+    with warnings_in_a_sentence():
+        return int(command.execute())
+
+
+def _command_class(name: str) -> type[Any]:
+    """Imports the command's module and returns its class."""
+    try:
+        module = importlib.import_module(f"hapticbridge.cli.{COMMANDS[name].module}")
+    except RuntimeError as error:
+        if "MUJOCO_GL" not in str(error):
+            raise
+        raise HapticBridgeError(
+            f"the environment variable MUJOCO_GL is {os.environ.get('MUJOCO_GL')!r}, which MuJoCo "
+            "does not know; unset it, or set it to 'egl', 'osmesa', 'glfw' or 'disable'"
+        ) from None
+    command: type[Any] = getattr(module, name.capitalize())
+    return command
+
+
+def _parsed(command: type[Any], name: str, words: list[str]) -> Any:
+    """Returns the command with its options; ``--help`` prints and exits."""
+    import inspect  # noqa: PLC0415 - not for --version and --help
+
+    import tyro  # noqa: PLC0415
+
+    description = inspect.getdoc(command) or ""
+    if "--help-all" in words:
+        words = ["--help"]
+    elif {"-h", "--help"} & set(words):
+        command, hidden = _with_first_options(command)
+        if hidden:
+            description += f"\n\n{hidden} more options: hapticbridge {name} --help-all"
+    return tyro.cli(
+        command,
+        prog=f"hapticbridge {name}",
+        description=description,
+        args=words,
+        config=(
+            tyro.conf.OmitSubcommandPrefixes,
+            tyro.conf.FlagCreatePairsOff,
+            tyro.conf.DisallowNone,
+        ),
+    )
+
+
+def _with_first_options(command: type[Any]) -> tuple[type[Any], int]:
+    """Returns a class whose help shows the command's ``FIRST_OPTIONS`` only, and the others' count.
+
+    A command without ``FIRST_OPTIONS`` has few options and shows all of them.
+    """
+    from dataclasses import fields, make_dataclass  # noqa: PLC0415 - for a command's help alone
+    from typing import Annotated, get_type_hints  # noqa: PLC0415
+
+    import tyro  # noqa: PLC0415
+
+    hints = get_type_hints(command, include_extras=True)
+    first = getattr(command, "FIRST_OPTIONS", hints)
+    hidden = [
+        (field.name, Annotated[hints[field.name], tyro.conf.Suppress], field)
+        for field in fields(command)
+        if field.name not in first
+    ]
+    return make_dataclass(command.__name__, hidden, bases=(command,), frozen=True), len(hidden)
+
+
+def _print_version() -> int:
+    from importlib.metadata import version  # noqa: PLC0415 - for --version alone
+
+    print(f"hapticbridge {version('hapticbridge')}, MuJoCo {version('mujoco')}", flush=True)
+    return DONE
+
+
+def _top_level_help() -> str:
+    lines = ["Feel a MuJoCo scene through a haptic device: hapticbridge COMMAND [OPTIONS]"]
+    group = ""
+    for name, entry in COMMANDS.items():
+        if entry.group != group:
+            group = entry.group
+            lines.append(group)
+        lines.append(f"  {name:<11}{entry.summary}")
+    return "\n".join([*lines, "Options of a command, with an example: hapticbridge COMMAND --help"])
+
+
+def _refuse(word: str) -> int:
+    import difflib  # noqa: PLC0415 - for a wrong command alone
+
+    near = difflib.get_close_matches(word, COMMANDS, n=1)
+    kind = "option" if word.startswith("-") else "command"
+    advice = f"did you mean '{near[0]}'?" if near else "'hapticbridge --help' lists the commands"
+    return _say("error", f"there is no {kind} '{word}'; {advice}")
+
+
+def _say(what: str, words: object, code: int = USAGE_ERROR) -> int:
+    """Prints what ended the command on stderr, in one line; returns the exit code."""
+    from hapticbridge.cli.terminal import print_error  # noqa: PLC0415 - imports rich
+
+    print_error(words, what)
+    return code
+
+
+def _discard_output() -> None:
+    """Sends what is left of stdout nowhere; else Python would write it again at exit, and fail."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

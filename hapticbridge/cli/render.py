@@ -15,11 +15,12 @@ from hapticbridge.film import Shot, draw
 
 @dataclass(frozen=True, slots=True)
 class Render:
-    """Draw a recorded run without a display: a picture, or a film of it.
+    """Draw a recorded run: a picture, or a film of it.
 
-    EGL or OSMesa draws, whichever works; MUJOCO_GL chooses. The handle is a ghost, the coupling a
-    line that turns red with its force, the arrow the force in the hand. Examples:
+    No display is needed: EGL or OSMesa draws, and MUJOCO_GL chooses between them. The handle is a
+    ghost, the coupling a line that turns red with its force, the arrow the force in the hand.
 
+    Examples:
         hapticbridge render run.mcap run.png --at 2.5
         hapticbridge render run.mcap run.mp4
         hapticbridge render run.mcap slow.mp4 --start 2 --stop 3 --speed 0.1

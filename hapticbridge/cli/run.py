@@ -9,7 +9,7 @@ from contextlib import ExitStack
 from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import tyro
 
@@ -35,12 +35,27 @@ from hapticbridge.view.window import BY
 class Run:
     """Put a scene behind a haptic device and feel it.
 
-    Ctrl-C stops cleanly: zero force first, then the recording is closed. Example:
+    Ctrl-C stops cleanly: zero force first, then the recording is closed.
 
+    Example:
         hapticbridge run peg_in_hole --duration 8 --record run.mcap
     """
 
-    scene: tyro.conf.Positional[str]
+    FIRST_OPTIONS: ClassVar = (
+        "scene",
+        "settings",
+        "device",
+        "duration",
+        "record",
+        "overwrite",
+        "fast",
+        "stiffness",
+        "damping",
+        "view",
+        "as_json",
+    )
+
+    scene: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="SCENE")]
     """An MJCF file, or a scene's name (see 'hapticbridge scenes')."""
     settings: Annotated[
         tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(name="set", metavar="NAME=VALUE")

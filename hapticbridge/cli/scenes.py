@@ -22,11 +22,12 @@ from hapticbridge.scene import (
 
 @dataclass(frozen=True, slots=True)
 class Scenes:
-    """List the scenes that come with hapticbridge, or the parameters of one.
+    """List the scenes, or the parameters of one.
 
-    Any of them, or any MJCF file, can be given to 'hapticbridge run', and its parameters set with
-    '--set'. Example:
+    Any scene of the list, or any MJCF file, can be given to 'hapticbridge run', and its parameters
+    set with '--set'.
 
+    Example:
         hapticbridge scenes peg_in_hole
     """
 

@@ -19,12 +19,13 @@ ALL = "all"
 
 @dataclass(frozen=True, slots=True)
 class Stability:
-    """Map where ways to render a tool lose passivity or stability, theory on top of measurement.
+    """Map where ways to render a tool lose passivity or stability.
 
-    Writes NAME.png, NAME.csv and NAME.json into the folder. What is done stays in NAME.parts:
-    begun again after a stop, a map goes on from there. After a change of hapticbridge or MuJoCo the
-    old parts are refused: give another folder or delete them. Example:
+    Theory is drawn on top of measurement. Writes NAME.png, NAME.csv and NAME.json into the folder.
+    What is done stays in NAME.parts: begun again after a stop, a map goes on from there. After a
+    change of hapticbridge or MuJoCo the old parts are refused: give another folder or delete them.
 
+    Example:
         hapticbridge stability coupling --out maps
     """
 

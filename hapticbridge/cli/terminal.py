@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import json
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING, TextIO
 
-from matplotlib.figure import Figure
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from hapticbridge.jsonable import jsonable
-from hapticbridge.picture import write_picture
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 out = Console(highlight=False, soft_wrap=True)
 """Results, on stdout."""
@@ -35,9 +37,40 @@ def tell(sentence: str) -> None:
     err.print(plain(sentence))
 
 
-def print_error(error: Exception) -> None:
-    """Prints what went wrong on stderr, in one line."""
-    err.print(f"[red]error:[/red] {plain(' '.join(str(error).splitlines()))}")
+def print_error(error: object, what: str = "error") -> None:
+    """Prints what went wrong on stderr, in one line that begins with ``what``."""
+    err.print(f"[red]{what}:[/red] {plain(' '.join(str(error).splitlines()))}")
+
+
+@contextmanager
+def warnings_in_a_sentence() -> Iterator[None]:
+    """Prints Python's and MuJoCo's warnings; MuJoCo would write MUJOCO_LOG.TXT beside the user."""
+    import mujoco  # noqa: PLC0415 - messages of the command line itself need none
+
+    before = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(_print_mujoco_warning)
+    try:
+        with warnings.catch_warnings():
+            warnings.showwarning = _show_warning  # type: ignore[assignment] # names differ
+            yield
+    finally:
+        mujoco.set_mju_user_warning(before)
+
+
+def _print_mujoco_warning(message: str) -> None:
+    err.print(f"[yellow]MuJoCo warns:[/yellow] {escape(message)}")
+
+
+def _show_warning(
+    message: Warning | str,
+    category: type[Warning],
+    _filename: str,
+    _lineno: int,
+    _file: TextIO | None = None,
+    _line: str | None = None,
+) -> None:
+    if issubclass(category, UserWarning):
+        err.print(f"[yellow]warning:[/yellow] {escape(str(message))}")
 
 
 @contextmanager
@@ -50,6 +83,13 @@ def progress(words: str) -> Iterator[Callable[..., None]]:
     Args:
         words: What runs.
     """
+    from rich.progress import (  # noqa: PLC0415 - a run shows none
+        BarColumn,
+        Progress,
+        TextColumn,
+        TimeRemainingColumn,
+    )
+
     columns = TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn()
     with Progress(*columns, console=err, transient=True, disable=not err.is_terminal) as bar:
         task = bar.add_task(words, total=None)
@@ -63,6 +103,8 @@ def progress(words: str) -> Iterator[Callable[..., None]]:
 
 def write_figure(figure: Figure, path: Path) -> None:
     """Writes a picture and says so on stderr."""
+    from hapticbridge.picture import write_picture  # noqa: PLC0415 - imports matplotlib
+
     with err.status("drawing …"):
         write_picture(figure, path)
     err.print(f"wrote {plain(str(path))}")

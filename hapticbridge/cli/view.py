@@ -17,10 +17,12 @@ from hapticbridge.view.window import check_view
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """Look at a recorded run in a browser: the scene, the coupling, curves, a slider for the time.
+    """Show a recorded run in a browser.
 
-    The page is there until Ctrl-C. Needs the extra 'view'. Example:
+    The page has the scene, the coupling, curves and a slider for the time. It is there until
+    Ctrl-C. Needs the extra 'view'.
 
+    Example:
         hapticbridge view run.mcap
     """
 

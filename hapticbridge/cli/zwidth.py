@@ -42,11 +42,12 @@ def next_command(stiffness: float, damping: float, rate: float) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Zwidth:
-    """Which stiffness and damping a device can show at a rate, and which to use.
+    """Compute the stiffness and damping that a device can show.
 
-    Every line that limits it is named, with the command that uses the coupling. With --measure the
-    limits are also tried on a device, and drawn beside the lines. Examples:
+    Every limit is named, with the command that uses the recommended coupling. With --measure the
+    limits are also tried on a device, and drawn beside the lines.
 
+    Examples:
         hapticbridge zwidth --damping 2 --mass 0.1 --friction 0.05 --resolution 1e-5 --plot out.png
         hapticbridge zwidth --measure simulated:hand=none --plot out.png
     """

@@ -2,10 +2,10 @@
 
 Read ``base`` (four calls) and ``data_sheet`` (what is known of a device) first, then ``simulated``
 and ``trajectory``, which need no hardware, then a real driver; ``rawhid`` is the plainest. Real
-ones stand on ``transport``, which carries their bytes and finds them. ``families`` lists them,
-``plugged`` says what of them is there; ``library`` opens one by its ``specification`` and fills in
-its sheet from a ``profile`` (``profile_search``). What all share is in ``lateness``, ``silence``
-and ``last_word``.
+ones stand on ``transport``, which carries their bytes and finds them. ``families`` is the table of
+their drivers, ``discovery`` lists those that are plugged in; ``library`` opens one by its
+``specification`` and fills in its sheet from a ``profile`` (``profile_search``). What all share is
+in ``lateness``, ``silence`` and ``last_word``.
 """
 
 from hapticbridge.device.base import Device as Device

@@ -1,93 +1,31 @@
-"""All hardware that there is a codec for: what is supported, what is plugged in, and its rules."""
+"""Table of the hardware drivers. A driver is imported when one of its devices is asked for."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from importlib import import_module
 
-from hapticbridge.device.falcon.finding import FAMILY as FALCON
-from hapticbridge.device.forcedimension.finding import FAMILY as FORCE_DIMENSION
-from hapticbridge.device.haply.finding import FAMILY as HAPLY
-from hapticbridge.device.pid.driver import FAMILY as PID
-from hapticbridge.device.plugged import Family, Plugged, UsbId
-from hapticbridge.device.rawhid.finding import FAMILY as RAWHID
-from hapticbridge.device.spacemouse.driver import FAMILY as SPACEMOUSE
-from hapticbridge.device.transport import hid_search, usb_search
+from hapticbridge.device.plugged import Family
 
-FAMILIES: tuple[Family, ...] = (FALCON, SPACEMOUSE, RAWHID, PID, HAPLY, FORCE_DIMENSION)
-"""In the order in which they are listed."""
-
-RULES_FILE = "/etc/udev/rules.d/70-hapticbridge.rules"
-"""Where the rules go. The number must be below 73: ``73-seat-late.rules`` is what turns the tag
-``uaccess`` into a permission, and rules are read in the order of their names."""
+DRIVERS = {
+    "falcon": "hapticbridge.device.falcon.finding",
+    "spacemouse": "hapticbridge.device.spacemouse.driver",
+    "rawhid": "hapticbridge.device.rawhid.finding",
+    "pid": "hapticbridge.device.pid.driver",
+    "haply": "hapticbridge.device.haply.finding",
+    "forcedimension": "hapticbridge.device.forcedimension.finding",
+}
+"""Module of each family by the family's name, in the order in which families are listed. The module
+holds the ``Family`` as ``FAMILY``."""
 
 
 def family_named(name: str) -> Family | None:
     """Returns the family that ``open_device`` knows by a name, or None."""
-    return next((family for family in FAMILIES if family.name == name), None)
+    if name not in DRIVERS:
+        return None
+    family: Family = import_module(DRIVERS[name]).FAMILY
+    return family
 
 
-def plugged_devices() -> list[Plugged]:
-    """Lists every device of every family that is plugged in; empty where there is no USB."""
-    return [device for family in FAMILIES for device in plugged_of(family)]
-
-
-def plugged_of(family: Family) -> list[Plugged]:
-    """Lists a family's devices that are plugged in, with what keeps each from being opened."""
-    if family.find is not None:
-        return family.find()
-    if family.transport == "hid":
-        return hid_search.find(family)
-    return usb_search.find(family)
-
-
-def blind_spots() -> list[str]:
-    """Says what keeps devices from being seen at all, one sentence each; empty where nothing."""
-    spots = []
-    if hid_search.hid_api() is None:
-        spots.append("hidapi cannot be loaded, so HID devices are not seen: 'pip install hidapi'")
-    if usb_search.libusb() is None:
-        spots.append(
-            "libusb cannot be loaded, so USB devices cannot be opened: 'pip install libusb-package'"
-        )
-    return spots
-
-
-def udev_rules(families: Sequence[Family] = FAMILIES) -> str:
-    """Returns the udev rules that let whoever sits at the machine open these devices.
-
-    A HID device is matched by its kernel name, ``BUS:VENDOR:PRODUCT.NUMBER``, which it has over
-    Bluetooth too, where there is no USB parent to look at. A rule cannot ask a device what it can
-    do, so a family that is a class gets a rule for each of its devices that is plugged in.
-    """
-    lines = [
-        "# Lets whoever sits at the machine open haptic devices. Written by",
-        "# 'hapticbridge devices --udev-rules'. Its number must stay below 73: 73-seat-late.rules",
-        "# turns the tag into a permission. To install it:",
-        f"#   hapticbridge devices --udev-rules | sudo tee {RULES_FILE}",
-        "#   sudo udevadm control --reload && sudo udevadm trigger",
-    ]
-    for family in families:
-        if not family.ids and family.recognises is None:
-            continue  # no node to open: a program of the maker's has it
-        lines += ["", f"# {family.name}: {family.about}"]
-        ids = family.ids if family.recognises is None else _ids_plugged_in(family)
-        if not ids:
-            lines.append("# none is plugged in: plug it in, and write these rules again")
-        for usb_id in ids:
-            vendor, product = f"{usb_id.vendor:04x}", f"{usb_id.product:04x}"
-            if family.transport == "hid":
-                kernels = f"*:{vendor}:{product}.*".upper()
-                match = f'SUBSYSTEM=="hidraw", KERNELS=="{kernels}"'
-            else:
-                match = (
-                    'SUBSYSTEM=="usb", ENV{DEVTYPE}=="usb_device", '
-                    f'ATTR{{idVendor}}=="{vendor}", ATTR{{idProduct}}=="{product}"'
-                )
-            lines += [f"# {usb_id.model}", f'{match}, TAG+="uaccess"']
-    return "\n".join(lines) + "\n"
-
-
-def _ids_plugged_in(family: Family) -> tuple[UsbId, ...]:
-    """Returns the products of a family that are plugged in, each once."""
-    found = {(one.vendor, one.product): one.name for one in plugged_of(family)}
-    return tuple(UsbId(*numbers, name) for numbers, name in sorted(found.items()))
+def all_families() -> tuple[Family, ...]:
+    """Returns every family; imports all drivers."""
+    return tuple(family for name in DRIVERS if (family := family_named(name)) is not None)

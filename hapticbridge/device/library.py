@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from hapticbridge.device.base import Device
-from hapticbridge.device.families import FAMILIES, family_named
+from hapticbridge.device.families import DRIVERS, family_named
 from hapticbridge.device.plugged import Tell, tell_nobody
 from hapticbridge.device.profile_search import modelled, profile_named, profile_of
 from hapticbridge.device.simulated.driver import SimulatedDevice
@@ -85,7 +85,7 @@ def open_device(spec: str, *, tell: Tell = tell_nobody, **options: object) -> De
             raise
         return device
     if name not in _OPENERS:
-        names = choices([*_OPENERS, *(family.name for family in FAMILIES)])
+        names = choices([*_OPENERS, *DRIVERS])
         raise DeviceError(f"unknown device '{name}'; there are {names}")
     return _OPENERS[name](rest, options)
 

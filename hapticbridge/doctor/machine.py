@@ -7,7 +7,7 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
-from hapticbridge.device.families import blind_spots, plugged_devices
+from hapticbridge.device.discovery import blind_spots, plugged_devices
 from hapticbridge.realtime import Grant
 from hapticbridge.realtime.remedies import CAPABILITIES, LASTING, SHELL
 

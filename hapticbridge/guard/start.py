@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from hapticbridge.clock import Clock, RealClock, SimulatedClock
 from hapticbridge.device import Device, DeviceInfo
-from hapticbridge.device.families import family_named
+from hapticbridge.device.families import DRIVERS
 from hapticbridge.errors import DeviceError
 from hapticbridge.guard.limits import Limits
 from hapticbridge.kernel.handle import handle_pose
@@ -88,7 +88,7 @@ def refuse_simulated_time(device: DeviceInfo | str, clock: Clock) -> None:
     """
     if isinstance(device, str):
         name = device.partition(":")[0]
-        is_bound = family_named(name) is not None
+        is_bound = name in DRIVERS
     else:
         name = device.name
         follows = device.is_prescribed and device.delay != 0.0 and device.duration is None

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import optimize
 
 from hapticbridge.arguments import shown
 from hapticbridge.coupling import Coupling
@@ -166,6 +165,8 @@ class SampledLoop:
         best = int(np.flatnonzero(needed >= most - FLATNESS * abs(most))[-1])
         if best in {0, theta.size - 1}:
             return float(theta[best] / self.period)
+        from scipy import optimize  # noqa: PLC0415 - 0.3 s, for this search alone
+
         found = optimize.minimize_scalar(
             lambda angle: -float(self.damping_spectrum(angle / self.period)),
             bounds=(theta[best - 1], theta[best + 1]),

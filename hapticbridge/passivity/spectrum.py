@@ -8,11 +8,10 @@ digits at low frequency.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import signal
 
 from hapticbridge.arguments import LARGEST, shown
 from hapticbridge.coupling import Coupling
@@ -24,6 +23,9 @@ from hapticbridge.passivity.transfer import (
     angles,
     coupling_transfer,
 )
+
+if TYPE_CHECKING:
+    from scipy import signal
 
 Transfer = Callable[[NDArray[np.complex128]], Any]
 """A transfer function of z, from the handle's position in m to the force in N."""
@@ -141,25 +143,7 @@ def damping_spectrum_of(
     period = scalar("period", period, "s", positive=True)
     theta = angles(frequency, period)
     z = np.exp(1j * theta)
-    if isinstance(transfer, signal.lti):
-        raise CouplingError(
-            "the transfer function is continuous in time; discretise it, for example with "
-            "scipy.signal.cont2discrete"
-        )
-    if isinstance(transfer, signal.dlti):
-        if transfer.dt is not True and not np.isclose(transfer.dt, period, rtol=1e-9, atol=0):
-            raise CouplingError(
-                f"the transfer function is sampled every {transfer.dt:g} s, not every {period:g} s"
-            )
-        rational = transfer.to_tf()
-        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):  # a pole is refused
-            value = np.polyval(rational.num, z) / np.polyval(rational.den, z)
-    elif callable(transfer):
-        value = transfer(z)
-    else:
-        raise CouplingError(
-            f"transfer is {shown(transfer)}; it must be a callable of z or a scipy.signal system"
-        )
+    value = transfer(z) if callable(transfer) else _value_of_system(transfer, period, z)
     try:
         given = np.asarray(value)
     except (TypeError, ValueError):  # as rows of different lengths
@@ -174,3 +158,28 @@ def damping_spectrum_of(
     if not (np.abs(response) <= LARGEST**2).all():
         raise CouplingError("the transfer function is not finite at one of the frequencies")
     return plain(needed_for_any_environment(response, period, theta))
+
+
+def _value_of_system(
+    system: signal.dlti, period: float, z: NDArray[np.complex128]
+) -> NDArray[np.complex128]:
+    """Returns the transfer function of a discrete ``scipy.signal`` system, evaluated at z."""
+    from scipy import signal  # noqa: PLC0415 - takes 0.6 s; who passes such a system has it
+
+    if isinstance(system, signal.lti):
+        raise CouplingError(
+            "the transfer function is continuous in time; discretise it, for example with "
+            "scipy.signal.cont2discrete"
+        )
+    if not isinstance(system, signal.dlti):
+        raise CouplingError(
+            f"transfer is {shown(system)}; it must be a callable of z or a scipy.signal system"
+        )
+    if system.dt is not True and not np.isclose(system.dt, period, rtol=1e-9, atol=0):
+        raise CouplingError(
+            f"the transfer function is sampled every {system.dt:g} s, not every {period:g} s"
+        )
+    rational = system.to_tf()
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):  # a pole is refused
+        value: NDArray[np.complex128] = np.polyval(rational.num, z) / np.polyval(rational.den, z)
+    return value

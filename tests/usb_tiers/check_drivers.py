@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 import hapticbridge as hb
 from hapticbridge.device import Device
-from hapticbridge.device.families import plugged_devices
+from hapticbridge.device.discovery import plugged_devices
 from hapticbridge.errors import DeviceError, DeviceLost, SafetyTrip
 from hapticbridge.tick import SAMPLE_DTYPE
 from usb_tiers.benches import (

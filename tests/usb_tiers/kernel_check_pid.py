@@ -17,7 +17,7 @@ from emulated.guest import NO_PIDFF
 from emulated.pid_model import PidStick
 
 import hapticbridge as hb
-from hapticbridge.device.families import plugged_devices
+from hapticbridge.device.discovery import plugged_devices
 from usb_tiers.benches import NEWTONS, STICK, free_stick
 from usb_tiers.conftest import Plug
 from usb_tiers.waiting import wait_for

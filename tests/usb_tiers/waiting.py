@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 from typing import TypeVar
 
-from hapticbridge.device.families import plugged_devices
+from hapticbridge.device.discovery import plugged_devices
 from hapticbridge.device.plugged import Plugged
 
 _Found = TypeVar("_Found")

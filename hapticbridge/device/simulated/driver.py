@@ -8,7 +8,6 @@ from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from hapticbridge.device.data_sheet import (
     AXES,
@@ -251,6 +250,8 @@ class SimulatedDevice:
         if not self._is_started or state["tick"] > 0:
             raise DeviceError("a device is displaced after its start and before its first sample")
         state["position"] += offset[:3]
+        from scipy.spatial.transform import Rotation  # noqa: PLC0415 - 0.3 s, and no run needs it
+
         x, y, z, w = Rotation.from_rotvec(offset[3:]).as_quat(canonical=True)
         state["quaternion"] = w, x, y, z
 

@@ -1,0 +1,78 @@
+"""Supported hardware that is plugged in, and the udev rules that let a user open it."""
+
+from __future__ import annotations
+
+from hapticbridge.device.families import all_families
+from hapticbridge.device.plugged import Family, Plugged, UsbId
+from hapticbridge.device.transport import hid_search, usb_search
+
+RULES_FILE = "/etc/udev/rules.d/70-hapticbridge.rules"
+"""Where the rules go. The number must be below 73: ``73-seat-late.rules`` is what turns the tag
+``uaccess`` into a permission, and rules are read in the order of their names."""
+
+
+def plugged_devices() -> list[Plugged]:
+    """Lists every device of every family that is plugged in; empty where there is no USB."""
+    return [device for family in all_families() for device in plugged_of(family)]
+
+
+def plugged_of(family: Family) -> list[Plugged]:
+    """Lists a family's devices that are plugged in, with what keeps each from being opened."""
+    if family.find is not None:
+        return family.find()
+    if family.transport == "hid":
+        return hid_search.find(family)
+    return usb_search.find(family)
+
+
+def blind_spots() -> list[str]:
+    """Says what keeps devices from being seen at all, one sentence each; empty where nothing."""
+    spots = []
+    if hid_search.hid_api() is None:
+        spots.append("hidapi cannot be loaded, so HID devices are not seen: 'pip install hidapi'")
+    if usb_search.libusb() is None:
+        spots.append(
+            "libusb cannot be loaded, so USB devices cannot be opened: 'pip install libusb-package'"
+        )
+    return spots
+
+
+def udev_rules() -> str:
+    """Returns the udev rules that let whoever sits at the machine open these devices.
+
+    A HID device is matched by its kernel name, ``BUS:VENDOR:PRODUCT.NUMBER``, which it has over
+    Bluetooth too, where there is no USB parent to look at. A rule cannot ask a device what it can
+    do, so a family that is a class gets a rule for each of its devices that is plugged in.
+    """
+    lines = [
+        "# Lets whoever sits at the machine open haptic devices. Written by",
+        "# 'hapticbridge devices --udev-rules'. Its number must stay below 73: 73-seat-late.rules",
+        "# turns the tag into a permission. To install it:",
+        f"#   hapticbridge devices --udev-rules | sudo tee {RULES_FILE}",
+        "#   sudo udevadm control --reload && sudo udevadm trigger",
+    ]
+    for family in all_families():
+        if not family.ids and family.recognises is None:
+            continue  # no node to open: a program of the maker's has it
+        lines += ["", f"# {family.name}: {family.about}"]
+        ids = family.ids if family.recognises is None else _ids_plugged_in(family)
+        if not ids:
+            lines.append("# none is plugged in: plug it in, and write these rules again")
+        for usb_id in ids:
+            vendor, product = f"{usb_id.vendor:04x}", f"{usb_id.product:04x}"
+            if family.transport == "hid":
+                kernels = f"*:{vendor}:{product}.*".upper()
+                match = f'SUBSYSTEM=="hidraw", KERNELS=="{kernels}"'
+            else:
+                match = (
+                    'SUBSYSTEM=="usb", ENV{DEVTYPE}=="usb_device", '
+                    f'ATTR{{idVendor}}=="{vendor}", ATTR{{idProduct}}=="{product}"'
+                )
+            lines += [f"# {usb_id.model}", f'{match}, TAG+="uaccess"']
+    return "\n".join(lines) + "\n"
+
+
+def _ids_plugged_in(family: Family) -> tuple[UsbId, ...]:
+    """Returns the products of a family that are plugged in, each once."""
+    found = {(one.vendor, one.product): one.name for one in plugged_of(family)}
+    return tuple(UsbId(*numbers, name) for numbers, name in sorted(found.items()))
