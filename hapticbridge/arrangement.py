@@ -14,9 +14,15 @@ from hapticbridge.clock import Clock, RealClock, period_of
 from hapticbridge.commands import Allowance, CommandQueue
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Device, device_for
-from hapticbridge.guard import Limits, guarding_for, limits_for, refuse_simulated_time
+from hapticbridge.errors import RecordingError
+from hapticbridge.guard import (
+    Limits,
+    button_mask,
+    guarding_for,
+    limits_for,
+    refuse_simulated_time,
+)
 from hapticbridge.inputs import Write
-from hapticbridge.kernel.counts import Counts
 from hapticbridge.kernel.parameters import checked_substeps, refuse_substeps
 from hapticbridge.realtime import wants_real_time
 from hapticbridge.recording.onlooker import Onlooker
@@ -70,8 +76,7 @@ class Arrangement:
         onlooker: Onlooker | None = None,
         pipelined: bool | None = None,
         realtime: bool | None = None,
-        start_state: bytes | None = None,
-        counts: Counts | None = None,
+        mark: int | None = None,
     ) -> None:
         """Checks everything that can be checked before the device is started.
 
@@ -114,10 +119,8 @@ class Arrangement:
             realtime: Ask the system for real time while the loop runs (``realtime.real_time``);
                 what it refuses is warned of once, with the command that grants it. None: for a real
                 device.
-            start_state: State of the scene (``provenance.start_state``) in which the run begins,
-                as a recording begun in mid-run carries it; None: the scene's own start, to which a
-                reset leads in any case.
-            counts: What the guard had counted by then, as such a recording carries it.
+            mark: Number of the button that writes an event ``mark`` into the recording each time it
+                is pressed.
 
         Raises:
             HapticBridgeError: An argument is out of range; the message says which and what is
@@ -131,6 +134,12 @@ class Arrangement:
         self._workspace = Workspace.of(scale, force_scale, axes, is_absolute=absolute)
         self._path = Path(recording) if recording is not None else None
         self._is_live, self._onlooker = live, onlooker
+        self._mark_button = button_mask(mark, "mark")
+        if self._mark_button and self._path is None:
+            raise RecordingError(
+                f"button {mark} is to mark moments of a recording, but nothing is recorded; name a "
+                "file to record to"
+            )
         self.clock = clock or RealClock()
         self._is_pipelined = self.clock.name == RealClock.name if pipelined is None else pipelined
         with ExitStack() as refused:
@@ -173,8 +182,7 @@ class Arrangement:
             refuse_simulated_time(device.info, self.clock)
             self._is_realtime = wants_real_time(realtime, self.clock, is_real=device.info.is_real)
             refused.pop_all()
-        self._contact_stiffness, self._start_state = contact_stiffness, start_state
-        self._start_counts = counts
+        self._contact_stiffness = contact_stiffness
         self._sample = np.zeros(1, SAMPLE_DTYPE)
         self._inputs: deque[list[Write]] = deque()
         # who wants the run to end, and the signal's name if one does; other threads append
@@ -189,8 +197,7 @@ class Arrangement:
             substeps=self._substeps,
             limits=self._limits,
         )
-        can_record = self._path is not None or onlooker is not None or live
-        self._commands = CommandQueue(allowance, can_record=can_record)
+        self._commands = CommandQueue(allowance, is_recorded=self._path is not None)
 
     @property
     def used(self) -> Coupling:

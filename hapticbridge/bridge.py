@@ -77,13 +77,9 @@ class Bridge(Commanded):
                 self._note_grants(stack.enter_context(real_time()))
             try:
                 self._come_to_rest()
-                while True:
-                    self.clock.start(round(self.period * 1e9))
-                    self._slept = slept_ns()
-                    reason = self._loop(on_tick)
-                    if self._pause is None or (reason := reason or self._silence()):
-                        break
-                    self._obey_in_pause()
+                self.clock.start(round(self.period * 1e9))
+                self._slept = slept_ns()
+                reason = self._loop(on_tick)
             except DeviceError as error:
                 reason = f"tick {self._tick}: {error}"
             finally:
@@ -94,7 +90,7 @@ class Bridge(Commanded):
         return self.summary()
 
     def _loop(self, on_tick: Callable[[int], None] | None) -> str:
-        """The ticks, until the end or a pause; returns why the kernel refused one, or nothing."""
+        """Runs the ticks until the end; returns why the kernel refused one, or nothing."""
         state, row = self._binding.state, self._binding.row
         model, data, substeps = self.scene.model, self.scene.data, range(self._substeps)
         stream, records, cursors = self._stream, self._stream.rows, self._stream.cursors
@@ -116,6 +112,8 @@ class Bridge(Commanded):
         )
         is_ahead = self._is_pipelined and can_split(model, self.method.scheme)
         stops = self._stops
+        buttons, mark = sample["buttons"], self._mark_button
+        held = mark  # a button that is held from the start on marks nothing
         next_look, looks = self._tick, max(round(RECORDER_LOOK / self.period), 1)
         while self._tick != self._end and not stops:
             if self._tick >= next_look:
@@ -124,8 +122,8 @@ class Bridge(Commanded):
             deadline, wake, skipped = wait()
             if on_tick is not None:
                 on_tick(self._tick)
-            if (inputs or commands or later) and self._take_changes():
-                return ""
+            if inputs or commands or later:
+                self._take_changes()
             news = outside[0] = read_device(sample)
             read_before, read = read, now()
             elapsed = 1e-9 * (read - read_before)
@@ -140,6 +138,10 @@ class Bridge(Commanded):
                 return trip_reason(code, self._tick)
             write_device(wrench)
             write = now()
+            if mark and buttons[0] & mark != held:
+                held = buttons[0] & mark
+                if held:
+                    self._event("mark", by="button")
             if is_ahead:
                 first_half(model, data)
             flags = news | stream.lost | (self._overrun(skipped) if skipped else 0)

@@ -1,37 +1,23 @@
-"""What a run is asked for while it goes on: inputs of its scene, commands, a recorder."""
+"""Inputs and commands that a run takes while it goes on."""
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
-from pathlib import Path
 from typing import Any, Self
 
 from numpy.typing import ArrayLike
 
-from hapticbridge.clock import RealClock, SimulatedClock
-from hapticbridge.commands import Command, Operator, Record, Repeat
+from hapticbridge.commands import Command, Operator, Repeat
 from hapticbridge.commands.command import Stop
-from hapticbridge.errors import CommandError, RecordingError, SceneError
+from hapticbridge.errors import CommandError, SceneError
 from hapticbridge.inputs import Write, apply_writes, input_writes
-from hapticbridge.kernel.counts import Counts
 from hapticbridge.opened import Opened
-from hapticbridge.provenance import (
-    MODEL_ATTACHMENT,
-    RESET_ATTACHMENT,
-    STATE_ATTACHMENT,
-    start_state,
-)
-from hapticbridge.summary import Summary
 
 
 class Commanded(Opened):
     """A bridge that takes inputs and commands between two ticks, and notes each with its tick."""
 
-    _pause: Record | None = None
-    _earlier_ticks, _end = 0, -1
-    _earlier_fault: tuple[int, str] | None = None
+    _end = -1
 
     def __enter__(self) -> Self:
         super().__enter__()
@@ -88,13 +74,10 @@ class Commanded(Opened):
     def command(self, command: Command, by: str = "caller") -> None:
         """Asks for something while the run goes on; from any thread, or from ``on_tick``.
 
-        It is done between two ticks and recorded with its tick, so that the run can be repeated. A
-        recorder that is started in mid-run gets a run that begins there: with tick 0, energies that
-        are counted from it, and the state that the scene is in, so that its file is audited like
-        any other. While it starts or stops, which takes about half a second, nothing is felt.
+        It is done between two ticks and recorded with its tick, so that the run can be repeated.
 
         Args:
-            command: A coupling, a switch, a reset, a recorder to be started or stopped, an end.
+            command: A coupling, a switch, a reset, a mark in the recording, an end.
             by: Who asks, for the recording.
 
         Raises:
@@ -106,11 +89,6 @@ class Commanded(Opened):
             return
         if not self._is_open:
             raise CommandError("the bridge is not open; nobody would do what is asked for")
-        if isinstance(command, Record):
-            if type(self.clock) not in (RealClock, SimulatedClock):
-                raise CommandError("a clock of another kind cannot begin anew; nothing is recorded")
-            if reason := self._needless(command):
-                raise CommandError(reason)
         self._commands.offer(command, by)
 
     def repeat_commands(self, events: Sequence[Mapping[str, Any]]) -> None:
@@ -147,98 +125,11 @@ class Commanded(Opened):
         while self._stops:
             self._stopped_by, self._signal = self._stops.popleft()
 
-    def summary(self) -> Summary:
-        """Returns what the run was so far; energies count from where it last began anew."""
-        now = super().summary()
-        ticks = now.ticks + self._earlier_ticks
-        duration = now.duration + self._earlier_ticks * self.period
-        fault = self._earlier_fault or now.fault
-        return replace(now, ticks=ticks, duration=duration, fault=fault)
-
-    def _take_changes(self) -> bool:
-        """Takes in what others want changed: between two ticks, and noted with its tick.
-
-        Returns:
-            Whether the loop must pause for it.
-        """
+    def _take_changes(self) -> None:
+        """Takes in what others want changed: between two ticks, and noted with its tick."""
         while self._inputs:
             writes = self._inputs.popleft()
             apply_writes(self.scene.data, writes)
             self._event("input", writes=writes)
         if self._commands.waiting or self._operator.later:
-            self._pause = self._operator.act(self._tick)
-        # asked for twice before the first was done: a pause would leave a hole in the recording
-        if self._pause is not None and (reason := self._needless(self._pause)):
-            self._pause = None
-            self._stream.tell({"event": "refused", "reason": reason})
-        return self._pause is not None
-
-    def _needless(self, record: Record) -> str:
-        """Returns why a recorder need not be started or stopped, or nothing."""
-        if record.on != self._stream.is_recording:
-            return ""
-        return f"this run is {'already' if record.on else 'not'} being recorded"
-
-    def _obey_in_pause(self) -> None:
-        """Starts or stops the recorder while nothing is felt."""
-        record, self._pause = self._pause, None
-        try:
-            if record is not None and record.on:
-                self._begin_anew()
-                self._record()
-            else:
-                self._event("stop", reason="recording stopped", dropped=self._stream.dropped)
-                self._stream.stop_recording()
-        except (RecordingError, OSError) as error:  # a name too long for the disk is one too
-            self._stream.tell({"event": "refused", "reason": str(error)})
-        path = str(self._path) if self._stream.is_recording else None
-        self._stream.tell({"event": "recording", "path": path})
-        if self._tick:
-            self._binding.resume()
-            self._event("resume")
-        else:
-            self._operator.begin(self._repeater, self._guarding.fade_ticks)
-
-    def _begin_anew(self) -> None:
-        """Lets a run begin in the state that the scene is in, with tick 0.
-
-        Energies count from there, but what the guard holds against the device goes on: else it
-        could be given the energy limit with each recorder that is started.
-        """
-        scene, method, counts = self.scene, self.method, Counts.of(self._binding.state)
-        self._earlier_ticks += self._tick
-        self._end -= self._tick if self._end >= 0 else 0
-        self._earlier_fault = self._earlier_fault or self.ledger.fault
-        self._tick, self.clock = 0, type(self.clock)()
-        self._binding.let_go()
-        scene.set_gains(*method.gains(self._operator.used, self.period / self._substeps))
-        state = start_state(scene.model, scene.data).tobytes()
-        self._begin_in(state, self._operator.felt, self.parameters.felt, counts)
-        files = {item.name: item.data for item in self._attachments()}
-        names = (MODEL_ATTACHMENT, STATE_ATTACHMENT, RESET_ATTACHMENT)
-        needed = {name: files[name] for name in names}
-        self._stream.tell(
-            {
-                "event": "begin",
-                "metadata": self._description(),
-                "attachments": {n: base64.b64encode(d).decode() for n, d in needed.items()},
-            }
-        )
-
-    def _record(self) -> None:
-        path = self._next_path()
-        self._stream.record(path, self._description(), self._attachments())
-        self._path = path
-        self._event("start")
-
-    def _next_path(self) -> Path:
-        """Returns the first of NAME.mcap, NAME-2.mcap, NAME-3.mcap … that does not exist."""
-        base = self._path or Path(f"{self.scene.name}.mcap")
-        stem, _, number = base.stem.rpartition("-")
-        if not (stem and number.isdecimal()):
-            stem = base.stem
-        candidate, count = base.with_stem(stem), 1
-        while candidate.exists():
-            count += 1
-            candidate = base.with_stem(f"{stem}-{count}")
-        return candidate
+            self._operator.act(self._tick)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from contextlib import ExitStack
-from dataclasses import replace
 from types import TracebackType
 from typing import Self
 
@@ -19,22 +18,13 @@ from hapticbridge.errors import DeviceError, HapticBridgeError
 from hapticbridge.guard import refuse_stretched_start, wait_until_still
 from hapticbridge.jit import direct
 from hapticbridge.kernel.after import answer_step
-from hapticbridge.kernel.counts import Counts
 from hapticbridge.kernel.layout import STATE_DTYPE
 from hapticbridge.kernel.publish import finish_tick, publish
 from hapticbridge.kernel.state import Binding
 from hapticbridge.kernel.step import before_step
 from hapticbridge.ledger import Ledger
-from hapticbridge.provenance import (
-    MID_RUN,
-    attachments,
-    describe_run,
-    elastic_energy,
-    restore_state,
-    start_state,
-)
+from hapticbridge.provenance import attachments, describe_run, start_state
 from hapticbridge.realtime import Grant, check_pace, memory_at_rest
-from hapticbridge.recording import Attachment
 from hapticbridge.recording.stream import RecordStream
 from hapticbridge.rendering import prepare
 from hapticbridge.summary import Summary
@@ -56,7 +46,7 @@ class Opened(Arrangement):
 
     _tick = _overruns = _skipped = 0
     _stopped_by = _signal = ""
-    _is_open = _is_mid_run = False
+    _is_open = False
     _grants: tuple[Grant, ...] = ()
 
     def __enter__(self) -> Self:
@@ -111,32 +101,19 @@ class Opened(Arrangement):
             self._grants = resources.enter_context(memory_at_rest())
         # last, because from here on the device is held, and its pose counts
         self._sample[:] = self.device.start(self.period)
-        self._reset_state = start_state(scene.model, scene.data).tobytes()
-        self._bind(self.coupling, felt)
-        self._home = self._description()["tool_start"]
-        if self._start_state is not None:
-            counts = self._start_counts
-            if counts is not None:  # what a scene stores at its start is this scene's to say
-                stored = Counts.of(self._binding.state).stored
-                counts = replace(counts, stored=stored)
-            self._begin_in(self._start_state, self.coupling, felt, counts)
+        self._bind(felt)
         refuse_stretched_start(self._binding.state, self._sample, self._limits)
         if self._stream.is_read:
-            self._stream.start(self._description(), self._attachments())
+            self._stream.start(self._description(), attachments(scene))
             self._event("start")
 
-    def _bind(
-        self,
-        coupling: Coupling,
-        felt: Coupling | None,
-        start_elastic: float = 0.0,
-        counts: Counts | None = None,
-    ) -> None:
-        """Lets a run begin in the state in which the scene is."""
+    def _bind(self, felt: Coupling | None) -> None:
+        """Binds the kernel to the scene, whose present state is where the run starts."""
         scene = self.scene
+        start = start_state(scene.model, scene.data).tobytes()
         self.parameters = parameters = run_parameters(
             scene,
-            coupling,
+            self.coupling,
             self.method,
             self._sample,
             period=self.period,
@@ -147,29 +124,12 @@ class Opened(Arrangement):
             workspace=self._workspace,
             contact_stiffness=self._contact_stiffness,
             guarding=self._guarding,
-            start_elastic=start_elastic,
-            counts=counts,
         )
         self._binding = binding = Binding(scene.model, scene.data, parameters)
-        reset = self._reset_state
-        repeater = Repeater(binding, scene.model, scene.data, self.method, parameters, reset)
-        self._repeater = repeater
-
-    def _begin_in(
-        self, state: bytes, coupling: Coupling, felt: Coupling | None, counts: Counts | None
-    ) -> None:
-        """Lets a run begin in mid-motion, as whoever simulates its file again will find it."""
-        scene = self.scene
-        restore_state(scene.model, scene.data, state)
-        self._bind(coupling, felt, elastic_energy(scene.data), counts)
-        self._is_mid_run = True
-
-    def _attachments(self) -> list[Attachment]:
-        return attachments(self.scene, self._reset_state if self._is_mid_run else None)
+        self._repeater = Repeater(binding, scene.model, scene.data, self.method, parameters, start)
 
     def _description(self) -> dict[str, str]:
-        began = {"began": MID_RUN, "home": self._home} if self._is_mid_run else {}
-        return began | describe_run(
+        return describe_run(
             self.scene,
             self.parameters,
             self._binding,

@@ -14,7 +14,6 @@ from numpy.typing import ArrayLike, NDArray
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo
 from hapticbridge.guard import UNLIMITED, Limits
-from hapticbridge.kernel.counts import Counts
 from hapticbridge.kernel.guarding import UNGUARDED, Guarding
 from hapticbridge.kernel.parameters import (
     RunParameters,
@@ -90,8 +89,6 @@ def run_parameters(
     workspace: Workspace = SAME_FRAME,
     contact_stiffness: float | None = None,
     guarding: Guarding = UNGUARDED,
-    start_elastic: float = 0.0,
-    counts: Counts | None = None,
 ) -> RunParameters:
     """Returns the parameters of a run that starts now.
 
@@ -108,8 +105,6 @@ def run_parameters(
         workspace: The map from the device's frame to the scene's.
         contact_stiffness: K_c in N/m of a tool without mass; None takes the coupling's stiffness.
         guarding: What the guard does within a tick.
-        start_elastic: What constraints store at most, in J, where the run begins in mid-motion.
-        counts: What the guard had counted by then.
 
     Raises:
         HapticBridgeError: A value is out of range.
@@ -136,6 +131,4 @@ def run_parameters(
         device_damping=burning,
         device_rotational_damping=rotational,
         guarding=guarding,
-        start_elastic=start_elastic,
-        counts=counts,
     )

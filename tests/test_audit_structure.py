@@ -12,10 +12,12 @@ from audit_cases import (
     verdict_of,
     without_model,
 )
+from cli_cases import Called
 
 from hapticbridge.audit import audit
 from hapticbridge.bridge import Bridge
 from hapticbridge.errors import RecordingError
+from hapticbridge.export import export
 from hapticbridge.recording import Recording, read_recording, repair
 from hapticbridge.scene.library import scene_path
 from hapticbridge.tick import CLOCK_FIELDS, TickFlag
@@ -150,3 +152,15 @@ def test_records_that_are_missing_before_the_stop_are_noticed(tap: Recording, fo
     report = verdict_of(tap, folder, ticks=tap.ticks[:-10])
     assert report.verdict == "invalid"
     assert "the last record is of" in report.reason
+
+
+def test_a_recording_of_an_earlier_version_that_begins_in_mid_run_is_refused_in_one_sentence(
+    tap: Recording, folder: Path, call: Called
+) -> None:
+    path = rewritten(tap, folder / "mid_run.mcap", meta={"began": "mid-run"})
+    for command in (("audit",), ("audit", "--what-if", "damping=1"), ("view",)):
+        code, out, err = call(command[0], path, *command[1:])
+        assert code == (1 if command == ("audit",) else 2)
+        assert "the recording begins in mid-run" in " ".join((out + err).split())
+    done = export(path, "csv")
+    assert (done.recording.count, done.damage) == (len(tap.ticks), ())

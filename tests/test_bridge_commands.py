@@ -11,17 +11,17 @@ from typing import Any
 import numpy as np
 import pytest
 from audit_cases import ScriptedDevice, recorded, rewritten, without_model
+from numpy.typing import NDArray
 from report_runs import ANVIL, LOOSE
 
 from hapticbridge.audit import audit
 from hapticbridge.bridge import Bridge
 from hapticbridge.clock import SimulatedClock
-from hapticbridge.commands import Command, Couple, Record, Reset, Switch
+from hapticbridge.commands import Command, Couple, Mark, Reset, Switch
 from hapticbridge.commands.change import tuning_ticks
 from hapticbridge.coupling import Coupling
-from hapticbridge.errors import CommandError, SafetyTrip
+from hapticbridge.errors import CommandError, DeviceError, RecordingError, SafetyTrip
 from hapticbridge.guard import Limits
-from hapticbridge.provenance import RESET_ATTACHMENT
 from hapticbridge.recording import read_recording
 
 T = 1e-3
@@ -45,7 +45,7 @@ def swaying(tick: int) -> tuple[float, ...]:
 
 
 class Script:
-    """Gives commands at ticks of the whole run, however often it began anew."""
+    """Gives commands at ticks of the run."""
 
     def __init__(self, commands: Mapping[int, Command]) -> None:
         self.commands, self.done = commands, 0
@@ -296,13 +296,10 @@ def rubbed_and_pushed(tick: int) -> tuple[float, ...]:
 PUSHED = {"scene": SPRING, "pose": rubbed_and_pushed, "limits": GUARDED, "controller": None}
 
 
-@pytest.mark.parametrize("recorder", [{}, {900: Record(on=False), 2550: Record(on=True)}])
-def test_what_a_scene_took_up_unfelt_is_not_given_to_the_hand(
-    run: Callable[..., Any], recorder: dict[int, Command]
-) -> None:
+def test_what_a_scene_took_up_unfelt_is_not_given_to_the_hand(run: Callable[..., Any]) -> None:
     # ½ 250 (40 mm)² = 0.2 J go in while nothing is felt, and would come out with up to 10 N; what
     # is rubbed away meanwhile does not pay for it
-    commands = {1000: Switch(force=False), 2700: Switch(force=True)} | recorder
+    commands = {1000: Switch(force=False), 2700: Switch(force=True)}
     with pytest.raises(SafetyTrip, match="more energy beyond what the hand put in"):
         run(commands, 5.0, **PUSHED)
 
@@ -408,114 +405,11 @@ def test_an_event_that_was_changed_is_found(
     )
 
 
-def test_a_recorder_started_in_mid_run_writes_a_file_that_is_judged_like_any_other(
-    run: Callable[..., Any],
-) -> None:
-    summary, path, _ = run(
-        {
-            60: Couple(1000.0, 0.5),
-            300: Record(on=False),
-            700: Couple(3000.0, 1.6),
-            900: Switch(clutch=True),
-            1400: Record(on=True),  # pressed on the floor, in motion, with the clutch held
-            1500: Switch(clutch=False),
-            1600: Couple(2000.0, 1.2),
-        },
-        2.5,
-    )
-    assert summary.recording == path.with_name("run-2.mcap")
-    assert (summary.ticks, summary.duration) == (2500, pytest.approx(2.5))
-    first, second = read_recording(path), read_recording(path.with_name("run-2.mcap"))
-    assert len(first.ticks) == 321
-    assert len(second.ticks) == 2500 - 1420  # a pause asks twice before one tick
-    assert first.events[-1]["reason"] == "recording stopped"
-    for file in (first.path, second.path):
-        report = audit(file)
-        assert (report.verdict, report.resimulation) == ("passive", "bit for bit")
-    # it begins where the run was, with the coupling that it had
-    assert float(second.meta["stiffness"]) == 3000.0
-    assert second.ticks["tool_position"][0, 2] < 0.0201
-    assert second.ticks["deadline_ns"][0] == 1_000_000
-    assert float(second.meta["start_elastic"]) > 0
-
-
-def test_a_reset_leads_to_where_the_run_began_whenever_it_is_recorded(
-    run: Callable[..., Any],
-) -> None:
-    _, path, _ = run({200: Record(on=False), 1300: Record(on=True), 2400: Reset()}, 2.7)
-    recording = read_recording(path.with_name("run-2.mcap"))
-    at = next(event["tick"] for event in recording.events if event["event"] == "reset")
-    height = recording.ticks["tool_position"][:, 2]
-    assert height[at - 1] < 0.025
-    assert height[at] == pytest.approx(0.03, abs=1e-4)
-    report = audit(recording.path)
-    assert report.verdict == "passive", report.reason
-    assert report.resimulation == "bit for bit"
-    kept = dict(recording.attachments)
-    del kept[RESET_ATTACHMENT]
-    lost = rewritten(replace(recording, attachments=kept), path.with_name("lost.mcap"))
-    assert audit(lost).verdict == "invalid"
-    short = {RESET_ATTACHMENT: b"short"}
-    report = audit(rewritten(recording, path.with_name("short.mcap"), attachments=short))
-    assert report.verdict == "invalid"
-    assert "'reset_state.f64' has 5 bytes" in report.reason
-
-
-def test_a_start_that_claims_more_elastic_energy_than_there_is_is_found(
-    run: Callable[..., Any],
-) -> None:
-    _, path, _ = run({200: Record(on=False), 1300: Record(on=True)}, 1.6)
-    recording = read_recording(path.with_name("run-2.mcap"))
-    more = 1e-3
-    claimed = {"start_elastic": repr(float(recording.meta["start_elastic"]) + more)}
-    report = audit(rewritten(recording, path.with_name("changed.mcap"), meta=claimed))
-    assert report.verdict == "invalid"
-    # energies that were made to fit leave only the attached scene to say so
-    ticks = recording.ticks.copy()
-    ticks["environment_energy"] -= more
-    fitting = rewritten(recording, path.with_name("fitting.mcap"), meta=claimed, ticks=ticks)
-    assert "metadata 'start_elastic'" in audit(fitting).reason
-
-
-def test_a_recorder_that_cannot_start_leaves_the_run_going(
-    run: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    nowhere = tmp_path / "gone" / "run.mcap"
-    monkeypatch.setattr("hapticbridge.commanded.Commanded._next_path", lambda _: nowhere)
-    summary, path, _ = run({200: Record(on=False), 1300: Record(on=True)}, 1.6)
-    assert summary.ticks == 1600
-    assert audit(path).verdict == "passive"
-    assert not nowhere.exists()
-
-
-def test_a_recorder_asked_for_while_it_starts_is_started_once(run: Callable[..., Any]) -> None:
-    def twice(bridge: Bridge, tick: int) -> None:
-        if script.done == 1310:  # as another page does while the first one's is not open yet
-            bridge._commands.waiting.append((Record(on=True), "another"))
-        script(bridge, tick)
-
-    script = Script({200: Record(on=False), 1300: Record(on=True)})
-    _, path, _ = run({}, 1.7, on_tick=twice)
-    second = path.with_name("run-2.mcap")
-    assert not path.with_name("run-3.mcap").exists()
-    assert len(read_recording(second).ticks) == 1700 - 1320
-    assert audit(second).verdict == "passive"
-
-
-def test_a_name_that_the_disk_does_not_take_leaves_the_run_going(
-    run: Callable[..., Any], tmp_path: Path
-) -> None:
-    path = tmp_path / ("a" * 250 + ".mcap")  # 255 bytes; with -2 it is too long
-    summary, _, _ = run({200: Record(on=False), 1300: Record(on=True)}, 1.6, path=path)
-    assert summary.ticks == 1600
-    assert audit(path).verdict == "passive"
-
-
 def test_a_bridge_that_is_not_open_takes_no_command(tmp_path: Path) -> None:
     file = tmp_path / "scene.xml"
     file.write_text(FLOOR)
     bridge = Bridge(str(file), ScriptedDevice(swaying), LOOSE, clock=SimulatedClock())
-    for command in (Record(on=True), Couple(1000.0, 0.5)):
+    for command in (Mark(), Couple(1000.0, 0.5)):
         with pytest.raises(CommandError, match="not open"):
             bridge.command(command)
     with bridge:
@@ -525,22 +419,55 @@ def test_a_bridge_that_is_not_open_takes_no_command(tmp_path: Path) -> None:
         bridge.command(Switch(force=False))
 
 
-def test_a_run_refuses_what_it_has_already_and_what_its_device_does_not_bear(
-    run: Callable[..., Any],
-) -> None:
-    for command, reason in (
-        (Record(on=True), "already being recorded"),
-        (Couple(4100.0, 0.0), "and this one has 2"),
-    ):
-        with pytest.raises(CommandError, match=reason):
-            run({10: command}, 0.1)
+def test_a_run_refuses_what_its_device_does_not_bear(run: Callable[..., Any]) -> None:
+    with pytest.raises(CommandError, match="and this one has 2"):
+        run({10: Couple(4100.0, 0.0)}, 0.1)
 
 
-def test_a_run_that_nobody_else_can_see_cannot_start_a_recorder(tmp_path: Path) -> None:
+def test_a_mark_is_an_event_and_changes_nothing_else(run: Callable[..., Any]) -> None:
+    _, path, _ = run({}, 0.2)
+    before = read_recording(path).ticks
+    _, path, _ = run({70: Mark()}, 0.2)
+    recording = read_recording(path)
+    [mark] = [event for event in recording.events if event["event"] == "mark"]
+    assert (mark["tick"], mark["by"], mark["time_ns"]) == (70, "test", 71_000_000)
+    assert recording.ticks.tobytes() == before.tobytes()
+    assert audit(path).resimulation == "bit for bit"
+
+
+class Pressed(ScriptedDevice):
+    """Has button 2 pressed before the first tick, and in ticks 30 to 39 and 50."""
+
+    def read(self, sample: NDArray[np.void]) -> int:
+        tick = self._tick
+        flags = super().read(sample)
+        is_down = tick < 5 or 30 <= tick < 40 or tick == 50
+        sample["buttons"] = 0b1 | (0b100 if is_down else 0)
+        return flags
+
+
+def test_each_press_of_the_button_marks_the_recording_once(tmp_path: Path) -> None:
+    file, path = tmp_path / "scene.xml", tmp_path / "run.mcap"
+    file.write_text(FLOOR)
+    recorded(path, str(file), Pressed(swaying), LOOSE, duration=0.1, mark=2)
+    recording = read_recording(path)
+    marks = [event for event in recording.events if event["event"] == "mark"]
+    assert [(event["tick"], event["by"]) for event in marks] == [(30, "button"), (50, "button")]
+    assert recording.ticks["buttons"][30] == 0b101
+    report = audit(path)
+    assert report.events["mark"] == 2
+    assert report.resimulation == "bit for bit"
+
+
+def test_a_run_that_is_not_recorded_cannot_be_marked(tmp_path: Path) -> None:
     file = tmp_path / "scene.xml"
     file.write_text(FLOOR)
     with Bridge(str(file), ScriptedDevice(swaying), LOOSE, clock=SimulatedClock()) as bridge:
-        with pytest.raises(CommandError, match="cannot start a recorder"):
-            bridge.command(Record(on=True))
+        with pytest.raises(CommandError, match="not recorded"):
+            bridge.command(Mark())
         bridge.command(Switch(force=False))
         assert bridge.run(0.05).ticks == 50
+    with pytest.raises(RecordingError, match="button 2 is to mark"):
+        Bridge(str(file), ScriptedDevice(swaying), LOOSE, mark=2)
+    with pytest.raises(DeviceError, match="mark button is 99"):
+        Bridge(str(file), ScriptedDevice(swaying), LOOSE, mark=99)

@@ -16,13 +16,13 @@ from hapticbridge.commands import (
     Command,
     CommandQueue,
     Couple,
-    Record,
+    Mark,
     Reset,
     Switch,
     command_of,
 )
 from hapticbridge.commands.command import LONGEST_LINE, Stop, line_of
-from hapticbridge.commands.queue import INTERVAL, MOST_WAITING, PAUSE_INTERVAL
+from hapticbridge.commands.queue import INTERVAL, MOST_WAITING, RESET_INTERVAL
 from hapticbridge.errors import CommandError
 from hapticbridge.guard import Limits
 from hapticbridge.rendering import method_named
@@ -176,11 +176,11 @@ def test_commands_that_follow_too_soon_are_refused() -> None:
         queue.offer(Switch(force=True), "test")
     time.now += 0.02 * INTERVAL
     queue.offer(Reset(), "test")
-    time.now += 0.99 * PAUSE_INTERVAL
+    time.now += 0.99 * RESET_INTERVAL
     queue.offer(Couple(1000.0, 0.5), "test")
     time.now += INTERVAL / 2
     with pytest.raises(CommandError, match="too recent"):
-        queue.offer(Record(on=True), "test")
+        queue.offer(Reset(), "test")
     assert [type(command) for command, _ in queue.waiting] == [Switch, Reset, Couple]
 
 
@@ -198,8 +198,8 @@ def test_a_loop_that_takes_nothing_is_told_nothing_more() -> None:
 
 
 def test_what_the_run_cannot_do_is_refused() -> None:
-    with pytest.raises(CommandError, match="recorder"):
-        CommandQueue(allowance(), can_record=False).offer(Record(on=True), "test")
+    with pytest.raises(CommandError, match="not recorded"):
+        CommandQueue(allowance(), is_recorded=False).offer(Mark(), "test")
     with pytest.raises(CommandError, match="without mass"):
         CommandQueue(allowance("direct")).offer(Reset(), "test")
 
@@ -258,7 +258,7 @@ def test_any_bytes_are_a_command_or_refused(said: bytes) -> None:
         Switch(clutch=True),
         Switch(),
         Reset(),
-        Record(on=True),
+        Mark(),
         Stop(),
     ],
 )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import importlib
 import json
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -136,13 +137,13 @@ def test_a_missing_package_is_one_sentence(
 ) -> None:
     found = importlib.import_module
 
-    def without(name: str) -> Any:
+    def without(name: str, package: str | None = None) -> Any:
         if name.split(".", maxsplit=1)[0] == module:
             raise ImportError(name)
-        return found(name)
+        return found(name, package)
 
     monkeypatch.setattr(importlib, "import_module", without)
-    code, out, err = call("export", recording, "--to", form)
+    code, out, err = call("export", recording, "--format", form)
     assert (code, out) == (2, "")
     assert f"pip install 'hapticbridge[{extra}]'" in " ".join(err.split())
     assert [path.name for path in recording.parent.iterdir()] == ["run.mcap"]  # no half file
@@ -153,12 +154,12 @@ def test_a_file_that_exists_is_kept_unless_it_may_be_replaced(
 ) -> None:
     target = recording.with_name("out.csv")
     sidecar_of(target).write_text("mine")
-    code, _, err = call("export", recording, "--to", "csv", "--out", target)
+    code, _, err = call("export", recording, "--format", "csv", "--out", target)
     assert code == 2
     assert "exists" in err
     assert sidecar_of(target).read_text() == "mine"
     assert not target.exists()
-    code, out, _ = call("export", recording, "--to", "csv", "--out", target, "--overwrite")
+    code, out, _ = call("export", recording, "--format", "csv", "--out", target, "--overwrite")
     assert code == 0
     assert f"{COUNT} ticks, 3 events" in out
     assert len(target.read_text().splitlines()) == COUNT + 1
@@ -178,7 +179,7 @@ def test_a_recording_is_never_replaced_by_its_export(recording: Path, call: Call
     before = recording.read_bytes()
     for name in ("run.mcap", "run.parquet", "run"):
         target = recording.with_name(name)
-        code, _, err = call("export", recording, "--to", "csv", "--out", target, "--overwrite")
+        code, _, err = call("export", recording, "--format", "csv", "--out", target, "--overwrite")
         assert (code, "does not end like csv; its endings: .csv" in " ".join(err.split())) == (
             2,
             True,
@@ -214,7 +215,7 @@ def test_a_cut_recording_is_exported_as_far_as_it_goes(tmp_path: Path, call: Cal
     write(path, random_rows(1000))
     data = path.read_bytes()
     path.write_bytes(data[: int(0.7 * len(data))])
-    code, out, err = call("export", path, "--to", "parquet", "--json")
+    code, out, err = call("export", path, "--format", "parquet", "--json")
     assert code == 0
     assert "cut" in err
     told = json.loads(out)
@@ -227,6 +228,66 @@ def test_a_changed_recording_is_exported_with_a_warning(recording: Path, call: C
     data = bytearray(recording.read_bytes())
     data[len(data) // 2] ^= 0xFF
     recording.write_bytes(data)
-    code, _, err = call("export", recording, "--to", "csv")
+    code, _, err = call("export", recording, "--format", "csv")
     assert code == 1
     assert "damaged" in err
+
+
+@pytest.mark.parametrize(("form", "read"), FORMATS)
+def test_a_piece_has_the_ticks_and_events_of_its_time(
+    form: str, read: Callable[[Path], Any], recording: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if form == "hdf5":
+        pytest.importorskip("h5py")
+    monkeypatch.setattr(reader, "BLOCK", 64)
+    done = export(recording, form, span=(0.03, 0.1))
+    columns, _, meta, events = read(done.files[0])
+    # tick k is due at (k + 1) ms; the end is excluded, so that two pieces share no tick
+    np.testing.assert_array_equal(columns["tick"], np.arange(29, 99))
+    assert (done.ticks, done.events, events) == (70, (), [])
+    assert json.loads(meta["cut"]) == [0.03, 0.1]
+    rest = export(
+        recording,
+        form,
+        recording.with_name("rest").with_suffix(done.files[0].suffix),
+        span=(0.1, math.inf),
+    )
+    columns, _, meta, events = read(rest.files[0])
+    np.testing.assert_array_equal(columns["tick"], np.arange(99, COUNT))
+    assert [event["time_ns"] for event in events] == [100_000_000]
+    assert json.loads(meta["cut"]) == [0.1, None]
+
+
+def test_a_piece_is_cut_where_deadlines_were_not_where_ticks_are_counted(tmp_path: Path) -> None:
+    rows = random_rows(100)
+    rows["deadline_ns"][40:] += 500_000_000  # the machine stood still for half a second
+    write(tmp_path / "late.mcap", rows)
+    done = export(tmp_path / "late.mcap", "csv", span=(0.3, 0.56))
+    assert from_csv(done.files[0])[0]["tick"].tolist() == list(range(40, 59))
+
+
+@pytest.mark.parametrize(
+    ("span", "message"),
+    [
+        ((0.1, 0.1), "from 0.1 s to 0.1 s is empty"),
+        ((0.2, 0.1), "its end must be later"),
+        ((math.nan, 0.1), "is empty"),
+        ((7.0, 8.0), "no tick was due from 7 s to 8 s; the recording ends at 0.15 s"),
+    ],
+)
+def test_a_piece_without_ticks_is_refused_and_leaves_no_file(
+    span: tuple[float, float], message: str, recording: Path
+) -> None:
+    with pytest.raises(RecordingError, match=message):
+        export(recording, "csv", span=span)
+    assert [path.name for path in recording.parent.iterdir()] == ["run.mcap"]
+
+
+def test_the_command_line_cuts_and_tells_the_marks(recording: Path, call: Called) -> None:
+    code, out, _ = call("export", recording, "--format", "csv", "--from", "0.05", "--to", "0.12")
+    assert code == 0
+    assert "70 ticks, 1 events" in " ".join(out.split())
+    assert "marks at 0.000 s, 0.100 s" in out
+    arguments = ("--format", "csv", "--from", "0.05", "--overwrite", "--json")
+    told = json.loads(call("export", recording, *arguments)[1])
+    assert (told["ticks"], told["marks"]) == (101, [0.0, 0.1])

@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from itertools import count
 from pathlib import Path
-from typing import Any
-from unittest.mock import patch
 
 import pytest
 from audit_cases import ScriptedDevice, SlowClock, recorded
@@ -15,7 +11,6 @@ from cli_cases import Called
 
 from hapticbridge.audit import audit
 from hapticbridge.bridge import Bridge
-from hapticbridge.commands import Record
 from hapticbridge.recording import read_recording
 
 MISSED = {0: 2, 50: 1, 51: 7, 120: 30}
@@ -77,38 +72,6 @@ def test_a_motion_that_ends_the_run_is_followed_to_its_end_however_long_it_takes
         assert bridge.latest_records(1)["device_position"][0, 0] == pytest.approx(0.01)
     with Bridge("point_mass", f"trajectory:{motion}", clock=SlowClock(MISSED)) as bridge:
         assert bridge.run(0.2).ticks == 160
-
-
-class Skipping(SlowClock):
-    """Misses 9 deadlines in every hundredth tick."""
-
-    def __init__(self) -> None:
-        super().__init__({})
-        self._stalls = dict.fromkeys(range(50, 2000, 100), 9)
-
-
-def test_a_recorder_in_mid_run_does_not_change_how_long_it_lasts(tmp_path: Path) -> None:
-    path, clock = tmp_path / "run.mcap", Skipping()
-    asked: Iterator[int] = count()
-    commands: dict[int, Any] = {100: Record(on=False), 300: Record(on=True)}
-
-    def act(_: int) -> None:
-        call = next(asked)
-        if call in commands:
-            bridge._commands._last = bridge._commands._last_pause = -1e9
-            bridge.command(commands[call])
-
-    with patch("hapticbridge.commanded.SimulatedClock", Skipping):
-        bridge = Bridge("point_mass", ScriptedDevice(sway), clock=clock, recording=path)
-        with bridge:
-            summary = bridge.run(0.6, act)
-    second = read_recording(tmp_path / "run-2.mcap").ticks
-    assert summary.ticks + summary.skipped == 600
-    assert summary.skipped > 40
-    assert summary.duration == pytest.approx(0.6)
-    begun = 600 - second["deadline_ns"][-1] // 1_000_000
-    assert 300 < begun < 400
-    assert audit(tmp_path / "run-2.mcap").verdict == "passive"
 
 
 def test_the_command_line_says_what_its_seconds_are(call: Called) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import contextlib
 import os
 import threading
@@ -24,11 +23,10 @@ from test_commands import allowance
 from hapticbridge.audit import audit
 from hapticbridge.bridge import Bridge
 from hapticbridge.clock import SimulatedClock
-from hapticbridge.commands import Couple, Record, Reset, Switch, command_of
+from hapticbridge.commands import Couple, Reset, Switch, command_of
 from hapticbridge.commands.command import Stop
 from hapticbridge.errors import HapticBridgeError, SafetyTrip
 from hapticbridge.guard import Limits
-from hapticbridge.provenance import MODEL_ATTACHMENT, STATE_ATTACHMENT
 from hapticbridge.recording import Ring, read_recording
 from hapticbridge.view.address import Address
 from hapticbridge.view.window import Window
@@ -46,8 +44,6 @@ pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptio
 
 K, B = "stiffness K (N/m)", "damping B (N s/m)"
 KR, BR = "turning stiffness K_r (N m/rad)", "turning damping B_r (N m s/rad)"
-
-ATTACHED = (MODEL_ATTACHMENT, STATE_ATTACHMENT)
 
 PATIENCE = 60.0
 """In s, for anything to happen in a run; it ends by itself after twice as long."""
@@ -242,45 +238,13 @@ def test_a_force_that_fades_for_a_moment_leaves_its_box_to_the_hand() -> None:
         assert "the force is off" not in shown.answer.content
 
 
-def test_why_a_recorder_did_not_start_stays_on_the_page(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with running(tmp_path) as (bridge, window), hand(window.url) as page:
+def test_the_page_marks_a_moment_of_the_recording(tmp_path: Path) -> None:
+    with running(tmp_path) as (_, window), hand(window.url) as page:
         said(page, "recording to")
-        # one button, which says what it would do at the time when the page was opened
-        button = next(label for label in page.elements if label.endswith(" recording"))
-        page.send(button, value=True)
-        said(page, "not recording")
-        until(lambda: not bridge._stream.is_recording)
-        monkeypatch.setattr(bridge, "_next_path", lambda: tmp_path / "no folder" / "run.mcap")
-        time.sleep(1.0)  # the least time between two pauses
-        page.send(button, value=True)
-        reason = said(page, "refused")
-        assert "no folder" in reason
-        assert "not recording" in reason
-        # nor does the force that comes back take it away
-        page.send("force", value=False)
-        assert "no folder" in said(page, "the force is off")
-
-
-def test_the_page_starts_a_recorder_in_mid_run_and_says_where(tmp_path: Path) -> None:
-    with running(tmp_path) as (bridge, window), browser(tmp_path) as tab:
-        page = tab()
-        page.open(window.url, 1200, 1300)
-        for label, word in (("stop", "not recording"), ("start", "recording to")):
-            button = (
-                "[...document.querySelectorAll('button')]"
-                f".find(b => b.innerText == '{label} recording')"
-            )
-            page.wait_for(f"!!{button}")
-            page.value(f"{button}.click()")
-            page.wait_for(f"document.body.innerText.includes('{word}')")
-            time.sleep(1.0)  # the least time between two pauses
-        until(lambda: bridge._tick > 200)
-        page.wait_for("document.body.innerText.includes('run-2.mcap')")
-    for name in ("run.mcap", "run-2.mcap"):
-        report = audit(tmp_path / name)
-        assert (report.verdict, report.resimulation) == ("passive", "bit for bit")
+        page.send("mark this moment", value=True)
+        said(page, "marked at")
+    [mark] = events(tmp_path / "run.mcap", "mark")
+    assert mark["by"] == "view"
 
 
 def test_commands_reach_the_bridge_slowly_and_the_newest_wins() -> None:
@@ -297,37 +261,6 @@ def test_commands_reach_the_bridge_slowly_and_the_newest_wins() -> None:
         said = [command_of(stream.readline()) for _ in range(3)]
     assert said == [Stop(), Couple(999.0, 0.5), Switch(force=False, clutch=True)]
     os.close(write)
-
-
-def test_the_view_follows_a_run_that_began_anew(tmp_path: Path) -> None:
-    scene = tmp_path / "floor.xml"
-    scene.write_text(FLOOR)
-    script = Script({200: Record(on=False), 1300: Record(on=True)})
-    recorded(
-        tmp_path / "run.mcap",
-        str(scene),
-        ScriptedDevice(swaying),
-        LOOSE,
-        duration=1.8,
-        on_tick=script,
-    )
-    first, second = (read_recording(tmp_path / name) for name in ("run.mcap", "run-2.mcap"))
-    ring = Ring.local(4096)
-    show = Show(ring, first, lag=5)
-    ring.append(first.ticks)
-    show.gather()
-    show.look()
-    files = {n: base64.b64encode(second.attachments[n]).decode() for n in ATTACHED}
-    show.note({"event": "begin", "metadata": second.meta, "attachments": files})
-    show.gather()
-    assert show.look() is None  # what is left of the old run is none of the new one
-    ring.append(second.ticks[:100])
-    show.gather()
-    sight = show.look()
-    assert sight is not None
-    assert not show.warning
-    body = show.model.body("ball").id
-    np.testing.assert_allclose(sight.places[body], second.ticks["tool_position"][94], atol=1e-9)
 
 
 def test_what_was_asked_for_while_the_view_was_behind_is_known_to_it_all_the_same(

@@ -15,7 +15,7 @@ from audit_cases import TAP, recorded, rewritten
 from cli_cases import Called
 
 from hapticbridge.bridge import Bridge
-from hapticbridge.commands import Command, Couple, Record, Reset, Switch
+from hapticbridge.commands import Command, Couple, Reset, Switch
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo, Hand
 from hapticbridge.errors import HapticBridgeError, RecordingError
@@ -106,7 +106,7 @@ def commanded(bridge: Bridge, tick: int) -> None:
         150: Reset(),
     }
     if tick in asked:
-        bridge._commands._last = bridge._commands._last_pause = -math.inf  # no time passes
+        bridge._commands._last = bridge._commands._last_reset = -math.inf  # no time passes
         bridge.command(asked[tick])
 
 
@@ -132,63 +132,6 @@ def test_commands_are_done_again(tmp_path: Path) -> None:
     for method, kept in (("direct", False), ("weld", True)):
         again = Repetition(run, run.settings.changed({"method": method}))
         assert (again.keeps_resets, again.keeps_couplings) == (kept, False)
-
-
-@pytest.fixture(scope="module")
-def begun_in_mid_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The second file of a run whose recorder was stopped and started while the peg moves."""
-    path = tmp_path_factory.mktemp("mid_run") / "run.mcap"
-    motion = path.with_name("tap.csv")
-    motion.write_text(TAP)
-
-    def record(bridge: Bridge, tick: int) -> None:
-        bridge._commands._last = bridge._commands._last_pause = -math.inf
-        if not bridge._earlier_ticks and tick in (20, 60):
-            bridge.command(Record(on=tick == 60))
-        if bridge._earlier_ticks and tick == 100:
-            bridge.command(Reset())
-
-    device = f"simulated:path={motion}"
-    recorded(path, "peg_in_hole", device, duration=0.3, on_tick=record)
-    return path.with_name("run-2.mcap")
-
-
-def test_a_recording_begun_in_mid_run_begins_there_again(begun_in_mid_run: Path) -> None:
-    found = what_if(begun_in_mid_run, {})
-    before, prescribed, closed = found.runs
-    home = json.loads(before.recording.meta["home"])
-    assert np.linalg.norm(before.ticks["tool_position"][0] - home[:3]) > 1e-3
-    same_in_every_bit(prescribed, before)
-    assert before.report.events["reset"] == prescribed.report.events["reset"] == 1
-    # it moves at the start; one that stood still would be behind, one that was hit ahead
-    assert np.linalg.norm(np.diff(before.ticks["device_position"][:2], axis=0)) > 1e-5
-    assert found.hand_error < 0.1e-3
-    assert closed.report.resimulation == "bit for bit"
-    softer = what_if(begun_in_mid_run, {"stiffness": 600, "damping": 0.6, "mass": 0.2})
-    for run in softer.runs[1:]:
-        assert run.report.verdict == "passive"
-        np.testing.assert_allclose(
-            run.ticks["tool_position"][0], before.ticks["tool_position"][0], atol=2e-4
-        )
-    assert softer.runs[1].peaks["force on tool"] < 0.6 * before.peaks["force on tool"]
-
-
-def test_what_cannot_begin_in_mid_run_is_refused(begun_in_mid_run: Path, tmp_path: Path) -> None:
-    with pytest.raises(RecordingError, match=r"in a state that the scene does not have .*'weld'"):
-        what_if(begun_in_mid_run, {"method": "weld"})
-    path, motion = tmp_path / "wall.mcap", tmp_path / "hand.csv"
-    motion.write_text("t,x,y,z\n0,0,0,0\n0.1,0.02,0,0\n0.3,0.02,0.003,0\n")
-
-    def record(bridge: Bridge, tick: int) -> None:
-        bridge._commands._last = bridge._commands._last_pause = -math.inf
-        if not bridge._earlier_ticks and tick in (100, 150):
-            bridge.command(Record(on=tick == 150))
-
-    recorded(path, "virtual_wall", f"simulated:path={motion}", duration=0.3, on_tick=record)
-    pressed = path.with_name("wall-2.mcap")
-    with pytest.raises(RecordingError, match=r"would be [45]\.?\d* mm inside another \(0"):
-        what_if(pressed, {"distance": 0.005})
-    assert what_if(pressed, {"mass": 0.06}).runs[1].report.verdict == "passive"
 
 
 def test_a_prescribed_motion_is_the_recorded_one(softer: WhatIf) -> None:

@@ -83,37 +83,6 @@ def check_start(recording: RecordingFile, state: NDArray[np.void]) -> None:
             )
 
 
-def check_elastic(claimed: float, present: float) -> None:
-    """Refuses a start that is said to store more than the attached scene's constraints do, in J.
-
-    Raises:
-        RecordingError: It is.
-    """
-    if not abs(claimed - present) <= FOREIGN_TOLERANCE * (1.0 + present):
-        raise RecordingError(
-            f"metadata 'start_elastic' is {claimed!r} J, the attached scene's constraints store "
-            f"{present!r} J at most"
-        )
-
-
-def check_stored(claimed: float, state: NDArray[np.void]) -> None:
-    """Refuses counts of the guard that begin with another energy than the whole run began with.
-
-    Args:
-        claimed: What the counts say that the scene stored, in J.
-        state: The kernel's, as the whole run began.
-
-    Raises:
-        RecordingError: They do.
-    """
-    present = float(state["start_energy"][0])
-    if not abs(claimed - present) <= FOREIGN_TOLERANCE * (1.0 + abs(present)):
-        raise RecordingError(
-            f"metadata 'counts' say that the scene stored {claimed!r} J when the run began, the "
-            f"attached scene stores {present!r} J there"
-        )
-
-
 def is_same_processor(recording: RecordingFile) -> bool:
     """Returns whether a run was recorded on this model of processor, as far as it says."""
     try:

@@ -64,15 +64,6 @@ class Account:
     excess: float = 0.0
     reversed: NDArray[np.bool_] = field(default_factory=lambda: np.zeros((WINDOW, 6), bool))
 
-    @classmethod
-    def at_start(cls, parameters: RunParameters, start_energy: float) -> Account:
-        """Returns what the first tick begins with; see ``Reached.at_start``."""
-        counts, account = parameters.counts, cls(parameters, start_energy)
-        if counts is not None:
-            account.account, account.axes = counts.account, np.array(counts.axes)
-            account.excess = counts.excess
-        return account
-
     def after(
         self,
         ticks: NDArray[np.void],

@@ -75,7 +75,7 @@ class Guarded:
         """Returns what the first tick begins with; see ``Reached.at_start``."""
         origin, target = np.array(parameters.device_origin), np.array(parameters.handle_origin)
         watch = Watch.at_start(parameters)
-        account = Account.at_start(parameters, start_energy)
+        account = Account(parameters, start_energy)
         return cls(parameters, watch, handle, tool, origin, target, account)
 
     def after(

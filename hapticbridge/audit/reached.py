@@ -35,7 +35,7 @@ class Reached:
         tool: Tool pose (7,).
         device: Device pose (7,).
         sent: Wrench that was sent to the device, (6,).
-        start_energy: Kinetic, potential and elastic energy before the first tick, in J.
+        start_energy: Kinetic plus potential energy before the first tick, in J.
         share: Of the wrench that the ramp let through.
         guarded: Where the guard has got to.
         sums: The cumulative energies so far, in J.
@@ -65,5 +65,4 @@ class Reached:
         device = np.array(parameters.device_start)
         guarded = Guarded.at_start(parameters, handle, tool, start_energy)
         sums = dict.fromkeys(SUMS, 0.0)
-        stored = start_energy + parameters.start_elastic
-        return cls(handle, tool, device, np.zeros(6), stored, 0.0, sums, guarded)
+        return cls(handle, tool, device, np.zeros(6), start_energy, 0.0, sums, guarded)

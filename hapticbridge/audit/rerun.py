@@ -5,19 +5,13 @@ from __future__ import annotations
 import json
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.audit.attached_scene import (
-    attached_model,
-    check_elastic,
-    check_start,
-    check_stored,
-)
+from hapticbridge.audit.attached_scene import attached_model, check_start
 from hapticbridge.commands import CHANGES as COMMANDED
 from hapticbridge.commands import Repeater
 from hapticbridge.errors import HapticBridgeError, RecordingError
@@ -25,14 +19,7 @@ from hapticbridge.inputs import apply_writes
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.simulation import simulate_recorded
 from hapticbridge.kernel.state import Binding
-from hapticbridge.provenance import (
-    MODEL_ATTACHMENT,
-    RESET_ATTACHMENT,
-    STATE_ATTACHMENT,
-    elastic_energy,
-    restore_state,
-    versions,
-)
+from hapticbridge.provenance import MODEL_ATTACHMENT, STATE_ATTACHMENT, restore_state, versions
 from hapticbridge.recording import RecordingFile
 from hapticbridge.rendering import method_named
 from hapticbridge.tick import SAMPLE_DTYPE, TICK_DTYPE, TickFlag
@@ -75,24 +62,12 @@ class Rerun:
         # an error inside the C symbol would end the process, so MuJoCo takes its first step in
         # Python
         self._start = start = recording.attachments[STATE_ATTACHMENT]
-        reset = recording.attachments.get(RESET_ATTACHMENT, start)
-        if len(reset) != len(start):
-            raise RecordingError(
-                f"attachment '{RESET_ATTACHMENT}' has {len(reset)} bytes, '{STATE_ATTACHMENT}' "
-                f"{len(start)}"
-            )
         method = method_named(recording.meta.get("method", ""))
-        if parameters.counts is not None and RESET_ATTACHMENT in recording.attachments:
-            restore_state(model, data, reset)
-            begun = replace(parameters, counts=None, start_elastic=0.0)
-            check_stored(parameters.counts.stored, Binding(model, data, begun).state)
         restore_state(model, data, start)
         method.step(model, data)
         restore_state(model, data, start)
-        if parameters.start_elastic:
-            check_elastic(parameters.start_elastic, elastic_energy(data))
         self.binding = Binding(model, data, parameters)
-        self._commands = Repeater(self.binding, model, data, method, parameters, reset)
+        self._commands = Repeater(self.binding, model, data, method, parameters, start)
         check_start(recording, self.binding.state)
 
     def warm_up(self) -> None:

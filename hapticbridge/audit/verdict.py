@@ -33,7 +33,7 @@ from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.felt import coupling_sentences, was_never_lossless
 from hapticbridge.guard import Limits, limits_for
 from hapticbridge.kernel.parameters import RunParameters
-from hapticbridge.provenance import STARTS, meta_home, meta_start, parameters_of
+from hapticbridge.provenance import STARTS, meta_start, parameters_of
 from hapticbridge.recording import RecordingFile, open_recording
 from hapticbridge.rendering import Method, method_named
 
@@ -60,7 +60,7 @@ def verdict_on(path: str | Path, *, strict: bool) -> AuditReport:
         parameters = replace(
             parameters, device_damping=burning, device_rotational_damping=rotational
         )
-        home = np.array(meta_home(recording.meta))
+        home = np.array(meta_start(recording.meta, "tool_start"))
         outside = Interventions.of(recording.events, parameters, home)
         facts |= _device_facts(info, parameters, outside.worst(info, method), method, recording)
         rendered = facts["rendered"]

@@ -12,7 +12,7 @@ import tyro
 
 from hapticbridge.cli.terminal import err, out, plain
 from hapticbridge.compare import Comparison, Difference, compare
-from hapticbridge.export import export
+from hapticbridge.export import export, time_of
 from hapticbridge.quantity import quantity
 
 
@@ -21,17 +21,22 @@ class Export:
     """Write a recording as Parquet, CSV or HDF5.
 
     The table has a row per tick. Parquet keeps units in the columns' metadata, CSV in a file .json
-    beside it, HDF5 in attributes; metadata and events go along. Exit code 1 if the recording is
-    damaged: what can be read is written.
+    beside it, HDF5 in attributes; metadata and events go along. --from and --to cut a piece out of
+    the run; the times of its marks are printed. Exit code 1 if the recording is damaged: what can
+    be read is written.
 
     Example:
-        hapticbridge export run.mcap --to parquet
+        hapticbridge export run.mcap --format csv --from 12.5 --to 20 --out grasp.csv
     """
 
     file: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FILE")]
     """The recording."""
-    to: Literal["parquet", "csv", "hdf5"]
+    form: Annotated[Literal["parquet", "csv", "hdf5"], tyro.conf.arg(name="format")]
     """The format; parquet needs the extra 'tables', hdf5 the extra 'hdf5'."""
+    start: Annotated[float, tyro.conf.arg(name="from", metavar="S")] = -math.inf
+    """First time to write, in s of the run; by default its start."""
+    end: Annotated[float, tyro.conf.arg(name="to", metavar="S")] = math.inf
+    """Time in s of the run before which the last tick lies; by default its end."""
     out: Path | None = None
     """File to write; by default the recording's name with .parquet, .csv or .h5."""
     overwrite: bool = False
@@ -42,14 +47,19 @@ class Export:
     def execute(self) -> int:
         """Exports; returns the exit code."""
         with err.status(f"exporting {plain(str(self.file))} …"):
-            done = export(self.file, self.to, self.out, overwrite=self.overwrite)
+            span = self.start, self.end
+            done = export(self.file, self.form, self.out, span=span, overwrite=self.overwrite)
         found = done.recording
+        marks = [time_of(event) for event in found.events if event.get("event") == "mark"]
         if self.as_json:
-            facts = {"files": [str(file) for file in done.files], "ticks": found.count}
-            out.print_json(json.dumps(facts | {"is_cut": found.is_cut, "damage": done.damage}))
+            facts = {"files": [str(file) for file in done.files], "ticks": done.ticks}
+            facts |= {"marks": marks, "is_cut": found.is_cut, "damage": done.damage}
+            out.print_json(json.dumps(facts))
         else:
             names = ", ".join(plain(str(file)) for file in done.files)
-            out.print(f"wrote {names}: {found.count} ticks, {len(found.events)} events")
+            out.print(f"wrote {names}: {done.ticks} ticks, {len(done.events)} events")
+            if marks:
+                out.print(f"marks at {', '.join(f'{time:.3f} s' for time in marks)}")
         if found.is_cut:
             err.print("[yellow]warning:[/yellow] the recording is cut; this is what it holds")
         if done.damage:

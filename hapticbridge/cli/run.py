@@ -137,6 +137,9 @@ class Run:
     """Button of the device, from 0: while it is held the device moves without the handle."""
     dead_man: int | None = None
     """Button of the device, from 0, that must be held for any force."""
+    mark: int | None = None
+    """Button of the device, from 0: each press of it writes an event 'mark' into the recording;
+    'hapticbridge export --from S --to S' cuts there."""
     stretch_limit: float = USUAL_STRETCH
     """Largest distance between handle and tool in m; beyond it the run is stopped."""
     reach_limit: float | None = None
@@ -212,6 +215,7 @@ class Run:
             controller=self.controller,
             clutch=self.clutch,
             dead_man=self.dead_man,
+            mark=self.mark,
             live=not self.as_json,
             onlooker=window,
             realtime=self.realtime or None,

@@ -10,7 +10,7 @@ from hapticbridge.commands.change import CHANGES as CHANGES
 from hapticbridge.commands.change import Repeater as Repeater
 from hapticbridge.commands.command import Command as Command
 from hapticbridge.commands.command import Couple as Couple
-from hapticbridge.commands.command import Record as Record
+from hapticbridge.commands.command import Mark as Mark
 from hapticbridge.commands.command import Repeat as Repeat
 from hapticbridge.commands.command import Reset as Reset
 from hapticbridge.commands.command import Switch as Switch

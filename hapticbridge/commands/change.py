@@ -1,8 +1,8 @@
 """What a command changes in a run, as the event that a recording keeps and a re-simulation repeats.
 
     coupling   stiffness, damping, rotational_stiffness, rotational_damping of the law; ticks
-    switch     force, clutch; fading where the force comes back after a reset or a recorder
-    reset      (nothing: the scene goes back to where the run began, recorded or not)
+    switch     force, clutch; fading where the force comes back after a reset
+    reset      (nothing: the scene goes back to where the run began)
 
 The loop applies the very event that it then records, so both ways are one.
 """

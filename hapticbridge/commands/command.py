@@ -76,21 +76,8 @@ class Reset:
 
 
 @dataclass(frozen=True, slots=True)
-class Record:
-    """Start or stop recording; the force fades, and rises again once the file is open or closed.
-
-    Attributes:
-        on: Whether to record.
-
-    Raises:
-        CommandError: The value is neither true nor false.
-    """
-
-    on: bool
-
-    def __post_init__(self) -> None:
-        if not isinstance(self.on, bool):
-            raise CommandError(f"on is {shown(self.on)}; it must be true or false")
+class Mark:
+    """Mark a moment: an event ``mark`` in the recording, which ``export`` can cut there."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,13 +96,13 @@ class Repeat:
     events: tuple[Mapping[str, Any], ...]
 
 
-Command = Couple | Switch | Reset | Record | Stop
+Command = Couple | Switch | Reset | Mark | Stop
 
 KINDS: dict[str, type[Command]] = {
     "couple": Couple,
     "switch": Switch,
     "reset": Reset,
-    "record": Record,
+    "mark": Mark,
     "stop": Stop,
 }
 

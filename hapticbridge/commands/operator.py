@@ -8,7 +8,7 @@ from dataclasses import asdict
 from typing import Any
 
 from hapticbridge.commands.change import Repeater, tuning_ticks
-from hapticbridge.commands.command import Command, Couple, Record, Repeat, Reset, Switch
+from hapticbridge.commands.command import Couple, Mark, Repeat, Reset, Switch
 from hapticbridge.commands.queue import CommandQueue
 from hapticbridge.coupling import Coupling
 
@@ -24,12 +24,12 @@ class Operator:
 
     Attributes:
         felt: The coupling that is to be felt, once its change is over.
-        later: What is done when the force has faded: tick, command, who gave it.
+        later: Resets that wait until the force has faded: tick, and who gave it.
     """
 
     def __init__(self, queue: CommandQueue, tell: Tell) -> None:
         self.felt: Coupling = queue.allowance.start
-        self.later: deque[tuple[int, Command, str]] = deque()
+        self.later: deque[tuple[int, str]] = deque()
         self._queue, self._tell = queue, tell
         self._has_force, self._is_clutched = True, False
         self._repeater: Repeater | None = None
@@ -52,23 +52,16 @@ class Operator:
         if not self._has_force or self._is_clutched:
             self._switch("run")
 
-    def act(self, tick: int) -> Record | None:
-        """Does what is due before a tick.
-
-        Returns:
-            What only a pause of the loop can do: a recorder to be started or stopped.
-        """
+    def act(self, tick: int) -> None:
+        """Does what is due before a tick."""
         if self.later:
-            due, postponed, by = self.later[0]
+            due, by = self.later[0]
             if tick < due:
-                return None  # in the order that they were given
+                return  # in the order that they were given
             self.later.popleft()
-            if isinstance(postponed, Record):
-                self._switch(by)
-                return postponed
             self._do({"event": "reset", "by": by})
             self._switch(by)
-            return None
+            return
         command, by = self._queue.waiting.popleft()
         if isinstance(command, Couple):
             self.felt = self._queue.allowance.felt(command, self.felt)
@@ -81,13 +74,14 @@ class Operator:
             if command.clutch is not None:
                 self._is_clutched = command.clutch
             self._switch(by)
-        elif isinstance(command, Reset | Record):
-            self.later.append((tick + self._fade_ticks + 1, command, by))
+        elif isinstance(command, Reset):
+            self.later.append((tick + self._fade_ticks + 1, by))
             self._switch(by, is_fading=True)
+        elif isinstance(command, Mark):
+            self._tell("mark", by=by)
         elif isinstance(command, Repeat):
             for event in command.events:
                 self._do({n: v for n, v in event.items() if n not in ("tick", "time_ns")})
-        return None
 
     def _switch(self, by: str, *, is_fading: bool = False) -> None:
         force = self._has_force and not is_fading

@@ -8,7 +8,7 @@ from collections import deque
 from collections.abc import Callable
 
 from hapticbridge.commands.allowance import Allowance
-from hapticbridge.commands.command import Command, Couple, Record, Repeat, Reset
+from hapticbridge.commands.command import Command, Couple, Mark, Repeat, Reset
 from hapticbridge.errors import CommandError
 
 MOST_WAITING = 8
@@ -19,9 +19,9 @@ INTERVAL = 0.05
 """In s, least time between two commands. A slider that is dragged needs no more than 20 a second to
 look smooth, and each takes the loop some 20 µs; a flood must not become a load."""
 
-PAUSE_INTERVAL = 1.0
-"""In s, likewise before a command that interrupts the force: a reset, and a recorder that starts or
-stops, take half a second with their ramps."""
+RESET_INTERVAL = 1.0
+"""Least time in s between two resets. The force fades before each and rises after it, which takes
+half a second. A shorter interval lets resets follow each other without any force between them."""
 
 
 class CommandQueue:
@@ -33,7 +33,7 @@ class CommandQueue:
 
     Args:
         allowance: What the device allows.
-        can_record: Whether the run can start and stop a recorder.
+        is_recorded: Whether the run is recorded, so that it can be marked.
         now: Time in s, that never runs backwards.
 
     Attributes:
@@ -44,14 +44,14 @@ class CommandQueue:
         self,
         allowance: Allowance,
         *,
-        can_record: bool = True,
+        is_recorded: bool = True,
         now: Callable[[], float] = time.monotonic,
     ) -> None:
         self.allowance = allowance
         self.waiting: deque[tuple[Command | Repeat, str]] = deque(maxlen=MOST_WAITING)
-        self._can_record, self._now = can_record, now
+        self._is_recorded, self._now = is_recorded, now
         self._offering = threading.Lock()  # never the loop's
-        self._last = self._last_pause = -float("inf")
+        self._last = self._last_reset = -float("inf")
 
     def warm_up(self) -> None:
         """Computes what takes long, so that no command is the first one."""
@@ -71,20 +71,20 @@ class CommandQueue:
                 the loop does not take any.
         """
         self._check(command)
-        is_pause = isinstance(command, Reset | Record)
+        is_reset = isinstance(command, Reset)
         with self._offering:
             now = self._now()
             early = max(
                 self._last + INTERVAL - now,
-                self._last_pause + PAUSE_INTERVAL - now if is_pause else 0.0,
+                self._last_reset + RESET_INTERVAL - now if is_reset else 0.0,
             )
             if early > 0:
                 raise CommandError(f"the last command is too recent; ask again in {early:.2f} s")
             if len(self.waiting) >= MOST_WAITING:
                 raise CommandError("the loop takes no commands; it stands still")
             self._last = now
-            if is_pause:
-                self._last_pause = now
+            if is_reset:
+                self._last_reset = now
             self.waiting.append((command, by))
 
     def _check(self, command: Command) -> None:
@@ -94,5 +94,5 @@ class CommandQueue:
             raise CommandError(
                 "a tool without mass is where the hand is; there is nothing to reset"
             )
-        elif isinstance(command, Record) and not self._can_record:
-            raise CommandError("this run cannot start a recorder")
+        elif isinstance(command, Mark) and not self._is_recorded:
+            raise CommandError("this run is not recorded; start it with a recording to mark it")

@@ -2,16 +2,25 @@
 
 from __future__ import annotations
 
+import json
+import math
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from hapticbridge.errors import RecordingError, choices
 from hapticbridge.export.csv_file import CsvSink, sidecar_of
 from hapticbridge.export.hdf5 import Hdf5Sink
 from hapticbridge.export.parquet import ParquetSink
 from hapticbridge.export.sink import Sink
+from hapticbridge.provenance import meta_float
 from hapticbridge.recording import RecordingFile, open_recording
+from hapticbridge.recording.run_time import Timeline, due_times
 
 FORMATS: dict[str, tuple[type[Sink], tuple[str, ...]]] = {
     "parquet": (ParquetSink, (".parquet", ".pq")),
@@ -21,6 +30,14 @@ FORMATS: dict[str, tuple[type[Sink], tuple[str, ...]]] = {
 """What writes each format, and the endings of its files, the usual one first."""
 
 
+EVERYTHING = (-math.inf, math.inf)
+"""Span in s of the run's clock that leaves nothing out."""
+
+_ROUNDING = 0.5e-9
+"""Half a nanosecond, in s. Recorded times are whole nanoseconds, so that a tick due at 0.3 s counts
+as due then, however 0.3 is rounded."""
+
+
 @dataclass(frozen=True, slots=True)
 class Exported:
     """What was written.
@@ -28,10 +45,14 @@ class Exported:
     Attributes:
         files: The table first, then what stands beside it.
         recording: What was read, without its ticks.
+        ticks: Count of rows in the table.
+        events: Events that were written.
     """
 
     files: tuple[Path, ...]
     recording: RecordingFile
+    ticks: int
+    events: tuple[dict[str, Any], ...]
 
     @property
     def damage(self) -> tuple[str, ...]:
@@ -52,7 +73,12 @@ def target_for(path: str | Path, form: str) -> Path:
 
 
 def export(
-    path: str | Path, form: str, target: str | Path | None = None, *, overwrite: bool = False
+    path: str | Path,
+    form: str,
+    target: str | Path | None = None,
+    *,
+    span: tuple[float, float] = EVERYTHING,
+    overwrite: bool = False,
 ) -> Exported:
     """Writes a recording as a table: a row per tick, a column per number, with their units.
 
@@ -66,12 +92,14 @@ def export(
         form: One of ``FORMATS``.
         target: The file, with an ending of the format; None: the recording's name with the usual
             one.
+        span: First time and end in s of the run's clock, the end excluded. Only ticks that were due
+            and events that happened in between are written; metadata ``cut`` then holds the two.
         overwrite: Replace files that exist.
 
     Raises:
         RecordingError: The recording cannot be read, the format is unknown or needs a package that
-            is not installed, or the target exists, is the recording, ends otherwise or cannot be
-            written.
+            is not installed, no tick lies in the span, or the target exists, is the recording, ends
+            otherwise or cannot be written.
     """
     sink_type, endings = _sink(form)
     recording = open_recording(path)
@@ -86,15 +114,19 @@ def export(
             raise RecordingError(f"'{file}' is the recording itself; choose another file")
         if file.exists() and not overwrite:
             raise RecordingError(f"'{file}' exists; choose another file or add --overwrite")
+    piece, count = _piece(recording, span), 0
     draft = target.with_name(f".{target.name}.draft")
     drafts = (draft, sidecar_of(draft)) if form == "csv" else (draft,)
     try:
-        sink = sink_type(draft, recording)
+        sink = sink_type(draft, piece)
         try:
-            for ticks in recording.blocks():
+            for ticks in _blocks(recording, span):
                 sink.add(ticks)
+                count += len(ticks)
         finally:
             sink.close()
+        if not count and span != EVERYTHING:
+            raise RecordingError(_no_tick(recording, span))
         for written, file in zip(drafts, files, strict=True):
             written.replace(file)
     except OSError as error:
@@ -106,7 +138,49 @@ def export(
         for written in drafts:
             with suppress(OSError):
                 written.unlink(missing_ok=True)
-    return Exported(files, recording)
+    return Exported(files, recording, count, tuple(piece.events))
+
+
+def time_of(event: Mapping[str, Any]) -> float:
+    """Returns when an event happened, in s of the run's clock; NaN where a damaged one lacks it."""
+    time = event.get("time_ns")
+    return 1e-9 * time if isinstance(time, int) else math.nan
+
+
+def _piece(recording: RecordingFile, span: tuple[float, float]) -> RecordingFile:
+    """Returns the description of a recording with the events of a span alone."""
+    start, end = span
+    if not start < end:  # nor where one is not a number
+        raise RecordingError(
+            f"the piece from {start:g} s to {end:g} s is empty; its end must be later"
+        )
+    if span == EVERYTHING:
+        return recording
+    events = [event for event in recording.events if start <= time_of(event) < end]
+    limits = [time if math.isfinite(time) else None for time in span]
+    meta = recording.meta | {"cut": json.dumps(limits)}
+    return replace(recording, events=events, meta=meta)
+
+
+def _blocks(recording: RecordingFile, span: tuple[float, float]) -> Iterator[NDArray[np.void]]:
+    """Yields the records that were due in a span."""
+    if span == EVERYTHING:
+        yield from recording.blocks()
+        return
+    start, end = span
+    period = meta_float(recording.meta, "period_s")
+    for ticks in recording.blocks():
+        due = due_times(ticks, period) + _ROUNDING
+        found = ticks[(start <= due) & (due < end)]
+        if found.size:
+            yield found
+
+
+def _no_tick(recording: RecordingFile, span: tuple[float, float]) -> str:
+    duration = Timeline(recording.blocks(), meta_float(recording.meta, "period_s")).duration
+    return (
+        f"no tick was due from {span[0]:g} s to {span[1]:g} s; the recording ends at {duration:g} s"
+    )
 
 
 def _sink(form: str) -> tuple[type[Sink], tuple[str, ...]]:

@@ -5,6 +5,7 @@ is before force, ``trip`` after it. The arithmetic is the kernel's.
 """
 
 from hapticbridge.guard.guarding import CONTROLLERS as CONTROLLERS
+from hapticbridge.guard.guarding import button_mask as button_mask
 from hapticbridge.guard.guarding import guarding_for as guarding_for
 from hapticbridge.guard.limits import UNLIMITED as UNLIMITED
 from hapticbridge.guard.limits import USUAL_ENERGY as USUAL_ENERGY

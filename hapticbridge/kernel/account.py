@@ -37,11 +37,11 @@ def unpaid(state: NDArray[np.void]) -> float:
 
         given + r min(S − S_0, 0),   r = force_scale/scale
 
-    ``given`` is w·δp − b δp²/t summed; S_0 is what the scene stored when the whole run began, be it
-    recorded from there or not: what it has given up of that has paid.
+    ``given`` is w·δp − b δp²/t summed; S_0 is what the scene stored when the run began: what it has
+    given up of that has paid.
     """
     s = state[0]
-    lost = min(s.kinetic + s.potential - s.first_energy, 0.0)
+    lost = min(s.kinetic + s.potential - s.start_energy, 0.0)
     return float(s.given + (s.force_scale / s.scale) * lost)
 
 
@@ -79,7 +79,7 @@ def keep_account(state: NDArray[np.void], moved: Vector, turned: Vector, interva
     s.excess_before = over
     own = stored - s.actuator_work - s.external_work
     gained = (s.force_scale / s.scale) * s.passed * (own - s.own_before)
-    kept = max(s.kinetic + s.potential - s.first_energy, 0.0)
+    kept = max(s.kinetic + s.potential - s.start_energy, 0.0)
     taken = own - s.own_before if s.commanded & FORCE_OFF else 0.0
     s.unfelt = min(max(s.unfelt + taken, 0.0), kept)
     s.own_before = own

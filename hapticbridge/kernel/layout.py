@@ -206,7 +206,6 @@ _RUNNING = (
     "kinetic",
     "potential",
     "start_energy",
-    "first_energy",
     "coupling_work",
     "actuator_work",
     "external_work",

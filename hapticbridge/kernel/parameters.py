@@ -11,7 +11,6 @@ from numpy.typing import ArrayLike
 from hapticbridge.arguments import Arguments
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import HapticBridgeError
-from hapticbridge.kernel.counts import Counts
 from hapticbridge.kernel.guarding import UNGUARDED, Guarding
 from hapticbridge.kernel.scheme import COUPLED, DIRECT, HELD, LOSSLESS, WELD, has_law, laws_per_tick
 
@@ -74,10 +73,6 @@ class RunParameters:
             motion is prescribed. What the device was given is held against what this burns.
         device_rotational_damping: In N m s/rad, None likewise, or where nothing turns.
         guarding: What the guard does within a tick.
-        start_elastic: What contacts, limits and equality constraints store at most at the start, in
-            J: it may come out again, and MuJoCo's energies do not have it. Zero for runs that begin
-            at a scene's own start, which presses on nothing.
-        counts: What the guard had counted where the run begins in mid-motion; None where at rest.
 
     Raises:
         HapticBridgeError: A value is out of range.
@@ -102,8 +97,6 @@ class RunParameters:
     device_damping: float | None = None
     device_rotational_damping: float | None = None
     guarding: Guarding = UNGUARDED
-    start_elastic: float = 0.0
-    counts: Counts | None = None
 
     def __post_init__(self) -> None:
         checked_substeps(self.substeps)
@@ -125,10 +118,6 @@ class RunParameters:
                 "without mass, and has no meaning for another"
             )
         refuse_substeps(self.scheme, self.substeps)
-        if not math.isfinite(self.start_elastic) or self.start_elastic < 0:
-            raise HapticBridgeError(
-                f"start_elastic is {self.start_elastic!r} J; it must be finite and >= 0"
-            )
         if self.ramp_ticks < 0:
             raise HapticBridgeError(f"ramp_ticks is {self.ramp_ticks}; it must be >= 0")
         for name in ("device_origin", "handle_origin", "device_start"):

@@ -8,13 +8,11 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.kernel.account import unpaid
 from hapticbridge.kernel.addresses import bind_addresses, gains_of
 from hapticbridge.kernel.direct import balance_contacts, tool_map
 from hapticbridge.kernel.guarding import Guarding
 from hapticbridge.kernel.handle import handle_pose
 from hapticbridge.kernel.layout import STATE_DTYPE
-from hapticbridge.kernel.lossless import leave
 from hapticbridge.kernel.meter import refresh_energies
 from hapticbridge.kernel.midpoint import note_twist
 from hapticbridge.kernel.names import COUPLING_ACTUATORS, HANDLE, WELD_NAME
@@ -92,7 +90,7 @@ class Binding:
         refresh_energies(state)
         after = float(state["kinetic"][0] + state["potential"][0])
         state["external_work"] += after - before
-        start, ratio = float(state["first_energy"][0]), state["force_scale"] / state["scale"]
+        start, ratio = float(state["start_energy"][0]), state["force_scale"] / state["scale"]
         state["given"] += ratio * (min(before - start, 0.0) - min(after - start, 0.0))
         forget_dissipation(state)
         state["is_seated_anew"] = 1
@@ -102,17 +100,6 @@ class Binding:
             self._owned["carried_force"][:] = 0.0
             set_gains(state, 1.0)
             note_twist(state)
-
-    def let_go(self) -> None:
-        """Leaves the scene as one that nobody carries anything over in, its energy unchanged.
-
-        For a start from here: another binding then finds all there is in model and data.
-        """
-        state = self.state
-        if state["scheme"][0] == LOSSLESS:
-            if state["is_midpoint"][0]:
-                leave(state)
-            self._data.qfrc_applied[:] = self._owned["qfrc_applied"][: self._model.nv]
 
     def _fill_parameters(self, model: mujoco.MjModel, parameters: RunParameters) -> None:
         state = self.state
@@ -238,12 +225,6 @@ class Binding:
             balance_contacts(state)
         else:
             refresh_energies(state)
-        state["start_energy"] = state["kinetic"] + state["potential"] + parameters.start_elastic
-        state["own_before"] = -parameters.start_elastic
-        state["first_energy"] = state["start_energy"]
-        if parameters.counts is not None:
-            parameters.counts.put(state)
-            forget_dissipation(state)  # a command, as any other
-            state["kicked"] = unpaid(state)
+        state["start_energy"] = state["kinetic"] + state["potential"]
         if parameters.scheme == LOSSLESS:
             note_twist(state)

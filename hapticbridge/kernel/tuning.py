@@ -83,7 +83,7 @@ def forget_dissipation(state: NDArray[np.void]) -> None:
     """
     s = state[0]
     ratio = float(s["force_scale"] / s["scale"])
-    kept = max(float(s["kinetic"] + s["potential"] - s["first_energy"] - s["unfelt"]), 0.0)
+    kept = max(float(s["kinetic"] + s["potential"] - s["start_energy"] - s["unfelt"]), 0.0)
     held = 0.0 if s["commanded"] & FORCE_OFF else held_energy(state)
     s["given"] = max(float(s["given"]), -(float(s["surplus"]) + held + ratio * kept))
 

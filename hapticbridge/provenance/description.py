@@ -14,7 +14,6 @@ from datetime import UTC, datetime
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import HapticBridgeError, RecordingError
-from hapticbridge.kernel.counts import Counts
 from hapticbridge.kernel.guarding import UNGUARDED, Guarding
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.scheme import WELD
@@ -33,27 +32,20 @@ from hapticbridge.rendering import Method, method_named
 from hapticbridge.scene import Scene
 
 MODEL_ATTACHMENT = "model.mjb"
-RESET_ATTACHMENT = "reset_state.f64"
 SOURCE_PREFIX = "scene/"
 
-MID_RUN = "mid-run"
-"""Metadata ``began`` of a recording whose start is not the scene's own."""
+_MID_RUN = "mid-run"
+"""Metadata ``began`` of a recording of an earlier version that begins while its run goes on."""
 
 _FLOATS = ("scale", "force_scale", "force_limit", "torque_limit", "contact_stiffness")
 _POSES = ("device_origin", "handle_origin", "device_start")
 _GAINS = ("stiffness", "damping", "rotational_stiffness", "rotational_damping")
-_ELASTIC, _COUNTS = "start_elastic", "counts"
 
 
-def attachments(scene: Scene, reset: bytes | None = None) -> list[Attachment]:
+def attachments(scene: Scene) -> list[Attachment]:
     """Returns the scene's sources, its compiled model and its start, as the recording keeps them.
 
     Call it after the scene was prepared and reset: gains and timestep are part of the model.
-
-    Args:
-        scene: The scene.
-        reset: Where a reset leads to (``start_state``), if not to the start: the recording of a run
-            that was on its way already.
     """
     kept = [
         Attachment(SOURCE_PREFIX + source.name, "application/octet-stream", source.data)
@@ -63,8 +55,6 @@ def attachments(scene: Scene, reset: bytes | None = None) -> list[Attachment]:
     state = start_state(scene.model, scene.data).astype("<f8").tobytes()
     kept.append(Attachment(MODEL_ATTACHMENT, "application/octet-stream", model))
     kept.append(Attachment(STATE_ATTACHMENT, "application/octet-stream", state))
-    if reset is not None:
-        kept.append(Attachment(RESET_ATTACHMENT, "application/octet-stream", reset))
     return kept
 
 
@@ -86,10 +76,6 @@ def describe_run(
     for name, count in STARTS.items():
         start = start_of(binding.state, name)
         meta[name] = json.dumps(start if count > 1 else start[0])
-    if parameters.start_elastic:
-        meta[_ELASTIC] = repr(parameters.start_elastic)
-    if parameters.counts is not None:
-        meta[_COUNTS] = parameters.counts.to_json()
     return meta | {
         "period_s": repr(parameters.period),
         "substeps": str(parameters.substeps),
@@ -124,8 +110,14 @@ def parameters_of(meta: Mapping[str, str]) -> RunParameters:
     """Returns the parameters of a recorded run.
 
     Raises:
-        RecordingError: Something is missing or out of range.
+        RecordingError: Something is missing or out of range, or the recording begins in mid-run, as
+            those of earlier versions could.
     """
+    if meta.get("began") == _MID_RUN:
+        raise RecordingError(
+            "the recording begins in mid-run, which only earlier versions of hapticbridge recorded "
+            "and judge; 'hapticbridge export' still reads its ticks"
+        )
     try:
         method = method_named(meta.get("method", ""))
         device = None if method.has_law else DeviceInfo.from_json(meta.get("device", ""))
@@ -150,8 +142,6 @@ def parameters_of(meta: Mapping[str, str]) -> RunParameters:
             device_damping=burning,
             device_rotational_damping=rotational,
             guarding=Guarding.from_json(meta["guard"]) if "guard" in meta else UNGUARDED,
-            start_elastic=meta_float(meta, _ELASTIC) if _ELASTIC in meta else 0.0,
-            counts=Counts.from_json(meta[_COUNTS]) if _COUNTS in meta else None,
         )
     except RecordingError:
         raise

@@ -60,15 +60,6 @@ def meta_start(meta: Mapping[str, str], name: str) -> list[float]:
     return list(meta_numbers(meta, name, STARTS[name]))
 
 
-def meta_home(meta: Mapping[str, str]) -> list[float]:
-    """Returns the tool pose (7,) to which a reset leads: ``home``, else where the recording starts.
-
-    Raises:
-        RecordingError: It is not as many finite numbers.
-    """
-    return list(meta_numbers(meta, "home", 7)) if "home" in meta else meta_start(meta, "tool_start")
-
-
 def meta_count(meta: Mapping[str, str], name: str) -> int:
     """Returns a count of the metadata.
 

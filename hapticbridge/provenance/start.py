@@ -50,20 +50,6 @@ def restore_state(model: mujoco.MjModel, data: mujoco.MjData, state: bytes) -> N
     mujoco.mj_setState(model, data, np.frombuffer(state, dtype="<f8").astype(np.float64), _STATE)
 
 
-def elastic_energy(data: mujoco.MjData) -> float:
-    """Returns what constraints store at most, Σ |λ_i r_i| in J.
-
-    A spring whose force λ grows with its way r stores ∫ λ dr <= λ r. Rows without a residual
-    (friction) store nothing.
-
-    Args:
-        data: After ``restore_state``, so that it is the same wherever it is computed.
-    """
-    return float(np.sum(np.abs(data.efc_force * np.minimum(data.efc_pos, 0.0)))) + float(
-        np.sum(np.abs(data.efc_force[: data.ne] * np.maximum(data.efc_pos[: data.ne], 0.0)))
-    )
-
-
 def start_of(state: NDArray[np.void], name: str) -> list[float]:
     """Returns one of ``STARTS`` from the kernel's state, as long as no tick has run."""
     if name in _STORED:

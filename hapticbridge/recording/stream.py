@@ -15,7 +15,7 @@ from hapticbridge.errors import RecordingError
 from hapticbridge.recording.format import Attachment
 from hapticbridge.recording.onlooker import Onlooker
 from hapticbridge.recording.recorder import Recorder
-from hapticbridge.recording.ring import HEAD, TAIL, Ring
+from hapticbridge.recording.ring import TAIL, Ring
 from hapticbridge.recording.salvage import salvage
 from hapticbridge.tick import TickFlag
 
@@ -103,61 +103,6 @@ class RecordStream:
         if self._onlooker is not None:
             self._onlooker.start(str(self._ring.name), metadata, attachments)
         self.tell({"event": "recording", "path": None if self._path is None else str(self._path)})
-
-    @property
-    def is_recording(self) -> bool:
-        """Whether a file is being written."""
-        return self.recorder is not None and self._path is not None
-
-    def record(
-        self, path: Path, metadata: Mapping[str, str], attachments: Sequence[Attachment]
-    ) -> None:
-        """Starts a recording of the ticks to come, in a pause of the loop.
-
-        Args:
-            path: The file, which must not exist.
-            metadata: Of a run that begins with the next tick.
-            attachments: Likewise.
-
-        Raises:
-            RecordingError: The file exists or cannot be written; nothing is recorded then.
-        """
-        if path.exists():
-            raise RecordingError(f"'{path}' exists")
-        self._replace_recorder(path, metadata, attachments)
-
-    def stop_recording(self) -> None:
-        """Closes the recording, in a pause of the loop; the ring is kept for others.
-
-        Raises:
-            RecordingError: The recorder's process died, or could not write the file.
-        """
-        self._replace_recorder(None, {}, [])
-
-    def _replace_recorder(
-        self,
-        path: Path | None,
-        metadata: Mapping[str, str],
-        attachments: Sequence[Attachment],
-    ) -> None:
-        before, self.recorder = self.recorder, None
-        try:
-            if before is not None:
-                self._close_recorder(before)
-        finally:
-            self._path = None
-            self._events.clear()
-            self.cursors[TAIL] = NOBODY_READS
-        if path is None and not self._is_live:
-            return
-        self.cursors[TAIL] = self.cursors[HEAD]
-        recorder = Recorder(self._ring, path, metadata, attachments, live=self._is_live)
-        try:
-            recorder.wait_until_ready()
-        except RecordingError:
-            self.cursors[TAIL] = NOBODY_READS
-            raise
-        self.recorder, self._path = recorder, path
 
     def tell(self, news: Mapping[str, object]) -> None:
         """Tells the onlooker alone, if there is one; never waits and never raises."""

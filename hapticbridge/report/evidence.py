@@ -19,7 +19,7 @@ from hapticbridge.device import DeviceInfo
 from hapticbridge.device.lateness import delay_ticks
 from hapticbridge.errors import HapticBridgeError
 from hapticbridge.kernel.parameters import RunParameters
-from hapticbridge.provenance import MODEL_ATTACHMENT, STARTS, meta_home, meta_start, parameters_of
+from hapticbridge.provenance import MODEL_ATTACHMENT, STARTS, meta_start, parameters_of
 from hapticbridge.recording import Recording, due_times
 from hapticbridge.recording.reader import BLOCK
 from hapticbridge.rendering import Method, method_named
@@ -118,7 +118,7 @@ class Evidence:
             parameters = replace(
                 parameters, device_damping=linear, device_rotational_damping=rotational
             )
-            home = np.array(meta_home(recording.meta))
+            home = np.array(meta_start(recording.meta, "tool_start"))
             outside = Interventions.of(recording.events, parameters, home)
             worst = outside.worst(info, method)
             energies = np.concatenate(

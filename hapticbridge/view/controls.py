@@ -18,7 +18,7 @@ from typing import Any
 
 import viser
 
-from hapticbridge.commands import Allowance, Command, Couple, Record, Reset, Switch
+from hapticbridge.commands import Allowance, Command, Couple, Mark, Reset, Switch
 from hapticbridge.commands.command import Stop, line_of
 from hapticbridge.commands.queue import INTERVAL
 from hapticbridge.commands.span import UNITS
@@ -129,15 +129,15 @@ class Controls:
             self._force = gui.add_checkbox("force", initial_value=True)
             self._clutch = gui.add_checkbox("clutch (the hand moves alone)", initial_value=False)
             reset = gui.add_button("back to the start")
-            self._record = gui.add_button("start recording")
+            mark = gui.add_button("mark this moment")
             self.answer = gui.add_markdown("")
         # how the run is, or soon will be
         self._gains = [sliders.span.gains(allowance.start) for sliders in self._sliders]
-        self._is_forced, self._is_clutched, self._is_recording = True, False, False
+        self._is_forced, self._is_clutched = True, False
         self._force.on_update(by_hand(self._switch_force))
         self._clutch.on_update(by_hand(self._switch_clutch))
         reset.on_click(lambda _: ask(Reset()))
-        self._record.on_click(lambda _: ask(Record(not self._is_recording)))
+        mark.on_click(lambda _: ask(Mark()))
         stop.on_click(lambda _: ask(Stop()))
 
     def _ends(self) -> str:
@@ -173,10 +173,10 @@ class Controls:
                 self._show_switches()
         elif kind == "reset":
             self._say("answer", "the scene is back at its start")
+        elif kind == "mark":
+            self._say("answer", f"marked at tick {event.get('tick')}")
         elif kind == "recording":
             path = event.get("path")
-            self._is_recording = path is not None
-            self._record.label = "stop recording" if path else "start recording"
             self._say("recording", f"recording to {path}" if path else "not recording")
         elif kind == "refused":
             self._refuse(str(event.get("reason")))

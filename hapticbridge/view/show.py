@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,6 @@ from hapticbridge.errors import HapticBridgeError
 from hapticbridge.film.stage import LEAST_REFERENCE
 from hapticbridge.provenance import parameters_of
 from hapticbridge.recording import RecordingFile, Ring
-from hapticbridge.recording.ring import HEAD
 from hapticbridge.tick import TICK_DTYPE
 from hapticbridge.view.pursuit import STRAY, Pursuit
 from hapticbridge.view.sight import Sight
@@ -42,29 +40,20 @@ class Show:
 
     def __init__(self, ring: Ring, run: RecordingFile, lag: int = 0) -> None:
         self._ring, self._lag = ring, lag
-        self._begin(run)
-        self._run.warm_up()  # a compilation of 20 s would be longer than what the ring holds
-        self._shown = mujoco.MjData(self.model)
-        self._number = self._boundary = 0
-        self._gathered = np.zeros(0, TICK_DTYPE)
-        self._awaits_first = False
-        self.reference = LEAST_REFERENCE
-
-    def _begin(self, run: RecordingFile) -> None:
         self.parameters = parameters_of(run.meta)
         self._run, self._skipped = Rerun(run, self.parameters), ""
+        self._run.warm_up()  # a compilation of 20 s would be longer than what the ring holds
         self._pursuit: Pursuit | None = None
         self.model, self._trace = self._run.model, Trace(TRACE)
         self._tendons = Tendons(self.model)
+        self._shown = mujoco.MjData(self.model)
+        self._number = 0
+        self._gathered = np.zeros(0, TICK_DTYPE)
+        self.reference = LEAST_REFERENCE
 
     def note(self, event: dict[str, Any]) -> None:
-        """Takes an event of the run; one that began anew is simulated from there on."""
-        if event.get("event") != "begin":
-            self._run.note(event)
-            return
-        files = {n: base64.b64decode(data) for n, data in event["attachments"].items()}
-        self._begin(facts(event["metadata"], files))
-        self._awaits_first, self._boundary = True, int(self._ring.cursors[HEAD])
+        """Takes an event of the run."""
+        self._run.note(event)
 
     def gather(self) -> None:
         """Takes what the ring has.
@@ -133,15 +122,9 @@ class Show:
 
     def _news(self) -> NDArray[np.void]:
         """Returns the records gathered since the last look."""
-        number, end = self._number, max(len(self._gathered) - self._lag, 0)
+        end = max(len(self._gathered) - self._lag, 0)
         rows, self._gathered = self._gathered[:end], self._gathered[end:]
         self._number += end
-        if self._awaits_first and rows.size:
-            first = np.flatnonzero(rows["tick"] == 0)
-            # what was written after the news is of the new run, even if its first record is gone
-            start = int(first[-1]) if first.size else max(self._boundary - number, 0)
-            rows = rows[start:]
-            self._awaits_first = not rows.size
         return rows
 
 

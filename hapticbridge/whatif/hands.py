@@ -16,7 +16,7 @@ from hapticbridge.device import AXES, DeviceInfo, Hand
 from hapticbridge.device.lateness import delay_ticks
 from hapticbridge.device.simulated.driver import SimulatedDevice
 from hapticbridge.whatif.again import Outside
-from hapticbridge.whatif.intent import INTENT, intended
+from hapticbridge.whatif.intent import intended
 
 Array = NDArray[np.float64]
 
@@ -43,9 +43,7 @@ class IdentifiedDevice(SimulatedDevice):
         hand: Who holds it.
         ticks: The recorded rows, ``TICK_DTYPE``, at least three.
         period: The recorded loop's in s.
-        start: Device pose (7,) before the first tick.
-        is_moving: Whether it moves at the start already, as in a recording begun in mid-run; it is
-            else held still until then.
+        start: Device pose (7,) before the first tick, where it is held still until then.
     """
 
     def __init__(
@@ -55,8 +53,6 @@ class IdentifiedDevice(SimulatedDevice):
         ticks: NDArray[np.void],
         period: float,
         start: tuple[float, ...],
-        *,
-        is_moving: bool = False,
     ) -> None:
         super().__init__(
             mass=info.mass or 0.0,
@@ -71,9 +67,7 @@ class IdentifiedDevice(SimulatedDevice):
             torque_limit=info.torque_limit,
             speed_limit=info.speed_limit,
         )
-        self._motion = intended(info, hand, ticks, period, start, is_moving=is_moving)
-        at_rest = np.zeros(3), np.zeros(3)
-        self._velocity = _first_velocity(ticks, period) if is_moving else at_rest
+        self._motion = intended(info, hand, ticks, period, start)
         self._start = np.array(start)
         self._origin = Rotation.from_quat(self._start[3:], scalar_first=True)
         self._outside = Outside(ticks, period)
@@ -88,7 +82,6 @@ class IdentifiedDevice(SimulatedDevice):
         state = self._states[0]
         state["target_position"] = self._motion[0, 1:4]
         state["target_quaternion"] = self._motion[0, 4:]
-        state["velocity"], state["angular_velocity"] = self._velocity
         return self._there(sample)
 
     def read(self, sample: NDArray[np.void]) -> int:
@@ -109,15 +102,3 @@ class IdentifiedDevice(SimulatedDevice):
         turned = Rotation.from_quat(sample["quaternion"][0], scalar_first=True) * self._origin
         sample["quaternion"][0] = turned.as_quat(canonical=True, scalar_first=True)
         return sample
-
-
-def _first_velocity(ticks: NDArray[np.void], period: float) -> tuple[Array, Array]:
-    """Returns velocity in m/s and angular velocity in rad/s with which a recorded motion begins.
-
-    The mean over ``INTENT``: one step of a rounded position is as much noise as motion.
-    """
-    last = min(max(round(INTENT / period), 1), len(ticks) - 1)
-    places, turns = ticks["device_position"], ticks["device_quaternion"]
-    first, later = (Rotation.from_quat(turns[row], scalar_first=True) for row in (0, last))
-    time = last * period
-    return (places[last] - places[0]) / time, (later * first.inv()).as_rotvec() / time

@@ -38,8 +38,6 @@ def intended(
     ticks: NDArray[np.void],
     period: float,
     start: tuple[float, ...],
-    *,
-    is_moving: bool = False,
 ) -> Array:
     """Returns where the hand wanted to be, as a ``Motion.table`` counted from the start.
 
@@ -52,19 +50,12 @@ def intended(
         ticks: The recorded rows.
         period: Of the recorded loop, in s.
         start: Device pose (7,) before the first tick.
-        is_moving: Whether it moves at the start already, as in a recording begun in mid-run.
     """
     origin = Rotation.from_quat(np.array(start[3:]), scalar_first=True)
     turned = Rotation.from_quat(ticks["device_quaternion"], scalar_first=True) * origin.inv()
     wrench = _held(ticks["wrench_on_device"], delay_ticks(info, period) or 0)
     wanted = [
-        _wanted(
-            moved,
-            force,
-            period,
-            (m + m_h, b + b_h, b_h, k_h, friction),
-            is_moving=is_moving,
-        )
+        _wanted(moved, force, period, (m + m_h, b + b_h, b_h, k_h, friction))
         for moved, force, m, m_h, b, b_h, k_h, friction in (
             (
                 ticks["device_position"] - np.array(start[:3]),
@@ -109,17 +100,13 @@ def _wanted(
     force: Array,
     period: float,
     law: tuple[float, float, float, float, float],
-    *,
-    is_moving: bool,
 ) -> Array:
     """Solves b_h p' + k_h p = M a + β v + k_h x − w + f_c sign(v) for p, by the bilinear rule.
 
     It is stable, and at half the rate, where central differences are noise, it answers nothing.
     """
     inertia, damping, hand_damping, stiffness, friction = law
-    # one that moves already moved on as it does: had it stood still, the start were a blow
-    before = 2 * moved[:1] - moved[1:2] if is_moving else moved[:1]
-    padded = np.concatenate([before, moved, moved[-1:]])
+    padded = np.concatenate([moved[:1], moved, moved[-1:]])
     velocity = (padded[2:] - padded[:-2]) / (2 * period)
     acceleration = (padded[2:] - 2 * moved + padded[:-2]) / period**2
     pull = inertia * acceleration + damping * velocity + stiffness * moved - force
@@ -128,9 +115,8 @@ def _wanted(
         wanted = pull / stiffness if stiffness else moved
     else:
         pole = 2 * hand_damping / period + stiffness
-        # the filter starts as if what is wanted had always moved as the device does at the start
-        resting = pull[:1] - hand_damping * velocity[:1] if is_moving else pull[:1]
-        first = resting / stiffness if stiffness else moved[:1]
+        # the filter starts as if what is wanted had always been where it is at the start
+        first = pull[:1] / stiffness if stiffness else moved[:1]
         rest = first - pull[:1] / pole
         wanted, _ = lfilter([1.0, 1.0], [pole, 2 * stiffness - pole], pull, axis=0, zi=rest)
     return np.asarray(gaussian_filter1d(wanted, INTENT / period, axis=0, mode="nearest"))

@@ -19,16 +19,12 @@ from hapticbridge.guard import CONTROLLERS, Limits, guarding_for
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.pose import IDENTITY_POSE
 from hapticbridge.provenance import (
-    MID_RUN,
-    STATE_ATTACHMENT,
     compiled_model,
     parameters_of,
-    restore_state,
 )
 from hapticbridge.recording import Recording
 from hapticbridge.rendering import Method, method_named, prepare
 from hapticbridge.scene import Scene, load_scene, scene_parameters
-from hapticbridge.scene.checks import MAXIMUM_START_PENETRATION
 from hapticbridge.tick import TickFlag
 from hapticbridge.whatif.changes import Settings
 from hapticbridge.whatif.exact import that_gives
@@ -134,48 +130,10 @@ class RecordedRun:
         return (*first["device_position"].tolist(), *first["device_quaternion"].tolist())
 
     @property
-    def start_state(self) -> bytes | None:
-        """State of the scene in which a recording of a run begins that was on its way already."""
-        if self.recording.meta.get("began") != MID_RUN:
-            return None
-        return self.recording.attachments.get(STATE_ATTACHMENT)
-
-    @property
     def trip(self) -> str:
         """Why the guard stopped the run, or nothing."""
         trips = [e for e in self.recording.events if e.get("event") == "trip"]
         return str(trips[0].get("reason", "unknown")) if trips else ""
-
-    def check_start(self, settings: Settings) -> None:
-        """Refuses to begin in mid-run in a scene that has become another there.
-
-        Raises:
-            RecordingError: Its state has other numbers, or something would begin inside another by
-                more than it did, which releases energy that nobody meters.
-        """
-        state = self.start_state
-        if state is None:
-            return
-        was, now = self._depth(self.settings, state), self._depth(settings, state)
-        if now - was > MAXIMUM_START_PENETRATION:
-            raise RecordingError(
-                f"the recording begins in mid-run, where with these changes something would be "
-                f"{1e3 * now:.3g} mm inside another ({1e3 * was:.3g} mm as recorded)"
-            )
-
-    def _depth(self, settings: Settings, state: bytes) -> float:
-        """Returns how deep in m the deepest contact is where the scene is in a state."""
-        scene = self.scene(settings)
-        step = settings.rate, settings.substeps, settings.method
-        prepare(scene, settings.coupling, 1.0 / step[0], *step[1:], warns=False)
-        try:
-            restore_state(scene.model, scene.data, state)
-        except RecordingError:
-            raise RecordingError(
-                "the recording begins in mid-run, in a state that the scene does not have with "
-                f"these changes (method '{settings.method.name}')"
-            ) from None
-        return max(0.0, -float(scene.data.contact.dist.min(initial=0.0)))
 
     def scene(self, settings: Settings) -> Scene:
         """Loads the scene with the parameters of some settings.

@@ -54,7 +54,6 @@ class Repetition:
             HapticBridgeError: The changed bridge is refused; the message says why.
         """
         run, settings = self._run, self.settings
-        run.check_start(settings)
         bridge = Bridge(
             run.scene(settings),
             device,
@@ -73,8 +72,6 @@ class Repetition:
             controller=settings.controller,
             clutch=run.clutch,
             dead_man=run.dead_man,
-            start_state=run.start_state,
-            counts=run.parameters.counts,
         )
         self._per_tick = run.parameters.period / bridge.period
         trip = ""

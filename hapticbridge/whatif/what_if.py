@@ -39,8 +39,8 @@ def what_if(
     Twice: with the recorded motion of the device, whatever the forces (``prescribed``, see
     ``again``), and, where the device's mass and damping are known, in a closed loop of that device
     and a model hand which wants what the recorded hand wanted (``hands``). Inputs of the scene,
-    buttons, commands and pauses come again at their times; a recording begun in mid-run begins in
-    the state that it carries. All runs are judged by the same audit. Memory holds all of them.
+    buttons, commands and pauses come again at their times. All runs are judged by the same audit.
+    Memory holds all of them.
 
     Args:
         path: The recording, neither damaged nor changed; it carries its scene.
@@ -139,10 +139,7 @@ class _Experiment:
         run = self._run
         scene = run.scene(settings)
         hand = scene_hand(scene.model, scene.path)
-        is_moving = run.start_state is not None
-        device = IdentifiedDevice(
-            run.info, hand, self._ticks, self._period, run.seat, is_moving=is_moving
-        )
+        device = IdentifiedDevice(run.info, hand, self._ticks, self._period, run.seat)
         return self._simulated(CLOSED, device, SimulatedClock(), settings)
 
     def _hand_error(self, same: WhatIfRun) -> float:
