@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import viser
 
-from hapticbridge.film.stage import Stage
+from hapticbridge.film_process import Stage
 from hapticbridge.view.address import Address
 from hapticbridge.view.page import Page
 from hapticbridge.view.server import serve, stop

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from hapticbridge.audit.rerun import Rerun
 from hapticbridge.errors import HapticBridgeError
-from hapticbridge.film.stage import LEAST_REFERENCE
+from hapticbridge.film_process import LEAST_REFERENCE
 from hapticbridge.provenance import parameters_of
 from hapticbridge.recording import RecordingFile, Ring
 from hapticbridge.recording.ring import HEAD
