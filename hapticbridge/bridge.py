@@ -34,6 +34,10 @@ RECORDER_LOOK = 0.1
 """In s, how often the loop looks whether the recorder still lives: 4 µs each time. A run that is to
 be recorded ends with its recorder."""
 
+PICTURE_PERIOD = 1 / 30
+"""Time in s between two pictures of the scene for an onlooker. Eyes see no more; each costs the
+loop one copy of some microseconds, after the wrench is out."""
+
 
 class Bridge(Commanded):
     """Joins a device and a scene by a virtual coupling and runs the loop between them.
@@ -111,9 +115,12 @@ class Bridge(Commanded):
             mujoco.mj_fwdPosition,
         )
         is_ahead = self._is_pipelined and can_split(model, self.method.scheme)
-        stops = self._stops
+        stops, snapshot = self._stops, self._snapshot
         buttons, mark = sample["buttons"], self._mark_button
         held = mark  # a button that is held from the start on marks nothing
+        publish_positions = self._publish_positions
+        pictures = max(round(PICTURE_PERIOD / self.period), 1)
+        next_picture = self._tick
         next_look, looks = self._tick, max(round(RECORDER_LOOK / self.period), 1)
         while self._tick != self._end and not stops:
             if self._tick >= next_look:
@@ -142,6 +149,9 @@ class Bridge(Commanded):
                 held = buttons[0] & mark
                 if held:
                     self._event("mark", by="button")
+            if snapshot is not None and self._tick >= next_picture:
+                publish_positions(state, cursors, snapshot.head, snapshot.numbers)
+                next_picture += pictures
             if is_ahead:
                 first_half(model, data)
             flags = news | stream.lost | (self._overrun(skipped) if skipped else 0)

@@ -19,12 +19,13 @@ from hapticbridge.guard import refuse_stretched_start, wait_until_still
 from hapticbridge.jit import direct
 from hapticbridge.kernel.after import answer_step
 from hapticbridge.kernel.layout import STATE_DTYPE
-from hapticbridge.kernel.publish import finish_tick, publish
+from hapticbridge.kernel.publish import finish_tick, publish, publish_positions
 from hapticbridge.kernel.state import Binding
 from hapticbridge.kernel.step import before_step
 from hapticbridge.ledger import Ledger
 from hapticbridge.provenance import attachments, describe_run, start_state
 from hapticbridge.realtime import Grant, check_pace, memory_at_rest
+from hapticbridge.recording.snapshot import Snapshot
 from hapticbridge.recording.stream import RecordStream
 from hapticbridge.rendering import prepare
 from hapticbridge.summary import Summary
@@ -85,12 +86,16 @@ class Opened(Arrangement):
         resources.callback(self.scene.release)
         scene, clock, method = self.scene, self.clock, self.method
         felt = prepare(scene, self.coupling, self.period, self._substeps, method)
+        self._snapshot = None if self._onlooker is None else Snapshot.shared(scene.model)
+        if self._snapshot is not None:
+            resources.callback(self._snapshot.close)
         self._stream = RecordStream(
             self._path,
             self.period,
             live=self._is_live,
             is_lossless=clock.is_lossless,
             onlooker=self._onlooker,
+            snapshot=str(self._snapshot and self._snapshot.name),
         )
         resources.callback(self._stream.close)
         self._compile()
@@ -156,6 +161,8 @@ class Opened(Arrangement):
         self._before_step = direct(before_step, state, sample, row, 0, 0.0)
         self._answer_step = direct(answer_step, state, row, 0)
         self._publish = direct(publish, row, rows, cursors, 0, 0, 0, 0, 0)
+        head, numbers = np.zeros(1, np.int64), np.zeros(1)
+        self._publish_positions = direct(publish_positions, state, cursors, head, numbers)
         self._finish_tick = direct(finish_tick, state, row, rows, cursors, 0, 0, 0, 0, 0, True)
 
     def _silence(self) -> str:

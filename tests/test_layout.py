@@ -34,7 +34,7 @@ ORDER = (
     ("provenance", "summary", "workspace", "realtime"),
     ("commands",),
     ("arrangement", "opened", "commanded", "bridge", "audit", "identify", "compare", "export"),
-    ("report", "film", "view", "study", "check", "doctor"),
+    ("report", "film", "film_process", "view", "study", "check", "doctor"),
     ("whatif",),  # runs the bridge and asks the audit, which must not know of either
     ("cli",),
 )

@@ -12,7 +12,7 @@ from audit_cases import ScriptedDevice, SlowClock, recorded
 from hapticbridge.audit import audit
 from hapticbridge.bridge import Bridge
 from hapticbridge.commands import Couple
-from hapticbridge.film.stage import Stage
+from hapticbridge.film_process import Stage
 from hapticbridge.recording import Recording, Timeline, due_times, read_recording
 from hapticbridge.report import telling_time
 from hapticbridge.report.curves import draw_recording

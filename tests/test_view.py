@@ -13,7 +13,7 @@ import sys
 import threading
 import time
 import types
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -29,12 +29,13 @@ from report_runs import LOOSE
 from test_view_address import OUTSIDE, outside
 
 from hapticbridge.audit import audit
-from hapticbridge.audit.rerun import Rerun
 from hapticbridge.bridge import Bridge
 from hapticbridge.commands import Command, Couple, Switch
 from hapticbridge.commands.command import Stop, line_of
-from hapticbridge.errors import HapticBridgeError
-from hapticbridge.recording import Recording, Ring, read_recording
+from hapticbridge.errors import HapticBridgeError, RecordingError
+from hapticbridge.film_process import Stage
+from hapticbridge.recording import Attachment, Ring, read_recording
+from hapticbridge.recording.snapshot import Snapshot
 from hapticbridge.view.address import COOKIE, Address
 from hapticbridge.view.trace import LINES, Trace
 from hapticbridge.view.window import Window
@@ -46,10 +47,11 @@ from page_client import PATIENCE, hand, said
 from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 
+from hapticbridge.view.process import LiveRun, run_of
 from hapticbridge.view.props import props_of
-from hapticbridge.view.replay import Replay, Theatre
-from hapticbridge.view.show import Show
+from hapticbridge.view.replay import Replay, Theatre, contacts_of
 from hapticbridge.view.sight import Sight
+from hapticbridge.view.tendons import Tendons
 
 # viser's threads and sockets end with the process
 pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
@@ -158,140 +160,124 @@ def test_every_shape_is_drawn_at_its_size(tmp_path: Path) -> None:
         assert prop.skin.image.tolist() == [[[255, 0, 0, 128]]]
 
 
-def live(recording: Recording, capacity: int) -> tuple[Show, Ring]:
-    ring = Ring.local(capacity)
-    ring.cursors[1] = 1 << 62  # nobody frees anything
-    return Show(ring, recording), ring
+class Watcher:
+    """An onlooker in the bridge's own process."""
+
+    live: LiveRun | None = None
+
+    def start(
+        self,
+        ring: str,
+        snapshot: str,
+        metadata: Mapping[str, str],
+        attachments: Sequence[Attachment],
+    ) -> None:
+        files = {item.name: item.data for item in attachments}
+        self.live = LiveRun(Ring.attach(ring), snapshot, run_of(dict(metadata), files))
+
+    def event(self, event: Mapping[str, object]) -> None:
+        """Is not interested."""
+
+    def close(self) -> None:
+        """Has nothing to close."""
 
 
-def glance(show: Show) -> Sight | None:
-    show.gather()
-    return show.look()
+LIFTED = FLOOR.replace(
+    "</worldbody>",
+    """<body name="lift" mocap="true" pos="0 0 0.5"><geom size="0.01"/></body>
+    <body name="loose" pos="0.08 0 0.04"><freejoint/><geom size="0.03" mass="0.1"/></body>
+    </worldbody>""",
+)
 
 
-def test_live_view_follows_the_ring_and_reads_it_without_freeing_anything(floor: Path) -> None:
-    recording = read_recording(floor)
-    show, ring = live(recording, 4096)
-    ring.cursors[1] = 0
-    assert glance(show) is None
-    for start, end in ((0, 33), (33, 700), (700, 1500)):
-        ring.append(recording.ticks[start:end])
-        sight = glance(show)
-        assert sight is not None
-        row = recording.ticks[end - 1]
-        ball = sight.places[show.model.body("ball").id]
-        np.testing.assert_allclose(ball, row["tool_position"], atol=1e-9)
-    assert sight is not None
-    assert len(sight.contact_places) == 1
-    assert glance(show) is None
-    assert ring.cursors[1] == 0
-    assert not show.warning
-
-
-def test_records_that_come_while_the_view_reads_are_shown_the_next_time(
-    floor: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("pipelined", [False, True])
+@pytest.mark.parametrize("cone", ["elliptic", "pyramidal"])
+def test_a_live_view_has_every_body_where_the_run_simulated_again_has_it(
+    tmp_path: Path, cone: str, pipelined: bool
 ) -> None:
-    recording = read_recording(floor)
-    show, ring = live(recording, 4096)
-    ring.cursors[1] = 0
+    scene, path = tmp_path / "lifted.xml", tmp_path / "run.mcap"
+    scene.write_text(LIFTED.replace("elliptic", cone))
+    watcher, sights = Watcher(), list[Sight]()
 
-    def wait() -> None:  # whoever reads is put aside between any two steps
-        head = int(ring.cursors[0])
-        ring.rows[head : head + 7] = recording.ticks[head : head + 7]
-        ring.cursors[0] = head + 7
+    def look(bridge: Bridge, tick: int) -> None:
+        assert watcher.live is not None
+        bridge.set_input(mocap={"lift": (0, 0, 0.5 + 1e-5 * tick)})
+        sight = watcher.live.look()
+        if sight is not None:
+            sights.append(sight)
 
-    monkeypatch.setattr(ring, "_fence", wait)
-    for _ in range(40):
-        sight = glance(show)
-    assert sight is not None
-    assert not show.warning
-
-
-def behind(recording: Recording, first: int) -> tuple[Show, Ring]:
-    """A view that saw 50 records and then none until the ring holds 63 up to another tick."""
-    show, ring = live(recording, 64)
-    ring.rows[:50] = recording.ticks[:50]
-    ring.cursors[0] = 50
-    assert glance(show) is not None
-    assert not show.warning
-    bring(ring, recording, first)
-    return show, ring
-
-
-def bring(ring: Ring, recording: Recording, end: int) -> None:
-    ticks = np.arange(end - 64, end)
-    ring.rows[ticks % 64] = recording.ticks[ticks]
-    ring.cursors[0] = end
-
-
-def test_a_view_that_fell_behind_says_so_and_picks_the_run_up_again(
-    floor: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    recording = read_recording(floor)
-    monkeypatch.delattr(Rerun, "restart")  # the scene stays as it was left
-    show, ring = behind(recording, 900)
-    for end in range(900, 1000, 20):
-        bring(ring, recording, end)
-        sight = glance(show)
-    assert sight is not None
-    assert "skipped 0.79 s" in show.warning  # 50 to 837 ms
-    assert "mm from where" not in show.warning
-    last = recording.ticks[979]
-    np.testing.assert_array_equal(sight.grip, last["tool_position"])
-    ball = sight.places[show.model.body("ball").id]
-    np.testing.assert_allclose(ball, last["tool_position"], atol=2e-4)
-    # pressed on the floor again, with the force that the coupling has by the record
-    force = sight.contact_forces.sum(axis=0)
-    np.testing.assert_allclose(force[2], -last["wrench_on_tool"][2], rtol=0.1)
+    device = ScriptedDevice(pressed)
+    recorded(
+        path,
+        str(scene),
+        device,
+        LOOSE,
+        duration=1.5,
+        on_tick=look,
+        onlooker=watcher,
+        pipelined=pipelined,
+    )
+    assert len(sights) == 46  # of 1500 ticks, one in 33
+    stage, touched = Stage(path), 0
+    lift = stage.model.body("lift").id
+    for sight in sights:
+        stage.show(stage.tick_at(sight.time))
+        contacts = contacts_of(stage.model, stage.data)
+        again = Sight.of(stage.model, stage.data, stage.row, Tendons(stage.model), contacts)
+        assert sight.time == again.time
+        np.testing.assert_array_equal(sight.places, again.places)
+        np.testing.assert_array_equal(sight.turns, again.turns)
+        np.testing.assert_array_equal(sight.contact_places, again.contact_places)
+        np.testing.assert_allclose(sight.contact_forces, again.contact_forces, atol=1e-12)
+        np.testing.assert_array_equal(sight.grip, again.grip)
+        touched += len(sight.contact_places) > 0
+    assert touched > 5
+    assert np.ptp([sight.places[lift, 2] for sight in sights]) > 0.01
+    assert audit(path).resimulation == "bit for bit"
 
 
-def test_the_margin_of_a_run_that_was_skipped_is_never_drawn_larger_than_it_is(
-    floor: Path, replay: Replay
-) -> None:
-    recording = read_recording(floor)
-    show, ring = behind(recording, 900)
-    for end in range(900, 1480, 20):
-        bring(ring, recording, end)
-        glance(show)
-    curves = show.curves()
-    assert curves is not None
-    drawn, true = curves[1][4][-1], replay.trace.curves()[1][4][-1]
-    assert 0 < drawn < true
+def test_a_live_view_frees_no_record_and_has_the_curves_of_the_run(tmp_path: Path) -> None:
+    scene, path, watcher = tmp_path / "floor.xml", tmp_path / "run.mcap", Watcher()
+    scene.write_text(FLOOR)
+
+    def look(_: Bridge, tick: int) -> None:
+        assert watcher.live is not None
+        if tick % 40 == 0:
+            watcher.live.look()
+
+    device = ScriptedDevice(pressed)
+    summary = recorded(
+        path, str(scene), device, LOOSE, duration=1.5, on_tick=look, onlooker=watcher
+    )
+    assert summary.dropped == 0
+    assert watcher.live is not None
+    time, lines = watcher.live.trace.curves()
+    ticks = read_recording(path).ticks
+    at = np.searchsorted(ticks["deadline_ns"], np.round(1e9 * time).astype(np.int64))
+    np.testing.assert_allclose(lines[2], 1e3 * ticks["device_energy"][at])
+    force = np.linalg.norm(ticks["wrench_on_tool"][:, :3], axis=1)
+    assert lines[0].max() == pytest.approx(force[: at[-1] + 1].max())
 
 
-def test_a_tool_that_cannot_be_put_anywhere_is_led_and_its_distance_is_said(
-    tmp_path: Path,
-) -> None:
-    hinged = FLOOR.replace("<freejoint/>", '<joint axis="0 1 0" pos="0 0 0.1" range="-1 1"/>')
-    scene, path = tmp_path / "arm.xml", tmp_path / "arm.mcap"
-    scene.write_text(hinged.replace('pos="0 0 0.03"', 'pos="0 0 0.1"'))
-    recorded(path, str(scene), ScriptedDevice(pressed), LOOSE, duration=1.5)
-    recording = read_recording(path)
-    show, ring = behind(recording, 500)
-    for end in range(500, 1400, 60):
-        bring(ring, recording, end)
-        glance(show)
-    assert "skipped" in show.warning
-    assert "mm from where it is drawn" not in show.warning
-    recording.ticks["tool_position"][:, 1] += 0.05  # where no hinge lets it be
-    bring(ring, recording, 1450)
-    glance(show)
-    assert "the tool is 50 mm from where it is drawn" in show.warning
-
-
-def test_news_that_come_too_late_are_said_and_do_not_hold_the_view_up(floor: Path) -> None:
-    recording = read_recording(floor)
-    show, ring = live(recording, 4096)
-    ring.cursors[1] = 0
-    ring.append(recording.ticks[:100])
-    glance(show)
-    show.note({"event": "switch", "tick": 90, "force": True, "clutch": False})
-    ring.append(recording.ticks[100:200])
-    sight = glance(show)
-    assert sight is not None
-    assert "lost the run at 0.1 s" in show.warning
-    ball = sight.places[show.model.body("ball").id]
-    np.testing.assert_allclose(ball, recording.ticks["tool_position"][199], atol=2e-4)
+def test_a_picture_that_is_being_written_is_not_shown() -> None:
+    model = mujoco.MjModel.from_xml_string(FLOOR)
+    snapshot = Snapshot.shared(model)
+    try:
+        other = Snapshot.attach(str(snapshot.name), model)
+        assert other.read() is None  # there is none yet
+        snapshot.head[:3] = 2, 7, 1
+        snapshot.numbers[0] = 0.5
+        picture = other.read()
+        assert picture is not None
+        assert (picture.number, picture.slack, len(picture.contacts)) == (7, 0.5, 1)
+        snapshot.head[0] = 3
+        assert other.read() is None
+        with pytest.raises(RecordingError, match="bytes, the scene"):
+            Snapshot.attach(str(snapshot.name), mujoco.MjModel.from_xml_string("<mujoco/>"))
+    finally:
+        snapshot.close()
+    with pytest.raises(RecordingError, match="no ring at"):
+        Snapshot.attach(str(snapshot.name), model)
 
 
 def answer(
@@ -536,17 +522,3 @@ def test_without_the_extra_a_sentence_says_how_to_get_it(
         code, _, err = call(*command)
         assert code == 2
         assert "hapticbridge[view]" in err
-
-
-def test_an_event_of_the_run_reaches_the_view(floor: Path) -> None:
-    recording = read_recording(floor)
-    show, ring = live(recording, 4096)
-    ring.cursors[1] = 0
-    # as the bridge tells it: what was set before tick 10
-    show.note(json.loads(json.dumps({"event": "input", "tick": 10, "writes": [["ctrl", 99, [1]]]})))
-    ring.append(recording.ticks[:10])
-    glance(show)
-    assert not show.warning
-    ring.append(recording.ticks[10:20])
-    glance(show)
-    assert show.warning  # the scene has no such control: applied, not passed over

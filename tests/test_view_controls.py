@@ -12,22 +12,21 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
-from audit_cases import COUPLING, ScriptedDevice, recorded
+from audit_cases import COUPLING, ScriptedDevice
 from chromium import Tab, browser
 from report_runs import LOOSE
-from test_bridge_commands import FLOOR, STEPS, Script, swaying
+from test_bridge_commands import FLOOR, STEPS, swaying
 from test_commands import allowance
 
 from hapticbridge.audit import audit
 from hapticbridge.bridge import Bridge
 from hapticbridge.clock import SimulatedClock
-from hapticbridge.commands import Couple, Reset, Switch, command_of
+from hapticbridge.commands import Couple, Switch, command_of
 from hapticbridge.commands.command import Stop
 from hapticbridge.errors import HapticBridgeError, SafetyTrip
 from hapticbridge.guard import Limits
-from hapticbridge.recording import Ring, read_recording
+from hapticbridge.recording import read_recording
 from hapticbridge.view.address import Address
 from hapticbridge.view.window import Window
 
@@ -37,7 +36,6 @@ from page_client import Hand, hand, said
 
 from hapticbridge.view.controls import Controls, Outlet, allowance_of
 from hapticbridge.view.server import serve, stop
-from hapticbridge.view.show import Show
 
 # viser's threads and sockets end with the process
 pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
@@ -261,31 +259,6 @@ def test_commands_reach_the_bridge_slowly_and_the_newest_wins() -> None:
         said = [command_of(stream.readline()) for _ in range(3)]
     assert said == [Stop(), Couple(999.0, 0.5), Switch(force=False, clutch=True)]
     os.close(write)
-
-
-def test_what_was_asked_for_while_the_view_was_behind_is_known_to_it_all_the_same(
-    tmp_path: Path,
-) -> None:
-    scene, path = tmp_path / "floor.xml", tmp_path / "run.mcap"
-    scene.write_text(FLOOR)
-    script = Script({300: Couple(1500.0, 0.5), 400: Reset()})
-    recorded(path, str(scene), ScriptedDevice(swaying), LOOSE, duration=2.0, on_tick=script)
-    recording = read_recording(path)
-    ring = Ring.local(64)
-    show = Show(ring, recording)
-    for end in (60, *range(1700, 1980, 40)):
-        ticks = np.arange(max(end - 64, 0), end)
-        ring.rows[ticks % 64] = recording.ticks[ticks]
-        ring.cursors[0] = end
-        show.gather()
-        sight = show.look()
-    assert sight is not None
-    assert "skipped" in show.warning
-    body = show.model.body("ball").id
-    last = recording.ticks[1939]
-    np.testing.assert_allclose(sight.places[body], last["tool_position"], atol=5e-4)
-    used = recording.events[[e["event"] for e in recording.events].index("coupling")]
-    assert show._run.binding.state["stiffness"][0] == used["stiffness"]
 
 
 @pytest.mark.parametrize(("stretch", "why"), [(0.2, "duration"), (1e-6, "stretch limit")])

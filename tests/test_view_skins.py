@@ -14,7 +14,7 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
-from hapticbridge.film.studio import RENDERERS
+from hapticbridge.film import RENDERERS
 
 pytest.importorskip("viser", reason="needs the extra 'view'")
 

@@ -70,18 +70,6 @@ class Rerun:
         self._commands = Repeater(self.binding, model, data, method, parameters, start)
         check_start(recording, self.binding.state)
 
-    def warm_up(self) -> None:
-        """Compiles what ``add`` needs, so that the first call takes no longer than others."""
-        binding = self.binding
-        simulate_recorded(
-            binding.state,
-            np.zeros(0, SAMPLE_DTYPE),
-            np.zeros(0, TICK_DTYPE)["flags"],
-            np.zeros(0),
-            binding.row,
-            np.zeros(0, TICK_DTYPE),
-        )
-
     @property
     def slack(self) -> float:
         """What the environment may have created by now, in J."""
@@ -132,32 +120,6 @@ class Rerun:
                 self._apply(self._changes.popleft())
         self.done += done
         return rows[:done]
-
-    def jump(self, tick: int, ahead: int = 0) -> None:
-        """Goes on from another tick, without those between; what was changed by then is changed.
-
-        The time of the next reading counts from 0.
-
-        Args:
-            tick: By which changes are applied.
-            ahead: How many ticks before it the next one to be simulated counts as.
-
-        Raises:
-            RecordingError: An event by then is damaged; it is left out.
-        """
-        self.done, self._read_ns, self.is_over = tick - ahead, 0, False
-        while self._changes:
-            event = self._changes.popleft()  # a damaged one is complained of once
-            if self._due(event) > tick:
-                self._changes.appendleft(event)
-                break
-            self._apply(event)
-
-    def restart(self) -> None:
-        """Puts the scene back to where the recording began, whatever became of it."""
-        restore_state(self.model, self.data, self._start)
-        self.binding.take_reset()
-        self.is_over = False
 
     def finish(self) -> None:
         """Applies the events after the last tick.

@@ -68,6 +68,9 @@ mj_apply_ft: Any = types.ExternalFunction(
     "mj_applyFT",
     types.void(_ADDRESS, _ADDRESS, _ADDRESS, _ADDRESS, _ADDRESS, types.int32, _ADDRESS),
 )
+mj_contact_force: Any = types.ExternalFunction(
+    "mj_contactForce", types.void(_ADDRESS, _ADDRESS, types.int32, _ADDRESS)
+)
 
 
 @intrinsic  # type: ignore[untyped-decorator] # numba ships no types

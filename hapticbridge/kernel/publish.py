@@ -8,10 +8,13 @@ from numpy.typing import NDArray
 from hapticbridge.jit import compiled
 from hapticbridge.kernel.after import close_tick
 from hapticbridge.kernel.codes import OK, RING_FULL
-from hapticbridge.kernel.native import release_fence
+from hapticbridge.kernel.native import floats, ints, mj_contact_force, pointer_at, release_fence
 
 HEAD, TAIL = 0, 1
 """Cursors of the ring: records written, records read."""
+
+SEQUENCE, NUMBER, CONTACTS = 0, 1, 2
+"""Head of a snapshot: sequence, odd during a write; number of the record; count of contacts."""
 
 
 @compiled
@@ -65,3 +68,49 @@ def finish_tick(
         return code
     taken = publish(row, ring, cursors, deadline_ns, wake_ns, read_ns, write_ns, flags)
     return OK if taken else RING_FULL
+
+
+@compiled
+def publish_positions(
+    state: NDArray[np.void],
+    cursors: NDArray[np.int64],
+    head: NDArray[np.int64],
+    numbers: NDArray[np.float64],
+) -> None:
+    """Copies the scene's positions and contacts to a snapshot (``recording.snapshot``).
+
+    Call it after MuJoCo's step and before the next one begins, while the contact forces of the step
+    are there. It changes nothing that the tick reads.
+
+    Args:
+        state: The kernel's state.
+        cursors: The ring's; the record of this tick is the next one to be written there.
+        head: The snapshot's head.
+        numbers: The snapshot's numbers: slack, positions, mocap poses, then 6 a contact.
+    """
+    s = state[0]
+    head[SEQUENCE] += 1
+    release_fence()
+    numbers[0], end = s.slack, 1
+    for source, count in (
+        (s.qpos, s.nq),
+        (s.mocap_pos, 3 * s.nmocap),
+        (s.mocap_quat, 4 * s.nmocap),
+    ):
+        numbers[end : end + count] = floats(source, count)
+        end += count
+    shown = min(ints(s.ncon, 1)[0], (numbers.size - end) // 6)
+    for c in range(shown):
+        contact = pointer_at(s.contact) + c * s.contact_size
+        slot, frame = numbers[end : end + 6], floats(contact + s.contact_frame, 9)
+        mj_contact_force(s.model, s.data, c, slot.ctypes.data)  # along the axes of its frame
+        normal, first, second = slot[0], slot[1], slot[2]
+        slot[:3] = floats(contact + s.contact_point, 3)
+        for axis in range(3):
+            slot[3 + axis] = (
+                normal * frame[axis] + first * frame[3 + axis] + second * frame[6 + axis]
+            )
+        end += 6
+    head[NUMBER], head[CONTACTS] = cursors[HEAD], shown
+    release_fence()
+    head[SEQUENCE] += 1

@@ -12,12 +12,17 @@ class Onlooker(Protocol):
     """Looks at a run from another process; the loop neither waits for it nor asks it anything."""
 
     def start(
-        self, ring: str, metadata: Mapping[str, str], attachments: Sequence[Attachment]
+        self,
+        ring: str,
+        snapshot: str,
+        metadata: Mapping[str, str],
+        attachments: Sequence[Attachment],
     ) -> None:
         """Starts looking.
 
         Args:
             ring: Name of the ring, as ``Ring.attach`` takes it; what attaches must free nothing.
+            snapshot: Name of the scene's newest positions, as ``Snapshot.attach`` takes it.
             metadata: Of the run, as a recording has them.
             attachments: Likewise.
         """

@@ -50,6 +50,7 @@ class RecordStream:
         is_lossless: Whether the loop may wait for the recorder (simulated time) instead of losing
             records.
         onlooker: Who looks at the newest records beside the recorder, unasked and unwaited for.
+        snapshot: Name of the shared memory with the scene's positions, for the onlooker.
 
     Attributes:
         rows: The ring's records, ``TICK_DTYPE``.
@@ -70,11 +71,12 @@ class RecordStream:
         live: bool,
         is_lossless: bool,
         onlooker: Onlooker | None = None,
+        snapshot: str = "",
     ) -> None:
         self._path, self._is_live, self._is_lossless = path, live, is_lossless
         self._is_read = path is not None or live
         capacity = min(round(RING_SECONDS / period), MOST_RECORDS)
-        self._onlooker = onlooker
+        self._onlooker, self._snapshot = onlooker, snapshot
         is_shared = self._is_read or onlooker is not None
         self._ring = Ring.shared(capacity) if is_shared else Ring.local(capacity)
         self.rows, self.cursors = self._ring.rows, self._ring.cursors
@@ -101,7 +103,7 @@ class RecordStream:
             )
             self.recorder.wait_until_ready()
         if self._onlooker is not None:
-            self._onlooker.start(str(self._ring.name), metadata, attachments)
+            self._onlooker.start(str(self._ring.name), self._snapshot, metadata, attachments)
         self.tell({"event": "recording", "path": None if self._path is None else str(self._path)})
 
     def tell(self, news: Mapping[str, object]) -> None:

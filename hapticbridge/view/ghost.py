@@ -17,7 +17,7 @@ import trimesh
 import viser
 from numpy.typing import ArrayLike, NDArray
 
-from hapticbridge.film.stage import force_colour
+from hapticbridge.film_process import force_colour
 from hapticbridge.view.props import props_of
 from hapticbridge.view.sight import Sight
 

@@ -8,10 +8,13 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import viser
+from numpy.typing import NDArray
 
-from hapticbridge.film.stage import Stage
+from hapticbridge.film_process import Stage
+from hapticbridge.recording.snapshot import MOST_CONTACTS
 from hapticbridge.view.address import Address
 from hapticbridge.view.page import Page
 from hapticbridge.view.server import serve, stop
@@ -55,7 +58,8 @@ class Replay:
         tendons = Tendons(stage.model)
         for number in range(count):
             stage.show(stage.tick_at(min(number * self.step, stage.duration)))
-            self.sights.append(Sight.of(stage.model, stage.data, stage.row, tendons))
+            contacts = contacts_of(stage.model, stage.data)
+            self.sights.append(Sight.of(stage.model, stage.data, stage.row, tendons, contacts))
             self.trace.add(stage.passed, stage.slack)
             if progress is not None:
                 progress(number + 1, count)
@@ -65,6 +69,17 @@ class Replay:
         if math.isnan(moment):
             return self.sights[0]
         return self.sights[round(min(max(moment / self.step, 0.0), len(self.sights) - 1.0))]
+
+
+def contacts_of(model: mujoco.MjModel, data: mujoco.MjData) -> NDArray[np.float64]:
+    """Returns position in m and force in N of contacts in the world frame, (n, 2, 3)."""
+    found = np.zeros((min(data.ncon, MOST_CONTACTS), 2, 3))
+    wrench = np.zeros(6)
+    for index, (place, force) in enumerate(found):
+        mujoco.mj_contactForce(model, data, index, wrench)
+        place[:] = data.contact.pos[index]
+        force[:] = data.contact.frame[index].reshape(3, 3).T @ wrench[:3]
+    return found
 
 
 class Theatre:

@@ -12,9 +12,6 @@ from hapticbridge.view.tendons import Tendons
 
 Array = NDArray[np.float64]
 
-MOST_CONTACTS = 32
-"""Contacts that are shown; more are a heap in which nobody sees one."""
-
 
 @dataclass(frozen=True, slots=True)
 class Sight:
@@ -28,7 +25,7 @@ class Sight:
         handle_turn: How it is turned, a quaternion (4,).
         grip: Where the grip on the tool is, (3,) in m.
         force: On the tool, (3,) in N; the hand feels the opposite.
-        contact_places: Shape (n, 3), n <= ``MOST_CONTACTS``, in m.
+        contact_places: Shape (n, 3) in m.
         contact_forces: In the world frame, (n, 3) in N.
         tendons: The straight pieces of each that is shown, (m, 2, 3) in m.
     """
@@ -51,23 +48,18 @@ class Sight:
         data: mujoco.MjData,
         row: NDArray[np.void],
         tendons: Tendons,
+        contacts: Array,
     ) -> Sight:
         """Looks at a scene.
 
         Args:
             model: The scene.
-            data: After the tick; a copy whose body poses may be refreshed here.
+            data: Positions after the tick; the poses of bodies are computed here.
             row: Of the tick, one element of ``TICK_DTYPE``.
             tendons: The scene's.
+            contacts: Position in m and force in N of each contact, (n, 2, 3).
         """
-        # contacts stay as the tick solved them; only what is drawn is brought to its end
         mujoco.mj_kinematics(model, data)
-        count = min(data.ncon, MOST_CONTACTS)
-        forces = np.zeros((count, 3))
-        wrench = np.zeros(6)
-        for index in range(count):
-            mujoco.mj_contactForce(model, data, index, wrench)
-            forces[index] = data.contact.frame[index].reshape(3, 3).T @ wrench[:3]
         return cls(
             time=1e-9 * float(row["deadline_ns"][0]),
             places=data.xpos.copy(),
@@ -76,7 +68,7 @@ class Sight:
             handle_turn=row["handle_quaternion"][0].copy(),
             grip=row["tool_position"][0].copy(),
             force=row["wrench_on_tool"][0, :3].copy(),
-            contact_places=np.array(data.contact.pos[:count]).reshape(count, 3),
-            contact_forces=forces,
+            contact_places=contacts[:, 0],
+            contact_forces=contacts[:, 1],
             tendons=tendons.pieces(data),
         )

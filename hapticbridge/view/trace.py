@@ -42,6 +42,8 @@ class Trace:
             slack: What the environment may have created by now, in J; NaN where unknown.
         """
         last = rows[-1]
+        if self._points and 1e-9 * float(last["deadline_ns"]) < self._points[-1][0]:
+            self._points.clear()  # the run began anew
         created = float(last["environment_energy"])
         late = rows["wake_ns"] - rows["deadline_ns"]
         self._points.append(

@@ -30,7 +30,7 @@ PATIENCE = 2.0
 _BOOTSTRAP = """
 import sys
 sys.path.insert(0, sys.argv[1])
-from hapticbridge.view.live import run
+from hapticbridge.view.process import run
 run()
 """
 
@@ -74,7 +74,11 @@ class Window:
         self.on_command: Callable[[Command], None] | None = None
 
     def start(
-        self, ring: str, metadata: Mapping[str, str], attachments: Sequence[Attachment]
+        self,
+        ring: str,
+        snapshot: str,
+        metadata: Mapping[str, str],
+        attachments: Sequence[Attachment],
     ) -> None:
         """Starts the process and waits until the page is there.
 
@@ -84,6 +88,7 @@ class Window:
         files = {item.name: item.data for item in attachments}
         job = {
             "ring": ring,
+            "snapshot": snapshot,
             "metadata": dict(metadata),
             "attachments": [[name, len(data)] for name, data in files.items()],
             "host": self.address.host,

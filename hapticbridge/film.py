@@ -1,4 +1,8 @@
-"""Draws a recorded run off-screen, with whichever renderer works here."""
+"""Pictures and films of a recorded run, drawn without a display by the first renderer that works.
+
+MuJoCo reads its renderer from the environment once, when it is imported. So a process of its own
+draws (``film_process``): it gets one job in a line of JSON and answers in lines of JSON.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +13,7 @@ import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import IO, Any, cast
@@ -18,16 +22,16 @@ from hapticbridge.arguments import Arguments
 from hapticbridge.errors import HapticBridgeError, RecordingError
 
 RENDERERS = ("egl", "osmesa")
-"""What draws without a display: EGL with a graphics card or Mesa, OSMesa on the processor alone."""
+"""Renderers without a display: EGL with a graphics card or Mesa, OSMesa on the processor alone."""
 
 ENDINGS = (".mp4", ".png")
-"""What a film's or a picture's name may end in."""
+"""Endings of the files that ``draw`` writes: a film, a picture."""
 
 PATIENCE = 120.0
-"""Longest wait for a renderer, in s; a machine that compiles anew needs half a minute."""
+"""Longest wait for a renderer in s. A machine that compiles anew needs half a minute."""
 
 MOST_PIXELS = 4096
-"""Of a side of a picture; drivers refuse much more."""
+"""Longest side of a picture in pixels. Drivers refuse much larger ones."""
 
 _BOOTSTRAP = """
 import sys
@@ -35,10 +39,10 @@ from mujoco.rendering.classic.gl_context import GLContext
 GLContext(16, 16).free()
 print('{"ready": true}', flush=True)
 sys.path.insert(0, sys.argv[1])
-from hapticbridge.film.artist import run
+from hapticbridge.film_process import run
 run()
 """
-# the renderer first, so that whatever fails later is not taken for one that does not work
+# the renderer first, so that a later failure is not taken for a renderer that does not work
 
 _NONE_WORKS = (
     "neither EGL nor OSMesa works here, so nothing can be drawn off-screen; on Debian: apt install "
@@ -50,16 +54,16 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Shot:
-    """What to draw.
+    """Time, camera and size of a picture or a film.
 
     Attributes:
-        at: Of a picture: time in s from the start of the run; None: the last tick.
-        start: Of a film: where in the run it begins, in s.
-        stop: Where it ends; None: with the run.
-        speed: How fast it shows the run, 0.001 to 1000: at 0.1 a second takes ten.
+        at: Time of a picture in s from the start of the run; None: the last tick.
+        start: Time in the run at which a film begins, in s.
+        stop: Time in the run at which a film ends, in s; None: with the run.
+        speed: Speed of a film relative to the run, 0.001 to 1000: at 0.1 a second takes ten.
         camera: Name of a camera of the scene; None: the free one, as the scene's file sets it.
-        width: In pixels, 16 to 4096 and even.
-        height: Likewise.
+        width: Pixels, 16 to 4096 and even.
+        height: Pixels, 16 to 4096 and even.
         fps: Frames per second of a film, 1 to 120.
 
     Raises:
@@ -93,7 +97,7 @@ class Shot:
 
     @property
     def is_of_film(self) -> bool:
-        """Whether it says what only a film has."""
+        """True if a value is set that only a film has."""
         is_timed = bool(self.start) or self.stop is not None or self.speed != 1.0
         return is_timed or self.fps != Shot().fps
 
@@ -106,13 +110,14 @@ def draw(
 ) -> str:
     """Draws a recording into a file.
 
-    Every body stands where the run, simulated again, has it, and the tool where its record says.
+    The run is simulated again, which gives the poses of all bodies. If writing fails or is
+    interrupted, an existing file is left unchanged and no partial file remains.
 
     Args:
         recording: The file.
         out: ``.png`` for one picture, ``.mp4`` for a film as long as the run; an existing file is
             replaced.
-        shot: When and how large; the last tick at 800 × 600 by default.
+        shot: Time, camera and size; the last tick at 800 × 600 by default.
         progress: Called with frames done and to do.
 
     Returns:
@@ -126,7 +131,6 @@ def draw(
     shot, target = shot or Shot(), Path(out)
     _check_target(target, shot)
     job = {"recording": str(recording), "name": str(target), **asdict(shot)}
-    # what is half done, or interrupted, must neither stand there nor replace what did
     try:
         with tempfile.TemporaryDirectory(
             prefix=".drawing-", dir=target.absolute().parent, ignore_cleanup_errors=True
@@ -140,7 +144,7 @@ def draw(
 
 
 def _draw_with_any(job: dict[str, Any], progress: Progress | None) -> str:
-    """Draws with the renderer that was asked for, or the first that works; returns its name."""
+    """Draws with the renderer of MUJOCO_GL, or the first that works; returns its name."""
     asked = os.environ.get("MUJOCO_GL")
     for renderer in [asked] if asked else RENDERERS:
         if _draw_with(renderer, job, progress):
@@ -171,7 +175,7 @@ def _check_target(target: Path, shot: Shot) -> None:
     if not target.absolute().parent.is_dir():
         raise HapticBridgeError(f"cannot write '{target}': its folder does not exist")
     if target.exists() and not target.is_file():
-        raise HapticBridgeError(f"cannot write '{target}': it is there, and no file")
+        raise HapticBridgeError(f"cannot write '{target}': it exists and is not a file")
     if ending == ".mp4" and shot.at is not None:
         raise HapticBridgeError("a time goes with a picture (.png); a film has start and stop")
     if ending == ".png" and shot.is_of_film:
@@ -183,13 +187,9 @@ def _check_target(target: Path, shot: Shot) -> None:
 
 
 def _draw_with(renderer: str, job: dict[str, Any], progress: Progress | None) -> bool:
-    """Draws in a process of its own; returns whether its renderer works.
-
-    Raises:
-        RecordingError: It works, but the recording cannot be drawn.
-    """
-    package = str(Path(__file__).resolve().parents[2])
-    # -P: a file in the user's working folder must not stand in for a module
+    """Draws in a process of its own; returns False if its renderer does not work."""
+    package = str(Path(__file__).resolve().parents[1])
+    # -P: a file in the user's working folder must not replace a module
     command = [sys.executable, "-P", "-c", _BOOTSTRAP, package]
     environment = {**os.environ, "MUJOCO_GL": renderer}
     environment.pop("PYOPENGL_PLATFORM", None)  # of another renderer, if one was tried in here
@@ -205,28 +205,22 @@ def _draw_with(renderer: str, job: dict[str, Any], progress: Progress | None) ->
     watch.start()
     try:
         with process:
-            told, told_by = cast(IO[str], process.stdin), cast(IO[str], process.stdout)
-            print(json.dumps(job), file=told, flush=True)
-            return _followed(_answers(told_by), watch, progress)
+            print(json.dumps(job), file=cast(IO[str], process.stdin), flush=True)
+            return _follow(cast(IO[str], process.stdout), watch, progress)
     except BrokenPipeError:
-        return False  # it ended before it was told anything
+        return False  # it ended before it read the job
     finally:
         watch.cancel()
         process.kill()
         process.wait()  # Popen does not where it was left by Ctrl-C
 
 
-def _answers(lines: IO[str]) -> Iterator[dict[str, Any]]:
-    for line in lines:
-        if line.startswith("{"):  # drivers print, too
-            yield json.loads(line)
-
-
-def _followed(
-    answers: Iterator[dict[str, Any]], watch: threading.Timer, progress: Progress | None
-) -> bool:
+def _follow(lines: IO[str], watch: threading.Timer, progress: Progress | None) -> bool:
     is_ready = False
-    for answer in answers:
+    for line in lines:
+        if not line.startswith("{"):  # drivers print, too
+            continue
+        answer = json.loads(line)
         if "ready" in answer:
             is_ready = True
             watch.cancel()
@@ -237,5 +231,5 @@ def _followed(
         elif "done" in answer:
             return True
     if is_ready:
-        raise RecordingError("the process that draws died in the middle of it")
+        raise RecordingError("the process that draws died while it was drawing")
     return False

@@ -1,0 +1,364 @@
+"""The process that draws a recorded run: the run simulated again, a camera, frames of a film.
+
+``hapticbridge.film`` starts it, writes one job in a line of JSON and reads one answer per line:
+``frame`` while a film is drawn, ``done``, or ``error`` with a sentence.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from PIL import Image
+
+from hapticbridge.audit.rerun import Rerun, obstacle
+from hapticbridge.errors import HapticBridgeError, RecordingError
+from hapticbridge.kernel.parameters import RunParameters
+from hapticbridge.provenance import parameters_of
+from hapticbridge.recording import RecordingFile, Timeline, open_recording
+
+PLACE = 1e-4
+"""Largest distance in m of the tool, simulated again, from its record. It is less than a pixel.
+Beyond it the picture would be of another run, and is refused."""
+
+LONGEST_ARROW = 0.8
+"""Length of the arrow of the largest force, as a share of the scene's extent. A longer one leaves
+the picture."""
+
+LEAST_REFERENCE = 0.1
+"""Least force in N that is drawn at full length. Smaller forces of a run are drawn small."""
+
+CONTACT_SIZE = 0.4
+"""Size of a contact's disc relative to MuJoCo's default, which would hide the tool."""
+
+SHADOW = 2048
+"""Largest side of the shadow map in pixels. On two busy cores without a graphics card, MuJoCo's
+4096 made 5.5 frames of 800 x 600 a second and this makes 8.5; less makes shadows' edges coarser."""
+
+TOOL_ALPHA = 0.5
+"""Opacity of moving bodies, 0 to 1. Grip, handle and spring are inside the tool and must be seen
+through it; below 0.4 the tool itself is hard to see."""
+
+QUALITY = 15
+"""Constant rate factor of H.264, 0 (best) to 51. At 15 the coupling's thin lines stay sharp."""
+
+Frame = NDArray[np.uint8]
+
+_PALE, _RED = np.array([0.75, 0.87, 0.98]), np.array([0.70, 0.15, 0.12])
+# pale to dark as well, which the colour-blind see
+_GHOST = (0.1, 0.37, 0.71, 0.45)
+_HAND = (0.90, 0.38, 0.0, 1.0)
+
+
+def force_colour(force: float, reference: float) -> NDArray[np.float64]:
+    """Returns the colour of a spring that pulls: pale blue at rest, red from a reference force on.
+
+    Args:
+        force: Its size in N.
+        reference: In N, > 0.
+
+    Returns:
+        Red, green and blue from 0 to 1, (3,).
+    """
+    share = min(abs(force) / reference, 1.0)
+    return np.asarray((1.0 - share) * _PALE + share * _RED)
+
+
+class Stage:
+    """A recorded run, simulated again tick by tick, forwards.
+
+    Args:
+        path: The recording.
+
+    Attributes:
+        recording: The recording without its ticks.
+        parameters: Parameters of the run.
+        model: The scene.
+        data: Its state at the tick last shown, with contacts as they were solved.
+        row: The record of that tick, one element of ``TICK_DTYPE``.
+        passed: The records since the tick shown before, that one not among them.
+        reference: The largest force on the tool in the run, in N, or ``LEAST_REFERENCE``.
+
+    Raises:
+        RecordingError: The file is no recording, or cannot be simulated again here.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.recording: RecordingFile = open_recording(path)
+        reason = obstacle(self.recording)
+        if not self.recording.count:
+            reason = "it holds no tick"
+        if reason:
+            raise RecordingError(f"'{path}' cannot be drawn: {reason}")
+        self.parameters: RunParameters = parameters_of(self.recording.meta)
+        self._run = Rerun(self.recording, self.parameters)
+        self.model = self._run.model
+        self.data = mujoco.MjData(self.model)
+        self._rest = self.recording.blocks()
+        self._block = next(self._rest)
+        self._at = 0  # in the block
+        self.row = self.passed = self._block[:1]
+        forces = (block["wrench_on_tool"][:, :3] for block in self.recording.blocks())
+        largest = (float(np.linalg.norm(force, axis=1).max()) for force in forces)
+        self.reference = max(LEAST_REFERENCE, *largest)
+        self._line = Timeline(self.recording.blocks(), self.parameters.period)
+        self._scale_contact_forces()
+
+    @property
+    def duration(self) -> float:
+        """Duration of the run in s of its clock, missed deadlines included."""
+        return self._line.duration
+
+    @property
+    def slack(self) -> float:
+        """Energy in J that the environment may have created by the tick shown."""
+        return self._run.slack
+
+    def tick_at(self, time: float) -> int:
+        """Returns the tick that is shown at a time in s from the start: the one due nearest to it.
+
+        Raises:
+            RecordingError: The run does not last so long.
+        """
+        if not 0 <= time <= self.duration:
+            raise RecordingError(
+                f"there is nothing at {time!r} s; the recording lasts from 0 to {self.duration:g} s"
+            )
+        return self._line.row_at(time)
+
+    def show(self, tick: int) -> None:
+        """Simulates up to a tick, the present one or a later one.
+
+        Raises:
+            RecordingError: Simulated again, the tool is elsewhere than recorded.
+        """
+        passed = []
+        while self._run.done <= tick:
+            if self._at == len(self._block):
+                self._block, self._at = next(self._rest), 0
+            end = min(len(self._block), self._at + tick + 1 - self._run.done)
+            recorded = self._block[self._at : end]
+            again = self._run.add(recorded)
+            self._refuse_another_run(recorded, again)
+            passed.append(recorded)
+            self._at, self.row = end, recorded[-1:]
+        self.passed = np.concatenate(passed) if passed else self.row
+        mujoco.mj_copyData(self.data, self.model, self._run.data)
+        # contacts stay as the tick solved them; only what is drawn is brought to its end
+        mujoco.mj_kinematics(self.model, self.data)
+        mujoco.mj_comPos(self.model, self.data)
+        mujoco.mj_camlight(self.model, self.data)
+        mujoco.mj_flex(self.model, self.data)
+        mujoco.mj_tendon(self.model, self.data)
+
+    def _refuse_another_run(self, recorded: NDArray[np.void], again: NDArray[np.void]) -> None:
+        off = np.abs(recorded["tool_position"][: len(again)] - again["tool_position"]).max(axis=1)
+        if len(again) < len(recorded) or not (off <= PLACE).all():
+            tick = int(recorded["tick"][0]) + int(np.argmax(np.append(~(off <= PLACE), True)))
+            raise RecordingError(
+                f"'{self.recording.path}' cannot be drawn: simulated again, the tool is not where "
+                f"the record of tick {tick} says; 'hapticbridge audit' tells more"
+            )
+
+    def _scale_contact_forces(self) -> None:
+        longest = LONGEST_ARROW * self.model.stat.extent / self.reference
+        self.model.vis.map.force = longest * self.model.stat.meanmass
+        self.model.vis.scale.contactwidth *= CONTACT_SIZE
+        self.model.vis.scale.contactheight *= CONTACT_SIZE
+
+    def add_coupling(self, scene: mujoco.MjvScene) -> None:
+        """Draws handle, coupling and the force in the hand into a scene made from ``data``."""
+        row, size = self.row[0], 0.015 * self.model.stat.extent
+        handle, tool = row["handle_position"], row["tool_position"]
+        force = row["wrench_on_tool"][:3]
+        strength = float(np.linalg.norm(force))
+        colour = (*force_colour(strength, self.reference), 1.0)
+        _add(scene, mujoco.mjtGeom.mjGEOM_SPHERE, _GHOST, position=handle, size=size)
+        if np.linalg.norm(handle - tool) > 0:
+            capsule = mujoco.mjtGeom.mjGEOM_CAPSULE
+            _add(scene, capsule, colour, between=(tool, handle), size=0.3 * size)
+        if strength > 0:
+            tip = handle - force * (LONGEST_ARROW * self.model.stat.extent / self.reference)
+            arrow = mujoco.mjtGeom.mjGEOM_ARROW
+            _add(scene, arrow, _HAND, between=(handle, tip), size=0.5 * size)
+
+
+def _add(
+    scene: mujoco.MjvScene,
+    kind: mujoco.mjtGeom,
+    colour: ArrayLike,
+    *,
+    size: float,
+    position: ArrayLike = (0.0, 0.0, 0.0),
+    between: tuple[ArrayLike, ArrayLike] | None = None,
+) -> None:
+    if scene.ngeom >= scene.maxgeom:
+        return
+    geom = scene.geoms[scene.ngeom]
+    mujoco.mjv_initGeom(
+        geom,
+        kind,
+        np.full(3, size),
+        np.asarray(position, dtype=np.float64),
+        np.eye(3).ravel(),
+        np.asarray(colour, dtype=np.float32),
+    )
+    if between is not None:
+        start, end = (np.asarray(point, dtype=np.float64) for point in between)
+        mujoco.mjv_connector(geom, kind, size, start, end)
+    geom.category = mujoco.mjtCatBit.mjCAT_DECOR
+    scene.ngeom += 1
+
+
+class Camera:
+    """MuJoCo's free camera on a stage, as the scene's file sets it, or a camera of the scene.
+
+    Args:
+        stage: The run.
+        width: Width of a frame in pixels.
+        height: Height of a frame in pixels.
+        name: A camera of the scene; None: the free one.
+
+    Raises:
+        RecordingError: The scene has no camera of that name.
+    """
+
+    def __init__(self, stage: Stage, width: int, height: int, name: str | None = None) -> None:
+        self._stage = stage
+        model = stage.model
+        model.vis.global_.offwidth, model.vis.global_.offheight = width, height
+        self._camera, self._shown = mujoco.MjvCamera(), mujoco.MjvOption()
+        mujoco.mjv_defaultFreeCamera(model, self._camera)
+        if name is not None:
+            self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
+            self._camera.fixedcamid = _camera_id(model, name)
+        shadows = model.vis.quality
+        shadows.shadowsize = min(shadows.shadowsize, SHADOW)
+        self._shown.sitegroup[:] = 0  # grip and handle are points for the computer
+        flags = mujoco.mjtVisFlag
+        model.vis.map.alpha = TOOL_ALPHA
+        for flag in (flags.mjVIS_CONTACTPOINT, flags.mjVIS_CONTACTFORCE, flags.mjVIS_TRANSPARENT):
+            self._shown.flags[flag] = True
+        self.renderer = mujoco.Renderer(model, height, width)
+
+    def frame(self, tick: int) -> Frame:
+        """Returns the picture of a tick, (height, width, 3)."""
+        self._stage.show(tick)
+        self.renderer.update_scene(self._stage.data, self._camera, self._shown)
+        self._stage.add_coupling(self.renderer.scene)
+        return np.array(self.renderer.render(), dtype=np.uint8)
+
+
+def _camera_id(model: mujoco.MjModel, name: str) -> int:
+    names = [model.camera(index).name for index in range(model.ncam)]
+    if name not in names:
+        there = f"cameras: {', '.join(map(repr, filter(None, names)))}" if any(names) else "none"
+        raise RecordingError(f"the scene has no camera '{name}'; it has {there}")
+    return names.index(name)
+
+
+def film_ticks(
+    stage: Stage, rate: float, start: float = 0.0, stop: float | None = None, speed: float = 1.0
+) -> Iterator[int]:
+    """Yields the tick of each frame of a film.
+
+    Args:
+        stage: The run.
+        rate: Frames per second.
+        start: Time in the run at which the film begins, in s.
+        stop: Time in the run at which the film ends, in s; None: with the run.
+        speed: Speed of the film relative to the run, without unit.
+
+    Raises:
+        RecordingError: The run does not last so long.
+    """
+    end = stage.duration if stop is None else stop
+    stage.tick_at(end), stage.tick_at(start)  # refused before the first frame
+    for frame in range(max(1, int((end - start) / speed * rate))):
+        yield stage.tick_at(start + frame * speed / rate)
+
+
+def write_film(path: str, frames: Iterator[Frame], size: tuple[int, int], fps: int) -> None:
+    """Writes frames as a film (H.264).
+
+    Args:
+        path: File to write; it ends in ``.mp4``.
+        frames: Pictures, (height, width, 3) each.
+        size: Width and height in pixels, both even.
+        fps: Frames per second.
+
+    Raises:
+        HapticBridgeError: ffmpeg does not start, or did not write all frames.
+    """
+    import imageio_ffmpeg  # noqa: PLC0415 - of the extra 'view', which a picture does not need
+
+    options = ["-crf", str(QUALITY), "-movflags", "+faststart"]
+    film = imageio_ffmpeg.write_frames(
+        path,
+        size,
+        fps=fps,
+        quality=None,
+        codec="libx264",
+        macro_block_size=2,
+        output_params=options,
+    )
+    count = 0
+    try:
+        film.send(None)
+        for frame in frames:
+            film.send(frame.tobytes())
+            count += 1
+        film.close()
+        written, _ = imageio_ffmpeg.count_frames_and_secs(path)
+    except (OSError, RuntimeError) as error:
+        raise HapticBridgeError(f"ffmpeg cannot write the film: {_first_line(error)}") from None
+    if written != count:
+        raise HapticBridgeError(f"ffmpeg wrote {written} of {count} frames; is the disk full?")
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0]
+
+
+def _answer(**answer: object) -> None:
+    print(json.dumps(answer), flush=True)
+
+
+def _draw(job: dict[str, Any]) -> None:
+    stage = Stage(job["recording"])
+    camera = Camera(stage, job["width"], job["height"], job["camera"])
+    out = job["out"]
+    if out.endswith(".png"):
+        tick = stage.recording.count - 1 if job["at"] is None else stage.tick_at(job["at"])
+        picture = Image.fromarray(camera.frame(tick))
+        try:
+            picture.save(out, optimize=True)
+        except OSError as error:
+            reason = error.strerror or error
+            raise RecordingError(f"cannot write '{job['name']}': {reason}") from None
+        return
+    ticks = list(film_ticks(stage, job["fps"], job["start"], job["stop"], job["speed"]))
+
+    def frames() -> Iterator[Frame]:
+        for number, tick in enumerate(ticks, start=1):
+            yield camera.frame(tick)
+            _answer(frame=number, frames=len(ticks))
+
+    write_film(out, frames(), (job["width"], job["height"]), job["fps"])
+
+
+def run() -> None:
+    """Draws one job."""
+    job = json.loads(sys.stdin.readline())
+    try:
+        _draw(job)
+    except HapticBridgeError as error:
+        _answer(error=str(error))
+    else:
+        _answer(done=True)

@@ -1,0 +1,160 @@
+"""Shared memory with the newest positions of a scene, beside the ring of records.
+
+A record has the poses of handle and tool. A view draws all bodies, so the loop also publishes the
+generalised positions, mocap poses and contacts of one tick, some 30 times a second. Only the newest
+picture is kept. The loop never waits: a reader that meets a picture being written reads again.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticbridge.errors import RecordingError
+from hapticbridge.recording.ring_memory import attached, created, memory_folder
+
+SEQUENCE, NUMBER, CONTACTS = 0, 1, 2
+"""Indices into ``Snapshot.head``: the sequence, odd while the loop writes; the number of the
+record of the same tick in the ring, counted from the ring's start; how many contacts there are."""
+
+MOST_CONTACTS = 32
+"""Largest number of contacts in a picture. More are a heap in which no single one is seen."""
+
+_HEAD = 8
+_ATTEMPTS = 100
+
+
+def snapshot_dtype(model: mujoco.MjModel) -> np.dtype[np.void]:
+    """Returns the layout of a picture of a scene: all numbers are 64-bit floats."""
+    return np.dtype(
+        [
+            ("slack", "<f8"),
+            ("qpos", "<f8", (model.nq,)),
+            ("mocap_pos", "<f8", (model.nmocap, 3)),
+            ("mocap_quat", "<f8", (model.nmocap, 4)),
+            ("contacts", "<f8", (MOST_CONTACTS, 2, 3)),
+        ]
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """Positions of a scene after one tick.
+
+    Attributes:
+        number: Number of the tick's record in the ring, counted from the ring's start.
+        slack: Energy in J that the environment may have created by then.
+        qpos: Generalised positions, (nq,).
+        mocap_pos: Positions of mocap bodies in m, (nmocap, 3).
+        mocap_quat: Orientations of mocap bodies, (nmocap, 4).
+        contacts: Position in m and force in N of each contact in the world frame, (n, 2, 3) with
+            n <= ``MOST_CONTACTS``.
+    """
+
+    number: int
+    slack: float
+    qpos: NDArray[np.float64]
+    mocap_pos: NDArray[np.float64]
+    mocap_quat: NDArray[np.float64]
+    contacts: NDArray[np.float64]
+
+
+class Snapshot:
+    """The newest picture of a scene, in shared memory or in this process's own.
+
+    Args:
+        memory: Bytes of ``size_of(model)``, zero at first.
+        model: The scene.
+        name: Path of the shared memory, or None.
+        is_owner: Whether ``close`` removes the name.
+
+    Attributes:
+        head: Shape (8,), int64; see ``SEQUENCE``.
+        numbers: Shape (n,), float64, as ``snapshot_dtype`` lays them out.
+        name: Path that ``attach`` takes, or None for memory of this process alone.
+    """
+
+    def __init__(
+        self, memory: Any, model: mujoco.MjModel, name: str | None = None, *, is_owner: bool = False
+    ) -> None:
+        layout = snapshot_dtype(model)
+        self.head = np.frombuffer(memory, np.int64, count=_HEAD)
+        offset = self.head.nbytes
+        self.numbers = np.frombuffer(memory, np.float64, layout.itemsize // 8, offset)
+        self.name = name
+        self._layout, self._is_owner, self._order = layout, is_owner, threading.Lock()
+
+    @classmethod
+    def shared(cls, model: mujoco.MjModel) -> Snapshot:
+        """Creates shared memory for a scene; ``close`` removes its name.
+
+        Raises:
+            RecordingError: There is no room for it.
+        """
+        size = size_of(model)
+        folder = memory_folder()
+        try:
+            memory, path = created(folder, size)
+        except OSError as error:
+            raise RecordingError(
+                f"no room for the positions of the scene ({size} bytes) in {folder}: "
+                f"{error.strerror}"
+            ) from error
+        return cls(memory, model, str(path), is_owner=True)
+
+    @classmethod
+    def attach(cls, name: str, model: mujoco.MjModel) -> Snapshot:
+        """Opens the shared memory that another process created.
+
+        Raises:
+            RecordingError: There is none of this name, or it is of another scene.
+        """
+        memory = attached(name)
+        if len(memory) != size_of(model):
+            raise RecordingError(f"{name} has {len(memory)} bytes, the scene {size_of(model)}")
+        return cls(memory, model, name)
+
+    def read(self) -> Picture | None:
+        """Returns the newest picture; None before the first, or if each read met a write."""
+        for _ in range(_ATTEMPTS):
+            sequence = int(self.head[SEQUENCE])
+            self._fence()
+            number, count = int(self.head[NUMBER]), int(self.head[CONTACTS])
+            numbers = self.numbers.copy()
+            self._fence()
+            if sequence == 0:
+                return None
+            if sequence % 2 == 0 and sequence == int(self.head[SEQUENCE]):
+                row = numbers.view(self._layout)[0]
+                return Picture(
+                    number=number,
+                    slack=float(row["slack"]),
+                    qpos=row["qpos"],
+                    mocap_pos=row["mocap_pos"],
+                    mocap_quat=row["mocap_quat"],
+                    contacts=row["contacts"][:count],
+                )
+        return None
+
+    def close(self) -> None:
+        """Removes the shared memory's name if this object created it; its arrays stay valid."""
+        if self._is_owner and self.name is not None:
+            with contextlib.suppress(OSError):  # already gone, or Windows: still mapped
+                Path(self.name).unlink()
+
+    def _fence(self) -> None:
+        # Python has no memory fence; taking and leaving a lock is one on every processor
+        with self._order:
+            pass
+
+
+def size_of(model: mujoco.MjModel) -> int:
+    """Returns the size of a scene's snapshot in bytes."""
+    return 8 * _HEAD + snapshot_dtype(model).itemsize

@@ -1,0 +1,202 @@
+"""The process that shows a run while it goes on. The loop never waits for it.
+
+It reads the newest positions of the scene (``recording.snapshot``) and the records of the ring, and
+draws them on the page. It ends when its input does.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import queue
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import IO, Any
+
+import mujoco
+import numpy as np
+
+from hapticbridge.audit.attached_scene import attached_model
+from hapticbridge.errors import HapticBridgeError
+from hapticbridge.film_process import LEAST_REFERENCE
+from hapticbridge.provenance import parameters_of
+from hapticbridge.recording import RecordingFile, Ring
+from hapticbridge.recording.snapshot import Snapshot
+from hapticbridge.view.address import Address
+from hapticbridge.view.controls import SHARED, Controls, Outlet, allowance_of
+from hapticbridge.view.page import Page
+from hapticbridge.view.server import serve
+from hapticbridge.view.sight import Sight
+from hapticbridge.view.tendons import Tendons
+from hapticbridge.view.trace import Trace
+
+FRAME = 1 / 30
+"""Time in s between two pictures, as often as the bridge publishes them."""
+
+REPLOT = 0.2
+"""Time in s between two drawings of the curves, which cost a browser more than the scene."""
+
+FAREWELL = 0.3
+"""Time in s that the process stays after the run, so that the last words reach the page."""
+
+BEHIND = 19
+"""Niceness of this process: all other work comes first."""
+
+TRACE = 600
+"""Points of a live curve: 20 s at 30 a second."""
+
+
+class LiveRun:
+    """A run that goes on, as the bridge publishes it.
+
+    Args:
+        ring: The run's records.
+        snapshot: Name of the shared memory with the scene's positions.
+        run: Metadata and attachments of the run.
+
+    Attributes:
+        model: The scene.
+        parameters: Parameters of the run.
+        reference: Largest force in N so far, or ``LEAST_REFERENCE``.
+        trace: The curves so far.
+    """
+
+    def __init__(self, ring: Ring, snapshot: str, run: RecordingFile) -> None:
+        self.parameters = parameters_of(run.meta)
+        self.model = attached_model(run, self.parameters)
+        self._ring, self._snapshot = ring, Snapshot.attach(snapshot, self.model)
+        self._data, self._tendons = mujoco.MjData(self.model), Tendons(self.model)
+        self._gathered, self._shown = 0, -1
+        self.trace = Trace(TRACE)
+        self.reference = LEAST_REFERENCE
+
+    def look(self) -> Sight | None:
+        """Returns the newest instant; None if it was returned before."""
+        picture = self._snapshot.read()
+        if picture is None or picture.number == self._shown:
+            return None
+        number, rows = self._ring.since(picture.number)
+        if number != picture.number or not rows.size:
+            return None  # its record is not written yet
+        self._shown = number
+        self._gather(picture.slack)
+        self._data.qpos[:] = picture.qpos
+        self._data.mocap_pos[:], self._data.mocap_quat[:] = picture.mocap_pos, picture.mocap_quat
+        sight = Sight.of(self.model, self._data, rows[:1], self._tendons, picture.contacts)
+        self.reference = max(self.reference, float(np.linalg.norm(sight.force)))
+        return sight
+
+    def _gather(self, slack: float) -> None:
+        """Adds the records since the last look to the curves."""
+        number, rows = self._ring.since(self._gathered)
+        self._gathered = number + len(rows)
+        if rows.size:
+            self.trace.add(rows, slack)
+
+
+def run_of(metadata: dict[str, str], files: dict[str, bytes]) -> RecordingFile:
+    """Returns metadata and attachments of a run that goes on as a recording without ticks."""
+    return RecordingFile(
+        path=Path("live"),
+        count=0,
+        last_tick=-1,
+        flags=0,
+        events=[],
+        meta=metadata,
+        attachments=files,
+        is_cut=True,
+        digest=None,
+        computed_digest="",
+        problems=(),
+    )
+
+
+def _listen(stream: IO[bytes], inbox: queue.SimpleQueue[dict[str, Any] | None]) -> None:
+    for line in stream:
+        if line.endswith(b"\n"):
+            inbox.put(json.loads(line))
+    inbox.put(None)
+
+
+def _told(stream: IO[bytes]) -> tuple[dict[str, Any], RecordingFile]:
+    job = json.loads(stream.readline())
+    files = {name: stream.read(size) for name, size in job["attachments"]}
+    run = run_of(job["metadata"], files)
+    return job, run
+
+
+def _calm() -> None:
+    if sys.platform == "linux":
+        with contextlib.suppress(OSError):
+            # idle: any other process that wakes on this core takes it at once; niceness alone lets
+            # a loop without real-time priority wait for the rest of a slice
+            os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
+    if hasattr(os, "nice"):
+        os.nice(BEHIND)
+
+
+def _ending(event: dict[str, Any]) -> str:
+    """Returns why a run ended, if that is what an event says."""
+    if event.get("event") == "trip" or (event.get("event") == "stop" and "overruns" in event):
+        return str(event.get("reason"))
+    return ""
+
+
+def _follow(
+    live: LiveRun, page: Page, controls: Controls, inbox: queue.SimpleQueue[dict[str, Any] | None]
+) -> str:
+    """Shows a run until it is over; returns the reason of its end."""
+    plotted, due, over = 0.0, time.monotonic(), ""
+    while True:
+        while not inbox.empty():
+            event = inbox.get()
+            if event is None:
+                return over
+            over = over or _ending(event)
+            controls.note(event)
+        sight = live.look()
+        if sight is not None:
+            page.reference = live.reference
+            page.show(sight)
+            force = float(np.linalg.norm(sight.force))
+            page.status.content = f"**{sight.time:.1f} s**, {force:.2f} N"
+        now = time.monotonic()
+        if now - plotted >= REPLOT and len(live.trace) > 1:
+            plotted = now
+            page.plot(*live.trace.curves())
+        # from the last due time on, so that a late picture does not make all later ones late
+        due = max(due + FRAME, now)
+        time.sleep(due - now)
+
+
+def run() -> None:
+    """Runs the process."""
+    _calm()
+    # what viser prints is no answer to the bridge
+    answers, sys.stdout = sys.stdout, sys.stderr
+    stream = sys.stdin.buffer
+    job, told = _told(stream)
+    try:
+        live = LiveRun(Ring.attach(job["ring"]), job["snapshot"], told)
+        address = Address(job["host"], job["port"], job["token"])
+        server = serve(address)
+        outlet = Outlet(answers.fileno())
+        if not address.is_loopback:
+            server.gui.add_markdown(SHARED)
+        page = Page(server, live.model, live.parameters, dict(told.meta), live.reference)
+        controls = Controls(server, allowance_of(told.meta), outlet.ask)
+        page.add_curves()
+    except HapticBridgeError as error:
+        print(json.dumps({"error": str(error)}), file=answers, flush=True)
+        return
+    print(json.dumps({"url": address.url(server.get_port())}), file=answers, flush=True)
+    inbox: queue.SimpleQueue[dict[str, Any] | None] = queue.SimpleQueue()
+    threading.Thread(target=_listen, args=(stream, inbox), daemon=True).start()
+    threading.Thread(target=outlet.run, daemon=True).start()
+    reason = _follow(live, page, controls, inbox) or "the bridge is gone"
+    page.status.content = f"**The run is over** ({reason}). This is how it was at the end."
+    time.sleep(FAREWELL)
+    os._exit(0)  # viser's threads would hold an ordinary exit up
