@@ -21,13 +21,13 @@ def test_it_prints_draws_and_saves_what_it_measured(
     assert main([*words, "--plot", str(fit), "--zwidth", str(width)]) == 0
     told = capsys.readouterr().out
     assert "resolution 20 µm" in told
-    assert "a hand that only damps cannot be told from the device" in " ".join(told.split())
+    assert "a hand that only damps cannot be distinguished from it" in " ".join(told.split())
     assert "speed squared" not in told
     assert "the largest safe stiffness is 29" in told  # 2 b / T at the lower end of b
     assert fit.read_bytes().startswith(b"\x89PNG") and "<svg" in width.read_text(encoding="utf-8")
     found = read_profile(profile)
     damping = found.quantities["damping"]
-    assert "a hand that only damps cannot be told from the device" in damping.source
+    assert "a hand that only damps cannot be distinguished from it" in damping.source
     assert damping.value == pytest.approx(1.5, rel=0.01)
     assert damping.interval is not None and damping.interval[0] < 1.5 < damping.interval[1]
     assert found.quantities["rotational_damping"].value == pytest.approx(2e-3, rel=0.01)

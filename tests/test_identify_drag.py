@@ -165,7 +165,7 @@ def test_a_hand_that_only_damps_is_told_to_be_beyond_what_can_be_seen() -> None:
     profile = measured_profile(found, device="d", serial="", date="2026-01-01", duration=6.0)
     for quantity in ("damping", "mass"):
         source = profile.quantities[quantity].source
-        assert "a hand that only damps cannot be told from the device" in source
+        assert "a hand that only damps cannot be distinguished from it" in source
 
 
 def test_an_interval_that_reaches_farther_down_says_so() -> None:

@@ -76,7 +76,7 @@ def test_a_motor_at_its_end_is_noticed(most: float, words: str) -> None:
         size = float(np.linalg.norm(wrench[:3]))
         return wrench * min(1.0, most / size) if size > 0.0 else wrench
 
-    refused(Wrapped(free(), on_write=clipped), words or "its motor may be at its end")
+    refused(Wrapped(free(), on_write=clipped), words or "its motor may be saturated")
     identify(Wrapped(free(), on_write=lambda w: w), SimulatedClock(), period=PERIOD, axes=("x",))
 
 

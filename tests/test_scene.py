@@ -114,7 +114,7 @@ def test_name_that_the_bridge_needs_is_refused_where_it_is_taken(
     text = mjcf(actuator, body=HINGE_TOOL.format(joint=""), world=world)
     message = refusal_of(tmp_path, text)
     assert culprit in message
-    assert "rename yours" in message
+    assert "rename it" in message
 
 
 def test_names_of_ours_are_free_for_other_kinds_of_things(tmp_path: Path) -> None:

@@ -230,7 +230,7 @@ def test_an_unknown_name_is_told_what_exists(tmp_path: Path) -> None:
     assert "clearance (5e-05 to 0.001 m, default 0.0002)" in message
     path = scene_with(tmp_path, "")
     assert refusal(path, mass=1.0) == (
-        "scene 'bench' has no parameters, so 'mass' cannot be set; they would stand in "
+        "scene 'bench' has no parameters, so 'mass' cannot be set; define parameters in "
         "'bench.toml' beside it"
     )
 

@@ -1,10 +1,10 @@
-"""What a device is, measured by moving it a little.
+"""Identification of a device's mechanics from small motions.
 
-Read ``identification`` first. ``experiment`` moves one axis by the force of ``excitation``;
-``weak_form`` makes linear equations of the run, ``fit`` solves them with intervals (``estimate``,
-``axis_fit``), ``resolution`` finds the encoder's step, and ``measured_profile`` keeps it all for
-later runs. ``wall`` and ``swing`` try walls on the device itself, ``measured_width`` holds them
-against theory.
+Read ``identification`` first. ``experiment`` moves one axis by the force of ``excitation``.
+``weak_form`` turns the run into linear equations and ``fit`` solves them with intervals
+(``estimate``, ``axis_fit``). ``resolution`` finds the encoder's step, and ``measured_profile``
+stores the result for later runs. ``wall`` and ``swing`` try virtual walls on the device,
+``measured_width`` compares them with theory.
 """
 
 from hapticbridge.identify.axis_fit import AxisFit as AxisFit

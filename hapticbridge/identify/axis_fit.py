@@ -1,4 +1,4 @@
-"""What a run tells of one axis of a device."""
+"""Identified parameters of one device axis."""
 
 from __future__ import annotations
 
@@ -14,26 +14,26 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class AxisFit:
-    """What a run tells of one axis.
+    """Identified parameters of one device axis.
 
     Attributes:
         mass: M in kg (rotation: kg m²).
         damping: b in N s/m (N m s/rad).
         friction: Coulomb friction f_c in N (N m).
         offset: Constant force c in N (N m): weight, or an offset of the motor.
-        delay: From a write until it shows in a sample, beyond the hold, in s.
-        spring: Stiffness k in N/m (N m/rad) that would explain the rest: a hand, a cable.
-        drag: Drag b_2 in N s²/m² (N m s²/rad²): a resistance b_2 v |v| beside b v, as of oil. It is
-            part of the law where its interval leaves zero out.
-        drag_speed: Speed v in m/s (rad/s) at which ``damping`` is taken, as (b v + b_2 v |v|)/v, so
-            that it is the least at any speed that was seen: 0, or the largest where b_2 < 0.
-        lost_gain: Share of the force above half of the largest that did not act, without unit: 0
+        delay: Time in s from a write to its effect in a sample, beyond the hold.
+        spring: Stiffness k in N/m (N m/rad) that explains the remainder, as of a hand or a cable.
+        drag: b_2 in N s²/m² (N m s²/rad²) of a drag b_2 v |v| beside b v, as of oil. It belongs to
+            the law if its interval excludes zero.
+        drag_speed: Speed v in m/s (rad/s) at which ``damping`` is taken, as (b v + b_2 v |v|)/v. It
+            is chosen so that ``damping`` is the smallest over the observed speeds: 0, or the
+            largest speed if b_2 < 0.
+        lost_gain: Share of the force above half of its maximum that had no effect, without unit: 0
             for a good motor, 1 for one that saturates there.
-        unexplained: RMS of the force that neither the law nor the noise and rounding of the
-            position explain, in N (N m).
-        force: RMS of the force that was applied, in N (N m).
-        window: Length of the windows used, in s.
-        count: How many there were.
+        unexplained: RMS force in N (N m) left by the law and by the position's noise and rounding.
+        force: RMS of the applied force in N (N m).
+        window: Length of the windows in s.
+        count: Number of windows.
     """
 
     mass: Estimate
@@ -51,7 +51,7 @@ class AxisFit:
     count: int
 
     def resistance(self, speed: Array) -> Array:
-        """Returns b v + b_2 v |v| + f_c sign(v) in N (N m), with b_2 where it is seen.
+        """Returns b v + b_2 v |v| + f_c sign(v) in N (N m), with b_2 only if it is significant.
 
         Args:
             speed: v in m/s (rad/s).

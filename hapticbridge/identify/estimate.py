@@ -1,4 +1,4 @@
-"""Numbers with intervals: least squares, and what leaving out parts of a run says of its result."""
+"""Least squares with jackknife intervals."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ CONFIDENCE = 0.95
 """Probability, without unit, that the true value lies within the interval."""
 
 BLOCKS = 12
-"""Parts of the run that are left out in turn to see how much the result depends on them. More would
-be shorter than the slowest swing, and then no longer independent."""
+"""Number of parts of the run, left out in turn to measure the scatter of the result. With more, a
+part would be shorter than the slowest swing and no longer independent."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,10 +24,10 @@ class Estimate:
     """A number with its interval of ``CONFIDENCE``.
 
     Attributes:
-        value: In SI units.
-        half_width: The true value is at most value + half_width, in the same unit.
-        below: How much farther than half_width the interval reaches down, 0 or more: what could
-            be there unseen and would make the true value smaller.
+        value: Estimate in SI units.
+        half_width: Largest excess of the true value over ``value``, in the unit of ``value``.
+        below: Additional lower width of the interval, >= 0. It covers effects too small to be
+            detected that would make the true value smaller.
     """
 
     value: float
@@ -46,11 +46,11 @@ class Estimate:
 
     @property
     def is_seen(self) -> bool:
-        """Whether the interval leaves zero out."""
+        """Significance: true if the interval excludes zero."""
         return self.least > 0.0 or self.most < 0.0
 
     def told(self) -> str:
-        """Returns the value and its interval, without digits that the half-width makes void."""
+        """Returns the value and its interval as text, rounded to the significant digits."""
         value = self.value
         if self.half_width > 0.0:
             value = round(value, -math.floor(math.log10(self.half_width))) + 0.0  # no −0
@@ -59,7 +59,7 @@ class Estimate:
 
 
 def solved(columns: Array, right: Array) -> Array:
-    """Returns the factors of the columns whose sum is nearest to the right side.
+    """Returns the least-squares factors x of columns · x = right.
 
     Args:
         columns: Shape (n, k).
@@ -71,9 +71,9 @@ def solved(columns: Array, right: Array) -> Array:
 
 
 def half_widths(columns: Array, right: Array) -> Array:
-    """Returns the half-widths that leaving out each of ``BLOCKS`` parts in turn shows (jackknife).
+    """Returns the half-widths of the least-squares factors by a jackknife over ``BLOCKS`` parts.
 
-    It asks nothing of the errors but that distant rows do not share them.
+    Its only assumption is that distant rows have independent errors.
 
     Args:
         columns: Shape (n, k), in the order of time, n >= ``BLOCKS``.

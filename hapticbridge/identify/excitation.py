@@ -1,4 +1,4 @@
-"""The force of a run that identifies an axis: tones that stay within a travel, tick by tick."""
+"""Excitation force of one axis: tones whose amplitude follows the travel."""
 
 from __future__ import annotations
 
@@ -12,53 +12,59 @@ from hapticbridge.jit import compiled
 from hapticbridge.pose import conjugate, product, quaternion_log
 
 Record: TypeAlias = Any
-"""A structured scalar inside compiled code, where fields are attributes; NumPy's type has none."""
+"""Structured scalar inside compiled code, where fields are attributes. NumPy's type has none."""
 
 LOWEST, HIGHEST, TONES = 0.7, 12.0, 9
-"""In Hz, and how many between them, evenly in their logarithm. Low ones show damping and friction,
-high ones mass; above 12 Hz an axis of 1 kg moves less than an encoder sees, below 0.7 Hz a run of
-12 s holds too few swings."""
+"""Lowest and highest frequency in Hz and number of tones, evenly spaced in log frequency. Low tones
+show damping and friction, high tones show mass. Above 12 Hz an axis of 1 kg moves less than an
+encoder resolves; below 0.7 Hz a run of 12 s holds too few swings."""
 
 SLOW_PERIOD = 0.003
-"""In s: a loop of longer periods moves the axis as much more slowly and for as much longer, because
-a window of the fit needs ``weak_form.LEAST_SAMPLES`` of them within half a swing."""
+"""Loop period in s above which all times of a run are stretched in proportion. A window of the fit
+needs ``weak_form.LEAST_SAMPLES`` periods within half a swing, so slower loops need slower
+motion."""
 
 _TILT, _SLOW_TILT = -0.3, -1.0
-"""Power of the frequency that a tone's amplitude follows. All tones then move a damped axis by
-similar amounts; in slow loops the low ones move it more, or its swings would be too short for
-``weak_form.LEAST_SAMPLES``."""
+"""Exponents of a tone's amplitude over its frequency, without unit. With the first, all tones move
+a damped axis by similar amounts. The second, for slow loops, favours low tones; otherwise swings
+would be too short for ``weak_form.LEAST_SAMPLES``."""
 
 START_SHARE = 0.03
-"""Share of the force limit with which the signal starts. It grows until the axis moves."""
+"""Initial amplitude as a share of the force limit, without unit. It grows until the axis moves."""
 
 GROWTH, SHRINKING = 0.7, 0.5
-"""Time in s in which the signal grows e-fold while the axis moves less than asked, and shrinks
-while it moves more. Faster overshoots the travel, slower wastes the run."""
+"""Time constants in s with which the amplitude grows while the axis moves too little, and shrinks
+while it moves too much. Faster growth overshoots the travel, slower growth wastes the run."""
 
 ENOUGH, TOO_MUCH = 0.4, 0.6
-"""Shares of the travel between which the signal is left as it is. The largest deflection is 1.4
-times the travel then, and twice it on a light device that breaks away from its friction (largest of
-300 runs: 2.14). Larger shares overshoot more, smaller ones move too few steps of an encoder."""
+"""Shares of the travel, without unit, between which the amplitude is kept. The largest deflection
+is then 1.4 times the travel, and twice it for a light device that breaks away from its friction
+(maximum of 300 runs: 2.14). Larger shares overshoot more, smaller ones cross too few encoder
+steps."""
 
 _RESCUE = 0.05
-"""Time in s in which the signal shrinks while the axis is beyond the travel, as a light one is that
-has just broken away from its friction."""
+"""Time constant in s with which the amplitude shrinks while the axis is beyond the travel, as after
+a light axis breaks away from its friction."""
 
-_MEMORY = 0.7  # s for which the largest deflection is remembered: half of the slowest swing
+_MEMORY = 0.7
+"""Time constant in s of the largest recent deflection: half of the slowest swing."""
 
 CENTRING = (40.0, 0.1)
 """Stiffness in N/m and N m/rad of the spring that keeps every axis near its start. It is part of
-the known force, so it does not disturb the fit. Stiffer leaves less travel to the signal."""
+the known force, so it does not disturb the fit. A stiffer spring leaves less travel to the
+signal."""
 
 CALMING = (1.0, 1e-3)
-"""Damping in N s/m and N m s/rad, of the motion over the last ``SPAN``, without which a heavy
-device of little damping would swing for ever. More would hide the damping that is looked for."""
+"""Damping in N s/m and N m s/rad, applied to the mean velocity over the last ``SPAN``. Without it a
+heavy device of low damping would swing for a long time. More would mask the damping to be
+measured."""
 
 SPAN = 0.01
-"""In s: an encoder's steps of 0.1 mm then make 0.01 N of noise."""
+"""Time in s over which the velocity is averaged. Encoder steps of 0.1 mm then cause 0.01 N of
+noise."""
 
 WEIGHT_TIME = 2.0
-"""Time in s in which the centring spring's integral takes over a weight."""
+"""Time in s in which the integral of the centring spring takes over a weight."""
 
 OK, FAR, TURNED_FAR, FAST, TURNED_FAST, BAD_POSE = range(6)
 
@@ -81,13 +87,15 @@ STATE_DTYPE = np.dtype(
         ("reach", "<f8"),
     ]
 )
-"""Of one run: period T in s, which axes there are (1 or 0), limits on force, travel, distance and
-speed per kind of axis, the pose at the start, the displacement from it (m, then rotation vector in
-rad), now and one tick ago, the integral of the springs in N and N m, and the signal's."""
+"""State of one run, per kind of axis where a field has two values (translation, rotation).
+
+Period T in s; presence of the six axes (1 or 0); limits on force, travel, distance and speed; pose
+at the start; displacement from it now and one tick earlier (m, then rotation vector in rad);
+integral of the springs in N and N m; amplitude and recent reach of the signal."""
 
 
 def stretch(period: float) -> float:
-    """Returns by how much all times of a run are longer than at 333 Hz and more, 1 there.
+    """Returns the factor by which all times of a run are longer than at 333 Hz and above (1 there).
 
     Args:
         period: T in s.
@@ -96,10 +104,10 @@ def stretch(period: float) -> float:
 
 
 def signal(axis_index: int, ticks: int, period: float) -> NDArray[np.float64]:
-    """Returns tones of random phase between −1 and 1, another one for each axis, the same always.
+    """Returns a sum of tones scaled to [−1, 1], shape (n,). Its phases depend on the axis only.
 
     Args:
-        axis_index: 0 to 5.
+        axis_index: 0 to 5, the seed of the phases.
         ticks: n.
         period: T in s.
     """
@@ -122,24 +130,24 @@ def next_wrench(
     ticks_passed: int,
     wrench: NDArray[np.float64],
 ) -> int:
-    """Computes the wrench of a tick from its sample; returns ``OK`` or what is wrong.
+    """Computes the wrench of a tick from its sample; returns ``OK`` or the code of a fault.
 
         F = a s(t) − k q − B q̇ − (k/τ) ∫ q
 
     Args:
         states: ``STATE_DTYPE``, shape (1,).
         samples: The device's sample, ``SAMPLE_DTYPE``, shape (1,).
-        past: Displacements of the last ``SPAN``, shape (n, 6), overwritten in turn.
+        past: Ring of displacements over the last ``SPAN``, shape (n, 6).
         tone: s of this tick.
         ticks_passed: Periods since the last call.
-        wrench: Filled in, shape (6,).
+        wrench: Output, shape (6,).
     """
     s = states[0]
     code = _displace(s, samples[0], ticks_passed * s.period)
     if code != OK:
         return code
     deflection = abs(s.place[s.axis])
-    time = min(s.period, SLOW_PERIOD)  # what a slow loop stretches
+    time = min(s.period, SLOW_PERIOD)  # slow loops stretch all times
     s.reach = max(deflection, s.reach * math.exp(-time / _MEMORY))
     kind = 0 if s.axis < 3 else 1
     if deflection > s.travel[kind]:
@@ -168,7 +176,7 @@ def next_wrench(
 
 @compiled
 def _displace(s: Record, sample: Record, time: float) -> int:
-    """Computes the displacement from the start; the first sample is the start."""
+    """Computes the displacement from the first sample; returns ``OK`` or the code of a fault."""
     q = sample.quaternion
     square = q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]
     total = square + sample.position[0] + sample.position[1] + sample.position[2]

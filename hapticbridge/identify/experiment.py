@@ -1,4 +1,4 @@
-"""A short, safe run that moves one axis of a device by itself, and what was recorded of it."""
+"""Short, safe run that moves one axis of a device and records it."""
 
 from __future__ import annotations
 
@@ -29,27 +29,27 @@ from hapticbridge.tick import SAMPLE_DTYPE, TickFlag
 Array = NDArray[np.float64]
 
 RUNAWAY = 3.0
-"""Multiple of the allowed travel at which a run is given up: the device is not doing what the force
-says, so no force is better than more of it."""
+"""Multiple of the allowed travel at which a run is aborted, without unit. Such a device does not
+follow the commanded force, so zero force is the safer command."""
 
 SPEED_MARGIN = 1.5
-"""Multiple of the device's own top speed that counts as a fault."""
+"""Multiple of the device's own top speed that counts as a fault, without unit."""
 
 _TOLD_PER_SECOND = 10
-"""How often progress is told."""
+"""Rate of progress reports in Hz."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AxisRun:
-    """What was commanded and seen of one axis.
+    """Commanded force and measured motion of one axis.
 
     Attributes:
         axis: One of ``AXES``.
         period: T in s.
-        position: In m or rad from the start, NaN where no new sample came, shape (n,).
-        force: In N or N m, held from each sample to the next, shape (n,).
-        intervals: Time between wakings in s, shape (n − 1,); with a simulated clock exactly T.
-        stale: Share of ticks in which the device had nothing new.
+        position: Displacement from the start in m or rad, NaN without a new sample, shape (n,).
+        force: Force in N or N m, held from each sample to the next, shape (n,).
+        intervals: Time between ticks in s, shape (n − 1,); exactly T with a simulated clock.
+        stale: Share of ticks without a new sample.
     """
 
     axis: str
@@ -62,10 +62,10 @@ class AxisRun:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Allowance:
-    """What a run may do, per kind of axis: translation (m, N, m/s), rotation (rad, N m, rad/s).
+    """Limits of a run per kind of axis: translation (m, N, m/s), rotation (rad, N m, rad/s).
 
     Attributes:
-        travel: From the start, to each side.
+        travel: Distance from the start, to each side.
         force: Largest force or torque.
         speed: The device's own top speed.
     """
@@ -85,22 +85,23 @@ def move_axis(
     allowance: Allowance,
     progress: Callable[[float], None] | None = None,
 ) -> AxisRun:
-    """Moves one axis of a started device and holds the others; ends with zero force in any case.
+    """Moves one axis of a started device and holds the others; always ends with zero force.
 
     The force is F = a(t) s(t) − k q − B q̇ − (k/τ)∫q: tones whose amplitude a follows the travel, a
-    spring to the start with a damper, and its integral, which takes over a weight.
+    spring to the start, a damper, and an integral that takes over a weight.
 
     Args:
-        device: Started at this period.
-        clock: Started.
+        device: Device, started at this period.
+        clock: Started clock.
         axis: One of the device's axes.
         period: T in s.
-        duration: In s.
+        duration: Length of the run in s.
         allowance: Limits on travel, force and speed.
-        progress: Called ten times a second with the share that is done.
+        progress: Called ten times a second with the completed share.
 
     Raises:
-        IdentificationError: It moved farther or faster than allowed, or its pose is not finite.
+        IdentificationError: The device moved farther or faster than allowed, or its pose is not
+            finite.
         DeviceError: The device failed.
     """
     ticks, index = round(duration / period), AXES.index(axis)
@@ -136,7 +137,7 @@ def move_axis(
 
 
 def _silence(device: Device) -> None:
-    """Commands zero force; a device that is gone has said so already."""
+    """Commands zero force; the error of a lost device has been raised already."""
     try:
         device.write(np.zeros(6))
     except DeviceError:
@@ -144,7 +145,6 @@ def _silence(device: Device) -> None:
 
 
 def _told(code: int, s: np.void) -> str:
-    """Says why a run was given up."""
     turns = code in (TURNED_FAR, TURNED_FAST)
     part, unit, factor = (slice(3, 6), "rad", 1.0) if turns else (slice(0, 3), "mm", 1e3)
     if code in (FAR, TURNED_FAR):
@@ -156,5 +156,11 @@ def _told(code: int, s: np.void) -> str:
         )
     if code in (FAST, TURNED_FAST):
         step = factor * float(np.linalg.norm(s["place"][part] - s["before"][part]))
-        return f"the device's pose jumped by {step:.3g} {unit} in a tick, faster than it can move"
-    return "the device's pose is not finite or not a rotation"
+        limit = factor * float(s["fastest"][int(turns)])
+        return (
+            f"the device's pose jumped by {step:.3g} {unit} in a tick, faster than the limit of "
+            f"{limit:.3g} {unit}/s; check its encoders and its connection"
+        )
+    return (
+        "the device's pose is not finite or not a rotation; check its encoders and its connection"
+    )

@@ -1,4 +1,4 @@
-"""Mass, damping, friction and delay of one axis from a recorded run, with what is known of them."""
+"""Least-squares fit of mass, damping, friction and delay of one axis, with intervals."""
 
 from __future__ import annotations
 
@@ -14,36 +14,38 @@ from hapticbridge.identify.weak_form import Windows, noise_of, windows
 Array = NDArray[np.float64]
 
 METHOD_ERROR = 0.001
-"""Half-width, relative to the value, that is added to every mass, damping and friction: what shifts
-all parts of a run together, which leaving parts out cannot see, beyond what the position's rounding
-and noise explain (``noise_share``). Measured on 40 simulated devices in runs of a minute, where
-chance has averaged out: mass was off by 0.07 % at most, and by 0.005 % more than the rest of its
-interval; friction by 0.05 % of the force; damping by 0.01 % (median)."""
+"""Half-width, relative to the value, added to every mass, damping and friction, without unit. It
+covers errors that shift all parts of a run together, which the jackknife cannot detect, beyond the
+position's rounding and noise (``noise_share``). Measured on 40 simulated devices in runs of a
+minute, which average out chance. The mass was off by 0.07 % at most, and by 0.005 % more than the
+rest of its interval; friction by 0.05 % of the force; damping by 0.01 % (median)."""
 
 SUM_ERROR = 3e-4
-"""Half-width, relative to force over speed (RMS), that is added to every damping: what the sums
-make of a mass. Without it a device of no damping was given 0.0012 ± 0.00001 N s/m."""
+"""Half-width, relative to force over speed (RMS), added to every damping, without unit. It covers
+the part of the mass that the sums attribute to damping. Without it a device without damping was
+reported with 0.0012 ± 0.00001 N s/m."""
 
 LENGTHS = (0.04, 0.06, 0.09, 0.13, 0.2)
-"""Lengths of windows in s that are tried; that with the narrowest result is taken. Short ones
-drown in the rounding of the position, long ones find too few stretches in one direction. Loops
-below 333 Hz stretch them (``stretch``)."""
+"""Trial lengths of windows in s; the length with the narrowest interval is used. In short windows
+the position's rounding dominates; long ones find too few stretches in one direction. Loops below
+333 Hz stretch them (``stretch``)."""
 
 LEAST_WINDOWS = 60
-"""Five in each of ``BLOCKS``: fewer say nothing of how much they differ."""
+"""Smallest number of windows: five in each of ``BLOCKS``. Fewer do not show their scatter."""
 
 MOST_NOISE = 0.005
-"""Largest ``noise_share`` that is worth a result. Below, all intervals grow by what it takes from
-the applied force. With 0.03, one good motor in thirty was taken for a saturated one."""
+"""Largest usable ``noise_share``, without unit. Below it all intervals grow by its share of the
+applied force. With 0.03, one good motor in thirty was reported as saturated."""
 
 DELAY_ERROR = 1e-5
-"""Half-width in s that is added to every delay, for the same reason: a hundredth of a tick."""
+"""Half-width in s added to every delay, for errors common to all parts of a run: a hundredth of a
+tick at 1 kHz."""
 
 MOST_DELAY = 0.02
-"""In s. A device later than this cannot be felt through."""
+"""Largest delay in s of the search. A device with more delay is of no use for haptics."""
 
 _ROUNDS = 12
-"""Of the search for the delay at most; each solves anew at the delay that the last one found."""
+"""Largest number of iterations of the search for the delay; each solves anew at the last result."""
 
 _MASS, _DAMPING, _FRICTION, _OFFSET, _DELAY = range(5)
 
@@ -51,20 +53,22 @@ _MASS, _DAMPING, _FRICTION, _OFFSET, _DELAY = range(5)
 def fit_axis(position: Array, force: Array, period: float, resolution: float = 0.0) -> AxisFit:
     """Fits M x'' + b x' + f_c sign(x') + c = F(t − d) to a run.
 
-    Least squares over the windows of ``weak_form``; d is moved until its own column vanishes. The
-    intervals come from leaving out each part of the run in turn (``half_widths``), and from
-    ``METHOD_ERROR`` and ``SUM_ERROR``. A spring k x and a drag b_2 x' |x'| are tried too, and join
-    the law where they are seen; a drag that is not seen lowers the lower end of b by what it could
-    be, because b of small speeds is what the guarantee takes.
+    The windows of ``weak_form`` are solved by least squares; d is adjusted until the factor of its
+    own column vanishes. The intervals come from a jackknife over the parts of the run
+    (``half_widths``), ``METHOD_ERROR`` and ``SUM_ERROR``.
+
+    A spring k x and a drag b_2 x' |x'| join the law if they are significant. A drag that is not
+    significant extends the interval of b downwards by its possible effect, because the guarantee
+    relies on b at small speeds.
 
     Args:
-        position: x in m (or rad) at the samples, shape (n,); NaN where there is none.
+        position: x in m (or rad) at the samples, shape (n,); NaN without a sample.
         force: F in N (or N m), held from each sample to the next, shape (n,).
         period: T in s.
-        resolution: Step of the position in m, 0 where it is exact.
+        resolution: Step of the position in m, 0 if it is exact.
 
     Raises:
-        IdentificationError: The axis hardly moved, or never long enough in one direction, or the
+        IdentificationError: The axis hardly moved, never moved long enough in one direction, or its
             position is too noisy.
 
     References:
@@ -81,16 +85,16 @@ def fit_axis(position: Array, force: Array, period: float, resolution: float = 0
     if noise > 0.0:
         raise IdentificationError(
             f"its position trembles by {noise:.2g} (RMS, m or rad), too much for so small a "
-            "motion; allow more travel or more force, or find what disturbs the position"
+            "motion; allow more travel or more force, or remove the source of the noise"
         )
     raise IdentificationError(
-        "it never moved long enough in one direction to tell mass from damping; allow more "
+        "it never moved long enough in one direction to separate mass from damping; allow more "
         "travel, more force or more time"
     )
 
 
 def _width(fit: AxisFit) -> float:
-    """Returns how uncertain a fit is: the intervals of M and b relative to their values."""
+    """Returns the uncertainty of a fit: the intervals of M and b relative to their values."""
     return sum((e.most - e.least) / max(abs(e.value), 1e-12) for e in (fit.mass, fit.damping))
 
 
@@ -118,7 +122,7 @@ def _fitted(
     spring, drag = _last(2, [found.columns, found.position, found.drag], found.right)
     law = [found.columns]
     if spring.is_seen:
-        law.append(found.position)  # a weak cable, or it would be taken for less mass
+        law.append(found.position)  # without it, a weak cable would reduce the fitted mass
     unbent, drag_speed = np.column_stack(law), 0.0
     if drag.is_seen:
         if drag.value < 0.0:
@@ -130,7 +134,7 @@ def _fitted(
     trembling = float(values[_MASS]) * found.mass_noise / area
 
     applied = float(np.sqrt(np.mean((found.right / area) ** 2)))
-    # a mass that is too small by a share leaves that share of the force to damping and friction
+    # an underestimate of the mass attributes that share of the force to damping and friction
     taken = found.noise_share * applied
     sums = (SUM_ERROR * applied + taken) / float(np.sqrt(np.mean((speeds / area) ** 2)))
     mass, damping, friction, offset = (float(value) for value in values[:_DELAY])
@@ -156,14 +160,14 @@ def _fitted(
 
 
 def _last(count: int, columns: list[Array], right: Array) -> list[Estimate]:
-    """Returns the factors of the last columns: of what an ordinary device does not have."""
+    """Returns the factors of the last columns, which belong to effects beyond the ordinary law."""
     stacked = np.column_stack(columns)
     found = zip(solved(stacked, right), half_widths(stacked, right), strict=True)
     return [Estimate(float(value), float(half)) for value, half in found][-count:]
 
 
 def _unseen(columns: Array, found: Windows, least: float) -> float:
-    """Returns how much farther down b may lie because of a drag that is too small to be seen."""
+    """Returns the additional lower width of b due to a drag too small to be significant."""
     bent = np.column_stack([columns, found.drag])
     value = solved(bent, found.right)[_DAMPING] - half_widths(bent, found.right)[_DAMPING]
     return max(least - float(value), 0.0)

@@ -1,8 +1,8 @@
-"""Everything that a minute of small motions tells of a device, or why it tells nothing.
+"""Identification of a device from about a minute of small motions.
 
-What no motion tells: who damps. A hand, a glove or a cable that only damps, without stiffness and
-without moving by itself, adds its damping to b in the equation of motion, where nothing sets the
-two apart. Such a b is too large, which is the unsafe side; ``UNHELD`` says so wherever b is told.
+Motion cannot show the origin of a damping. A hand, a glove or a cable that only damps, without
+stiffness and without moving by itself, adds its damping to b in the equation of motion. Such a b is
+too large, which is the unsafe side. ``UNHELD`` states this wherever b is reported.
 """
 
 from __future__ import annotations
@@ -26,51 +26,53 @@ from hapticbridge.identify.resolution import step_of
 Array = NDArray[np.float64]
 
 UNHELD = (
-    "that nobody held it is the user's word: a hand that only damps cannot be told from the device"
+    "the device is assumed to be free: a hand that only damps cannot be distinguished from it"
 )
-"""Goes with every b that was measured."""
+"""Caveat printed with every measured b."""
 
 DURATION = 12.0
-"""Seconds per axis: eight swings of the slowest tone. The half-widths fall with its square root."""
+"""Time per axis in s: eight swings of the slowest tone. The half-widths fall with its square
+root."""
 
 TRAVEL = (0.015, 0.3)
-"""To each side in m and rad: a tenth of a desktop device's workspace, 300 steps of the coarsest
-encoder."""
+"""Travel to each side in m and rad: a tenth of a desktop device's workspace, and 300 steps of the
+coarsest encoder."""
 
 FORCE_SHARE = 0.5
-"""Share of the device's force limit that the signal may use."""
+"""Share of the device's force limit that the signal may use, without unit."""
 
 UNLIKELY_SPRING = (1.0, 1e-3)
-"""Stiffness in N/m and N m/rad from which on somebody or something holds the device. Our choice:
-simulated free devices show less than 0.1, the softest hand tried 3."""
+"""Stiffness in N/m and N m/rad above which the device counts as held. Our choice: simulated free
+devices show less than 0.1, the softest hand tried 3."""
 
 UNEXPLAINED_SHARE = 0.1
-"""Share of the applied force that may stay unexplained. A simulated free
-device leaves 0.02 at most, a hand that moves 0.7; no real device was measured."""
+"""Largest unexplained share of the applied force, without unit. A simulated free device leaves 0.02
+at most, a moving hand 0.7; no real device was measured."""
 
 LOST_GAIN = 0.05
-"""Share of the force above half of the largest whose loss counts as saturation."""
+"""Share of the force above half of its maximum whose loss counts as saturation, without unit."""
 
 PRECISION = 0.2
-"""Largest half-width of the mass, relative to its value, that is worth a result."""
+"""Largest usable half-width of the mass, relative to its value, without unit."""
 
 MOST_STALE = 0.5
-"""Share of ticks without a new sample beyond which the loop runs too fast for the device."""
+"""Largest share of ticks without a new sample, without unit. Beyond it the loop is too fast for the
+device."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Identification:
-    """What a device is, axis by axis.
+    """Identified mechanics of a device, axis by axis.
 
     Attributes:
-        info: The data sheet it had before.
-        runs: What was commanded and seen, per axis.
-        fits: What follows from it, per axis.
-        resolution: Step of the reported position in m, 0 where none was seen; None where it does
-            not move along any axis.
+        info: Data sheet before identification.
+        runs: Commanded force and measured motion per axis.
+        fits: Identified parameters per axis.
+        resolution: Step of the reported position in m; 0 if none was found, None without a
+            translational axis.
         period: Mean time between ticks in s.
-        period_spread: Its standard deviation in s.
-        period_most: The longest but one in a thousand, in s.
+        period_spread: Standard deviation of the time between ticks in s.
+        period_most: 99.9 % quantile of the time between ticks in s.
     """
 
     info: DeviceInfo
@@ -82,12 +84,13 @@ class Identification:
     period_most: float
 
     def of_all(self, name: str, *, turns: bool, most: bool = False) -> Estimate | None:
-        """Returns an estimate for all axes of a kind: the one that is on the safe side.
+        """Returns the estimate over all axes of a kind that lies on the safe side.
 
         Args:
             name: A field of ``AxisFit``.
-            turns: Whether of rotation.
-            most: Whether the largest is the safe one (delay); else the smallest.
+            turns: True for rotation.
+            most: True if the largest value is the safe one (delay); otherwise the smallest is
+                returned.
         """
         fits = [fit for axis, fit in self.fits.items() if (len(axis) == 2) == turns]
         found: list[Estimate] = [getattr(fit, name) for fit in fits]
@@ -107,35 +110,35 @@ def identify(
     force_share: float = FORCE_SHARE,
     progress: Callable[[str, float], None] | None = None,
 ) -> Identification:
-    """Measures mass, damping, friction, delay and resolution of a device that nobody holds.
+    """Measures mass, damping, friction, delay and resolution of a free device.
 
-    Each axis is moved by itself for ``duration`` seconds while weak springs hold the others; zero
-    force is commanded at the end whatever happens.
+    Each axis moves in turn while weak springs hold the others. Zero force is commanded at the end
+    in every case.
 
     Args:
-        device: Not started yet; it is started here, and left to be closed by the caller.
-        clock: Not started yet.
-        period: T in s of the loop.
-        axes: Which; None: all that the device has.
-        duration: Seconds per axis; None: ``duration_at`` the period.
-        travel: To each side, in m and rad.
+        device: Device that is not started; it is started here, and the caller closes it.
+        clock: Clock that is not started.
+        period: T of the loop in s.
+        axes: Axes to move; None: all axes of the device.
+        duration: Time per axis in s; None: ``duration_at`` the period.
+        travel: Travel to each side, in m and rad.
         force_share: Share of the device's limits that may be used.
-        progress: Called with the axis and the share of its run that is done.
+        progress: Called with the axis and the completed share of its run.
 
     Raises:
-        IdentificationError: A run tells nothing: the reason, and what to change.
+        IdentificationError: A run is not usable; the message names the reason and the remedy.
         DeviceError: The device failed.
     """
     info = device.info
     if info.is_prescribed:
         raise IdentificationError(
-            f"the device '{info.name}' does not react to force; there is nothing to identify"
+            f"the device '{info.name}' does not react to force, so it has no mechanics to identify"
         )
     chosen = info.axes if axes is None else axes
     allowance = Allowance(
         travel=travel,
         force=(force_share * info.force_limit, force_share * info.torque_limit),
-        # a turn is not faster than the rim of a 50 mm handle at the device's speed
+        # rotation is limited to the device's speed at the rim of a handle of 50 mm diameter
         speed=(info.speed_limit, info.speed_limit / 0.025),
     )
     duration = duration_at(period) if duration is None else duration
@@ -161,14 +164,14 @@ def identify(
         fits=fits,
         resolution=_resolution(info, runs),
         period=float(intervals.mean()),
-        # in whole nanoseconds, as the clock counts: a steady one has no spread, not 1e-19 s
+        # whole nanoseconds, the clock's unit, so that a steady clock gives 0 and not 1e-19 s
         period_spread=1e-9 * float(np.rint(1e9 * intervals).std()),
         period_most=float(np.quantile(intervals, 0.999)),
     )
 
 
 def duration_at(period: float) -> float:
-    """Returns how many seconds an axis takes unless somebody says otherwise: 12, more below 333 Hz.
+    """Returns the default time per axis in s: 12, and more below 333 Hz.
 
     Args:
         period: T in s.
@@ -181,7 +184,7 @@ def _bound(progress: Callable[[str, float], None], axis: str) -> Callable[[float
 
 
 def _judged(run: AxisRun, info: DeviceInfo) -> AxisFit:
-    """Fits a run, and refuses what it cannot be trusted with."""
+    """Fits a run and refuses untrustworthy results."""
     turns = len(run.axis) == 2
     unit, spring_unit = ("N m", "N m/rad") if turns else ("N", "N/m")
     where = f"axis {run.axis}"
@@ -204,7 +207,7 @@ def _judged(run: AxisRun, info: DeviceInfo) -> AxisFit:
         raise IdentificationError(
             f"{where}: {fit.unexplained:.2g} {unit} of the {fit.force:.2g} {unit} that moved it "
             "were not commanded: let go of it, keep it from touching anything, or lower "
-            "--force-share (its motor may be at its end)"
+            "--force-share (its motor may be saturated)"
         )
     if fit.lost_gain.least > LOST_GAIN:
         largest = float(np.abs(run.force).max())
@@ -224,5 +227,5 @@ def _resolution(info: DeviceInfo, runs: dict[str, AxisRun]) -> float | None:
     found = [step_of(run.position) for axis, run in runs.items() if len(axis) == 1]
     if not found:
         return None
-    # joint encoders make no even steps in space; a driver then knows better
+    # joint encoders make no even steps in space; then the driver's value is used
     return max(found) or info.resolution or 0.0

@@ -1,4 +1,4 @@
-"""What was measured of a device as a profile, which every later run can take."""
+"""Measured values of a device as a profile."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ def measured_profile(
     duration: float,
     workspace: tuple[float, float, float] | None = None,
 ) -> Profile:
-    """Returns a profile of the unit: of each kind of axis the values that promise least.
+    """Returns a profile of the unit with the most cautious values of each kind of axis.
 
     Args:
-        result: What ``identify`` returned.
+        result: Result of ``identify``.
         device: Name of the driver.
-        serial: Of the unit; may be empty.
-        date: When, as the file should say it.
-        duration: Seconds per axis, likewise.
-        workspace: In m, of a device whose metres are the user's word: what was measured holds only
-            with it.
+        serial: Serial number of the unit; may be empty.
+        date: Date of the measurement, as written into the file.
+        duration: Time per axis in s, as written into the file.
+        workspace: Workspace in m, for a device whose metres are stated by the user. The measured
+            values hold only together with it.
     """
     info = result.info
     source = f"identified on {date}: {duration:g} s per axis ({', '.join(result.fits)}); {UNHELD}"
@@ -51,7 +51,7 @@ def measured_profile(
     ]
     quantities["delay"] = _quantity(max(late, key=lambda delay: delay.most), source)
     for name in ("force_limit", "torque_limit", "speed_limit"):
-        quantities[name] = Quantity(float(getattr(info, name)), "the driver's, not measured")
+        quantities[name] = Quantity(float(getattr(info, name)), "from the driver, not measured")
     if info.reach is not None:
         quantities["reach"] = Quantity(info.reach, "as known before, not measured")
     if workspace is not None:
@@ -68,6 +68,6 @@ def measured_profile(
 
 
 def _quantity(found: Estimate, source: str) -> Quantity:
-    # friction and delay are not negative; what is measured of zero may be
+    # friction and delay are not negative, but a measurement of zero may be
     value = max(found.value, 0.0)
     return Quantity(value, source, (min(max(found.least, 0.0), value), max(found.most, value)))

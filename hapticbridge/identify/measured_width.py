@@ -1,4 +1,4 @@
-"""The stiffness and damping that a device bears, tried on the device, beside what theory says."""
+"""Measured and predicted Z-width of a device."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ from hapticbridge.passivity import ZWidth
 from hapticbridge.passivity.z_width import WITHOUT_HAND
 
 SHARES = (0.0, 0.15, 0.3, 0.5, 0.75)
-"""Dampings that are tried, as shares of the largest that is passive for any hand."""
+"""Trial dampings as shares of the largest damping that is passive for any hand, without unit."""
 
 FIRST_SHARE, MOST_SHARE = 0.2, 6.0
-"""Where each search begins and gives up, as shares of the stiffness that theory allows at B = 0. A
-device that nobody holds bears up to three times what is safe for any hand."""
+"""Start and end of each search as shares of the predicted stiffness at B = 0, without unit. A free
+device bears up to three times the stiffness that is safe for any hand."""
 
 FORCE_SHARE = 0.5
-"""Share of the device's force limit that walls and pushes may use."""
+"""Share of the device's force limit that walls and pushes may use, without unit."""
 
 
 @dataclass(frozen=True, slots=True)
 class MeasuredWidth:
-    """Limits found by trying.
+    """Stiffness limits measured on a device, beside the predicted ones.
 
     Attributes:
-        limits: One per damping, ascending.
-        predicted: The least K in N/m of all lines of theory at each damping.
-        unheld: The line of a device that nobody holds there; None where its mass is unknown.
+        limits: One limit per damping, ascending.
+        predicted: Smallest predicted K in N/m over all lines of theory at each damping.
+        unheld: Predicted K in N/m of the device without a hand; None if its mass is unknown.
     """
 
     limits: tuple[MeasuredLimit, ...]
@@ -48,15 +48,15 @@ def measure_width(
     force_share: float = FORCE_SHARE,
     progress: Callable[[int, int, str], None] | None = None,
 ) -> MeasuredWidth:
-    """Finds the stiffest wall at several dampings; the device is started here, not closed.
+    """Finds the stiffest wall at several dampings; starts the device and leaves it open.
 
     Args:
-        device: Not started yet.
-        clock: Not started yet.
-        z: What theory says of the device, at the rate to be tried.
+        device: Device that is not started.
+        clock: Clock that is not started.
+        z: Predicted Z-width of the device at the trial rate.
         axis: One of x, y, z that the device has.
         force_share: Share of the device's force limit that may be used.
-        progress: Called with what is done, of how much, and what is tried.
+        progress: Called with the completed count, the total count and a description of the trial.
 
     Raises:
         IdentificationError: The pose is not finite.
@@ -100,7 +100,7 @@ def measure_width(
 
 
 def measured_points(measured: MeasuredWidth) -> list[tuple[float, float, float]]:
-    """Returns B, K and the half-width of K of every limit that was found."""
+    """Returns (B, K, half-width of K) of every limit found."""
     return [
         (limit.damping, limit.stiffness, 0.5 * (limit.not_borne - limit.borne))
         for limit in measured.limits

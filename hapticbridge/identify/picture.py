@@ -1,4 +1,4 @@
-"""How well the law fits: what resists an axis, against its speed."""
+"""Plot of the identified law: resistance of each axis over its speed."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from hapticbridge.picture import new_figure
 _COLOURS = {"x": "#a51d2d", "y": "#1b7837", "z": "#1a5fb4"}
 
 _WIDTHS = {"x": 5.0, "y": 3.0, "z": 1.2}
-"""In points: axes that are alike lie on each other, and all shall be seen."""
+"""Line widths in points. Lines of similar axes coincide, and all must remain visible."""
 
 
 def draw_identification(result: Identification) -> Figure:
-    """Draws, for each axis, the force that neither its mass nor a constant takes, over the speed.
+    """Draws the force of each axis, less inertia and constant, over the speed.
 
-    Each point is one window: F − M x'' − c against x'. A device that obeys the law lies on the
-    line b x' + b_2 x' |x'| + f_c sign(x'); b_2 is there where it was seen.
+    Each point is one window: F − M x'' − c over x'. A device that obeys the law lies on the line b
+    x' + b_2 x' |x'| + f_c sign(x'), with b_2 only if it is significant.
 
     Args:
-        result: What ``identify`` returned.
+        result: Result of ``identify``.
     """
     kinds = [turns for turns in (False, True) if any((len(a) == 2) == turns for a in result.fits)]
     figure = new_figure(8, 4.0 * len(kinds) + 0.3)
@@ -42,7 +42,7 @@ def draw_identification(result: Identification) -> Figure:
     bends = any(fit.drag.is_seen for fit in result.fits.values())
     law = f"b v + {'b_2 v |v| + ' if bends else ''}f_c sign(v)"
     figure.suptitle(
-        f"What resists {result.info.name}: points measured, lines {law}",
+        f"Resistance of {result.info.name}: points measured, lines {law}",
         fontsize="medium",
         parse_math=False,
     )

@@ -1,4 +1,4 @@
-"""The step of a reported position, found from the positions alone."""
+"""Position resolution, found from positions."""
 
 from __future__ import annotations
 
@@ -10,24 +10,25 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 MOST_STEPS = 2_000_000
-"""Step of resolution below travel/MOST_STEPS is none: rounding of a double, or of a float."""
+"""Largest number of steps in the travel. A smaller step counts as rounding of a double or a
+float."""
 
 
 def step_of(position: Array) -> float:
-    """Returns the step of a reported position, 0 where it has none.
+    """Returns the step of a reported position in its unit, 0 if it has none.
 
-    All differences between positions that occur must be multiples of it. It is found as the
-    smallest difference, and made exact by all of them: Σ n d / Σ n² over the differences d = n Δ.
+    All differences between positions must be multiples of the step. The smallest difference is
+    refined by all of them: Δ = Σ n d / Σ n² over the differences d = n Δ.
 
     Args:
-        position: In m, NaN where there is none.
+        position: Position in m, NaN without a sample.
     """
     values = np.unique(position[np.isfinite(position)])
     if len(values) < 3:
         return 0.0
     gaps = np.diff(values)
     span = float(values[-1] - values[0])
-    gaps = gaps[gaps > span / MOST_STEPS]  # equal numbers, reached by different roundings
+    gaps = gaps[gaps > span / MOST_STEPS]  # smaller gaps are equal positions rounded differently
     if not gaps.size:
         return 0.0
     step = float(gaps.min())

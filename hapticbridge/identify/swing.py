@@ -1,4 +1,4 @@
-"""Whether the swing of a device on a virtual wall dies down."""
+"""Decay of a device's swing on a virtual wall."""
 
 from __future__ import annotations
 
@@ -10,27 +10,28 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 NOISE_STEPS = 2.0
-"""Amplitude in steps of resolution below which a swing has died down."""
+"""Amplitude in steps of resolution below which a swing has decayed."""
 
 DIED_DOWN = 1e-3
-"""Share of the largest deflection below which a swing has died down, whatever it does then."""
+"""Amplitude relative to the largest deflection, without unit, below which a swing has decayed."""
 
 HALTED = 0.95
-"""Share of the allowed force at which the wall pushes as hard as it may: it is not a wall then."""
+"""Share of the allowed force, without unit, at which the wall counts as saturated. It then no
+longer acts as a wall."""
 
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """One wall.
+    """Result of one wall.
 
     Attributes:
         stiffness: K in N/m.
         damping: B in N s/m.
-        is_borne: Whether the swing died down.
+        is_borne: True if the swing decayed.
         growth: Amplitude in the last third of the trial over that in the middle third, without
-            unit; 0 where nothing swung any more.
-        swing: Time of one swing in s; 0 where nothing moved.
-        energy: What the wall gave to the device after the push, in J.
+            unit; 0 if nothing swings any more.
+        swing: Period of one swing in s; 0 if nothing moved.
+        energy: Energy in J from the wall to the device after the push.
         peak: Largest force after the push in N.
     """
 
@@ -54,21 +55,21 @@ def judged(
     force: float,
     resolution: float,
 ) -> Trial:
-    """Tells a swing that dies down from one that does not.
+    """Classifies a swing as decaying or not.
 
-    Its amplitude is that of x² + (x'/ω)², which for a swing of one frequency ω does not depend on
-    where in a swing a third of the trial begins. What it swings about is the mean of the last
-    third: a weight pulls it off the wall's place, and a slow return that does not swing is nearest
-    there.
+    Its squared amplitude is x² + (x'/ω)². For a swing of one frequency ω it does not depend on the
+    phase at which a third of the trial begins. The centre of the swing is the mean of the last
+    third. A weight pulls the device away from the wall's position, and a slow return without
+    swinging is closest to its end there.
 
     Args:
         position: x − x_0 in m, shape (n,).
         given: Force on the device in N, shape (n,).
-        push: Ticks of the push.
+        push: Length of the push in ticks.
         period: T in s.
         stiffness: K in N/m.
         damping: B in N s/m.
-        force: Largest force that was allowed, in N.
+        force: Largest allowed force in N.
         resolution: Step of the position in m.
     """
     after = position[push:] - np.array_split(position[push:], 3)[2].mean()

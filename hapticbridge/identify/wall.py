@@ -1,12 +1,12 @@
-"""How stiff a virtual wall the device really bears: tried, step by step, on the device itself.
+"""Stiffest virtual wall that a device bears, found by trials on the device.
 
-The wall holds one axis at the place x_0 where it is when the trial begins,
+The wall holds one axis at its position x_0 at the start of the trial,
 
     F_k = −K (x_k − x_0) − (B/T)(x_k − x_{k−1}),
 
-and a short push sets it swinging. While the swing dies down the wall can be shown; where it grows,
-or stays as a limit cycle, device and wall together create energy. K rises until that happens, and
-is then narrowed down.
+and a short push sets it swinging. If the swing decays, the device bears the wall. If it grows, or
+stays as a limit cycle, device and wall together generate energy. K rises until that happens and is
+then bisected.
 """
 
 from __future__ import annotations
@@ -30,32 +30,34 @@ PUSH = 0.003
 """Length of the push in s: shorter than half a swing of any wall that a device bears."""
 
 PUSH_SHARE = 0.3
-"""Share of the allowed force that the push takes. The wall's own force is then about as large."""
+"""Force of the push as a share of the allowed force, without unit. The wall's own force is then
+about as large."""
 
 TRIAL, LONGEST_TRIAL = 1.2, 6.0
-"""Least and greatest length of a trial in s. A device of 0.1 kg and 2 N s/m tells 1 % below its
-limit from it in the least."""
+"""Shortest and longest trial in s. The shortest one reveals 1 % below the limit for a device of 0.1
+kg and 2 N s/m."""
 
 SWINGS = 15
-"""Swings that a trial should hold, within these lengths: five in each third."""
+"""Intended number of swings per trial, within these lengths: five in each third."""
 
 REST = 0.4
 """Time in s between trials, in which soft springs bring the device back."""
 
 STEP_UP = 1.25
-"""Factor between the first stiffnesses tried. Larger steps are quicker and shake the device more
-when they pass the limit."""
+"""Factor between the first trial stiffnesses, without unit. Larger steps are quicker and shake the
+device more when they pass the limit."""
 
 
 @dataclass(frozen=True, slots=True)
 class MeasuredLimit:
-    """The stiffest wall at one damping.
+    """Stiffest wall at one damping.
 
     Attributes:
         damping: B in N s/m.
-        borne: Largest K in N/m that died down, 0 where none did.
-        not_borne: Smallest K that did not; None where even ``most_stiffness`` was borne.
-        trials: All that were made, in order.
+        borne: Largest K in N/m whose swing decayed, 0 if none did.
+        not_borne: Smallest K in N/m whose swing did not decay; None if ``most_stiffness`` was
+            borne.
+        trials: All trials, in order.
     """
 
     damping: float
@@ -65,7 +67,7 @@ class MeasuredLimit:
 
     @property
     def stiffness(self) -> float:
-        """The middle between the two, or what was borne, in N/m."""
+        """Middle between the two in N/m, or the borne stiffness."""
         return self.borne if self.not_borne is None else 0.5 * (self.borne + self.not_borne)
 
 
@@ -85,15 +87,15 @@ def measure_limit(
     """Finds the stiffest wall that a started device bears at one damping.
 
     Args:
-        device: Started at this period.
-        clock: Started.
+        device: Device, started at this period.
+        clock: Started clock.
         damping: B in N s/m.
         period: T in s.
         force: Largest force in N.
         axis: One of x, y, z that the device has.
-        first_stiffness: Where to begin, in N/m, > 0.
-        most_stiffness: Where to give up, in N/m.
-        precision: Relative width to which K is narrowed down.
+        first_stiffness: First trial K in N/m, > 0.
+        most_stiffness: Largest trial K in N/m.
+        precision: Relative width at which the bisection of K ends.
         progress: Called before each trial with its stiffness.
 
     Raises:
@@ -127,7 +129,7 @@ def measure_limit(
             return MeasuredLimit(damping, borne, None, tuple(trials))
         stiffness = min(STEP_UP * stiffness, most_stiffness)
     not_borne = stiffness
-    # softer than the first: where even that is too stiff, down to a hundredth of it
+    # if even the first wall is too stiff, search down to a hundredth of it
     while not_borne - borne > precision * not_borne and not_borne > 0.01 * first_stiffness:
         middle = 0.5 * (borne + not_borne)
         if is_borne(middle):
@@ -148,17 +150,17 @@ def try_wall(
     axis: str = "x",
     duration: float = TRIAL,
 ) -> Trial:
-    """Shows one wall for a second, after a rest; ends with zero force in any case.
+    """Renders one wall after a rest; always ends with zero force.
 
     Args:
-        device: Started at this period.
-        clock: Started.
+        device: Device, started at this period.
+        clock: Started clock.
         stiffness: K in N/m.
         damping: B in N s/m.
         period: T in s.
         force: Largest force in N.
         axis: One of x, y, z that the device has.
-        duration: In s.
+        duration: Length of the trial in s.
 
     Raises:
         IdentificationError: The pose is not finite.
@@ -177,7 +179,9 @@ def try_wall(
             device.read(sample)
             x = float(place[index])
             if not np.isfinite(place).all():
-                raise IdentificationError("the device's pose is not finite")
+                raise IdentificationError(
+                    "the device's pose is not finite; check its encoders and its connection"
+                )
             wall = -stiffness * (x - origin) - damping / period * (x - before)
             before = x
             wanted = wall + (PUSH_SHARE * force if k < push else 0.0)
@@ -207,7 +211,7 @@ def _rest(
     period: float,
     force: float,
 ) -> Array:
-    """Holds the device softly until it is still; returns where it was at first."""
+    """Holds the device softly for ``REST``; returns its initial position."""
     device.read(sample)
     place = sample["position"][0]
     centre = place.copy()

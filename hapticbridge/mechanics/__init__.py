@@ -1,7 +1,8 @@
 """Reference mechanics without MuJoCo: integrators of known energy, and impact with friction.
 
-``particle`` and ``rotation`` move a body by four integrators each, ``coupled_mass`` a mass behind
-the coupling; ``impact``, on ``normal_path``, is Routh's method with three laws of restitution.
+``particle`` and ``rotation`` move a body by four integrators each, ``coupled_mass`` moves a mass
+behind the coupling. ``impact``, on ``normal_path``, is Routh's method with three laws of
+restitution.
 """
 
 from hapticbridge.mechanics.coupled_mass import CoupledMotion as CoupledMotion

@@ -1,4 +1,4 @@
-"""The checks of the reference mechanics' arguments: each returns what is valid, or raises."""
+"""Argument checks of the reference mechanics."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.errors import MechanicsError
 
 MOST_STEPS = 10**8
-"""Longest run in steps: a day at 1 kHz, and what fits into memory."""
+"""Largest length of a run in steps: a day at 1 kHz, which still fits into memory."""
 
 _ARGUMENTS = Arguments(MechanicsError)
 
 
 def finite(name: str, value: ArrayLike, unit: str) -> Array:
-    """Returns numbers as an array, all finite, or raises MechanicsError."""
+    """Returns finite numbers as an array, or raises MechanicsError."""
     return _ARGUMENTS.numbers(name, value, unit)
 
 
@@ -47,7 +47,7 @@ def chosen(name: str, value: str, valid: Iterable[str]) -> str:
 
 
 def common_shape(**arrays: Array) -> tuple[int, ...]:
-    """Returns the shape to which the arrays broadcast together, or raises MechanicsError."""
+    """Returns the broadcast shape of the arrays, or raises MechanicsError."""
     return _ARGUMENTS.shape(**arrays)
 
 

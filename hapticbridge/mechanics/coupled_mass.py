@@ -1,4 +1,4 @@
-"""A point mass that a handle drives through the coupling, by four integrators."""
+"""Point mass driven by a handle through the coupling, with four integrators."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ COUPLED_SCHEMES = ("held", "implicit", "compensated", "midpoint")
 class CoupledMotion(ParticleMotion):
     """Motion of a mass behind a coupling at the samples 0 … N.
 
-    ``force`` is the coupling's on the mass; the device receives −f_k, and f_0 acts in no step
-    except under ``held``. Its ``energy_gain`` is 0 under ``midpoint``, and −½ m (v_k − v_{k−1})²
-    under ``implicit`` and ``compensated``.
+    ``force`` acts on the mass; the device receives −f_k. f_0 acts only in the ``held`` scheme.
+    ``energy_gain`` is 0 under ``midpoint``, and −½ m (v_k − v_{k−1})² under ``implicit`` and
+    ``compensated``.
     """
 
     __slots__ = ()
@@ -44,26 +44,32 @@ def drive_mass(
     position: ArrayLike | None = None,
     velocity: ArrayLike = 0.0,
 ) -> CoupledMotion:
-    """Moves a free mass by the translational coupling to a handle whose motion is given.
+    """Moves a free mass by the translational coupling to a handle with prescribed motion.
 
     With e = h − x and M for the mass:
 
         held         f_k = K e_k + (B/T)(e_k − e_{k−1}),            v_k = v_{k−1} + (T/M) f_{k−1},
                      x_k = x_{k−1} + T v_k
-        implicit     f_k as held,                                   v_k = v_{k−1} + (T/M) f_k,
+        implicit     f_k as for held,                               v_k = v_{k−1} + (T/M) f_k,
                      x_k = x_{k−1} + T v_k
         compensated  implicit with max(B − K T, 0) for B
         midpoint     f_k = K (e_k + e_{k−1})/2 + (B/T)(e_k − e_{k−1}),
                      v_k = v_{k−1} + (T/M) f_k,   x_k = x_{k−1} + T (v_{k−1} + v_k)/2
 
-    ``held`` creates energy and is stable only above some mass (without damping K T²/4); below, the
-    motion grows until it overflows to inf or nan. The others are stable for every mass.
-    ``implicit`` and ``compensated`` are passive and first order, ``midpoint`` is passive without
-    numerical damping and second order. The device needs b > K T/2 + B under ``implicit``,
-    b > K T/2 + max(B − K T, 0) under ``compensated``, and b > B under ``midpoint`` if
-    B >= K T/2. Below that the midpoint coupling is a backward difference with the negative damping
-    B − K T/2: b > (K T)²/(4 B) is then needed, and is enough for linear hands and scenes only.
-    The handle has not moved before sample 0.
+    ``held`` generates energy and is stable only above a certain mass (K T²/4 without damping).
+    Below it the motion grows until it overflows to inf or nan. The other schemes are stable for
+    every mass. ``implicit`` and ``compensated`` are passive and of first order. ``midpoint`` is
+    passive without numerical damping and of second order.
+
+    Required device damping:
+
+        implicit     b > K T/2 + B
+        compensated  b > K T/2 + max(B − K T, 0)
+        midpoint     b > B for B >= K T/2;  b > (K T)²/(4 B) below that
+
+    For B < K T/2 the midpoint coupling is a backward difference with the negative damping B − K
+    T/2, and its condition suffices for linear hands and scenes only. The handle rests before sample
+    0.
 
     Args:
         coupling: K and B; the rotational pair is not used.
@@ -95,15 +101,14 @@ def drive_mass(
     f, x, v = (np.empty((len(h), *shape)) for _ in range(3))
     x[0], v[0] = start, velocity
     f[0] = k * (h[0] - x[0])
-    # share of the step's end in the spring's mean stretch
-    nearest = 0.5 if scheme == "midpoint" else 1.0
-    # idle below is the force on a mass that would stay where it is, loss how much of it each m/s
-    # of the step takes away: f = idle − loss · (x_k − x_{k−1})/T
-    loss = b + nearest * k * period
+    # weight of the step's end in the spring's mean stretch
+    end_weight = 0.5 if scheme == "midpoint" else 1.0
+    # f = idle − loss · (x_k − x_{k−1})/T, with idle the force on a mass that stays where it is
+    loss = b + end_weight * k * period
     with np.errstate(over="ignore", invalid="ignore"):
         for i in range(1, len(h)):
             moved = h[i] - h[i - 1]
-            idle = k * (h[i - 1] + nearest * moved - x[i - 1]) + b / period * moved
+            idle = k * (h[i - 1] + end_weight * moved - x[i - 1]) + b / period * moved
             if scheme == "held":
                 v[i] = v[i - 1] + period / mass * f[i - 1]
                 mean = v[i]
@@ -128,10 +133,10 @@ def exact_mass_response(
     Args:
         coupling: K and B.
         mass: M in kg, finite and > 0.
-        frequency: In Hz, finite and > 0; broadcast against the mass.
+        frequency: Frequency in Hz, finite and > 0; broadcast against the mass.
 
     Returns:
-        X/H, complex, of the shape that mass and frequency broadcast to; inf at the resonance of an
+        X/H, complex, of the broadcast shape of mass and frequency; inf at the resonance of an
         undamped mass.
 
     Raises:

@@ -19,10 +19,10 @@ LAWS = ("newton", "poisson", "stronge")
 
 
 class Mode(IntEnum):
-    """What the contact point does along the tangent while the impact lasts.
+    """Tangential behaviour of the contact point during an impact.
 
-    ``SLIDING`` also stands for a contact that hits without tangential velocity and slides one way
-    from then on. A contact that sticks neither slips nor, on a round body, stops rolling.
+    ``SLIDING`` includes a contact that starts without tangential velocity and then slides one way.
+    A contact that sticks does not slip; a round body then rolls.
 
     References:
         Routh 1905; Wang & Mason 1992, J. Applied Mechanics 59, table 1.
@@ -37,7 +37,7 @@ class Mode(IntEnum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImpactBody:
-    """A rigid body that is hit at one point, in the contact frame: t tangential, n normal.
+    """Rigid body hit at one point, in the contact frame: t tangential, n normal.
 
     An impulse P at the contact point changes that point's velocity by
 
@@ -81,7 +81,7 @@ class ImpactBody:
         )
 
     def velocity_change(self, impulse: ArrayLike) -> Array:
-        """Returns what an impulse at the contact does to the body.
+        """Returns the change of the body's velocity due to an impulse at the contact.
 
         Args:
             impulse: (P_t, P_n) on this body in N s, shape (..., 2).
@@ -110,10 +110,11 @@ class Impact:
 
     Attributes:
         impulse: (P_t, P_n) on the first body in N s, shape (..., 2); the second receives −P.
-        velocity: Relative velocity (v_t, v_n) at the contact afterwards in m/s, shape (..., 2).
+        velocity: Relative velocity (v_t, v_n) at the contact after the impact in m/s, shape (...,
+            2).
         compression: P_n at the end of compression in N s, shape (...).
         energy_change: Kinetic energy of all bodies after minus before in J, ½ P·(v⁻ + v⁺).
-        mode: A ``Mode`` each, shape (...).
+        mode: ``Mode`` of each impact, shape (...).
     """
 
     impulse: Array
@@ -131,24 +132,26 @@ def resolve_impact(
     law: Law = "stronge",
     other: ImpactBody | None = None,
 ) -> Impact:
-    """Finds the impulse between two bodies, or a body and the ground, that collide at a point.
+    """Returns the impact of two bodies, or of a body and the ground, at one point.
 
-    Over the growing normal impulse P_n, with s = sgn(v_t⁻), Routh's path is
+    As the normal impulse P_n grows, with s = sgn(v_t⁻), Routh's path is
 
         slide           dP_t = −μ s dP_n       until v_t = 0 at P_s = |v_t⁻|/(μA + sG), if > 0
         then stick      dP_t = (G/A) dP_n      if μA >= |G|
         or slide back   dP_t = μ sgn(G) dP_n   if μA < |G|
 
-    Compression ends at v_n = 0 (P_n = P_c), the impact itself by the law:
+    Compression ends at v_n = 0 (P_n = P_c). The law of restitution ends the impact:
 
         newton     v_n⁺ = −e v_n⁻
         poisson    P_n = (1 + e) P_c
         stronge    work of P_n after P_c = −e² · work until P_c
 
-    In a jam (D + μsG <= 0: sliding drives the bodies together) the path goes on through P_s, where
-    it always ends. Poisson and Stronge never gain energy; Newton does in about 1 % of random
-    impacts, and exists to be compared. Validity: one contact point, no change of pose during the
-    impact, dry friction with one coefficient.
+    In a jam (D + μsG <= 0) sliding drives the bodies together. The path then continues through P_s,
+    where the jam always ends. Poisson and Stronge never gain energy. Newton gains energy in about 1
+    % of random impacts and is included for comparison.
+
+    Valid for one contact point, no change of pose during the impact, and dry friction with one
+    coefficient.
 
     Args:
         body: The first body; n points into it.
@@ -160,8 +163,8 @@ def resolve_impact(
         other: The second body, its arm from its own centre of mass; None for the ground.
 
     Raises:
-        MechanicsError: An argument is not finite, out of range or mis-shaped, or they lie so far
-            apart that the impulse overflows.
+        MechanicsError: An argument is not finite, out of range or mis-shaped, or the arguments
+            differ so much that the impulse overflows.
 
     References:
         Routh 1905, Dynamics of a System of Rigid Bodies I, art. 182 ff.; Stronge 1990, Proc. R.
@@ -185,21 +188,21 @@ def resolve_impact(
     a, d, g = body.compliance()
     if other is not None:
         common_shape(body=a, other=other.compliance()[0])
-        a, d, g = (mine + its for mine, its in zip((a, d, g), other.compliance(), strict=True))
+        a, d, g = (left + right for left, right in zip((a, d, g), other.compliance(), strict=True))
     common_shape(bodies=a, velocity=v_t, friction=mu, restitution=e)
 
-    # what overflows is refused below, what divides by zero is not used
+    # overflow is refused below, and results of a division by zero are not used
     with np.errstate(all="ignore"):
         side = np.sign(v_t)
         braking = mu * a + side * g
-        # P_s; a contact without tangential velocity has no first segment, one that speeds up no
-        # second
+        # P_s: 0 without tangential velocity (no first segment), inf if sliding accelerates
         slide_end = np.where(braking > 0, np.abs(v_t) / braking, np.inf)
         slide_end = np.where(side == 0, 0.0, slide_end)
         sticks = mu * a >= np.abs(g)
         later_slope = np.where(sticks, g / a, mu * np.sign(g))
-        first = d + mu * side * g  # dv_n/dP_n while sliding, later: in what follows
-        # D − G²/A = (A D − G²)/A, and what sliding back adds to it, as sums of what is positive
+        first = d + mu * side * g  # dv_n/dP_n while sliding
+        # dv_n/dP_n afterwards: D − G²/A = (A D − G²)/A, plus a term for sliding back. Both terms
+        # are >= 0, so nothing cancels.
         second = _determinant(body, other) / a
         second = second + np.where(sticks, 0.0, np.abs(g) * (np.abs(g) / a - mu))
         path = NormalPath(v_n, first, second, slide_end)

@@ -1,4 +1,4 @@
-"""The normal velocity of an impact as a function of its normal impulse: two straight pieces."""
+"""Normal velocity of an impact over its normal impulse."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from hapticbridge.arguments import Array
 
 @dataclass(frozen=True, slots=True)
 class NormalPath:
-    """v_n over P_n: from ``start`` with slope ``first`` up to ``corner``, then with ``second`` > 0.
+    """Piecewise linear v_n(P_n): slope ``first`` up to ``corner``, then slope ``second`` > 0.
 
-    Where ``first`` <= 0 (a jam), the corner is finite: μ|G| >= D and A D > G² give μA > |G|.
+    If ``first`` <= 0 (a jam), the corner is finite: μ|G| >= D and A D > G² give μA > |G|.
 
     Attributes:
         start: v_n at P_n = 0 in m/s, < 0.
         first: dv_n/dP_n up to the corner in 1/kg, any sign.
-        second: dv_n/dP_n beyond it in 1/kg, > 0.
-        corner: P_n at which the slip ends in N s, >= 0, inf where it never does.
+        second: dv_n/dP_n beyond the corner in 1/kg, > 0.
+        corner: P_n at which the slip ends in N s, >= 0; inf if it never ends.
     """
 
     start: Array
@@ -37,7 +37,7 @@ class NormalPath:
         return np.where(early <= self.corner, early, late)
 
     def impulse_after_work(self, compression: Array, e: Array) -> Array:
-        """Returns P_n at which restitution has returned e² of the work that compression took."""
+        """Returns P_n at which restitution has returned e² of the work done in compression."""
         corner = np.where(np.isfinite(self.corner), self.corner, 0.0)
         at_corner = self.start + self.first * corner
         turns_early = compression <= self.corner  # compression ends in the first segment
@@ -49,11 +49,11 @@ class NormalPath:
         )
         returned = -(e**2) * taken
         slope = np.where(turns_early, self.first, self.second)
-        # where the slope is <= 0 the other branch is taken
+        # for a slope <= 0 the other branch below is used
         with np.errstate(divide="ignore", invalid="ignore"):
             plain = compression + np.sqrt(2 * returned / slope)
-        # restitution that begins before the corner may go on behind it by the root q of
-        # ½ second q² + v q = rest, written so that it does not cancel for a small rest
+        # Restitution that begins before the corner may continue beyond it by q, a root of
+        # ½ second q² + v q = rest. This form of the root does not cancel for a small rest.
         speed = np.maximum(at_corner, 0.0)
         rest = np.maximum(returned - 0.5 * speed * (corner - compression), 0.0)
         root = speed + np.sqrt(speed**2 + 2 * self.second * rest)

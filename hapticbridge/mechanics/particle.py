@@ -1,4 +1,4 @@
-"""A point mass under a given force, by four integrators, and the energy that each creates."""
+"""Point mass under a prescribed force, with four integrators and their generated energy."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class ParticleMotion:
 
     @property
     def energy_gain(self) -> Array:
-        """What the mass gained beyond its port's work at the samples 1 … N, in J, shape (N, ...).
+        """Energy gained beyond the work of the force at the samples 1 … N, in J, shape (N, ...).
 
             E_k = S_k − S_{k−1} − f_k (x_k − x_{k−1}),    S = ½ m v²
 
@@ -50,9 +50,9 @@ class ParticleMotion:
             implicit        −½ m (v_k − v_{k−1})² = −T² f_k² / (2 m) <= 0                    (16)
             midpoint        0
 
-        The second counts the kinetic energy once the force of the sample has acted; the storages
-        so counted differ from S by one step, so their sums differ by bounded terms only. Where the
-        motion itself has overflowed to inf or nan, so has what it gained.
+        ``semi_implicit`` counts the kinetic energy after the sample's force has acted. This storage
+        differs from S by one step, so the sums differ by bounded terms only. If the motion
+        overflows to inf or nan, the gain does too.
 
         References:
             Brown & Colgate 1997, eqs. (11), (13), (16), (18).
@@ -78,8 +78,8 @@ def integrate_particle(
         implicit        v_k = v_{k−1} + (T/m) f_k,       x_k = x_{k−1} + T v_k               (15)
         midpoint        v_k = v_{k−1} + (T/m) f_k,       x_k = x_{k−1} + T (v_{k−1} + v_k)/2
 
-    f_k is the force that is known together with x_k (midpoint: that of the step that ends at k).
-    The sums are formed in closed form, not by a loop; they hold for any T > 0.
+    f_k is the force that is known together with x_k; under ``midpoint`` it is the force of the step
+    that ends at k. The sums are formed in closed form and hold for any T > 0.
 
     Args:
         mass: m in kg, finite and > 0, shape (...).

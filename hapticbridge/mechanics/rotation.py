@@ -1,4 +1,4 @@
-"""A rigid body that turns about its centre of mass, by four integrators."""
+"""Rigid body turning about its centre of mass, with four integrators."""
 
 from __future__ import annotations
 
@@ -15,12 +15,13 @@ from hapticbridge.mechanics.particle import SCHEMES, Scheme
 from hapticbridge.pose import Quaternion, Vector, cross, norm, product, quaternion_exp, scaled
 
 TOLERANCE = 1e-12
-"""Change of the angular velocity, relative to its size and without unit, below which Newton's
-iteration ends. It converges quadratically, so what is left is far below rounding; at 1e-16 it would
-never end, above 1e-8 energy would drift."""
+"""Relative change of the angular velocity, without unit, at which Newton's iteration ends. The
+iteration converges quadratically, so the remaining error is far below rounding. At 1e-16 it would
+never end; above 1e-8 energy would drift."""
 
 ITERATIONS = 50
-"""Newton steps before a step counts as too long. At T |ω| < 0.5 rad 3 to 5 are enough."""
+"""Largest number of Newton iterations per step. At T |ω| < 0.5 rad 3 to 5 are enough; a step that
+exceeds it counts as too long."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,24 +61,24 @@ def integrate_rotation(
     *,
     torque: ArrayLike | None = None,
 ) -> Rotation:
-    """Turns a rigid body, free or under a torque given in its own frame.
+    """Turns a rigid body, free or under a torque in its own frame.
 
     With a(ω, τ) = I⁻¹(τ − ω × Iω) and ω̄ = (ω_{k−1} + ω_k)/2:
 
         explicit        ω_k = ω_{k−1} + T a(ω_{k−1}, τ_{k−1}),   q_k = q_{k−1} ⊗ exp(T ω_{k−1})
-        semi_implicit   ω_k as explicit,                         q_k = q_{k−1} ⊗ exp(T ω_k)
+        semi_implicit   ω_k as for explicit,                     q_k = q_{k−1} ⊗ exp(T ω_k)
         implicit        ω_k = ω_{k−1} + T a(ω_k, τ_k),           q_k = q_{k−1} ⊗ exp(T ω_k)
         midpoint        ω_k = ω_{k−1} + T a(ω̄, τ_k),             q_k = q_{k−1} ⊗ cay(T ω̄)
 
     cay is the Cayley map, rotation by 2 atan(|Tω̄|/2). Without torque ``explicit`` and
-    ``semi_implicit`` gain ½ T² aᵀ I a in every step, ``implicit`` loses it, and ``midpoint``
-    conserves both the energy and the momentum in the world frame, exactly but for rounding. Under
-    torque ``midpoint`` gains precisely T τ_k · ω̄. Where T |ω| exceeds about 1 rad per sample,
-    the implicit steps mean little and Newton's method may not find them, which is refused.
+    ``semi_implicit`` gain ½ T² aᵀ I a in every step, and ``implicit`` loses it. ``midpoint``
+    conserves the energy, and the momentum in the world frame, up to rounding. Under torque
+    ``midpoint`` gains precisely T τ_k · ω̄. Above T |ω| of about 1 rad per sample the implicit
+    schemes are inaccurate and Newton's method may fail, which raises an error.
 
     Args:
-        inertia: Principal moments in kg m², finite, > 0, none larger than the sum of the other
-            two, shape (..., 3).
+        inertia: Principal moments in kg m², finite, > 0, none larger than the sum of the other two,
+            shape (..., 3).
         angular_velocity: ω_0 in the body's frame in rad/s, shape (..., 3).
         period: T in s, finite and > 0.
         steps: N >= 1.
@@ -85,12 +86,12 @@ def integrate_rotation(
         torque: τ_0 … τ_N in the body's frame in N m, shape (N + 1, ..., 3); none by default.
 
     Raises:
-        MechanicsError: An argument is not finite, out of range or mis-shaped, or a step is too
-            long to be solved.
+        MechanicsError: An argument is not finite, out of range or mis-shaped, or a step is too long
+            to be solved.
 
     References:
-        Simo & Wong 1991, Int. J. Numerical Methods in Engineering 31 (midpoint); the other
-        three are Brown & Colgate's schemes (15), (17) applied to Euler's equations.
+        Simo & Wong 1991, Int. J. Numerical Methods in Engineering 31 (midpoint); the other three
+        are Brown & Colgate's schemes (15), (17) applied to Euler's equations.
     """
     chosen("scheme", scheme, SCHEMES)
     inertia, period = positive("inertia", inertia, "kg m²"), step(period)
@@ -102,9 +103,12 @@ def integrate_rotation(
     for name, array in (("inertia", inertia), ("angular velocity", omega), ("torque", tau[0])):
         if array.shape[-1:] != (3,):
             raise MechanicsError(f"{name} has shape {array.shape}; it must be (..., 3)")
-    # 1e-12 for moments of a flat body, whose largest equals the sum by rounding
+    # 1e-12 admits a flat body, whose largest moment equals the sum of the others up to rounding
     if np.any(2 * inertia.max(axis=-1) > inertia.sum(axis=-1) * (1 + 1e-12)):
-        raise MechanicsError("a principal moment exceeds the sum of the other two: no body has it")
+        raise MechanicsError(
+            "a principal moment exceeds the sum of the other two, which no rigid body has; "
+            "correct the moments of inertia"
+        )
     shape = common_shape(inertia=inertia, angular_velocity=omega, torque=tau[0])
     tau = tau.reshape(len(tau), *(1,) * (len(shape) + 1 - tau.ndim), *tau.shape[1:])
     rates = np.empty((steps + 1, *shape))
@@ -118,7 +122,7 @@ def integrate_rotation(
         rates.reshape(steps + 1, -1, 3),
         turns.reshape(steps + 1, -1, 4),
     )
-    # beyond, the energy would overflow
+    # beyond this limit the energy would overflow
     if not (np.abs(rates).max() <= LARGEST**3 and np.isfinite(turns).all()):
         turn = period * float(np.max(np.linalg.norm(omega, axis=-1)))
         raise MechanicsError(
@@ -130,14 +134,13 @@ def integrate_rotation(
 
 @compiled
 def _gyroscopic(inertia: Vector, omega: Vector) -> Vector:
-    """Returns ω × Iω."""
     momentum = (inertia[0] * omega[0], inertia[1] * omega[1], inertia[2] * omega[2])
     return cross(omega, momentum)
 
 
 @compiled
 def _implicit_rate(inertia: Vector, before: Vector, torque: Vector, period: float) -> Vector:
-    """Solves I(ω − before) + T (ω × Iω − τ) = 0 by Newton's method; nan where it fails."""
+    """Solves I(ω − before) + T (ω × Iω − τ) = 0 by Newton's method; nan if it fails."""
     i0, i1, i2 = inertia
     # (ω × Iω)_x = p ω_y ω_z, and so on around
     p, q, r = period * (i2 - i1), period * (i0 - i2), period * (i1 - i0)
@@ -160,7 +163,7 @@ def _implicit_rate(inertia: Vector, before: Vector, torque: Vector, period: floa
 
 @compiled
 def _turned(q: Quaternion, turn: Quaternion) -> Quaternion:
-    """Returns q ⊗ turn, of unit length: rounding would let the length drift."""
+    """Returns q ⊗ turn, normalised so that rounding does not let the length drift."""
     w, x, y, z = product(q, turn)
     length = np.sqrt(w * w + x * x + y * y + z * z)
     return w / length, x / length, y / length, z / length

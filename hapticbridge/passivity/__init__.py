@@ -1,11 +1,12 @@
-"""Theory of passive haptic display: what device damping a coupling needs, and what it allows.
+"""Theory of passive haptic display: device damping required by a sampled coupling.
 
-No MuJoCo here. Read ``transfer`` (the coupling, sampled), ``spectrum`` (the damping needed at each
-frequency) and ``bounds`` (its supremum) first, then ``worst_hand`` and ``sampled_loop``, which find
-the same limit in the time domain (``recursion``, ``stability``). ``wall``, ``worst_frequency`` and
-``delay`` treat delays, ``virtual_mass`` the tool's integrator, ``matrix`` several dimensions,
-``compensation`` the damping that is felt, ``transmission_line`` another law. ``quantization``,
-``free_device`` and ``passive_line`` are the limits of a ``z_width``. ``grid`` checks all arguments.
+This package does not use MuJoCo. Reading order: ``transfer`` (the sampled coupling), ``spectrum``
+(required damping at each frequency), ``bounds`` (its supremum). ``worst_hand`` and ``sampled_loop``
+find the same limit in the time domain, with ``recursion`` and ``stability``. ``wall``,
+``worst_frequency`` and ``delay`` treat delays, ``virtual_mass`` the integrator of the tool,
+``matrix`` several dimensions. ``compensation`` treats the damping that an integrator adds,
+``transmission_line`` an alternative law. ``quantization``, ``free_device`` and ``passive_line`` are
+the limits of a ``z_width``. ``grid`` validates all arguments.
 """
 
 from hapticbridge.passivity.bounds import maximum_stiffness as maximum_stiffness

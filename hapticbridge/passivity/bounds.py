@@ -1,4 +1,4 @@
-"""Conditions between a coupling, the sampling period and the device's damping."""
+"""Passivity conditions between coupling, sampling period and device damping."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from hapticbridge.passivity.transfer import Discretization, SampledLaw
 from hapticbridge.passivity.wall import wall_supremum
 
 STIFFNESS_MARGIN = 0.8
-"""Share of the largest passive stiffness that a default coupling uses, without unit. The rest pays
-for what is not known of a device: its real damping, friction, timing. Nearer to 1 feels stiffer and
-leaves less."""
+"""Stiffness of a default coupling divided by the largest passive stiffness, without unit. The rest
+covers what is uncertain about a device: its true damping, friction and timing. A value nearer to 1
+feels stiffer and leaves less margin."""
 
 DAMPING_SHARE = 0.25
-"""Share of the device's damping that a default coupling spends on its own damper, without unit.
-More damps the tool better against the handle and leaves less stiffness: K ∝ b − B."""
+"""Damping of a default coupling divided by the device's damping, without unit. A larger value damps
+the tool better against the handle and leaves less stiffness, because K ∝ b − B."""
 
 
 @overload
@@ -63,34 +63,35 @@ def minimum_damping(
     filter_time: float = 0.0,
     axis: Axis = "translation",
 ) -> float | NDArray[np.float64]:
-    """Returns the damping that a device needs so that this coupling is passive on it.
+    """Returns the device damping above which a coupling is passive.
 
         backward     b > K T/2 + B                     low-passed: K T/2 + B T/(T + 2τ)
         tustin       b > K T/2 for B = 0, else inf     low-passed: K T/2 + B T/(2τ)
 
-    Without a delay this is necessary, and sufficient for any passive hand and any environment that
-    is discrete-time passive (14), whatever it consists of (for the low-passed ones: any linear
-    hand and environment).
+    Without a delay the bound is necessary. It is sufficient for any passive hand and any
+    environment that is discrete-time passive (14). With a low-pass, sufficiency is shown for linear
+    hands and environments only.
 
-    With a delay of d samples it is the bound against a **wall** (the tool does not move):
+    With a delay of d samples the bound holds against a **wall**, that is for a tool that does not
+    move:
 
         b > (K T/2) sin((2d + 1)θ/2)/sin(θ/2) − B cos((d + 1)θ)  for all θ;  B = 0: K (T/2 + d T)
 
-    The damper may help there. For a *general* environment behind a delayed coupling no damping
-    suffices (``damping_spectrum_of`` of C z⁻ᵈ shows it): no bound can be promised.
+    The coupling's damper may lower this bound. For a *general* environment behind a delayed
+    coupling no damping suffices, so no bound exists (see ``damping_spectrum_of`` of C z⁻ᵈ).
 
     Args:
-        coupling: K, B and their rotational counterparts; a ``CouplingGrid`` for many at once.
-        period: T in s, finite and > 0: how long the device holds a wrench.
-        discretization: Of the damper.
+        coupling: K, B and their rotational counterparts; a ``CouplingGrid`` evaluates many at once.
+        period: T in s, finite and > 0: duration for which the device holds a wrench.
+        discretization: Rule that takes the damper's velocity from sampled positions.
         delay: d, whole samples from position to force, 0 to 50.
-        filter_time: τ in s, >= 0, of a first-order low-pass behind the damper, discretised alike.
-        axis: Which pair of K and B is asked for.
+        filter_time: τ in s, >= 0, of a first-order low-pass behind the damper, discretised by the
+            same rule.
+        axis: Kind of axis, which selects the pair of K and B.
 
     Returns:
-        The bound on b in N s/m (rotation: N m s/rad), shaped like the coupling; inf where no
-        damping suffices, as for Tustin's damper without low-pass at any delay (its gain at
-        Nyquist is infinite).
+        The bound on b in N s/m (rotation: N m s/rad), shaped like the coupling. It is inf for
+        Tustin's damper without low-pass at any delay, because its gain at Nyquist is infinite.
 
     Raises:
         CouplingError: An argument is out of range, or the axis or discretization is unknown.
@@ -101,7 +102,7 @@ def minimum_damping(
     law = SampledLaw.of(coupling, period, discretization, delay, filter_time, axis)
     stiffness, damping, period, delay, filter_time, unbounded = law
     if delay:
-        # without low-pass, Tustin is only asked where B = 0, and is the backward difference there
+        # without low-pass, Tustin's bound is finite only for B = 0, where both rules agree
         scheme: Discretization = "backward" if unbounded else discretization
         needed, _ = wall_supremum(stiffness, damping, period, scheme, delay, filter_time)
     else:
@@ -138,10 +139,11 @@ def maximum_stiffness(
         damping: B in N s/m, finite, 0 <= B < b.
 
     Returns:
-        K in N/m, of the shape that the arguments broadcast to; a coupling must stay below it.
+        K in N/m, of the broadcast shape of the arguments. The stiffness of a coupling must stay
+        below it.
 
     Raises:
-        CouplingError: An argument is out of range; B >= b leaves no stiffness at all.
+        CouplingError: An argument is out of range; for B >= b no stiffness is passive.
 
     References:
         Brown & Colgate 1997, eq. (6) solved for K.
@@ -155,19 +157,19 @@ def maximum_stiffness(
         worst = np.argmax(spent - available)
         raise CouplingError(
             f"coupling damping {spent.flat[worst]:g} N s/m is not below the device's "
-            f"{available.flat[worst]:g} N s/m, so no stiffness is passive"
+            f"{available.flat[worst]:g} N s/m, so no stiffness is passive; lower the damping"
         )
     return plain(2 * (available - spent) / step)
 
 
 def stiffest_coupling(damping: float, rotational_damping: float, period: float) -> Coupling:
-    """Returns the default coupling of a device: 80 % of the bound, with B a quarter of b.
+    """Returns the default coupling of a device: 80 % of the largest stiffness at B = b/4.
 
-        B = b / 4,    K = 0.8 · 2 (b − B) / T        (rotation likewise)
+        B = b / 4,    K = 0.8 · 2 (b − B) / T        for translation and for rotation
 
     Args:
         damping: b in N s/m as seen in the scene (divided by scale · force scale), > 0.
-        rotational_damping: Likewise in N m s/rad, > 0.
+        rotational_damping: b_r in N m s/rad as seen in the scene, > 0.
         period: T in s, finite and > 0.
 
     Raises:

@@ -1,4 +1,4 @@
-"""What a delay leaves of *stability*, which is less than passivity."""
+"""Stability limit of a delayed coupling."""
 
 from __future__ import annotations
 
@@ -11,22 +11,23 @@ from hapticbridge.passivity.grid import checked, plain, scalar, together
 def coupled_stability_limit(
     device_damping: ArrayLike, period: float, *, damping: ArrayLike = 0.0, delay: float = 0.0
 ) -> float | NDArray[np.float64]:
-    """Returns the stiffness up to which device and coupling against a wall stay stable.
+    """Returns the stiffness below which device and coupling are stable against a wall.
 
         K = (b + B) / (T/2 + t_d),    t_d = delay · T
 
-    A rule for design, not a guarantee: it says nothing of a hand, and it holds for low damping; at
-    B = 20 N s/m and a delay of one sample it is 28 % too optimistic. B enters with the sign
-    opposite to ``minimum_damping``: a damper helps stability and costs passivity.
+    This is a design rule for *stability*, which is weaker than passivity: it ignores the hand. It
+    holds for low damping; at B = 20 N s/m and one sample of delay it is 28 % too optimistic. The
+    sign of B is opposite to that in ``minimum_damping``, because a damper helps stability and costs
+    passivity.
 
     Args:
         device_damping: b in N s/m, finite and >= 0.
         period: T in s, finite and > 0.
         damping: B in N s/m, finite and >= 0.
-        delay: Delay from position to force in samples, >= 0; fractions are meant.
+        delay: Delay from position to force in samples, >= 0; fractions are allowed.
 
     Returns:
-        K in N/m, of the shape that the arguments broadcast to.
+        K in N/m, of the broadcast shape of the arguments.
 
     Raises:
         CouplingError: An argument is out of range.

@@ -1,12 +1,12 @@
-"""Stability of a device that nobody holds, against a wall behind the coupling.
+"""Stability of a free device, without a hand, against a wall behind the coupling.
 
-In units of the period and the device's mass, x = b T/m, κ = K T²/m, β = B T/m, ν = τ/T, d samples
-of delay, an exact zero-order hold gives the closed loop
+In units of the period and of the device's mass, x = b T/m, κ = K T²/m, β = B T/m, ν = τ/T, with d
+samples of delay, an exact zero-order hold gives the closed loop
 
     p(z) = (z − 1)(z − e^{−x}) z^d F(z) + [φ₂ (z − e^{−x}) + φ₁²] [κ F(z) + β (z − 1)]
     F(z) = (1 + ν) z − ν,    φ₁ = (1 − e^{−x})/x,    φ₂ = (1 − φ₁)/x
 
-and it is stable where all roots of p lie inside the unit circle.
+The loop is stable if all roots of p lie inside the unit circle.
 """
 
 from __future__ import annotations
@@ -21,23 +21,24 @@ from hapticbridge.passivity.grid import checked, delayed_by, plain, scalar, toge
 _Array = NDArray[np.float64]
 
 FIRST_SHARE = 1e-6
-"""Where the search starts, as a share of (b + B)/T in stiffness or of b + m/T in damping, without
-unit. A limit below it is returned as 0. Smaller only takes longer: no device is that soft."""
+"""Start of the search, without unit, as a share of (b + B)/T in stiffness or of b + m/T in damping.
+A limit below it is returned as 0; no real device is that soft. A smaller value takes longer."""
 
 SMALL = 1e-2
-"""b T/m below which φ₂ is summed as a series, without unit; five terms leave 1e-14 there, while
-the closed form loses that many digits to cancellation below it."""
+"""Value of b T/m, without unit, below which φ₂ is summed as a series. Five terms leave an error of
+1e-14 there. Below it the closed form loses as many digits to cancellation."""
 
 BISECTIONS = 27
-"""Halvings of an octave: 2^-27 = 7e-9, a hundredth of what double roots near 1 let the boundary be
-known to (1e-6). More would only take longer."""
+"""Number of halvings of an octave: 2^-27 = 7e-9. This is a hundredth of the accuracy of the
+boundary, 1e-6, which double roots near 1 limit. More halvings only take longer."""
 
 OCTAVES = 200
-"""Doublings after which the search gives up, far beyond every limit."""
+"""Number of doublings after which the search ends. The end, 2^200 times the start, lies beyond
+every limit."""
 
 
 def _plant(x: _Array) -> tuple[_Array, _Array, _Array]:
-    """Returns e^{−x}, φ₁ and φ₂ of a damped mass under an exact hold."""
+    """Returns e^{−x}, φ₁ and φ₂ of a damped mass under an exact zero-order hold."""
     safe = np.where(x > 0, x, 1.0)
     first = np.where(x > 0, -np.expm1(-safe) / safe, 1.0)
     series = 1 / 2 - x / 6 * (1 - x / 4 * (1 - x / 5 * (1 - x / 6)))
@@ -45,7 +46,7 @@ def _plant(x: _Array) -> tuple[_Array, _Array, _Array]:
 
 
 def _product(first: list[_Array], second: list[_Array]) -> list[_Array]:
-    """Multiplies polynomials given by coefficient arrays, highest power first."""
+    """Multiplies polynomials whose coefficient arrays start with the highest power."""
     result = [np.zeros_like(first[0]) for _ in range(len(first) + len(second) - 1)]
     for i, left in enumerate(first):
         for j, right in enumerate(second):
@@ -54,7 +55,6 @@ def _product(first: list[_Array], second: list[_Array]) -> list[_Array]:
 
 
 def _is_stable(coefficients: list[_Array]) -> NDArray[np.bool_]:
-    """Returns whether all roots lie inside the unit circle."""
     degree = len(coefficients) - 1
     companion = np.zeros((*coefficients[0].shape, degree, degree))
     companion[..., range(1, degree), range(degree - 1)] = 1
@@ -64,7 +64,7 @@ def _is_stable(coefficients: list[_Array]) -> NDArray[np.bool_]:
 
 
 def _first_unstable(stable_at: Callable[[_Array], NDArray[np.bool_]], start: _Array) -> _Array:
-    """Returns the value up to which all values from the start on are stable; 0 where none is."""
+    """Returns the end of the stable range from the start value on; 0 if the start is unstable."""
     low, high = np.zeros_like(start), start
     growing = stable_at(start)
     for _ in range(OCTAVES):
@@ -84,7 +84,7 @@ def _first_unstable(stable_at: Callable[[_Array], NDArray[np.bool_]], start: _Ar
 def _loop(
     device_damping: _Array, mass: _Array, damping: _Array, period: float, delay: int, lag: float
 ) -> Callable[[_Array], list[_Array]]:
-    """Returns p(z) for a stiffness κ, with its trivial zero z = 1 divided out for κ = 0."""
+    """Returns p(z) as a function of κ; for κ = 0 its trivial root z = 1 is divided out."""
     x, beta = device_damping * period / mass, damping * period / mass
     decay, first, second = _plant(x)
     one, zero = np.ones_like(x), np.zeros_like(x)
@@ -104,7 +104,7 @@ def _loop(
 
 
 def _sum(long: list[_Array], short: list[_Array]) -> list[_Array]:
-    """Adds two polynomials, the second of a lower degree."""
+    """Adds two polynomials; the second has the lower degree."""
     head = len(long) - len(short)
     return [*long[:head], *(a + b for a, b in zip(long[head:], short, strict=True))]
 
@@ -118,16 +118,18 @@ def free_device_stiffness(
     delay: int = 0,
     filter_time: float = 0.0,
 ) -> float | NDArray[np.float64]:
-    """Returns the stiffness up to which a free device stays stable against a wall.
+    """Returns the stiffness up to which a free device is stable against a wall.
 
-    The device is a mass with viscous damping, m_d v' = −b v − f, in nobody's hand, and f is the
-    force of the coupling, held for a period (exact zero-order hold), against a wall (the tool does
-    not move). No friction, no quantisation. It is a *stability* limit of this one loop: a hand that
-    stores energy can lower it down to ``maximum_stiffness``, and with a little damping of its
-    own it raises it. The damper helps it, until about m_d/T.
+    The device is a mass with viscous damping, m_d v' = −b v − f, without a hand. The coupling's
+    force f is held for a period (exact zero-order hold). The tool does not move. Friction and
+    quantisation are left out.
 
-    The boundary is exact to 1e-6 for b T/m_d > 1e-6; a heavier device has its roots so near to 1
-    that double precision no longer tells its damping.
+    This is a *stability* limit of one loop. A hand that stores energy can lower it down to
+    ``maximum_stiffness``; a little damping of the hand raises it. The coupling's damper raises it
+    until B reaches about m_d/T.
+
+    The boundary is exact to 1e-6 for b T/m_d > 1e-6. The roots of a heavier device lie so near to 1
+    that double precision no longer resolves its damping.
 
     Args:
         device_damping: b in N s/m, finite and >= 0.
@@ -138,15 +140,15 @@ def free_device_stiffness(
         filter_time: τ in s, >= 0, of a first-order low-pass behind the damper (backward).
 
     Returns:
-        K in N/m, of the shape that the arguments broadcast to: every smaller one is stable too; 0
-        where none is (as for b = B = 0).
+        K in N/m, of the broadcast shape of the arguments. Every smaller stiffness is stable too. 0
+        if none is stable, as for b = B = 0.
 
     Raises:
         CouplingError: An argument is out of range or mis-shaped.
 
     References:
         Gil, Avello, Rubio, Flórez 2004, Stability analysis of a 1 DOF haptic interface using the
-        Routh-Hurwitz criterion (the same loop without a low-pass).
+        Routh-Hurwitz criterion (this loop without a low-pass).
     """
     period = scalar("period", period, "s", positive=True)
     lag = scalar("filter time", filter_time, "s") / period
@@ -171,9 +173,7 @@ def free_device_damping(
     delay: int = 0,
     filter_time: float = 0.0,
 ) -> float | NDArray[np.float64]:
-    """Returns the coupling damping up to which a free device is stable with a soft spring.
-
-    Where ``free_device_stiffness`` falls to 0: the limit of K → 0.
+    """Returns the coupling damping at which ``free_device_stiffness`` falls to 0, the limit K → 0.
 
     Args:
         device_damping: b in N s/m, finite and >= 0.
@@ -183,13 +183,13 @@ def free_device_damping(
         filter_time: τ in s, >= 0, of a first-order low-pass behind the damper (backward).
 
     Returns:
-        B in N s/m, of the shape that the arguments broadcast to.
+        B in N s/m, of the broadcast shape of the arguments.
 
     Raises:
         CouplingError: An argument is out of range or mis-shaped.
 
     References:
-        As ``free_device_stiffness``.
+        Gil, Avello, Rubio, Flórez 2004, as for ``free_device_stiffness``.
     """
     period = scalar("period", period, "s", positive=True)
     lag = scalar("filter time", filter_time, "s") / period

@@ -1,4 +1,4 @@
-"""Many couplings at once, and the checks on numbers that every bound shares."""
+"""Arrays of couplings, and argument checks shared by all bounds."""
 
 from __future__ import annotations
 
@@ -14,24 +14,28 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.errors import CouplingError
 
 Axis = Literal["translation", "rotation"]
-"""Which pair of K and B a bound is about."""
+"""Kind of axis; it selects the pair of K and B."""
 
 MOST_DELAY = 50
-"""Longest delay in samples that is computed: 50 ms at 1 kHz, where a coupling has long been too
-soft to be of use. The time to find a bound grows with its square; more would only take longer."""
+"""Largest delay in samples: 50 ms at 1 kHz, where a coupling is too soft to be useful. The time to
+compute a bound grows with its square."""
 
 MOST_SAMPLES = 10**8
-"""Longest run or series in samples: a day at 1 kHz, and what fits into memory."""
+"""Largest length of a run or series in samples: a day at 1 kHz, which still fits into memory."""
 
 _ARGUMENTS = Arguments(CouplingError)
-# a frequency is an angle over a period
+# a frequency is an angle divided by a period, so its range is squared
 _FREQUENCIES = Arguments(CouplingError, SMALLEST**2, LARGEST**2)
 
 
 def checked(
     name: str, value: ArrayLike, unit: str = "", *, positive: bool = False
 ) -> NDArray[np.float64]:
-    """Returns numbers as an array, all finite and >= 0 (> 0 if positive), or CouplingError."""
+    """Returns numbers as an array, all finite and >= 0 (> 0 if positive).
+
+    Raises:
+        CouplingError: A value is not a number or out of range.
+    """
     return _ARGUMENTS.numbers(name, value, unit, least=0, is_open=positive)
 
 
@@ -46,7 +50,7 @@ def frequencies(value: ArrayLike) -> NDArray[np.float64]:
 
 
 def finite(name: str, value: ArrayLike, unit: str = "") -> NDArray[np.float64]:
-    """Returns numbers of any sign as an array, all finite, or raises CouplingError."""
+    """Returns finite numbers of any sign as an array, or raises CouplingError."""
     return _ARGUMENTS.numbers(name, value, unit)
 
 
@@ -72,17 +76,16 @@ def together(**arrays: NDArray[np.float64]) -> list[NDArray[np.float64]]:
 
 
 def plain(array: NDArray[np.float64]) -> float | NDArray[np.float64]:
-    """Returns a float for an array without dimensions, and any other array as it is."""
+    """Returns a float for an array without dimensions, and any other array unchanged."""
     return array if array.ndim else float(array)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CouplingGrid:
-    """Couplings side by side: each field an array, or a number that holds for all.
+    """Couplings in arrays, for maps over thousands; the fields broadcast as in NumPy.
 
-    What ``Coupling`` is for one spring and damper, for maps over thousands. The bounds of this
-    package take either; a bridge takes only a ``Coupling``. The fields broadcast against each
-    other as in NumPy and are kept as read-only arrays.
+    The bounds of this package accept it in place of a ``Coupling``; a bridge does not. The fields
+    are kept as read-only arrays.
 
     Attributes:
         stiffness: K in N/m, finite and > 0.
@@ -120,7 +123,8 @@ def spring_and_damper(
     """Returns K and B of one kind of axis, broadcast to one shape.
 
     Raises:
-        CouplingError: The axis is unknown, the coupling is none, or a value is too large or small.
+        CouplingError: The axis is unknown, the coupling has a wrong type, or a value is out of
+            range.
     """
     is_translation = one_of("axis", axis, ("translation", "rotation")) == "translation"
     if not isinstance(coupling, Coupling | CouplingGrid):
@@ -129,7 +133,7 @@ def spring_and_damper(
         )
     names = ("stiffness", "damping") if is_translation else _OF_ROTATION
     if isinstance(coupling, Coupling):
-        # a Coupling knows no largest value, and may hold fractions
+        # Coupling has no upper limit and accepts fractions.Fraction, so convert and check here
         stiffness, damping = (
             checked(f"coupling {name}", float(getattr(coupling, name)), positive=is_first)
             for name, is_first in zip(names, (is_translation, False), strict=True)
@@ -143,7 +147,7 @@ def single(coupling: Coupling) -> tuple[float, float]:
     """Returns K and B in translation of one coupling.
 
     Raises:
-        CouplingError: It is no ``Coupling``, or a value is too large or small.
+        CouplingError: The argument is not a ``Coupling``, or a value is out of range.
     """
     if not isinstance(coupling, Coupling):
         raise CouplingError(f"coupling is {shown(coupling)}; it must be one Coupling")

@@ -1,4 +1,4 @@
-"""The device condition in several dimensions."""
+"""Device condition in several dimensions."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from hapticbridge.errors import CouplingError
 from hapticbridge.passivity.grid import finite, scalar
 
 SYMMETRY = 1e-9
-"""Largest asymmetry relative to a matrix' largest entry that passes for rounding, without unit."""
+"""Largest asymmetry of a matrix that counts as rounding, relative to its largest entry, without
+unit."""
 
 
 def _symmetric(name: str, value: ArrayLike) -> NDArray[np.float64]:
@@ -20,7 +21,7 @@ def _symmetric(name: str, value: ArrayLike) -> NDArray[np.float64]:
         raise CouplingError(f"{name} has shape {matrix.shape}; it must be square: (..., n, n)")
     transposed = np.swapaxes(matrix, -1, -2)
     if np.abs(matrix - transposed).max() > SYMMETRY * np.abs(matrix).max():
-        raise CouplingError(f"{name} is not symmetric; the condition holds only for symmetric ones")
+        raise CouplingError(f"{name} is not symmetric; the condition requires symmetric matrices")
     return (matrix + transposed) / 2
 
 
@@ -35,16 +36,16 @@ def matrix_margin(
 ) -> float | NDArray[np.float64]:
     """Returns the smallest eigenvalue of b − s (K T/2 + B), s = scale · force scale.
 
-    The coupling is passive on the device, for any passive hand and any discrete-time passive
-    environment, where it is >= 0. K and B are constant; where device damping depends on the
-    pose, the condition must hold everywhere in the workspace. Entries of different units
-    (translation beside rotation) leave the sign meaningful, not the size.
+    Where it is >= 0, the coupling is passive for any passive hand and any discrete-time passive
+    environment. K and B are constant. If the device's damping depends on the pose, the condition
+    must hold everywhere in the workspace. With entries of different units (translation beside
+    rotation) only the sign has a meaning.
 
     Args:
-        stiffness: K in N/m, symmetric and positive semidefinite, shape (..., n, n); a number
-            is 1 × 1.
-        damping: B in N s/m, likewise.
-        device_damping: b in N s/m, symmetric, likewise.
+        stiffness: K in N/m, symmetric and positive semidefinite, shape (..., n, n); a number is 1 ×
+            1.
+        damping: B in N s/m, symmetric and positive semidefinite, shape (..., n, n).
+        device_damping: b in N s/m, symmetric, shape (..., n, n).
         period: T in s, finite and > 0.
         scale: Handle motion per device motion, > 0.
         force_scale: Force on the device per force on the tool, > 0.

@@ -1,4 +1,4 @@
-"""The line of passivity in the plane of K and B."""
+"""Line of passivity in the plane of K and B."""
 
 from __future__ import annotations
 
@@ -12,8 +12,9 @@ from hapticbridge.passivity.wall import wall_supremum
 _Array = NDArray[np.float64]
 
 SECANTS, SETTLED = 60, 1e-13
-"""Most secant steps towards the line against a wall (about ten are taken), and the relative step in
-K at which they end: what the bound itself resolves. Both without unit."""
+"""Largest number of secant steps towards the line against a wall, and relative step in K at which
+they end. About ten steps are taken. The step equals the resolution of the bound. Both without
+unit."""
 
 SOFT = 1e-12
 """Stiffness, as a share of B/T or b/T, that stands for K → 0, without unit."""
@@ -21,12 +22,12 @@ SOFT = 1e-12
 
 @dataclass(frozen=True, slots=True)
 class PassiveLine:
-    """The largest stiffness over the coupling's damping that is passive on a device.
+    """Largest passive stiffness of a device as a function of the coupling's damping.
 
     Attributes:
         b: Device damping in N s/m, > 0.
         period: T in s, > 0.
-        delay: d in samples; with one it is the line against a wall.
+        delay: d in samples; for d >= 1 the line is that against a wall.
         filter_time: τ in s, >= 0.
     """
 
@@ -37,15 +38,15 @@ class PassiveLine:
 
     @property
     def share(self) -> float:
-        """How much of B the low-pass leaves to be paid for, without a delay."""
+        """Share of B in the device condition without a delay: T/(T + 2τ)."""
         return self.period / (self.period + 2 * self.filter_time)
 
     def stiffness(self, damping: _Array) -> _Array:
-        """Returns the largest K for any hand; with a delay against a wall."""
+        """Returns the largest K in N/m for any hand; with a delay, against a wall."""
         if self.delay == 0:
             return np.maximum(0.0, 2 * (self.b - self.share * damping) / self.period)
-        # what a wall needs is convex in K, so secants from above never step past the line; they
-        # start beyond it, because at ω → 0 the wall alone asks for (d + ½) K T − B
+        # The damping that a wall requires is convex in K, so secants from above never cross the
+        # line. They start above it, because at ω → 0 a wall already requires (d + ½) K T − B.
         soft = SOFT * self.b / self.period
         before, last = ((self.b + damping) / (self.period * self.delay) * x for x in (1.1, 1.0))
         needed_before = self._needed(before, damping)
@@ -60,7 +61,7 @@ class PassiveLine:
         return np.where(last > 2 * soft, last, 0.0)
 
     def largest_damping(self) -> float:
-        """Returns the B at which ``stiffness`` has fallen to 0."""
+        """Returns the B in N s/m at which ``stiffness`` falls to 0."""
         if self.delay == 0:
             return self.b / self.share
         return float(self.b / self._needed(np.full(1, SOFT / self.period), np.ones(1))[0])

@@ -1,4 +1,4 @@
-"""What a finite resolution and Coulomb friction allow."""
+"""Stiffness limits from position resolution and Coulomb friction."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from hapticbridge.errors import CouplingError
 from hapticbridge.passivity.grid import scalar, single
 
 Region = Literal["passive", "locally stable", "bounded limit cycle", "unstable"]
-"""Diolaiti's four regions of (β, σ)."""
+"""Regions of (β, σ) after Diolaiti et al. 2006."""
 
 
 class Mechanism(Protocol):
-    """What must be known of a device: one axis of its mechanics and its encoder."""
+    """Mechanics and encoder of one device axis, as the quantization limit requires them."""
 
     @property
     def damping(self) -> float | None:
@@ -31,16 +31,16 @@ class Mechanism(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class QuantizationLimit:
-    """What a coupling asks of a device that quantises its position.
+    """Limits of a coupling on a device that quantises its position.
 
     Attributes:
-        stiffness: Largest K in N/m that damping and friction both allow, 0 if the damper alone is
-            too much; inf never, because the damping bounds it.
+        stiffness: Largest K in N/m that damping and friction both allow; 0 if the damper alone
+            exceeds them. Always finite, because the damping bounds it.
         limited_by: The line that limits it: ``damping`` or ``friction``.
         beta: β = b / (K T), without unit.
         sigma: σ = f_c / (K Δ), without unit; inf for Δ = 0.
-        region: ``passive`` (β and σ above ½), ``locally stable`` (only σ), ``bounded limit
-            cycle`` (only β), ``unstable`` (neither). For a coupling without damper.
+        region: ``passive`` (β and σ above ½), ``locally stable`` (only σ), ``bounded limit cycle``
+            (only β), ``unstable`` (neither). Defined for a coupling without damper.
         friction_needed: K Δ/2 + B Δ/T in N.
     """
 
@@ -53,14 +53,14 @@ class QuantizationLimit:
 
 
 def quantization_limit(device: Mechanism, coupling: Coupling, period: float) -> QuantizationLimit:
-    """Returns what friction and resolution of a device allow, and where a coupling lies.
+    """Returns the stiffness that friction and resolution allow, and the region of a coupling.
 
         K <= min( 2(b − B)/T,  2(f_c/Δ − B/T) ),      f_c >= K Δ/2 + B Δ/T
 
-    Friction has its own line beside damping: motion over one quantum may be arbitrarily slow.
+    Friction sets a line of its own, because motion over one quantum may be arbitrarily slow.
 
     Args:
-        device: Damping, friction and resolution of one axis, all known.
+        device: Damping, friction and resolution of one axis, none of them None.
         coupling: K and B in translation.
         period: T in s, finite and > 0.
 

@@ -1,4 +1,4 @@
-"""One run of a sampled loop, sample by sample, compiled."""
+"""Compiled time-domain run of a sampled loop."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from hapticbridge.jit import compiled
 _Array = NDArray[np.float64]
 
 KICK = 1e-3
-"""First displacement of the handle in m. The loop is linear, so it only scales what follows."""
+"""First displacement of the handle in m. The loop is linear, so it only scales the motion."""
 
 HUGE = 1e100
-"""Force in N at which a run has diverged beyond doubt and ends."""
+"""Force in N at which a run counts as diverged and ends."""
 
 
 @compiled
@@ -32,10 +32,11 @@ def run(
     handle: _Array,
     tool: _Array,
 ) -> int:
-    """Fills the arrays with f_k, h_k and x_k; returns how many samples it took.
+    """Fills the arrays with f_k, h_k and x_k and returns the number of samples taken.
 
-    The recursion is that of ``SampledLoop``: c and a of its damper, p, q and r of its hand, the
-    integrator as its samples of delay. A run that ends in its last sample is one short.
+    The recursion is that of ``SampledLoop``. Its arguments c and a belong to the damper, p, q and r
+    to the hand; ``integrator`` is given as samples of delay. A run that diverges in its last sample
+    returns one sample fewer, so that a length below the capacity always means divergence.
     """
     h, x, v, stretch, damper, f = KICK, 0.0, 0.0, 0.0, 0.0, 0.0
     held_before, device_velocity = 0.0, 0.0

@@ -1,4 +1,4 @@
-"""Device, hand, coupling and tool in the time domain: the bounds' independent witness."""
+"""Device, hand, coupling and tool in the time domain, as an independent check of the bounds."""
 
 from __future__ import annotations
 
@@ -25,20 +25,21 @@ from hapticbridge.passivity.worst_hand import WorstHand
 _Array = NDArray[np.float64]
 
 GRID_POINTS = 2000
-"""Angles, even in θ and even in log θ, from which the search for the worst frequency starts."""
+"""Number of angles in each search grid for the worst frequency: one even in θ, one even in log
+θ."""
 
 LOWEST_ANGLE = 1e-2
-"""θ in rad below which no worst hand is looked for: it would be a mass of 2 b T/θ², whose loop, for
-a share δ of the damping missing, grows as slowly as δ θ²/4 a sample. A supremum at θ → 0 is missed
+"""Smallest θ in rad of a worst hand. Below it the hand would be a mass of 2 b T/θ². With a share δ
+of the damping missing, such a loop grows by only δ θ²/4 per sample. A supremum at θ → 0 is missed
 by a share of (d² + d) θ²/6: 0.05 % at a delay of 5 samples."""
 
 FLATNESS = 1e-12
-"""Relative difference between values of a spectrum that counts as rounding, without unit."""
+"""Relative difference between spectrum values that counts as rounding, without unit."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoopMotion:
-    """What a loop did at the samples 0 … N − 1; fewer where it diverged.
+    """Motion of a loop at samples 0 … N − 1, or fewer if it diverged.
 
     Attributes:
         force: f_k on the tool in N.
@@ -53,13 +54,13 @@ class LoopMotion:
 
 @dataclass(frozen=True, slots=True)
 class SampledLoop:
-    """A coupling between a device with its hand and a wall, or a point mass.
+    """A coupling between a device with its hand and a wall or a point mass.
 
         f_k = K e_k + g_k,    e_k = h_k − x_k,    g_k = a g_{k−1} + c (e_k − e_{k−1})
         backward:  a = τ/(T + τ),            c = B/(T + τ)
         tustin:    a = (τ − T/2)/(τ + T/2),  c = B/(τ + T/2)
 
-    The device gets −f_{k−d}, held for a period. The mass moves by one of
+    The device receives −f_{k−d}, held for a period. The mass moves by one of
 
         implicit        v_k = v_{k−1} + (T/m) f_k       x_k = x_{k−1} + T v_k
         semi_implicit   v_{k+1} = v_k + (T/m) f_k       x_{k+1} = x_k + T v_{k+1}
@@ -69,8 +70,8 @@ class SampledLoop:
         coupling: K and B in translation.
         period: T in s, finite and > 0.
         mass: m in kg, finite and > 0; None for a wall, x = 0.
-        integrator: Of the mass.
-        discretization: Of the damper.
+        integrator: Integration scheme of the mass.
+        discretization: Discretization of the damper.
         delay: d, whole samples from the coupling's force to the device, 0 to 50.
         filter_time: τ in s of a first-order low-pass behind the damper, >= 0.
 
@@ -100,7 +101,7 @@ class SampledLoop:
         one_of("discretization", self.discretization, DISCRETIZATIONS)
 
     def response(self, frequency: ArrayLike) -> NDArray[np.complex128]:
-        """Returns what the device feels, H = C e^{−jdθ} / (1 − λ C e^{j(1−n)θ}).
+        """Returns the force response at the device, H = C e^{−jdθ} / (1 − λ C e^{j(1−n)θ}).
 
         λ = T²/(4 m sin²(θ/2)), 0 for a wall; n = 0, 1, 2 samples from force to position.
 
@@ -129,7 +130,7 @@ class SampledLoop:
         return np.asarray(transfer * np.exp(-1j * self.delay * theta), dtype=np.complex128)
 
     def damping_spectrum(self, frequency: ArrayLike) -> _Array:
-        """Returns the device damping that this loop needs at each frequency, for any hand.
+        """Returns the device damping required at each frequency, for any hand.
 
             b(ω) = (T/2) Re{(1 − e^{−jωT}) H} / (1 − cos ωT)
 
@@ -137,8 +138,8 @@ class SampledLoop:
             frequency: ω in rad/s, 0 < ω <= π/T, any shape.
 
         Returns:
-            b in N s/m; the supremum is needed, provided that the tool is stable behind a handle
-            held still (``minimum_mass``).
+            b in N s/m. The loop requires the supremum, provided that the tool is stable behind a
+            fixed handle (``minimum_mass``).
 
         Raises:
             CouplingError: A frequency is out of range.
@@ -152,12 +153,12 @@ class SampledLoop:
     def worst_frequency(self) -> float:
         """Returns ω in rad/s at which ``damping_spectrum`` is largest, >= 0.01/T.
 
-        Where it is flat, as for a plain spring on a wall, the highest of equals is taken, because
+        Of equal maxima, as for a plain spring on a wall, the highest frequency is returned, because
         there a loop grows fastest.
         """
-        # not the search of ``wall_supremum``, whose grid knows ripples of a delay only: a tool on
-        # its spring has a resonance, anywhere and as narrow as its damping is low, so the grid is
-        # fine throughout; and it starts where a worst hand can still be told
+        # The grid of ``wall_supremum`` resolves only the ripples of a delay. A tool on its spring
+        # also resonates, at any frequency and the more sharply the lower its damping. This grid
+        # is therefore fine throughout.
         even = np.linspace(LOWEST_ANGLE, np.pi, GRID_POINTS)
         theta = np.union1d(even, np.geomspace(LOWEST_ANGLE, np.pi, GRID_POINTS))
         needed = self.damping_spectrum(theta / self.period)
@@ -179,17 +180,18 @@ class SampledLoop:
         """Runs the loop from a handle displaced by 1 mm.
 
         Args:
-            hand: Device and hand, of the loop's period; None holds the handle still.
-            samples: How many, >= 1. A run that exceeds 1e100 N ends there.
+            hand: Device and hand with the loop's period; None fixes the handle.
+            samples: Length of the run in samples, >= 1. A run that exceeds 1e100 N ends early.
 
         Raises:
-            CouplingError: The periods differ, or samples is no whole number >= 1.
+            CouplingError: The periods differ, or samples is not a whole number >= 1.
         """
         if hand is not None and not isinstance(hand, WorstHand):
             raise CouplingError(f"hand is {shown(hand)}; it must be a WorstHand or None")
         if hand is not None and hand.period != self.period:
             raise CouplingError(
-                f"the hand's period is {hand.period:g} s, the loop's {self.period:g} s"
+                f"the hand's period is {hand.period:g} s, the loop's {self.period:g} s; "
+                "they must be equal"
             )
         force, handle, tool = np.zeros((3, whole("run", samples, least=1)))
         step = self.period if self.discretization == "backward" else self.period / 2

@@ -1,8 +1,8 @@
-"""Which device damping a coupling needs at each frequency, for any transfer function.
+"""Device damping required at each frequency, for any transfer function.
 
-Notation: θ = ωT, u = 1 − e^{−jθ}. Because u / (1 − cos θ) = 1 + j cot(θ/2), both conditions
-below need only the real and imaginary parts of a transfer function and cot(θ/2), and lose no
-digits at low frequency.
+Notation: θ = ωT, u = 1 − e^{−jθ}. Because u / (1 − cos θ) = 1 + j cot(θ/2), both conditions need
+only the real and imaginary parts of a transfer function and cot(θ/2). They lose no digits at low
+frequency.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from scipy import signal
 
 Transfer = Callable[[NDArray[np.complex128]], Any]
-"""A transfer function of z, from the handle's position in m to the force in N."""
+"""Transfer function of z, from the handle's position in m to the force in N."""
 
 
 def needed_for_any_environment(
@@ -36,7 +36,8 @@ def needed_for_any_environment(
 ) -> NDArray[np.float64]:
     """Returns (T/2)(1 − cos θ) / Re{(1 − e^{−jθ})/C}; inf where the real part is not positive.
 
-    Worst hand and worst discrete-time passive environment behind the coupling together.
+    This is the requirement for the worst hand together with the worst discrete-time passive
+    environment behind the coupling.
 
     References:
         Brown & Colgate 1997, eq. (2).
@@ -45,14 +46,14 @@ def needed_for_any_environment(
     size = np.abs(transfer) ** 2
     with np.errstate(divide="ignore", invalid="ignore"):
         needed = period / 2 * size / power
-    # a coupling without force asks for nothing
+    # a coupling without force requires no damping
     return np.where(size == 0, 0.0, np.where(power > 0, needed, np.inf))
 
 
 def needed_for_fixed_environment(
     transfer: NDArray[np.complex128], period: float, theta: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Returns (T/2) Re{(1 − e^{−jθ}) H} / (1 − cos θ) for what the device is known to feel.
+    """Returns (T/2) Re{(1 − e^{−jθ}) H} / (1 − cos θ) for a response H at the device.
 
     References:
         Colgate & Schenkel 1997, necessary and sufficient for any passive hand.
@@ -71,24 +72,24 @@ def damping_spectrum(
     filter_time: float = 0.0,
     axis: Axis = "translation",
 ) -> NDArray[np.float64]:
-    """Returns the device damping that a coupling needs at each frequency.
+    """Returns the device damping that a coupling requires at each frequency.
 
         delay = 0:   b(ω) = (T/2)(1 − cos ωT) / Re{(1 − e^{−jωT}) / C}        any environment
         delay = d:   b(ω) = (T/2) Re{(1 − e^{−jωT}) C e^{−jdωT}} / (1 − cos ωT)        a wall
 
-    ``minimum_damping`` is the supremum over 0 < ω <= π/T. With a delay the environment is a wall
-    (the tool does not move): behind a delayed coupling no damping suffices for *every* passive
-    environment; ``damping_spectrum_of`` of C z⁻ᵈ shows that as inf. Against a wall the damper can
-    help, so values may be negative.
+    ``minimum_damping`` is the supremum over 0 < ω <= π/T. With a delay the environment is a wall,
+    that is a tool that does not move. Behind a delayed coupling no damping suffices for *every*
+    passive environment; ``damping_spectrum_of`` of C z⁻ᵈ is inf there. Against a wall the
+    coupling's damper can help, so values may be negative.
 
     Args:
         coupling: K and B, shape S.
         period: T in s, finite and > 0.
         frequency: ω in rad/s, 0 < ω <= π/T, shape F.
-        discretization: Of the damper.
+        discretization: Rule that takes the damper's velocity from sampled positions.
         delay: d, whole samples from position to force, 0 to 50.
         filter_time: τ in s of a first-order low-pass behind the damper, >= 0.
-        axis: Which pair of K and B is asked for.
+        axis: Kind of axis, which selects the pair of K and B.
 
     Returns:
         b in N s/m (rotation: N m s/rad), shape S + F; inf where none suffices.
@@ -118,15 +119,15 @@ def damping_spectrum(
 def damping_spectrum_of(
     transfer: Transfer | signal.dlti, period: float, frequency: ArrayLike
 ) -> float | NDArray[np.float64]:
-    """Returns the device damping that any coupling needs at each frequency.
+    """Returns the device damping that any coupling requires at each frequency.
 
         b(ω) = (T/2)(1 − cos ωT) / Re{(1 − e^{−jωT}) / C(e^{jωT})}
 
-    for every passive hand and every discrete-time passive environment behind the coupling.
+    The result holds for every passive hand and every discrete-time passive environment.
 
     Args:
-        transfer: C, a callable of an array of complex z, or a discrete ``scipy.signal`` system
-            (its ``dt`` is the period, or True), from h − x in m to the force on the tool in N.
+        transfer: C from h − x in m to the force on the tool in N: a callable of an array of complex
+            z, or a discrete ``scipy.signal`` system whose ``dt`` is the period or True.
         period: T in s, finite and > 0.
         frequency: ω in rad/s, 0 < ω <= π/T, any shape.
 
@@ -134,8 +135,8 @@ def damping_spectrum_of(
         b in N s/m, shaped like the frequency; inf where no damping suffices.
 
     Raises:
-        CouplingError: An argument is out of range, the system is continuous or sampled at another
-            period, or C is not finite at a frequency.
+        CouplingError: An argument is out of range, the system is continuous or has another period,
+            or C is not finite at a frequency.
 
     References:
         Brown & Colgate 1997, eq. (2).
@@ -146,14 +147,14 @@ def damping_spectrum_of(
     value = transfer(z) if callable(transfer) else _value_of_system(transfer, period, z)
     try:
         given = np.asarray(value)
-    except (TypeError, ValueError):  # as rows of different lengths
+    except (TypeError, ValueError):  # for example rows of different lengths
         given = np.empty(0, dtype=object)
     if given.dtype.kind not in "iufc":
         raise CouplingError(f"transfer returned {shown(value)}; it must return numbers in N/m")
     response: NDArray[np.complex128] = given.astype(np.complex128)
     if response.shape not in {(), theta.shape}:
         raise CouplingError(
-            f"transfer returned shape {response.shape} for z of shape {theta.shape}"
+            f"transfer returned shape {response.shape}; it must have z's shape {theta.shape}"
         )
     if not (np.abs(response) <= LARGEST**2).all():
         raise CouplingError("the transfer function is not finite at one of the frequencies")

@@ -1,4 +1,4 @@
-"""The limit of stability, found in the time domain."""
+"""Stability limit of a sampled loop from time-domain runs."""
 
 from __future__ import annotations
 
@@ -12,40 +12,41 @@ from hapticbridge.passivity.sampled_loop import SampledLoop
 from hapticbridge.passivity.worst_hand import WorstHand
 
 SAMPLES = 60_000
-"""Samples over which a loop must decay to count as stable. Two windows of a fifth of that are
-compared: growth of 1e-9 a sample is seen. More samples find the limit closer, in more time."""
+"""Length of a run in samples over which a stable loop must decay. Two windows of a fifth of it are
+compared, which detects growth of 1e-9 per sample. More samples locate the limit more closely and
+take longer."""
 
 DECAYED = 1e-9
-"""Share of its largest value below which a force has decayed beyond doubt, without unit: above
-rounding, and far below what a marginal mode keeps."""
+"""Force relative to its largest value, without unit, below which it counts as decayed. The value
+lies above rounding and far below the amplitude of a marginal mode."""
 
 LEAKAGE = 1e-5
-"""Relative difference in energy between two windows of a steady oscillation, without unit, that
-Hann's window leaves from 0.03 rad upwards. Without it a tool on a spring without any damping would
-count as stable by chance; larger ones shift limits at low frequency."""
+"""Relative difference in energy, without unit, between two windows of a steady oscillation under
+Hann's window, for 0.03 rad per sample and more. Without this allowance a tool on an undamped spring
+would count as stable by chance. Larger values shift limits at low frequency."""
 
 TOLERANCE = 1e-5
-"""Relative width at which the bisection ends, a hundredth of what the bounds are checked to."""
+"""Relative width at which the bisection ends, without unit: a hundredth of the accuracy to which
+the bounds are checked."""
 
 STEP = 10.0
-"""Factor by which a threshold is enclosed before it is bisected, without unit. Any would do; ten
-makes a search plainly independent of the number that it is to confirm."""
+"""Factor between trial values that enclose a threshold, without unit. Powers of ten keep the search
+independent of the predicted number that it confirms."""
 
 
 def stability_limit(loop: SampledLoop) -> float:
     """Returns the smallest device damping at which the loop with its worst hand is stable.
 
-    Found by runs in the time domain, which are stable if the force decays: powers of ten around
-    K T + B enclose the limit, and bisection closes in. Of the theory only the hand is used, tuned
-    to ``worst_frequency`` and the same for every b.
+    A run is stable if its force decays. Powers of ten around K T + B enclose the limit, then
+    bisection narrows it. The theory supplies only the hand, which is tuned to ``worst_frequency``
+    for every b.
 
     Args:
-        loop: What the device feels.
+        loop: Coupling and environment.
 
     Returns:
-        b in N s/m; 0 where the loop needs none, inf where the tool is not even stable behind a
-        handle held still, or an unfiltered Tustin damper rings against a wall: its own pole at
-        Nyquist is undamped.
+        b in N s/m. 0 if the loop requires none. inf if the tool is unstable behind a fixed handle,
+        or for an unfiltered Tustin damper against a wall, whose own pole at Nyquist is undamped.
     """
     is_ringing = loop.discretization == "tustin" and loop.filter_time == 0
     if is_ringing and loop.mass is None and loop.coupling.damping > 0:
@@ -65,17 +66,16 @@ def stability_limit(loop: SampledLoop) -> float:
 
 
 def threshold(holds: Callable[[float], bool], start: float, tolerance: float) -> float:
-    """Returns the value above which something holds, knowing only where to begin.
+    """Returns the value above which a condition holds.
 
     Args:
-        holds: Whether it holds at a positive value; false below the threshold, true above.
-        start: First value that is tried, > 0; steps by ``STEP`` lead from it to both sides of the
-            threshold.
+        holds: Condition at a positive value; false below the threshold, true above.
+        start: First trial value, > 0; steps by the factor ``STEP`` enclose the threshold.
         tolerance: Relative width at which the bisection ends.
 
     Returns:
-        The middle of the last bracket; 0 where it holds everywhere down to 1e-30, inf where
-        nowhere up to 1e30.
+        The middle of the last bracket; 0 if the condition holds down to 1e-30, inf if it fails up
+        to 1e30.
     """
     lower = upper = float(start)
     does_hold = holds(start)
@@ -95,19 +95,18 @@ def decays(force: NDArray[np.float64], samples: int, floor: float = 0.0) -> bool
     """Returns whether a force fell from one late window to the next.
 
     Args:
-        force: f_k in N, or any signal that is linear in it; shorter than asked if the run ended
-            early, which counts as divergence.
-        samples: How many were asked for.
-        floor: What cannot be told from zero, in N.
+        force: f_k in N, or any signal linear in it. A signal with fewer samples counts as diverged.
+        samples: Expected number of samples.
+        floor: Force in N below which the signal counts as zero.
     """
     if force.size < samples:
         return False
     width = samples // 5
     late, last = force[-2 * width : -width], force[-width:]
-    # what is left of a force that has decayed is rounding, which neither grows nor falls
+    # a decayed force consists of rounding, which neither grows nor falls
     if np.abs(last).max() <= max(DECAYED * np.abs(force).max(), floor):
         return True
-    # Hann's window, or the fraction of a cycle that a window holds would outweigh a small growth
+    # without Hann's window, a fraction of a cycle at its ends would outweigh a small growth
     weight = np.hanning(width) / np.abs(late).max()
     fallen = np.square(last * weight).sum() / np.square(late * weight).sum()
     return bool(fallen < 1 - LEAKAGE)

@@ -1,4 +1,4 @@
-"""The coupling as a transfer function of z, sampled and discretised as the loop has it."""
+"""Sampled and discretised coupling as a transfer function of z."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from hapticbridge.passivity.grid import (
 )
 
 Discretization = Literal["backward", "tustin"]
-"""How the damper's velocity is taken from sampled positions."""
+"""Rule that takes the damper's velocity from sampled positions."""
 
 DISCRETIZATIONS = ("backward", "tustin")
 
 _NYQUIST_ROUNDING = 1e-12
-"""Relative distance from π/T that is taken for rounding, without unit: (π/T)·T may differ from π,
-and at Nyquist itself a hand has no reactance."""
+"""Relative distance from π/T that counts as rounding, without unit. (π/T)·T may differ from π, and
+a hand has no reactance exactly at Nyquist."""
 
 
 def angles(frequency: ArrayLike, period: float) -> NDArray[np.float64]:
@@ -62,7 +62,7 @@ def coupling_transfer(
         damping: B in N s/m.
         period: T in s.
         theta: θ in rad.
-        discretization: Of the damper and its filter alike.
+        discretization: Rule for the damper and its filter.
         filter_time: τ in s of the first-order low-pass behind the damper; 0: none.
 
     Raises:
@@ -72,7 +72,7 @@ def coupling_transfer(
         Brown & Colgate 1997, eqs. (4) and (5).
     """
     if one_of("discretization", discretization, DISCRETIZATIONS) == "backward":
-        # 2 sin²(θ/2) is 1 − cos θ without its cancellation
+        # 2 sin²(θ/2) equals 1 − cos θ without cancellation
         difference = 2 * np.sin(theta / 2) ** 2 + 1j * np.sin(theta)
         step = period
     else:
@@ -85,15 +85,15 @@ def coupling_transfer(
 
 
 class SampledLaw(NamedTuple):
-    """What every bound of a coupling is asked about, checked.
+    """Validated arguments of a bound.
 
     Attributes:
         stiffness: K in N/m, shaped like the coupling.
-        damping: B in N s/m, likewise.
+        damping: B in N s/m, shaped like the coupling.
         period: T in s.
         delay: d in samples.
         filter_time: τ in s.
-        rings: Whether the damper is Tustin's without low-pass: its gain is infinite at Nyquist.
+        rings: True for Tustin's damper without low-pass, whose gain is infinite at Nyquist.
     """
 
     stiffness: NDArray[np.float64]
@@ -113,7 +113,7 @@ class SampledLaw(NamedTuple):
         filter_time: float,
         axis: Axis,
     ) -> SampledLaw:
-        """Checks what a bound was given.
+        """Validates the arguments of a bound.
 
         Raises:
             CouplingError: An argument is out of range, or the axis or discretization is unknown.

@@ -1,10 +1,10 @@
-"""A lossless transmission line in place of the spring and damper: does it buy stiffness?
+"""Lossless transmission line in place of the spring and damper.
 
-The waves p = (F + Z v)/2 run to the tool and q = (F − Z v)/2 back to the device; from end to end
-they need one sample, n = 2 there and back. Two ways to end the line at the device:
+The waves p = (F + Z v)/2 run to the tool and q = (F − Z v)/2 back to the device. Each needs one
+sample from end to end, n = 2 for both ways. The line can be terminated at the device in two ways:
 
     software    v_k = (h_k − h_{k−1})/T, and F_k = Z v_k + 2 q_k is sent to the device
-    device      v_k = (h_{k+1} − h_k)/T, and F_k = 2 q_k: the physical damping b is the end
+    device      v_k = (h_{k+1} − h_k)/T, and F_k = 2 q_k: the physical damping b terminates it
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from hapticbridge.passivity.grid import checked, one_of, plain, scalar, whole
 from hapticbridge.passivity.transfer import angles
 
 Termination = Literal["software", "device"]
-"""What ends the line at the device."""
+"""Element that terminates the line at the device."""
 
 LONGEST_TRIP = 1_000_000
-"""Longest way there and back in samples: beyond it nθ/2 is no longer told from a pole."""
+"""Largest round trip in samples. Beyond it rounding no longer separates nθ/2 from a pole."""
 
 
 def _checked(termination: Termination, round_trip: int) -> int:
@@ -37,25 +37,26 @@ def transmission_line_spectrum(
     terminated_by: Termination = "device",
     round_trip: int = 2,
 ) -> NDArray[np.float64]:
-    """Returns the device damping that a line in front of a wall needs at each frequency.
+    """Returns the device damping that a line in front of a wall requires at each frequency.
 
         software    H = (Z/T)(1 − z⁻¹)(1 + z⁻ⁿ)/(1 − z⁻ⁿ)     b(θ) = Z sin θ cot(nθ/2)
         device      H = (2Z/T)(1 − z⁻¹) z^{1−n}/(1 − z⁻ⁿ)     b(θ) = Z
 
-    With n = 2 the first is Z cos θ.
+    For n = 2 the software termination gives b(θ) = Z cos θ.
 
-    Ended by the device, the line is a wave port that counts the hand's work exactly, because the
-    force is held and v is the mean velocity of the hold: with b >= Z it is passive for any hand and
-    any discrete-time passive environment behind it. Ended in software it delays, and like a delayed
-    coupling no damping suffices for every passive environment; the spectrum is that of a wall.
+    Terminated by the device, the line is a wave port that counts the hand's work exactly, because
+    the force is held and v is the mean velocity of the hold. With b >= Z it is passive for any hand
+    and any discrete-time passive environment. Terminated in software, the line delays. As for a
+    delayed coupling, no damping then suffices for every passive environment; the spectrum is that
+    of a wall.
 
     Args:
         impedance: Z in N s/m, finite and > 0, shape S.
         period: T in s, finite and > 0.
         frequency: ω in rad/s, 0 < ω <= π/T, shape F.
-        terminated_by: What ends the line at the device.
+        terminated_by: Element that terminates the line at the device.
         round_trip: n, whole samples there and back, >= 1; 2 for one sample each way. In software
-            the supremum is 2 Z for n = 1, Z for n = 2, and infinite for more.
+            the supremum is 2 Z for n = 1, Z for n = 2, and infinite for larger n.
 
     Returns:
         b in N s/m, shape S + F; may be negative in software.
@@ -74,7 +75,7 @@ def transmission_line_spectrum(
     z = z.reshape(z.shape + (1,) * theta.ndim)
     if terminated_by == "device":
         return np.asarray(z * np.ones_like(theta))
-    # sin θ / tan(nθ/2) where θ is a multiple of 2π/n: a pole, or at Nyquist with even n a limit
+    # at multiples of 2π/n, sin θ / tan(nθ/2) has a pole, or a limit at Nyquist with even n
     phase = trip * theta / 2
     turns = np.rint(phase / np.pi)
     is_pole = np.abs(phase - turns * np.pi) < 1e-12
@@ -91,18 +92,18 @@ def transmission_line_stiffness(
     terminated_by: Termination = "device",
     round_trip: int = 2,
 ) -> float | NDArray[np.float64]:
-    """Returns the static stiffness of the stiffest line that a device bears in front of a wall.
+    """Returns the largest static stiffness of a passive line in front of a wall.
 
         K = 2 Z/(n T)  with  Z = b  (software, n = 1: Z = b/2; n > 2: none, 0)
 
-    With one sample each way that is b/T, **half** of what the spring and damper reach, 2 b/T. Only
-    a line that returns within one sample, which is a plain spring, reaches as much: the line buys
-    no stiffness.
+    With one sample each way K is b/T, **half** of the 2 b/T of a spring and damper. Only a line
+    that returns within one sample, which is a plain spring, reaches 2 b/T. A line gains no
+    stiffness.
 
     Args:
         device_damping: b in N s/m, finite and > 0.
         period: T in s, finite and > 0.
-        terminated_by: What ends the line at the device.
+        terminated_by: Element that terminates the line at the device.
         round_trip: n, whole samples there and back, >= 1.
 
     Returns:

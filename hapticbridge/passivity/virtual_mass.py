@@ -1,4 +1,4 @@
-"""A point mass behind the coupling, and what its integrator costs the device.
+"""Point mass behind the coupling, and the device damping that its integrator requires.
 
 Each scheme is a delay of j samples from the force to the position of the mass:
 
@@ -6,7 +6,7 @@ Each scheme is a delay of j samples from the force to the position of the mass:
     j = 1  semi_implicit   v_{k+1} = v_k + (T/m) f_k       x_{k+1} = x_k + T v_{k+1}
     j = 2  explicit        v_k = v_{k−1} + (T/m) f_{k−1}   x_k = x_{k−1} + T v_{k−1}
 
-so that the device feels H = C / (1 − λ C e^{j(1−j)θ}), λ = T²/(4 m sin²(θ/2)).
+The response at the device is H = C / (1 − λ C e^{j(1−j)θ}), λ = T²/(4 m sin²(θ/2)).
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ from hapticbridge.passivity.grid import (
 )
 
 Integrator = Literal["implicit", "semi_implicit", "explicit"]
-"""How the mass behind the coupling is integrated."""
+"""Integration scheme of the mass behind the coupling."""
 
 FORCE_DELAY: dict[str, int] = {"implicit": 0, "semi_implicit": 1, "explicit": 2}
 """Samples from force to position, per integrator."""
 
 LARGEST_PRODUCT = 1e280
-"""Largest product of two coefficients, in units of K: the double's range, less what a sum of a few
-needs."""
+"""Largest product of two coefficients, in units of K: the range of a double, less a reserve for
+sums of a few products."""
 
 _Array = NDArray[np.float64]
 
@@ -63,20 +63,22 @@ def _smallest_stable_mass(stiffness: _Array, damping: _Array, period: float, del
 def minimum_mass(
     coupling: Coupling | CouplingGrid, period: float, integrator: Integrator = "implicit"
 ) -> float | NDArray[np.float64]:
-    """Returns the mass that a tool must exceed so that it is stable behind a handle held still.
+    """Returns the mass above which a tool is stable behind a fixed handle.
 
         implicit        0
         semi_implicit   (T/2)(K T/2 + B)
         explicit        B² T / (B − K T);  inf for B <= K T
 
+    A light tool on a stiff coupling requires the implicit step. With the explicit step the smallest
+    mass for any damper is 4 K T², at B = 2 K T.
+
     Args:
         coupling: K and B.
         period: T in s, finite and > 0.
-        integrator: Of the mass.
+        integrator: Integration scheme of the mass.
 
     Returns:
-        m in kg, shaped like the coupling. A light tool on a stiff coupling needs the implicit
-        step; with the explicit one 4 K T² (at B = 2 K T) is the least that any damper allows.
+        m in kg, shaped like the coupling.
 
     Raises:
         CouplingError: An argument is out of range.
@@ -144,8 +146,8 @@ def _stationary_points(top: _Array, bottom: _Array) -> _Array:
         for j in range(4):
             if i != j:  # p'q gives i p_i q_j y^{i+j−1}, pq' the same with j
                 derivative[..., i + j - 1] += (i - j) * top[..., i] * bottom[..., j]
-    # a companion matrix of 1/y: it always exists, because the lowest coefficient, −μ k⁴ S(0), is
-    # never 0, while the highest ones may vanish
+    # The companion matrix of 1/y always exists: the lowest coefficient, −μ k⁴ S(0), is never 0,
+    # while the highest ones may vanish.
     companion = np.zeros((*shape, 4, 4))
     companion[..., range(1, 4), range(3)] = 1
     companion[..., 0, :] = -derivative[..., 1:] / derivative[..., :1]
@@ -161,32 +163,32 @@ def environment_minimum_damping(
     mass: ArrayLike,
     integrator: Integrator = "implicit",
 ) -> float | NDArray[np.float64]:
-    """Returns the device damping that a point mass behind the coupling needs, for any hand.
+    """Returns the device damping that a point mass behind the coupling requires, for any hand.
 
-    The supremum over 0 < θ = ωT <= π of, with s = sin(θ/2), λ = T²/(4 m s²), b0' = KT/2 − B cos θ
-    and A = |C|² = K² + 4s²(B/T)(K + B/T),
+    It is the supremum over 0 < θ = ωT <= π of the following, with s = sin(θ/2), λ = T²/(4 m s²),
+    b0' = KT/2 − B cos θ and A = |C|² = K² + 4s²(B/T)(K + B/T),
 
         implicit        [b0' − (T/2)λA sin(3θ/2)/s] / |1 − λ C e^{+jθ}|²
         semi_implicit   [b0' − (T/2)λA]             / |1 − λ C|²
         explicit        [b0' + (T/2)λA]             / |1 − λ C e^{−jθ}|²
 
     found exactly, at the stationary points of a rational function of cos θ. It holds for this
-    environment alone: a mass that touches something else needs up to ``minimum_damping``, if its
-    integrator is passive at all (only the implicit one is).
+    environment only. A mass in contact with something else requires up to ``minimum_damping``, and
+    only the implicit integrator is passive at all.
 
     Args:
         coupling: K and B.
         period: T in s, finite and > 0.
         mass: m in kg, finite and > 0, broadcast against the coupling.
-        integrator: Of the mass.
+        integrator: Integration scheme of the mass.
 
     Returns:
         b in N s/m; inf where the environment itself is not asymptotically stable: at or below
         ``minimum_mass``, and with the semi-implicit step for B = 0.
 
     Raises:
-        CouplingError: An argument is out of range or mis-shaped, or K, B/T and m/T² lie a hundred
-            orders of magnitude apart.
+        CouplingError: An argument is out of range or mis-shaped, or K, B/T and m/T² differ by a
+            hundred orders of magnitude.
 
     References:
         Brown & Colgate 1997, eq. (19) (reconstructed for the explicit scheme).
@@ -199,14 +201,14 @@ def environment_minimum_damping(
     stable = masses > _smallest_stable_mass(k, damping, period, delay)
     if delay == 1:
         stable &= damping > 0
-    # in units of K and of 2m/T² = K, so that nothing under- or overflows
+    # work in units of K and of 2m/T² = K to avoid under- and overflow
     g = damping / period / k
     inertia = 2 * masses / period**2 / k
     unit = np.ones_like(k)
     with np.errstate(over="ignore", invalid="ignore"):
         top, bottom = _polynomials(unit, g, inertia, delay)
         size = np.abs(top).max(axis=-1) * np.abs(bottom).max(axis=-1)
-    # products of the coefficients must be doubles, and μ k⁴ must not vanish beside them
+    # products of the coefficients must fit a double, and μ k⁴ must not underflow
     is_exact = (size < LARGEST_PRODUCT) & (inertia > 1 / LARGEST_PRODUCT)
     if not (is_exact | ~stable).all():
         raise CouplingError(

@@ -1,4 +1,4 @@
-"""The supremum over frequency of what a delayed coupling against a wall needs, and where it is."""
+"""Supremum over frequency of the damping that a delayed coupling requires against a wall."""
 
 from __future__ import annotations
 
@@ -13,22 +13,23 @@ from hapticbridge.passivity.transfer import Discretization, coupling_transfer
 _Array = NDArray[np.float64]
 
 POINTS_PER_RIPPLE = 16
-"""Grid points per ripple of the spectrum, which has d + 1 of them, without unit. The golden section
-that follows needs each maximum bracketed; more only takes longer."""
+"""Grid points per ripple of the spectrum, which has d + 1 ripples, without unit. The golden section
+that follows needs every maximum bracketed. More points only take longer."""
 
 LOWEST_ANGLE = 1e-6
 """θ in rad at which the search starts. The spectrum is even in θ, so its limit at 0 is missed by a
-share of about (d θ)² and (τθ/T)²: 1e-9 up to a delay or low-pass of 30 samples."""
+share of about (d θ)² and (τθ/T)². That is 1e-9 up to a delay or low-pass of 30 samples."""
 
 POINTS_PER_SEGMENT = 8
 """Grid cells that share one refinement, without unit: half a ripple, which has one maximum."""
 
 GOLDEN_STEPS = 32
-"""Golden-section steps: 0.618^32 = 2e-7 of a grid cell. The spectrum is flat at its top, so the
-value there is off by less than 1e-15 of itself; more steps would compare rounding."""
+"""Golden-section steps, without unit: 0.618^32 = 2e-7 of a grid cell. The spectrum is flat at its
+top, so the value there is exact to 1e-15 of itself. More steps would only compare rounding."""
 
 BATCH = 100_000
-"""Values that are computed at once: enough that NumPy's calls do not count, and a megabyte."""
+"""Values computed at once: about a megabyte, and enough that the overhead of NumPy calls is
+negligible."""
 
 _RATIO = (np.sqrt(5) - 1) / 2
 
@@ -44,22 +45,21 @@ def wall_supremum(
     """Returns the supremum over 0 < θ <= π of (T/2) Re{(1 − e^{−jθ}) C e^{−jdθ}} / (1 − cos θ).
 
     The grid is even in θ and, with a low-pass, also in log θ down to its corner. The best cell of
-    every half ripple is then refined by golden section, because ripples can be equally high.
+    every half ripple is refined by golden section, because ripples can be equally high.
 
     Args:
         stiffness: K in N/m.
-        damping: B in N s/m, of the same shape.
+        damping: B in N s/m, of the shape of the stiffness.
         period: T in s.
-        scheme: How the damper is discretised; finite at Nyquist.
+        scheme: Discretization of the damper; must be finite at Nyquist.
         delay: d in samples.
         filter_time: τ in s.
 
     Returns:
-        The supremum in N s/m, and θ in rad at which it is attained, to about 1e-7; of equal maxima
-        the first.
+        The supremum in N s/m, and the θ in rad of its first occurrence, to about 1e-7.
     """
     grid = search_grid(delay, filter_time / period)
-    # the points of each segment; segments share their ends
+    # indices of the points of each segment; neighbouring segments share their ends
     firsts = np.arange(0, grid.size - 1, POINTS_PER_SEGMENT)
     points = np.minimum(firsts[:, None] + np.arange(POINTS_PER_SEGMENT + 1), grid.size - 1)
     batch = max(1, BATCH // max(1, stiffness.size * points.shape[1]))
@@ -88,15 +88,15 @@ def wall_supremum(
 
 
 def search_grid(delay: int, lag: float) -> _Array:
-    """Returns the angles in rad, ascending, between which maxima are looked for.
+    """Returns the grid of angles in rad, ascending, that brackets the maxima.
 
     Args:
         delay: d in samples.
         lag: τ/T, without unit.
     """
     grid = np.linspace(LOWEST_ANGLE, np.pi, POINTS_PER_RIPPLE * (delay + 1) + 1)
-    # from a hundredth of the corner on, but no nearer to an end of the first cell than a factor of
-    # two: points crowded between them could differ by rounding alone
+    # Start at a hundredth of the corner, but stay a factor of two away from both ends of the
+    # first cell: points crowded there could differ by rounding alone.
     corner = max(1e-2 / lag, 2.0 * LOWEST_ANGLE) if lag > 0 else np.inf
     if corner < 0.5 * grid[1]:
         low = np.geomspace(corner, grid[1], POINTS_PER_RIPPLE)

@@ -1,4 +1,4 @@
-"""Where in frequency a coupling asks most of a device."""
+"""Frequency at which a coupling requires the most device damping."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from hapticbridge.passivity.transfer import Discretization, SampledLaw, coupling
 from hapticbridge.passivity.wall import wall_supremum
 
 SAME = 1e-9
-"""Relative difference below which an end of the band counts as the supremum, without unit: what the
-search itself resolves."""
+"""Relative difference, without unit, below which an end of the band counts as the supremum: the
+resolution of the search."""
 
 
 def worst_frequency(
@@ -25,24 +25,24 @@ def worst_frequency(
     filter_time: float = 0.0,
     axis: Axis = "translation",
 ) -> float | NDArray[np.float64]:
-    """Returns the frequency at which the supremum of ``damping_spectrum`` is attained.
+    """Returns the frequency at which ``damping_spectrum`` reaches its supremum.
 
-    Without a delay it is Nyquist's, π/T, for every coupling (a spring alone asks for the same at
-    all frequencies; π/T stands for them). With a delay, against a wall, a soft damper leaves
-    it at low frequency and a strong one moves it towards π/((d + 1) T) and its odd multiples.
+    Without a delay it is Nyquist's, π/T, for every coupling; the spectrum of a spring alone is
+    flat. With a delay, against a wall, a soft damper leaves it at low frequency. A strong damper
+    moves it towards π/((d + 1) T) and its odd multiples.
 
     Args:
-        coupling: K and B; a ``CouplingGrid`` for many at once.
+        coupling: K and B; a ``CouplingGrid`` evaluates many at once.
         period: T in s, finite and > 0.
-        discretization: Of the damper.
+        discretization: Rule that takes the damper's velocity from sampled positions.
         delay: d, whole samples from position to force, 0 to 50.
         filter_time: τ in s of a first-order low-pass behind the damper, >= 0.
-        axis: Which pair of K and B is asked for.
+        axis: Kind of axis, which selects the pair of K and B.
 
     Returns:
-        ω in rad/s, shaped like the coupling: 0.0 where the supremum is the limit for ω → 0, π/T
-        where it is attained at Nyquist or infinite there. Accurate to about 1e-7 of π/T: the
-        spectrum is flat at its top. Of several equal maxima any one.
+        ω in rad/s, shaped like the coupling: 0.0 if the supremum is the limit for ω → 0, π/T if it
+        is reached at Nyquist or infinite there. Accurate to about 1e-7 of π/T, because the spectrum
+        is flat at its top. Of several equal maxima any one.
 
     Raises:
         CouplingError: An argument is out of range or unknown.
@@ -54,10 +54,10 @@ def worst_frequency(
     k, b, period, samples, tau, is_ringing = law
     if samples == 0:
         return plain(np.full(k.shape, np.pi / period))
-    # a spring alone is the same under either rule, and the backward difference is finite at Nyquist
+    # both rules agree for a spring alone, and the backward difference is finite at Nyquist
     scheme: Discretization = "backward" if is_ringing else discretization
     top, angle = wall_supremum(k, b, period, scheme, samples, tau)
-    # d T K is what the delay adds to K T/2 − B, the limit at ω → 0
+    # limit at ω → 0: K T/2 − B plus d T K for the delay
     at_zero = (samples + 0.5) * k * period - b
     nyquist = np.asarray(np.pi)
     transfer = coupling_transfer(k, b, period, nyquist, scheme, tau) * (-1.0) ** samples

@@ -1,4 +1,4 @@
-"""The passive hand that makes a sampled loop unstable first."""
+"""Passive hand that makes a sampled loop unstable first."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from hapticbridge.passivity.transfer import angles
 class WorstHand:
     """Device and worst passive hand: a damper b beside a lossless line tuned to one frequency.
 
-    A hand that takes no power can still turn the phase of the loop, and the worst one turns it
-    until the loop closes on itself at θ0 = ω T. Device mass and hand together are then one of
+    A hand that absorbs no power can still turn the phase of the loop. The worst hand turns it until
+    the loop closes on itself at θ0 = ω T. Device mass and hand together are then one of
 
         Z tanh(sT/2)   at θ:  +j Z tan(θ/2)   (like a mass)
         Z coth(sT/2)   at θ:  −j Z cot(θ/2)   (like a spring)
 
-    With H the response that the device feels, force per displacement at θ0, the loop is marginal
-    at θ0 precisely for
+    Let H be the response at the device, force per displacement at θ0. The loop is marginal at θ0
+    for
 
         b = (T/2)(Re H − cot(θ0/2) Im H)
         X = (T/2)(Im H + cot(θ0/2) Re H),    Z = X cot(θ0/2) if X >= 0, else Z = −X tan(θ0/2)
 
-    (the first line is the bound of Colgate & Schenkel at θ0). Where H is real, and so for a spring,
-    Z = b cot²(θ0/2). At Nyquist Z = 0 and the damper alone is the worst hand.
+    The first line is the bound of Colgate & Schenkel at θ0. For a real H, as of a spring, Z = b
+    cot²(θ0/2). At Nyquist Z = 0 and the damper alone is the worst hand.
 
     Under a zero-order hold the recursion is exact, σ = 1 for tanh and −1 for coth:
 
@@ -39,7 +39,7 @@ class WorstHand:
 
     Attributes:
         damping: b of the device in N s/m, finite and > 0.
-        frequency: ω in rad/s, 0 < ω <= π/T: where the hand is worst.
+        frequency: ω in rad/s to which the hand is tuned, 0 < ω <= π/T.
         period: T in s, finite and > 0.
         response: H(e^{jθ0}) in N/m; None for the line of a real H, Z = b cot²(θ0/2).
 
@@ -68,9 +68,9 @@ class WorstHand:
 
     @property
     def reactance(self) -> float:
-        """X in N s/m at θ0: > 0 like a mass, < 0 like a spring."""
+        """Reactance X in N s/m at θ0: > 0 like a mass, < 0 like a spring."""
         theta = float(angles(self.frequency, self.period))
-        # at Nyquist 1/tan(π/2) leaves 6e-17 of the response, which must not count as a line
+        # at Nyquist 1/tan(π/2) is 6e-17 instead of 0, which must not create a line
         cotangent = 0.0 if theta == np.pi else 1 / np.tan(theta / 2)
         if self.response is None:
             return float(self.damping * cotangent)
@@ -90,6 +90,6 @@ class WorstHand:
         """Returns (p, q, r) of v_k = p v_{k−1} + q F_k + r F_{k−1}, in 1 and m/(N s)."""
         b, z = self.damping, self.impedance
         if z == 0:
-            return 0.0, 1 / b, 0.0  # the line's own pole at −1 cancels; do not carry it along
+            return 0.0, 1 / b, 0.0  # the line's own pole at −1 cancels
         sign = 1.0 if self.reactance >= 0 else -1.0
         return sign * (z - b) / (b + z), 1 / (b + z), sign / (b + z)

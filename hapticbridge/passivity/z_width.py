@@ -1,7 +1,7 @@
-"""Z-width: which stiffness and damping a device can show, and what limits it.
+"""Z-width: the stiffness and damping that a device can render, and its limits.
 
-B is the damping of the coupling's law here, that is B' where a method adds damping by itself and
-more is felt (``compensation``); the sentences say B'.
+B is the damping of the coupling's law. For a method that adds damping by integration it is B', and
+the effective damping is higher (``compensation``); the printed sentences use B'.
 """
 
 from __future__ import annotations
@@ -25,15 +25,16 @@ NO_LIMIT_CYCLES = "free of limit cycles"
 WITHOUT_HAND = "stable without a hand"
 
 LEAST_FRICTION_SHARE = 0.1
-"""Share of the device's damping that friction must allow, f_c T/Δ >= share · b, to be counted as a
-limit, without unit. Below it a coupling free of limit cycles would be softer than a tenth of the
-passive one, and the result tells of limit cycles instead. Our choice; larger tolerates more."""
+"""Smallest f_c T/Δ, as a share of the device's damping b, at which friction counts as a limit,
+without unit. Below it a coupling free of limit cycles would be softer than a tenth of the passive
+one, so the result reports limit cycles instead. A larger value reports them earlier. Our choice."""
 
 MOST_POINTS = 100_000
-"""Most values of B: far more than a picture has pixels."""
+"""Largest number of values of B: far more than the pixels of a plot."""
 
 MARGIN_OF_RANGE = 1.25
-"""How far B reaches beyond what passivity allows, without unit; more shows more of what is not."""
+"""Range of B divided by the largest passive B, without unit. A larger value shows more of the
+region that is not passive."""
 
 _CYCLES = "limit cycles, which stay bounded as long as K < 2b/T"
 _DELAYED = "with a delay the bound is that of a wall; in general none can be promised, meter it"
@@ -41,14 +42,15 @@ _DELAYED = "with a delay the bound is that of a wall; in general none can be pro
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LimitLine:
-    """One line in the plane of K and B; below it, its name is true.
+    """A limit in the plane of K and B; below the line the named property holds.
 
     Attributes:
-        name: What holds below the line.
+        name: Property that holds below the line.
         reason: The condition, in one line.
         stiffness: Largest K in N/m at each B of the result, >= 0.
-        largest_damping: B in N s/m at which K has fallen to 0.
-        is_required: Whether it bounds the region to use; else it is shown for information.
+        largest_damping: B in N s/m at which K falls to 0.
+        is_required: True if the line bounds the usable region; otherwise it is shown for
+            information.
     """
 
     name: str
@@ -60,23 +62,23 @@ class LimitLine:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ZWidth:
-    """The region of couplings that a device can show: 0 < K < limit(B).
+    """Region of couplings that a device can render: 0 < K < limit(B).
 
     Attributes:
         damping: B in N s/m, ascending from 0, shape (n,).
         lines: All lines, each of the shape of ``damping``.
-        limit: Least K in N/m over the lines that are required, shape (n,).
+        limit: Smallest K in N/m over the required lines, shape (n,).
         limited_by: Name of that line at each B.
-        corner: The coupling to use (translation; its rotational part is 0): B is a quarter of what
-            the limit allows at K → 0, K is 80 % of the limit there.
+        corner: Recommended coupling in translation (rotational part 0). B is a quarter of the limit
+            at K → 0, K is 80 % of the limit at that B.
         corner_limited_by: Name of the line above the corner.
-        notes: What the lines leave open, in sentences.
+        notes: Sentences about effects that the lines do not cover.
         device_damping: b in N s/m.
         period: T in s.
         delay: d in samples.
         filter_time: τ in s.
-        mass: m_d in kg; None where it was not given.
-        friction: f_c in N; None where it was not given.
+        mass: m_d in kg; None if unknown.
+        friction: f_c in N; None if unknown.
         resolution: Δ in m.
     """
 
@@ -107,32 +109,35 @@ def z_width(
     filter_time: float = 0.0,
     points: int = 101,
 ) -> ZWidth:
-    """Returns the couplings (K, B) that a device can show, and which to use.
+    """Returns the couplings (K, B) that a device can render, and a recommended one.
 
         passive for any hand     K = 2(b − B T/(T + 2τ))/T              d = 0
         passive against a wall   minimum_damping(K, B, delay=d) = b     d >= 1
         free of limit cycles     K = 2(f_c/Δ − B/T)                     Δ > 0
-        stable without a hand    ``free_device_stiffness``              m_d given
+        stable without a hand    ``free_device_stiffness``              m_d known
 
     Without a delay the first line is sufficient for any passive hand and any environment that is
-    discrete-time passive. **With a delay no bound holds for a general environment**: the line is
-    that of a wall, necessary but not sufficient, and the energy meter must decide. The friction
-    line is that of a loop without delay and without low-pass (which makes the damper's jumps
-    smaller). It is required only where f_c T/Δ reaches ``LEAST_FRICTION_SHARE`` of b; else limit
-    cycles are to be expected, which stay bounded while β = b/(K T) > ½, that is everywhere below
-    the first line, and the note says so. What is passive against a wall is stable without a hand:
-    the last line lies above the first one, and where rounding puts that of a very heavy device
-    below, the first one is taken.
+    discrete-time passive. **With a delay no bound holds for a general environment**: the line
+    against a wall is necessary but not sufficient, and the energy meter must decide.
+
+    The friction line holds for a loop without delay and low-pass; a low-pass makes the damper's
+    jumps smaller. It is required only if f_c T/Δ reaches ``LEAST_FRICTION_SHARE`` of b. Otherwise a
+    note announces limit cycles, which stay bounded while β = b/(K T) > ½, that is below the first
+    line.
+
+    A coupling that is passive against a wall is stable without a hand, so the last line lies above
+    the first one. If rounding puts the line of a very heavy device below it, the first line is
+    used.
 
     Args:
         device_damping: b in N s/m, finite and > 0.
         period: T in s, finite and > 0.
-        mass: m_d in kg, finite and > 0; None leaves its line out.
+        mass: m_d in kg, finite and > 0; None omits its line.
         friction: f_c in N, finite and >= 0; None: unknown.
         resolution: Δ in m, finite and >= 0; 0: positions are exact.
         delay: d, whole samples from position to force, 0 to 50.
         filter_time: τ in s, >= 0, of a first-order low-pass behind the damper.
-        points: How many values of B, >= 2.
+        points: Number of values of B, >= 2.
 
     Raises:
         CouplingError: An argument is out of range.
@@ -154,7 +159,7 @@ def z_width(
     is_kept = (allowed or 0.0) >= LEAST_FRICTION_SHARE * loop.b
     available = min(passive_damping, allowed) if allowed and is_kept else passive_damping
     grid = np.linspace(0.0, MARGIN_OF_RANGE * passive_damping, count)
-    # the corner's B rides along at the end of the arrays
+    # the last element of the arrays is the corner's B
     damping = np.append(grid, DAMPING_SHARE * available)
 
     lines = [_passive_line(loop, damping, passive_damping)]
@@ -165,7 +170,7 @@ def z_width(
     if mass is not None:
         heft = scalar("mass", mass, "kg", positive=True)
         lines.append(_free_line(loop, heft, damping, lines[0]))
-    # where several are 0, the one that was so first limits
+    # if several lines are 0, the one that reached 0 at the smallest B is the limit
     required = [line for line in lines if line.is_required]
     required.sort(key=lambda line: line.largest_damping)
     rows = np.stack([line.stiffness for line in required])
@@ -200,7 +205,7 @@ def _free_line(loop: PassiveLine, mass: float, damping: _Array, passive: LimitLi
     b, period, late, tau = loop.b, loop.period, loop.delay, loop.filter_time
     stiffness = free_device_stiffness(b, period, mass, damping, delay=late, filter_time=tau)
     largest = free_device_damping(b, period, mass, delay=late, filter_time=tau)
-    # the roots of a heavy device lie so near to 1 that its damping is lost in rounding
+    # the roots of a heavy device lie so near to 1 that rounding hides its damping
     stiffness = np.maximum(stiffness, passive.stiffness)
     largest = max(float(largest), passive.largest_damping)
     reason = f"{mass:g} kg let go against a wall"
@@ -210,7 +215,7 @@ def _free_line(loop: PassiveLine, mass: float, damping: _Array, passive: LimitLi
 def _friction(
     friction: float | None, quantum: float, loop: PassiveLine
 ) -> tuple[float | None, str]:
-    """Returns f_c T/Δ, what friction allows of B (None: no such line), and what to say of it."""
+    """Returns f_c T/Δ, the largest B that friction allows (None: no such line), and a note."""
     known = None if friction is None else scalar("friction", friction, "N")
     if quantum == 0:
         return None, ""

@@ -1,12 +1,12 @@
-"""MJCF scenes put behind a haptic device: loading, the handle and its coupling, checks.
+"""MJCF scenes behind a haptic device: loading, handle, coupling and checks.
 
-Read ``load`` first: it reads a scene, puts the handle and its coupling into it (``attach``,
-``start``), compiles it (``compiler``) and refuses what no hand should feel (``checks``). What comes
-out is ``scene.Scene``, which a bridge steps. ``source`` keeps the files' bytes for the recording;
-``parameter_file`` and ``parameters`` are what a user may set, ``custom`` what the file says of
-itself, ``library`` the scenes that are shipped. ``contact_rule``, with ``contact_check`` and
-``contact_concerns``, is what was measured of contacts that create energy. ``methods`` and ``weld``
-serve the methods that exist to be compared.
+Read ``load`` first. It reads a scene, adds the handle and its coupling (``attach``, ``start``),
+compiles it (``compiler``) and refuses unsuitable scenes (``checks``). The result is a
+``scene.Scene``, which a bridge steps. ``source`` keeps the files' bytes for the recording.
+``parameter_file`` and ``parameters`` hold the scene's settable numbers, ``custom`` its custom data,
+``library`` the shipped scenes. ``contact_rule``, ``contact_check`` and ``contact_concerns`` hold a
+measured rule for contacts that generate energy. ``methods`` and ``weld`` serve the methods for
+comparison.
 """
 
 from hapticbridge.scene.custom import custom_numbers as custom_numbers

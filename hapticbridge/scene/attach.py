@@ -1,9 +1,12 @@
-"""Adds the handle and its coupling to a scene's specification.
+"""Handle and coupling, added to a scene's specification.
 
-The coupling is expressed in MuJoCo: six site actuators from the handle's site to the grip,
-force = −K l − B l̇ + B u, where l is the grip's pose in the handle's frame and u, the control, the
-handle's velocity in that frame. Under ``integrator="discrete"`` it is implicit in position and
-velocity and solved together with the contacts.
+The coupling consists of six MuJoCo site actuators from the handle's site to the grip,
+
+    force = −K l − B l̇ + B u
+
+l is the grip's pose in the handle's frame; the control u is the handle's velocity in that frame.
+Under ``integrator="discrete"`` the coupling is implicit in position and velocity and is solved
+together with the contacts.
 """
 
 from __future__ import annotations
@@ -15,7 +18,7 @@ from hapticbridge.errors import SceneError, choices
 from hapticbridge.kernel.names import COUPLING_ACTUATORS, HANDLE, WELD_NAME
 
 _PREFIX = "hapticbridge_"
-"""Keeps the default class that comes along with the handle apart from the scene's classes."""
+"""Prefix that separates the handle's default class from the scene's classes."""
 
 
 def attach_handle(spec: mujoco.MjSpec, grip: str) -> None:
@@ -26,7 +29,7 @@ def attach_handle(spec: mujoco.MjSpec, grip: str) -> None:
         grip: Name of the site on the tool.
 
     Raises:
-        SceneError: There is no such site, or a name that the bridge needs is taken.
+        SceneError: The site does not exist, or the scene uses a name that the bridge adds.
     """
     sites = [site.name for site in spec.sites if site.name]
     if grip not in sites:
@@ -42,14 +45,15 @@ def attach_handle(spec: mujoco.MjSpec, grip: str) -> None:
     _refuse_taken("site", HANDLE, sites)
     for name in COUPLING_ACTUATORS:
         _refuse_taken("actuator", name, [actuator.name for actuator in spec.actuators])
-    # a weld comes later, if at all, and is then known by its name alone
+    # a weld is added later and identified by its name only
     _refuse_taken("equality constraint", WELD_NAME, [each.name for each in spec.equalities])
 
-    # made apart: a <default> of the scene would turn its site, boundmass would give it weight
-    apart = mujoco.MjSpec()
-    made = apart.worldbody.add_body(name=HANDLE, mocap=True)
-    made.add_site(name=HANDLE)
-    body = spec.worldbody.add_frame().attach_body(made, _PREFIX, "")
+    # in a specification of its own: a <default> of the scene could rotate the handle's site, and
+    # boundmass could give it mass
+    handle_spec = mujoco.MjSpec()
+    handle = handle_spec.worldbody.add_body(name=HANDLE, mocap=True)
+    handle.add_site(name=HANDLE)
+    body = spec.worldbody.add_frame().attach_body(handle, _PREFIX, "")
     body.name = body.sites[0].name = HANDLE
     for axis, name in enumerate(COUPLING_ACTUATORS):
         _add_coupling_actuator(spec, name, axis, grip)
@@ -58,12 +62,12 @@ def attach_handle(spec: mujoco.MjSpec, grip: str) -> None:
 def _refuse_taken(kind: str, name: str, taken: list[str]) -> None:
     if name in taken:
         raise SceneError(
-            f"the scene already has {kind} '{name}', a name that the bridge adds; rename yours"
+            f"the scene already has {kind} '{name}', a name that the bridge adds; rename it"
         )
 
 
 def _add_coupling_actuator(spec: mujoco.MjSpec, name: str, axis: int, grip: str) -> None:
-    """Sets every field: a user's ``<default><general …>`` would reach what is left unset."""
+    """Adds an actuator with every field set, so that no <default> of the scene applies."""
     actuator = spec.add_actuator(name=name)
     gear = np.zeros(6)
     gear[axis] = 1.0
@@ -86,10 +90,10 @@ def _add_coupling_actuator(spec: mujoco.MjSpec, name: str, axis: int, grip: str)
 
 
 def set_options(spec: mujoco.MjSpec) -> None:
-    """Sets the options under which the coupling is implicit and every step's energy is known."""
+    """Sets the options for an implicit coupling and a known energy of every step."""
     option = spec.option
     option.integrator = mujoco.mjtIntegrator.mjINT_DISCRETE
     option.solver = mujoco.mjtSolver.mjSOL_NEWTON
     option.enableflags |= mujoco.mjtEnableBit.mjENBL_ENERGY | mujoco.mjtEnableBit.mjENBL_DIAGEXACT
-    # a reset in mid-run would jump the tool without a word; the guard trips on what is not finite
+    # a reset during a run would move the tool unnoticed; the guard trips on non-finite values
     option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET

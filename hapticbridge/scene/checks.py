@@ -1,4 +1,4 @@
-"""What a scene must satisfy before a hand may feel it; each refusal is one sentence."""
+"""Requirements on a scene before it may be felt."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from hapticbridge.kernel.names import COUPLING_ACTUATORS
 from hapticbridge.scene.source import SourceFile, read_elements
 
 MAXIMUM_START_PENETRATION = 1e-4
-"""How deep the tool may start inside something, in m. A start in penetration releases contact
-energy that nobody meters: 26 mJ within 15 ms were seen."""
+"""Largest penetration of the tool at the start, in m. A penetration releases contact energy that no
+port meters: 26 mJ within 15 ms were measured. A larger value allows a larger push at the start."""
 
 
 def check_options(spec: mujoco.MjSpec) -> list[str]:
-    """Refuses options that do not belong under a bridge; returns warnings.
+    """Refuses options that are incompatible with the coupling; returns warnings.
 
     Raises:
-        SceneError: An option excludes the coupling from the implicit step (PGS, noslip), carries
-            state that is not saved (ipc), or switches off actuators or the step itself.
+        SceneError: An option excludes the coupling from the implicit step (PGS, noslip), has state
+            that is not saved (ipc), or disables actuators or the step.
     """
     option = spec.option
     if option.solver == mujoco.mjtSolver.mjSOL_PGS:
@@ -42,8 +42,8 @@ def check_options(spec: mujoco.MjSpec) -> list[str]:
         )
     if option.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP:
         raise SceneError(
-            "the scene enables flag sleep, under which a sleeping tool would not feel its "
-            "coupling; disable it"
+            "the scene enables flag sleep, under which the coupling would not move a sleeping "
+            "tool; disable it"
         )
     if option.disableflags & mujoco.mjtDisableBit.mjDSBL_ACTUATION:
         raise SceneError(
@@ -63,20 +63,21 @@ def check_options(spec: mujoco.MjSpec) -> list[str]:
         )
     if np.any(np.asarray(option.wind)):
         warnings.append(
-            "wind does work on the scene that no port meters; the environment may be called active"
+            "wind does work on the scene that no port meters; the audit may report the environment "
+            "as active"
         )
     return warnings
 
 
 _MASSES = ("mass", "density", "diaginertia", "fullinertia")
-_FREE_TEXT = ("text", "numeric")  # <custom>: nobody computes with it
+_FREE_TEXT = ("text", "numeric")  # <custom> elements, which MuJoCo does not compute with
 
 
 def check_numbers(sources: Iterable[SourceFile]) -> None:
-    """Refuses nan wherever it is written, and masses and inertias that are not finite.
+    """Refuses nan in any attribute, and masses and inertias that are not finite.
 
-    MuJoCo takes ``mass="nan"`` for a mass that was not given, and computes one; elsewhere it warns,
-    and what a nan reaches stands still or ends the run.
+    MuJoCo treats ``mass="nan"`` as a missing mass and computes one. Elsewhere it only warns, and a
+    nan stops parts of the scene or ends the run.
 
     Raises:
         SceneError: Names the file, the line, the element and the value.
@@ -116,7 +117,7 @@ def _number(word: str) -> float:
     try:
         return float(word)
     except ValueError:
-        return 0.0  # no number, and MuJoCo says better what is wrong with it
+        return 0.0  # not a number; MuJoCo's own message is more specific
 
 
 def check_model(model: mujoco.MjModel, grip: str) -> list[str]:
@@ -124,7 +125,7 @@ def check_model(model: mujoco.MjModel, grip: str) -> list[str]:
 
     Raises:
         SceneError: Masses or inertias are not finite, the grip cannot move, a joint would cap the
-            coupling's force, or a coupling actuator is not as it was set.
+            coupling's force, or a default of the scene changed a coupling actuator.
     """
     for body_id in range(model.nbody):
         mass, inertia = model.body_mass[body_id], model.body_inertia[body_id]
@@ -154,8 +155,8 @@ def check_model(model: mujoco.MjModel, grip: str) -> list[str]:
     warnings = []
     if np.any(model.geom_surfacevel):
         warnings.append(
-            "a geom's surfacevel does work on the scene that no port meters; the environment may "
-            "be called active"
+            "a geom's surfacevel does work on the scene that no port meters; the audit may report "
+            "the environment as active"
         )
     return warnings
 
@@ -183,13 +184,13 @@ def _check_coupling_actuator(model: mujoco.MjModel, name: str) -> None:
     )
     if not is_as_set:
         raise SceneError(
-            f"a <default> of the scene reached the coupling's actuator '{name}'; move it into a "
-            "named class"
+            f"a <default> of the scene changed the coupling's actuator '{name}'; move that default "
+            "into a named class"
         )
 
 
 def check_start(model: mujoco.MjModel, data: mujoco.MjData, grip: str) -> None:
-    """Refuses a start that is not finite or in which the tool is inside something.
+    """Refuses a start that is not finite or in which the tool penetrates a body.
 
     Args:
         model: The compiled scene.
@@ -197,7 +198,7 @@ def check_start(model: mujoco.MjModel, data: mujoco.MjData, grip: str) -> None:
         grip: Name of the site on the tool.
 
     Raises:
-        SceneError: Names the pair of geoms and the depth.
+        SceneError: Names the state or the pair of geoms, with the depth.
     """
     for name in ("qpos", "qvel", "act", "ctrl", "mocap_pos", "mocap_quat", "qacc"):
         if not np.all(np.abs(getattr(data, name)) <= mujoco.mjMAXVAL):
@@ -216,8 +217,8 @@ def check_start(model: mujoco.MjModel, data: mujoco.MjData, grip: str) -> None:
         if root in roots:
             names = " and ".join(_side_name(model, geom, flex) for geom, flex in pair)
             raise SceneError(
-                f"the tool starts {-contact.dist * 1e3:.3g} mm inside something: {names} overlap; "
-                f"at most {MAXIMUM_START_PENETRATION * 1e3:g} mm are allowed"
+                f"the tool starts in penetration: {names} overlap by {-contact.dist * 1e3:.3g} mm; "
+                f"at most {MAXIMUM_START_PENETRATION * 1e3:g} mm are allowed; move the tool's start"
             )
 
 

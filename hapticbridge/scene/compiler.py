@@ -1,4 +1,4 @@
-"""MuJoCo's compiler, fed with the bytes of a scene's files, and its errors as a clause."""
+"""Compilation of a scene from the bytes of its files."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from hapticbridge.scene.source import SourceFile
 
 
 def compiled(spec: mujoco.MjSpec, sources: tuple[SourceFile, ...]) -> mujoco.MjModel:
-    """Compiles a scene from the bytes of its files instead of from their places.
+    """Compiles a scene from the bytes of its files, independent of their folder.
 
-    A compiled model names the files of its meshes and textures; with their places it would differ
-    from folder to folder, and a recording would tell where its user keeps what. Files outside the
-    scene's own folder, and whatever MuJoCo finds only by itself, are taken from where they are.
+    A compiled model names the files of its meshes and textures. With their paths it would differ
+    from folder to folder, and a recording would reveal the user's folders. Files outside the
+    scene's own folder, and files that only MuJoCo finds, are read from their place.
     """
     main, *assets = sources
     if not assets or "/" in main.name:
@@ -45,13 +45,13 @@ _WORDING: tuple[tuple[str, str | Callable[[re.Match[str]], str]], ...] = (
         r"could not find decoder.*",
         "its name must end in .xml and it must hold MJCF (of a compiled .mjb, the file behind it)",
     ),
-    (r"(engine error: Could not allocate memory)", r"\1; ask for less in <size>"),
+    (r"(engine error: Could not allocate memory)", r"\1; reduce the numbers in <size>"),
 )
-"""How MuJoCo words an error, and how that reads behind a colon."""
+"""Patterns of MuJoCo's error messages, and their wording after a colon."""
 
 
 def clause(error: Exception) -> str:
-    """Returns what MuJoCo said was wrong, to be put behind a colon."""
+    """Returns MuJoCo's error message, worded to follow a colon."""
     text = " ".join(str(error).split())
     for pattern, wording in _WORDING:
         text = re.sub(pattern, wording, text)

@@ -1,4 +1,4 @@
-"""Which contacts of a scene the measured rule has concerns about, by name."""
+"""Contacts of a scene, checked against the measured rule."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from hapticbridge.scene.contact_concerns import contact_concerns
 
 
 class ContactSetting(NamedTuple):
-    """What MuJoCo gives a contact: solref, solimp, condim, and the coefficient of sliding."""
+    """MuJoCo's parameters of a contact; ``friction`` is the coefficient of sliding."""
 
     solref: tuple[float, ...]
     solimp: tuple[float, ...]
@@ -24,8 +24,8 @@ class ContactSetting(NamedTuple):
     friction: float
 
 
-class _Say(NamedTuple):
-    """What one geom has to say in the mixture; the fields are MuJoCo's."""
+class _GeomSetting(NamedTuple):
+    """Contact parameters of one geom, before mixing; the fields are MuJoCo's."""
 
     priority: int
     solmix: float
@@ -36,12 +36,12 @@ class _Say(NamedTuple):
 
 
 def warn_of_contacts(model: mujoco.MjModel, grip: str, scene: object) -> None:
-    """Warns of contacts that are likely to create more energy than the slack allows.
+    """Warns of contacts that are likely to generate more energy than the slack allows.
 
     Args:
-        model: The compiled scene with the time step that it will run at.
+        model: The compiled scene with the time step of the run.
         grip: Name of the site on the tool.
-        scene: Its path, for the sentence.
+        scene: Path of the scene, for the message.
     """
     for concern in check_contacts(model, grip):
         warnings.warn(f"scene '{scene}': {concern}", UserWarning, stacklevel=3)
@@ -54,29 +54,29 @@ def check_contacts(
     is_thorough: bool = False,
     only: Collection[frozenset[int]] | None = None,
 ) -> list[str]:
-    """Returns what ``contact_concerns`` says about the contacts that the tool can have.
+    """Returns the concerns about all contacts that the tool can have.
 
-    Flexes, and the ``solreffriction`` of pairs, are not looked at.
+    Flexes, and the ``solreffriction`` of pairs, are not checked.
 
     Args:
-        model: The compiled scene with the time step that it will run at.
+        model: The compiled scene with the time step of the run.
         grip: Name of the site on the tool.
-        is_thorough: Whether to say too where a contact is soft or solved with the approximate
-            diagonal: MuJoCo's defaults, for which nobody asked. Otherwise only what is likely to
-            create more energy than the slack allows.
-        only: Pairs of geoms to look at; None: all that the tool can have.
+        is_thorough: If true, soft contacts and the approximate diagonal are reported too; both are
+            MuJoCo's defaults. Otherwise only contacts that are likely to generate more energy than
+            the slack allows.
+        only: Pairs of geoms to check; None: all that the tool can have.
     """
-    option, where = model.opt, dict[ContactSetting, list[str]]()
+    option, names_by_setting = model.opt, dict[ContactSetting, list[str]]()
     pairs = contact_settings(model, grip) if only is None else settings_among(model)
     for first, second, setting in pairs:
         if only is None or frozenset((first, second)) in only:
             names = f"{geom_name(model, first)} with {geom_name(model, second)}"
-            where.setdefault(setting, []).append(names)
+            names_by_setting.setdefault(setting, []).append(names)
     step = float(option.timestep)
     return [
         f"the contact of {names[0]}{_others(len(names) - 1)} (solref {_words(setting.solref)}, "
         f"solimp {_words(setting.solimp[:3])}, time step {step:g} s) {concern}"
-        for setting, names in where.items()
+        for setting, names in names_by_setting.items()
         for concern in contact_concerns(
             setting.solref,
             setting.solimp,
@@ -92,10 +92,10 @@ def check_contacts(
 
 
 def contact_settings(model: mujoco.MjModel, grip: str) -> Iterator[tuple[int, int, ContactSetting]]:
-    """Yields geoms that may collide, one of the tool at least, with their contact's setting.
+    """Yields pairs of geoms that may collide, at least one of the tool, with their setting.
 
-    The tool is all that moves with the grip: the bodies below one child of the world. Whether two
-    geoms are ever near each other is not asked.
+    The tool consists of everything that moves with the grip: the bodies below one child of the
+    world. Distances are ignored, so a pair may never meet.
 
     Args:
         model: The compiled scene.
@@ -105,7 +105,7 @@ def contact_settings(model: mujoco.MjModel, grip: str) -> Iterator[tuple[int, in
 
 
 def tool_geoms(model: mujoco.MjModel, grip: str) -> NDArray[np.bool_]:
-    """Tells of every geom whether it is of the tool: whether it moves with the grip."""
+    """Returns a mask of the geoms that move with the grip, shape (ngeom,)."""
     root = model.body_rootid[model.site(grip).bodyid[0]]
     return np.asarray(model.body_rootid[model.geom_bodyid] == root, dtype=bool)
 
@@ -113,12 +113,12 @@ def tool_geoms(model: mujoco.MjModel, grip: str) -> NDArray[np.bool_]:
 def settings_among(
     model: mujoco.MjModel, among: NDArray[np.bool_] | None = None
 ) -> Iterator[tuple[int, int, ContactSetting]]:
-    """Yields geoms that may collide with their contact's setting; ``among`` as in the pairs."""
-    mixed = cache(_mixed)  # geoms of one class say the same
-    says = [_say(model, g) for g in range(model.ngeom)]
+    """Yields pairs of geoms that may collide, as ``meeting_pairs``, with their setting."""
+    mixed = cache(_mixed)  # many geoms share their parameters
+    geoms = [_geom_setting(model, g) for g in range(model.ngeom)]
     for first, second, pair in meeting_pairs(model, among):
         if pair < 0:
-            setting = mixed(says[first], says[second])
+            setting = mixed(geoms[first], geoms[second])
         else:
             setting = ContactSetting(
                 _floats(model.pair_solref[pair]),
@@ -132,14 +132,14 @@ def settings_among(
 def meeting_pairs(
     model: mujoco.MjModel, among: NDArray[np.bool_] | None = None
 ) -> Iterator[tuple[int, int, int]]:
-    """Yields geoms that may collide, by masks, exclusions, parents and explicit pairs.
+    """Yields pairs of geoms that may collide, by masks, exclusions, parents and explicit pairs.
 
     Args:
         model: The compiled scene.
-        among: Per geom, whether a pair with it counts; None counts all.
+        among: Mask of geoms of which at least one must belong to the pair; None: all.
 
     Yields:
-        Two geoms, and the explicit pair that they are, or -1.
+        Two geoms, and the index of their explicit pair, or -1.
     """
     disable = mujoco.mjtDisableBit
     if model.opt.disableflags & (disable.mjDSBL_CONTACT | disable.mjDSBL_CONSTRAINT):
@@ -162,17 +162,17 @@ def meeting_pairs(
 
 
 def _partners(model: mujoco.MjModel, geom: int) -> NDArray[np.bool_]:
-    """Tells which geoms pass MuJoCo's filters of masks, welded bodies, and parents."""
+    """Returns a mask of the geoms that pass MuJoCo's filters (masks, welded bodies, parents)."""
     meets = (model.geom_contype[geom] & model.geom_conaffinity) | (
         model.geom_contype & model.geom_conaffinity[geom]
     )
-    # bodies without joints between them are one
+    # bodies without joints between them count as one
     group = model.body_weldid[model.geom_bodyid]
     parent = model.body_weldid[model.body_parentid[group]]
     can_meet = (meets != 0) & (group != group[geom])
     if not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_FILTERPARENT:
         is_near = (parent == group[geom]) | (group == parent[geom])
-        # the world is no parent in this
+        # MuJoCo does not count the world as a parent here
         can_meet &= ~is_near | (group == 0) | (group[geom] == 0)
     return np.asarray(can_meet, dtype=bool)
 
@@ -181,10 +181,10 @@ def _excluded(model: mujoco.MjModel) -> set[frozenset[int]]:
     return {frozenset((int(s) >> 16, int(s) & 0xFFFF)) for s in model.exclude_signature}
 
 
-def _mixed(one: _Say, other: _Say) -> ContactSetting:
-    """Mixes as MuJoCo's ``mj_contactParam`` does."""
+def _mixed(one: _GeomSetting, other: _GeomSetting) -> ContactSetting:
+    """Mixes two geoms' parameters by the rules of MuJoCo's ``mj_contactParam``."""
     if one.priority != other.priority:
-        sole = max(one, other, key=lambda say: say.priority)
+        sole = max(one, other, key=lambda geom: geom.priority)
         return ContactSetting(sole.solref, sole.solimp, sole.condim, sole.friction)
     least = mujoco.mjMINVAL
     if one.solmix >= least and other.solmix >= least:
@@ -209,8 +209,8 @@ def _mixed(one: _Say, other: _Say) -> ContactSetting:
     )
 
 
-def _say(model: mujoco.MjModel, geom: int) -> _Say:
-    return _Say(
+def _geom_setting(model: mujoco.MjModel, geom: int) -> _GeomSetting:
+    return _GeomSetting(
         int(model.geom_priority[geom]),
         float(model.geom_solmix[geom]),
         _floats(model.geom_solref[geom]),
@@ -245,6 +245,6 @@ def _others(count: int) -> str:
 
 
 def geom_name(model: mujoco.MjModel, geom_id: int) -> str:
-    """Returns what a sentence calls a geom: its name, or its number where it has none."""
+    """Returns the name of a geom for a message, or its number if it has no name."""
     name = model.geom(geom_id).name
     return f"geom '{name}'" if name else f"geom {geom_id}"

@@ -1,4 +1,4 @@
-"""What the measured rule for contacts has to say against a setting, in words."""
+"""Concerns about a contact's setting, in words."""
 
 from __future__ import annotations
 
@@ -16,16 +16,17 @@ from hapticbridge.scene.contact_rule import (
 )
 
 LOW_FRICTION = 0.4
-"""Coefficient below which a pyramidal cone is called a risk, no unit. Measured once, not in the
-map: with MuJoCo's default ``solref`` 0.96 of the slack at 0.42; a test has 1.5 times it at 0.1."""
+"""Coefficient of sliding, without unit, below which a pyramidal cone counts as a risk. Measured
+apart from the map: with MuJoCo's default ``solref`` 0.96 of the slack was used at 0.42. A test uses
+1.5 times the slack at 0.1."""
 
 SOFT_STEPS = 10.0
-"""timeconst·dampratio/h beyond which a contact is called soft: 25 times softer than at 2 h, some
-0.3 mm under 3 N on a 0.1 kg peg (computed), more than its clearance."""
+"""timeconst·dampratio/h above which a contact counts as soft. It is then 25 times softer than at 2
+h: some 0.3 mm under 3 N on a peg of 0.1 kg (computed), more than its clearance."""
 
 
 def suggested_solref(timestep: float) -> str:
-    """Returns the attribute that is strict at a time step in s: timeconst h/2, dampratio 8."""
+    """Returns the strict ``solref`` for a time step in s: timeconst h/2, dampratio 8."""
     return f'solref="{SUGGESTED[0] * timestep:g} {SUGGESTED[1]:g}"'
 
 
@@ -41,33 +42,33 @@ def contact_concerns(
     friction: float = 1.0,
     only_active: bool = False,
 ) -> list[str]:
-    """Says what a contact setting risks, one clause each; nothing where it is as recommended.
+    """Returns the risks of a contact setting, one clause each; empty for a recommended setting.
 
     Args:
-        solref: As ``contact_numbers`` takes it.
-        solimp: Likewise.
+        solref: (timeconst in s, dampratio), or (−stiffness in 1/s², −damping in 1/s).
+        solimp: MuJoCo's d₀, d_w, width in m, midpoint, power; trailing values may be left out.
         timestep: h in s.
-        cone: Of friction; it matters for condim > 1 and a friction below 0.4 only.
-        diagexact: Whether MuJoCo's exact diagonal is on; without it more runs of the map's shipped
-            setting create energy.
-        refsafe: As ``contact_numbers`` takes it.
-        condim: Of the contact; 1 is without friction.
+        cone: Friction cone; it matters only for condim > 1 and a friction below 0.4.
+        diagexact: True if MuJoCo's exact diagonal is enabled. Without it more runs of the map's
+            shipped setting generate energy.
+        refsafe: True if MuJoCo raises a time constant that the step cannot resolve.
+        condim: Dimension of the contact; 1 is without friction.
         friction: Coefficient of sliding.
-        only_active: Leave out what is not likely to go beyond the slack.
+        only_active: If true, only risks that are likely to exceed the slack are returned.
 
     Returns:
-        Clauses that go after "the contact of …": what is wrong, the risk, what to write instead.
+        Clauses that follow "the contact of …": the fault, the risk, and what to write instead.
 
     Raises:
-        SceneError: As ``contact_numbers``.
+        SceneError: A number is not finite, the time step is not > 0, or a sequence is too short.
     """
     numbers = contact_numbers(solref, solimp, timestep, refsafe=refsafe)
-    # + 0.0: a negative zero would be printed as one
+    # + 0.0 turns a negative zero into 0
     steps, instead = numbers.relaxation + 0.0, suggested_solref(timestep)
     concerns = []
     if numbers.grade == "active" and numbers.is_too_stiff:
         concerns.append(
-            f"is stiffer than was seen to stay passive (impedance {numbers.impedance:.3g}, "
+            f"is stiffer than any that stayed passive in tests (impedance {numbers.impedance:.3g}, "
             f"stiffness {numbers.stiffness:.3g} inertia/step²; at most {LARGEST_IMPEDANCE:g} and "
             f"{STIFFEST:g}) and may create more energy than the coupling's slack allows; write "
             f'{instead} and solimp="0.9 0.95 0.001"'
@@ -94,6 +95,6 @@ def contact_concerns(
     if numbers.resolved > SOFT_STEPS * (1 + ROUNDING):
         concerns.append(
             f"is soft: a steady force sinks in {numbers.softness:.3g} times as deep as with "
-            f'solref="{REFERENCE_STEPS * timestep:g} 1"; write {instead} unless that is meant'
+            f'solref="{REFERENCE_STEPS * timestep:g} 1"; write {instead} unless this is intended'
         )
     return concerns

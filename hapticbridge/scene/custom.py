@@ -1,9 +1,4 @@
-"""What a scene's file says about itself in ``<custom>``: texts and lists of numbers, by name.
-
-Three names mean something here, each may be missing: the text ``about`` is a sentence on what the
-scene is, the number ``picture`` the second of the hand path at which it is drawn, and the numbers
-``simulated_hand`` are who performs the path (``device.scene_hand``).
-"""
+"""Custom texts and numbers of a scene (``<custom>`` in MJCF), by name."""
 
 from __future__ import annotations
 
@@ -11,7 +6,10 @@ import mujoco
 
 
 def custom_text(model: mujoco.MjModel, name: str) -> str:
-    """Returns the custom text of a name; empty where the scene has none."""
+    """Returns the custom text of a name; empty if the scene has none.
+
+    The bridge uses the text ``about``, a sentence that describes the scene.
+    """
     text_id = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_TEXT, name)
     if text_id < 0:
         return ""
@@ -20,7 +18,11 @@ def custom_text(model: mujoco.MjModel, name: str) -> str:
 
 
 def custom_numbers(model: mujoco.MjModel, name: str) -> tuple[float, ...]:
-    """Returns the custom numbers of a name, finite or not; nothing where the scene has none."""
+    """Returns the custom numbers of a name, finite or not; empty if the scene has none.
+
+    The bridge uses ``picture``, the time in s on the hand path at which the scene is drawn. It also
+    uses ``simulated_hand``, the hand that follows the path (``device.simulated.scene_hand``).
+    """
     number_id = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_NUMERIC, name)
     if number_id < 0:
         return ()

@@ -1,4 +1,4 @@
-"""The scenes that come with hapticbridge, by name."""
+"""Shipped scenes, by name."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from hapticbridge.errors import SceneError, choices
 @cache
 def _folder() -> Path:
     package = Path(__file__).resolve().parents[1]
-    installed = package / "models"  # where the wheel puts it
+    installed = package / "models"  # place in an installed wheel
     return installed if installed.is_dir() else package.parent / "models"
 
 
 def scene_names() -> tuple[str, ...]:
-    """Returns the names that ``load_scene`` knows, sorted."""
+    """Returns the names of the shipped scenes, sorted."""
     return tuple(sorted(path.parent.name for path in _folder().glob("*/*.xml") if _is_scene(path)))
 
 
@@ -25,14 +25,14 @@ def _is_scene(path: Path) -> bool:
 
 
 def scene_path(path_or_name: str | Path) -> Path:
-    """Returns the MJCF file that a path or a scene's name stands for.
+    """Returns the MJCF file of a path or of a shipped scene's name.
 
     Args:
-        path_or_name: A file, or one of ``scene_names()``. A name without a dot or a slash is never
-            taken for a file unless the file exists.
+        path_or_name: A file, or one of ``scene_names()``. A name without a dot or a slash is taken
+            as a file only if that file exists.
 
     Raises:
-        SceneError: There is neither such a file nor such a name.
+        SceneError: No such file and no such name exists.
     """
     if not str(path_or_name):
         raise SceneError(

@@ -1,4 +1,4 @@
-"""Loads an MJCF scene and puts a handle and a coupling into it."""
+"""Loading of an MJCF scene with a handle and a coupling."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from hapticbridge.scene.start import seat_handle
 
 @dataclass(frozen=True, slots=True)
 class SceneSource:
-    """A scene as its file says, with its parameters set and nothing put into it.
+    """A scene as read from its file, with its parameters set, before handle and coupling are added.
 
     Attributes:
         path: The MJCF file.
         spec: MuJoCo's specification of it.
         sources: The original bytes of the file, its includes and its assets.
-        parameters: Value of each of the scene's parameters, in the unit that its file names.
-        concerns: What will run otherwise than the file says, a clause each.
+        parameters: Value of each of the scene's parameters, in the unit of its parameter file.
+        concerns: Clauses on deviations of the run from the file.
     """
 
     path: Path
@@ -41,37 +41,37 @@ class SceneSource:
 
 
 def load_scene(path_or_name: str | Path, grip: str = "grip", **parameters: float) -> Scene:
-    """Loads an MJCF file, or a scene by name, and puts a handle and a coupling into it.
+    """Loads an MJCF file, or a shipped scene by name, and adds a handle and a coupling.
 
-    The user's own actuators, equality constraints, keyframes and assets survive. The grip may sit
-    on a free body, on a body at the end of joints, or on one with a single slide joint.
+    The user's own actuators, equality constraints, keyframes and assets are kept. The grip may be
+    on a free body, on a body at the end of joints, or on a body with a single slide joint.
 
     Args:
         path_or_name: An MJCF file, or one of ``scene_names()``.
         grip: Name of the site on the tool.
-        **parameters: Values of the scene's parameters, such as ``clearance=0.1e-3``; see
-            ``scene.scene_parameters`` or ``hapticbridge scenes NAME`` for what there is.
+        **parameters: Values of the scene's parameters, such as ``clearance=0.1e-3``.
+            ``scene.scene_parameters`` and ``hapticbridge scenes NAME`` list them.
 
     Raises:
-        SceneError: The scene cannot be read, compiled or put behind a device, or has no such
-            parameter or not of that value; says why.
+        SceneError: The scene cannot be read, compiled or put behind a device, a parameter is
+            unknown, or its value is out of range.
 
     Warns:
-        UserWarning: The scene will run, but not quite as its file says.
+        UserWarning: The run deviates from the file in a detail.
     """
     return compile_scene(read_scene(path_or_name, **parameters), grip, stacklevel=3)
 
 
 def read_scene(path_or_name: str | Path, **parameters: float) -> SceneSource:
-    """Reads a scene without putting anything into it: what ``compile_scene`` makes a scene of.
+    """Reads a scene for ``compile_scene``, without adding anything to it.
 
     Args:
         path_or_name: An MJCF file, or one of ``scene_names()``.
         **parameters: Values of the scene's parameters.
 
     Raises:
-        SceneError: The scene cannot be read or has an option that does not belong under a bridge,
-            or has no such parameter or not of that value.
+        SceneError: The scene cannot be read, has an incompatible option, or a parameter is unknown
+            or out of range.
     """
     path = scene_path(path_or_name)
     try:
@@ -86,10 +86,10 @@ def read_scene(path_or_name: str | Path, **parameters: float) -> SceneSource:
 
 
 def plain_model(source: SceneSource) -> mujoco.MjModel:
-    """Compiles a scene as its files say, without handle and coupling, so that it needs no grip.
+    """Compiles a scene without handle and coupling, so that it needs no grip.
 
     Raises:
-        SceneError: The scene cannot be compiled; says why.
+        SceneError: The scene cannot be compiled.
     """
     with _refused(source.path):
         return compiled(source.spec.copy(), source.sources)
@@ -103,22 +103,20 @@ def compile_scene(
     checks_start: bool = True,
     stacklevel: int = 2,
 ) -> Scene:
-    """Puts handle and coupling into a scene that was read, and compiles it.
+    """Adds handle and coupling to a scene that was read, and compiles it.
 
     Args:
-        source: What ``read_scene`` returned, or the same with a changed specification; it stays as
-            it is.
+        source: Result of ``read_scene``, possibly with a changed specification; it is not modified.
         grip: Name of the site on the tool.
-        warns: Whether to say what will run otherwise than the file says.
-        checks_start: Whether to refuse a start that no hand should feel: inside something, or not
-            finite.
-        stacklevel: Whose line the warnings name.
+        warns: If true, deviations of the run from the file are issued as warnings.
+        checks_start: If true, a start in penetration or that is not finite is refused.
+        stacklevel: Stack level of the warnings.
 
     Raises:
-        SceneError: The scene cannot be compiled or put behind a device; says why.
+        SceneError: The scene cannot be compiled or put behind a device.
 
     Warns:
-        UserWarning: The scene will run, but not quite as its file says.
+        UserWarning: The run deviates from the file in a detail.
     """
     path, spec = source.path, source.spec.copy()
     attach_handle(spec, grip)
@@ -140,7 +138,7 @@ def compile_scene(
 
 @contextmanager
 def _refused(path: Path) -> Iterator[None]:
-    """Turns what MuJoCo says while it compiles into a sentence that names the scene."""
+    """Converts MuJoCo's errors during compilation into a SceneError that names the scene."""
     try:
         yield
     except (ValueError, OSError, MemoryError, mujoco.FatalError) as error:

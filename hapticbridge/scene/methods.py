@@ -1,4 +1,4 @@
-"""What a scene must satisfy so that a method other than the default can render and meter it."""
+"""Requirements of the rendering methods for comparison on a scene."""
 
 from __future__ import annotations
 
@@ -9,20 +9,21 @@ from hapticbridge.errors import SceneError, choices
 from hapticbridge.kernel.names import COUPLING_ACTUATORS
 
 AXES_TOLERANCE = 1e-9
-"""How far from orthogonal the axes of a planar tool's joints may be, without unit: rounding of
-axes that MJCF gives in 16 digits, far below what would move the grip off the handle."""
+"""Largest deviation from orthogonality of the joint axes of a planar tool, without unit. It admits
+rounding of axes with 16 digits in MJCF, far below a noticeable motion of the grip off the
+handle."""
 
 
 def check_massless_tool(model: mujoco.MjModel, grip: str, method: str) -> None:
-    """Refuses a scene in which anything but one rigid tool can move.
+    """Refuses a scene in which anything moves besides one rigid tool.
 
     Args:
         model: The compiled scene, with its handle.
         grip: Name of the site on the tool.
-        method: How the user called for it, for the message.
+        method: Name of the method, for the message.
 
     Raises:
-        SceneError: Says what else moves, or how the tool must be jointed.
+        SceneError: Names the other moving parts, or the joints that the tool requires.
     """
     body_id = int(model.site(grip).bodyid[0])
     first, count = int(model.body_jntadr[body_id]), int(model.body_jntnum[body_id])
@@ -53,21 +54,21 @@ def check_massless_tool(model: mujoco.MjModel, grip: str, method: str) -> None:
     if found:
         raise SceneError(
             f"method '{method}' renders one tool and nothing else that moves; the scene has "
-            f"{' and '.join(found)}"
+            f"{' and '.join(found)}; remove them or choose another method"
         )
 
 
 def check_metered(model: mujoco.MjModel, integrator: str, method: str) -> None:
-    """Refuses a scene whose own forces could not be metered under an integrator.
+    """Refuses a scene with forces of its own that cannot be metered under an integrator.
 
-    A port's work in a step is h Q·v⁺ with the force Q that the step used. ``Euler`` uses the one
-    at its start; ``implicitfast`` uses that too where the force does not depend on velocity; RK4
-    uses four, of which nothing is kept.
+    The work of a port in a step is h Q·v⁺, with the force Q that the step used. ``Euler`` uses the
+    force at the start of the step. ``implicitfast`` does so too for forces that do not depend on
+    velocity. RK4 uses four forces and keeps none.
 
     Args:
         model: The compiled scene, with its coupling.
-        integrator: By its name in MJCF.
-        method: How the user called for it, for the message.
+        integrator: Name of the integrator in MJCF.
+        method: Name of the method, for the message.
 
     Raises:
         SceneError: Names the actuator or body.

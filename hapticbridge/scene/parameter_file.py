@@ -1,27 +1,4 @@
-"""What a scene's file of parameters says: numbers that its user may set, such as a clearance.
-
-A scene ``NAME.xml`` may have a file ``NAME.toml`` beside it. Each of its tables says what one
-number is, and which numbers of the MJCF follow from it:
-
-    [parameters.clearance]
-    unit = "m"
-    default = 0.2e-3
-    minimum = 0.05e-3
-    maximum = 1e-3
-    about = "gap between peg and wall, a side"
-    sets = [
-      { kind = "geom", name = "hole_east", field = "pos", index = 0, offset = 0.02, factor = 1.0 },
-    ]
-
-    field[index] = offset + factor · value
-
-in the units of the MJCF. ``name`` may hold ``*``, ``?`` and ``[]`` and then means every element
-that fits; ``index`` is left out where the field is a single number. The default must give what the
-MJCF says, so that the file alone, opened in any viewer, is the scene that runs by default; what is
-not set stays as the file says, to the bit. Where several parameters set the same number, it is the
-sum of what each says: a torque at which a nut breaks away, less the one with which it runs, is what
-its clamp holds.
-"""
+"""Parameter file of a scene."""
 
 from __future__ import annotations
 
@@ -44,7 +21,7 @@ KINDS = {
     "pair": "pairs",
     "key": "keys",
 }
-"""What may be set, and where MjSpec keeps it."""
+"""Elements that a parameter may set, and the attribute of MjSpec that lists them."""
 
 TAKEN = ("path_or_name", "grip")
 """Arguments of ``load_scene`` that are not parameters."""
@@ -52,15 +29,15 @@ TAKEN = ("path_or_name", "grip")
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """One number of the MJCF that follows from a parameter: offset + factor · value.
+    """One number of the MJCF that depends on a parameter: offset + factor · value.
 
     Attributes:
-        kind: Of the element: ``geom``, ``joint``, …
-        name: The element's, or a pattern.
-        field: As MjSpec calls it.
-        index: Within the field; None for a field that is one number.
-        offset: In the field's unit.
-        factor: The field's unit per unit of the parameter.
+        kind: Kind of the element: ``geom``, ``joint``, …
+        name: Name of the element, or a pattern.
+        field: Name of the field in MjSpec.
+        index: Index within the field; None for a field that is one number.
+        offset: Offset in the field's unit.
+        factor: Factor in the field's unit per unit of the parameter.
     """
 
     kind: str
@@ -73,16 +50,16 @@ class Setting:
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """A number of a scene that its user may set.
+    """A settable number of a scene, such as a clearance.
 
     Attributes:
-        name: As ``load_scene`` and ``--set`` take it.
-        unit: SI, or empty for a number without one.
-        default: What the scene's MJCF says.
-        minimum: Smallest value that is allowed.
-        maximum: Largest.
-        about: What it is, in half a sentence.
-        sets: What follows from it.
+        name: Name in ``load_scene`` and ``--set``.
+        unit: SI unit, or empty.
+        default: Value in the scene's MJCF.
+        minimum: Smallest allowed value.
+        maximum: Largest allowed value.
+        about: Description, in half a sentence.
+        sets: Numbers of the MJCF that depend on it.
     """
 
     name: str
@@ -95,7 +72,7 @@ class Parameter:
 
     @property
     def range(self) -> str:
-        """The range in words, with its unit: ``5e-05 to 0.001 m``."""
+        """Allowed range with its unit: ``5e-05 to 0.001 m``."""
         return f"{self.minimum:g} to {self.maximum:g} {self.unit}".rstrip()
 
     def __str__(self) -> str:
@@ -103,20 +80,44 @@ class Parameter:
 
 
 def parameters_file(scene: Path) -> Path:
-    """Returns where the parameters of a scene's MJCF file are, if it has any."""
+    """Returns the path of a scene's parameter file, which may not exist."""
     return scene.with_suffix(".toml")
 
 
 def scene_parameters(scene: Path) -> tuple[Parameter, ...]:
-    """Returns what may be set in a scene, in the order of its file; nothing without a file.
+    """Returns the parameters of a scene, in the order of its file; empty without a file.
 
-    A TOML file without a table ``parameters`` is somebody else's, and passed over.
+    A scene ``NAME.xml`` may have a file ``NAME.toml`` beside it. Each table describes one parameter
+    and the numbers of the MJCF that depend on it:
+
+        [parameters.clearance]
+        unit = "m"
+        default = 0.2e-3
+        minimum = 0.05e-3
+        maximum = 1e-3
+        about = "gap between peg and wall, a side"
+        sets = [
+          { kind = "geom", name = "hole_east", field = "pos", index = 0, offset = 0.02, factor = 1.0
+          },
+        ]
+
+        field[index] = offset + factor · value
+
+    in the units of the MJCF. ``name`` may contain ``*``, ``?`` and ``[]`` and then selects all
+    matching elements. ``index`` is omitted for a field that is a single number.
+
+    The default must reproduce the value in the MJCF, so that the MJCF alone is the default scene in
+    any viewer. Numbers without a setting remain as in the file, bit for bit. If several parameters
+    set one number, it is the sum of their terms. For example, the holding torque of a clamp is the
+    nut's breakaway torque minus its running torque.
+
+    A TOML file without a table ``parameters`` is ignored.
 
     Args:
         scene: The MJCF file.
 
     Raises:
-        SceneError: The file cannot be read, or something in it is unknown, missing or out of range.
+        SceneError: The file cannot be read, or an entry is unknown, missing or out of range.
     """
     file = parameters_file(scene)
     if not file.is_file():
@@ -131,7 +132,7 @@ def scene_parameters(scene: Path) -> tuple[Parameter, ...]:
 
 
 def is_finite_number(value: object) -> bool:
-    """Returns whether a value is a real number, not a truth value, and finite."""
+    """Returns whether a value is a finite real number; booleans are not numbers."""
     return isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
 
 
@@ -142,7 +143,9 @@ _SET_KEYS = {"kind", "name", "field", "index", "offset", "factor"}
 def _parameter(name: str, table: object, file: Path) -> Parameter:
     where = f"parameter '{name}' in '{file}'"
     if not name.isidentifier() or name in TAKEN:
-        raise SceneError(f"{where} must be named as a Python argument, and not {choices(TAKEN)}")
+        raise SceneError(
+            f"{where} must have the name of a Python argument, but not {choices(TAKEN)}"
+        )
     if not isinstance(table, dict) or set(table) != _KEYS:
         raise SceneError(f"{where} must have the keys {choices(_KEYS)} and no others")
     numbers = [table[key] for key in ("minimum", "default", "maximum")]

@@ -1,8 +1,4 @@
-"""Sets the parameters of a scene in its specification, before it is compiled.
-
-What there is to set, and what follows from it, stands in the scene's file of parameters; see
-``parameter_file``. What is not set stays as the MJCF says, to the bit.
-"""
+"""Parameters of a scene, set in its specification."""
 
 from __future__ import annotations
 
@@ -27,8 +23,8 @@ from hapticbridge.scene.parameter_file import (
 )
 
 _AGREEMENT, _ROUNDING = 1e-9, 1e-12
-"""Relative and absolute difference allowed between the MJCF and the default: a file that gives ten
-digits, and the rounding of a sum that should be 0."""
+"""Largest relative and absolute difference between the MJCF and the default. The first admits a
+file with ten digits, the second the rounding of a sum that should be 0."""
 
 
 def apply_parameters(
@@ -37,16 +33,16 @@ def apply_parameters(
     """Sets parameters in a scene before it is compiled.
 
     Args:
-        spec: The scene as its file says; changed in place.
+        spec: The scene as read from its file; changed in place.
         scene: The MJCF file.
-        values: What to set, by name; what is not named keeps its default.
+        values: Values by name; other parameters keep their defaults.
 
     Returns:
-        Every parameter of the scene with the value that holds.
+        Every parameter of the scene with its effective value.
 
     Raises:
-        SceneError: A name is unknown, a value is not finite or out of range, or the file of
-            parameters does not fit the scene.
+        SceneError: A name is unknown, a value is not finite or out of range, or the parameter file
+            does not fit the scene.
     """
     known = {parameter.name: parameter for parameter in scene_parameters(scene)}
     for name, value in values.items():
@@ -67,7 +63,7 @@ def settings_from(words: Iterable[str]) -> dict[str, float]:
     """Returns values by name from words such as ``clearance=0.1e-3``.
 
     Raises:
-        SceneError: A word is not a name and a number, or a name comes twice.
+        SceneError: A word is not a name and a number, or a name occurs twice.
     """
     values: dict[str, float] = {}
     for word in words:
@@ -90,7 +86,7 @@ def settings_from(words: Iterable[str]) -> dict[str, float]:
 def _check_value(scene: str, name: str, value: float, known: Mapping[str, Parameter]) -> None:
     if not known:
         raise SceneError(
-            f"scene '{scene}' has no parameters, so '{name}' cannot be set; they would stand in "
+            f"scene '{scene}' has no parameters, so '{name}' cannot be set; define parameters in "
             f"'{scene}.toml' beside it"
         )
     exist = "; ".join(map(str, known.values()))
@@ -117,7 +113,7 @@ def _elements(spec: mujoco.MjSpec, setting: Setting, parameter: str) -> list[Any
 
 @dataclass(slots=True)
 class _Place:
-    """One number of the MJCF and what it follows from: the sum of offset + factor · value."""
+    """One number of the MJCF and its terms: the sum of offset + factor · value."""
 
     element: Any
     setting: Setting
@@ -125,14 +121,14 @@ class _Place:
     default: float = 0.0
 
     def add(self, parameter: Parameter, setting: Setting) -> None:
-        """Adds what a parameter contributes."""
+        """Adds the term of a parameter."""
         if parameter.name in self.terms:
             raise SceneError(f"parameter '{parameter.name}' sets {self._words} twice; set it once")
         self.terms[parameter.name] = setting
         self.default += setting.offset + setting.factor * parameter.default
 
-    def set(self, used: Mapping[str, float], asked: Mapping[str, float]) -> None:
-        """Checks that the defaults give what the file says, then sets it if one was asked for."""
+    def set(self, used: Mapping[str, float], requested: Mapping[str, float]) -> None:
+        """Checks the default against the file, then sets the number if it was requested."""
         names, index = " and ".join(map(repr, self.terms)), self.setting.index
         is_one = len(self.terms) == 1
         subject = f"parameter {names} sets" if is_one else f"parameters {names} together set"
@@ -147,7 +143,7 @@ class _Place:
                 f"{where} to {self.default:g} by default, where the scene's file has {now:g}; make "
                 "them equal"
             )
-        if not asked.keys() & self.terms.keys():
+        if not requested.keys() & self.terms.keys():
             return
         result = sum(term.offset + term.factor * used[name] for name, term in self.terms.items())
         values[() if index is None else index] = result

@@ -1,4 +1,4 @@
-"""A scene that is compiled, with a handle and a coupling in it: what the loop steps."""
+"""Compiled scene with a handle and a coupling."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ class Scene:
     Attributes:
         path: The MJCF file.
         grip: Name of the site on the tool.
-        model: MuJoCo's model, with the bridge's handle and coupling in it.
-        data: Its state.
+        model: MuJoCo's model, with the bridge's handle and coupling.
+        data: State of the model.
         sources: The original bytes of the file, its includes and its assets.
-        parameters: Value of each of the scene's parameters, in the unit that its file names.
+        parameters: Value of each of the scene's parameters, in the unit of its parameter file.
     """
 
     path: Path
@@ -42,30 +42,30 @@ class Scene:
     _reach: float = 0.0
 
     def claim(self) -> None:
-        """Reserves the scene for one bridge: two would move the same tool.
+        """Reserves the scene for one bridge, because two bridges would move one tool.
 
         Raises:
-            SceneError: Another bridge has it.
+            SceneError: Another bridge uses it.
         """
         if self._is_claimed:
             raise SceneError(f"scene '{self.name}' is in use by another bridge; load it again")
         self._is_claimed = True
 
     def release(self) -> None:
-        """Lets another bridge have the scene."""
+        """Releases the scene for another bridge."""
         self._is_claimed = False
 
     @property
     def name(self) -> str:
-        """The file's name without its ending."""
+        """The file's name without its suffix."""
         return self.path.stem
 
     def reset(self) -> None:
-        """Puts the scene to keyframe ``home`` if it has one, else ``qpos0``; handle at the grip."""
+        """Resets the scene to ``home`` or ``qpos0``, with the handle at the grip."""
         go_to_start(self.model, self.data, self.grip)
 
     def grip_pose(self) -> tuple[float, ...]:
-        """Returns the grip's pose (x, y, z, qw, qx, qy, qz) in the world frame, in m."""
+        """Returns the grip's pose (x, y, z, qw, qx, qy, qz) in the world frame, positions in m."""
         site_id = self.model.site(self.grip).id
         position, quaternion = self.data.site_xpos[site_id], self.data.site_xquat[site_id]
         sign = 1.0 if quaternion[0] >= 0 else -1.0
@@ -75,7 +75,7 @@ class Scene:
         """Sets MuJoCo's timestep to period / substeps, in s.
 
         Raises:
-            SceneError: The period is not finite and positive, or there is no whole substep.
+            SceneError: The period is not finite and positive, or substeps is below 1.
         """
         if not np.isfinite(period) or period <= 0:
             raise SceneError(f"period is {period!r} s; it must be finite and > 0")
@@ -84,9 +84,9 @@ class Scene:
         self.model.opt.timestep = period / substeps
 
     def set_reach(self, distance: float) -> None:
-        """Lets MuJoCo find contacts, without a force, from a distance in m before they touch.
+        """Lets MuJoCo detect contacts, without a force, from a distance in m before they touch.
 
-        It is added to the gaps that the scene's file gives.
+        The distance is added to the gaps in the scene's file.
         """
         if distance == self._reach:
             return
@@ -98,11 +98,11 @@ class Scene:
     def set_gains(
         self, force: tuple[float, float, float], torque: tuple[float, float, float]
     ) -> None:
-        """Sets factor of the control, stiffness and damping of the coupling's actuators.
+        """Sets control gain, stiffness and damping of the coupling's actuators.
 
         Args:
-            force: Of the three that push, in SI units per metre and metre per second.
-            torque: Of the three that turn, in SI units per rad and rad per second.
+            force: Gains of the three translational actuators, in SI units per m and m/s.
+            torque: Gains of the three rotational actuators, in SI units per rad and rad/s.
         """
         for axis, name in enumerate(COUPLING_ACTUATORS):
             gain, stiffness, damping = force if axis < 3 else torque  # forces come first
@@ -112,10 +112,10 @@ class Scene:
             self.model.actuator_biasprm[actuator_id, 2] = -damping
 
     def set_weld(self, coupling: Coupling | None) -> None:
-        """Welds the grip to the handle with K and B as ``solref``, or (None) takes the weld off.
+        """Welds the grip to the handle with K and B as ``solref``; None removes the weld.
 
-        A weld changes the model's size, so ``model`` and ``data`` become new ones; what was changed
-        in the old model is carried over. Without a weld before and after, nothing changes.
+        A weld changes the model's size, so ``model`` and ``data`` are replaced. Changes to the old
+        model are copied to the new one. Without a weld before and after, nothing changes.
 
         Raises:
             SceneError: The scene was not made by ``load_scene``.
@@ -123,7 +123,10 @@ class Scene:
         has_weld = mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_EQUALITY, WELD_NAME) >= 0
         if has_weld != (coupling is not None):
             if self._spec is None:
-                raise SceneError("only a scene from load_scene can be welded to its handle")
+                raise SceneError(
+                    "only a scene from load_scene can be welded to its handle; load it with "
+                    "load_scene, or choose another method"
+                )
             spec = self._spec.copy()
             if coupling is not None:
                 add_weld(spec, self.grip)

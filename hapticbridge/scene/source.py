@@ -1,8 +1,8 @@
-"""The original bytes of a scene: its XML, what it includes, and the assets it names.
+"""Original files of a scene: its XML, includes and assets.
 
-A recording keeps them, because what MuJoCo writes back is not what was read: ``to_xml`` rounds
-numbers to 6 digits and ``to_zip`` leaves assets out. Its list of dependencies
-(``mju_getXMLDependencies``) has no order and looks for height fields in the wrong folder.
+A recording stores them, because MuJoCo's own output is not equivalent. ``to_xml`` rounds numbers to
+6 digits, and ``to_zip`` omits assets. Its list of dependencies (``mju_getXMLDependencies``) has no
+order and searches height fields in the wrong folder.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ _FILE_ATTRIBUTES = (
     "filename",  # URDF
 )
 
-# MuJoCo's parser accepts more than well-formed XML ("--" in a comment, a bare "&"), and so must
-# whoever looks for the files that it read.
+# MuJoCo's parser accepts more than well-formed XML ("--" in a comment, a bare "&"), so these
+# patterns must accept it too.
 _NOT_AN_ELEMENT = re.compile(r"<!--.*?-->|<\?.*?\?>|<![A-Z].*?>", re.DOTALL)
 _ELEMENT = re.compile(r"<([A-Za-z_][\w.:-]*)((?:\s+[\w.:-]+\s*=\s*(?:\"[^\"]*\"|'[^']*'))*)\s*/?>")
 _ATTRIBUTE = re.compile(r"([\w.:-]+)\s*=\s*(?:\"([^\"]*)\"|'([^']*)')")
@@ -38,8 +38,8 @@ class SourceFile:
     """One file of a scene.
 
     Attributes:
-        name: Path relative to the deepest folder that holds all files of the scene, with forward
-            slashes; that is the folder of the main file if nothing lies outside it.
+        name: Path relative to the deepest folder that contains all files of the scene, with forward
+            slashes. It is the main file's folder if all files are inside it.
         data: The file's bytes.
     """
 
@@ -52,9 +52,9 @@ class Element:
     """One element of an XML file.
 
     Attributes:
-        tag: Its name.
-        attributes: Their values by name.
-        line: Where it starts, counted from 1.
+        tag: Name of the element.
+        attributes: Attribute values by name.
+        line: Line of its start, counted from 1.
     """
 
     tag: str
@@ -63,12 +63,11 @@ class Element:
 
 
 def collect_sources(path: Path) -> tuple[SourceFile, ...]:
-    """Returns the main file, first, and everything it refers to that can be found.
+    """Returns the main file, first, and all existing files that it refers to.
 
-    A file of parameters beside the main file is one of them. MuJoCo has already read the scene when
-    this runs, so what cannot be found here (a file in a search path of MuJoCo's own) is left out
-    instead of refused. Written into an empty folder under their names, the files compile to the
-    same model.
+    A parameter file beside the main file is included. MuJoCo has read the scene before, so a file
+    that is not found here (in a search path of MuJoCo's own) is left out without an error. Written
+    into an empty folder under their names, the files compile to an identical model.
     """
     found: dict[Path, Path] = {}
     _find_files(path, found)
@@ -86,7 +85,7 @@ def collect_sources(path: Path) -> tuple[SourceFile, ...]:
 
 
 def read_elements(data: bytes) -> Iterator[Element]:
-    """Yields the elements of an XML file in order; what is not an element is passed over."""
+    """Yields the elements of an XML file in order; other content is skipped."""
     text = data.decode("utf-8-sig", errors="replace")
     text = _NOT_AN_ELEMENT.sub(lambda match: "\n" * match[0].count("\n"), text)
     line, end = 1, 0
@@ -122,7 +121,7 @@ def _find_files(path: Path, found: dict[Path, Path]) -> None:
 
 
 def _key(path: Path) -> Path:
-    """Returns the path without ``..``, which would lead out of a folder of copies."""
+    """Returns the absolute path without ``..``, which could leave a folder of copies."""
     parts: list[str] = []
     for part in path.absolute().parts:
         if part == "..":
@@ -133,7 +132,7 @@ def _key(path: Path) -> Path:
 
 
 def _expanded(path: Path, folder: Path, seen: set[Path]) -> Iterator[tuple[Element, Path]]:
-    """Yields the elements of an MJCF file and of its includes, each with the file it stands in."""
+    """Yields the elements of an MJCF file and of its includes, each with its own file."""
     for element in read_elements(path.read_bytes()):
         yield element, path
         if element.tag == "include" and "file" in element.attributes:
@@ -144,7 +143,7 @@ def _expanded(path: Path, folder: Path, seen: set[Path]) -> Iterator[tuple[Eleme
 
 
 def _asset_folders(elements: list[Element]) -> dict[str, str]:
-    """Returns the compiler's folders, of which the last one set holds for the whole model."""
+    """Returns the compiler's asset folders; the last setting holds for the whole model."""
     folders = {"meshdir": "", "texturedir": "", "strippath": "false"}
     for element in elements:
         if element.tag == "compiler":
@@ -158,7 +157,7 @@ def _asset_folders(elements: list[Element]) -> dict[str, str]:
 def _candidates(
     reference: str, tag: str, homes: tuple[Path, Path], folders: dict[str, str]
 ) -> Iterator[Path]:
-    """Yields where MuJoCo looks for an asset, in its order."""
+    """Yields the paths at which MuJoCo looks for an asset, in its order."""
     if tag in {"include", "model"}:
         yield from _beside(reference, homes)
         return
@@ -170,7 +169,7 @@ def _candidates(
 
 
 def _beside(reference: str, homes: Sequence[Path]) -> Iterator[Path]:
-    """Yields a file relative to the model's folder, then to that of the file that names it."""
+    """Yields a file relative to the model's folder, then to the folder of the referring file."""
     for name in dict.fromkeys((reference, reference.replace("\\", "/"))):
         for home in homes:
             yield home / name

@@ -1,4 +1,4 @@
-"""Where a scene starts: keyframe ``home`` if it has one, else ``qpos0``; the handle at the grip."""
+"""Start of a scene, with the handle at the grip."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ import mujoco
 from hapticbridge.kernel.names import HANDLE
 
 START_KEYFRAME = "home"
-"""Name of the keyframe that a scene starts from, if it has one."""
+"""Name of the keyframe that a scene starts from; without it a scene starts from ``qpos0``."""
 
 
 def go_to_start(model: mujoco.MjModel, data: mujoco.MjData, grip: str) -> None:
-    """Puts the data to the start, with the handle at the grip and everything computed there.
+    """Resets the data to the start, with the handle at the grip, and calls ``mj_forward``.
 
     Args:
         model: A scene with the handle.
@@ -23,7 +23,7 @@ def go_to_start(model: mujoco.MjModel, data: mujoco.MjData, grip: str) -> None:
         mujoco.mj_resetDataKeyframe(model, data, key)
     else:
         mujoco.mj_resetData(model, data)
-    # the model has the handle there too, unless its start was changed since it was loaded
+    # the model's own handle pose may be outdated if its start was changed after loading
     mujoco.mj_kinematics(model, data)
     handle = model.body_mocapid[model.body(HANDLE).id]
     data.mocap_pos[handle] = data.site(grip).xpos
@@ -32,7 +32,7 @@ def go_to_start(model: mujoco.MjModel, data: mujoco.MjData, grip: str) -> None:
 
 
 def seat_handle(model: mujoco.MjModel, grip: str) -> None:
-    """Puts the handle at the grip, in ``qpos0`` and in every keyframe of a compiled model.
+    """Places the handle at the grip, in ``qpos0`` and in every keyframe of a compiled model.
 
     Args:
         model: A scene with the handle; changed in place.

@@ -1,4 +1,4 @@
-"""A weld between grip and handle, as MuJoCo's equality constraint, and how stiff it truly is."""
+"""Weld between grip and handle (MuJoCo's equality constraint)."""
 
 from __future__ import annotations
 
@@ -12,12 +12,13 @@ from hapticbridge.kernel.names import HANDLE, WELD_NAME
 from hapticbridge.scene.start import go_to_start
 
 IMPEDANCE = 0.95
-"""d of the weld, without unit, the same at every displacement (MuJoCo's default reaches 0.95 at
-1 mm). The true stiffness is mass times K/(1 − d): nearer to 1 the weld is stiffer."""
+"""Impedance d of the weld, without unit, equal at every displacement (MuJoCo's default reaches 0.95
+at 1 mm). The true stiffness is mass times K/(1 − d), so a value nearer to 1 makes the weld
+stiffer."""
 
 PROBE = 1e-6
-"""Displacement in m, angle in rad and velocity in m/s and rad/s by which the weld is measured: the
-constraint is linear in them as long as the angle's sine is the angle."""
+"""Displacement in m, angle in rad and velocity in m/s and rad/s with which the weld is measured.
+The constraint is linear in them as long as sin φ ≈ φ."""
 
 _FLAGS = {
     "constraint": mujoco.mjtDisableBit.mjDSBL_CONSTRAINT,
@@ -40,20 +41,20 @@ def add_weld(spec: mujoco.MjSpec, grip: str) -> None:
 
 
 def set_weld_gains(model: mujoco.MjModel, coupling: Coupling) -> None:
-    """Gives K and B to the weld as its direct ``solref``, one pair for all six axes."""
+    """Sets K and B of the weld as its direct ``solref``, one pair for all six axes."""
     weld_id = model.equality(WELD_NAME).id
     model.eq_solref[weld_id] = -coupling.stiffness, -coupling.damping
     model.eq_solimp[weld_id] = IMPEDANCE, IMPEDANCE, 1e-3, 0.5, 2.0
 
 
 def check_weldable(model: mujoco.MjModel, grip: str) -> None:
-    """Refuses a scene without equality constraints, or a tool that cannot move about all axes.
+    """Refuses disabled equality constraints and a tool that cannot move about all axes.
 
-    A row of the weld whose axis the joints block has no inertia to give way: MuJoCo makes it rigid
-    (1e18 N/m), and its force, which moves nothing, would be what the hand feels.
+    If the joints block the axis of a row of the weld, the row has no inertia to yield. MuJoCo makes
+    it rigid (1e18 N/m), and the hand would feel a force that moves nothing.
 
     Raises:
-        SceneError: Names the flag, or says how many directions the joints leave.
+        SceneError: Names the disabled flag, or the number of directions that the joints leave free.
     """
     for flag, bit in _FLAGS.items():
         if model.opt.disableflags & bit:
@@ -74,11 +75,11 @@ def check_weldable(model: mujoco.MjModel, grip: str) -> None:
 
 
 def carry_over(old: mujoco.MjModel, new: mujoco.MjModel) -> None:
-    """Copies everything from a model to one that differs by equality constraints alone.
+    """Copies all values between models that differ only by equality constraints.
 
-    What was changed after loading (masses, contact parameters, gains of the scene's own equality
-    constraints) would be lost in a compilation. The weld is the last row of the equalities, so the
-    rows before it are the same constraints in both.
+    A compilation would lose changes made after loading (masses, contact parameters, gains of the
+    scene's own equality constraints). The weld is the last equality row, so the rows before it
+    correspond.
     """
     for name in dir(old):
         if name.startswith(("_", *_NOT_CARRIED)):
@@ -108,16 +109,16 @@ def _copy_values(old: object, new: object) -> None:
 
 
 def measured_weld(model: mujoco.MjModel, grip: str) -> Coupling:
-    """Returns the stiffness and damping that a weld truly has at the scene's start, by MuJoCo.
+    """Returns the true stiffness and damping of a weld at the scene's start, from MuJoCo.
 
-    With the tool held still, the constraint's force is λ = D a_ref, where D = d/((1 − d) A), A the
-    inverse inertia that the row sees, and a_ref = −b v − k r with direct solref k = K/d, b = B/d.
-    Static stiffness m K/(1 − d) and damping m B/(1 − d) follow, m = 1/A: mass for translation
-    through the centre of mass, inertia for rotation, less for a grip off centre. Where they differ
-    between axes, the largest is returned: that is the one the device must bear.
+    With a fixed tool the constraint's force is λ = D a_ref, where D = d/((1 − d) A). A is the
+    inverse inertia of the row, and a_ref = −b v − k r with the direct solref k = K/d, b = B/d. This
+    gives the static stiffness m K/(1 − d) and damping m B/(1 − d) with m = 1/A. m is the mass for
+    translation through the centre of mass and the inertia for rotation; it is less for a grip off
+    centre. If axes differ, the largest value is returned, because the device must bear it.
 
     Args:
-        model: A scene that ``check_weldable`` accepts, with the weld, its gains set.
+        model: A scene that passes ``check_weldable``, with the weld and its gains set.
         grip: Name of the site on the tool.
 
     References:
@@ -150,7 +151,7 @@ def measured_weld(model: mujoco.MjModel, grip: str) -> Coupling:
 
 
 def _static_force(model: mujoco.MjModel, data: mujoco.MjData, axis: int) -> float:
-    """The weld's force against a displacement or velocity along an axis, the tool held still."""
+    """Returns the weld's force for a displacement or velocity along an axis, with a fixed tool."""
     mujoco.mj_forward(model, data)
     weld_id = model.equality(WELD_NAME).id
     is_weld = (data.efc_type[: data.ne] == mujoco.mjtConstraint.mjCNSTR_EQUALITY) & (
@@ -158,5 +159,5 @@ def _static_force(model: mujoco.MjModel, data: mujoco.MjData, axis: int) -> floa
     )
     rows: NDArray[np.intp] = np.flatnonzero(is_weld)
     force = -(data.efc_D[rows] * data.efc_aref[rows])[axis]
-    # a row of rotation is half an angle, in force as in displacement
+    # a rotational row uses half the angle, for force and displacement
     return float(0.5 * force if axis >= 3 else force)
