@@ -1,4 +1,4 @@
-"""What an argument may be, refused in one sentence otherwise."""
+"""Validation of arguments, with one-sentence refusals."""
 
 from __future__ import annotations
 
@@ -13,13 +13,12 @@ from hapticbridge.errors import HapticBridgeError, choices
 Array = NDArray[np.float64]
 
 SMALLEST, LARGEST = 1e-30, 1e30
-"""Range of a magnitude, in the unit of the argument. Nothing that is built or simulated lies
-outside. The theory multiplies up to about ten arguments, and 1e300 is still a double: within the
-range nothing overflows that matters. Larger limits would let it; a magnitude below the range counts
-as 0 where 0 is valid."""
+"""Range of a magnitude in the unit of the argument; no real or simulated quantity lies outside. The
+theory multiplies about ten arguments, and 1e300 is still a double, so nothing relevant overflows.
+Larger limits could overflow. A smaller magnitude counts as 0 if 0 is valid."""
 
 LONGEST = 80
-"""Characters of a refused value that a message shows; more makes it no clearer."""
+"""Largest number of characters of a refused value in a message."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,8 +26,8 @@ class Arguments:
     """Checks of the arguments of one part of the package, with that part's own error.
 
     Attributes:
-        error: What is raised.
-        smallest: Smallest magnitude that is not 0.
+        error: Exception to raise.
+        smallest: Smallest magnitude other than 0.
         largest: Largest magnitude.
     """
 
@@ -49,18 +48,17 @@ class Arguments:
         """Returns finite numbers within limits as an array of doubles.
 
         Args:
-            name: What the numbers are, for the message.
-            value: Any shape; not empty, and no flags, text or dates. Magnitudes are at most
-                ``largest``; below ``smallest`` they are taken for 0.
-            unit: For the message.
+            name: Name of the argument, for the message.
+            value: Numbers of any shape, not empty; no flags, text or dates. Magnitudes are at most
+                ``largest``; those below ``smallest`` become 0.
+            unit: Unit, for the message.
             least: Smallest valid value.
             most: Largest valid value.
-            is_open: Whether the smallest value is out of range too; what is smaller than
-                ``smallest`` then also is.
+            is_open: True excludes the smallest value itself, and magnitudes below ``smallest``.
 
         Raises:
-            HapticBridgeError: The family's own: a value is not a number, not finite, or out of
-                range; names the first such value and the range.
+            HapticBridgeError: ``error``: a value is not a number, not finite, or out of range. The
+                message names the first such value and the range.
         """
         try:
             given = np.asarray(value)
@@ -116,7 +114,7 @@ class Arguments:
         """Returns a whole number within limits; flags and floats are refused.
 
         Raises:
-            HapticBridgeError: It is none, or out of range.
+            HapticBridgeError: The value is not a whole number or out of range.
         """
         is_whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
         if not is_whole or not least <= value <= most:
@@ -130,7 +128,7 @@ class Arguments:
         """Returns the value if it is one of the valid names.
 
         Raises:
-            HapticBridgeError: It is none of them; lists them.
+            HapticBridgeError: The value is not valid; the message lists the choices.
         """
         names = tuple(valid)
         if not isinstance(value, str) or value not in names:
@@ -141,7 +139,7 @@ class Arguments:
         """Returns the shape to which arrays broadcast together.
 
         Raises:
-            HapticBridgeError: They do not; names each with its shape.
+            HapticBridgeError: They do not broadcast; the message names each with its shape.
         """
         try:
             return np.broadcast_shapes(*(array.shape for array in arrays.values()))
@@ -153,7 +151,7 @@ class Arguments:
 
 
 def shown(value: object) -> str:
-    """Returns what a message shows of a refused value: one line, not too long."""
+    """Formats a refused value for a message: one line of limited length."""
     try:
         text = " ".join(repr(value).split())
     except ValueError:  # a whole number of more digits than Python prints

@@ -1,7 +1,7 @@
-"""Time, injected: a real clock with absolute deadlines, and a simulated one.
+"""Injected clocks: a real one with absolute deadlines, and a simulated one.
 
-Both answer the same calls, so the loop does not know which one drives it. Times are integer
-nanoseconds of running: zero at the first start, and a later start goes on where the last run ended.
+Times are integer nanoseconds of running: zero at the first start. A later start continues at the
+end of the last run.
 """
 
 from __future__ import annotations
@@ -13,17 +13,18 @@ from typing import Protocol
 from hapticbridge.errors import HapticBridgeError
 
 SPIN_NS = 150_000
-"""The end of each wait is spun instead of slept, in ns. A sleeping thread wakes some 50 to 100 µs
-late on an ordinary kernel; longer spins cost processor time."""
+"""Time in ns before a deadline that is spent spinning instead of sleeping. A sleeping thread wakes
+50 to 100 µs late on an ordinary kernel; a longer spin costs processor time."""
 
 SPIN_SHARE = 0.75
-"""Largest share of a period that is spun, no unit: it counts above 5 kHz. Under SCHED_FIFO the
-kernel stops a thread for 50 ms in each second in which it did not sleep for 50 ms (5 %); with this,
-a tick may take another 20 % of the period before that happens. Less wakes later at such rates."""
+"""Largest share of a period spent spinning, without unit; it applies above 5 kHz. Under SCHED_FIFO
+the kernel stops a thread for 50 ms in each second in which it did not sleep for 50 ms (5 %). With
+this share a tick may take another 20 % of the period before that happens. A smaller share wakes
+later at such rates."""
 
 LOWEST_RATE, HIGHEST_RATE = 1.0, 1e6
-"""In Hz. Below one tick a second nothing can be felt; above 1 MHz no step of MuJoCo fits between
-two ticks, and the clock's nanoseconds become too coarse."""
+"""Range of the rate in Hz. Below 1 Hz nothing can be felt. Above 1 MHz no step of MuJoCo fits
+between two ticks, and the clock's nanoseconds become too coarse."""
 
 
 def period_of(rate: float) -> float:
@@ -40,25 +41,25 @@ def period_of(rate: float) -> float:
 
 
 class Clock(Protocol):
-    """What drives the loop.
+    """Clock that paces the loop.
 
     Attributes:
-        name: "real" or "simulated", as the recording's metadata names it.
-        is_lossless: Whether the loop may wait for the recorder instead of dropping records.
+        name: "real" or "simulated", as in the recording's metadata.
+        is_lossless: True if the loop may wait for the recorder instead of dropping records.
     """
 
     name: str
     is_lossless: bool
 
     def start(self, period_ns: int) -> None:
-        """Starts or resumes time with the tick's period in ns; the next deadline is one away."""
+        """Starts or resumes time with the period in ns; the first deadline is one period away."""
 
     def wait(self) -> tuple[int, int, int]:
         """Waits for the next deadline.
 
         Returns:
-            The deadline and the time of waking, both in ns of running, and how many deadlines
-            were skipped because they had already passed by a period or more.
+            Deadline and wake-up time in ns of running, and the number of skipped deadlines. A
+            deadline is skipped if it has passed by a period or more.
         """
 
     def now(self) -> int:
@@ -68,8 +69,8 @@ class Clock(Protocol):
 def running_ns() -> int:
     """Returns monotonic time in ns that also passes while the machine is suspended.
 
-    Linux's CLOCK_MONOTONIC stands still then: the loop would go on as if no time had passed, with
-    the force of a pose that is long gone. Setting the time of day moves neither.
+    Linux's CLOCK_MONOTONIC stops then, and the loop would continue with the force of an old pose.
+    Setting the time of day affects neither.
     """
     if sys.platform == "linux":
         return time.clock_gettime_ns(time.CLOCK_BOOTTIME)
@@ -77,9 +78,9 @@ def running_ns() -> int:
 
 
 def slept_ns() -> int:
-    """Returns for how long the machine has been suspended since it was booted, in ns; 0 elsewhere.
+    """Returns the time in ns for which the machine was suspended since boot; 0 except on Linux.
 
-    Between its two readings some microseconds may pass.
+    It is the difference of two readings, which may be microseconds apart.
     """
     if sys.platform == "linux":
         return running_ns() - time.monotonic_ns()
@@ -87,10 +88,10 @@ def slept_ns() -> int:
 
 
 class RealClock:
-    """Wall time: monotonic, absolute deadlines, overruns skipped and counted, never caught up.
+    """Real time with absolute deadlines; overruns are skipped and counted, never caught up.
 
-    Deadlines are multiples of the period from the start, so no error accumulates (a sleep that is
-    re-based on "now" loses rate: 887 Hz were measured where 1000 were asked).
+    Deadlines are multiples of the period from the start, so no error accumulates. A sleep relative
+    to "now" loses rate: 887 Hz were measured for 1000.
     """
 
     name = "real"
@@ -100,13 +101,13 @@ class RealClock:
         self._period = self._spin = self._origin = self._deadline = 0
 
     def start(self, period_ns: int) -> None:
-        """Puts the last deadline to now (see ``Clock.start``)."""
+        """Sets the last deadline to now (see ``Clock.start``)."""
         self._period = period_ns
         self._spin = min(SPIN_NS, round(SPIN_SHARE * period_ns))
         self._origin = running_ns() - self._deadline
 
     def wait(self) -> tuple[int, int, int]:
-        """Sleeps to shortly before the deadline, then spins (see ``Clock.wait``)."""
+        """Sleeps until shortly before the deadline, then spins (see ``Clock.wait``)."""
         deadline = self._deadline + self._period
         now = running_ns() - self._origin
         skipped = 0
@@ -127,7 +128,7 @@ class RealClock:
 
 
 class SimulatedClock:
-    """Time that passes only by ticks: as fast as the loop goes, and the same in every run."""
+    """Time that advances only by ticks, as fast as the loop runs; equal in every run."""
 
     name = "simulated"
     is_lossless = True
@@ -136,7 +137,7 @@ class SimulatedClock:
         self._period = self._now = 0
 
     def start(self, period_ns: int) -> None:
-        """Takes the period; time stands still between runs."""
+        """Sets the period; time stands still between runs."""
         self._period = period_ns
 
     def wait(self) -> tuple[int, int, int]:

@@ -1,4 +1,4 @@
-"""The virtual coupling: a spring and a damper between the handle and the tool."""
+"""Virtual coupling: a spring and a damper between the handle and the tool."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ class Coupling:
         f_k = K (h_k − x_k) + (B / T) ((h_k − h_{k−1}) − (x_k − x_{k−1}))
         τ_k = K_r φ_k + (B_r / T) (δφ_h − δφ_x),    φ_k = log(R_h R_xᵀ)
 
-    and the device receives −f_k, −τ_k. h is the handle's pose, x the grip's, R their orientations,
-    δφ the rotation vectors from the previous tick to this one, T the period in s; all in the world
-    frame. The rotational spring is convex for |φ| < π; beyond, it jumps.
+    and the device receives −f_k, −τ_k. All quantities are in the world frame: pose h of the handle
+    and x of the grip, their orientations R, their rotation vectors δφ since the previous tick. T is
+    the period in s. The rotational spring is convex for |φ| < π; beyond, it jumps.
 
     Attributes:
         stiffness: K in N/m, finite and > 0.

@@ -1,7 +1,7 @@
-"""What can go wrong, as one small family of exceptions.
+"""Exceptions of hapticbridge.
 
-Every message says what is wrong, where, and what would be valid. The command line prints it and
-exits with 2 (3 for a safety trip); nothing of the family is ever a traceback to a user.
+Every message names the fault, its place and the valid choices. The command line prints it without a
+traceback and exits with 2 (3 for a safety trip).
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ class HapticBridgeError(Exception):
 
 
 class SceneError(HapticBridgeError):
-    """A scene cannot be loaded, or cannot be put behind a haptic device."""
+    """A scene cannot be loaded or cannot be coupled to a haptic device."""
 
 
 class CouplingError(HapticBridgeError):
-    """A virtual coupling's parameters are out of range."""
+    """A virtual coupling's parameter is out of range."""
 
 
 class MechanicsError(HapticBridgeError):
@@ -31,23 +31,23 @@ class MechanicsError(HapticBridgeError):
 
 
 class StudyError(HapticBridgeError):
-    """A sweep, a map or a closed loop cannot be run as asked."""
+    """A sweep, map or closed loop cannot be run with these settings."""
 
 
 class DeviceError(HapticBridgeError):
     """A device cannot be opened, read or written, or its input file is bad."""
 
 
-class DeviceLost(DeviceError):  # noqa: N818 - as SafetyTrip: what happened, not a mistake
-    """A device is gone in mid-run: unplugged, or silent for longer than it may be."""
+class DeviceLost(DeviceError):  # noqa: N818 - an event like SafetyTrip, not a mistake
+    """A device was unplugged, or was silent for too long, during a run."""
 
 
 class CommandError(HapticBridgeError):
-    """A command to a run that goes on is refused; the run goes on as it was."""
+    """A command to a run is refused; the run continues unchanged."""
 
 
 class IdentificationError(DeviceError):
-    """A run does not tell what a device is: too little motion, a hand on it, a motor at its end."""
+    """A recording does not determine a device: little motion, a hand on it, a saturated motor."""
 
 
 class RecordingError(HapticBridgeError):
@@ -55,10 +55,10 @@ class RecordingError(HapticBridgeError):
 
 
 class SafetyTrip(HapticBridgeError):  # noqa: N818 - the field's word for it
-    """The bridge stopped itself: zero force was commanded first, then this was raised.
+    """The guard stopped the bridge; zero force was commanded before this was raised.
 
     Attributes:
-        records: The last second of tick records (``TICK_DTYPE``), newest last.
+        records: Tick records of the last second (``TICK_DTYPE``), newest last.
     """
 
     def __init__(self, message: str, records: NDArray[np.void]) -> None:

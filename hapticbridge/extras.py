@@ -1,4 +1,4 @@
-"""Packages that only some of the work needs: who wants it installs one of the project's extras."""
+"""Import of optional packages."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from hapticbridge.errors import HapticBridgeError
 def optional_module(
     module: str, purpose: str, extra: str, error: type[HapticBridgeError], package: str = ""
 ) -> Any:
-    """Returns a module of a package that may not be there.
+    """Imports a module of an optional package.
 
     Args:
-        module: What is imported, with dots.
-        purpose: What needs it, for the message.
-        extra: Which of the project's extras brings it.
-        error: What is raised.
-        package: What the user knows it as; the module's first part by default.
+        module: Dotted name of the module.
+        purpose: Feature that needs it, for the message.
+        extra: The project's extra that installs it.
+        error: Exception to raise.
+        package: Name of the package for the user; the module's first part by default.
 
     Raises:
-        HapticBridgeError: An ``error`` that says what to install.
+        HapticBridgeError: ``error``, with the command that installs the package.
     """
     try:
         return importlib.import_module(module)

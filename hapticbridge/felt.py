@@ -1,8 +1,4 @@
-"""What a run's coupling feels like, and which damper that takes, in words.
-
-A hand feels K and B. The damper of the coupling's law has B' less than that where the integration
-adds damping by itself, and it is B' that the device's condition b >= K T/2 + B' counts.
-"""
+"""Sentences on the effective coupling and its law."""
 
 from __future__ import annotations
 
@@ -20,43 +16,46 @@ from hapticbridge.tick import TickFlag
 
 
 def is_always_held(model: mujoco.MjModel, grip: str) -> bool:
-    """Tells whether a lossless coupling will stay implicit, because something never lets go.
+    """Returns True if a lossless coupling stays implicit because the tool is never free.
 
     Args:
-        model: The compiled scene, with its handle.
+        model: The compiled scene with its handle.
         grip: Name of the site on the tool.
 
     References:
-        ``kernel.tree.ToolTree.is_never_free`` says what that may be.
+        ``kernel.tree.ToolTree.is_never_free`` lists the causes.
     """
     own = [model.actuator(name).id for name in COUPLING_ACTUATORS]
     return tree_of_tool(model, int(model.site(grip).bodyid[0]), own).is_never_free
 
 
 def was_always_held(ticks: NDArray[np.void]) -> bool:
-    """Tells the same of a run, from its records: no tick was lossless. False without a record."""
+    """Returns True if no record of a run was lossless; False without records."""
     return was_never_lossless(len(ticks), int(np.bitwise_or.reduce(ticks["flags"])))
 
 
 def was_never_lossless(count: int, flags: int) -> bool:
-    """Tells it from how many records there are, and all flags that any of them has."""
+    """Returns True if no record was lossless, by the number of records and their combined flags."""
     return count > 0 and not flags & int(TickFlag.MIDPOINT)
 
 
 def coupling_sentences(
     used: Coupling, method: Method, period: float, substeps: int, *, is_always_held: bool = False
 ) -> tuple[str, ...]:
-    """Returns what is felt and what is used, translation first, then rotation if it has a spring.
+    """Describes effective and law coupling: translation, then rotation if it has a spring.
 
         B = B' + adds K h,    h = T / substeps        (away from contact, to first order in h)
 
+    A hand feels K and B. The law uses a smaller B' if the integration adds damping by itself, and
+    the device condition b >= K T/2 + B' counts B'.
+
     Args:
         used: K and B' of the law.
-        method: How the tool is rendered; behind no coupling law there is nothing to say.
+        method: The rendering method; without a coupling law there are no sentences.
         period: T in s.
         substeps: MuJoCo steps per tick.
-        is_always_held: Whether a tool behind a lossless coupling is never let go: then that is
-            implicit all the time, and adds what the implicit form adds. Says nothing of others.
+        is_always_held: True if the tool of a lossless coupling is never free. The coupling is then
+            always implicit and adds the implicit form's damping. No effect on other methods.
     """
     if not method.has_law:
         return ()

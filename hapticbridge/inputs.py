@@ -1,7 +1,7 @@
-"""The scene's own inputs, changed while a run goes on, and kept so that it can be repeated.
+"""Inputs of the scene during a run.
 
-An input is a list of plain writes into MuJoCo's data: they are what is applied, what the recording
-keeps, and what a re-simulation applies again at the same tick.
+An input is a list of plain writes into MuJoCo's data. The bridge applies them, the recording keeps
+them, and a re-simulation applies them again at the recorded tick.
 """
 
 from __future__ import annotations
@@ -34,13 +34,14 @@ def input_writes(
 
     Args:
         model: The scene's model.
-        ctrl: Control per actuator of the scene.
-        mocap: Pose (x, y, z[, qw, qx, qy, qz]) in m per mocap body of the scene.
-        joint_force: Generalised force per joint, in N or N m per degree of freedom.
-        body_wrench: (force, torque) in N and N m per body, world frame, about its centre of mass.
+        ctrl: Controls by actuator of the scene.
+        mocap: Poses (x, y, z[, qw, qx, qy, qz]) in m by mocap body of the scene.
+        joint_force: Generalised forces by joint, in N or N m per degree of freedom.
+        body_wrench: Wrenches (force, torque) in N and N m by body, in the world frame about its
+            centre of mass.
 
     Raises:
-        SceneError: A name does not exist, is the bridge's own, or has the wrong count of numbers.
+        SceneError: A name does not exist, belongs to the bridge, or has the wrong number of values.
     """
     given = {"ctrl": ctrl, "mocap": mocap, "joint_force": joint_force, "body_wrench": body_wrench}
     for kind, values in given.items():
@@ -96,7 +97,7 @@ def _numbers(what: str, value: ArrayLike, counts: tuple[int, ...]) -> list[float
         array = np.atleast_1d(np.asarray(value, dtype=np.float64)).ravel()
     except (TypeError, ValueError):
         raise SceneError(f"{what} is {value!r:.80}; it must be numbers") from None
-    # MuJoCo takes a larger control for a failure and ignores all, the coupling's included
+    # MuJoCo treats a larger control as a failure and ignores all controls, also the coupling's
     if array.size not in counts or not np.all(np.abs(array) <= mujoco.mjMAXVAL):
         expected = " or ".join(str(count) for count in counts)
         raise SceneError(
@@ -107,10 +108,10 @@ def _numbers(what: str, value: ArrayLike, counts: tuple[int, ...]) -> list[float
 
 
 def apply_writes(data: mujoco.MjData, writes: Sequence[Sequence[Any]]) -> None:
-    """Applies writes, as they come from ``input_writes`` or from a recording's event.
+    """Applies writes from ``input_writes`` or from a recorded event.
 
     Raises:
-        SceneError: A write names another field or reaches beyond it.
+        SceneError: A write names another field or exceeds it.
     """
     for field, first, numbers in writes:
         if field not in _FIELDS:

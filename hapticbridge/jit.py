@@ -1,4 +1,4 @@
-"""How this package compiles: one decorator for every function that runs inside a tick."""
+"""Compilation of the functions that run inside a tick."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ _Function = TypeVar("_Function", bound=Callable[..., object])
 
 @cache
 def cache_folder() -> str:
-    """Returns where machine code is kept: one folder per state of all compiled sources.
+    """Returns the folder of the machine code, one per state of all compiled sources.
 
-    numba looks only at the file of the function that it loads, but compiled functions inline each
-    other across files, and the kernel's constants too: with one folder for all, a change in one
-    module would leave its old code in the callers. ``NUMBA_CACHE_DIR`` moves the folder.
+    numba checks only the file of the function that it loads, but compiled functions inline each
+    other across files, and the kernel's constants too. With one folder for all, callers would keep
+    the old code of a changed module. ``NUMBA_CACHE_DIR`` moves the folder.
     """
     digest = hashlib.sha256()
     for path in sorted(Path(__file__).parent.rglob("*.py")):
@@ -44,31 +44,30 @@ def _compiled(function: _Function, *, nogil: bool) -> _Function:
 def compiled(function: _Function) -> _Function:
     """Compiles a function with numba: nopython, cached on disk, holding the interpreter lock.
 
-    Floating-point semantics stay IEEE (no ``fastmath``): the live loop, the sweeps and the audit's
-    re-simulation inline the same functions into different callers and must agree to the bit.
-    Division by zero gives inf or nan as in NumPy instead of raising, because an exception cannot
-    be raised in the middle of a tick; what is not finite trips the guard. The lock is held because
-    a tick that lets it go for a microsecond may wait milliseconds to get it back.
+    Floating-point semantics stay IEEE (no ``fastmath``). The live loop, the sweeps and the audit's
+    re-simulation inline the functions into different callers and must agree to the bit. Division by
+    zero gives inf or nan as in NumPy, because a tick must not raise; a result that is not finite
+    trips the guard. The lock is held because a tick that releases it for a microsecond may wait
+    milliseconds to regain it.
     """
     return _compiled(function, nogil=False)
 
 
 def compiled_for_threads(function: _Function) -> _Function:
-    """As ``compiled``, but lets the interpreter lock go: for whole runs in several threads."""
+    """Compiles like ``compiled``, but releases the interpreter lock: for whole runs in threads."""
     return _compiled(function, nogil=True)
 
 
 def direct(function: _Function, *arguments: object) -> _Function:
-    """Returns a compiled function's machine code for arguments of these types.
+    """Returns a compiled function's machine code for arguments of these types, without calling it.
 
-    Calling it skips the dispatcher, which looks at the types of all arguments in every call: with
-    three structured arrays that takes 0.6 µs, the call itself 0.2 µs. Compiles, or loads from the
-    cache, but does not call.
+    It skips the dispatcher, which checks the types of all arguments in every call: 0.6 µs with
+    three structured arrays, while the call itself takes 0.2 µs.
 
     Args:
-        function: What ``compiled`` returned.
-        *arguments: Examples of the arguments; only their types matter. The result must never be
-            called with others: nothing checks them any more.
+        function: Function from ``compiled``.
+        *arguments: Examples of the arguments, for their types. The result must never be called with
+            other types; nothing checks them.
     """
     dispatcher = cast(numba.core.dispatcher.Dispatcher, function)
     signature = tuple(numba.typeof(argument) for argument in arguments)

@@ -1,4 +1,4 @@
-"""Facts as JSON can hold them: it knows neither NaN nor infinity."""
+"""JSON without NaN and infinity."""
 
 from __future__ import annotations
 
@@ -8,11 +8,10 @@ from typing import Any
 
 
 def jsonable(value: Any) -> Any:
-    """Returns a value with None in place of every number in it that is not finite.
+    """Replaces every number that is not finite by None.
 
     Args:
-        value: Numbers, text, and mappings, lists and tuples of them, as deep as they go; tuples
-            come back as lists.
+        value: Numbers, text, and nested mappings, lists and tuples of them; tuples become lists.
     """
     if isinstance(value, Mapping):
         return {key: jsonable(inner) for key, inner in value.items()}

@@ -1,4 +1,4 @@
-"""What the kernel metered, in words: energy per port, and whether the environment is passive."""
+"""Energies metered by the kernel, and the environment's verdict."""
 
 from __future__ import annotations
 
@@ -13,27 +13,27 @@ Environment = Literal["strict", "within slack", "active"]
 
 @dataclass(frozen=True, slots=True)
 class Ledger:
-    """Energies of a run so far, all in J and cumulative since its start except the storage.
+    """Energies of a run in J; all but the storage are cumulative since its start.
 
-    E_k = S_k − S_{k−1} − (works of all ports in tick k); the environment gave out no more than it
-    got while Σ E_k <= 0 (BC97 (14)), and the device stays safe while Σ E_k stays below the slack,
-    Σ ½‖δx_k‖²_{K+B/T} and its rotational counterpart.
+    E_k = S_k − S_{k−1} − (works of all ports in tick k). The environment has released no more
+    energy than it received while Σ E_k <= 0 (BC97 (14)). The device stays safe while Σ E_k stays
+    below the slack, Σ ½‖δx_k‖²_{K+B/T} and its rotational counterpart.
 
     Attributes:
-        kinetic: Kinetic energy now.
-        potential: Potential energy now: gravity and springs.
+        kinetic: Present kinetic energy.
+        potential: Present potential energy of gravity and springs.
         coupling_work: Work of the coupling on the tool, Σ f_k·δx_k + τ_k·δφ_k.
         actuator_work: Work of the scene's own actuators.
         external_work: Work of applied forces, gravity compensation, moved mocap bodies and resets.
-        tuning_work: Work of commands that changed the coupling, on its spring (``kernel.tuning``).
-        environment_energy: Σ E_k: what the simulation created (> 0) or dissipated (< 0).
-        device_energy: Energy given to the device by the wrenches that were sent.
-        slack: What Σ E_k may reach before the guarantee is lost.
-        slack_share: Largest share of the slack that was ever used, 0 if always strict.
+        tuning_work: Work on the coupling's spring by commands that changed it (``kernel.tuning``).
+        environment_energy: Σ E_k: energy created (> 0) or dissipated (< 0) by the simulation.
+        device_energy: Energy given to the device by the wrenches sent.
+        slack: Bound of Σ E_k up to which the guarantee holds.
+        slack_share: Largest share of the slack used so far; 0 if always strict.
         first_unstrict: First tick at which (14) did not hold, or None.
         first_active: First tick at which the slack was exceeded, or None.
-        first_kick: First tick at which a device whose wrench comes from no coupling law had been
-            given more than its damping burns and the scene gave up, or None.
+        first_kick: First tick at which a device without a coupling law had received more than its
+            damping dissipates and the scene released, or None.
     """
 
     kinetic: float
@@ -52,7 +52,7 @@ class Ledger:
 
     @classmethod
     def of(cls, state: NDArray[np.void]) -> Ledger:
-        """Reads the ledger out of the kernel's state (``STATE_DTYPE``, one element)."""
+        """Reads the ledger from the kernel's state (``STATE_DTYPE``, one element)."""
         values = {name: float(state[name][0]) for name in _ENERGIES}
         ticks = [int(state[name][0]) for name in _TICKS]
         unstrict, active, kick = (tick if tick >= 0 else None for tick in ticks)
@@ -60,7 +60,7 @@ class Ledger:
 
     @property
     def environment(self) -> Environment:
-        """``strict`` if (14) held throughout, ``within slack`` or ``active``."""
+        """``strict`` if (14) always held, ``within slack`` or ``active``."""
         if self.first_active is not None:
             return "active"
         return "strict" if self.first_unstrict is None else "within slack"

@@ -1,4 +1,4 @@
-"""What every picture shares: its name, its canvas, how it is written."""
+"""Figures and picture files."""
 
 from __future__ import annotations
 
@@ -14,21 +14,18 @@ from hapticbridge.errors import HapticBridgeError
 from hapticbridge.whole_file import whole_file
 
 ENDINGS = (".pdf", ".png", ".svg")
-"""What a picture's name may end in."""
+"""Extensions of picture files."""
 
 DOTS_PER_INCH = 100
-"""Resolution of a written picture in 1/inch: a figure 8 inches wide is legible at 800 pixels. More
-makes files larger."""
+"""Resolution of a picture file in 1/inch: a figure 8 inches wide has 800 pixels. A larger one makes
+larger files."""
 
 
 def check_ending(path: Path) -> None:
-    """Checks that a picture can be written under its name, before anything is computed for it.
-
-    Args:
-        path: The file to be written.
+    """Checks that a picture can be written to a file, before anything is computed for it.
 
     Raises:
-        HapticBridgeError: The name ends in none of ``ENDINGS``, or its folder does not exist.
+        HapticBridgeError: The extension is not one of ``ENDINGS``, or the folder does not exist.
     """
     if path.suffix.lower() not in ENDINGS:
         raise HapticBridgeError(
@@ -39,12 +36,7 @@ def check_ending(path: Path) -> None:
 
 
 def new_figure(width: float, height: float) -> Figure:
-    """Returns an empty figure that needs no display.
-
-    Args:
-        width: In inches.
-        height: In inches.
-    """
+    """Returns an empty figure, sizes in inches, that needs no display."""
     figure = Figure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)
     return figure
@@ -52,20 +44,16 @@ def new_figure(width: float, height: float) -> Figure:
 
 def _save(figure: Figure, target: Path | io.StringIO, **options: Any) -> None:
     with warnings.catch_warnings():
-        # a name in letters that the font lacks is drawn as boxes, which is no news
+        # characters missing in the font are drawn as boxes without a warning
         warnings.filterwarnings("ignore", message="Glyph", category=UserWarning)
         figure.savefig(target, **options)
 
 
 def write_picture(figure: Figure, path: Path) -> None:
-    """Writes a figure in the format that the file's name says.
-
-    Args:
-        figure: What to write.
-        path: Its ending is one of ``ENDINGS``.
+    """Writes a figure in the format of the file's extension.
 
     Raises:
-        HapticBridgeError: The ending is no picture format, or the file cannot be written.
+        HapticBridgeError: The extension is no picture format, or the file cannot be written.
     """
     check_ending(path)
     try:
@@ -78,7 +66,7 @@ def write_picture(figure: Figure, path: Path) -> None:
 def inline_svg(figure: Figure) -> str:
     """Returns a figure as an ``<svg>`` element for a page."""
     buffer = io.StringIO()
-    # no metadata: a page needs none of matplotlib's own
+    # a page needs none of matplotlib's metadata
     unwanted = dict.fromkeys(("Creator", "Date", "Format", "Type"))
     _save(figure, buffer, format="svg", metadata=unwanted)
     text = buffer.getvalue()

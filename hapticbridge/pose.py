@@ -1,8 +1,8 @@
 """Rotations and poses as compiled functions on tuples of scalars.
 
-Quaternions are (w, x, y, z); rotation vectors are axis times angle, in rad. Tuples instead of
-arrays, because these run inside a tick and must not allocate. MuJoCo's ``mju_`` functions are the
-independent check.
+Quaternions are (w, x, y, z); rotation vectors are axis times angle, in rad. The functions run
+inside a tick and must not allocate, so they take tuples instead of arrays. MuJoCo's ``mju_``
+functions are the independent check.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ Quaternion: TypeAlias = tuple[float, float, float, float]
 
 ZERO_VECTOR: Vector = (0.0, 0.0, 0.0)
 IDENTITY_POSE = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
-"""A place in m and an orientation (w, x, y, z), both the frame's own."""
+"""Identity pose: position in m and quaternion (w, x, y, z)."""
 
 
 @compiled
@@ -102,10 +102,10 @@ def product(a: Quaternion, b: Quaternion) -> Quaternion:
 
 @compiled
 def canonical(q: Quaternion) -> Quaternion:
-    """Returns the unit quaternion with w >= 0 of the same rotation (q and −q are one rotation).
+    """Returns the unit quaternion with w >= 0 of a rotation (q and −q are one rotation).
 
-    Idempotent to the bit: what is of unit length to 1e-12 is not scaled again, or a recorded
-    quaternion that is read back would differ in its last digit.
+    The function is idempotent to the bit: a quaternion of unit length to 1e-12 is not scaled again.
+    Otherwise a recorded quaternion would change in its last digit when read back.
     """
     square = q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]
     factor = 1.0 / math.sqrt(square) if abs(square - 1.0) > 1e-12 else 1.0
@@ -126,10 +126,10 @@ def rotated(q: Quaternion, v: Vector) -> Vector:
 def quaternion_exp(v: Vector) -> Quaternion:
     """Returns the unit quaternion of the rotation vector v.
 
-    exp(v) = (cos(θ/2), sin(θ/2) v/θ) with θ = |v| in rad.
+    exp(v) = (cos(θ/2), sin(θ/2) v/θ),   θ = |v| in rad
     """
     angle = norm(v)
-    # below 1e-8 rad the next term of sin(θ/2)/θ = 1/2 − θ²/48 is under the rounding of a double
+    # below 1e-8 rad the second term of sin(θ/2)/θ = 1/2 − θ²/48 is below a double's rounding
     factor = math.sin(0.5 * angle) / angle if angle > 1e-8 else 0.5
     return math.cos(0.5 * angle), factor * v[0], factor * v[1], factor * v[2]
 
@@ -138,8 +138,8 @@ def quaternion_exp(v: Vector) -> Quaternion:
 def quaternion_log(q: Quaternion) -> Vector:
     """Returns the rotation vector of a unit quaternion, of length 0 to π rad.
 
-    At exactly π the axis is one of two; a step across it flips the vector's sign, so whoever uses
-    it as a spring's deflection must stay below π.
+    At π the axis is ambiguous and the vector's sign flips, so a spring's deflection must stay below
+    π.
     """
     w, v = q[0], (q[1], q[2], q[3])
     if w < 0.0:
@@ -151,5 +151,5 @@ def quaternion_log(q: Quaternion) -> Vector:
 
 @compiled
 def rotation_between(a: Quaternion, b: Quaternion) -> Vector:
-    """Returns log(R(b) R(a)ᵀ), the rotation vector in the world frame that takes a to b."""
+    """Returns log(R(b) R(a)ᵀ), the rotation vector in the world frame from a to b."""
     return quaternion_log(product(b, conjugate(a)))

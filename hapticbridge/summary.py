@@ -1,4 +1,4 @@
-"""What a run was, in one object."""
+"""Summary of a run."""
 
 from __future__ import annotations
 
@@ -20,40 +20,40 @@ from hapticbridge.rendering import Method
 
 @dataclass(frozen=True, slots=True)
 class Summary:
-    """What a run was.
+    """Summary of a run.
 
     Attributes:
         ticks: Ticks since the bridge was opened.
         duration: Time of the run's clock in s: a period for each tick and each skipped deadline.
         overruns: Ticks that started a period or more after their deadline.
-        skipped: Deadlines that were skipped for it.
-        dropped: Records that the recorder did not get because it was too far behind.
+        skipped: Skipped deadlines.
+        dropped: Records lost because the recorder was too far behind.
         peak_force: Largest norm of the force on the tool in N.
         peak_torque: Largest norm of the torque on the tool in N m.
         energies: Energies by name in J.
         environment: ``strict``, ``within slack`` or ``active``.
         slack_share: Largest share of the slack that was used.
-        method: How the tool was rendered.
-        about: What that means, in a sentence.
-        hazard: What it may do on a real device, in a sentence; empty where the device condition is
-            all that is to be said.
-        coupling: The coupling asked for: what should be felt.
-        used: That of the law, whose damping B' the device condition counts.
-        rendered: What is felt away from contact, or everywhere if the tool was never let go, and
-            what is used, in sentences.
-        felt: The coupling that the tool was truly held by, where no law says it (a weld: the
-            stiffest axis, as measured at the start).
-        fault: Tick and port (``environment`` or ``device``) of the first fault, or None. Behind a
-            coupling law the device's port is not metered while it runs: a certified device needs
-            no watch, and of another the audit of its recording tells.
-        conditions: What the device must satisfy, as sentences.
-        is_certified: Whether b >= scale · force_scale · (KT/2 + B') holds for the device in
-            translation and rotation; None where its damping is unknown, or where no coupling law
-            makes that condition enough.
-        stopped_by: ``duration``, ``signal``, ``caller``, or who else called ``Bridge.stop``.
-        recording: The file, if one was written.
-        reach: Distance of the device in m from the origin of its frame beyond which it moved
-            without the handle and without force; None without such a limit.
+        method: Name of the rendering method.
+        about: Description of the method in a sentence.
+        hazard: Hazard on a real device beyond the device condition, in a sentence; empty without
+            one.
+        coupling: Requested coupling: K and B to be felt.
+        used: Coupling of the law, with the damping B' of the device condition.
+        rendered: Sentences on effective and law coupling. They hold away from contact, or
+            everywhere if the tool was never released.
+        felt: Effective coupling of a weld (its stiffest axis, measured at the start); None with a
+            coupling law.
+        fault: Tick and port (``environment`` or ``device``) of the first fault, or None. With a
+            coupling law the device port is not metered during the run. A certified device needs no
+            metering; for any other the audit of the recording decides.
+        conditions: Device conditions, as sentences.
+        is_certified: True if b >= scale · force_scale · (KT/2 + B') holds for the device in
+            translation and rotation. None if its damping is unknown, or if no coupling law makes
+            the condition sufficient.
+        stopped_by: ``duration``, ``signal``, ``caller``, or another caller of ``Bridge.stop``.
+        recording: The recording, or None.
+        reach: Distance in m of the device from the origin of its frame beyond which it moved
+            without handle and force; None without such a limit.
     """
 
     ticks: int
@@ -82,7 +82,7 @@ class Summary:
 
     @property
     def verdict(self) -> str:
-        """``passive`` (strict or within slack, and no kick that is metered) or ``active``."""
+        """``passive`` (strict or within slack, without a metered kick) or ``active``."""
         return "active" if self.fault is not None else "passive"
 
     @classmethod

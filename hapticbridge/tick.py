@@ -1,7 +1,7 @@
-"""One tick of the bridge as data: the record that is written, and the sample that is read.
+"""Record of one tick, and sample of a device.
 
-All fields are 8 bytes wide and little-endian, so a record is at once a NumPy structured scalar,
-a row of the shared-memory ring, and the payload of a message in the recording.
+All fields are 8 bytes wide and little-endian. A record is therefore a NumPy structured scalar, a
+row of the shared-memory ring, and the payload of a message in the recording.
 """
 
 from __future__ import annotations
@@ -17,19 +17,19 @@ class TickFlag(IntFlag):
     """Bits of the record's ``flags``.
 
     Attributes:
-        OVERRUN: The tick started after its deadline by a period or more; deadlines were skipped.
-        DROPPED_BEFORE: Records were lost between the previous record and this one (ring full).
-        FORCE_LIMITED: Force or torque was scaled down to the limit.
-        SLEW_LIMITED: The wrench changed faster than the slew limit allows.
-        RAMPING: The wrench still rises, after the start or after the coupling was re-seated.
+        OVERRUN: The tick started a period or more after its deadline; deadlines were skipped.
+        DROPPED_BEFORE: Records before this one were lost because the ring was full.
+        FORCE_LIMITED: Force or torque was scaled down to its limit.
+        SLEW_LIMITED: The change of the wrench was cut to the slew limit.
+        RAMPING: The wrench is rising after the start or after a re-anchoring of the coupling.
         CONTROLLER_ACTIVE: The passivity controller injected damping.
         CONTACT: MuJoCo found at least one contact in the scene.
         CLUTCH: The device moves without the handle.
-        STALE_SAMPLE: The device had nothing new since the previous tick.
-        TRIP: The guard stopped the run in this tick; the wrench sent is zero. A tick that is not
-            finite is not recorded at all; the event ``trip`` names it.
-        RESEATED: The handle was put to the tool before this tick, and the device's pose belongs to
-            it from here on; the wrench rises from zero again.
+        STALE_SAMPLE: The device had no new sample since the previous tick.
+        TRIP: The guard stopped the run in this tick and sent zero wrench. A tick that is not finite
+            is not recorded; the event ``trip`` names it.
+        RESEATED: The coupling was re-anchored before this tick: the handle was set to the tool at
+            the device's present pose, and the wrench rises from zero again.
         MIDPOINT: The coupling was lossless in this tick: its torque follows the midpoint rule.
     """
 
@@ -78,11 +78,11 @@ TICK_DTYPE = np.dtype(
     ]
 )
 """One record. Row k holds the sample read in tick k, the wrench computed from it, and the energies
-after the step. Positions in m, quaternions (w, x, y, z) with w >= 0, wrenches (force in N, torque
-in N m) in the world frame about the grip (``wrench_on_tool``) or in the device's frame
-(``wrench_on_device``), energies and cumulative works in J. ``injected_damping`` in N s/m and
-``injected_rotational_damping`` in N m s/rad are the largest that the passivity controller added on
-an axis of either kind."""
+after the step. Positions are in m, quaternions (w, x, y, z) with w >= 0, energies and cumulative
+works in J. Wrenches (force in N, torque in N m) are in the world frame about the grip
+(``wrench_on_tool``) or in the device's frame (``wrench_on_device``). ``injected_damping`` in N s/m
+and ``injected_rotational_damping`` in N m s/rad are the passivity controller's largest on any axis
+of that kind."""
 
 _POSITION, _QUATERNION = (("x", "y", "z"), "m"), (("w", "x", "y", "z"), "1")
 _WRENCH = ("fx", "fy", "fz", "tx", "ty", "tz"), "N"
@@ -114,13 +114,13 @@ UNITS = {
 
 
 class Column(NamedTuple):
-    """One number of a record, as tables and messages name it.
+    """One number of a record, as in tables and messages.
 
     Attributes:
-        name: The field's, with ``_x`` and the like where the field is a vector.
-        field: Of ``TICK_DTYPE``.
-        part: Index in the field; None where the field is one number.
-        unit: SI, ``ns`` where the name says so, ``1`` for counts, bits and quaternions.
+        name: Name of the field, with a suffix such as ``_x`` for a vector.
+        field: Field of ``TICK_DTYPE``.
+        part: Index in the field; None for a scalar.
+        unit: SI unit; ``ns`` if the name says so; ``1`` for counts, bits and quaternions.
     """
 
     name: str
@@ -141,10 +141,10 @@ def _columns() -> Iterator[Column]:
 
 
 COLUMNS = tuple(_columns())
-"""Every number of a record in order."""
+"""All numbers of a record, in order."""
 
 CLOCK_FIELDS = ("deadline_ns", "wake_ns", "read_ns", "write_ns")
-"""Fields that depend on the clock, not on the input: two runs of one input may differ here."""
+"""Fields that depend on the clock; they may differ between two runs with equal input."""
 
 SAMPLE_DTYPE = np.dtype([("position", "<f8", 3), ("quaternion", "<f8", 4), ("buttons", "<i8")])
-"""What a device reports: position in m and orientation in the device's frame, button bits."""
+"""Device sample: position in m and orientation in the device's frame, button bits."""

@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all."""
+"""Atomic file replacement."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from pathlib import Path
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
-    """Yields a name to write under; the file takes its place once the block is over.
+    """Yields a temporary path; after the block the file replaces the target.
 
-    What the disk did not take all of, or was interrupted, then neither stands there nor replaces
-    what did.
+    If writing fails or is interrupted, an existing file is left unchanged and no partial file
+    remains.
 
     Args:
-        path: Where the file is to stand; where it is a link, what it leads to. What is there and no
-            file, like a pipe or /dev/stdout, is written to at once.
+        path: The target; a link is followed. An existing path that is not a regular file, such as a
+            pipe or /dev/stdout, is written directly.
 
     Raises:
-        OSError: The file cannot take its place.
+        OSError: The file cannot replace the target.
     """
     target = path.resolve()
     if path.exists() and not path.is_file():

@@ -1,7 +1,7 @@
-"""Where the device's frame lies in the scene, and with it all that decides what a run computes.
+"""Map between the device's frame and the scene's, and the run parameters of a start.
 
-The live loop, the closed-loop sweeps and the studies begin their runs here, so that one method on
-one device means the same parameters in all of them.
+The live loop, the closed-loop sweeps and the studies build their parameters here, so that one
+method on one device has equal parameters in all of them.
 """
 
 from __future__ import annotations
@@ -27,20 +27,19 @@ from hapticbridge.scene import Scene
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Workspace:
-    """The map from the device's frame to the scene's.
+    """Map from the device's frame to the scene's.
 
         h = h_0 + scale · A (p − p_0),   R_h = A R_p R_p0ᵀ Aᵀ R_h0,   w = −force_scale · Aᵀ f
 
-    p is the device's position in m, h the handle's, f the force on the tool and w that on the
-    device in N. p_0 is where the device is at the start and h_0 where the grip is, or both are
-    zero.
+    p is the device's position in m, h the handle's, f the force on the tool and w the force on the
+    device in N. p_0 is the device's start and h_0 the grip's; with absolute poses both are zero.
 
     Attributes:
         scale: Handle motion per device motion, without unit, finite and > 0.
-        force_scale: Force on the device per force on the tool, likewise. ``RunParameters`` refuses
-            what is out of range.
+        force_scale: Force on the device per force on the tool, without unit, finite and > 0.
+            ``RunParameters`` checks both ranges.
         axes: A, row by row.
-        is_absolute: Whether the device's poses are poses in the scene.
+        is_absolute: True if the device's poses are poses in the scene.
     """
 
     scale: float = 1.0
@@ -52,16 +51,17 @@ class Workspace:
     def of(
         cls, scale: float, force_scale: float | None, axes: ArrayLike | None, *, is_absolute: bool
     ) -> Workspace:
-        """Returns the workspace that a user asks for.
+        """Builds a workspace from the user's arguments.
 
         Args:
-            scale: Of motion.
-            force_scale: Of force; None takes ``scale``, which keeps power equal on both sides.
+            scale: Handle motion per device motion.
+            force_scale: Force on the device per force on the tool; None takes ``scale``, which
+                keeps power equal on both sides.
             axes: 3 × 3 rotation; None is the identity.
-            is_absolute: Whether the device's poses are poses in the scene.
+            is_absolute: True if the device's poses are poses in the scene.
 
         Raises:
-            HapticBridgeError: The axes are no right-handed rotation.
+            HapticBridgeError: The axes are not a right-handed rotation.
         """
         return cls(
             scale=scale,
@@ -72,7 +72,7 @@ class Workspace:
 
 
 SAME_FRAME = Workspace()
-"""Device and scene share axes and scale; the device starts at the grip."""
+"""Workspace with equal axes and scales; the device starts at the grip."""
 
 
 def run_parameters(

@@ -70,7 +70,7 @@ def test_one_core_that_is_clocked_down_is_found(
         ({"proc/version": DEBIAN.format("PREEMPT_RT")}, True, "PREEMPT_RT"),
         ({"proc/version": DEBIAN.format("PREEMPT")}, True, "PREEMPT"),
         ({"proc/version": DEBIAN.format("")}, False, "no PREEMPT"),
-        ({"proc/version": DEBIAN.format("PREEMPT_DYNAMIC")}, None, "does not show"),
+        ({"proc/version": DEBIAN.format("PREEMPT_DYNAMIC")}, None, "is not visible"),
         (
             {
                 "proc/version": DEBIAN.format("PREEMPT_DYNAMIC"),
@@ -120,7 +120,7 @@ def test_a_host_that_took_more_than_a_thousandth_of_the_time_is_blamed(
     seen = {item.name: item for item in findings(system, GRANTED, stolen, 20.0)}["host"]
     assert seen.is_good is is_good
     assert ("it took" in seen.sentence) == (stolen > 0)
-    assert "run on the machine itself" in seen.remedy
+    assert "run on a physical machine" in seen.remedy
 
 
 def test_what_the_host_took_is_read_from_the_kernel(tmp_path: Path) -> None:
@@ -244,7 +244,7 @@ def test_the_verdict_says_whose_delays_they_are_and_what_to_do() -> None:
     assert judged(alone, (mend, again), 1000.0)[1].count("sudo prlimit") == 1
     assert "bare sleep loop" in judged(alone | {"bare sleep": late}, (), 1000.0)[1]
     assert "machine itself stalls" in judged(alone | {"cyclictest": late}, (mend,), 1000.0)[1]
-    assert "nothing is to be done" in judged(alone | {"bridge": good}, (), 1000.0)[1]
+    assert "no change is needed" in judged(alone | {"bridge": good}, (), 1000.0)[1]
 
 
 @pytest.mark.parametrize(("worst", "is_told"), [(0.019, False), (0.021, True)])
@@ -253,7 +253,9 @@ def test_a_stall_longer_than_a_devices_watchdog_is_told_with_what_it_means_for_t
 ) -> None:
     stalled = {name: lateness(1e-5, 1e-5, worst, missed=200) for name in ("bridge", "bare sleep")}
     sentence = judged(stalled, (), 1000.0)[1]
-    assert ("stood still for 21 ms: for so long a device goes on" in sentence) == is_told
+    assert (
+        "stalled for 21 ms: meanwhile a device keeps applying its last force" in sentence
+    ) == is_told
     assert ("'hapticbridge devices'" in sentence) == is_told
 
 
@@ -305,7 +307,7 @@ def test_cyclictest_takes_its_turns_where_it_is_and_may(
     assert ("cyclictest" in result.lateness) == (late is not None)
     said = {finding.name: finding.sentence for finding in result.findings}["baseline"]
     if late is None:  # tried once, and the two others share the time
-        assert "but it failed: no reason" in said
+        assert "it failed: no reason" in said
         assert len(asked) == 1
         assert result.lateness["bridge"].ticks == 3000
     else:
@@ -321,7 +323,7 @@ def test_cyclictest_takes_its_turns_where_it_is_and_may(
         (True, 0, CYCLICTEST, "needs SCHED_FIFO, which was refused"),
         (True, 80, CYCLICTEST, ""),
         (True, 80, "Unable to change!\nMissing capabilities.\n", "it failed: Missing capabil"),
-        (True, 80, subprocess.TimeoutExpired("cyclictest", 5.0), "did not come to an end"),
+        (True, 80, subprocess.TimeoutExpired("cyclictest", 5.0), "did not finish"),
         (True, 80, FileNotFoundError(2, "No such file"), "cannot be started (No such file)"),
     ],
 )

@@ -338,7 +338,7 @@ def test_a_run_that_is_told_to_end_while_an_absolute_device_strays_is_no_trip() 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"controller": "magic"}, "there are 'damper', 'environment', 'off', 'tank'"),
+        ({"controller": "magic"}, "choices: 'damper', 'environment', 'off', 'tank'"),
         ({"clutch": -1}, "clutch button is -1"),
         ({"dead_man": 99}, "dead-man button is 99"),
         ({"clutch": 1, "dead_man": 1}, "exclude each other"),

@@ -194,7 +194,7 @@ def test_memory_to_come_is_locked_only_where_no_limit_can_fail_it(
     with memory_at_rest() as grants:
         pass
     assert library.asked == [flags, 0]
-    assert ("not what is added later" in named(grants, "memory").sentence) == (flags == 1)
+    assert ("later allocations are not" in named(grants, "memory").sentence) == (flags == 1)
 
 
 def test_an_isolated_core_is_taken_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -308,7 +308,7 @@ def test_a_passive_page_says_whether_the_device_bears_the_coupling(
     told = {
         True: "The device bears this coupling, in any hand.",
         False: "The device does not bear this coupling",
-        None: "in any hand is not known",
+        None: "It is not known if the device bears this coupling in any hand.",
     }
     for certified, words in told.items():
         judged = replace(report, certified=certified)

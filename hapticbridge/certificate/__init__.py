@@ -1,7 +1,7 @@
-"""Whether a device bears a coupling, and which coupling it bears by default.
+"""Device damping required by a coupling, and the default coupling.
 
-``damping`` is how much a coupling asks for with substeps, a rate and a delay; ``conditions`` holds
-that against what the device has; ``default`` chooses the stiffest coupling that leaves a margin.
+``damping`` computes the requirement with substeps, rate and delay; ``conditions`` compares it with
+the device's damping; ``default`` chooses the stiffest coupling that leaves a margin.
 """
 
 from hapticbridge.certificate.conditions import Condition as Condition

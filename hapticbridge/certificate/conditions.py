@@ -1,4 +1,4 @@
-"""Whether a device bears a coupling, kind of axis by kind of axis, in words and as a verdict."""
+"""Device conditions and their verdict."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ class Condition:
 
     Attributes:
         axis: ``translation`` or ``rotation``.
-        needed: The right-hand side in N s/m (rotation: N m s/rad).
-        available: The device's damping b; None where unknown.
-        remedy: What to change if it does not hold.
-        delay: After how many ticks a wrench answers a sample, 0 at best; None where unknown.
+        needed: Right-hand side in N s/m (rotation: N m s/rad).
+        available: The device's damping b; None if unknown.
+        remedy: Change that helps if the condition fails.
+        delay: Ticks from a sample to the wrench that answers it, 0 at best; None if unknown.
     """
 
     axis: str
@@ -33,11 +33,11 @@ class Condition:
 
     @property
     def holds(self) -> bool | None:
-        """Whether the device has enough damping; None where that is unknown."""
+        """True if the device has enough damping; None if that is unknown."""
         return None if self.available is None else self.available >= self.needed
 
     def sentence(self) -> str:
-        """Says it, with what to change if it does not hold."""
+        """Describes the condition, with the remedy if it fails."""
         unit = "N s/m" if self.axis == "translation" else "N m s/rad"
         if self.available is None:
             return (
@@ -63,22 +63,21 @@ def device_conditions(
     laws: int = 1,
     method: Method | None = None,
 ) -> tuple[Condition, ...]:
-    """Returns the condition per kind of axis that the device has, if b of translation is known.
+    """Returns the condition for each kind of axis of a device with known translational damping.
 
-    A handle that moves ``scale`` times as far and a force that returns ``force_scale`` times as
-    large make the coupling scale · force_scale times as stiff for the device; angles are not
-    scaled, so torques return by force_scale / scale. A device's own rate and delay count
-    (``device.lateness``).
+    For the device, the coupling is scale · force_scale times as stiff in translation. Angles are
+    not scaled, so the factor for rotation is force_scale / scale. The device's own rate and delay
+    count (``device.lateness``).
 
     Args:
         info: The device.
-        coupling: K and B' of the law: what is used, not what is felt.
+        coupling: K and B' of the law, not the effective coupling.
         period: T in s.
         scale: Handle motion per device motion.
         force_scale: Force on the device per force on the tool.
-        laws: How often per tick the wrench is computed (substeps).
-        method: How the tool is rendered, which decides what helps where the damping is too low;
-            None: one that uses the damping as asked.
+        laws: Evaluations of the wrench per tick (substeps).
+        method: Rendering method, which decides the remedy; None for one that uses the damping as
+            requested.
 
     References:
         Brown & Colgate 1997, eq. (6); sufficient for any environment that satisfies (14).
@@ -105,9 +104,9 @@ def needed_on_axes(
     laws: int,
     method: Method,
 ) -> tuple[float, float]:
-    """Returns the damping that a coupling needs in N s/m and N m s/rad; 0 where nothing asks.
+    """Returns the damping that a coupling needs, in N s/m and N m s/rad; 0 without a condition.
 
-    See ``device_conditions`` for the arguments.
+    Arguments are those of ``device_conditions``.
     """
     if not method.has_coupling:
         return 0.0, 0.0
@@ -117,10 +116,10 @@ def needed_on_axes(
 
 
 def _remedy(method: Method | None, used: float) -> str:
-    """Returns what lowers the damping needed.
+    """Returns the change that lowers the required damping.
 
-    A method that takes its own damping off what is felt spends on B' what a softer spring or a
-    shorter period saves, or more, as long as there is some B': until then only B counts.
+    For a method that subtracts its own damping, a softer spring or a shorter period raises B' by as
+    much as it saves, or more. While B' > 0, only a lower B helps.
     """
     if method is None or method.lag == 0.0:
         return "lower stiffness or damping, or raise the rate"
@@ -132,7 +131,7 @@ def run_conditions(
 ) -> tuple[Condition, ...]:
     """Returns the device conditions of a run; none for a prescribed motion or without a coupling.
 
-    A weld is judged by the stiffness and damping that it truly has.
+    A weld is judged by its measured stiffness and damping.
     """
     if info.is_prescribed or not method.has_coupling:
         return ()
@@ -150,11 +149,10 @@ def run_conditions(
 def condition_sentences(
     info: DeviceInfo, parameters: RunParameters, method: Method
 ) -> tuple[str, ...]:
-    """Returns what is to be said of device and method, one sentence each.
+    """Returns sentences on the device conditions, or on geometry for a method without a coupling.
 
-    Without a coupling geometry decides: two contacts of stiffness K_c on opposite sides of a tool,
-    L apart, are a rotational spring of ½ K_c L² about the middle, and stable only for
-    L <= 2 √(b_θ/(T K_c)).
+    Without a coupling, two contacts of stiffness K_c on opposite sides of a tool, L apart, act as a
+    rotational spring of ½ K_c L² about the middle. They are stable only for L <= 2 √(b_θ/(T K_c)).
 
     References:
         Brown & Colgate 1997, eq. (1).
@@ -173,25 +171,25 @@ def condition_sentences(
 
 
 def is_run_certified(conditions: tuple[Condition, ...], method: Method) -> bool | None:
-    """As ``is_certified``; None also where the conditions hold, but no coupling law makes them do.
+    """Returns ``is_certified``, but None instead of True for a method without a coupling law.
 
-    For a weld b >= KT/2 + B' is necessary with what it truly is, but nothing proves it enough.
+    For a weld b >= KT/2 + B' with its measured K and B is necessary, but not proven sufficient.
     """
     verdict = is_certified(conditions)
     return None if verdict and not method.has_law else verdict
 
 
 def is_certified(conditions: tuple[Condition, ...]) -> bool | None:
-    """Returns whether all conditions hold; None where unknown, or where a delay forbids a proof."""
+    """Returns True if all conditions hold; None if one is unknown or a delay forbids a proof."""
     held = {condition.holds for condition in conditions}
     is_late = any(condition.delay != 0 for condition in conditions)
     return False if False in held else None if None in held or not held or is_late else True
 
 
 def damping_margin(conditions: tuple[Condition, ...]) -> float | None:
-    """Returns the least share of the device's damping that is left, 1 − needed / b.
+    """Returns the smallest share of the device's damping that is left, 1 − needed / b.
 
-    Negative where more is needed than there is; None where no damping is known.
+    It is negative if more is needed than available; None if no damping is known.
     """
     shares = [
         1.0 - condition.needed / condition.available if condition.available else -math.inf

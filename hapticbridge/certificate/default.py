@@ -1,4 +1,4 @@
-"""Which coupling a device bears by default."""
+"""Default coupling of a device."""
 
 from __future__ import annotations
 
@@ -14,22 +14,24 @@ from hapticbridge.passivity import stiffest_coupling
 from hapticbridge.rendering import Method, default_method
 
 UNKNOWN_DAMPING, UNKNOWN_ROTATIONAL_DAMPING = 2.0, 2e-3
-"""N s/m and N m s/rad from which the default coupling follows where the device's are unknown: those
-of the default simulated device. Larger ones would feel stiffer and be safe on fewer devices."""
+"""Damping in N s/m and N m s/rad assumed for a device of unknown damping: that of the default
+simulated device. Larger values give a stiffer default coupling that is safe on fewer devices."""
 
 UNKNOWN_REAL_DAMPING, UNKNOWN_REAL_ROTATIONAL_DAMPING = 0.2, 2e-4
-"""The same for a device that moves a motor: a tenth, the low end of what desktop devices are
-believed to have, because almost no maker publishes it."""
+"""Damping in N s/m and N m s/rad assumed for a device with motors of unknown damping. It is a tenth
+of ``UNKNOWN_DAMPING``: the low end of estimates for desktop devices, because almost no maker
+publishes it."""
 
 NEEDED_SHARE = 0.85
-"""Share of the device's damping that the default coupling needs, without unit: K T/2 + B of 80 % of
-the bound with B = b/4 is 0.6 b + 0.25 b. More is stiffer and leaves less for an error in b."""
+"""Share of the device's damping that the default coupling needs, without unit. K T/2 + B at 80 % of
+the bound with B = b/4 is 0.6 b + 0.25 b. A larger share is stiffer and leaves less for an error in
+b."""
 
 
 def assumed_damping(info: DeviceInfo) -> tuple[float, float]:
-    """Returns the damping in N s/m and N m s/rad that a device has, or is taken to have.
+    """Returns the device's damping in N s/m and N m s/rad, or the assumed values.
 
-    Unknown, or zero, it is ``UNKNOWN_DAMPING``, of a real device ``UNKNOWN_REAL_DAMPING``.
+    Unknown or zero damping becomes ``UNKNOWN_DAMPING``, or ``UNKNOWN_REAL_DAMPING`` with motors.
     """
     linear = info.damping or (UNKNOWN_REAL_DAMPING if info.is_real else UNKNOWN_DAMPING)
     angular = info.rotational_damping or (
@@ -50,23 +52,21 @@ def default_coupling(
 ) -> Coupling:
     """Returns the stiffest coupling that is safe on a device: 80 % of the bound, B' = b / 4.
 
-    It is what is to be felt: K and B = B' + what the method adds by itself, so that the method uses
-    B' without clipping. It needs 85 % of b. Where several laws a tick or a delay need more, K and
-    B' are lowered together until they need no more than that, each kind of axis by itself:
-    ``needed_damping`` is linear in the two.
+    The result is the requested coupling: K and B = B' + the method's own damping, so that the law
+    uses B' without clipping. It needs 85 % of b. If several laws per tick or a delay need more, K
+    and B' are lowered together to meet it, separately for each kind of axis; ``needed_damping`` is
+    linear in both.
 
     Args:
-        info: The device; where its damping is unknown, ``UNKNOWN_DAMPING`` is assumed, of a real
-            one ``UNKNOWN_REAL_DAMPING``.
+        info: The device; unknown damping is replaced as in ``assumed_damping``.
         period: T in s.
         scale: Handle motion per device motion.
         force_scale: Force on the device per force on the tool.
-        laws: How often per tick the wrench is computed (substeps).
-        method: How the tool is rendered; None takes ``rendering.default_method``.
+        laws: Evaluations of the wrench per tick (substeps).
+        method: Rendering method; None takes ``rendering.default_method``.
 
     Raises:
-        CouplingError: The number of laws is out of range, or a scale is not finite and positive, or
-            so is the period.
+        CouplingError: The number of laws, a scale or the period is out of range.
     """
     for name, value in (("scale", scale), ("force_scale", force_scale)):
         if not math.isfinite(value) or value <= 0:

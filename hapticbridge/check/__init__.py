@@ -1,8 +1,8 @@
-"""What a scene models, what that costs, what is wrong with it, and what could go unnoticed.
+"""Checks and simplification of a scene.
 
-Read ``case`` first: it leads a scene through its ``motion`` as a bridge would (``rehearsal``) and
-keeps what was seen (``observation``). ``inventory`` says what is modelled, ``rules`` what is wrong
-(a module of faults per subject, each a ``faults.Fault`` with its place from ``places``), ``cost``
-what it takes. ``lean`` then tries to do with less: each edit of ``simplifications`` is made on a
-``draft`` and judged by ``trial`` and ``felt``.
+``case`` leads a scene through its ``motion`` as a bridge would and keeps an ``observation``.
+``inventory`` counts the model's parts. ``rules`` lists the faults; each is a ``faults.Fault`` with
+its place in the files. ``cost`` measures the time of a tick. ``lean`` tries the edits of
+``simplifications`` on a ``draft``; ``trial`` judges each by its cost and by the force difference of
+``felt``.
 """

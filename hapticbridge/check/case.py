@@ -1,4 +1,4 @@
-"""A scene under check: as its files say, as it runs, and what it did in a motion."""
+"""A scene under check: source, compiled model, motion and observation."""
 
 from __future__ import annotations
 
@@ -24,20 +24,21 @@ from hapticbridge.rendering import default_method
 from hapticbridge.scene import Scene, SceneSource, compile_scene
 
 DEFAULT_PERIOD = 1e-3
-"""T in s of ``hapticbridge run`` by itself."""
+"""Tick period T in s. It is the default of ``hapticbridge run``."""
 
 LARGEST_WORKSPACE = 0.4
-"""Edge in m of the cube that a device reaches where nobody says: the makers of table-top devices
-state from 0.1 m (Novint Falcon) to 0.4 m (Force Dimension delta.3), so what does not fit in here
-fits none of them. The simulated device has no walls."""
+"""Default edge in m of the cube that a device reaches. Makers of table-top devices state 0.1 m
+(Novint Falcon) to 0.4 m (Force Dimension delta.3), so a motion beyond it fits none of them. The
+simulated device has no walls."""
 
 DEFAULT_SECONDS = 5.0
-"""How long the default hand motion is followed, in s: it has its full size after 2 s."""
+"""Duration in s of the default hand motion, which reaches its full size after 2 s."""
 
 _DEFAULT_STEP = 0.01  # s; the motion's fastest part has 0.41 Hz
 _REFUSED = re.compile(r"(mass and inertia of|inertia must satisfy).*?, id (\d+)")
 STAND_IN_MASS, STAND_IN_INERTIA = 0.01, 1e-6
-"""In kg and kg m²: of something that a finger carries, for a body whose own MuJoCo refuses."""
+"""Mass in kg and inertia in kg m² that replace an inertia refused by MuJoCo: those of a thing on a
+fingertip."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,21 +46,22 @@ class Case:
     """A scene under check.
 
     Attributes:
-        source: The scene as its files say.
+        source: The scene as its files describe it.
         scene: The scene as it runs, with handle and coupling.
-        places: Where things are written.
-        info: Data sheet of the device that it is checked for.
-        coupling: K and B that should be felt.
+        places: Lines of the files on which elements are written.
+        info: Data sheet of the device.
+        coupling: Requested K and B.
         period: T in s.
         scale: Handle motion per device motion, without unit.
-        motion: Of the handle.
-        motion_name: Whose motion it is, in words.
+        motion: Motion of the handle.
+        motion_name: Description of the motion's origin.
         samples: The motion, one sample per tick.
-        refused: Bodies whose inertia MuJoCo refuses, with what it says; something stands in for it.
-        workspace: Edge of the cube in m that the device reaches.
-        is_rate_given: Whether somebody asked for this period, and not the default.
-        observation: What the motion showed; None where it did not end.
-        motion_fault: Why it did not end.
+        refused: MuJoCo's message by the id of each body whose inertia it refuses; a stand-in
+            replaces it.
+        workspace: Edge in m of the cube that the device reaches.
+        is_rate_given: True if the user chose the period.
+        observation: Result of the motion; None if the motion did not finish.
+        motion_fault: Reason why the motion did not finish.
     """
 
     source: SceneSource
@@ -80,12 +82,12 @@ class Case:
 
     @property
     def model(self) -> mujoco.MjModel:
-        """The compiled scene, with the handle and the time step that it runs at."""
+        """Compiled scene with handle, at its running time step."""
         return self.scene.model
 
     @property
     def used(self) -> Coupling:
-        """The coupling whose law gives the wrench, in the method that a bridge takes by itself."""
+        """Coupling that the default method's law uses."""
         return default_method().used(self.coupling, self.period)
 
 
@@ -103,21 +105,21 @@ def open_case(
     """Compiles a scene and leads it through its motion.
 
     Args:
-        source: What ``read_scene`` returned; it stays as it is.
+        source: Scene from ``read_scene``; it is not changed.
         grip: Name of the site on the tool.
-        coupling: K and B that should be felt; None takes the default of the simulated device.
+        coupling: Requested K and B; None takes the default of the simulated device.
         period: T in s; None takes ``DEFAULT_PERIOD``.
         scale: Handle motion per device motion.
-        workspace: Edge of the cube that the device reaches, in m, > 0.
-        motion: A CSV file or a recording; None takes ``NAME.csv`` beside the scene, or else the
-            hand motion that ``hapticbridge run`` would make.
-        progress: Called with ticks done and to do.
+        workspace: Edge in m of the cube that the device reaches, > 0.
+        motion: CSV file or recording. None takes ``NAME.csv`` beside the scene, or else the default
+            hand motion of ``hapticbridge run``.
+        progress: Called with the number of ticks done and the total.
 
     Raises:
-        SceneError: The scene cannot be compiled or put behind a device for another reason than an
-            inertia or its start.
-        DeviceError: The motion cannot be read, or the period or scale is out of range.
-        RecordingError: Likewise.
+        SceneError: The scene does not compile or cannot be coupled to a device. A refused inertia
+            or a bad start does not raise.
+        DeviceError: The motion cannot be read, or the period, scale or workspace is out of range.
+        RecordingError: The recording cannot be read.
     """
     if not math.isfinite(workspace) or workspace <= 0:
         raise DeviceError(f"workspace is {workspace!r} m; it must be finite and > 0")
@@ -156,7 +158,7 @@ def open_case(
 
 
 def _compiled(source: SceneSource, grip: str) -> tuple[Scene, dict[int, str]]:
-    """Compiles with a stand-in for every inertia that MuJoCo refuses, so that the rest is seen."""
+    """Compiles with a stand-in for each inertia that MuJoCo refuses, so other checks can run."""
     refused: dict[int, str] = {}
     while True:
         try:

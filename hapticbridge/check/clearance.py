@@ -1,4 +1,4 @@
-"""How much room the tool has between opposite walls, found along a motion."""
+"""Clearance of the tool between opposite walls."""
 
 from __future__ import annotations
 
@@ -7,11 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 FARTHEST = 2e-3
-"""Distance in m beyond which two geoms are no part of a clearance: fits are tenths of that, and
-what is farther away is another place in the scene."""
+"""Distance in m beyond which two geoms do not form a clearance. Fits are tenths of it; anything
+farther away belongs to another part of the scene."""
 
 OPPOSITE = -0.95
-"""Cosine between the directions towards two walls from which they count as opposite: 18 degrees."""
+"""Cosine between the directions to two walls below which they count as opposite; 18 degrees from
+straight."""
 
 _WITHOUT_DISTANCE = [int(mujoco.mjtGeom.mjGEOM_HFIELD), int(mujoco.mjtGeom.mjGEOM_SDF)]
 
@@ -24,20 +25,20 @@ def clearances(
     is_tool: NDArray[np.bool_],
     postures: NDArray[np.float64],
 ) -> dict[tuple[int, int], float]:
-    """Returns the room per side that the tool has towards geoms that it lies between, in m.
+    """Returns the clearance per side between the tool and the geoms around it, in m.
 
     Between two geoms in opposite directions the tool can move by the sum of its distances from
-    them, half of it to each side. Of all postures the one with the largest sum counts, because a
-    tilted tool has less; of all opposite geoms the nearest.
+    them; the clearance per side is half of it. Each pair of walls counts with its largest sum over
+    all postures, because a tilted tool has less room. Each geom counts with its smallest clearance.
 
     Args:
         model: The compiled scene.
-        pairs: Geoms that may collide, one of the tool at least.
-        is_tool: Per geom, whether it is of the tool.
+        pairs: Geoms that may collide; at least one of each pair belongs to the tool.
+        is_tool: True for each geom of the tool.
         postures: ``qpos`` of each posture, shape (n, nq).
 
     Returns:
-        By pair; pairs that are no part of a clearance are left out.
+        Clearance by pair; pairs that form no clearance are absent.
     """
     data, segment = mujoco.MjData(model), np.zeros(6)
     known = ~np.isin(model.geom_type, _WITHOUT_DISTANCE)
@@ -71,7 +72,7 @@ def clearances(
 def _may_be_near(
     model: mujoco.MjModel, data: mujoco.MjData, pairs: NDArray[np.int64]
 ) -> NDArray[np.bool_]:
-    """Tells by their bounding spheres which pairs may be within ``FARTHEST``."""
+    """Selects the pairs whose bounding spheres come within ``FARTHEST``."""
     first, second = pairs.T
     reach = np.where(model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE, np.inf, model.geom_rbound)
     apart = np.linalg.norm(data.geom_xpos[first] - data.geom_xpos[second], axis=1)

@@ -1,4 +1,4 @@
-"""Faults of constraints that are no contacts: soft stops, soft joints between bodies, creep."""
+"""Faults of joint limits, equality constraints and dry friction."""
 
 from __future__ import annotations
 
@@ -15,23 +15,21 @@ from hapticbridge.scene.contact_concerns import SOFT_STEPS
 from hapticbridge.scene.contact_rule import REFERENCE_STEPS, ROUNDING, contact_numbers, impedance_at
 
 CREEP_LOAD = 0.5
-"""Share of the dry friction at which its creep is judged, no unit: it grows with the load."""
+"""Load as a share of the dry friction at which creep is judged, without unit. Creep grows with the
+load."""
 
 FASTEST_CREEP, FASTEST_TURN = 1e-4, 1e-3
-"""Creep in m/s and rad/s from which a friction does not hold: 1 mm in 10 s, 0.1 m off the axis. The
-shipped scenes' creep by at most a fifth of it; MuJoCo's default by about 5 mm/s at 5 N/kg."""
+"""Creep in m/s and rad/s above which dry friction is reported: 1 mm in 10 s, on the axis or 0.1 m
+off it. The shipped scenes creep by at most a fifth of it; MuJoCo's default creeps by about 5 mm/s
+at 5 N/kg."""
 
 LEAST_GIVE, LEAST_TURN = 1e-4, 1e-3
-"""How far in m and rad a limit must give under all that the device can push to count as soft: 0.1
-mm, on the axis or 0.1 m off it. A heavy arm's is stiff even by MuJoCo's default."""
+"""Penetration in m and rad above which a limit counts as soft, under the device's full force: 0.1
+mm, on the axis or 0.1 m off it. The limit of a heavy arm is stiff even with MuJoCo's default."""
 
 
 def constraint_faults(case: Case) -> Iterator[Fault]:
-    """Yields limits, equality constraints and dry friction that are as soft as MuJoCo's default.
-
-    Args:
-        case: The scene under check.
-    """
+    """Yields limits, equality constraints and dry friction that are as soft as MuJoCo's default."""
     case.scene.reset()
     yield from _limits(case)
     yield from _equalities(case)
@@ -41,15 +39,17 @@ def constraint_faults(case: Case) -> Iterator[Fault]:
 def creep_speed(
     force: float, solref: Sequence[float], solimp: Sequence[float], inertia: float
 ) -> float:
-    """Returns how fast dry friction slides under a force that it should hold, in m/s.
+    """Returns the creep speed of dry friction under a force below the friction, in m/s.
 
         v = F (1 − d) d_w timeconst/(2 d m)
 
+    with the impedance d at depth zero and d_w beyond the width of ``solimp``.
+
     Args:
-        force: F in N, below the friction (of a hinge in N m, and the result is in rad/s).
+        force: F in N; N m for a hinge, which gives a result in rad/s.
         solref: (timeconst in s, dampratio), or (−stiffness in 1/s², −damping in 1/s).
-        solimp: Its impedance d at depth zero, and d_w from the width on.
-        inertia: m in kg that the joint moves (of a hinge in kg m²).
+        solimp: MuJoCo's five impedance parameters.
+        inertia: m in kg that the joint moves; kg m² for a hinge.
     """
     impedance, last = impedance_at(solimp, 0.0), impedance_at(solimp, np.inf)
     damping = 2.0 / solref[0] if solref[0] > 0 else -float(solref[1])

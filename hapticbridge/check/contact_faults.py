@@ -1,4 +1,4 @@
-"""Faults of contacts' settings: too soft, too stiff, too slippery."""
+"""Faults of contact settings: too soft, too stiff, too slippery."""
 
 from __future__ import annotations
 
@@ -18,24 +18,18 @@ from hapticbridge.scene.contact_concerns import SOFT_STEPS, contact_concerns
 from hapticbridge.scene.contact_rule import REFERENCE_STEPS, ROUNDING, contact_numbers
 
 LEAST_PUSH = 1.0
-"""Force in N that a contact is tested with at least: a light touch. A motion that touches nothing
-stretches the coupling by nothing, and says nothing about what the contact must bear."""
+"""Smallest force in N that contacts are tested with: a light touch. A motion without contact does
+not stretch the coupling, so it gives no test force."""
 
 MUJOCO_SOLREF = (0.02, 1.0)
-"""What a geom has that says nothing."""
+"""Default ``solref`` of a MuJoCo geom."""
 
 _LEAST_FRICTION = float(mujoco.mjMINMU)
-_TYPICAL_INERTIA = 0.1  # kg; only of pairs of which neither side moves by itself
+_TYPICAL_INERTIA = 0.1  # kg; for pairs of which neither side moves by itself
 
 
 def contact_faults(case: Case) -> Iterator[Fault]:
-    """Yields what is wrong with the settings of contacts that the hand can feel.
-
-    Looked at are the contacts that the tool can have, and those that any two things had.
-
-    Args:
-        case: The scene under check.
-    """
+    """Yields faults of the tool's possible contacts and of every contact in the motion."""
     model, option = case.model, case.model.opt
     meetings = case.observation.meetings if case.observation else {}
     is_tool = tool_geoms(model, case.scene.grip)
@@ -63,7 +57,7 @@ def contact_faults(case: Case) -> Iterator[Fault]:
         ):
             clause, _, change = concern.partition("; write ")
             is_cone = "pyramidal" in clause
-            if is_cone and cone_told:  # one word changes it for all
+            if is_cone and cone_told:  # one option changes it for all contacts
                 continue
             cone_told |= is_cone
             yield Fault(
@@ -77,7 +71,8 @@ def contact_faults(case: Case) -> Iterator[Fault]:
 def push_of(case: Case) -> float:
     """Returns the force in N that contacts are tested with.
 
-    It is the coupling's largest in the motion, within ``LEAST_PUSH`` and what the device can give.
+    It is the largest coupling force in the motion, at least ``LEAST_PUSH`` and at most the device's
+    force limit.
     """
     largest = float(case.observation.force.max()) if case.observation else 0.0
     return min(max(largest, LEAST_PUSH), max(case.info.force_limit, LEAST_PUSH))
@@ -98,7 +93,6 @@ def _soft(
     push: float,
     rooms: dict[tuple[int, int], float],
 ) -> Fault | None:
-    """Says how deep a push sinks in, where the setting is soft or a clearance is less deep."""
     step = float(case.model.opt.timestep)
     depths = {
         pair: depth_under(
@@ -108,7 +102,7 @@ def _soft(
     }
     numbers = contact_numbers(setting.solref, setting.solimp, step)
     if numbers.resolved <= REFERENCE_STEPS * (1 + ROUNDING):
-        return None  # as stiff as any that was seen to be passive with light tools
+        return None  # as stiff as the settings that were passive with light tools
     tight = [pair for pair in pairs if depths[pair] > rooms.get(pair, np.inf)]
     if not tight and numbers.resolved <= SOFT_STEPS * (1 + ROUNDING):
         return None
@@ -138,10 +132,11 @@ def _soft(
 
 
 def inertia_of(case: Case, pair: tuple[int, int], setting: ContactSetting) -> float:
-    """Returns the inertia in kg that the contact of two geoms has, the least that was seen.
+    """Returns the smallest effective inertia in kg that the contact of two geoms had in the motion.
 
-    Where they did not meet it is that of their centres at the start: 1/m = Σ 1/m_i, plus the
-    coupling's share h B' + h² K at the tool, with a pyramidal cone times that of its edges.
+    For geoms that did not meet it follows from the bodies' centres at the start: 1/m = Σ 1/m_i. The
+    tool's inertia includes the coupling's share h B' + h² K. A pyramidal cone multiplies the result
+    by the factor of its edges.
     """
     model = case.model
     seen = case.observation.meetings.get(pair) if case.observation else None
@@ -157,12 +152,12 @@ def inertia_of(case: Case, pair: tuple[int, int], setting: ContactSetting) -> fl
 
 
 def _edges(model: mujoco.MjModel, setting: ContactSetting) -> float:
-    """Returns how many times as stiff as an elliptic cone's a pyramidal cone's edges are together.
+    """Returns the stiffness of a pyramidal cone's edges together, relative to an elliptic cone.
 
         (dim − 1)/(μ² (1 + μ²))
 
-    for the friction μ and a contact that is as heavy sideways as it is along its normal: 198 times
-    at μ = 0.1, once at μ = 1 and dim = 3. Measured with MuJoCo at rest, to 9 digits.
+    for friction μ and a contact with equal inertia along the normal and the tangents: 198 at μ =
+    0.1, 1 at μ = 1 and dim = 3. Measured with MuJoCo at rest, to 9 digits.
     """
     friction = max(setting.friction, _LEAST_FRICTION)
     if model.opt.cone != mujoco.mjtCone.mjCONE_PYRAMIDAL or setting.condim == 1:
@@ -171,10 +166,11 @@ def _edges(model: mujoco.MjModel, setting: ContactSetting) -> float:
 
 
 def _place(case: Case, pair: tuple[int, int], *, is_soft: bool) -> tuple[Place, str]:
-    """Returns where to change a contact's setting, and what else must say the same.
+    """Returns the place to change a contact's setting, and a note on a second place to change.
 
-    That is an explicit pair, else the geom whose own solref is the softer (or the stiffer); the
-    tool's, where both say the same, and then the other must change too: MuJoCo takes the mean.
+    An explicit pair comes first, then the geom with the higher priority. Otherwise it is the geom
+    with the softer ``solref`` (for ``is_soft``) or the stiffer one. If both are equal it is the
+    tool's geom, and the other must change too, because MuJoCo averages the two.
     """
     model = case.model
     for p in range(model.npair):
@@ -193,7 +189,7 @@ def _place(case: Case, pair: tuple[int, int], *, is_soft: bool) -> tuple[Place, 
 
 
 def _softness(solref: np.ndarray) -> float:
-    """Returns timeconst · dampratio in s, for either format."""
+    """Returns timeconst · dampratio in s for either format of ``solref``."""
     first, second = (float(value) for value in solref)
     if first > 0 and second > 0:
         return first * second
@@ -201,7 +197,7 @@ def _softness(solref: np.ndarray) -> float:
 
 
 def pair_names(case: Case, pairs: list[tuple[int, int]]) -> str:
-    """Returns the names of the first of some pairs of geoms, and how many more there are."""
+    """Returns the names of the first pair of geoms, and the number of further pairs."""
     first, second = (case.places.geom(geom).element for geom in pairs[0])
     return f"{first} with {second}{others(len(pairs) - 1)}"
 

@@ -1,4 +1,4 @@
-"""What a constraint of MuJoCo amounts to in N/m, and how deep a force sinks into it."""
+"""Stiffness of MuJoCo's constraints at rest, and penetration under a force."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from hapticbridge.scene.contact_rule import impedance_at
 
 _ROUNDS = 60
-"""Halvings of the depth's bracket: to the last bit."""
+"""Number of bisections of the depth's bracket; enough for the last bit."""
 
 
 def constraint_stiffness(
@@ -18,26 +18,27 @@ def constraint_stiffness(
     timestep: float,
     depth: float = 0.0,
 ) -> float:
-    """Returns the stiffness that a contact, limit or equality constraint amounts to at rest.
+    """Returns the stiffness in N/m that a contact, limit or equality constraint has at rest.
 
         K_c = m k d²/(1 − d),
         k = min(1/(d_w timeconst dampratio)², 1/(d h²))    or    −solref[0]/d_w²
 
-    with the inertia m that MuJoCo sees there, the impedance d at that depth, and d_w from the width
-    of ``solimp`` on. The second term of the minimum is what the step h resolves (flag ``refsafe``).
+    m is the inertia at the constraint as MuJoCo computes it, d the impedance at that depth, and d_w
+    the impedance beyond the width of ``solimp``. The second term of the minimum is the limit of the
+    step h (flag ``refsafe``).
 
     Args:
         solref: (timeconst in s, dampratio), or (−stiffness in 1/s², −damping in 1/s).
         solimp: d₀, d_w, width in m, midpoint, power.
-        inertia: m in kg, > 0; of a hinge in kg m², and the result is in N m/rad.
+        inertia: m in kg, > 0; kg m² for a hinge, which gives a result in N m/rad.
         timestep: h in s.
-        depth: In m, >= 0 (of a hinge in rad).
+        depth: Penetration in m, >= 0; rad for a hinge.
 
     Returns:
-        K_c in N/m, the force over the depth.
+        K_c in N/m: force divided by depth.
 
     References:
-        MuJoCo's documentation, "Solver parameters"; compared with runs at rest in the tests.
+        MuJoCo's documentation, "Solver parameters"; the tests compare it with runs at rest.
     """
     impedance, last = impedance_at(solimp, depth), impedance_at(solimp, math.inf)
     first, second = float(solref[0]), float(solref[1])
@@ -55,16 +56,10 @@ def depth_under(
     inertia: float,
     timestep: float,
 ) -> float:
-    """Returns how deep a steady force sinks in, in m; infinite where nothing pushes back.
+    """Returns the penetration in m under a steady force; infinite for zero stiffness.
 
-    It solves F = K_c(r) r for the depth r; K_c grows or falls with depth as ``solimp`` says.
-
-    Args:
-        force: F in N, >= 0 (of a hinge in N m).
-        solref: As ``constraint_stiffness`` takes it, as are the rest.
-        solimp: Likewise.
-        inertia: In kg.
-        timestep: h in s.
+    It solves F = K_c(r) r for the depth r; K_c depends on r through ``solimp``. Parameters are
+    those of ``constraint_stiffness``; F is in N, or in N m for a hinge.
     """
 
     def stiffness(depth: float) -> float:

@@ -1,4 +1,4 @@
-"""What a scene costs: the time of a tick, where it goes, and how it grows with contacts."""
+"""Processor cost of a scene: time of a tick, its stages, and its growth with contacts."""
 
 from __future__ import annotations
 
@@ -34,35 +34,37 @@ STAGES: dict[str, int] = {
     "solver": int(_TIMER.mjTIMER_CONSTRAINT),
     "integration": int(_TIMER.mjTIMER_ADVANCE),
 }
-"""Stages of MuJoCo's step by the timers that it keeps itself; none lies within another."""
+"""Stages of MuJoCo's step and the ids of its built-in timers; no stage contains another."""
 
 REST, BRIDGE = "rest of the step", "bridge"
-"""What no timer covers; and what is no step: coupling, energies, guard and record."""
+"""Step time that no timer covers; and time outside the step: coupling, energies, guard and
+record."""
 
 WARM_UP = 50
-"""Ticks at the beginning that are not counted: caches are cold."""
+"""Number of ticks at the start that are not counted, because the caches are cold."""
 
 PASSES = 2
-"""How often the motion is timed; all ticks count."""
+"""Number of times that the motion is timed; the ticks of all passes count."""
 
 TICK_SHARE = 0.5
-"""Share of a period that the 99th percentile of the tick may fill, no unit: the rest is for the
-device's own transfer and for waking up late, neither of which can be known here."""
+"""Share of a period that the tick's 99th percentile may fill, without unit. The rest is left for
+the device's transfer and for late wake-ups, which cannot be measured here."""
 
-_RING = 1 << 12  # records; the newest stay, nobody reads them
+_RING = 1 << 12  # records; without a reader the newest stay
 
 
 @dataclass(frozen=True, slots=True)
 class Cost:
-    """What a scene costs on this machine, in s.
+    """Tick times of a scene on this machine, in s.
 
     Attributes:
         free: Whole ticks out of contact.
         contact: Whole ticks in contact.
-        all_ticks: Both.
-        stages: Median time of each stage out of contact and in contact; nan where there was no
-            such tick.
-        highest_rate: Hz at which the 99th percentile of all ticks fills ``TICK_SHARE`` of a period.
+        all_ticks: All whole ticks.
+        stages: Median time of each stage, out of contact and in contact; nan if there was no such
+            tick.
+        highest_rate: Rate in Hz at which the 99th percentile of all ticks fills ``TICK_SHARE`` of a
+            period.
         by_contacts: Growth with the number of contacts.
         by_rows: Growth with the number of constraint rows.
     """
@@ -85,18 +87,18 @@ def measure_cost(
     clock: Callable[[], int] = time.perf_counter_ns,
     progress: Callable[[int, int], None] | None = None,
 ) -> Cost:
-    """Times a scene under its motion: whole ticks as the live loop runs them, then the stages.
+    """Times a scene under its motion: whole ticks as in the live loop, then the stages.
 
-    Device and recorder are left out: a tick is the arithmetic before and after MuJoCo's step, the
-    step, and the hand-over of the record.
+    A tick is the bridge's arithmetic before and after MuJoCo's step, the step, and the hand-over of
+    the record. Device and recorder are left out.
 
     Args:
         scene: Changed in place: reset, with the coupling's gains and the time step set.
-        samples: Poses counted from the first, ``SAMPLE_DTYPE``.
+        samples: Poses relative to the first, ``SAMPLE_DTYPE``.
         coupling: K and B.
         period: T in s.
-        clock: Time in ns.
-        progress: Called with ticks done and to do.
+        clock: Returns the time in ns.
+        progress: Called with the number of ticks done and the total.
 
     Raises:
         SceneError: A value is out of range, or a result is not finite.
@@ -145,7 +147,7 @@ def _time_ticks(
     period: float,
     clock: Callable[[], int],
 ) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64]]:
-    """Returns times in s, contacts and constraint rows of every tick."""
+    """Returns time in s, contacts and constraint rows of every tick."""
     binding = Binding(scene.model, scene.data, rehearsal_parameters(scene, coupling, period))
     state, row, ring = binding.state, binding.row, Ring.local(_RING)
     ring.cursors[TAIL] = NOBODY_READS
@@ -166,7 +168,10 @@ def _time_ticks(
         times[k] = clock() - begin
         if code != OK:
             raise not_finite(scene, k, samples.size)
-        contacts[k], rows[k] = int(row["contacts"][0]), data.nefc  # what is near is no contact
+        contacts[k], rows[k] = (
+            int(row["contacts"][0]),
+            data.nefc,
+        )  # without near misses
     ring.close()
     return 1e-9 * times, contacts, rows
 
@@ -174,7 +179,7 @@ def _time_ticks(
 def _time_stages(
     scene: Scene, samples: NDArray[np.void], coupling: Coupling, period: float
 ) -> tuple[dict[str, NDArray[np.float64]], NDArray[np.int64]]:
-    """Returns MuJoCo's own times in s of every stage of every step, and the contacts."""
+    """Returns the time in s of every stage of every step by MuJoCo's timers, and the contacts."""
     binding = Binding(scene.model, scene.data, rehearsal_parameters(scene, coupling, period))
     state, row, model, data = binding.state, binding.row, scene.model, scene.data
     spent = np.zeros((samples.size, int(_TIMER.mjNTIMER)))

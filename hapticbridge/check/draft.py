@@ -1,4 +1,4 @@
-"""A version of a scene under way: its specification, and how it is run."""
+"""A version of a scene under simplification, and its run settings."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from hapticbridge.scene import Scene, SceneSource, compile_scene
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """How a scene is run.
+    """Coupling and rate at which a scene is run.
 
     Attributes:
-        coupling: K and B that should be felt.
+        coupling: Requested K and B.
         period: T in s.
         substeps: MuJoCo steps per tick.
     """
@@ -34,7 +34,7 @@ class Setting:
 
     @property
     def needed_damping(self) -> float:
-        """Damping in N s/m that a device needs behind the method that a bridge would take."""
+        """Device damping in N s/m required by the default method."""
         method = default_method(self.substeps)
         used = method.used(self.coupling, self.period / self.substeps)
         return needed_damping(used, self.period, method.laws(self.substeps))
@@ -45,9 +45,9 @@ class Draft:
     """A version of a scene.
 
     Attributes:
-        source: What was read; its specification may be changed, it belongs to the draft alone.
+        source: Scene source whose specification belongs to this draft alone and may be changed.
         grip: Name of the site on the tool.
-        setting: How it is run.
+        setting: Coupling and rate.
     """
 
     source: SceneSource
@@ -60,7 +60,7 @@ class Draft:
         return self.source.spec
 
     def copy(self) -> Draft:
-        """Returns a draft whose specification can be changed by itself."""
+        """Returns a draft with a specification of its own."""
         return Draft(self.with_spec(self.spec.copy()), self.grip, self.setting)
 
     def with_spec(self, spec: mujoco.MjSpec) -> SceneSource:
@@ -71,16 +71,16 @@ class Draft:
         """Returns the scene with handle and coupling.
 
         Raises:
-            SceneError: It does not compile, or cannot be put behind a device.
+            SceneError: It does not compile or cannot be coupled to a device.
         """
         return compile_scene(self.source, self.grip, warns=False)
 
     def samples(self, motion: Motion) -> NDArray[np.void]:
-        """Returns the motion at this draft's rate."""
+        """Returns the motion sampled at this draft's rate."""
         return samples_of(motion, self.setting.period)
 
     def rehearsed(self, motion: Motion) -> Rehearsal:
-        """Compiles and leads the scene through a motion.
+        """Compiles the scene and leads it through a motion.
 
         Raises:
             SceneError: It does not compile, or a result is not finite.
@@ -96,10 +96,10 @@ class Draft:
 
 
 def name_everything(spec: mujoco.MjSpec) -> None:
-    """Names bodies, joints and geoms that have no name, so that an edit can find them again.
+    """Names every unnamed body, joint and geom, so that a later edit finds it.
 
-    An id would not do: it changes as soon as something before it is deleted. A joint or geom is
-    called after its body, so that a reader of its name knows which one it is.
+    Ids change as soon as an earlier element is deleted. The name of a joint or geom starts with its
+    body's name.
     """
     for kind, elements in (("body", spec.bodies), ("joint", spec.joints), ("geom", spec.geoms)):
         taken = {element.name for element in elements}
@@ -118,12 +118,12 @@ def name_everything(spec: mujoco.MjSpec) -> None:
 
 
 def model_of(spec: mujoco.MjSpec) -> mujoco.MjModel:
-    """Compiles a specification on its way: it stays as it is, and its start is not judged."""
+    """Compiles a copy of a specification, without checks of its start."""
     return spec.copy().compile()
 
 
 def census(model: mujoco.MjModel) -> tuple[int, ...]:
-    """Counts what refers to bodies, joints and geoms: MuJoCo leaves it out along with them."""
+    """Counts the elements that MuJoCo drops together with a body, joint or geom they refer to."""
     kinds = (
         "sensor",
         "actuator",

@@ -1,4 +1,4 @@
-"""The picture of what a scene costs."""
+"""Plot of a scene's cost."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from hapticbridge.check.cost import BRIDGE, TICK_SHARE, Cost
 from hapticbridge.picture import new_figure
 
 _FREE, _CONTACT, _LINE = "tab:blue", "tab:orange", "0.3"
-_LEAST_SHARE = 0.01  # of the tick; a stage below is not drawn
+_LEAST_SHARE = 0.01  # of the tick; smaller stages are not drawn
 
 
 def _known(seconds: float) -> float:
@@ -18,12 +18,7 @@ def _known(seconds: float) -> float:
 
 
 def draw_cost(cost: Cost, title: str) -> Figure:
-    """Draws where a tick's time goes, and how it grows with constraint rows.
-
-    Args:
-        cost: What was measured.
-        title: Of the picture.
-    """
+    """Draws the stages of a tick and its growth with constraint rows."""
     figure = new_figure(8.0, 4.4)
     figure.suptitle(f"{title} (rate: p99 within {100 * TICK_SHARE:g} % of the period)")
     stages, growth = figure.subplots(1, 2, width_ratios=(1.25, 1.0))

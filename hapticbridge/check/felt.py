@@ -1,4 +1,4 @@
-"""How much of a difference between two versions of a scene a hand could feel."""
+"""Perceptible difference between two versions of a scene."""
 
 from __future__ import annotations
 
@@ -11,31 +11,31 @@ from hapticbridge.errors import SceneError
 
 WEBER = 0.07
 """Just noticeable difference of a force as a share of it, without unit: 7 % from 2.5 to 10 N in the
-fingers (Pang, Tan & Durlach 1991). For torque 12.7 % was measured (Jandura & Srinivasan 1994); the
-same 7 % here is the stricter. Larger lets more be taken out of a scene."""
+fingers (Pang, Tan & Durlach 1991). For torque 12.7 % was measured (Jandura & Srinivasan 1994), so 7
+% is the stricter choice. A larger value allows more simplification."""
 
 FORCE_FLOOR = 0.03
-"""Force in N below which nothing is felt: 29 to 44 mN over fingers (King, Donlin & Hannaford 2010),
-21 mN with a pen (Lee & Hannaford 2003). It keeps a share of almost nothing from counting."""
+"""Smallest noticeable force in N: 29 to 44 mN at the fingers (King, Donlin & Hannaford 2010), 21 mN
+with a pen (Lee & Hannaford 2003). It keeps a share of a very small force from counting."""
 
 LEVER = 0.05
-"""Arm in m at which a hand feels a torque as a force: half a hand's breadth. The threshold of
-torque is never below the threshold of force on this arm."""
+"""Lever arm in m that converts a torque threshold into a force threshold: half a hand's breadth.
+The torque threshold is at least the force threshold times this arm."""
 
 
 @dataclass(frozen=True, slots=True)
 class FeltError:
-    """Difference between what two versions of a scene did under one motion of the handle.
+    """Difference of two versions of a scene under one motion of the handle.
 
     Attributes:
-        force_rms: Of the difference of forces, in N, over all ticks and axes: √(mean ‖Δf‖²).
+        force_rms: RMS force difference over all ticks and axes in N: √(mean ‖Δf‖²).
         force_peak: Largest ‖Δf‖ in N.
-        torque_rms: In N m, likewise.
-        torque_peak: In N m.
+        torque_rms: RMS torque difference in N m: √(mean ‖Δτ‖²).
+        torque_peak: Largest ‖Δτ‖ in N m.
         force_threshold: One just noticeable difference of force, in N.
-        torque_threshold: In N m.
+        torque_threshold: One just noticeable difference of torque, in N m.
         position_peak: Largest distance between the two tools, in m.
-        angle_peak: Largest angle between them, in rad.
+        angle_peak: Largest angle between the two tools, in rad.
     """
 
     force_rms: float
@@ -49,37 +49,38 @@ class FeltError:
 
     @property
     def force(self) -> float:
-        """RMS of the force's difference in just noticeable differences."""
+        """RMS force difference in just noticeable differences."""
         return self.force_rms / self.force_threshold
 
     @property
     def torque(self) -> float:
-        """RMS of the torque's difference in just noticeable differences."""
+        """RMS torque difference in just noticeable differences."""
         return self.torque_rms / self.torque_threshold
 
     @property
     def felt(self) -> float:
-        """The larger of force and torque: 1 is just noticeable."""
+        """Larger of force and torque difference; 1 is just noticeable."""
         return max(self.force, self.torque)
 
     @property
     def peak(self) -> float:
-        """Largest momentary difference, in the same thresholds; reported, never judged by."""
+        """Largest momentary difference in just noticeable differences; reported, not judged."""
         return max(self.force_peak / self.force_threshold, self.torque_peak / self.torque_threshold)
 
 
 def felt_error(original: NDArray[np.void], variant: NDArray[np.void]) -> FeltError:
     """Compares two rehearsals of one motion.
 
-        felt = RMS ‖Δf‖ / max(0.07 RMS ‖f‖, 0.03 N),   torque likewise, where its threshold is
+        felt = max(RMS ‖Δf‖ / θ_f, RMS ‖Δτ‖ / θ_τ)
+        θ_f = max(0.07 RMS ‖f‖, 0.03 N),    θ_τ = max(0.07 RMS ‖τ‖, 0.05 m · θ_f)
 
-    never below 0.05 m times that of force. RMS runs over the whole motion, so that an event that
-    comes a tick later does not count as its full height; in turn a short event is weighed against
-    everything else in the motion. Compare motions that do one thing.
+    The RMS runs over the whole motion. An event that comes one tick later therefore does not count
+    with its full height, but a short event is diluted by the rest of the motion. Compare motions
+    that do one thing.
 
     Args:
-        original: Records, ``TICK_DTYPE``; its forces set the thresholds.
-        variant: Records of the same motion: as many, or every n-th of them at an n-th of the rate.
+        original: Records, ``TICK_DTYPE``; its wrenches set the thresholds.
+        variant: Records of the same motion: equally many, or every n-th at an n-th of the rate.
 
     Raises:
         SceneError: There are no records, or they are not of the same motion.
@@ -116,9 +117,9 @@ def felt_error(original: NDArray[np.void], variant: NDArray[np.void]) -> FeltErr
 
 
 def tool_angles(first: NDArray[np.void], second: NDArray[np.void]) -> NDArray[np.float64]:
-    """Returns the angles between the tools of two records in rad, shape (n,), within 0 to π.
+    """Returns the angles in rad between the tools of two records, shape (n,), from 0 to π.
 
-    From sine and cosine of half the angle: its arccosine alone would round below 3e-8 rad.
+    It uses sine and cosine of half the angle; the arccosine alone rounds below 3e-8 rad.
     """
     a, b = first["tool_quaternion"], second["tool_quaternion"]
     sine = np.linalg.norm(_vector_part(a, b), axis=1)
@@ -130,5 +131,5 @@ def _rms(vectors: NDArray[np.float64]) -> float:
 
 
 def _vector_part(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Vector part of a b⁻¹: its length is the sine of half the angle, exact where that is tiny."""
+    """Returns the vector part of a b⁻¹, whose length is the sine of half the angle."""
     return b[:, :1] * a[:, 1:] - a[:, :1] * b[:, 1:] - np.cross(a[:, 1:], b[:, 1:])

@@ -1,4 +1,4 @@
-"""Poses and rotations as arrays, by MuJoCo's own functions; quaternions are (w, x, y, z)."""
+"""Poses and rotations as NumPy arrays, by MuJoCo's functions."""
 
 from __future__ import annotations
 
@@ -9,25 +9,25 @@ from numpy.typing import ArrayLike, NDArray
 Array = NDArray[np.float64]
 
 IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
-"""The quaternion that does not turn."""
+"""Identity quaternion (w, x, y, z)."""
 
 
 def matrix_of(quaternion: ArrayLike) -> Array:
-    """Returns the rotation matrix of a unit quaternion."""
+    """Returns the rotation matrix of a unit quaternion (w, x, y, z)."""
     matrix = np.zeros(9)
     mujoco.mju_quat2Mat(matrix, np.asarray(quaternion, dtype=np.float64))
     return matrix.reshape(3, 3)
 
 
 def quaternion_of(matrix: Array) -> Array:
-    """Returns the unit quaternion of a rotation matrix."""
+    """Returns the unit quaternion (w, x, y, z) of a rotation matrix."""
     quaternion = np.zeros(4)
     mujoco.mju_mat2Quat(quaternion, np.ascontiguousarray(matrix).ravel())
     return quaternion
 
 
 def rotation_vector(start: ArrayLike, now: ArrayLike) -> Array:
-    """Returns the rotation vector in rad that leads from one orientation to another."""
+    """Returns the rotation vector in rad from one orientation to another."""
     inverse, turn, vector = np.zeros(4), np.zeros(4), np.zeros(3)
     mujoco.mju_negQuat(inverse, np.asarray(start, dtype=np.float64))
     mujoco.mju_mulQuat(turn, np.asarray(now, dtype=np.float64), inverse)
@@ -40,7 +40,7 @@ def pose_in(frame: Array, pose: Array) -> Array:
 
     Args:
         frame: Pose of the frame, shape (7,).
-        pose: In the coordinates that the frame's is in.
+        pose: Pose in the same coordinates as ``frame``.
     """
     position, turn, found = np.zeros(3), np.zeros(4), np.zeros(7)
     mujoco.mju_negPose(position, turn, frame[:3], frame[3:])

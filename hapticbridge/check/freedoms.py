@@ -1,4 +1,4 @@
-"""Fewer degrees of freedom: joints that hardly move are fixed, free ones get the axes they use."""
+"""Simplifications of joints: fixed joints, and free joints replaced by their used axes."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from hapticbridge.check.simplifications import OTHER_MOTIONS, Simplification
 from hapticbridge.check.witness import Witness
 
 HARDLY_FAR, HARDLY_TURNED = 5e-4, 1e-2
-"""Way in m and rad up to which a joint hardly moves, so that fixing it is tried. A grip held fast
-on the default coupling (2400 N/m, 2.4 N m/rad) would feel 1.2 N and 24 mN m: whether it may go is
-judged by what is felt, and more would be tried in vain."""
+"""Travel in m and rad up to which fixing a joint is tried. With a grip held by the default coupling
+(2400 N/m, 2.4 N m/rad) it amounts to 1.2 N and 24 mN m. The felt error decides; larger values would
+be tried in vain."""
 
 MOST_JOINTS = 8
-"""Joints that are tried one by one; beyond, a scene is large and they are tried together."""
+"""Largest number of nearly still joints that are fixed one by one; more are fixed together."""
 
 _FREE, _BALL = mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL
 _SLIDE, _HINGE = mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE
@@ -27,11 +27,11 @@ _AXES = "xyz"
 
 Array = NDArray[np.float64]
 Keys = list[dict[str, tuple[Array, Array]]]
-"""Of every keyframe, position and velocity by joint."""
+"""Position and velocity by joint, for each keyframe."""
 
 
 def freedom_simplifications(draft: Draft, seen: Witness) -> list[Simplification]:
-    """Returns joints to fix and free joints to replace, as the motion allows."""
+    """Returns the joints to fix and the free joints to replace, as the motion allows."""
     still, simpler = [], []
     for joint in draft.spec.joints:
         way = np.abs(seen.travel[joint.name]).max(axis=0)
@@ -67,7 +67,7 @@ def _fix(spec: mujoco.MjSpec, keys: Keys, name: str, seen: Witness) -> bool:
         return False
     body = joint.parent
     if len(list(body.joints)) > 1:
-        # away from its reference it would turn the axes of the joints before it
+        # fixing it away from its reference would turn the axes of the joints before it
         if joint.type == _BALL or abs(seen.start[name][0] - joint.ref) > 1e-12:
             return False
     else:
@@ -79,7 +79,7 @@ def _fix(spec: mujoco.MjSpec, keys: Keys, name: str, seen: Witness) -> bool:
 
 
 def _replacements(name: str, far: Array, turned: Array, seen: Witness) -> list[Simplification]:
-    """Returns the fewest axes that the motion uses, then all three slides with its one hinge."""
+    """Returns replacements by the used axes alone, and by all three slides with the used hinge."""
     if turned.sum() > 1:
         return []
     hinge = [int(axis) for axis in np.flatnonzero(turned)]
@@ -119,7 +119,7 @@ def _replaced(name: str, slides: list[int], hinges: list[int], seen: Witness) ->
 
 
 def _is_special(spec: mujoco.MjSpec, joint: mujoco.MjsJoint) -> bool:
-    """Whether a free joint has what slides and hinges would not take over."""
+    """Returns True for a free joint with properties that slides and hinges cannot take over."""
     loads = (joint.stiffness, joint.damping, [joint.armature, joint.frictionloss])
     aligned = mujoco.mjtAlignFree.mjALIGNFREE_TRUE
     return (
@@ -131,7 +131,7 @@ def _is_special(spec: mujoco.MjSpec, joint: mujoco.MjsJoint) -> bool:
 
 
 def _add_joint(body: mujoco.MjsBody, name: str, kind: mujoco.mjtJoint, axis: Array) -> None:
-    """Sets every field: a user's ``<default><joint …>`` would reach what is left unset."""
+    """Adds a joint with every field set; a user's ``<default>`` class would fill unset fields."""
     joint = body.add_joint(name=name)
     plain = mujoco.MjSpec().worldbody.add_body().add_joint()
     for field in dir(plain):
@@ -146,12 +146,12 @@ def _add_joint(body: mujoco.MjsBody, name: str, kind: mujoco.mjtJoint, axis: Arr
 def _in_world(position: Array, velocity: Array, start: Array) -> tuple[Array, Array]:
     """Returns displacement and rotation vector from the start, and velocity, in the world frame."""
     vector = rotation_vector(start[3:], position[3:])
-    spin = matrix_of(position[3:]) @ velocity[3:]  # MuJoCo holds it in the body's frame
+    spin = matrix_of(position[3:]) @ velocity[3:]  # MuJoCo stores it in the body's frame
     return np.concatenate([position[:3] - start[:3], vector]), np.concatenate([velocity[:3], spin])
 
 
 def _place(spec: mujoco.MjSpec, body: mujoco.MjsBody, pose: Array) -> None:
-    """Puts a body to a pose in its parent's frame, whatever frame it is written in."""
+    """Moves a body to a pose in its parent's frame, even if it is written in another frame."""
     body.pos, body.quat = np.zeros(3), IDENTITY
     body.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
     model = model_of(spec)
@@ -161,7 +161,7 @@ def _place(spec: mujoco.MjSpec, body: mujoco.MjsBody, pose: Array) -> None:
 
 
 def _edit_joints(draft: Draft, change: Callable[[mujoco.MjSpec, Keys], bool]) -> bool:
-    """Changes joints and carries the keyframes over; refuses where something refers to them."""
+    """Changes joints and carries keyframes over; refuses if other elements refer to the joints."""
     spec, before = draft.spec.copy(), model_of(draft.spec)
     keys = _read_keys(before)
     if not change(spec, keys):

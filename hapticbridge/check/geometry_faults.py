@@ -1,4 +1,4 @@
-"""Faults of sizes and shapes: units, holes that are closed, a grip in the air, a small device."""
+"""Faults of sizes and shapes: units, filled holes, a distant grip, a small device."""
 
 from __future__ import annotations
 
@@ -15,27 +15,24 @@ from hapticbridge.check.inventory import VISUAL, geom_uses
 from hapticbridge.check.places import Place
 
 LARGEST_TOOL, HEAVIEST_TOOL = 3.0, 50.0
-"""Length in m and mass in kg beyond which no hand holds a tool: its units are taken for others."""
+"""Length in m and mass in kg above which no hand holds a tool, so that wrong units are
+suspected."""
 
 DEEPEST_DENT = 0.02
-"""Depth of a mesh's dent below its convex hull over its largest extent, no unit: rounding of
-vertices and of facets stays far below."""
+"""Depth of a mesh's dent below its convex hull, relative to the mesh's largest extent, without
+unit. Rounding of vertices and facets stays far below it."""
 
 FARTHEST_GRIP = 1.0
-"""Distance from the grip to the tool's centre of mass over the tool's largest extent, no unit: a
-grip on the tool itself is at most at 1."""
+"""Distance from the grip to the tool's centre of mass, relative to the tool's largest extent,
+without unit. A grip on the tool itself is at most at 1."""
 
-_AT_ONCE = 1000  # triangles compared with all facets of a hull: some 100 MB at 10 000 facets
+_AT_ONCE = 1000  # triangles per block; about 100 MB with a hull of 10 000 facets
 
-_SMALLEST_EXTENT = 1e-3  # m; nearer than this the grip is on any tool
+_SMALLEST_EXTENT = 1e-3  # m; a grip nearer than this counts as on the tool
 
 
 def geometry_faults(case: Case) -> Iterator[Fault]:
-    """Yields what is wrong with sizes and shapes.
-
-    Args:
-        case: The scene under check.
-    """
+    """Yields faults of sizes and shapes."""
     yield from _units(case)
     yield from _dented_meshes(case)
     yield from _far_grip(case)
@@ -71,7 +68,7 @@ def _units(case: Case) -> Iterator[Fault]:
 
 
 def _dented_meshes(case: Case) -> Iterator[Fault]:
-    """Finds meshes that collide and are not convex: MuJoCo collides their hulls."""
+    """Finds colliding meshes that are not convex; MuJoCo collides their hulls."""
     model, uses = case.model, geom_uses(case.model)
     told = set()
     for geom in range(model.ngeom):
@@ -98,7 +95,7 @@ def _dented_meshes(case: Case) -> Iterator[Fault]:
 
 
 def mesh_of(model: mujoco.MjModel, mesh: int) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Returns vertices, shape (n, 3), in m, and triangles, shape (m, 3), of a compiled mesh."""
+    """Returns the vertices in m, shape (n, 3), and triangles, shape (m, 3), of a compiled mesh."""
     first, count = int(model.mesh_vertadr[mesh]), int(model.mesh_vertnum[mesh])
     start, faces = int(model.mesh_faceadr[mesh]), int(model.mesh_facenum[mesh])
     return (
@@ -108,19 +105,19 @@ def mesh_of(model: mujoco.MjModel, mesh: int) -> tuple[NDArray[np.float64], NDAr
 
 
 def dent_of(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> tuple[float, float]:
-    """Returns how deep a mesh's surface dips below its convex hull, and what the hull adds.
+    """Returns the depth of a mesh's dents below its convex hull, and the volume they hold.
 
     Args:
         vertices: Shape (n, 3), in m.
         faces: Shape (m, 3).
 
     Returns:
-        The depth in m of the centre of a triangle that is deepest inside, and in m³ the volume of
-        the hull less that of the mesh; 0 for a surface that is not closed, which has none.
+        Depth in m of the triangle centre that lies deepest inside the hull, and volume of the hull
+        minus that of the mesh in m³. The volume is 0 for a surface that is not closed.
     """
     try:
         hull = ConvexHull(vertices)
-    except (QhullError, ValueError):  # flat: MuJoCo gives it no volume either
+    except (QhullError, ValueError):  # a flat mesh; MuJoCo gives it no volume either
         return 0.0, 0.0
     triangles = vertices[faces]
     dent = 0.0
@@ -160,7 +157,7 @@ def _far_grip(case: Case) -> Iterator[Fault]:
 
 
 def _workspace(case: Case) -> Iterator[Fault]:
-    """Compares what the device must move with the cube that it reaches."""
+    """Compares the device's part of the motion with the cube that it reaches."""
     extent = float(np.ptp(case.motion.table[:, 1:4], axis=0).max()) / case.scale
     if extent <= case.workspace:
         return
@@ -182,7 +179,7 @@ def _tool_bodies(case: Case) -> NDArray[np.bool_]:
 
 
 def _tool_extent(case: Case) -> NDArray[np.float64]:
-    """Returns the edges in m of the upright box around the tool's geoms at the start."""
+    """Returns the edges in m of the axis-aligned box around the tool's geoms at the start."""
     model, scene = case.model, case.scene
     scene.reset()
     mine = _tool_bodies(case)

@@ -1,4 +1,4 @@
-"""Times of many ticks in few numbers: their spread, and how they grow with a count."""
+"""Statistics of tick times."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 LEAST_GROUP = 20
-"""Ticks with one number of rows from which their median counts."""
+"""Smallest number of ticks with one count whose median is used."""
 
 
 @dataclass(frozen=True, slots=True)
 class Spread:
-    """Times in s of some ticks.
+    """Distribution of tick times, in s.
 
     Attributes:
-        ticks: How many.
-        median: Half of them were faster; nan if there was none.
-        p99: 99 of 100 were faster.
+        ticks: Number of ticks.
+        median: Median; nan without ticks.
+        p99: 99th percentile; nan without ticks.
     """
 
     ticks: int
@@ -27,7 +27,7 @@ class Spread:
 
     @classmethod
     def of(cls, times: NDArray[np.float64]) -> Spread:
-        """Returns the spread of times in s."""
+        """Computes the distribution of times in s."""
         if not times.size:
             return cls(0, float("nan"), float("nan"))
         return cls(int(times.size), float(np.median(times)), float(np.percentile(times, 99)))
@@ -35,13 +35,13 @@ class Spread:
 
 @dataclass(frozen=True, slots=True)
 class Growth:
-    """How the tick's time grows with constraint rows, or with contacts.
+    """Growth of the tick's time with the number of constraint rows or contacts.
 
     Attributes:
-        steps: Number of rows (contacts), ticks that had it, and their median time in s.
-        base: Time in s without any, by the line of least squares through the medians; None where
-            there are fewer than two.
-        per_one: What each adds, in s; None likewise.
+        steps: For each count: the count, the number of ticks, and their median time in s.
+        base: Time in s at count zero, from a least-squares line through the medians; None with
+            fewer than two medians.
+        per_one: Additional time in s per row or contact; None with fewer than two medians.
     """
 
     steps: tuple[tuple[int, int, float], ...]
@@ -50,7 +50,7 @@ class Growth:
 
 
 def growth_of(counts: NDArray[np.int64], times: NDArray[np.float64]) -> Growth:
-    """Returns how times grow with counts: the medians, and a line weighted by their ticks.
+    """Returns the median time by count, and a line weighted by the number of ticks.
 
     Args:
         counts: Shape (n,).

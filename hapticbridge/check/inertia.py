@@ -1,9 +1,4 @@
-"""The inertia that a push on a joint or on a body meets, armature included.
-
-MuJoCo's own ``dof_invweight0`` and ``body_invweight0`` leave the armature out where a body is
-simple (alone in its tree, without rotation between its frames), as seen in MuJoCo 4.0: a slide of
-0.5 g with 0.1 kg of armature has 1/0.0005.
-"""
+"""Effective inertia of joints and bodies."""
 
 from __future__ import annotations
 
@@ -14,15 +9,12 @@ import numpy as np
 
 
 def joint_inertia(model: mujoco.MjModel, data: mujoco.MjData, dof: int) -> float:
-    """Returns what a force along one degree of freedom meets: 1/(M⁻¹)_ii.
+    """Returns the inertia in kg (hinge: kg m²) along a degree of freedom: 1/(M⁻¹)_ii.
 
-    Args:
-        model: The compiled scene.
-        data: Its state, after ``mj_forward``.
-        dof: The degree of freedom.
-
-    Returns:
-        In kg, of a hinge in kg m²; the other degrees of freedom give way.
+    The other degrees of freedom move freely; ``data`` must be current (``mj_forward``). Armature is
+    included. MuJoCo's ``dof_invweight0`` and ``body_invweight0`` omit it for simple bodies (alone
+    in their tree, without rotation between their frames). Seen in MuJoCo 4.0: a slide of 0.5 g with
+    0.1 kg of armature has 1/0.0005.
     """
     unit, answer = np.zeros((2, 1, model.nv))
     unit[0, dof] = 1.0
@@ -31,17 +23,11 @@ def joint_inertia(model: mujoco.MjModel, data: mujoco.MjData, dof: int) -> float
 
 
 def body_inertia(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> float:
-    """Returns what a push at a body's centre of mass meets in the direction that gives way most.
+    """Returns a body's inertia in kg at its centre of mass, in the most compliant direction.
 
-    1/m is the largest eigenvalue of J M⁻¹ Jᵀ, with the Jacobian J of the centre of mass.
-
-    Args:
-        model: The compiled scene.
-        data: Its state, after ``mj_forward``.
-        body: The body.
-
-    Returns:
-        m in kg; infinite where the body cannot move.
+    1/m is the largest eigenvalue of J M⁻¹ Jᵀ, with the Jacobian J of the centre of mass. Armature
+    is included; ``data`` must be current (``mj_forward``). A body that cannot move has infinite
+    inertia.
     """
     if model.nv == 0 or model.body_treeid[body] < 0:
         return math.inf

@@ -1,4 +1,4 @@
-"""What a scene models: counted in the user's own model, without what the bridge adds to it."""
+"""Inventory of the user's model, without the parts that the bridge adds."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ MEETS_OTHER = "that meet something else"
 MOVING = "moving that meet nothing"
 FIXED = "fixed that meet nothing"
 USES = (TOOL, MEETS_TOOL, MEETS_OTHER, MOVING, FIXED, VISUAL)
-"""What a geom is there for, in the order in which it is printed."""
+"""Roles of a geom, in the order in which they are printed."""
 
 
 @dataclass(frozen=True, slots=True)
 class Idle:
-    """Something that cannot influence the grip.
+    """An element that cannot influence the grip.
 
     Attributes:
-        place: Where it is written.
-        reason: Why it cannot.
+        place: Line on which it is written.
+        reason: Why it has no influence.
     """
 
     place: Place
@@ -39,27 +39,28 @@ class Idle:
 
 @dataclass(frozen=True, slots=True)
 class Inventory:
-    """What a scene models.
+    """Counts of a scene's parts.
 
     Attributes:
-        bodies: All but the world.
-        moving_bodies: Those that a joint moves, their own or one further up.
-        degrees_of_freedom: Of the whole scene.
-        tool_degrees_of_freedom: Of what moves with the grip.
-        tool_mass: Of what moves with the grip, in kg.
-        geoms: By use, one of ``USES``; with a motion it counts what met, without what can.
-        triangles: Of the convex hulls of all meshes that collide.
+        bodies: Bodies without the world.
+        moving_bodies: Bodies moved by their own joint or by one further up.
+        degrees_of_freedom: Degrees of freedom of the whole scene.
+        tool_degrees_of_freedom: Degrees of freedom of the grip's kinematic tree.
+        tool_mass: Mass in kg of the grip's kinematic tree.
+        geoms: Number of geoms by role, see ``USES``; with a motion, only contacts that occurred
+            count.
+        triangles: Triangles of the convex hulls of all meshes that collide.
         possible_pairs: Pairs of geoms that may collide.
-        met_pairs: Those that did in the motion; None without one.
-        rows: By kind, largest and median number of constraint rows in a step; None without motion.
-        stiffness: Least and largest stiffness in N/m that a contact of the tool amounted to under a
-            force that can be felt; None without such a contact.
-        deepest: How deep the tool was in something at most, in m; 0 without a contact.
-        actuators: The scene's own.
+        met_pairs: Pairs that collided in the motion; None without a motion.
+        rows: Largest and median number of constraint rows per step, by kind; None without a motion.
+        stiffness: Smallest and largest contact stiffness of the tool in N/m under a perceptible
+            force; None without such a contact.
+        deepest: Largest penetration of the tool in m; 0 without a contact.
+        actuators: Actuators of the scene itself.
         equalities: Equality constraints.
         tendons: Tendons.
-        flexes: Flexes; with one, what meets it is not told by geoms.
-        idle: What cannot influence the grip.
+        flexes: Flexes; contacts with them are not counted by geom.
+        idle: Elements that cannot influence the grip.
     """
 
     bodies: int
@@ -84,13 +85,13 @@ class Inventory:
 def take_inventory(
     model: mujoco.MjModel, grip: str, places: Places, observation: Observation | None = None
 ) -> Inventory:
-    """Counts what a scene models.
+    """Counts the parts of a scene.
 
     Args:
-        model: The compiled scene, with or without the bridge's handle: it is not counted.
+        model: The compiled scene; the bridge's handle, if present, is not counted.
         grip: Name of the site on the tool.
-        places: Where things are written.
-        observation: What a motion showed; None counts as met what can meet.
+        places: Lines of the files on which elements are written.
+        observation: Result of a motion; None counts every possible contact as met.
     """
     own = np.array([model.body(i).name != HANDLE for i in range(model.nbody)])
     own[0] = False
@@ -134,7 +135,7 @@ def take_inventory(
 
 
 def geom_uses(model: mujoco.MjModel) -> list[str]:
-    """Returns what every geom is there for, as far as masks and pairs tell: for no tool."""
+    """Returns the role of every geom by its collision masks and pairs, without regard to a tool."""
     possible = {(min(a, b), max(a, b)) for a, b, _ in meeting_pairs(model)}
     return _uses(model, np.zeros(model.nbody, dtype=bool), possible, possible)
 
@@ -145,7 +146,6 @@ def _uses(
     possible: set[tuple[int, int]],
     met: set[tuple[int, int]],
 ) -> list[str]:
-    """Tells of every geom what it is there for."""
     of_tool = is_tool[model.geom_bodyid]
     meets_tool, meets = np.zeros((2, model.ngeom), dtype=bool)
     for first, second in met:
@@ -178,7 +178,7 @@ def _rows(observation: Observation) -> dict[str, tuple[int, float]]:
 
 
 def _hull_triangles(model: mujoco.MjModel, uses: list[str]) -> int:
-    """Counts the triangles of the convex hulls: what MuJoCo collides is the hull, not the mesh."""
+    """Counts triangles of the convex hulls, which are what MuJoCo collides."""
     meshes = {
         int(model.geom_dataid[geom])
         for geom in range(model.ngeom)
@@ -197,9 +197,9 @@ def _idle(
     met: set[tuple[int, int]],
     when: str,
 ) -> tuple[Idle, ...]:
-    """Lists what no chain of contacts, equality constraints and tendons joins to the tool.
+    """Lists the elements without a chain of contacts, equality constraints or tendons to the tool.
 
-    A fixed body hands nothing on: two things on one table do not feel each other through it.
+    A fixed body ends a chain: two things on one table do not influence each other through it.
     """
     tree = model.body_treeid
     reached = reached_trees(model, tool, met)

@@ -1,8 +1,8 @@
-"""Finds what a scene models beyond need: what could go without the hand noticing.
+"""Search for the leanest version of a scene that feels the same.
 
-Each simplification is tried alone, then those that may go are taken together: the one that saves
-most first, but what another motion might miss after all others. The judge is always the scene as it
-was read: what the hand would feel of all changes together must stay under the budget.
+Each simplification is tried alone. Those that pass are then combined, the largest saving first;
+those that only this motion does not need come last. Every combination is judged against the scene
+as it was read: the felt error of all changes together must stay below the budget.
 """
 
 from __future__ import annotations
@@ -31,13 +31,14 @@ from hapticbridge.errors import HapticBridgeError, SceneError
 from hapticbridge.scene import SceneSource
 
 Progress = Callable[[int, int, str], None]
-"""Called with what is done, what there is to do at most, and what is being tried."""
+"""Called with the steps done, the largest possible number of steps, and the name of the present
+one."""
 
 _ARGUMENTS = Arguments(SceneError)
 
 
 def checked_budget(budget: float) -> float:
-    """Returns a felt error in just noticeable differences that may be allowed.
+    """Returns the allowed felt error in just noticeable differences.
 
     Raises:
         SceneError: It is not finite and > 0.
@@ -47,13 +48,14 @@ def checked_budget(budget: float) -> float:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Lean:
-    """What was found.
+    """Result of the search.
 
     Attributes:
-        judge: The scene as it was read, the motion, and what was allowed.
-        draft: The leanest version that was found; the original's equal if nothing may go.
-        alone: Each simplification by itself.
-        together: Those that were taken, in order; each with all before it.
+        judge: The original scene, the motion, and the limits.
+        draft: The leanest version; equal to the original if no simplification passed.
+        alone: Each simplification tried alone.
+        together: The simplifications that were combined, in order; each trial includes all before
+            it.
         result: The leanest version against the original.
     """
 
@@ -65,7 +67,7 @@ class Lean:
 
     @property
     def removable(self) -> tuple[Trial, ...]:
-        """What may go and loses nothing else: what a lean scene has none of."""
+        """Simplifications that pass alone and lose nothing else; a lean scene has none."""
         return tuple(trial for trial in self.alone if trial.verdict == MAY_GO and not trial.loses)
 
 
@@ -80,18 +82,18 @@ def find_lean(
     cost: CostMeter = processor_costs,
     progress: Progress | None = None,
 ) -> Lean:
-    """Looks for the leanest version of a scene that feels the same in a motion.
+    """Finds the leanest version of a scene that feels the same in a motion.
 
     Args:
-        source: The scene; stays as it is.
+        source: The scene; it is not changed.
         grip: Name of the site on the tool.
-        motion: Of the handle, counted from its first pose.
-        setting: How the scene is run.
-        budget: Felt error in just noticeable differences that is allowed, > 0.
-        device_damping: b of the device in N s/m; a rate at which the coupling needs more than that,
-            and more than it needs as it is, is refused.
-        cost: Measures two versions side by side.
-        progress: Is told what is being tried.
+        motion: Motion of the handle, relative to its first pose.
+        setting: Coupling and rate.
+        budget: Allowed felt error in just noticeable differences, > 0.
+        device_damping: b of the device in N s/m. A rate whose coupling needs more than b, and more
+            than the original needs, is refused.
+        cost: Measures the cost of two versions side by side.
+        progress: Receives the name of each trial.
 
     Raises:
         SceneError: The scene cannot be run, the motion is shorter than a tick, or a number is out
@@ -129,10 +131,10 @@ def _search(judge: Judge, simpler: list[Simplification], progress: Progress | No
             progress(k, total, each.name)
         if (found := _tried(judge, each, judge.original)) is not None:
             alone.append((each, found[1]))
-    # what saves little of the whole may save much of what is left
+    # a small saving of the whole may be a large share of the rest
     order = [pair for pair in alone if pair[1].verdict in (MAY_GO, SAVES_NOTHING)]
     order = [pair for pair in order if (pair[1].cost or 0.0) < 1.0 + judge.least_saving]
-    # what only this motion does not need goes last: it may turn out not to be worth it
+    # simplifications for this motion alone go last; they may turn out not to be needed
     order.sort(key=lambda pair: (pair[0].loses == OTHER_MOTIONS, pair[1].cost or 0.0))
     best, share, together = judge.original, 1.0, []
     for k, (each, _) in enumerate(order):
@@ -143,7 +145,7 @@ def _search(judge: Judge, simpler: list[Simplification], progress: Progress | No
             best, share = found[0], found[1].cost or share
             together.append(found[1])
     result = judge.judge("lean", "all that was taken", best, is_last_word=True)
-    if together and result.verdict != MAY_GO:  # what was saved step by step was the machine's noise
+    if together and result.verdict != MAY_GO:  # the steps' savings were timing noise
         best, together = judge.original, []
         result = judge.judge("lean", "all that was taken", best)
     if not together:
@@ -156,12 +158,12 @@ def _search(judge: Judge, simpler: list[Simplification], progress: Progress | No
 def _tried(
     judge: Judge, each: Simplification, base: Draft, share: float = 1.0
 ) -> tuple[Draft, Trial] | None:
-    """Applies a simplification to a version; None where there is nothing to change."""
+    """Applies a simplification to a version; returns None if there is nothing to change."""
     draft = base.copy()
     try:
         if not each.edit(draft):
             return None
         return draft, judge.judge(each.name, each.sentence, draft, base, share, each.loses)
-    except (HapticBridgeError, ValueError) as error:  # MuJoCo raises the latter for what it refuses
+    except (HapticBridgeError, ValueError) as error:  # MuJoCo raises ValueError
         reason = " ".join(str(error).split())
         return draft, Trial(each.name, reason, FAILS, each.loses)

@@ -1,4 +1,4 @@
-"""Writes the leanest version of a scene as MJCF, reads it back and judges it again."""
+"""MJCF file of the leanest version, read back and judged again."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ ENDING = ".xml"
 
 
 def check_target(source: SceneSource, path: Path, *, overwrite: bool = False) -> None:
-    """Checks that a leaner scene can be written, before anything is computed for it.
+    """Checks that a leaner scene can be written, before the search starts.
 
     Raises:
         SceneError: The file's name does not end in .xml, its folder does not exist, it is a file of
-            the scene itself, or it exists and ``overwrite`` is not set.
+            the scene itself, or it exists and ``overwrite`` is False.
     """
     if path.suffix.lower() != ENDING:
         raise SceneError(f"cannot write the scene to '{path}': its name must end in {ENDING}")
@@ -36,22 +36,22 @@ def check_target(source: SceneSource, path: Path, *, overwrite: bool = False) ->
 
 
 def write_lean(lean: Lean, path: Path, *, overwrite: bool = False) -> Trial:
-    """Writes the leanest version that was found.
+    """Writes the leanest version as MJCF.
 
-    Included files become part of it, paths of assets count from its own folder, and its comment
-    says what was changed. MuJoCo writes numbers with 6 digits, so what is in the file is not to the
-    bit what was judged: it is read back, and judged again.
+    Included files become part of it, asset paths are relative to its folder, and its comment lists
+    the changes. MuJoCo writes numbers with 6 digits, so the file differs from the judged version by
+    rounding. It is therefore read back and judged again.
 
     Args:
-        lean: What was found.
+        lean: Result of ``find_lean``.
         path: The file.
-        overwrite: Whether to replace a file that exists.
+        overwrite: True replaces an existing file.
 
     Returns:
         The written scene against the original.
 
     Raises:
-        SceneError: Nothing may go, the file must not or cannot be written, or cannot be read back.
+        SceneError: No simplification passed, or the file cannot be written or read back.
     """
     judge, source = lean.judge, lean.draft.source
     check_target(source, path, overwrite=overwrite)
@@ -75,7 +75,7 @@ def write_lean(lean: Lean, path: Path, *, overwrite: bool = False) -> Trial:
 
 
 def _files(source: SceneSource) -> list[Path]:
-    """Returns where the files of a scene are; the first is the main one."""
+    """Returns the paths of a scene's files; the first is the main one."""
     main = source.path.absolute()
     root = main
     for _ in PurePath(source.sources[0].name).parts:
@@ -84,7 +84,7 @@ def _files(source: SceneSource) -> list[Path]:
 
 
 def _point_to_assets(spec: mujoco.MjSpec, source: SceneSource, folder: Path) -> None:
-    """Makes the paths of meshes, textures and height fields count from a folder."""
+    """Makes the paths of meshes, textures and height fields relative to a folder."""
     files = _files(source)
 
     def moved(name: str, directory: str) -> str:
@@ -116,7 +116,7 @@ def _point_to_assets(spec: mujoco.MjSpec, source: SceneSource, folder: Path) -> 
 
 
 def _comment(lean: Lean, before: str) -> str:
-    """Says what was changed; XML allows no two dashes in a row within a comment."""
+    """Returns the list of changes; XML forbids two dashes in a row within a comment."""
     source, setting, result = lean.draft.source, lean.draft.setting, lean.result
     felt = 0.0 if result.felt is None else result.felt.felt
     judge, cost = lean.judge, 100.0 * (result.cost or 1.0)

@@ -1,4 +1,4 @@
-"""Draws cost against felt error: every version that was tried, by name."""
+"""Plot of cost against felt error."""
 
 from __future__ import annotations
 
@@ -32,22 +32,17 @@ _MARKERS = {MAY_GO: "o", SAVES_NOTHING: "s", IS_FELT: "^", CREATES: "X", WARNS: 
 _PATH = "#1a5fb4"
 
 LINEAR = 0.01
-"""JND below which the scale is even, so that what is not felt at all can be shown."""
+"""Felt error in JND below which the axis is linear, so that zero can be shown."""
 
 LINE = 0.19
-"""Height of a name in inches: 8 points with air."""
+"""Height of a name in inches: 8 points and a gap."""
 
 NAMES = 1.04
-"""Where the names begin, in widths of the axes."""
+"""Left edge of the column of names, in widths of the axes."""
 
 
 def draw_lean(lean: Lean, name: str) -> Figure:
-    """Returns the picture of what was tried.
-
-    Args:
-        lean: What was found.
-        name: Of the scene, for the title.
-    """
+    """Draws cost against felt error of every version that was tried."""
     points = [(trial.name, trial, "") for trial in lean.alone if trial.felt is not None]
     steps = [(f"{k + 1}: {t.name}", t, "path") for k, t in enumerate(lean.together)]
     points += steps
@@ -105,7 +100,7 @@ def _draw_path(axes: Axes, lean: Lean) -> None:
 def _write_names(axes: Axes, points: list[tuple[str, Trial, str]]) -> None:
     """Writes the names in a column beside the axes, each with a line to its point.
 
-    Many points share a place, so that names beside them would cover each other.
+    Names at the points would overlap, because many points coincide.
     """
     order = sorted(points, key=lambda point: (_felt(point[1]), -_cost(point[1])))
     heights = np.linspace(0.0, 1.0, len(order)) if len(order) > 1 else np.array([0.5])

@@ -1,4 +1,4 @@
-"""What lean found, as facts for a program and as a table."""
+"""Results of a search as JSON facts and CSV."""
 
 from __future__ import annotations
 
@@ -33,18 +33,18 @@ COLUMNS = (
     "needed_damping_ns_per_m",
     "sentence",
 )
-"""Of the table. ``step`` is empty for what was tried alone, and counts what was taken together."""
+"""Columns of the CSV table. ``step`` is empty for single trials and counts the combined ones."""
 
 
 def lean_rows(lean: Lean) -> list[dict[str, str | float | int | None]]:
-    """Returns one row per trial: each alone, then those taken together, then all of them."""
+    """Returns one row per trial: each alone, those combined, and the final version."""
     steps = [("", trial) for trial in lean.alone]
     steps += [(str(k + 1), trial) for k, trial in enumerate(lean.together)]
     return [trial_facts(trial) | {"step": step} for step, trial in [*steps, ("all", lean.result)]]
 
 
 def trial_facts(trial: Trial) -> dict[str, str | float | int | None]:
-    """Returns what is known of one trial; None where it failed."""
+    """Returns one trial as a dictionary; values that a failed trial lacks are None."""
     felt = trial.felt
     return {
         "name": trial.name,
@@ -69,7 +69,7 @@ def trial_facts(trial: Trial) -> dict[str, str | float | int | None]:
 
 
 def lean_facts(lean: Lean, written: Trial | None = None) -> dict[str, object]:
-    """Returns what was found, for JSON."""
+    """Returns the result of a search, for JSON."""
     judge = lean.judge
     return {
         "budget_jnd": judge.budget,
@@ -89,15 +89,15 @@ def lean_facts(lean: Lean, written: Trial | None = None) -> dict[str, object]:
 
 
 def check_table(path: Path, scenes: Iterable[Path]) -> None:
-    """Checks that a table can be written, before anything is computed for it.
+    """Checks that a table can be written, before the search starts.
 
     Args:
         path: The file.
-        scenes: MJCF files that are there, or will be.
+        scenes: MJCF files, existing or to be written.
 
     Raises:
-        SceneError: Its name does not end in .csv, its folder does not exist, or it would be taken
-            for a scene's hand motion.
+        SceneError: Its name does not end in .csv, its folder does not exist, or it would be read as
+            a scene's hand motion.
     """
     if path.suffix.lower() != ENDING:
         raise SceneError(f"cannot write the table to '{path}': its name must end in {ENDING}")

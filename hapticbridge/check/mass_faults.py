@@ -1,4 +1,4 @@
-"""Faults of masses: none, made up by MuJoCo, too unequal, or too heavy to be carried."""
+"""Faults of masses: missing, chosen by MuJoCo, too unequal, or too heavy for the coupling."""
 
 from __future__ import annotations
 
@@ -13,22 +13,18 @@ from hapticbridge.check.faults import Fault, length, number, others, weight
 from hapticbridge.check.inertia import body_inertia
 
 WATER = 1000.0
-"""Density in kg/m³ that MuJoCo gives a geom that says neither mass nor density."""
+"""Default density of a MuJoCo geom in kg/m³."""
 
 LARGEST_RATIO = 1000.0
-"""Ratio of two masses in contact, or of a load to what carries it, no unit: a contact has the
-stiffness of the lighter one, and the heavier then sinks in a thousand times as deep."""
+"""Largest ratio of two masses in contact, or of a load to its carrier, without unit. A contact has
+the stiffness of the lighter body, so the heavier one penetrates a thousand times as deep."""
 
 LARGEST_SAG = 1e-3
-"""How far the tool's weight may stretch the coupling at rest, in m."""
+"""Largest stretch in m of the coupling under the tool's weight at rest."""
 
 
 def mass_faults(case: Case) -> Iterator[Fault]:
-    """Yields bodies without inertia, with one that nobody chose, and masses that do not fit.
-
-    Args:
-        case: The scene under check.
-    """
+    """Yields missing, unintended and mismatched masses."""
     for body, refusal in case.refused.items():
         place = case.places.body(body)
         is_none = "mass and" in refusal
@@ -49,9 +45,9 @@ def mass_faults(case: Case) -> Iterator[Fault]:
 
 
 def _of_water(case: Case) -> Iterator[Fault]:
-    """Finds moving bodies of which a geom has the density of water because it says nothing."""
+    """Finds moving bodies with a geom that has the default density because it sets none."""
     model, geoms = case.model, list(case.source.spec.geoms)
-    if len(geoms) != model.ngeom:  # the compiler threw some away, so ids do not tell which is which
+    if len(geoms) != model.ngeom:  # the compiler dropped some, so ids do not match
         return
     silent: dict[int, list[int]] = {}
     for geom, written in enumerate(geoms):
@@ -93,7 +89,7 @@ def _says_nothing(case: Case, geom: int, written: Any) -> bool:
 
 
 def _contact_ratios(case: Case) -> Iterator[Fault]:
-    """Compares what met: the inertia that a push on a body meets, armature included."""
+    """Compares the effective inertias of bodies that met, armature included."""
     model, told = case.model, set()
     case.scene.reset()
     for pair in case.observation.meetings if case.observation else ():
@@ -116,7 +112,7 @@ def _contact_ratios(case: Case) -> Iterator[Fault]:
 
 
 def _load_ratios(case: Case) -> Iterator[Fault]:
-    """Compares a moving body with what hangs on it by further joints."""
+    """Compares a moving body with the load on its further joints."""
     model = case.model
     for body in range(1, model.nbody):
         parent = int(model.body_weldid[model.body_parentid[body]])
@@ -139,7 +135,7 @@ def _load_ratios(case: Case) -> Iterator[Fault]:
 
 
 def _sag(case: Case) -> Iterator[Fault]:
-    """Computes how far the tool hangs below the handle: (JᵀKJ + K_joints) δq = its weight."""
+    """Computes the tool's sag below the handle: (JᵀKJ + K_joints) δq = its weight."""
     model, scene = case.model, case.scene
     scene.reset()
     data, site = scene.data, model.site(scene.grip).id
@@ -170,7 +166,7 @@ def _sag(case: Case) -> Iterator[Fault]:
     yield Fault(
         "heavy tool",
         case.places.body(root),
-        f"the tool weighs {weight(mass)}; what of it the hand carries, {number(pull)} N, stretches "
+        f"the tool weighs {weight(mass)}; the part the hand carries, {number(pull)} N, stretches "
         f"the coupling of {coupling.stiffness:.4g} N/m by {length(sag)} at rest",
         'gravcomp="1" in the body and those below it, or less mass',
     )

@@ -1,4 +1,4 @@
-"""The motion that a scene is checked with: its own hand path, a file of poses, or a recording."""
+"""Motion for a check: the scene's own hand path, a file of poses, or a recording."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ RECORDING = ".mcap"
 
 
 def motion_for(scene: Scene, path: str | Path | None = None) -> Motion | None:
-    """Returns the handle's motion, counted from its first pose.
+    """Returns the handle's motion relative to its first pose.
 
     Args:
-        scene: The scene that is checked.
-        path: A CSV file (``t,x,y,z[,qw,qx,qy,qz]``) or a recording; None takes ``NAME.csv`` beside
-            the scene.
+        scene: The scene under check.
+        path: CSV file (``t,x,y,z[,qw,qx,qy,qz]``) or recording; None takes ``NAME.csv`` beside the
+            scene.
 
     Returns:
-        The motion; None where no file was named and none lies beside the scene.
+        The motion; None if no file was named and none lies beside the scene.
 
     Raises:
         DeviceError: The file is not a motion.
-        RecordingError: It is not a recording.
+        RecordingError: The file is not a recording.
     """
     if path is None:
         beside = scene.path.with_suffix(".csv")
@@ -42,14 +42,14 @@ def motion_for(scene: Scene, path: str | Path | None = None) -> Motion | None:
         period = float(recording.meta["period_s"])
     except (KeyError, ValueError):
         raise DeviceError(f"{path}: the recording does not say its period (period_s)") from None
-    # the handle's pose, not the device's: scale and axes are in it
+    # the handle's pose already includes scale and axes; the device's does not
     return Motion(
         ticks["tick"] * period, ticks["handle_position"], ticks["handle_quaternion"]
     ).relative()
 
 
 def samples_of(motion: Motion, period: float) -> NDArray[np.void]:
-    """Returns the motion as the loop would read it, one ``SAMPLE_DTYPE`` per period T in s.
+    """Samples the motion as the loop would, one ``SAMPLE_DTYPE`` per period T in s.
 
     Raises:
         DeviceError: The period is not finite and > 0.

@@ -1,4 +1,4 @@
-"""What happens inside MuJoCo while a scene is led through a motion, tick by tick."""
+"""Observation of a scene's contacts, constraint rows and energies during a motion."""
 
 from __future__ import annotations
 
@@ -30,32 +30,32 @@ ROW_KINDS: dict[str, tuple[int, ...]] = {
     "limit": (int(_TYPE.mjCNSTR_LIMIT_JOINT), int(_TYPE.mjCNSTR_LIMIT_TENDON)),
     "equality": (int(_TYPE.mjCNSTR_EQUALITY),),
 }
-"""Kinds of constraint rows by the names that a scene's author knows, and MuJoCo's types."""
+"""Kinds of constraint rows in the words of MJCF, and MuJoCo's types."""
 
 _PYRAMIDAL = int(_TYPE.mjCNSTR_CONTACT_PYRAMIDAL)
 
 LEAST_FORCE = 0.05
-"""Normal force in N from which a contact's stiffness is kept: below, it is not felt."""
+"""Normal force in N above which a contact's stiffness is kept; a smaller force is not felt."""
 
 POSTURES = 100
-"""How many postures are kept; a motion of 8 s passes a hole in more than two of them."""
+"""Approximate number of postures kept; a motion of 8 s passes a hole in more than two of them."""
 
 PROGRESS_EVERY = 500
-"""Ticks between two reports of progress."""
+"""Ticks between two calls of ``progress``."""
 
 
 @dataclass(slots=True)
 class Meeting:
-    """What two geoms did to each other over a motion.
+    """Contacts of two geoms over a motion.
 
     Attributes:
-        ticks: In how many ticks they were in contact.
-        deepest: How deep one was in the other at most, in m; negative where they never overlapped.
+        ticks: Number of ticks in contact.
+        deepest: Largest penetration in m; negative if they never overlapped.
         force: Largest normal force in N of one contact.
-        inertia: Least that MuJoCo saw at one of their contacts, in kg, the coupling's share of
-            h B' + h² K included; inf if no contact carried ``LEAST_FORCE``.
-        softest: Least stiffness in N/m of such a contact; inf if none.
-        stiffest: The largest; 0 if none.
+        inertia: Smallest effective inertia in kg at a contact, with the coupling's share h B' + h²
+            K; inf if no contact carried ``LEAST_FORCE``.
+        softest: Smallest stiffness in N/m of such a contact; inf without one.
+        stiffest: Largest stiffness in N/m of such a contact; 0 without one.
     """
 
     ticks: int = 0
@@ -68,15 +68,15 @@ class Meeting:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observation:
-    """What a motion showed.
+    """Result of a motion.
 
     Attributes:
-        meetings: By the ids of two geoms, the smaller first.
+        meetings: Contacts by the ids of two geoms, the smaller first.
         postures: ``qpos`` at times spread over the motion, shape (n, nq).
-        rows: By kind, how many constraint rows each tick had.
-        force: Force on the tool in N, its norm in each tick.
-        full_ticks: In how many ticks the solver stopped at its limit of iterations.
-        warnings: How often MuJoCo warned, by its own words.
+        rows: Number of constraint rows in each tick, by kind.
+        force: Norm of the force on the tool in each tick, in N.
+        full_ticks: Number of ticks in which the solver stopped at its iteration limit.
+        warnings: Number of MuJoCo's warnings by text.
         environment: ``strict``, ``within slack`` or ``active``.
         slack_share: Largest share of the slack that was used, without unit.
     """
@@ -98,17 +98,17 @@ def observe(
     period: float,
     progress: Callable[[int, int], None] | None = None,
 ) -> Observation:
-    """Leads a scene through a motion, as ``rehearse`` does, and looks into every step.
+    """Leads a scene through a motion, as ``rehearse`` does, and inspects every step.
 
     Args:
         scene: Changed in place: reset, with the coupling's gains and the time step set.
-        samples: Poses counted from the first, ``SAMPLE_DTYPE``.
+        samples: Poses relative to the first, ``SAMPLE_DTYPE``.
         coupling: K and B.
         period: T in s.
-        progress: Called with ticks done and to do.
+        progress: Called with the number of ticks done and the total.
 
     Raises:
-        SceneError: A value is out of range, or a result is not finite; says at which tick.
+        SceneError: A value is out of range, or a result is not finite; the message names the tick.
     """
     binding = Binding(scene.model, scene.data, rehearsal_parameters(scene, coupling, period))
     model, data, state, row = scene.model, scene.data, binding.state, binding.row
@@ -151,7 +151,7 @@ def observe(
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Keeps MuJoCo's warnings from being printed, and from a file MUJOCO_LOG.TXT: they are kept."""
+    """Suppresses MuJoCo's printed warnings and its file MUJOCO_LOG.TXT; counters still count."""
     before = mujoco.get_mju_user_warning()
     mujoco.set_mju_user_warning(lambda _message: None)
     try:
@@ -165,22 +165,22 @@ def _note_contacts(
 ) -> None:
     """Adds the contacts of one step.
 
-    A row's force at rest is a_ref/R. Under ``discrete`` both are divided by the same number, which
-    makes the row's own spring and damper implicit in the step h:
+    A row's force at rest is a_ref/R. Under ``discrete`` both are divided by one number, which makes
+    the row's own spring and damper implicit in the step h:
 
         a_ref = −(b v + k d r)/(1 + h b + h² k d),    R = (1 − d)/d A/(1 + h b + h² k d),
 
-    with the depth −r, the velocity v, MuJoCo's k and b of the row, its impedance d at that depth,
-    and 1/A the inertia that the contact really has. So f/r = k d/(R (1 + h b + h² k d)) is the
-    stiffness that it amounts to. With a pyramidal cone 2 (dim − 1) rows share the normal force, and
-    together they are as stiff as one with that many times the inertia.
+    with depth −r, velocity v, MuJoCo's k and b of the row, its impedance d at that depth, and the
+    contact's true inertia 1/A. Its stiffness is therefore f/r = k d/(R (1 + h b + h² k d)). With a
+    pyramidal cone, 2 (dim − 1) rows share the normal force; together they are as stiff as one row
+    with that many times the inertia.
     """
     contacts, rows = data.contact, data.efc_type
     addresses, dims, depths = contacts.efc_address.tolist(), contacts.dim, (-contacts.dist).tolist()
     seen = set()
     for k, (one, other) in enumerate(contacts.geom.tolist()):
         adr = addresses[k]
-        if min(one, other) < 0 or adr < 0:  # a flex, or too far away to act
+        if min(one, other) < 0 or adr < 0:  # a flex, or outside the active distance
             continue
         pair = min(one, other), max(one, other)
         meeting = meetings.setdefault(pair, Meeting())

@@ -1,4 +1,4 @@
-"""Faults of a scene's options: what will run otherwise than the file says."""
+"""Faults of a scene's options that the bridge overrides."""
 
 from __future__ import annotations
 
@@ -16,12 +16,10 @@ _SAME_STEP = 1e-9  # relative: 0.001 as 1/1000
 
 
 def option_faults(case: Case) -> Iterator[Fault]:
-    """Yields options that the bridge replaces, and what it was told of them when it loaded.
+    """Yields options that the bridge replaces, and concerns from loading the scene.
 
-    The scene runs, but not as it was tried out in a viewer: write what it runs with.
-
-    Args:
-        case: The scene under check.
+    The scene runs, but not as it did in a viewer; the remedy writes down the options that it runs
+    with.
     """
     option, places = case.source.spec.option, case.places
     if option.integrator != mujoco.mjtIntegrator.mjINT_DISCRETE:
@@ -70,11 +68,7 @@ def option_faults(case: Case) -> Iterator[Fault]:
 
 
 def keyframe_faults(case: Case) -> Iterator[Fault]:
-    """Yields keyframes of which none is the start.
-
-    Args:
-        case: The scene under check.
-    """
+    """Yields a fault if the scene has keyframes but no start among them."""
     names = [str(key.name) for key in case.source.spec.keys]
     if names and START_KEYFRAME not in names:
         listed = choices(name for name in names if name)

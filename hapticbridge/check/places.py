@@ -1,4 +1,4 @@
-"""Where in the files of a scene an element is written."""
+"""Lines of a scene's files on which its elements are written."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ _EQUALITIES = ("connect", "weld", "joint", "tendon", "flex", "flexvert", "flexst
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """One element of a scene's files.
+    """An element in a scene's files.
 
     Attributes:
         file: Name of the file, relative to the scene's folder.
-        line: Counted from 1; 0 where the element could not be found in the files.
-        element: What it is and is called: ``geom 'peg'``, ``<option>``.
+        line: Line, from 1; 0 if the element was not found in the files.
+        element: Kind and name: ``geom 'peg'``, ``<option>``.
     """
 
     file: str
@@ -35,11 +35,11 @@ class Place:
 
 
 class Places:
-    """Finds the line on which an element of a compiled scene stands.
+    """Finder of the lines of a compiled scene's elements.
 
-    MuJoCo knows the line of what stands in the main file, and none of what was included. There an
-    element is found by its name, one without a name by its place among those of its kind without
-    one, where their number says that none was added or left out on the way.
+    MuJoCo records lines of the main file, but not of included files. There an element is found by
+    its name. An unnamed element is found by its position among the unnamed elements of its kind,
+    provided that their numbers in files and model agree.
     """
 
     def __init__(self, source: SceneSource, model: mujoco.MjModel) -> None:
@@ -47,7 +47,7 @@ class Places:
 
         Args:
             source: The scene as it was read.
-            model: What was compiled from it, with or without the bridge's handle.
+            model: Model compiled from it, with or without the bridge's handle.
         """
         self._spec, self._model = source.spec, model
         self._files = [
@@ -91,16 +91,16 @@ class Places:
         return self._find(("pair",), self._spec.pairs, pair_id, self._model.pair)
 
     def mesh(self, mesh_id: int) -> Place:
-        """Returns the place of a mesh; one without a name is called as its file is."""
+        """Returns the place of a mesh; an unnamed mesh has the name of its file."""
         return self._find(("mesh",), self._spec.meshes, mesh_id, self._model.mesh)
 
     def named(self, tag: str, name: str) -> Place:
-        """Returns the place of an element by its name, as an error of MuJoCo tells it."""
+        """Returns the place of an element by its tag and name."""
         found = self._first((tag,), lambda element: element.attributes.get("name") == name)
         return found or Place(self._main, 0, f"{tag} '{name}'")
 
     def option(self, attribute: str) -> Place:
-        """Returns where <option> sets an attribute, or else where it would be set."""
+        """Returns the place at which <option> sets an attribute, or at which it would be set."""
         return (
             self._first(("option", "flag"), lambda element: attribute in element.attributes)
             or self._first(("option",), lambda _: True)
@@ -109,17 +109,17 @@ class Places:
         )
 
     def option_change(self, attribute: str, value: str) -> str:
-        """Returns what to write at ``option(attribute)``; a scene need not have an <option>."""
+        """Returns the text to write at ``option(attribute)``, also for a scene without <option>."""
         written = f'{attribute}="{value}"'
         is_missing = self.option(attribute).element == "<mujoco>"
         return f"<option {written}/> in <mujoco>" if is_missing else written
 
     def flag(self) -> Place:
-        """Returns where flags are set: MuJoCo takes one <flag> per <option>."""
+        """Returns the place of flags; MuJoCo takes one <flag> per <option>."""
         return self._first(("flag",), lambda _: True) or self.option("flag")
 
     def with_attribute(self, attribute: str) -> Place | None:
-        """Returns the first element that has an attribute, of whatever tag."""
+        """Returns the first element of any tag that has an attribute."""
         for file, elements in self._files:
             for element in elements:
                 if attribute in element.attributes:
@@ -127,7 +127,7 @@ class Places:
         return None
 
     def attributes_at(self, place: Place) -> dict[str, str]:
-        """Returns what is written at a place itself, without the defaults that reach it."""
+        """Returns the attributes written at a place, without inherited defaults."""
         for name, elements in self._files:
             for element in elements:
                 if (name, element.line) == (place.file, place.line) and (
@@ -151,7 +151,7 @@ class Places:
         owner: str = "",
         kind: str = "",
     ) -> Place:
-        """Finds an element by its name, its line, or its place among those without a name."""
+        """Finds an element by its name, its line, or its position among unnamed elements."""
         kind, name = kind or tags[0], str(compiled(index).name)
         label = f"{kind} '{name}'" if name else f"{kind} {index}{owner}"
         if name and (found := self._first(tags, lambda e: e.attributes.get("name") == name)):
@@ -192,7 +192,7 @@ def _line(element: Any) -> int:
 
 
 def _outside_defaults(elements: list[Element]) -> list[Element]:
-    """Leaves out what stands before the first body or world of a file: classes have geoms too."""
+    """Drops the elements before the first body or world; default classes contain geoms too."""
     for k, element in enumerate(elements):
         if element.tag in ("worldbody", "body"):
             return elements[k:]

@@ -1,4 +1,4 @@
-"""The primitive that fits a cloud of points best: what a mesh may become."""
+"""Primitive shapes fitted to a mesh."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ _GEOM = mujoco.mjtGeom
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Primitive:
-    """A geometric shape as MuJoCo has it.
+    """A geometric shape of MuJoCo.
 
     Attributes:
-        kind: Box, cylinder, capsule or sphere. An ellipsoid is not tried: its contacts cost as much
-            as a mesh's.
-        size: MuJoCo's three numbers, in m.
-        position: Of its centre, in m.
-        axes: Its axes as columns, a rotation.
-        error: Largest distance of a point from its surface over the radius of the points, plus the
-            relative difference between its volume and that of the points' hull; without unit.
+        kind: Box, cylinder, capsule or sphere. Ellipsoids are not tried, because their contacts
+            cost as much as a mesh's.
+        size: MuJoCo's three sizes, in m.
+        position: Centre, in m.
+        axes: Rotation whose columns are the shape's axes.
+        error: Largest distance of a point from the surface divided by the points' radius, plus the
+            relative volume difference to the points' hull; without unit.
     """
 
     kind: mujoco.mjtGeom
@@ -38,13 +38,13 @@ class Primitive:
 
 
 def best_primitive(points: Array, frames: Iterable[Array]) -> Primitive:
-    """Returns the best of the primitives that just hold some points.
+    """Returns the best of the primitives that just contain some points.
 
-    MuJoCo's own fit takes the axes of inertia, which are arbitrary for a square bar: its box comes
-    out turned by 45 degrees. Here the frames are given.
+    MuJoCo's own fit uses the axes of inertia, which are arbitrary for a square bar: its box comes
+    out turned by 45 degrees. Here the caller provides the frames.
 
     Args:
-        points: In m, shape (n, 3), not all in one plane.
+        points: Points in m, shape (n, 3), not all in one plane.
         frames: Rotations whose columns are the axes to try.
     """
     volume = float(ConvexHull(points).volume)
@@ -86,12 +86,12 @@ def _error(kind: mujoco.mjtGeom, size: Array, local: Array, volume: float, radiu
 
 
 def signed_distance(kind: mujoco.mjtGeom, size: Array, points: Array) -> Array:
-    """Returns how far points lie outside a primitive, in m; negative inside.
+    """Returns the distance of points from a primitive's surface, in m; negative inside.
 
     Args:
         kind: Box, cylinder, capsule or sphere.
-        size: MuJoCo's numbers, in m.
-        points: In the primitive's frame, in m, shape (n, 3).
+        size: MuJoCo's sizes, in m.
+        points: Points in the primitive's frame, in m, shape (n, 3).
     """
     if kind in (_GEOM.mjGEOM_SPHERE, _GEOM.mjGEOM_CAPSULE):
         length = size[1] if kind == _GEOM.mjGEOM_CAPSULE else 0.0

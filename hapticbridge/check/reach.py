@@ -1,4 +1,4 @@
-"""What the tool is joined to: by contacts, equality constraints and tendons, step by step."""
+"""Kinematic trees joined to the tool."""
 
 from __future__ import annotations
 
@@ -6,16 +6,16 @@ import mujoco
 
 
 def reached_trees(model: mujoco.MjModel, tool: int, met: set[tuple[int, int]]) -> set[int]:
-    """Returns the kinematic trees that can influence the tool's, its own among them.
+    """Returns the kinematic trees that can influence the tool's tree, including it.
 
-    In a scene with flexes all of them count.
+    Contacts, equality constraints and tendons join trees. In a scene with flexes all trees count.
 
     Args:
         model: The compiled scene.
         tool: The tool's kinematic tree.
-        met: Geoms that met, by their ids.
+        met: Ids of the geoms that met.
     """
-    if model.nflex:  # what touches a flex is not told by geoms
+    if model.nflex:  # contacts of a flex are not listed by geom
         return set(range(model.ntree))
     tree = model.body_treeid
     links = [{int(tree[model.geom_bodyid[geom]]) for geom in pair} for pair in met]
@@ -40,7 +40,7 @@ def _trees_of_equality(model: mujoco.MjModel, equality: int) -> set[int]:
         return {int(tree[model.jnt_bodyid[each]]) for each in ids}
     if form == kind.mjEQ_TENDON:
         return {t for each in ids for t in _trees_of_tendon(model, each)}
-    if form not in (kind.mjEQ_CONNECT, kind.mjEQ_WELD):  # of flexes, whose bodies are many
+    if form not in (kind.mjEQ_CONNECT, kind.mjEQ_WELD):  # a flex has many bodies
         return set(range(model.ntree))
     if model.eq_objtype[equality] == mujoco.mjtObj.mjOBJ_SITE:
         ids = [int(model.site_bodyid[each]) for each in ids]

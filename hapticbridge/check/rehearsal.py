@@ -1,8 +1,4 @@
-"""Leads a scene through a motion as the bridge would, and keeps what the hand would feel.
-
-The hand does not yield: the handle is where the motion says, whatever the force. So two versions of
-a scene can be compared tick by tick, and what differs between their wrenches is their doing.
-"""
+"""Rehearsal of a scene under a motion."""
 
 from __future__ import annotations
 
@@ -25,19 +21,20 @@ from hapticbridge.scene import Scene
 from hapticbridge.tick import TICK_DTYPE
 
 _UNLIMITED = 1e30
-"""Force in N and torque in N m that are cut: none, because the force itself is compared."""
+"""Force limit in N and torque limit in N m without effect, because the full force is compared."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rehearsal:
-    """What a scene did under a motion.
+    """Result of a scene under a motion.
 
     Attributes:
-        records: One per tick, ``TICK_DTYPE``; ``wrench_on_tool`` is what the hand would feel.
+        records: One per tick, ``TICK_DTYPE``; ``wrench_on_tool`` is the wrench that the hand would
+            feel.
         environment: ``strict``, ``within slack`` or ``active``.
         slack_share: Largest share of the slack that was used, without unit.
         fault: Tick and port of the first fault, or None.
-        warnings: How often MuJoCo warned.
+        warnings: Number of MuJoCo's warnings.
         seconds: Processor time of the run in s: MuJoCo's step and the bridge's arithmetic.
     """
 
@@ -56,17 +53,20 @@ def rehearse(
     period: float,
     substeps: int = 1,
 ) -> Rehearsal:
-    """Runs the scene from its start, one tick per sample.
+    """Runs the scene from its start as the bridge would, one tick per sample.
+
+    The hand does not yield: the handle follows the motion at any force. Two versions of a scene can
+    therefore be compared tick by tick.
 
     Args:
         scene: Changed in place: reset, with the coupling's gains and the time step set.
-        samples: Poses counted from the first, ``SAMPLE_DTYPE``, as ``samples_of`` returns them.
-        coupling: K and B that should be felt.
+        samples: Poses relative to the first, ``SAMPLE_DTYPE``, from ``samples_of``.
+        coupling: Requested K and B.
         period: T in s.
         substeps: MuJoCo steps per tick.
 
     Raises:
-        SceneError: A value is out of range, or a result is not finite; says at which tick.
+        SceneError: A value is out of range, or a result is not finite; the message names the tick.
     """
     parameters = rehearsal_parameters(scene, coupling, period, substeps)
     binding = Binding(scene.model, scene.data, parameters)
@@ -88,7 +88,7 @@ def rehearse(
 
 
 def not_finite(scene: Scene, tick: int, ticks: int) -> SceneError:
-    """Returns what is said of a motion that ends before its time."""
+    """Returns the error for a motion that became not finite at a tick."""
     return SceneError(
         f"scene '{scene.name}' is not finite after tick {tick} of {ticks} of the motion"
     )
@@ -97,16 +97,14 @@ def not_finite(scene: Scene, tick: int, ticks: int) -> SceneError:
 def rehearsal_parameters(
     scene: Scene, coupling: Coupling, period: float, substeps: int = 1
 ) -> RunParameters:
-    """Puts a scene to its start for a rehearsal, and returns what ``Binding`` needs.
-
-    The method is the one that a bridge takes by itself.
+    """Resets a scene for the default method, and returns the parameters for ``Binding``.
 
     Raises:
         SceneError: A value is out of range.
     """
     method = default_method(substeps)
     prepare(scene, coupling, period, substeps, method, warns=False)
-    # an error inside the C symbol would end the process, so MuJoCo takes its first step in Python
+    # an error inside the C function would end the process; the first step in Python raises instead
     mujoco.mj_step(scene.model, scene.data)
     scene.reset()
     return RunParameters(

@@ -1,4 +1,4 @@
-"""All rules by which a scene is judged."""
+"""Rules by which a scene is judged."""
 
 from __future__ import annotations
 
@@ -23,13 +23,9 @@ RULES = (
     constraint_faults,
     run_faults,
 )
-"""Each yields the faults of one subject, in the order in which they are best mended."""
+"""Functions that yield the faults of one subject, in the best order for mending."""
 
 
 def find_faults(case: Case) -> tuple[Fault, ...]:
-    """Returns everything that is wrong with a scene; nothing where it is as it should be.
-
-    Args:
-        case: What ``open_case`` returned; its scene is put to its start.
-    """
+    """Returns all faults of a scene from ``open_case``; the scene is reset."""
     return tuple(fault for rule in RULES for fault in rule(case))

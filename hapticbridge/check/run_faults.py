@@ -1,4 +1,4 @@
-"""Faults that only the motion shows."""
+"""Faults that appear only in a motion."""
 
 from __future__ import annotations
 
@@ -13,26 +13,23 @@ from hapticbridge.check.observation import Observation
 from hapticbridge.scene.contact_concerns import suggested_solref
 
 ITERATIONS = 100
-"""MuJoCo's own limit on the solver's iterations; Newton's takes 1 to 8 in the shipped scenes."""
+"""MuJoCo's default limit of solver iterations. Newton's solver takes 1 to 8 in the shipped
+scenes."""
 
 LITTLE_DAMPING = 0.001
-"""Damping in N m s/rad to begin with where a jointed tool creates energy by itself: it took all
-from a bare lever of 36 g, and a hand that turns it at 1 rad/s feels 1 mN m."""
+"""First joint damping in N m s/rad to try if a jointed tool creates energy by itself. It removed
+all of it from a bare lever of 36 g; a hand that turns the lever at 1 rad/s feels 1 mN m."""
 
 
 def run_faults(case: Case) -> Iterator[Fault]:
-    """Yields what went wrong while the scene was led through its motion.
-
-    Args:
-        case: The scene under check.
-    """
+    """Yields faults that occurred during the motion."""
     seen, option = case.observation, case.places.option
     if seen is None:
         yield Fault(
             "motion not finished",
             option("timestep"),
             f"under {case.motion_name}: {case.motion_fault}",
-            "what stands above, if anything; else a softer contact or a heavier tool",
+            "mend the faults above first; if there are none, a softer contact or a heavier tool",
         )
         return
     if seen.full_ticks:
@@ -49,14 +46,14 @@ def run_faults(case: Case) -> Iterator[Fault]:
             "MuJoCo warning",
             option("timestep"),
             f"MuJoCo warned {count} times in the motion: {words}",
-            "see what it says",
+            "follow the warning's advice",
         )
     if seen.environment != "strict":
         yield _energy_created(case, seen)
 
 
 def _energy_created(case: Case, seen: Observation) -> Fault:
-    """Names the contact that carried most: which one created the energy, no meter tells."""
+    """Names the contact with the largest force; the meter cannot tell which created energy."""
     used = f"{number(100 * seen.slack_share)} % of the coupling's slack, which covers it"
     if seen.environment == "active":
         used = "more than the coupling's slack covers"
@@ -75,7 +72,7 @@ def _energy_created(case: Case, seen: Observation) -> Fault:
 
 
 def _created_without_contact(case: Case, sentence: str) -> Fault:
-    """Names the tool's joints: their axes turn within a step, and its energy is exact without."""
+    """Names the tool's joints: their axes turn within a step, the only other source of energy."""
     model = case.model
     tree = model.body_treeid[model.site(case.scene.grip).bodyid[0]]
     mine = np.flatnonzero(model.body_treeid[model.jnt_bodyid] == tree)

@@ -1,4 +1,4 @@
-"""Simpler shapes: fewer corners of a mesh, a primitive in its place, nothing that is only seen."""
+"""Simplifications of shapes: fewer hull corners, primitives, no visual geoms."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from hapticbridge.check.primitive import Primitive, best_primitive
 from hapticbridge.check.simplifications import PICTURE, Simplification, collides, paired_geoms
 
 HULL_CORNERS = (64, 32, 16, 8)
-"""Corners that a convex hull keeps at most, as tried."""
+"""Numbers of corners to which convex hulls are limited in turn."""
 
 
 def shape_simplifications() -> list[Simplification]:
-    """Returns what may be left out of shapes; masses and inertias stay as they were compiled."""
+    """Returns simplifications of shapes; masses and inertias stay as compiled."""
     return [
         Simplification(
             "nothing only seen",
@@ -38,7 +38,7 @@ def _drop_visual_geoms(draft: Draft) -> bool:
     spec = draft.spec
     left = spec.copy()
     left.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO
-    left.discard_visual()  # knows what sensors, tendons and the like refer to
+    left.discard_visual()  # keeps geoms that sensors, tendons and other elements refer to
     kept = {geom.name for geom in left.geoms}
     dropped = [geom for geom in spec.geoms if geom.name not in kept]
     _keep_inertia(spec, {geom.parent.name for geom in dropped})
@@ -64,7 +64,7 @@ def _hull(count: int) -> Simplification:
 
 
 def _hull_corners(spec: mujoco.MjSpec) -> dict[str, int]:
-    """Returns how many corners the hulls of the colliding meshes have."""
+    """Returns the number of hull corners of each colliding mesh."""
     meshes = {geom.meshname for geom in _mesh_geoms(spec)}
     if not meshes:
         return {}
@@ -84,7 +84,7 @@ def _mesh_geoms(spec: mujoco.MjSpec) -> list[mujoco.MjsGeom]:
 
 
 def _name(mesh: mujoco.MjsMesh) -> str:
-    """A mesh without a name is called as its file is."""
+    """Returns a mesh's name; an unnamed mesh has the name of its file."""
     return str(mesh.name or PurePath(str(mesh.file).replace("\\", "/")).stem)
 
 
@@ -104,7 +104,7 @@ def _fit_primitives(draft: Draft) -> bool:
         geom.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
     for mesh in [mesh for mesh in spec.meshes if not _is_used(spec, mesh)]:
         spec.delete(mesh)
-    # where a geom is written in a frame, its pose counts from there
+    # the pose of a geom written in a frame is relative to that frame
     frames = model_of(spec)
     for name in names:
         geom, at = spec.geom(name), frames.geom(name).id
@@ -115,7 +115,7 @@ def _fit_primitives(draft: Draft) -> bool:
 
 
 def _forget_mesh(spec: mujoco.MjSpec, geom: mujoco.MjsGeom) -> None:
-    """Takes the mesh off a geom and its classes, from which a written file would get it back."""
+    """Removes the mesh from a geom and from its classes, which would restore it in a file."""
     geom.meshname = ""
     for default in (geom.classname, spec.default):
         if default is not None:
@@ -138,13 +138,13 @@ def _fit(model: mujoco.MjModel, name: str) -> Primitive:
 
 
 def _keep_inertia(spec: mujoco.MjSpec, bodies: set[str]) -> None:
-    """Writes down the inertia that some bodies have from their geoms, as compiled.
+    """Writes down the compiled inertia of bodies that take it from their geoms.
 
-    MuJoCo's own ``adopt_inertial`` refuses a scene whose geoms overrule what is written.
+    MuJoCo's ``adopt_inertial`` refuses a scene whose geoms overrule written inertias.
     """
     compiler, model = spec.compiler, model_of(spec)
     is_forced = compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
-    if is_forced or compiler.settotalmass > 0:  # one is overruled or scaled together with all
+    if is_forced or compiler.settotalmass > 0:  # overruled or scaled together
         bodies = {body.name for body in spec.bodies}
         compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO
     unwritten = mujoco.MjSpec().worldbody.add_body()

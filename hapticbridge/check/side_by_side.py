@@ -1,4 +1,4 @@
-"""What two versions of a scene cost, measured side by side."""
+"""Costs of two versions measured side by side."""
 
 from __future__ import annotations
 
@@ -18,26 +18,26 @@ from hapticbridge.kernel.state import Binding
 from hapticbridge.tick import TICK_DTYPE
 
 CHUNKS = 40
-"""Into how many stretches of time a motion is cut. The two versions take turns stretch by stretch,
-so whatever slows the machine slows both; more stretches cost 20 µs each."""
+"""Number of stretches into which a motion is cut. The two versions take turns after each, so that a
+disturbance of the machine slows both. More stretches cost 20 µs each."""
 
 REPEATS = 5
-"""Passes at most. The work is the same in each, and whatever disturbs it only adds: so each stretch
-counts with its least time. Beside six other processes on two cores, a scene measured against itself
-came out within 1 %; with the median it scattered twice as much."""
+"""Largest number of passes. The work is equal in each and disturbances only add time, so each
+stretch counts with its smallest time. Beside six other processes on two cores, a scene measured
+against itself came out within 1 %; the median scattered twice as much."""
 
 PATIENCE = 0.6
-"""Processor time in s that one comparison may take before it makes do with fewer passes."""
+"""Processor time in s after which a comparison stops with fewer passes."""
 
 CostMeter: TypeAlias = Callable[[Draft, Draft, Motion], tuple[float, float]]
-"""Returns the processor time in s that each of two versions takes per second of the motion."""
+"""Returns the processor time in s of each of two versions per second of motion."""
 
 
 def processor_costs(first: Draft, second: Draft, motion: Motion) -> tuple[float, float]:
-    """Runs two versions side by side: processor time in s per second of motion.
+    """Measures the processor time of two versions in s per second of motion.
 
-    MuJoCo's step with the bridge's arithmetic, nothing else of the machine: the thread's own clock.
-    The first pass is for warming up, unless there is no patience for three.
+    It covers MuJoCo's step and the bridge's arithmetic, by the thread's own clock. The first pass
+    is a warm-up and is dropped if there are at least three.
 
     Raises:
         SceneError: A version does not compile, or a result is not finite.
@@ -55,14 +55,14 @@ def processor_costs(first: Draft, second: Draft, motion: Motion) -> tuple[float,
 
 
 class Stage:
-    """A version of a scene that is led through a motion stretch by stretch.
+    """A version of a scene that runs through a motion in stretches.
 
     Attributes:
-        rows: What it did, ``TICK_DTYPE``.
+        rows: Records of the run, ``TICK_DTYPE``.
     """
 
     def __init__(self, draft: Draft, motion: Motion) -> None:
-        """Compiles the scene; ``reset`` before the first stretch."""
+        """Compiles the scene; call ``reset`` before the first stretch."""
         self._scene = draft.compiled()
         self._setting = draft.setting
         self._samples = draft.samples(motion)
@@ -70,7 +70,7 @@ class Stage:
         self._edges = np.linspace(0, self._samples.size, CHUNKS + 1).astype(int)
 
     def reset(self) -> None:
-        """Puts the scene to its start."""
+        """Resets the scene."""
         setting = self._setting
         parameters = rehearsal_parameters(
             self._scene, setting.coupling, setting.period, setting.substeps
@@ -81,7 +81,7 @@ class Stage:
         """Runs one stretch; returns its processor time in s.
 
         Raises:
-            SceneError: The scene does not stay finite.
+            SceneError: A result is not finite.
         """
         binding, part = self._binding, slice(self._edges[chunk], self._edges[chunk + 1])
         rows = self.rows[part]
@@ -94,7 +94,7 @@ class Stage:
 
 
 def one_pass(stages: list[Stage]) -> NDArray[np.float64]:
-    """Leads versions through the whole motion, by turns; returns s by version and stretch."""
+    """Runs all versions through the whole motion in turns; returns s by version and stretch."""
     for stage in stages:
         stage.reset()
     return np.array([[stage.run(chunk) for stage in stages] for chunk in range(CHUNKS)]).T

@@ -1,4 +1,4 @@
-"""What could be taken out of a scene: a list of edits, each tried and judged by ``lean``."""
+"""Simplifications of a scene: edits that ``lean`` tries and judges."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from hapticbridge.check.draft import Draft
 from hapticbridge.check.witness import Witness
 
 OTHER_MOTIONS, PICTURE = "in this motion", "with the picture"
-"""What a simplification may lose that a hand in one motion cannot tell."""
+"""Losses of a simplification that a hand cannot notice in one motion."""
 
 
 @dataclass(frozen=True, slots=True)
 class Simplification:
-    """One way to model less.
+    """One edit that reduces the model.
 
     Attributes:
-        name: Short, for tables.
-        sentence: What it does.
-        edit: Changes a draft in place; returns whether there was anything to change.
-        loses: What else goes that a hand in this motion cannot tell: ``OTHER_MOTIONS``, ``PICTURE``
-            or nothing.
+        name: Short name, for tables.
+        sentence: Description of the edit.
+        edit: Changes a draft in place; returns False if there was nothing to change.
+        loses: Loss that a hand in this motion cannot notice: ``OTHER_MOTIONS``, ``PICTURE`` or
+            empty.
     """
 
     name: str
@@ -33,18 +33,18 @@ class Simplification:
 
 
 ITERATIONS = (1, 2, 3, 5, 10, 20, 50)
-"""Limits of solver iterations that are tried, where a step took more."""
+"""Limits of solver iterations that are tried if a step took more."""
 
 TOLERANCE, LINE_TOLERANCE = 1e-8, 1e-2
-"""MuJoCo's defaults: where the solver stops, in its own scaled units."""
+"""MuJoCo's default solver tolerances, in its scaled units."""
 
 RATE_DIVISORS = {2: "half", 4: "a quarter of"}
-"""By how much the rate is lowered, and how that is called. More than 4 ms between ticks is slower
-than any haptic device asks for."""
+"""Divisors of the rate and their names. A period above 4 ms is slower than any haptic device
+requires."""
 
 
 def solver_simplifications(seen: Witness) -> list[Simplification]:
-    """Returns what may be left out of the solver's work."""
+    """Returns simplifications of the solver."""
     simpler = [
         Simplification(
             "usual tolerance",
@@ -76,7 +76,7 @@ def _relax_tolerance(draft: Draft) -> bool:
 
 
 def rate_simplifications(draft: Draft) -> list[Simplification]:
-    """Returns larger time steps: fewer substeps, and a lower rate, which the device must bear."""
+    """Returns larger time steps: fewer substeps, and lower rates that the device must support."""
     substeps, period = draft.setting.substeps, draft.setting.period
     counts = sorted({1, max(substeps // 2, 1)} - {substeps})
     simpler = [_substeps(count, substeps) for count in counts]
@@ -105,7 +105,7 @@ def _rate(divisor: int, word: str, period: float) -> Simplification:
 
 
 def contact_simplifications(seen: Witness) -> list[Simplification]:
-    """Returns what may be left out of contacts: friction, dimensions, the round cone, pairs."""
+    """Returns simplifications of contacts: friction, dimensions, elliptic cone, pairs."""
     return [
         _condim(1, "no friction", "contacts do not resist sliding (condim 1)"),
         _condim(3, "condim 3", "contacts resist sliding, not twisting or rolling"),
@@ -131,12 +131,12 @@ def contact_simplifications(seen: Witness) -> list[Simplification]:
 
 
 def collides(geom: mujoco.MjsGeom) -> bool:
-    """Returns whether a geom's masks let it collide with anything."""
+    """Returns True if a geom's masks allow collisions."""
     return bool(geom.contype or geom.conaffinity)
 
 
 def paired_geoms(spec: mujoco.MjSpec) -> set[str]:
-    """Returns the names of geoms in explicit pairs, which collide whatever their masks say."""
+    """Returns the names of geoms in explicit pairs, which collide regardless of their masks."""
     return {name for pair in spec.pairs for name in (pair.geomname1, pair.geomname2)}
 
 

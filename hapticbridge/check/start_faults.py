@@ -1,4 +1,4 @@
-"""Faults of where contacts begin: inside each other at the start, or before they touch."""
+"""Faults of contacts at the start, and of contact margins."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def margin_faults(case: Case) -> Iterator[Fault]:
 
 
 def start_faults(case: Case) -> Iterator[Fault]:
-    """Yields starts that are not finite, and geoms inside each other: energy that nobody meters."""
+    """Yields starts that are not finite, and overlapping geoms, whose energy is not metered."""
     case.scene.reset()
     model, data = case.model, case.scene.data
     beyond = [
@@ -66,8 +66,8 @@ def start_faults(case: Case) -> Iterator[Fault]:
             "starts in contact",
             case.places.geom(mover),
             f"{pair_names(case, [(first, second)])} overlap by {length(-contact.dist)} at the "
-            f"start; more than {length(MAXIMUM_START_PENETRATION)} release energy that nobody "
-            "meters",
+            f"start; more than {length(MAXIMUM_START_PENETRATION)} release energy that is not "
+            "metered",
             _moved_out(case, body, out),
         )
 

@@ -1,4 +1,4 @@
-"""Judges a version of a scene against the scene as it was read: may it take its place?"""
+"""Judgement of one version of a scene."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from hapticbridge.check.side_by_side import CostMeter
 from hapticbridge.device import Motion
 
 LEAST_SAVING = 0.05
-"""Share of the cost that a simplification must save, without unit. The same scene measured against
-itself differs by 1 % at most on a machine at work (where it differs by more, three times that
-counts), and less than a twentieth is no reason to touch a scene. A larger share keeps more in."""
+"""Share of the cost that a simplification must save, without unit. On a busy machine a scene
+measured against itself differs by at most 1 %; where it differs by more, three times that
+difference counts. A larger share keeps more of the scene."""
 
 CLEARLY_MORE = 1.2
-"""Cost over that of what it must beat, without unit, at which one run is enough to see it."""
+"""Cost relative to the version to beat, without unit, above which a single run decides."""
 
 _ROUNDING = 1e-9  # relative, of a sum of products
 
@@ -28,18 +28,18 @@ CREATES, WARNS, NOT_BORNE, FAILS = "creates energy", "MuJoCo warns", "device too
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """A version of a scene against the scene as it was read.
+    """A version of a scene compared with the original.
 
     Attributes:
-        name: Of the simplification.
-        sentence: What it does, or why it failed.
-        verdict: ``MAY_GO`` or why not: one of the constants of this module.
-        loses: What else goes, see ``Simplification``.
-        cost: Processor time over that of the original, without unit, from a single run where it is
-            refused for another reason; None where it failed.
-        felt: What a hand would feel; None where it failed.
+        name: Name of the simplification.
+        sentence: Description of the edit, or reason of the failure.
+        verdict: ``MAY_GO``, or the reason against it: one of the constants of this module.
+        loses: Further loss, see ``Simplification``.
+        cost: Processor time relative to the original, without unit. It comes from a single run if
+            the version is refused for another reason; None if it failed.
+        felt: Perceptible difference; None if it failed.
         environment: ``strict``, ``within slack`` or ``active``.
-        warnings: How often MuJoCo warned.
+        warnings: Number of MuJoCo's warnings.
         needed_damping: b in N s/m that a device needs at this version's rate.
     """
 
@@ -55,16 +55,16 @@ class Trial:
 
 
 class Judge:
-    """Compares versions of one scene in one motion.
+    """Comparison of versions of one scene in one motion.
 
     Attributes:
         original: The scene as it was read.
-        motion: Of the handle.
-        budget: Felt error in just noticeable differences that is allowed.
+        motion: Motion of the handle.
+        budget: Allowed felt error in just noticeable differences.
         device_damping: b of the device in N s/m.
-        rehearsal: What the original did.
+        rehearsal: Rehearsal of the original.
         seconds: Processor time of the original in s per second of motion.
-        least_saving: Share of the cost that counts as less, without unit.
+        least_saving: Share of the cost that counts as a saving, without unit.
     """
 
     def __init__(
@@ -75,7 +75,7 @@ class Judge:
         device_damping: float,
         cost: CostMeter,
     ) -> None:
-        """Rehearses the original, and measures it against itself.
+        """Rehearses the original and measures its cost against itself.
 
         Raises:
             SceneError: It does not compile, or a result is not finite.
@@ -99,16 +99,16 @@ class Judge:
         *,
         is_last_word: bool = False,
     ) -> Trial:
-        """Returns whether a version may take the original's place.
+        """Judges if a version may replace the original.
 
         Args:
-            name: Of what was changed.
-            sentence: What was changed.
+            name: Name of the change.
+            sentence: Description of the change.
             draft: The version.
-            base: What it must be cheaper than; None takes the original.
-            share: Cost of ``base`` over that of the original, without unit.
-            loses: What else goes.
-            is_last_word: Whether the cost is measured well even where one run says that it is more.
+            base: Version that it must be cheaper than; None takes the original.
+            share: Cost of ``base`` relative to the original, without unit.
+            loses: Further loss, see ``Simplification``.
+            is_last_word: True measures the cost thoroughly even if a single run shows no saving.
 
         Raises:
             SceneError: The version does not compile, or a result is not finite.
@@ -120,7 +120,7 @@ class Judge:
         cost = done.seconds / (self.seconds * self.motion.duration)
         if not verdict and not is_last_word and cost > CLEARLY_MORE * share:
             verdict = SAVES_NOTHING
-        if not verdict:  # what is refused anyway need not be measured well
+        if not verdict:  # a refused version needs no thorough measurement
             before, after = self._cost(base or self.original, draft, self.motion)
             verdict = MAY_GO if after <= (1.0 - self.least_saving) * before else SAVES_NOTHING
             cost = share * after / before
@@ -137,7 +137,7 @@ class Judge:
         )
 
     def _refusal(self, done: Rehearsal, felt: FeltError, needed: float) -> str:
-        """Returns why a version cannot be, whatever it saves; empty if it can."""
+        """Returns the reason against a version regardless of its cost; empty if there is none."""
         ranks = [_ENVIRONMENTS.index(each.environment) for each in (done, self.rehearsal)]
         bearable = max(self.device_damping, self.original.setting.needed_damping)
         if done.warnings > self.rehearsal.warnings:

@@ -1,4 +1,4 @@
-"""What happened in a scene under a motion: which geoms met, how near they came, what moved."""
+"""Motion trace of a scene: pairs that came near, joint travel, start pose."""
 
 from __future__ import annotations
 
@@ -18,32 +18,32 @@ from hapticbridge.scene.contact_check import meeting_pairs
 from hapticbridge.tick import TICK_DTYPE
 
 CLEARANCE = 2e-3
-"""Distance in m that geoms must keep throughout to count as never meeting. A wider one takes less
-out of a scene, and holds for motions that differ more."""
+"""Distance in m that geoms must keep throughout to count as never meeting. A larger value
+simplifies less, and the result holds for motions that differ more."""
 
 LOOK_EVERY = 5e-3
-"""Time in s from one look at distances to the next; contacts are looked at in every tick. In it a
-tool that misses ``CLEARANCE`` would have to move at 0.4 m/s or more."""
+"""Time in s between distance checks; contacts are checked in every tick. A tool that crosses
+``CLEARANCE`` unseen would have to move at 0.4 m/s or more."""
 
 _UNMEASURED = (mujoco.mjtGeom.mjGEOM_HFIELD, mujoco.mjtGeom.mjGEOM_SDF)
-"""Geoms whose distance MuJoCo does not compute: they count as near everything."""
+"""Geom types without a distance function in MuJoCo; they count as near everything."""
 
 Pair = frozenset[str]
 
 
 @dataclass(slots=True)
 class Witness:
-    """What was seen, by name.
+    """Motion trace, by name.
 
     Attributes:
-        possible: Pairs of geoms that may collide by MuJoCo's filters.
-        near: Those that met or came nearer than ``CLEARANCE``; with a flex each geom by itself too.
-        travel: By joint, its way from the start: values in m and rad, shape (looks, 1); for a ball
-            rotation vectors (looks, 3); for a free joint displacements in m and rotation vectors in
-            the world frame (looks, 6).
-        start: By joint, its values at the start of the motion.
-        pose: By body, position in m and quaternion in its parent's frame at the start, shape (7,).
-        solver_iterations: Most that a step took.
+        possible: Pairs of geoms that MuJoCo's filters let collide.
+        near: Pairs that met or came nearer than ``CLEARANCE``; with a flex also each geom alone.
+        travel: Displacement from the start, by joint: m or rad, shape (looks, 1); ball joint:
+            rotation vectors (looks, 3); free joint: displacements in m and rotation vectors in the
+            world frame (looks, 6).
+        start: Joint values at the start of the motion, by joint.
+        pose: Position in m and quaternion in the parent's frame at the start, shape (7,), by body.
+        solver_iterations: Largest number of iterations in a step.
     """
 
     possible: set[Pair] = field(default_factory=set)
@@ -55,16 +55,16 @@ class Witness:
 
     @property
     def near_geoms(self) -> set[str]:
-        """Geoms that met anything, or came near it."""
+        """Geoms that met another or came near it."""
         return {name for pair in self.near for name in pair}
 
 
 def witness(draft: Draft, motion: Motion) -> Witness:
-    """Leads a scene through a motion tick by tick, and watches.
+    """Leads a scene through a motion tick by tick and records its trace.
 
     Args:
-        draft: Its bodies, joints and geoms have names.
-        motion: Of the handle.
+        draft: Version whose bodies, joints and geoms all have names.
+        motion: Motion of the handle.
 
     Raises:
         SceneError: The scene does not compile, or a result is not finite.
@@ -79,7 +79,7 @@ def witness(draft: Draft, motion: Motion) -> Witness:
     pairs = np.array([pair[:2] for pair in meeting_pairs(model)], np.intp).reshape(-1, 2)
     names = [model.geom(g).name for g in range(model.ngeom)]
     seen.possible = {frozenset((names[a], names[b])) for a, b in pairs}
-    if model.nflex:  # how near a flex is to a geom nobody measures: all count as near to one
+    if model.nflex:  # distances to a flex are not measured: every geom counts as near to it
         seen.near |= {frozenset((name,)) for name in names}
     looks: dict[str, list[NDArray[np.float64]]] = {name: [] for name in seen.start}
     every = max(1, round(LOOK_EVERY / setting.period))
@@ -105,7 +105,7 @@ def _look_at_pairs(
     names: list[str],
     near: set[Pair],
 ) -> NDArray[np.intp]:
-    """Adds pairs that are near to each other now; returns those that never were so far."""
+    """Adds the pairs that are near each other now; returns those that never were."""
     if not pairs.size:
         return pairs
     first, second = pairs[:, 0], pairs[:, 1]

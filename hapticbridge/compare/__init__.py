@@ -1,6 +1,6 @@
-"""Where two recorded runs part.
+"""Comparison of two recorded runs.
 
-Read ``compare`` first; what it finds is a ``comparison``.
+Read ``compare`` first; its result is a ``comparison``.
 """
 
 from hapticbridge.compare.compare import compare as compare

@@ -1,4 +1,4 @@
-"""Where two recorded runs part: first tick, field and size."""
+"""Comparison of two recorded runs: first tick, field and size of a difference."""
 
 from __future__ import annotations
 
@@ -45,39 +45,38 @@ DECISIVE = (
     "start_kinetic",
     "start_potential",
 )
-"""Metadata that decide what a run computes."""
+"""Metadata that determine what a run computes."""
 
 _BESIDE = ("versions", "host", "clock")
-"""Metadata that may explain why two runs differ, but make no difference by themselves."""
+"""Metadata that may explain a difference, but do not cause one by themselves."""
 
 _CHANGES = ("input", *COMMANDED)
-"""Events that decide what a run computes: what they say counts, not only how many there are."""
+"""Events that determine what a run computes; their content is compared, not only their number."""
 
 _UNHELD = int(TickFlag.OVERRUN | TickFlag.DROPPED_BEFORE)
-"""Flags that clock and recorder set; like times, they differ between any two real runs."""
+"""Flags set by clock and recorder; like times, they differ between any two real runs."""
 
 SHORTEST, LONGEST = 1e-9, 1e3
-"""Periods in s that are compared: ticks are matched by whole ns, in 64 bits."""
+"""Range of periods in s; ticks are matched by whole ns in 64 bits."""
 
 COMPARED = tuple(column for column in COLUMNS if column.field not in CLOCK_FIELDS)
-"""What is compared: every number of a record but its times."""
+"""Compared columns: every number of a record except times."""
 
 
 def compare(first: str | Path, second: str | Path) -> Comparison:
-    """Compares two recordings tick by tick, bit by bit, without holding either in memory.
+    """Compares two recordings tick by tick and bit by bit, in constant memory.
 
-    Ticks are matched by the time at which they were due, number times period: two runs at
-    different rates are compared where their ticks coincide (1 kHz and 500 Hz: at every second tick
-    of the first), and gaps shift nothing. Times of the clock and the flags ``OVERRUN`` and
-    ``DROPPED_BEFORE`` are left out, because they differ between any two real runs.
+    Ticks are matched by their due time, number times period. Runs at different rates are compared
+    at coinciding ticks (1 kHz and 500 Hz: every second tick of the first), and gaps shift nothing.
+    Clock times and the flags ``OVERRUN`` and ``DROPPED_BEFORE`` are ignored, because they differ
+    between any two real runs.
 
     Args:
         first: A recording.
-        second: Another one.
+        second: Another recording.
 
     Raises:
-        RecordingError: One of them cannot be read, does not say its period, or its ticks are out of
-            order.
+        RecordingError: One of them cannot be read, has no period, or has ticks out of order.
     """
     files = open_recording(first), open_recording(second)
     periods = _period(files[0]), _period(files[1])
@@ -99,7 +98,7 @@ def compare(first: str | Path, second: str | Path) -> Comparison:
 
 
 class _Found:
-    """Gathers differences while pairs of ticks pass by."""
+    """Differences collected over matching ticks."""
 
     def __init__(self, periods: tuple[float, float]) -> None:
         self._periods = periods
@@ -110,7 +109,7 @@ class _Found:
         self.largest: dict[str, Difference] = {}
 
     def add_all(self, files: tuple[RecordingFile, RecordingFile]) -> None:
-        """Compares all records that were due at the same time, block by block."""
+        """Compares all records with equal due times, block by block."""
         streams = self._due(files, 0), self._due(files, 1)
         nothing = np.zeros(0, TICK_DTYPE), np.zeros(0, np.int64)
         waiting = [nothing, nothing]
@@ -121,27 +120,27 @@ class _Found:
             (a, due_a), (b, due_b) = waiting
             if not (a.size and b.size):
                 break
-            # no further than both are known; what is behind waits for the other's next block
+            # compare up to the end of the shorter block; the rest waits for the other's next block
             until = min(due_a.max(), due_b.max())
             _, mine, other = np.intersect1d(due_a, due_b, return_indices=True)
             if mine.size:
                 self.add(a[mine], b[other])
             waiting = [(rows[due > until], due[due > until]) for rows, due in waiting]
-        for stream in streams:  # what is behind the end of the shorter run is counted
+        for stream in streams:  # count the ticks after the end of the shorter run
             for _ in stream:
                 pass
 
     def _due(
         self, files: tuple[RecordingFile, RecordingFile], side: int
     ) -> Iterator[tuple[NDArray[np.void], NDArray[np.int64]]]:
-        """Yields the records of one file with the times in ns at which they were due."""
+        """Yields the records of one file with their due times in ns."""
         last = -1
         for ticks in files[side].blocks():
             numbers = np.concatenate([[last], ticks["tick"]])
             if (back := np.flatnonzero(np.diff(numbers) <= 0)).size:
                 raise RecordingError(
                     f"{files[side].path}: tick {numbers[back[0]]} is followed by tick "
-                    f"{numbers[back[0] + 1]}; what is out of order cannot be compared"
+                    f"{numbers[back[0] + 1]}; ticks out of order cannot be compared"
                 )
             last = int(numbers[-1])
             due = ticks["tick"] * self._steps[side]
@@ -149,7 +148,7 @@ class _Found:
             yield ticks, due
 
     def add(self, a: NDArray[np.void], b: NDArray[np.void]) -> None:
-        """Compares records of the same times."""
+        """Compares records of equal due times."""
         self.compared += len(a)
         earliest: tuple[int, Difference] | None = None
         for column in COMPARED:
@@ -214,7 +213,7 @@ def _event_differences(
 
 
 def _said(file: RecordingFile, name: str) -> list[dict[str, Any]]:
-    """Returns the events of a name, without when the clock said they were and who asked."""
+    """Returns the events of a name without their times and origin."""
     return [
         {key: value for key, value in event.items() if key not in ("time_ns", "by")}
         for event in file.events
@@ -224,7 +223,7 @@ def _said(file: RecordingFile, name: str) -> list[dict[str, Any]]:
 
 def _notes(file: RecordingFile) -> Iterator[str]:
     if file.is_cut:
-        yield f"{file.path} is cut; what it holds is compared"
+        yield f"{file.path} is cut; the rest is compared"
     elif file.digest != file.computed_digest:
         yield f"{file.path} does not match its digest: it was changed"
     if file.problems:

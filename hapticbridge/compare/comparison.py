@@ -1,4 +1,4 @@
-"""How two recorded runs differ, in one object."""
+"""Result of a comparison."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from hapticbridge.jsonable import jsonable
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """Two numbers that should be one.
+    """A difference in one number of one tick.
 
     Attributes:
-        time: Of the tick in s, its number times the period.
-        ticks: Number of the tick in either run.
-        column: Which number of the record.
-        unit: Its unit.
-        values: In either run.
+        time: Time of the tick in s, its number times the period.
+        ticks: Number of the tick in each run.
+        column: Column of the record.
+        unit: Unit of the column.
+        values: Value in each run.
     """
 
     time: float
@@ -31,7 +31,7 @@ class Difference:
 
     @property
     def size(self) -> float:
-        """|a − b|; infinite where only one of them is a number."""
+        """|a − b|; infinite if one of them is not a number."""
         a, b = self.values
         size = abs(a - b)
         return size if np.isfinite(size) else np.inf
@@ -39,22 +39,22 @@ class Difference:
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """How two recorded runs differ.
+    """Differences of two recorded runs.
 
     Attributes:
         paths: The recordings.
-        ticks: How many records each has.
-        periods: Of either in s.
-        compared: How many pairs of ticks of one time there are.
-        alone: How many ticks of either have none of the other run at their time, where it should
-            have one: what was lost, or recorded after the end of the shorter run.
-        first: Where they part, or None.
-        largest: Per column that differs anywhere, where it differs most.
-        decisive: Metadata that decide what a run computes and differ: name, and either value.
-        beside: Metadata that may explain a difference.
-        events: Names of events whose counts differ, or of inputs and commands that say other
-            things, and either count.
-        notes: What is wrong with a file as a whole, a sentence each.
+        ticks: Number of records of each.
+        periods: Period of each in s.
+        compared: Number of pairs of ticks with equal due times.
+        alone: Number of ticks of each without a partner where one was due: lost ticks, and those
+            after the end of the shorter run.
+        first: First difference, or None.
+        largest: Largest difference of each column that differs.
+        decisive: Differing metadata that determine what a run computes: name and both values.
+        beside: Differing metadata that may explain a difference.
+        events: Names of events with differing numbers, or of inputs and commands with differing
+            content, and both numbers.
+        notes: Problems of a whole file, one sentence each.
     """
 
     paths: tuple[Path, Path]
@@ -71,11 +71,11 @@ class Comparison:
 
     @property
     def is_same(self) -> bool:
-        """Whether both are the same run: alike in every tick, in length, and in what decided it."""
+        """True if the runs agree in every tick, in length, and in decisive metadata and events."""
         return self.first is None and not any((*self.alone, self.decisive, self.events))
 
     def to_json(self) -> str:
-        """Returns it as one JSON object; a number that is not finite becomes null."""
+        """Returns the comparison as one JSON object; a number that is not finite becomes null."""
         values = asdict(self) | {"paths": [str(path) for path in self.paths]}
         values["is_same"] = self.is_same
         for told, found in zip(values["largest"], self.largest, strict=True):

@@ -1,7 +1,7 @@
-"""Whether this machine holds a rate: measured, and what stands in its way.
+"""Diagnosis of a machine's ability to hold a rate.
 
-Read ``diagnosis``: the bridge's clock and a bare sleep loop (``wakeups``) and, where it can run,
-``cyclictest`` take turns, ``machine`` looks at the system, and one verdict follows.
+Read ``diagnosis``: the bridge's clock, a bare sleep loop (``wakeups``) and, if possible,
+``cyclictest`` take turns. ``machine`` inspects the system, and one verdict follows.
 """
 
 from hapticbridge.doctor.diagnosis import Diagnosis as Diagnosis

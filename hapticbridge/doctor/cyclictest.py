@@ -1,7 +1,4 @@
-"""``cyclictest`` as a baseline: what a program in C reaches on this machine.
-
-It comes with the real-time tests of the kernel's developers (Debian: ``apt install rt-tests``).
-"""
+"""Baseline of a C program, ``cyclictest``."""
 
 from __future__ import annotations
 
@@ -16,13 +13,13 @@ from hapticbridge.realtime import Lateness, lateness_of
 
 INSTALL = "sudo apt install rt-tests"
 _LONGEST_US = 50_000
-"""Width of the histogram in µs; later wake-ups are counted at the maximum."""
+"""Width of the histogram in µs; later wake-ups count as the maximum."""
 
 _TRIAL_NS = 1_000_000
-"""Period of the one wake-up that shows whether it runs at all."""
+"""Period in ns of the single wake-up that tests if the program runs."""
 
 _PATIENCE = 5.0
-"""Time in s beyond twice what its wake-ups take, after which it is given up."""
+"""Time in s, beyond twice the expected duration, after which a run is aborted."""
 
 _BAR = re.compile(r"^(\d{6,}) (\d+)", re.MULTILINE)
 _MAXIMUM = re.compile(r"^# Max Latencies: (\d+)", re.MULTILINE)
@@ -30,21 +27,23 @@ _OVERFLOWS = re.compile(r"^# Histogram Overflows: (\d+)", re.MULTILINE)
 
 
 def lateness(period_ns: int, late_ns: NDArray[np.int64]) -> Lateness:
-    """Returns the numbers of a run: a whole period late is a deadline that was skipped."""
+    """Returns the statistics of a run; each whole period of lateness is a skipped deadline."""
     return lateness_of(late_ns, int((late_ns // period_ns).sum()))
 
 
 def is_there() -> bool:
-    """Tells whether the program is installed."""
+    """Returns True if the program is installed."""
     return shutil.which("cyclictest") is not None
 
 
 def refusal(priority: int, *, locks_memory: bool) -> str:
-    """Returns why the program cannot be run here, or nothing.
+    """Returns the reason why the program cannot run here; empty if it can.
+
+    It is part of the kernel developers' real-time tests (Debian: ``apt install rt-tests``).
 
     Args:
-        priority: Of the loop under SCHED_FIFO, 0 where that was refused: it runs at no other.
-        locks_memory: Whether the loop may lock its memory.
+        priority: The loop's priority under SCHED_FIFO; 0 if that was refused.
+        locks_memory: True if the loop may lock its memory.
     """
     if not is_there():
         return "it is not installed"
@@ -62,17 +61,17 @@ def run(
     locks_memory: bool,
     core: int | None = None,
 ) -> NDArray[np.int64] | str:
-    """Runs one thread at the loop's priority; returns how late each tick woke in ns.
+    """Runs one thread at the loop's priority; returns the lateness of each tick in ns.
 
     Args:
-        period_ns: In ns; the program takes whole µs.
-        ticks: How many wake-ups; it skips the deadlines that it missed.
-        priority: Under SCHED_FIFO, 1 to 99.
-        locks_memory: Whether its memory is locked.
-        core: Where it runs; None: anywhere.
+        period_ns: Period in ns; the program takes whole µs.
+        ticks: Number of wake-ups; the program skips missed deadlines.
+        priority: Priority under SCHED_FIFO, 1 to 99.
+        locks_memory: True to lock its memory.
+        core: Core to run on; None leaves it free.
 
     Returns:
-        Why there is nothing, in words, where it failed.
+        The lateness, or the reason of a failure in words.
     """
     period_us = max(round(period_ns * 1e-3), 1)
     command = ["cyclictest", "--quiet", f"--priority={priority}", f"--interval={period_us}"]
@@ -88,7 +87,7 @@ def run(
             check=False,
         )
     except subprocess.TimeoutExpired:
-        return f"it did not come to an end at {1e9 / period_ns:g} Hz"
+        return f"it did not finish at {1e9 / period_ns:g} Hz"
     except OSError as error:
         return f"it cannot be started ({error.strerror})"
     late = parsed(done.stdout) if done.returncode == 0 else None
@@ -99,7 +98,7 @@ def run(
 
 
 def parsed(text: str) -> NDArray[np.int64] | None:
-    """Reads the histogram that ``cyclictest --histogram`` prints; None where there is none."""
+    """Parses the histogram of ``cyclictest --histogram``; returns None if there is none."""
     bars = [(int(late), int(count)) for late, count in _BAR.findall(text)]
     late = [np.full(count, 1000 * us, dtype=np.int64) for us, count in bars]
     maximum, overflows = _MAXIMUM.search(text), _OVERFLOWS.search(text)

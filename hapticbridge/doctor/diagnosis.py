@@ -1,4 +1,4 @@
-"""The measurement, the findings, and one verdict."""
+"""Measurement, findings and verdict."""
 
 from __future__ import annotations
 
@@ -21,31 +21,32 @@ from hapticbridge.realtime import (
 )
 
 LATE_SHARE = 0.25
-"""Share of the period by which a tick may be late, no unit. The coupling is chosen at 80 % of the
-bound, so the hold may last T/0.8 = 1.25 T before the condition b >= KT/2 + B' is broken."""
+"""Allowed lateness of a tick as a share of the period, without unit. The default coupling uses 80 %
+of the bound, so the hold may last T/0.8 = 1.25 T before the condition b >= KT/2 + B' fails."""
 
 FEW_MISSED = 1e-4
-"""Share of deadlines missed that is still called fair: one in 10 s at 1 kHz."""
+"""Share of missed deadlines up to which the verdict is fair: one in 10 s at 1 kHz."""
 
 SHORTEST, LONGEST = 1.0, 3600.0
-"""Duration in s: percentiles of less say nothing, and the longest wait is an hour."""
+"""Range of the duration in s. Percentiles of a shorter run mean nothing; an hour is the longest
+wait."""
 
 TURN = 1.0
-"""Length in s of one turn. The loops take turns, so that a disturbance meets all of them."""
+"""Length of one turn in s. The loops take turns, so that a disturbance affects all of them."""
 
 BASELINE = "cyclictest"
 
 
 @dataclass(frozen=True, slots=True)
 class Diagnosis:
-    """What the doctor found.
+    """Result of a diagnosis.
 
     Attributes:
-        rate: In Hz.
-        lateness: Per loop: ``bridge``, ``bare sleep`` and, where it ran, ``cyclictest``.
-        findings: What was looked at.
+        rate: Rate in Hz.
+        lateness: Lateness by loop: ``bridge``, ``bare sleep`` and, if it ran, ``cyclictest``.
+        findings: Findings about the system.
         verdict: ``fit``, ``fair`` or ``unfit``.
-        sentence: The verdict with its reason, and what to do.
+        sentence: The verdict with reason and advice.
     """
 
     rate: float
@@ -64,13 +65,13 @@ def diagnose(
     """Measures this machine.
 
     Args:
-        rate: Ticks per second, as the bridge takes them.
-        duration: Of the whole measurement, in s, 1 to 3600; the loops share it.
-        system: Where the kernel tells of itself.
+        rate: Ticks per second.
+        duration: Duration of the whole measurement in s, 1 to 3600; the loops share it.
+        system: Roots of the kernel's file systems.
         tell: Called with the time done and the whole time, in s.
 
     Raises:
-        HapticBridgeError: Rate or duration are out of range.
+        HapticBridgeError: Rate or duration is out of range.
     """
     if not (math.isfinite(duration) and SHORTEST <= duration <= LONGEST):
         raise HapticBridgeError(
@@ -95,7 +96,7 @@ def diagnose(
             if not refused:
                 late = cyclictest.run(period_ns, ticks, priority, locks_memory=is_locked)
                 if isinstance(late, str):
-                    refused = late  # and is not tried again
+                    refused = late  # no further attempt
                 else:
                     baseline.add(late, cyclictest.lateness(period_ns, late).missed)
             tell(duration * (turn + 1) / rounds, duration)
@@ -109,11 +110,11 @@ def diagnose(
 
 def _baseline(refused: str) -> Finding:
     if not refused:
-        return Finding("baseline", None, "cyclictest ran in turns with the loop, as a program in C")
+        return Finding("baseline", None, "cyclictest, a C program, ran in turns with the loop")
     return Finding(
         "baseline",
         None,
-        f"no program in C to compare with: cyclictest is one, but {refused}",
+        f"no comparison with cyclictest, a C program: {refused}",
         "" if cyclictest.is_there() else cyclictest.INSTALL,
     )
 
@@ -124,20 +125,20 @@ def judged(
     """Returns the verdict and its sentence.
 
     Args:
-        lateness: Per loop, ``bridge`` and ``bare sleep`` at least.
-        found: What was found.
-        rate: In Hz.
+        lateness: Lateness by loop, at least ``bridge`` and ``bare sleep``.
+        found: Findings about the system.
+        rate: Rate in Hz.
     """
     mine, period = lateness["bridge"], 1.0 / rate
     allowed = LATE_SHARE * period
     missed = mine.missed / (mine.ticks + mine.missed)
-    # what was found first counts most; one remedy often mends two things
+    # earlier findings matter more; one remedy often serves two findings
     remedies = dict.fromkeys(f.remedy for f in found if f.is_good is False and f.remedy)
     advice = "; ".join(list(remedies)[:2])
     held = f"{rate:g} Hz"
     numbers = f"99.9 % of ticks within {mine.p999 * 1e6:.0f} µs, {mine.missed} missed"
     if mine.p999 <= allowed and mine.missed == 0:
-        rest = f"; better still: {advice}" if advice else "; nothing is to be done"
+        rest = f"; better still: {advice}" if advice else "; no change is needed"
         return "fit", f"fit for {held}: {numbers}{rest}"
     if mine.p99 <= allowed and missed <= FEW_MISSED:
         verdict, words = "fair", f"fair for {held}"
@@ -147,24 +148,23 @@ def judged(
 
 
 def _held(mine: Lateness) -> str:
-    """Says what a stall means for the hand, where one was long enough to."""
+    """Describes the effect of a long stall on the hand; empty if all were short."""
     if mine.worst <= SHORTEST_WATCHDOG:
         return ""
     return (
-        f"; it stood still for {1e3 * mine.worst:.0f} ms: for so long a device goes on with its "
-        "last force, but for those that let go by themselves (see 'hapticbridge devices')"
+        f"; it stalled for {1e3 * mine.worst:.0f} ms: meanwhile a device keeps applying its "
+        "last force, unless it has a watchdog (see 'hapticbridge devices')"
     )
 
 
 def _cause(lateness: dict[str, Lateness], allowed: float, advice: str) -> str:
-    """Says whose the delays are, and what to do."""
     baseline = lateness.get(BASELINE)
     if baseline is not None and baseline.worst > allowed:
         stalls = (
-            f"the machine itself stalls (a program in C woke up to {baseline.worst * 1e6:.0f} µs "
-            "late too)"
+            f"the machine itself stalls (a C program also woke up to {baseline.worst * 1e6:.0f} µs "
+            "late)"
         )
-        return f"{stalls}: {advice or 'use another one, or a lower rate'}"
+        return f"{stalls}: {advice or 'use another machine, or a lower rate'}"
     if advice:
         return advice
     if lateness["bare sleep"].worst > allowed:

@@ -1,4 +1,4 @@
-"""What of the machine decides how late a loop wakes, one finding with one sentence each."""
+"""Properties of the machine that decide a loop's lateness."""
 
 from __future__ import annotations
 
@@ -12,20 +12,19 @@ from hapticbridge.realtime import Grant
 from hapticbridge.realtime.remedies import CAPABILITIES, LASTING, SHELL
 
 STOLEN_SHARE = 1e-3
-"""Share of the measured time that the host of a virtual machine may take, no unit: a millisecond a
-second is one tick in each second at 1 kHz."""
+"""Share of the measured time that a virtual machine's host may take, without unit. A millisecond
+per second is one tick per second at 1 kHz."""
 
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One thing that was looked at.
+    """One finding.
 
     Attributes:
-        name: What.
-        is_good: Whether it helps; False where it stands in the way; None where it cannot be seen
-            or decides nothing.
-        sentence: How it is, and what that means.
-        remedy: What to do; empty where there is nothing.
+        name: Subject.
+        is_good: True if it helps, False if it hinders, None if it is unknown or has no effect.
+        sentence: State and consequence.
+        remedy: Command or advice; empty if none is needed.
     """
 
     name: str
@@ -36,7 +35,7 @@ class Finding:
 
 @dataclass(frozen=True, slots=True)
 class System:
-    """Where the kernel tells of itself.
+    """Roots of the kernel's file systems.
 
     Attributes:
         sys: Root of sysfs.
@@ -47,7 +46,7 @@ class System:
     proc: Path = Path("/proc")
 
     def text(self, path: Path) -> str | None:
-        """Returns what a file of the kernel says, or None where it is not there or not to read."""
+        """Returns the content of a kernel file; None if it is missing or unreadable."""
         try:
             return path.read_text(encoding="utf-8", errors="replace").strip()
         except OSError:
@@ -57,13 +56,13 @@ class System:
 def findings(
     system: System, grants: tuple[Grant, ...], stolen: float = 0.0, duration: float = 1.0
 ) -> tuple[Finding, ...]:
-    """Looks at everything; whatever the system does not show becomes a finding too.
+    """Inspects the machine; properties that the system does not show become findings too.
 
     Args:
-        system: Where to look.
-        grants: What the system answered when the loop asked for real time.
+        system: Roots of the kernel's file systems.
+        grants: Results of the loop's real-time requests.
         stolen: Time in s that the host took from all cores during the measurement.
-        duration: Of the measurement in s, > 0.
+        duration: Duration of the measurement in s, > 0.
     """
     return (
         *(Finding(g.name, g.is_granted, g.sentence, g.remedy) for g in grants),
@@ -78,21 +77,21 @@ def findings(
 
 
 def _lasting_ways(grants: tuple[Grant, ...]) -> tuple[Finding, ...]:
-    """How to get for good what was refused and a command grants to one shell."""
+    """Returns permanent ways to grant requests that a command grants to one shell only."""
     if all(grant.remedy != SHELL for grant in grants):
         return ()
     return (
         Finding(
             "for good",
             None,
-            "that command lasts as long as its shell; permissions can be granted for good too",
-            f"{LASTING}; or to this interpreter alone: {CAPABILITIES}",
+            "that command lasts as long as its shell; permissions can also be granted permanently",
+            f"{LASTING}; or for this interpreter alone: {CAPABILITIES}",
         ),
     )
 
 
 def _throttling(system: System) -> Finding:
-    """Real-time threads are stopped by the kernel once they filled their share of each second."""
+    """Checks the share of each second after which the kernel stops real-time threads."""
     name = "throttling"
     budget = system.text(system.proc / "sys/kernel/sched_rt_runtime_us")
     whole = system.text(system.proc / "sys/kernel/sched_rt_period_us")
@@ -104,14 +103,14 @@ def _throttling(system: System) -> Finding:
     return Finding(
         name,
         share >= 0.9,
-        f"a real-time thread is stopped once it was busy for {share:.0%} of a second; the loop "
-        "sleeps in each period, so it stays below",
+        f"a real-time thread is stopped after {share:.0%} of a second of work; the loop "
+        "sleeps in each period, so it stays below that",
         "" if share >= 0.9 else "sudo sysctl kernel.sched_rt_runtime_us=950000",
     )
 
 
 def _preemption(system: System) -> Finding:
-    """How soon the kernel lets go of a core for a thread that should run."""
+    """Checks if the kernel can preempt its own work."""
     name = "preemption"
     if sys.platform != "linux":
         return Finding(name, None, f"real time is only supported on Linux, this is {sys.platform}")
@@ -134,11 +133,11 @@ def _preemption(system: System) -> Finding:
 
 
 def _dynamic_preemption(system: System) -> Finding:
-    """A kernel whose model is chosen when it starts."""
+    """Checks a kernel whose preemption model is chosen at boot."""
     chosen = _dynamic_model(system)
     if chosen == "full":
         return Finding("preemption", True, "the kernel is preemptible (PREEMPT_DYNAMIC: full)")
-    shown = chosen or "which model is in use, it does not show here"
+    shown = chosen or "its model is not visible here"
     return Finding(
         "preemption",
         None,
@@ -148,7 +147,7 @@ def _dynamic_preemption(system: System) -> Finding:
 
 
 def _dynamic_model(system: System) -> str:
-    """Returns the model in use, in brackets in ``none voluntary (full)``; empty if not visible."""
+    """Returns the model in use, in brackets in ``none voluntary (full)``; empty if unknown."""
     text = system.text(system.sys / "kernel/debug/sched/preempt") or ""
     if "(" in text:
         return text.partition("(")[2].partition(")")[0]
@@ -158,7 +157,7 @@ def _dynamic_model(system: System) -> str:
 
 
 def _governor(system: System) -> Finding:
-    """A core that is clocked down needs time to speed up, and until then every tick is long."""
+    """Checks the frequency governor; after a pause a slow core makes ticks long."""
     name = "frequency"
     files = sorted(system.sys.glob("devices/system/cpu/cpu[0-9]*/cpufreq/scaling_governor"))
     governors = {text for text in map(system.text, files) if text}
@@ -171,7 +170,7 @@ def _governor(system: System) -> Finding:
     return Finding(
         name,
         False,
-        f"cores are clocked down when idle (governor {', '.join(sorted(governors))}): ticks after "
+        f"idle cores lower their frequency (governor {', '.join(sorted(governors))}): ticks after "
         "a pause are longer",
         "sudo cpupower frequency-set -g performance",
     )
@@ -183,13 +182,11 @@ def _cores() -> Finding:
     busy = os.getloadavg()[0] if hasattr(os, "getloadavg") else 0.0
     if not count or count < 2:
         return Finding(
-            name, False, "there is one core: loop and recorder share it", "give it two at least"
+            name, False, "there is one core: loop and recorder share it", "provide at least two"
         )
     sentence = f"{count} cores, {busy:.1f} processes wanted to run in the last minute"
     if busy > count:
-        return Finding(
-            name, False, f"{sentence}: more than there are cores", "end what else is running"
-        )
+        return Finding(name, False, f"{sentence}: more than there are cores", "end other programs")
     return Finding(name, True, sentence)
 
 
@@ -197,21 +194,21 @@ def _host(system: System, stolen: float, duration: float) -> Finding:
     name = "host"
     flags = system.text(system.proc / "cpuinfo")
     if flags is None:
-        return Finding(name, None, "whether this is a virtual machine is not visible here")
+        return Finding(name, None, "it is not visible here if this is a virtual machine")
     if " hypervisor" in flags:
         sentence = (
             "this is a virtual machine: its host may stop it for tens of milliseconds, and nothing "
-            "in it can prevent or foresee that"
+            "inside it can prevent or foresee"
         )
         if stolen > 0.0:
             sentence += f"; during the measurement it took {stolen * 1e3:.0f} ms from the cores"
         is_bad = stolen > STOLEN_SHARE * duration
-        return Finding(name, False if is_bad else None, sentence, "run on the machine itself")
+        return Finding(name, False if is_bad else None, sentence, "run on a physical machine")
     return Finding(name, True, "no virtual machine")
 
 
 def _usb() -> Finding:
-    """Whether the haptic devices that are plugged in may be opened."""
+    """Checks that the connected haptic devices may be opened."""
     name = "usb"
     unseen = blind_spots()
     plugged = plugged_devices()

@@ -1,4 +1,4 @@
-"""How late a thread wakes: the bridge's clock, and a bare sleep loop beside it."""
+"""Wake-up times of the bridge's clock and of a bare sleep loop."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from hapticbridge.realtime import Lateness, lateness_of
 
 @dataclass(slots=True)
 class Wakeups:
-    """Wake-ups of one kind of loop, gathered over several turns.
+    """Wake-ups of one kind of loop, over several turns.
 
     Attributes:
-        name: Which loop.
-        late_ns: Per turn, how late each tick woke, in ns.
-        missed: Deadlines that were skipped.
+        name: Name of the loop.
+        late_ns: Lateness of each tick in ns, by turn.
+        missed: Number of skipped deadlines.
     """
 
     name: str
@@ -33,10 +33,10 @@ class Wakeups:
         self.missed += missed
 
     def lateness(self) -> Lateness:
-        """Returns the numbers over all turns.
+        """Returns the statistics of all turns.
 
         Raises:
-            HapticBridgeError: There was none.
+            HapticBridgeError: There was no turn.
         """
         return lateness_of(
             np.concatenate([np.zeros(0, dtype=np.int64), *self.late_ns]), self.missed
@@ -47,11 +47,11 @@ def clock_turn(period_ns: int, ticks: int) -> tuple[NDArray[np.int64], int]:
     """Waits with the bridge's own clock, which sleeps and then spins.
 
     Args:
-        period_ns: In ns.
-        ticks: How many deadlines, those skipped among them.
+        period_ns: Period in ns.
+        ticks: Number of deadlines, including skipped ones.
 
     Returns:
-        How late each tick woke, in ns, and how many deadlines were skipped.
+        Lateness of each tick in ns, and number of skipped deadlines.
     """
     clock = RealClock()
     clock.start(period_ns)
@@ -59,7 +59,7 @@ def clock_turn(period_ns: int, ticks: int) -> tuple[NDArray[np.int64], int]:
 
 
 def bare_turn(period_ns: int, ticks: int) -> tuple[NDArray[np.int64], int]:
-    """Waits as the simplest loop does: sleeps until the deadline, as ``clock_turn`` returns it."""
+    """Waits with plain sleeps until each deadline; returns the same values as ``clock_turn``."""
     monotonic, sleep = time.monotonic_ns, time.sleep
     deadline = monotonic()
 

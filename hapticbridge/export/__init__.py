@@ -1,6 +1,6 @@
-"""A recording as a table for other programs: Parquet, CSV or HDF5.
+"""Export of a recording as a table: Parquet, CSV or HDF5.
 
-Read ``export`` first; it pours a recording into a ``sink``: ``parquet``, ``csv_file`` or ``hdf5``.
+Read ``export`` first; it writes a recording into a ``sink``: ``parquet``, ``csv_file`` or ``hdf5``.
 """
 
 from hapticbridge.export.export import FORMATS as FORMATS

@@ -1,4 +1,4 @@
-"""CSV: a header of names alone, and units, metadata and events beside it."""
+"""CSV format."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from hapticbridge.recording import RecordingFile
 from hapticbridge.tick import COLUMNS
 
 SIDECAR = ".json"
-"""Ending of the file beside the CSV, added to its whole name."""
+"""Extension of the file beside the CSV, appended to its whole name."""
 
 
 def sidecar_of(path: Path) -> Path:
-    """Returns the file that holds what CSV cannot."""
+    """Returns the path of the file with units, metadata and events."""
     return path.with_name(path.name + SIDECAR)
 
 
 class CsvSink:
-    """Writes numbers with as many digits as bring back the same double; NaN loses its payload.
+    """CSV writer whose numbers read back to the same doubles; NaN loses its payload.
 
-    Units, metadata and events stand in ``NAME.csv.json`` as one object ``{"units", "meta",
-    "events"}``: comments in the CSV itself would stop most programs that read one.
+    The header has names only. Units, metadata and events go to ``NAME.csv.json`` as one object
+    ``{"units", "meta", "events"}``, because most programs cannot read comments in a CSV.
     """
 
     def __init__(self, path: Path, recording: RecordingFile) -> None:
@@ -40,11 +40,11 @@ class CsvSink:
         self._file.write(",".join(column.name for column in COLUMNS) + "\n")
 
     def add(self, ticks: NDArray[np.void]) -> None:
-        """See ``Sink.add``."""
+        """Implements ``Sink.add``."""
         # repr of a float is the shortest text that reads back to it
         texts = [map(repr, column_values(ticks, column).tolist()) for column in COLUMNS]
         self._file.writelines(",".join(row) + "\n" for row in zip(*texts, strict=True))
 
     def close(self) -> None:
-        """See ``Sink.close``."""
+        """Implements ``Sink.close``."""
         self._file.close()

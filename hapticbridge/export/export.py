@@ -1,4 +1,4 @@
-"""Writes a recording's ticks, metadata and events in another format."""
+"""Export of a recording's ticks, metadata and events."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ FORMATS: dict[str, tuple[type[Sink], tuple[str, ...]]] = {
     "csv": (CsvSink, (".csv",)),
     "hdf5": (Hdf5Sink, (".h5", ".hdf5")),
 }
-"""What writes each format, and the endings of its files, the usual one first."""
+"""Writer and file extensions of each format, the usual extension first."""
 
 
 EVERYTHING = (-math.inf, math.inf)
@@ -40,11 +40,11 @@ as due then, however 0.3 is rounded."""
 
 @dataclass(frozen=True, slots=True)
 class Exported:
-    """What was written.
+    """Result of an export.
 
     Attributes:
-        files: The table first, then what stands beside it.
-        recording: What was read, without its ticks.
+        files: The table, then its sidecar if there is one.
+        recording: The recording without its ticks.
         ticks: Count of rows in the table.
         events: Events that were written.
     """
@@ -56,7 +56,7 @@ class Exported:
 
     @property
     def damage(self) -> tuple[str, ...]:
-        """What is wrong with the recording, a sentence each; that it is cut is no damage."""
+        """Damage of the recording, one sentence each; a cut recording is not damaged."""
         found = self.recording
         if found.problems or found.is_cut or found.digest == found.computed_digest:
             return found.problems
@@ -64,7 +64,7 @@ class Exported:
 
 
 def target_for(path: str | Path, form: str) -> Path:
-    """Returns where an export goes that names no file: beside the recording.
+    """Returns the default target of an export: a file beside the recording.
 
     Raises:
         RecordingError: The format is unknown.
@@ -80,26 +80,26 @@ def export(
     span: tuple[float, float] = EVERYTHING,
     overwrite: bool = False,
 ) -> Exported:
-    """Writes a recording as a table: a row per tick, a column per number, with their units.
+    """Writes a recording as a table: a row per tick, a column per number, with units.
 
     Vectors become columns with the suffixes ``_x`` and so on (a wrench's ``_fx`` to ``_tz``).
-    Doubles are kept to the bit (in CSV all but the payload of a NaN), metadata and events too; the
-    attached scene is not. The file appears whole or not at all, and memory does not grow with the
-    recording's length. What is damaged is left out; the result says whether anything was.
+    Doubles keep every bit (in CSV all but the payload of a NaN). Metadata and events are included,
+    the attached scene is not. If writing fails, no partial file remains. Memory does not grow with
+    the recording's length. Damaged parts are left out and listed in the result.
 
     Args:
         path: The recording.
         form: One of ``FORMATS``.
-        target: The file, with an ending of the format; None: the recording's name with the usual
+        target: File with an extension of the format; None takes the recording's name with the usual
             one.
-        span: First time and end in s of the run's clock, the end excluded. Only ticks that were due
-            and events that happened in between are written; metadata ``cut`` then holds the two.
-        overwrite: Replace files that exist.
+        span: First time and end in s of the run's clock, the end excluded. Only ticks due and events
+            in between are written; metadata ``cut`` then holds the two times.
+        overwrite: True replaces existing files.
 
     Raises:
-        RecordingError: The recording cannot be read, the format is unknown or needs a package that
-            is not installed, no tick lies in the span, or the target exists, is the recording, ends
-            otherwise or cannot be written.
+        RecordingError: The recording cannot be read; the format is unknown or its package is not
+            installed; no tick lies in the span; or the target exists, is the recording, has a wrong
+            extension or cannot be written.
     """
     sink_type, endings = _sink(form)
     recording = open_recording(path)

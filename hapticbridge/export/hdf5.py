@@ -1,4 +1,4 @@
-"""HDF5: a data set per number, its unit in an attribute."""
+"""HDF5 format."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from hapticbridge.recording import RecordingFile
 from hapticbridge.tick import COLUMNS, TICK_DTYPE
 
 _CHUNK = 8192
-"""Rows a chunk, 64 kB: larger packs better, smaller reads faster where few rows are wanted."""
+"""Rows per chunk, 64 kB. Larger chunks compress better; smaller ones read faster for few rows."""
 
 
 _CACHE = 2 * 8 * _CHUNK
-"""Bytes of written chunks that HDF5 keeps per column: those of one block. Its own choice is 8 MB,
-which 17 minutes at 1 kHz fill: 0.4 GB in all columns, and nothing here is read again."""
+"""Chunk cache in bytes per column: the chunks of one block. HDF5's default of 8 MB fills after 17
+minutes at 1 kHz, 0.4 GB for all columns, and nothing is read again here."""
 
 
 class Hdf5Sink:
-    """Writes ``/ticks/NAME`` per column, ``/meta/KEY`` per metadata text, and ``/events``.
+    """HDF5 writer: ``/ticks/NAME`` per column, ``/meta/KEY`` per metadata text, and ``/events``.
 
-    Each data set of ``/ticks`` has the attribute ``unit``. Events are JSON texts. Metadata are data
-    sets of text, since an attribute ends at 64 kB.
+    Each data set of ``/ticks`` has the attribute ``unit``. Events are JSON texts. Metadata are text
+    data sets, because an attribute is limited to 64 kB.
 
     Raises:
         RecordingError: h5py is not installed.
@@ -39,7 +39,7 @@ class Hdf5Sink:
         text = h5py.string_dtype()
         meta = self._file.create_group("meta")
         for key, value in recording.meta.items():
-            # a slash would make a folder of what stands before it
+            # a slash in the name would create a group
             meta.create_dataset(key.replace("/", "_"), data=value, dtype=text)
         events = [json.dumps(event) for event in recording.events]
         self._file.create_dataset("events", (len(events),), text, data=events)
@@ -55,7 +55,7 @@ class Hdf5Sink:
             self._columns.append((column, data))
 
     def add(self, ticks: NDArray[np.void]) -> None:
-        """See ``Sink.add``."""
+        """Implements ``Sink.add``."""
         end = self._count + len(ticks)
         for column, data in self._columns:
             data.resize((end,))
@@ -63,5 +63,5 @@ class Hdf5Sink:
         self._count = end
 
     def close(self) -> None:
-        """See ``Sink.close``."""
+        """Implements ``Sink.close``."""
         self._file.close()

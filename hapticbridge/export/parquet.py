@@ -1,4 +1,4 @@
-"""Parquet: a column per number, its unit in the column's metadata."""
+"""Parquet format."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from hapticbridge.tick import COLUMNS, TICK_DTYPE
 
 
 class ParquetSink:
-    """Writes a row group per block.
+    """Parquet writer with one row group per block.
 
-    Column metadata hold ``unit``; the schema's hold ``hapticbridge.meta`` (the recording's metadata
-    as a JSON object of texts) and ``hapticbridge.events`` (its events as a JSON list).
+    Column metadata hold ``unit``. Schema metadata hold ``hapticbridge.meta`` (the recording's
+    metadata as a JSON object of texts) and ``hapticbridge.events`` (its events as a JSON list).
 
     Raises:
         RecordingError: pyarrow is not installed.
@@ -43,16 +43,16 @@ class ParquetSink:
             "hapticbridge.events": json.dumps(recording.events),
         }
         self._schema = self._arrow.schema(fields, metadata=about)
-        # hardly a number comes twice: a dictionary would only take room
+        # values rarely repeat, so a dictionary would only take space
         self._writer = parquet.ParquetWriter(
             path, self._schema, compression="zstd", use_dictionary=False
         )
 
     def add(self, ticks: NDArray[np.void]) -> None:
-        """See ``Sink.add``."""
+        """Implements ``Sink.add``."""
         arrays = [self._arrow.array(column_values(ticks, column)) for column in COLUMNS]
         self._writer.write_table(self._arrow.Table.from_arrays(arrays, schema=self._schema))
 
     def close(self) -> None:
-        """See ``Sink.close``."""
+        """Implements ``Sink.close``."""
         self._writer.close()

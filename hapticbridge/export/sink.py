@@ -1,4 +1,4 @@
-"""What a format does: takes the description of a recording, then its ticks block by block."""
+"""Interface of table writers."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from hapticbridge.tick import Column
 
 
 class Sink(Protocol):
-    """A table that is being written.
+    """A table being written.
 
     Args:
         path: The file to write.
-        recording: Where metadata and events come from.
+        recording: Source of metadata and events.
     """
 
     def __init__(self, path: Path, recording: RecordingFile) -> None: ...

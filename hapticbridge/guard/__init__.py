@@ -1,7 +1,8 @@
-"""What stands between a computed wrench and a motor in somebody's hand.
+"""Safety guard between the computed wrench and the motor.
 
-Read ``limits`` first, what may be asked for, then ``guarding``, what the kernel is told; ``start``
-is before force, ``trip`` after it. The arithmetic is the kernel's.
+Read ``limits`` first, the user's limits; then ``guarding``, the kernel's parameters. ``start``
+holds the checks before force is enabled, ``trip`` the reasons of a stop. The kernel does the
+arithmetic.
 """
 
 from hapticbridge.guard.guarding import CONTROLLERS as CONTROLLERS

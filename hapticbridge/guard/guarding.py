@@ -1,4 +1,4 @@
-"""What the guard does in a run with a given device: the numbers that the kernel takes."""
+"""Guard parameters of a run on a given device."""
 
 from __future__ import annotations
 
@@ -15,48 +15,51 @@ CONTROLLERS = {"damper": DAMPER, "environment": ENVIRONMENT, "tank": TANK, "off"
 """Passivity controllers by name."""
 
 SURPLUS = 0.05
-"""In J: what earlier dissipation may pay for. A default coupling holds 0.021 J at 10 N, contacts
-behind it about as much; what they give back must not be taken for activity. A larger one lets a
-larger kick pass before the controller acts."""
+"""Energy credit in J that earlier dissipation may provide. A default coupling stores 0.021 J at 10
+N and contacts behind it about as much; their release must not count as activity. A larger credit
+lets a larger kick pass before the controller acts."""
 
 UNCERTIFIED_CREDIT = 0.5
-"""Share of its damping that a device is taken to burn where it has less than the coupling needs,
-without unit. With all of it a swing is kept from growing and does not end; with half of it the
-other half ends it. With none of it the controller would brake free motion."""
+"""Share of its damping that a device is assumed to dissipate with, if that is less than the
+coupling needs; without unit. With all of it a swing stops growing but does not end; with half, the
+other half ends it. With none the controller would brake free motion."""
 
 STALE_PERIODS = 10
-"""Periods of the device without a new sample after which the wrench fades. Fewer make a device that
-loses single samples rattle, more hold the force of a pose that is long gone."""
+"""Number of the device's periods without a new sample after which the wrench fades. A smaller
+number makes a device that loses single samples rattle; a larger one holds the force of an old pose
+longer."""
 
 FADE = 0.02
-"""In s: how long the wrench takes to fade. Shorter is felt as a blow, longer pushes blindly."""
+"""Duration in s of the fading of the wrench. A shorter one feels like a blow, a longer one pushes
+without knowledge of the hand."""
 
 LONGEST_STALL, STALL_PERIODS = 0.05, 5
-"""A loop that stood still for longer than 50 ms, or five periods where they are longer, knows no
-more where the hand is: 20 mm away at 0.4 m/s."""
+"""Longest stall of the loop: 50 ms, or five periods if these are longer. Afterwards the hand's
+position is unknown: at 0.4 m/s it has moved 20 mm."""
 
 RAMP_ENERGY = 0.01
-"""In J: what the coupling may hold while the wrench rises at full pace, 7 N at 2400 N/m; and what a
-start may give to the hand at most in the time of its ramp. A quarter of the energy limit, so that
-no start alone ends a run; less makes the force of a heavy tool rise slowly."""
+"""Energy in J that the coupling may store while the wrench rises at full pace (7 N at 2400 N/m),
+and that a start may give to the hand during its ramp. It is a quarter of the energy limit, so that
+a start alone never ends a run. A smaller value slows the rise with a heavy tool."""
 
 JUMP_MARGIN = 2.0
-"""How much faster than its data sheet says a device may seem to move: a sample that is read late
-and the next one in time show up to two periods of motion in one."""
+"""Factor on the data sheet's speed limit, without unit. A late sample followed by a punctual one
+shows up to two periods of motion in one."""
 
 FASTEST_TURN = 300.0
-"""In rad/s. A hand turns a stylus at 30; a half turn within a tick of 1 kHz is 3000."""
+"""Largest plausible angular velocity in rad/s. A hand turns a stylus at 30; half a turn within a
+tick of 1 kHz is 3000."""
 
 
 def button_mask(button: int | None, what: str) -> int:
     """Returns the bit of a button; 0 for None.
 
     Args:
-        button: Its number, from 0.
-        what: What it is for, for the message.
+        button: Number of the button, from 0.
+        what: Purpose of the button, for the message.
 
     Raises:
-        DeviceError: It is out of range.
+        DeviceError: The number is out of range.
     """
     if button is None:
         return 0
@@ -77,33 +80,33 @@ def guarding_for(
     dead_man: int | None = None,
     is_absolute: bool = False,
 ) -> Guarding:
-    """Returns what the guard does in a run.
+    """Returns the guard's parameters for a run.
 
-    A device whose motion is prescribed feels nothing: for it only limits, slew and buttons count.
+    A device with prescribed motion has no hand; it gets limits, slew and buttons only.
 
     Args:
-        info: The device. Where its damping is unknown, the account takes what the default coupling
-            takes (``certificate.assumed_damping``); where its mass is, the clip is b alone.
-        limits: Of the run.
+        info: The device. Unknown damping is replaced by ``certificate.assumed_damping``; with
+            unknown mass the clip is b alone.
+        limits: Limits of the run.
         period: T in s.
         needed: Damping in N s/m and N m s/rad that the coupling needs
-            (``certificate.device_conditions``). A device that has it is taken to burn all that its
-            damping can: its account stays balanced, and the controller idle.
+            (``certificate.device_conditions``). A device that has it counts with all its
+            dissipation, so its energy account stays balanced and the controller idle.
         scale: Handle motion per device motion.
-        controller: One of ``CONTROLLERS``; None: ``damper`` where the device has less damping than
-            the coupling needs, else ``environment``. A device that has it needs none for what it
-            does itself, and a spring that was turned far beyond the torque limit gives back more
-            than the surplus covers: there the account of both ports would blame an honest run.
+        controller: One of ``CONTROLLERS``. None selects ``damper`` for a device with less damping
+            than the coupling needs, else ``environment``. With enough damping the device port needs
+            no controller. A spring turned far beyond the torque limit returns more than the credit
+            covers, and an account of both ports would then blame a passive run.
         clutch: Button that lets the device move without the handle.
         dead_man: Button that must be held for any force.
-        is_absolute: Whether the device's pose is one in the scene; it is then not re-seated before
-            the first tick.
+        is_absolute: True if the device's pose is a pose in the scene; it is then not re-anchored
+            before the first tick.
 
     Raises:
         DeviceError: The controller's name or a button is not valid.
     """
     if controller is not None and controller not in CONTROLLERS:
-        raise DeviceError(f"unknown controller {controller!r}; there are {choices(CONTROLLERS)}")
+        raise DeviceError(f"unknown controller {controller!r}; choices: {choices(CONTROLLERS)}")
     buttons = button_mask(clutch, "clutch"), button_mask(dead_man, "dead-man")
     if buttons[0] and buttons[0] == buttons[1]:
         raise DeviceError(f"clutch and dead-man are both button {clutch}; they exclude each other")

@@ -1,4 +1,4 @@
-"""Limits on the wrench that is sent, and on what a run may be before it is stopped."""
+"""Limits of the wrench and of the run."""
 
 from __future__ import annotations
 
@@ -9,44 +9,44 @@ from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import DeviceError
 
 LONGEST_RAMP = 60.0
-"""In s. Nobody waits longer for a force to come up; a larger number is a mistake in the unit."""
+"""Longest ramp in s. A larger number is taken for a mistake in the unit."""
 
 USUAL_RISE = 2e-3
-"""In s: the shortest time in which the wrench may go from zero to its limit. 10 N in 2 ms is what a
-coupling of 2400 N/m does at 2 m/s, faster than a hand taps; a longer time delays honest contacts,
-and a delay creates energy; a shorter one lets a jump of the scene through as a blow."""
+"""Shortest time in s from zero wrench to its limit. A coupling of 2400 N/m produces 10 N in 2 ms at
+2 m/s, faster than a hand taps. A longer time delays true contacts, and delay creates energy; a
+shorter one passes a jump of the scene as a blow."""
 
 USUAL_STRETCH = 0.2
-"""In m, of the device's motion: no hand goes that far from its tool on a desk. Shorter stops
-whoever pulls on a stuck tool, longer lets a lost tool go unnoticed."""
+"""Stretch limit in m of the device's motion; no hand at a desk goes that far from its tool. A
+smaller limit stops users who pull on a stuck tool; a larger one misses a lost tool."""
 
 USUAL_ANGLE = 2.8
-"""In rad. At π the torque of the coupling changes sides; 160 degrees leave room for one tick."""
+"""Angle limit in rad. At π the coupling's torque changes sign; 160 degrees leave room for one
+tick."""
 
 USUAL_ENERGY = 0.04
-"""In J, given to the device beyond what the hand put in: 10 N over 4 mm, a nudge and no blow. It is
-seen a tick later; with what 10 N do in that at 1 m/s, the sum stays below 0.05 J. Motors of a scene
-that are meant to push the hand need more."""
+"""Energy limit in J, given to the device beyond the hand's own work: 10 N over 4 mm, a nudge and no
+blow. Detection takes one tick; with the work of 10 N at 1 m/s in it, the sum stays below 0.05 J.
+Scenes whose motors push the hand need more."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Limits:
-    """Limits on the wrench that is sent, in this order after scale and controller, and on the run.
+    """Limits of the wrench, applied in this order after scale and controller, and of the run.
 
     Attributes:
-        force: Largest norm of the force in N, > 0; a longer one keeps its direction.
+        force: Largest norm of the force in N, > 0; a larger force keeps its direction.
         torque: Largest norm of the torque in N m, > 0.
-        rise: Shortest time in s in which force and torque go from zero to their limits, >= 0; 0
-            lets them step.
-        ramp: Time in s over which the wrench rises linearly at the start, 0 to 60; it takes longer
-            where the coupling holds much energy meanwhile (``kernel.ramp``).
-        stretch: Largest distance between handle and grip in m, over the scale, > 0; beyond it the
-            run is stopped. So it is beyond the others:
-        angle: Largest angle between them in rad, > 0 and < π, or inf.
-        energy: Most energy in J that the device may be given beyond what the hand put in, > 0.
-        reach: Farthest in m that the device may be from the middle of its workspace, the origin of
-            its frame, > 0; inf: no limit; None: the device's own, where it knows it. It is not
-            stopped there: beyond, it moves without the handle and without force, as with a clutch.
+        rise: Shortest time in s from zero to the limits, >= 0; 0 allows steps.
+        ramp: Time in s of the linear rise at the start, 0 to 60. It takes longer if the coupling
+            stores much energy meanwhile (``kernel.ramp``).
+        stretch: Largest distance between handle and grip divided by the scale, in m, > 0. Beyond
+            this and the next two limits the run is stopped.
+        angle: Largest angle between handle and grip in rad, > 0 and < π, or inf.
+        energy: Largest energy in J given to the device beyond the hand's own work, > 0.
+        reach: Largest distance in m of the device from the origin of its frame, the middle of its
+            workspace, > 0. inf means no limit, None the device's own if known. Beyond it the device
+            moves without handle and force, as with a clutch; the run goes on.
 
     Raises:
         DeviceError: A value is not finite or out of range.
@@ -80,7 +80,7 @@ class Limits:
             )
 
     def reach_of(self, info: DeviceInfo) -> float:
-        """Returns the reach in m: the one asked for, else the device's own, else inf."""
+        """Returns the reach in m: the requested one, else the device's own, else inf."""
         own = math.inf if info.reach is None else info.reach
         return own if self.reach is None else self.reach
 
@@ -89,7 +89,7 @@ class Limits:
         return round(self.ramp / period)
 
     def rises(self, period: float) -> tuple[float, float]:
-        """Returns by how much force (N) and torque (N m) may change in a tick."""
+        """Returns the largest change of force (N) and torque (N m) per tick."""
         if self.rise == 0:
             return math.inf, math.inf
         return self.force * period / self.rise, self.torque * period / self.rise
@@ -104,15 +104,15 @@ UNLIMITED = Limits(
     angle=math.inf,
     energy=math.inf,
 )
-"""Of runs that nobody feels: no force of a simulation that is still finite comes near."""
+"""No limits, for simulations without a device; no finite force comes near."""
 
 
 def limits_for(info: DeviceInfo, limits: Limits | None) -> Limits:
-    """Returns the limits of a run: those asked for, or the device's own.
+    """Returns the requested limits of a run, or else the device's own.
 
     Raises:
-        DeviceError: More is asked for than the device bears. One whose motion is prescribed feels
-            nothing, so any limit is accepted for it.
+        DeviceError: A requested limit exceeds the device's. Any limit is accepted for a prescribed
+            motion, which has no hand.
     """
     if limits is None:
         return Limits(force=info.force_limit, torque=info.torque_limit)

@@ -1,4 +1,4 @@
-"""What must hold before force is enabled."""
+"""Checks before force is enabled."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from hapticbridge.pose import canonical
 from hapticbridge.tick import SAMPLE_DTYPE
 
 STILL_TIME, PATIENCE = 0.1, 5.0
-"""In s: how long a real device must be still before force is enabled, and how long that is waited
-for. A hand that reaches for a device stays for longer than the first."""
+"""Time in s for which a real device must be still before force is enabled, and time in s after
+which waiting for it fails. A hand that reaches for a device stays longer than the first."""
 
 STILL_DISTANCE = 1e-3
-"""In m, moved within ``STILL_TIME``: 1 cm/s, what a hand that holds still stays below."""
+"""Largest motion in m within ``STILL_TIME``: 1 cm/s, more than a hand that holds still."""
 
 _NO_FORCE = np.zeros(6)
 
@@ -35,23 +35,23 @@ def wait_until_still(
 ) -> None:
     """Waits until a device with motors is still; returns at once for any other.
 
-    It is commanded zero force in every period: a Falcon says where it is only when it is told what
-    force to give, and a device with a watchdog must not find its host silent.
+    Zero force is commanded in every period: a Falcon reports its position only in answer to a
+    force, and a device with a watchdog must not find its host silent.
 
     Args:
-        device: Started.
-        sample: Shape (1,), ``SAMPLE_DTYPE``; receives the newest one.
+        device: The started device.
+        sample: Shape (1,), ``SAMPLE_DTYPE``; receives the newest sample.
         period: T in s, at which it is read.
-        clock: The run's. Only real time is waited for; a clock that somebody drives also drives
-            what the device does, which must not begin before the run.
-        is_over: Tells whether the run was told to end meanwhile; then nothing is waited for.
+        clock: Clock of the run. The wait happens only in real time; an injected clock also drives
+            the device, which must not move before the run.
+        is_over: Returns True if the run was stopped meanwhile; the wait then ends.
 
     Raises:
-        DeviceError: It moves on.
+        DeviceError: The device keeps moving.
     """
     if not device.info.is_real or device.info.is_prescribed or type(clock) is not RealClock:
         return
-    clock = RealClock()  # another: the run's time begins with its first tick
+    clock = RealClock()  # a separate one, because the run's time begins with its first tick
     clock.start(round(1e9 * period))
     anchor = np.zeros(1, SAMPLE_DTYPE)
     since = begun = None
@@ -74,17 +74,17 @@ def wait_until_still(
 
 
 def refuse_simulated_time(device: DeviceInfo | str, clock: Clock) -> None:
-    """Refuses a clock that runs ahead of a device that lives in real time.
+    """Refuses a simulated clock for a device bound to real time.
 
-    That is a device with motors, and one that follows a hand without end, some time after it.
+    Such a device has motors, or follows a live hand without end and with a delay.
 
     Args:
-        device: Its data sheet; or what it is to be opened as, before a user is asked to home it:
-            all hardware lives in real time.
-        clock: The run's.
+        device: Data sheet, or device string before the device is opened and homed; all hardware is
+            bound to real time.
+        clock: Clock of the run.
 
     Raises:
-        DeviceError: It is so.
+        DeviceError: The device is bound to real time and the clock is simulated.
     """
     if isinstance(device, str):
         name = device.partition(":")[0]
@@ -103,15 +103,15 @@ def refuse_simulated_time(device: DeviceInfo | str, clock: Clock) -> None:
 def refuse_stretched_start(
     state: NDArray[np.void], sample: NDArray[np.void], limits: Limits
 ) -> None:
-    """Refuses a start at which the coupling would already pull with more than the force limit.
+    """Refuses a start at which the coupling would already exceed the force limit.
 
     Args:
-        state: The kernel's state (``STATE_DTYPE``, one element) before the first tick.
-        sample: Where the device is, shape (1,), ``SAMPLE_DTYPE``.
-        limits: Of the run.
+        state: Kernel state (``STATE_DTYPE``, one element) before the first tick.
+        sample: Device sample, shape (1,), ``SAMPLE_DTYPE``.
+        limits: Limits of the run.
 
     Raises:
-        DeviceError: Says how far the handle is from the grip, and where the grip is.
+        DeviceError: The message names the handle's distance from the grip, and the grip's position.
     """
     s = state[0]
     x, y, z = sample["position"][0].tolist()

@@ -1,4 +1,4 @@
-"""Why the guard stopped a run, in words."""
+"""Reasons of a guard's stop, in words."""
 
 from __future__ import annotations
 
@@ -27,22 +27,22 @@ _DIVERGED = (
 
 
 def trip_reason(code: int, tick: int) -> str:
-    """Says why the kernel refused a tick.
+    """Describes why the kernel refused a tick.
 
     Args:
-        code: What ``before_step`` or ``after_step`` returned, not ``OK``.
-        tick: The tick's number.
+        code: Result of ``before_step`` or ``after_step``, not ``OK``.
+        tick: Number of the tick.
     """
     return f"tick {tick}: {_REASONS.get(code, _DIVERGED)}"
 
 
 def with_remedy(reason: str) -> str:
-    """Returns a reason with what to do about it, for whoever sees the run stop.
+    """Appends the remedy to a reason, for the message to the user.
 
-    Error and recording keep the reason alone: it is compared when the run is done again.
+    Exception and recording keep the bare reason, because it is compared when the run is repeated.
 
     Args:
-        reason: What ``trip_reason`` returned, or another cause of a trip, which stays as it is.
+        reason: Result of ``trip_reason``; any other text is returned unchanged.
     """
     for code, remedy in _REMEDIES.items():
         if reason.endswith(_REASONS[code]):

@@ -1,7 +1,7 @@
-"""What the loop asks of the system, and how late it wakes.
+"""Real-time requests to the operating system, and lateness of the loop.
 
-``grants`` asks and gives back, ``remedies`` names the commands that grant what was refused,
-``pace`` checks that a scene's step fits into the period, ``lateness`` and ``host`` measure.
+``grants`` makes the requests and undoes them, ``remedies`` names the commands that grant a refused
+one, ``pace`` checks that a scene's step fits into the period, ``lateness`` and ``host`` measure.
 """
 
 from hapticbridge.realtime.grants import Grant as Grant

@@ -1,8 +1,8 @@
-"""What the loop asks of the system while it runs, and gives back afterwards.
+"""Real-time requests of the loop, undone when it ends.
 
-An ordinary process is paused whenever the kernel finds something else to do, its pages may be taken
-away, and it is moved from core to core. Each of the requests here removes one such cause of a late
-tick. None is refused in silence: what was not granted is said, with the command that grants it.
+The kernel may pause an ordinary process, take its memory pages away and move it between cores. Each
+request removes one of these causes of late ticks. A refusal is reported with the command that
+grants it.
 """
 
 from __future__ import annotations
@@ -27,21 +27,21 @@ if sys.platform != "win32":
 _LOCK_PRESENT, _LOCK_FUTURE = 1, 2  # MCL_CURRENT, MCL_FUTURE
 _SET_TIMER_SLACK, _GET_TIMER_SLACK = 29, 30  # prctl
 TIMER_SLACK_NS = 1
-"""How much later than asked the kernel may wake the loop, in ns, so that it can wake several
-threads at once. Ordinary threads begin with 50 000: that alone is 5 % of a period of 1 ms."""
+"""Timer slack in ns: time by which the kernel may delay a wake-up to combine it with others.
+Ordinary threads start with 50 000 ns, 5 % of a period of 1 ms."""
 
 ISOLATED = Path("/sys/devices/system/cpu/isolated")
 
 
 @dataclass(frozen=True, slots=True)
 class Grant:
-    """The answer to one request.
+    """Result of one request.
 
     Attributes:
         name: ``scheduling``, ``memory``, ``core``, ``timer`` or ``collector``.
-        is_granted: Whether it is so while the loop runs.
-        sentence: What is granted; or what is not, why, and what that means.
-        remedy: The command that grants it; empty where it is granted or cannot be.
+        is_granted: True if it is in force while the loop runs.
+        sentence: The grant; or the refusal with reason and consequence.
+        remedy: Command that grants it; empty if granted or impossible.
     """
 
     name: str
@@ -51,19 +51,19 @@ class Grant:
 
 
 def wants_real_time(asked: bool | None, clock: Clock, *, is_real: bool) -> bool:
-    """Tells whether a run asks for real time.
+    """Decides if a run requests real time.
 
     Args:
-        asked: What the user said; None: for a real device, in real time.
-        clock: What drives the loop.
-        is_real: Whether the device moves a motor in somebody's hand.
+        asked: The user's choice; None requests it for a real device on a real clock.
+        clock: Clock of the loop.
+        is_real: True if the device drives a motor in a person's hand.
 
     Raises:
-        HapticBridgeError: It was asked for where time is not real.
+        HapticBridgeError: Real time was requested with a clock that is not real.
     """
     if asked and clock.name != RealClock.name:
         raise HapticBridgeError(
-            f"real time is asked for, and a {clock.name} clock: they exclude each other"
+            f"real time and a {clock.name} clock exclude each other; request only one of them"
         )
     return is_real and clock.name == RealClock.name if asked is None else asked
 
@@ -72,10 +72,10 @@ def wants_real_time(asked: bool | None, clock: Clock, *, is_real: bool) -> bool:
 def memory_at_rest() -> Iterator[tuple[Grant, ...]]:
     """Locks the process's memory and stops the garbage collector; undone at the end.
 
-    It takes a third of a second, so it is to be done before a device is held.
+    It takes a third of a second, so call it before a hand holds the device.
 
     Yields:
-        One answer per request.
+        One result per request.
     """
     with ExitStack() as restore:
         yield _collector(restore), _memory(restore)
@@ -83,29 +83,29 @@ def memory_at_rest() -> Iterator[tuple[Grant, ...]]:
 
 @contextmanager
 def real_time(core: int | None = None) -> Iterator[tuple[Grant, ...]]:
-    """Asks for real time for the calling thread; gives everything back at the end.
+    """Requests real time for the calling thread; undone at the end.
 
-    Threads and processes that are started meanwhile do not inherit the priority.
+    Threads and processes started meanwhile do not inherit the priority.
 
     Args:
-        core: Where to run; None takes an isolated core if there is one, else the last one allowed
-            (the first serves most interrupts).
+        core: Core to run on; None takes an isolated core, or else the last allowed one, because the
+            first serves most interrupts.
 
     Yields:
-        One answer per request.
+        One result per request.
     """
     with ExitStack() as restore:
-        # the priority comes last, so that no other request runs, or waits, under it
+        # the priority comes last, so that no other request runs under it
         yield _timer(restore), _core(restore, core), _scheduling(restore)
 
 
 def current_priority() -> int:
-    """Returns the calling thread's priority under SCHED_FIFO, 1 to 99; 0 where it has none."""
+    """Returns the calling thread's priority under SCHED_FIFO, 1 to 99; 0 without one."""
     return os.sched_getparam(0).sched_priority if hasattr(os, "sched_getparam") else 0
 
 
 def warn_of_refusals(grants: tuple[Grant, ...]) -> None:
-    """Warns once of each request that was refused, with the command that grants it."""
+    """Warns of each refused request, with the command that grants it."""
     for grant in grants:
         if not grant.is_granted:
             remedy = f"; to grant it: {grant.remedy}" if grant.remedy else ""
@@ -113,7 +113,7 @@ def warn_of_refusals(grants: tuple[Grant, ...]) -> None:
 
 
 def shown_limit(limit: int, unit: int = 1) -> str:
-    """Returns a limit of ``resource.getrlimit`` as ``ulimit`` shows it."""
+    """Formats a limit of ``resource.getrlimit`` as ``ulimit`` shows it."""
     return "unlimited" if limit == resource.RLIM_INFINITY else str(limit // unit)
 
 
@@ -123,7 +123,7 @@ def _scheduling(restore: ExitStack) -> Grant:
         return Grant(name, False, f"{sys.platform} has no SCHED_FIFO; only Linux is supported")
     policy, parameter = os.sched_getscheduler(0), os.sched_getparam(0)
     limit = resource.getrlimit(resource.RLIMIT_RTPRIO)[0]
-    # what a limit allows is better than nothing: any real-time priority goes before all others
+    # a lower priority still helps: any real-time priority precedes all ordinary threads
     wanted = dict.fromkeys((PRIORITY, min(PRIORITY, limit)) if limit > 0 else (PRIORITY,))
     for priority in wanted:
         try:
@@ -153,8 +153,8 @@ def _memory(restore: ExitStack) -> Grant:
         return Grant(name, False, f"memory is not locked on {sys.platform}; only Linux does it")
     library = ctypes.CDLL(None, use_errno=True)
     limit = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0]
-    # under a limit, locking what comes would make the allocation beyond it fail in mid-run; what is
-    # larger already can only be locked by a process that no limit binds (CAP_IPC_LOCK)
+    # Under a limit, locking future memory would make an allocation beyond it fail during the run.
+    # A process larger than the limit can lock only with CAP_IPC_LOCK, which lifts the limit.
     is_bound = limit != resource.RLIM_INFINITY and _mapped() <= limit
     whole = _LOCK_PRESENT | _LOCK_FUTURE
     for flags in (_LOCK_PRESENT,) if is_bound else (whole, _LOCK_PRESENT):
@@ -162,22 +162,24 @@ def _memory(restore: ExitStack) -> Grant:
             restore.callback(library.munlockall)
             shown = "all memory is locked"
             if flags != whole:
-                shown = "the memory in use is locked, not what is added later"
+                shown = "the memory in use is locked, later allocations are not"
             if is_bound:
-                shown += f": the limit 'ulimit -l' of {shown_limit(limit, 1024)} kB could fail it"
+                shown += (
+                    f": the limit 'ulimit -l' of {shown_limit(limit, 1024)} kB could make them fail"
+                )
             return Grant(name, True, shown)
     reason = os.strerror(ctypes.get_errno())
     return Grant(
         name,
         False,
         f"memory could not be locked ({reason}; the limit 'ulimit -l' is "
-        f"{shown_limit(limit, 1024)} kB): a page that the system took away makes a tick late",
+        f"{shown_limit(limit, 1024)} kB): a page that the system removed makes a tick late",
         way_to_grant(),
     )
 
 
 def _mapped() -> int:
-    """Returns the size in bytes of what the process has mapped, which is what would be locked."""
+    """Returns the size in bytes of the process's mapped memory, which is what would be locked."""
     pages = Path("/proc/self/statm").read_text(encoding="utf-8").split()[0]
     return int(pages) * resource.getpagesize()
 
@@ -208,7 +210,7 @@ def _core(restore: ExitStack, core: int | None) -> Grant:
     except (OSError, ValueError, OverflowError) as error:
         reason = getattr(error, "strerror", None) or error
         sentence = (
-            f"the loop could not be pinned to core {chosen} ({reason}): moves make ticks late"
+            f"the loop could not be pinned to core {chosen} ({reason}): migrations make ticks late"
         )
         return Grant(name, False, sentence, way_to_pin(chosen, getattr(error, "errno", None)))
     restore.callback(os.sched_setaffinity, 0, allowed)
@@ -217,12 +219,12 @@ def _core(restore: ExitStack, core: int | None) -> Grant:
 
 
 def loop_core() -> int:
-    """Returns the core on which a loop is put unless it is told another; only on Linux."""
+    """Returns the default core of a loop; on Linux only."""
     return min(_isolated_cores(), default=max(os.sched_getaffinity(0)))
 
 
 def _isolated_cores() -> set[int]:
-    """Returns the cores that the kernel gives no work of its own (``isolcpus``)."""
+    """Returns the cores that the kernel keeps free of other work (``isolcpus``)."""
     try:
         text = ISOLATED.read_text(encoding="utf-8").strip()
     except OSError:
@@ -235,7 +237,7 @@ def _isolated_cores() -> set[int]:
 
 
 def _collector(restore: ExitStack) -> Grant:
-    """Stops Python's collector of reference cycles: it would stop the loop for milliseconds."""
+    """Stops Python's collector of reference cycles, which would pause the loop for milliseconds."""
     was_enabled, had_frozen = gc.isenabled(), gc.get_freeze_count() > 0
     gc.collect()
     gc.freeze()

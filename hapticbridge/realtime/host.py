@@ -1,4 +1,4 @@
-"""The host of a virtual machine, which stops it without a word."""
+"""Time stolen by the host of a virtual machine."""
 
 from __future__ import annotations
 
@@ -6,17 +6,13 @@ import os
 from pathlib import Path
 
 _STOLEN = 8
-"""Column of the line ``cpu`` in ``/proc/stat``, the line's name being column 0."""
+"""Column of the line ``cpu`` in ``/proc/stat``; column 0 is the line's name."""
 
 
 def stolen_time(proc: Path = Path("/proc")) -> float | None:
-    """Returns the time in s that the host took from all cores together since the start.
+    """Returns the time in s that the host took from all cores since the start.
 
-    Args:
-        proc: Root of procfs.
-
-    Returns:
-        In steps of a clock tick, 10 ms as a rule; None where the kernel does not tell.
+    The resolution is one clock tick, usually 10 ms. Returns None if the kernel does not report it.
     """
     try:
         columns = (proc / "stat").read_text(encoding="utf-8").split("\n", 1)[0].split()

@@ -1,4 +1,4 @@
-"""How late a loop woke, as the numbers that tell whether it holds its rate."""
+"""Statistics of a loop's lateness."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from hapticbridge.errors import HapticBridgeError
 
 @dataclass(frozen=True, slots=True)
 class Lateness:
-    """How late the ticks of one loop woke.
+    """Lateness of the ticks of one loop; times in s.
 
     Attributes:
-        ticks: How many woke.
-        missed: Deadlines that passed without a tick.
-        median: In s, as all that follow.
-        p99: Later than this was one tick in a hundred.
-        p999: One in a thousand.
-        worst: The latest of all.
+        ticks: Number of ticks that woke.
+        missed: Number of deadlines without a tick.
+        median: Median.
+        p99: 99th percentile.
+        p999: 99.9th percentile.
+        worst: Maximum.
     """
 
     ticks: int
@@ -31,7 +31,7 @@ class Lateness:
     worst: float
 
     def sentence(self) -> str:
-        """Returns the numbers in µs, in one line."""
+        """Formats the numbers in µs, in one line."""
         return (
             f"p50 {self.median * 1e6:.0f}, p99 {self.p99 * 1e6:.0f}, p99.9 {self.p999 * 1e6:.0f}, "
             f"max {self.worst * 1e6:.0f} µs, {self.missed} of {self.ticks + self.missed} missed"
@@ -42,17 +42,17 @@ def lateness_of(late_ns: ArrayLike, missed: int) -> Lateness:
     """Returns the percentiles of times from deadline to wake-up.
 
     Args:
-        late_ns: In ns, at least one; 0 or less counts as on time.
-        missed: Deadlines that were skipped.
+        late_ns: Times in ns, at least one; 0 or less counts as on time.
+        missed: Number of skipped deadlines.
 
     Raises:
-        HapticBridgeError: There is no time at all.
+        HapticBridgeError: There are no times.
     """
     late = np.maximum(np.asarray(late_ns, dtype=np.float64).ravel(), 0.0) * 1e-9
     if late.size == 0:
         raise HapticBridgeError("no tick woke, so there is no lateness; run it for longer")
     late.sort()
-    # no interpolation: a percentile is a lateness that was seen
+    # without interpolation, so each percentile is a measured lateness
     median, p99, p999 = (
         float(late[-(-late.size * thousandths // 1000) - 1]) for thousandths in (500, 990, 999)
     )

@@ -1,4 +1,4 @@
-"""Whether a scene's step fits into the period, measured before any force is on."""
+"""Check that a scene's step fits into the period."""
 
 from __future__ import annotations
 
@@ -13,34 +13,35 @@ from hapticbridge.rendering import Method
 from hapticbridge.scene import Scene
 
 STEPS, LONGEST = 50, 0.1
-"""Most steps that are timed, and the time in s after which no further one is begun: enough for a
-median that one interruption does not move, and no wait that anybody notices."""
+"""Largest number of timed steps, and time in s after which no further one starts. One interruption
+does not move the median of so many, and the wait is not noticed."""
 
 BESIDE_THE_STEP = 5e-6
-"""Time in s of a tick beside MuJoCo's step: device, wrench, ledger, guard and record take 3 to
-4 µs on a 3 GHz core. Less promises a rate that cannot be held."""
+"""Time in s of a tick outside MuJoCo's step. Device, wrench, ledger, guard and record take 3 to 4
+µs on a 3 GHz core. A smaller value promises a rate that cannot be held."""
 
 SPARE = 0.8
-"""Share of the period that a tick may fill, no unit. Contacts cost more than the start does, and a
-tick that fills its period misses the next deadline."""
+"""Share of the period that a tick may fill, without unit. Contacts cost more than the start does,
+and a tick that fills its period misses the next deadline."""
 
 
 def check_pace(
     scene: Scene, method: Method, period: float, substeps: int, *, is_real: bool
 ) -> None:
-    """Refuses a scene that cannot hold the rate on a real device, and warns of it on others.
+    """Refuses a scene that cannot hold the rate on a real device; warns on others.
 
-    Each missed deadline is a longer hold, and the bound b > KT/2 + B' needs more damping then.
+    A missed deadline prolongs the hold, and the condition b > KT/2 + B' then needs more damping.
 
     Args:
-        scene: Prepared; its state is left as it is.
-        method: How it is rendered.
+        scene: Prepared scene; its state is not changed.
+        method: Rendering method.
         period: T in s.
         substeps: MuJoCo steps per tick.
-        is_real: Whether the device moves a motor in somebody's hand.
+        is_real: True if the device drives a motor in a person's hand.
 
     Raises:
-        SceneError: The steps of a tick take longer than the period; says what rate it could hold.
+        SceneError: The steps of a tick take longer than the period; the message names a possible
+            rate.
     """
     needed = substeps * step_time(scene, method)
     if needed <= period:
@@ -49,7 +50,7 @@ def check_pace(
     message = (
         f"scene '{scene.name}' needs {needed * 1e3:.3g} ms of MuJoCo a tick at its start, the "
         f"period is {period * 1e3:.3g} ms; it could hold about {held:g} Hz: lower the "
-        "rate, or see with 'hapticbridge check' what costs the time"
+        "rate, or find the cause with 'hapticbridge check'"
     )
     if is_real:
         raise SceneError(message)
@@ -62,9 +63,9 @@ def rate_for(needed: float) -> float:
 
 
 def step_time(scene: Scene, method: Method) -> float:
-    """Returns the median time in s of MuJoCo's step from the scene's state on, taken on a copy."""
+    """Returns the median time in s of MuJoCo's step from the scene's state, measured on a copy."""
     data, step, now = copy.copy(scene.data), method.step, time.perf_counter_ns
-    step(scene.model, data)  # not counted: it meets cold caches
+    step(scene.model, data)  # not counted, because caches are cold
     times: list[int] = []
     begin = now()
     while len(times) < STEPS and (not times or now() - begin < LONGEST * 1e9):

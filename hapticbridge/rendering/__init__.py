@@ -1,8 +1,8 @@
-"""The methods that render a rigid tool, behind one interface.
+"""Rendering methods of a rigid tool.
 
-A method decides how the coupling's wrench reaches the tool: which integrator MuJoCo uses, which
-gains its actuators get, whether a weld replaces them, or whether there is a coupling at all. The
-tick's arithmetic is the kernel's in every method, and so are ledger, records and audit.
+A method decides how the coupling's wrench reaches the tool: MuJoCo's integrator, the actuators'
+gains, a weld instead of them, or no coupling at all. Tick arithmetic, ledger, records and audit are
+common to all methods.
 """
 
 from hapticbridge.kernel.tuning import Gains as Gains

@@ -1,4 +1,4 @@
-"""A way to render: how the coupling's wrench reaches the tool."""
+"""Description of a rendering method."""
 
 from __future__ import annotations
 
@@ -17,23 +17,23 @@ from hapticbridge.passivity.compensation import felt_damping, law_damping
 
 @dataclass(frozen=True, slots=True)
 class Method:
-    """A way to render.
+    """A rendering method.
 
     Attributes:
-        name: What ``--method`` and the recording's metadata call it.
-        about: What it is, in one sentence.
-        hazard: What it may do on a real device, in one sentence; empty where nothing more than the
-            device condition is to be said.
-        scheme: How the wrench reaches the tool, as the kernel counts (``kernel.scheme.COUPLED`` …).
-        integrator: MuJoCo's, by the name that MJCF gives it.
-        discretization: How the coupling's damper is discretised, as the bounds call it; ``none``
-            where no coupling law gives the wrench.
-        compensated: Whether the actuators get the extra K h of damping, h the time step, that makes
-            the implicit integration of velocity alone one of position too.
-        lag: Share of K h that is taken off the damping asked for, because the integration adds it;
-            no unit.
-        adds: Share of K h that the integration adds to the damping, whether it is taken off or
-            not; None where it adds another amount, or takes some away.
+        name: Name for ``--method`` and the recording's metadata.
+        about: Description in one sentence.
+        hazard: Hazard on a real device beyond the device condition, in one sentence; empty without
+            one.
+        scheme: Code of the kernel's scheme (``kernel.scheme.COUPLED`` …).
+        integrator: MuJoCo's integrator by its MJCF name.
+        discretization: Discretisation of the coupling's damper in the bounds; ``none`` without a
+            law.
+        compensated: True if the actuators get K h of extra damping, h the time step. It turns the
+            implicit integration of velocity into one of position too.
+        lag: Share of K h that is subtracted from the requested damping because the integration adds
+            it; no unit.
+        adds: Share of K h that the integration adds to the damping, subtracted or not; None if it
+            adds another amount or removes some.
     """
 
     name: str
@@ -48,9 +48,9 @@ class Method:
 
     @property
     def step(self) -> Callable[[Any, Any], None]:
-        """MuJoCo's part of a substep, through the Python bindings, on model and data.
+        """MuJoCo's part of a substep through the Python bindings.
 
-        ``kernel.step.advance`` is the same by C symbol, to the bit.
+        ``kernel.step.advance`` calls the C function with equal results to the bit.
         """
         step: Callable[[Any, Any], None] = (
             mujoco.mj_step if self.has_coupling else mujoco.mj_fwdPosition
@@ -58,22 +58,22 @@ class Method:
         return step
 
     def laws(self, substeps: int) -> int:
-        """Returns how often per tick the wrench on the tool is computed."""
+        """Returns the evaluations of the tool's wrench per tick."""
         return laws_per_tick(self.scheme, substeps)
 
     @property
     def has_law(self) -> bool:
-        """Whether the coupling law gives the wrench, so that the device condition proves safety."""
+        """True if the coupling law gives the wrench, so that the device condition proves safety."""
         return has_law(self.scheme)
 
     @property
     def meters_inputs(self) -> bool:
-        """Whether the work of applied forces and moved mocap bodies is known."""
+        """True if the work of applied forces and moved mocap bodies is metered."""
         return self.integrator != "RK4" and self.scheme != DIRECT
 
     @property
     def has_coupling(self) -> bool:
-        """Whether anything elastic lies between handle and tool."""
+        """True if an elastic coupling lies between handle and tool."""
         return self.scheme != DIRECT
 
     def gains(self, coupling: Coupling, timestep: float) -> tuple[Gains, Gains]:
@@ -88,14 +88,14 @@ class Method:
         return (b, k, b + k * more), (br, kr, br + kr * more)
 
     def used(self, coupling: Coupling, timestep: float) -> Coupling:
-        """Returns the coupling whose law and gains make a tool feel like the one asked for.
+        """Returns the law's coupling for a requested one: B' = max(B − lag K h, 0).
 
-        B' = max(B − lag K h, 0), and B_r alike: the integration adds lag K h again. The device
-        needs b >= K T/2 + B', so what is taken off is also gained in stiffness.
+        The integration adds lag K h again; rotation follows the same rule. The device needs b >= K
+        T/2 + B', so the subtracted damping allows more stiffness.
 
         Args:
-            coupling: What should be felt.
-            timestep: h in s, MuJoCo's.
+            coupling: The requested coupling.
+            timestep: MuJoCo's time step h in s.
 
         Raises:
             CouplingError: The time step is not finite and > 0.
@@ -106,9 +106,10 @@ class Method:
         return self._with_damping(coupling, timestep, law_damping)
 
     def rendered(self, used: Coupling, timestep: float) -> Coupling:
-        """Returns what must be asked for where ``used`` is the law: B = B' + lag K h.
+        """Returns the requested coupling for the law's one: B = B' + lag K h.
 
-        It is what is felt, but for methods that take nothing off what they add (``adds``).
+        It is also the effective coupling, except for methods that do not subtract their own damping
+        (``adds``).
         """
         return self._with_damping(used, timestep, felt_damping)
 
@@ -127,13 +128,13 @@ class Method:
 
 
 def refuse_unknowing(method: Method, *, is_real: bool, i_know: bool) -> None:
-    """Refuses a method that may kick on a device with a motor, unless the user knows.
+    """Refuses a hazardous method on a device with motors without the user's consent.
 
     Raises:
-        DeviceError: Says what the method may do, and how to go on.
+        DeviceError: The message names the hazard and the way to consent.
     """
     if is_real and method.hazard and not i_know:
         raise DeviceError(
-            f"method '{method.name}' on a real device: {method.hazard}; use 'implicit', or say "
-            "--i-know (Bridge(i_know=True))"
+            f"method '{method.name}' on a real device: {method.hazard}; use 'implicit', or consent "
+            "with --i-know (Bridge(i_know=True))"
         )

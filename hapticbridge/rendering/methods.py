@@ -1,4 +1,4 @@
-"""The methods there are, by name; all but those with the coupling as actuators stand to compare."""
+"""Table of rendering methods; those without coupling actuators serve for comparison."""
 
 from __future__ import annotations
 
@@ -105,18 +105,18 @@ METHODS = {
 
 
 def default_method(substeps: int = 1) -> Method:
-    """Returns the method that is taken where none is asked for.
+    """Returns the default method: ``lossless`` with one MuJoCo step per tick, else ``implicit``.
 
-    ``lossless`` where a tick is one MuJoCo step: on every shipped scene, in 20 hands each, it is
-    strict; away from contact it is ten times and more as accurate as ``implicit``, and in contact
-    it is that, with the same B' and so for the same device. It takes no substeps; with them,
-    ``implicit``.
+    ``lossless`` takes no substeps. It is strict on every shipped scene, in 20 hands each. Away from
+    contact it is at least ten times as accurate as ``implicit``; in contact it equals ``implicit``
+    with the same B', and so suits the same device.
 
-    Where a contact creates energy, ``implicit`` with the same B' has burned some on the way there,
-    and ``lossless`` has not: tapping on a wall it uses 7.2 % of the slack instead of 7.0 % at most,
-    on jamming pegs the same (``scripts/bench_methods --same device``). Near contact it adds K T to
-    B', and says K T/2: tapping at 6 Hz it is 54 µm RMS away from what it says is felt, ``implicit``
-    26 µm from what that says, B + K T/2, and 116 µm from B (``scripts/bench_front``).
+    ``implicit`` dissipates some energy on the way to a contact and ``lossless`` does not, so energy
+    created by contacts uses more slack: at most 7.2 % instead of 7.0 % when tapping on a wall, and
+    equal shares with jamming pegs (``scripts/bench_methods --same device``). Near contact
+    ``lossless`` adds K T to B', but reports K T/2. When tapping at 6 Hz it is 54 µm RMS off its
+    reported effective coupling. ``implicit`` is 26 µm off its own report, B + K T/2, and 116 µm off
+    B (``scripts/bench_front``).
     """
     return LOSSLESS_COUPLING if substeps == 1 else IMPLICIT
 
@@ -125,7 +125,7 @@ def method_named(name: str) -> Method:
     """Returns a method by its name.
 
     Raises:
-        SceneError: There is no such method; lists those that exist.
+        SceneError: The name is unknown; the message lists the methods.
     """
     if name not in METHODS:
         raise SceneError(f"no method is called '{name}'; methods: {choices(METHODS)}")

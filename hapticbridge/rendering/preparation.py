@@ -1,4 +1,4 @@
-"""Making a scene ready to render a coupling by a method, and checking that one is."""
+"""Preparation of a scene for a method."""
 
 from __future__ import annotations
 
@@ -31,17 +31,17 @@ _INTEGRATORS = {
 _ARGUMENTS = Arguments(SceneError)
 
 MEASURED_AGAIN = 1e-6
-"""Relative difference at which a weld measured again is another one; no unit. Probing by 1e-6 m
-leaves 1e-10 of rounding, another processor hardly more."""
+"""Relative difference, without unit, above which a second measurement of a weld disagrees. Probing
+by 1e-6 m leaves rounding of 1e-10, on another processor hardly more."""
 
 
 def contact_stiffness_of(
     method: Method, coupling: Coupling, contact_stiffness: float | None
 ) -> float:
-    """Returns K_c in N/m for ``RunParameters``: as asked, or the coupling's K; 0 for others.
+    """Returns K_c in N/m: the requested one, or the coupling's K; 0 for methods with a coupling.
 
     Raises:
-        SceneError: It is not finite, not > 0 or beyond 1e-30 to 1e30, or the method has no contact
+        SceneError: It is not finite, not > 0 or outside 1e-30 to 1e30, or the method has no contact
             springs of its own.
     """
     if method.has_coupling:
@@ -56,15 +56,15 @@ def contact_stiffness_of(
 
 
 def check_scene(model: mujoco.MjModel, grip: str, method: Method) -> None:
-    """Refuses a scene that a method cannot render, or whose ports could not be metered under it.
+    """Refuses a scene that a method cannot render or meter.
 
     Args:
         model: The compiled scene.
         grip: Name of the site on the tool.
-        method: How it will be rendered.
+        method: The rendering method.
 
     Raises:
-        SceneError: Says what in the scene is the obstacle.
+        SceneError: The message names the obstacle in the scene.
     """
     if method.scheme == DIRECT:
         check_massless_tool(model, grip, method.name)
@@ -81,24 +81,24 @@ def prepare(
     method: Method = IMPLICIT,
     warns: bool = True,
 ) -> Coupling | None:
-    """Makes a scene render a coupling by a method: integrator, gains, timestep, and a reset.
+    """Sets a scene's integrator, gains and time step for a method, and resets it.
 
     Args:
-        scene: Changed in place; for a weld its model and data become new ones, with everything that
-            was changed in the old model carried over.
-        coupling: What the user should feel.
+        scene: Changed in place. For a weld its model and data are replaced; changes to the old
+            model are carried over.
+        coupling: The requested coupling.
         period: T in s.
         substeps: MuJoCo steps per tick.
-        method: How.
-        warns: Whether to warn of contacts that may create energy at this time step.
+        method: The rendering method.
+        warns: True to warn of contacts that may create energy at this time step.
 
     Returns:
-        The coupling that the tool is really held by, where it is not the one asked for (a weld);
-        for ``RunParameters.felt``.
+        The measured effective coupling of a weld, for ``RunParameters.felt``; None for other
+        methods.
 
     Raises:
-        SceneError: Period, substeps or a magnitude of the coupling are out of range (1e-30 to
-            1e30), or the scene does not suit the method.
+        SceneError: Period, substeps or a gain is out of range (1e-30 to 1e30), or the scene does
+            not suit the method.
     """
     checked_substeps(substeps, SceneError)
     for item in fields(Coupling):
@@ -118,17 +118,20 @@ def prepare(
 
 
 def check_prepared(model: mujoco.MjModel, parameters: RunParameters, method: Method) -> None:
-    """Refuses a model that ``prepare`` would not have left for these parameters.
+    """Refuses a model that differs from the result of ``prepare`` for these parameters.
 
     Raises:
-        SceneError: Names the first difference.
+        SceneError: The message names the first difference.
     """
     check_scene(model, parameters.grip, method)
     if model.opt.integrator != _INTEGRATORS[method.integrator]:
         raise SceneError(f"the integrator is not {method.integrator}, that of '{method.name}'")
     has_weld = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_EQUALITY, WELD_NAME) >= 0
     if has_weld != (method.scheme == WELD):
-        raise SceneError(f"a weld to the handle is not as '{method.name}' wants it")
+        raise SceneError(
+            f"method '{method.name}' requires {'a' if method.scheme == WELD else 'no'} "
+            "weld to the handle"
+        )
     if has_weld:
         gains = -model.eq_solref[model.equality(WELD_NAME).id]
         coupling = parameters.coupling

@@ -1,10 +1,9 @@
-"""Pictures and pages of a recorded run.
+"""Plots and HTML pages of a recorded run.
 
-Read ``page`` first: what stands on a page, all of it from ``evidence``. Words come from ``lead``,
-the verdict in a sentence, and ``facts``; pictures from ``energies``, ``motion``, ``timing`` and
-``moment``, which share ``panels``, and ``curves`` for a picture alone. ``likely`` finds the
-``cause`` of an active run: ``at_device``, with a ``remedy`` in numbers, or ``in_environment``, with
-what ``touched``.
+Read ``page`` first; it draws an ``evidence``. ``lead`` and ``facts`` write its words. ``energies``,
+``motion``, ``timing`` and ``moment`` draw its plots with the help of ``panels``; ``curves`` draws a
+plot of its own. ``likely`` finds the ``cause`` of an active run: ``at_device`` with a ``remedy`` in
+numbers, or ``in_environment`` with the geoms that ``touched``.
 """
 
 from hapticbridge.report.curves import DRAWABLE as DRAWABLE

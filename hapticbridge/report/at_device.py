@@ -1,4 +1,4 @@
-"""Why a device was given energy that nobody put in."""
+"""Causes of unpaid energy at the device."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from hapticbridge.report.remedy import what_would_do
 from hapticbridge.tick import TickFlag
 
 COUNTED = 2.0
-"""Resolutions of the device; a step of at most so many between two samples is one of the encoder
-and not of the hand."""
+"""Largest step in multiples of the device's resolution, without unit. A smaller step between two
+samples comes from the encoder and not from the hand."""
 
 FEWEST_REPEATS = 0.02
-"""Share of samples that must repeat an older one before that is called a cause, no unit: one in
-fifty is jitter between two clocks, which halves no margin."""
+"""Share of samples beyond expectation that must repeat an older one to count as a cause, without
+unit. One in fifty is jitter between two clocks."""
 
 
 def cause_at_device(evidence: Evidence, window: slice) -> Cause:
-    """Returns why the device got too much.
+    """Returns the likely cause of unpaid energy at the device.
 
     Args:
-        evidence: Of the run.
-        window: The ticks that lead to the moment.
+        evidence: Evidence of the run.
+        window: Ticks that lead to the moment.
     """
     method = evidence.method
     hazard = Cause("method", f"method '{method.name}': {method.hazard}", SAFE_METHOD)
@@ -60,7 +60,7 @@ _UNITS = {"translation": "N s/m", "rotation": "N m s/rad"}
 
 
 def _delayed(evidence: Evidence, failing: list[Condition]) -> Cause | None:
-    """Returns that samples are old, where without that the device would bear the coupling."""
+    """Returns a delay as the cause if the device could bear the coupling without it."""
     worst, info = evidence.worst, evidence.info
     late, own = delay_ticks(info, worst.period) or 0, info.damping or 0.0
     prompt = worst.scale * worst.force_scale
@@ -76,13 +76,13 @@ def _delayed(evidence: Evidence, failing: list[Condition]) -> Cause | None:
 
 
 def _overloaded(evidence: Evidence, failing: list[Condition]) -> Cause:
-    """Returns that the coupling asks too much: of its spring at this rate, or of its damper."""
+    """Returns too stiff a spring for the rate, or too strong a damper, as the cause."""
     worst, own = evidence.worst, evidence.info.damping or 0.0
     damper = worst.scale * worst.force_scale * evidence.asked.damping
     if failing[0].axis == "translation" and damper >= own:
         return Cause(
             "damping",
-            f"{_told(failing)}; its damper alone asks {damper:.4g} at any rate",
+            f"{_told(failing)}; its damper alone needs {damper:.4g} at any rate",
             what_would_do(evidence),
         )
     return Cause("rate", f"{_told(failing)}: it is too stiff for its rate", what_would_do(evidence))
@@ -103,15 +103,15 @@ def _unexplained(evidence: Evidence) -> Cause:
 
 
 def _timing(evidence: Evidence, window: slice) -> Cause | None:
-    """Returns what missed deadlines or samples explain, where the device bears the coupling."""
+    """Returns missed deadlines or repeated samples as the cause; the device bears the coupling."""
     flags = evidence.ticks["flags"][window]
     missed = int(np.count_nonzero(flags & int(TickFlag.OVERRUN)))
     span = len(flags) * evidence.parameters.period
     if missed:
         return Cause(
             "rate",
-            f"ticks late by a period or more in the {span:.2g} s before: {missed}, so that a "
-            "wrench was held for longer than the coupling was chosen for",
+            f"ticks late by a period or more in the {span:.2g} s before: {missed}, so that the "
+            "wrench was held longer than the coupling allows",
             "lower the rate or the load of the machine ('hapticbridge doctor')",
         )
     repeated = float(np.mean((flags & int(TickFlag.STALE_SAMPLE)) != 0))
@@ -122,17 +122,17 @@ def _timing(evidence: Evidence, window: slice) -> Cause | None:
         return Cause(
             "delay",
             f"{repeated:.0%} of the samples in the {span:.2g} s before repeated an older one, "
-            f"{expected:.0%} are to be expected: the force answered where the handle had been",
+            f"{expected:.0%} are expected: the force followed an older position of the handle",
             "mend the link to the device, or lower the rate to what it delivers",
         )
     return None
 
 
 def _counted(evidence: Evidence, window: slice) -> str:
-    """Says that the device was driven by single steps of its encoder, if that is what happened.
+    """Describes encoder steps as the cause; empty if they did not bring most of the energy.
 
-    A coupling that is unstable anyway passes through small steps, too, but its energy comes when
-    the swings have grown: so what counts are the joules from the window to the worst moment.
+    An unstable coupling passes through small steps too, but gains its energy after the swings have
+    grown. So the energy from the window to the worst moment counts.
     """
     info, worst = evidence.info, evidence.worst
     if not info.resolution:
@@ -160,10 +160,7 @@ def _counted(evidence: Evidence, window: slice) -> str:
 
 
 def _largest_steps(position: NDArray[np.float64], span: slice) -> NDArray[np.float64]:
-    """Returns the largest step of an axis into each tick, in m; the one before a run is not known.
-
-    The first tick of a run has none, so that it counts as a small one.
-    """
+    """Returns the largest step of any axis into each tick, in m; 0 for the first tick of a run."""
     before = position[max(span.start - 1, 0) : span.stop]
     steps = np.abs(np.diff(before, axis=0)).max(axis=1, initial=0.0)
     missing = span.stop - span.start - len(steps)

@@ -1,8 +1,4 @@
-"""Why a run became active: the likeliest of a few known causes, by rule, with its evidence.
-
-The rules look at the records around the moment and at what the run was set to. They are tried in an
-order in which the more special one comes first; a cause is likely, not proven.
-"""
+"""Likely cause of an active run, by rules on the records and the run's settings."""
 
 from __future__ import annotations
 
@@ -17,24 +13,24 @@ Kind = Literal[
 ]
 
 WINDOW = 0.2
-"""Seconds before the moment that are looked at: some ten swings of an unstable coupling, and less
-than a hand needs to do something else."""
+"""Time in s before the moment that the rules inspect: about ten swings of an unstable coupling, and
+too short for a hand to change its action."""
 
 MOST = 0.5
-"""Share from which on something is called what mostly happened, without unit."""
+"""Share above which a contribution counts as the main one, without unit."""
 
 SAFE_METHOD = "use method 'lossless' or 'implicit'"
-"""What helps against a method with a hazard: the two that need no warning."""
+"""Remedy for a method with a hazard."""
 
 
 @dataclass(frozen=True, slots=True)
 class Cause:
-    """A likely cause.
+    """Likely cause of an active run; not a proof.
 
     Attributes:
-        kind: Its name.
-        evidence: What speaks for it, with numbers.
-        remedy: What to change.
+        kind: Name of the cause.
+        evidence: Support for it, with numbers.
+        remedy: Change that removes it.
     """
 
     kind: Kind
@@ -43,12 +39,7 @@ class Cause:
 
 
 def window_before(evidence: Evidence, report: AuditReport) -> slice | None:
-    """Returns the ticks that lead to the moment, it among them; None where there was none.
-
-    Args:
-        evidence: Of the run.
-        report: The audit's verdict on it.
-    """
+    """Returns the last ``WINDOW`` seconds before the fault; None if the run is not active."""
     if report.verdict != "active" or report.tick is None or report.tick >= len(evidence.ticks):
         return None
     begin = report.tick + 1 - round(WINDOW / evidence.parameters.period)

@@ -1,4 +1,4 @@
-"""Curves of a recording over time, drawn without losing a peak."""
+"""Curves of a recording over time, reduced without loss of peaks."""
 
 from __future__ import annotations
 
@@ -17,15 +17,17 @@ from hapticbridge.recording import Recording, due_times
 from hapticbridge.rendering import method_named
 
 BINS = 1500
-"""Points per curve at most; each is drawn as its least and greatest value in a bin, so that no peak
-is lost. More makes a page larger without showing more at its width."""
+"""Largest number of bins per curve. Each bin draws its minimum and maximum, so no peak is lost.
+More bins enlarge the file without a visible gain."""
 
 AXES = ("x", "y", "z")
 COLOURS = ("#d55e00", "#009e73", "#0072b2")
-"""Of the axes: vermilion, green and blue that the colour-blind tell apart (Okabe & Ito)."""
+"""Colours of the axes: vermilion, green and blue, distinct for colour-blind readers (Okabe &
+Ito)."""
 
 DRAWABLE = 1e9
-"""Newtons, metres and joules beyond this are no physics; the picture's axes would not bear them."""
+"""Largest magnitude in N, m or J that is drawn; a larger one is not physical and breaks the plot's
+axes."""
 
 _ENERGIES = (
     ("coupling_work", "work of the coupling", "#0072b2", "-"),
@@ -44,12 +46,12 @@ _DRAWN = (
 def decimated(
     time: NDArray[np.float64], values: NDArray[np.float64], bins: int = BINS
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Keeps the least and the greatest value of each bin, in their order.
+    """Keeps the minimum and the maximum of each bin, in their order.
 
     Args:
         time: Shape (n,), n >= 1.
         values: Shape (n,).
-        bins: How many, >= 1.
+        bins: Number of bins, >= 1.
 
     Returns:
         At most 2 bins + 1 times and values.
@@ -61,7 +63,7 @@ def decimated(
     blocks = values[: count * size].reshape(count, size)
     picks = np.sort(np.stack([blocks.argmin(1), blocks.argmax(1)], axis=1), axis=1)
     index = (picks + size * np.arange(count)[:, None]).ravel()
-    if rest := len(values) - count * size:  # the end of a run is where it went wrong
+    if rest := len(values) - count * size:  # a fault often lies at the end of a run
         last = values[-rest:]
         index = np.append(index, count * size + np.sort([last.argmin(), last.argmax()]))
     index = np.append(index, len(values) - 1)
@@ -72,8 +74,8 @@ def draw_recording(recording: Recording) -> Figure:
     """Draws force, position and energies over time.
 
     Raises:
-        RecordingError: The recording holds no tick, a number that cannot be drawn, or no
-            parameters of a run.
+        RecordingError: The recording has no tick, no run parameters, or a number that cannot be
+            drawn.
     """
     ticks, meta = recording.ticks, recording.meta
     if not len(ticks):
@@ -96,7 +98,7 @@ def draw_recording(recording: Recording) -> Figure:
         drawn = decimated(time, 1e3 * ticks[name])
         energy_axes.plot(*drawn, color=colour, ls=style, label=label)
     force_axes.set_ylabel("force on the tool (N)")
-    position_axes.set_ylabel("way from the start (mm)")
+    position_axes.set_ylabel("displacement (mm)")
     energy_axes.set_ylabel("energy (mJ)")
     energy_axes.set_xlabel("time (s)")
     method = method_named(meta.get("method", ""))
@@ -108,7 +110,7 @@ def draw_recording(recording: Recording) -> Figure:
         is_always_held=was_always_held(ticks),
     ) or ("no coupling law",)
     title = f"{meta.get('scene', '')}: method {method.name}, {1 / parameters.period:g} Hz"
-    # a control code would make a broken SVG
+    # a control character would break the SVG
     title = "".join(letter if letter.isprintable() else "�" for letter in title) + f"\n{told[0]}"
     figure.suptitle(title, fontsize="medium", parse_math=False)
     for axes in (force_axes, position_axes, energy_axes):
@@ -117,17 +119,17 @@ def draw_recording(recording: Recording) -> Figure:
 
 
 def finish(axes: Axes) -> None:
-    """Gives a panel its grid, and its legend above the curves, not on them."""
+    """Adds the grid, and a legend above the curves."""
     axes.grid(alpha=0.3)
     axes.margins(x=0.01)
     axes.legend(loc="lower right", bbox_to_anchor=(1, 1), fontsize="small", ncols=4, frameon=False)
 
 
 def plot_recording(recording: Recording, path: Path) -> None:
-    """Writes ``draw_recording`` to a picture.
+    """Writes ``draw_recording`` to a picture file.
 
     Raises:
         RecordingError: The recording cannot be drawn.
-        HapticBridgeError: The file's ending is no picture format, or it cannot be written.
+        HapticBridgeError: The file's extension is no picture format, or it cannot be written.
     """
     write_picture(draw_recording(recording), path)

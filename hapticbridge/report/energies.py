@@ -1,4 +1,4 @@
-"""The picture of energies per port, against what is allowed."""
+"""Plot of each port's energy and its bound."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _PORTS = (
 
 
 def draw_energies(evidence: Evidence) -> Figure:
-    """Draws the energy of each port, and what environment and device may have at most."""
+    """Draws the energy of each port, and the bounds of environment and device."""
     ticks, time = evidence.ticks, evidence.time
     is_watched = bool(evidence.kicked.any())
     figure = new_figure(8, 6.6 if is_watched else 4.8)

@@ -1,4 +1,4 @@
-"""What a page draws and judges by: a run's records, and the energies that they give."""
+"""Records and energies of a run, prepared for plots and rules."""
 
 from __future__ import annotations
 
@@ -30,19 +30,19 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
-    """A run that can be drawn: n ticks, and per tick what each port has given and may give.
+    """A run of n ticks that can be drawn.
 
     Attributes:
-        recording: As it was read, with n >= 1 ticks.
-        parameters: The run's.
-        worst: The same with the coupling that asks most of the device, where commands changed it.
+        recording: The recording, with n >= 1 ticks.
+        parameters: Run parameters.
+        worst: Run parameters with the most demanding coupling that commands selected.
         info: The device.
-        method: How the tool was rendered.
-        time: When each tick was due, in s of the clock that the events tell, (n,).
-        created: What the environment has created so far, (n,) in J.
-        allowed: Its slack: what it may have created so far, (n,) in J.
-        kicked: What the device was given beyond what is paid for, (n,) in J; zero throughout where
-            that cannot be told (``Balance.kicked``).
+        method: The rendering method.
+        time: Due time of each tick in s on the clock of the events, (n,).
+        created: Energy that the environment has created so far, (n,) in J.
+        allowed: Slack: energy that the environment may have created so far, (n,) in J.
+        kicked: Unpaid energy given to the device so far, (n,) in J; zeros if it cannot be computed
+            (``Balance.kicked``).
         model: The compiled scene; None if the file lacks it or this MuJoCo cannot load it.
     """
 
@@ -59,20 +59,20 @@ class Evidence:
 
     @property
     def ticks(self) -> NDArray[np.void]:
-        """The records, ``TICK_DTYPE``, (n,)."""
+        """Records, ``TICK_DTYPE``, (n,)."""
         return self.recording.ticks
 
     @property
     def events(self) -> list[dict[str, Any]]:
-        """What happened."""
+        """Recorded events."""
         return self.recording.events
 
     @property
     def asked(self) -> Coupling:
-        """The least coupling that a user asks for to get ``worst``.
+        """Smallest requested coupling that leads to ``worst``.
 
-        Where the law's B' is 0 a method has taken off all the damping that was asked for, which
-        may have been anything up to what is felt: then it counts as 0.
+        If the law's B' is 0, the method removed all requested damping, which may have had any value
+        up to the effective one. It then counts as 0.
         """
         used, step = self.worst.coupling, self.worst.period / self.worst.substeps
         asked = self.method.rendered(used, step)
@@ -84,27 +84,26 @@ class Evidence:
 
     @property
     def lateness(self) -> Array:
-        """How long after its deadline each tick began, (n,) in s."""
+        """Delay of each tick's start after its deadline, (n,) in s."""
         return np.asarray(1e-9 * (self.ticks["wake_ns"] - self.ticks["deadline_ns"]))
 
     def judged(self, report: AuditReport) -> tuple[Array, Array]:
-        """Returns what the port at fault has given, and what it may have given, (n,) in J each.
+        """Returns the energy of the port at fault and its bound, (n,) in J each.
 
         Args:
-            report: The audit's verdict on the run, ``active``.
+            report: The audit's verdict ``active``.
         """
         if report.port == "device":
             return self.kicked, np.zeros_like(self.kicked)
-        # asked for strictly, the slack does not count
+        # a strict audit grants no slack
         is_slack_used_up = report.environment == "active"
         return self.created, self.allowed if is_slack_used_up else np.zeros_like(self.allowed)
 
     @classmethod
     def of(cls, recording: Recording) -> Evidence | None:
-        """Returns what can be drawn of a recording; None for a damaged one, or one without ticks.
+        """Computes the evidence of a recording; None if it is damaged or has no ticks.
 
-        Args:
-            recording: As it was read; it need not have passed an audit.
+        The recording need not have passed an audit.
         """
         ticks = recording.ticks
         fields = (name for name in ticks.dtype.names or () if ticks.dtype[name].base.kind == "f")
@@ -147,7 +146,7 @@ class Evidence:
 def _balances(
     recording: Recording, parameters: RunParameters, info: DeviceInfo, outside: Interventions
 ) -> Iterator[Balance]:
-    """Yields the balance block by block: of a long run one takes many times the records' room."""
+    """Yields the energy balance by blocks; the whole run at once would need much more memory."""
     starts = {name: np.array(meta_start(recording.meta, name)) for name in STARTS}
     ticks, late = recording.ticks, delay_ticks(info, parameters.period) or 0
     energy = float(starts["start_kinetic"][0] + starts["start_potential"][0])

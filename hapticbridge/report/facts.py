@@ -1,4 +1,4 @@
-"""What a page says of a run in words and numbers."""
+"""Facts of a run in words and numbers."""
 
 from __future__ import annotations
 
@@ -21,13 +21,14 @@ from hapticbridge.tick import TickFlag
 Facts = list[tuple[str, str]]
 
 MOST_EVENTS = 200
-"""Events that a page lists."""
+"""Largest number of events on a page."""
 
 MOST_INPUTS = 10
-"""Of them inputs; a run with scripted inputs has one per tick, which would bury all others."""
+"""Largest number of inputs among them. A run with scripted inputs has one per tick, which would
+hide all other events."""
 
 _LONGEST = 200
-"""Letters of an event that are shown; an input names every number that it wrote."""
+"""Largest number of characters of an event; an input lists every number that it wrote."""
 
 _RUN = {
     "scene": "",
@@ -48,19 +49,19 @@ _RUN = {
     "ramp_ticks": "ticks",
     "scene_sha256": "",
 }
-"""Metadata that a page shows, with their units; the gains are those of the law, B' and not B."""
+"""Metadata on a page, with units. The gains are those of the law: B', not B."""
 
 _NAMES = {
     "period_s": "period",
     "damping": "damping used",
     "rotational_damping": "rotational damping used",
 }
-"""What a page calls them, where that is not their name."""
+"""Names on a page that differ from the metadata's."""
 
 _DEVICE = {"name": "", "axes": ""} | DATA_SHEET_UNITS
 
 _WITHOUT = {"rate": "the loop's", "duration": "without end"}
-"""What it means that a data sheet leaves these open; of all else it means that nobody knows."""
+"""Meaning of a missing value in the data sheet; any other missing value is unknown."""
 
 _GUARD = {
     "controller": "",
@@ -84,11 +85,11 @@ _GUARD = {
     "clutch": "(mask of buttons)",
     "dead_man": "(mask of buttons)",
 }
-"""What the guard may do, with units; ``kernel.guarding.Guarding`` says what each is."""
+"""Guard settings on a page, with units; see ``kernel.guarding.Guarding``."""
 
 
 def json_object(text: str) -> dict[str, Any]:
-    """Returns a JSON object of the metadata; an empty one where it is damaged."""
+    """Parses a JSON object of the metadata; returns an empty one if it is damaged."""
     try:
         return dict(json.loads(text))
     except (ValueError, TypeError, RecursionError):
@@ -96,7 +97,7 @@ def json_object(text: str) -> dict[str, Any]:
 
 
 def run_facts(meta: Mapping[str, str]) -> Facts:
-    """Returns what was set: names, and values with their units."""
+    """Returns the run's settings: names, and values with units."""
     told = {name: meta[name] for name in _RUN if name in meta}
     if values := json_object(told.get("scene_parameters", "")):
         told["scene_parameters"] = _listed(values)
@@ -106,7 +107,7 @@ def run_facts(meta: Mapping[str, str]) -> Facts:
 
 
 def device_facts(meta: Mapping[str, str]) -> Facts:
-    """Returns what the device's data sheet says."""
+    """Returns the device's data sheet."""
     sheet = json_object(meta.get("device", ""))
     for name, meant in _WITHOUT.items():
         if name in sheet and sheet[name] is None:
@@ -121,7 +122,7 @@ def software_facts(meta: Mapping[str, str]) -> Facts:
 
 
 def guard_facts(evidence: Evidence) -> Facts:
-    """Returns what the guard was set to; what it did not do is left out."""
+    """Returns the active settings of the guard."""
     guarding = asdict(evidence.parameters.guarding)
     told = [("controller", controller_of(evidence))]
     for name, unit in _GUARD.items():
@@ -138,7 +139,7 @@ def controller_of(evidence: Evidence) -> str:
 
 
 def head_facts(report: AuditReport, evidence: Evidence) -> Facts:
-    """Returns what is to be known first: what was run, how it went, and what was checked."""
+    """Returns the main facts: setup, course of the run, and checks."""
     parameters, meta = evidence.parameters, evidence.recording.meta
     flags = evidence.ticks["flags"]
     ports = evidence.ticks["wrench_on_device"]
@@ -184,7 +185,7 @@ def _controlled(evidence: Evidence) -> str:
 
 
 def balance_of(report: AuditReport) -> str:
-    """Returns the energies at the end of a run; those of rounding alone are left out."""
+    """Returns the energies at the end of a run; those of rounding are left out."""
     told = [
         f"{_spaced(name)} {quantity(energy, 'J')}"
         for name, energy in report.energies.items()
@@ -194,20 +195,21 @@ def balance_of(report: AuditReport) -> str:
 
 
 ROUNDING = 1e-12
-"""J below which an energy is not told: a thousandth of what the verdict allows for rounding."""
+"""Energy in J below which a value is left out: a thousandth of the verdict's tolerance for
+rounding."""
 
 
 def percent(is_on: NDArray[np.bool_]) -> str:
-    """Returns in which share of the ticks something was on; what happened at all is not 0 %."""
+    """Formats the share of ticks in which something was on; rare events are not rounded to 0 %."""
     share = 100 * float(np.mean(is_on))
     return f"{share:.2g}%" if share < 99.5 else f"{share:.0f}%"
 
 
 def event_rows(events: Sequence[Mapping[str, Any]]) -> list[tuple[str, str, str, str]]:
-    """Returns name, tick, time and the rest of events, in their order.
+    """Returns name, tick, time and details of events, in their order.
 
-    At most ``MOST_EVENTS``, ``MOST_INPUTS`` of them inputs; inputs are left out first: they are
-    many, and what stopped a run is last.
+    At most ``MOST_EVENTS`` events are kept, at most ``MOST_INPUTS`` of them inputs. Inputs are
+    dropped first, because they are many and the event that stopped a run is last.
     """
     is_input = [event.get("event") == "input" for event in events]
     inputs = [index for index, each in enumerate(is_input) if each][:MOST_INPUTS]
@@ -234,7 +236,7 @@ def _spaced(name: str) -> str:
 
 
 def _valued(value: object, unit: str) -> str:
-    """Returns a value with its unit; numbers, also such as text holds, without rounding's tail."""
+    """Formats a value with its unit; numbers, also those given as text, lose rounding digits."""
     if value is None:
         return "unknown"
     if isinstance(value, list | tuple):

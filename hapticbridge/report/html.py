@@ -1,4 +1,4 @@
-"""Self-contained pages, written from templates."""
+"""Self-contained HTML pages."""
 
 from __future__ import annotations
 
@@ -11,17 +11,14 @@ from hapticbridge.quantity import quantity
 from hapticbridge.whole_file import whole_file
 
 PAGES = (".html", ".htm")
-"""What a page's name may end in; a browser takes another for text, and it is no recording."""
+"""Allowed extensions of a page; browsers show others as text."""
 
 
 def check_page_name(path: Path) -> None:
-    """Checks that a page can be written under its name, before anything is computed for it.
-
-    Args:
-        path: The file to be written.
+    """Checks that a page can be written under a name, before anything is computed for it.
 
     Raises:
-        RecordingError: The name does not end like a page, or its folder does not exist.
+        RecordingError: The extension is not one of ``PAGES``, or the folder does not exist.
     """
     if path.suffix.lower() not in PAGES:
         raise RecordingError(f"'{path}' does not end like a page; endings: {', '.join(PAGES)}")
@@ -30,12 +27,12 @@ def check_page_name(path: Path) -> None:
 
 
 def write_page(path: Path, template: str, **told: object) -> None:
-    """Writes a page.
+    """Writes a page; an existing file is replaced.
 
     Args:
-        path: Where to; an existing file is replaced.
+        path: The file.
         template: Name of a file in ``hapticbridge/templates``.
-        told: What it says, by the names that it has there.
+        told: The template's variables.
 
     Raises:
         RecordingError: The page cannot be written, or not under this name.

@@ -1,4 +1,4 @@
-"""Why an environment created energy."""
+"""Causes of energy created in the environment."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from hapticbridge.report.touched import Pairs, touched_pairs
 from hapticbridge.scene.contact_check import check_contacts, geom_name
 
 FAST_TURN = 0.02
-"""rad a tick of the tool from which on its gyroscopic torque is suspected. At 1 kHz 50 rad/s were
-measured to create 0.05 J in a second under a coupling of translation alone; less suspects hands,
-which turn at 10 rad/s, more passes over what was seen."""
+"""Rotation of the tool in rad per tick above which its gyroscopic torque is suspected. At 1 kHz, 50
+rad/s created 0.05 J in a second under a coupling of translation alone (measured). A smaller value
+suspects hands, which turn at 10 rad/s; a larger one misses such cases."""
 
 _SOFTER = "lower the stiffness, raise the rate, or make the contacts softer"
 
 
 def cause_in_environment(evidence: Evidence, report: AuditReport, window: slice) -> Cause:
-    """Returns why the environment created too much.
+    """Returns the likely cause of energy created in the environment.
 
     Args:
-        evidence: Of the run.
+        evidence: Evidence of the run.
         report: The audit's verdict on it.
-        window: The ticks that lead to the moment.
+        window: Ticks that lead to the moment.
     """
     method = evidence.method
     gained = np.diff(evidence.created, prepend=0.0)[window].clip(min=0.0)
@@ -71,13 +71,13 @@ def _without_contact(evidence: Evidence, window: slice, where: str) -> Cause:
         )
     return Cause(
         "unknown",
-        f"{where}, and method '{method.name}' is not known to create any without",
-        "see with 'hapticbridge audit FILE --what-if rate=…' whether a higher rate helps",
+        f"{where}; method '{method.name}' is not known to create energy without contact",
+        "try a higher rate with 'hapticbridge audit FILE --what-if rate=…'",
     )
 
 
 def _largest_turn(evidence: Evidence, window: slice) -> float:
-    """Returns by how much the tool turned in a tick at most, in rad."""
+    """Returns the largest rotation of the tool in one tick, in rad."""
     quaternion = evidence.ticks["tool_quaternion"][max(window.start - 1, 0) : window.stop + 1]
     return float(
         np.linalg.norm(turn_between(quaternion[:-1], quaternion[1:]), axis=1).max(initial=0.0)
@@ -94,7 +94,7 @@ def _named(evidence: Evidence, pairs: Pairs) -> str:
 
 
 def _concerns(evidence: Evidence, pairs: Pairs | None) -> list[str]:
-    """Returns what is wrong with the contacts that touched; with any where nobody can tell."""
+    """Returns concerns about the contacts that touched; about all contacts if unknown."""
     if evidence.model is None:
         return []
     only = None if pairs is None else list(pairs)
@@ -102,7 +102,7 @@ def _concerns(evidence: Evidence, pairs: Pairs | None) -> list[str]:
 
 
 def _can_push(evidence: Evidence, pairs: Pairs | None, share: float) -> bool:
-    """Tells whether a mocap body of the scene held, or touched, anything when energy came."""
+    """Returns True if a mocap body held or touched anything while the energy was created."""
     model = evidence.model
     if model is None:
         return True
@@ -119,6 +119,7 @@ def _moved_bodies(evidence: Evidence, window: slice) -> int:
         event.get("event") == "input"
         and isinstance(event.get("tick"), int)
         and window.start <= event["tick"] < window.stop
-        and "mocap_" in str(event.get("writes"))  # as text: a damaged event has any shape
+        and "mocap_"
+        in str(event.get("writes"))  # as text, because a damaged event may have any shape
         for event in evidence.events
     )

@@ -1,4 +1,4 @@
-"""The first sentences of a page: was it safe, and if not, how much came from where."""
+"""First sentences of a page."""
 
 from __future__ import annotations
 
@@ -7,17 +7,17 @@ from hapticbridge.quantity import quantity
 
 PLACES = {
     "environment": "environment: the simulated scene, as the tool meets it",
-    "device": "device: what the hand holds",
+    "device": "device: the handle in the hand",
 }
-"""What a port is, for those who meet it first."""
+"""Descriptions of the ports for readers new to them."""
 
 
 def lead_sentence(report: AuditReport, worst: float | None) -> str:
-    """Returns what to know first of a run.
+    """Returns the main result of a run in one sentence.
 
     Args:
         report: The audit's verdict on it.
-        worst: The largest energy beyond what is allowed, in J; None where that cannot be told.
+        worst: Largest energy beyond the bound, in J; None if unknown.
     """
     if report.verdict == "invalid":
         return f"This recording proves nothing: {report.reason}"
@@ -28,26 +28,22 @@ def lead_sentence(report: AuditReport, worst: float | None) -> str:
 
 def _too_much(report: AuditReport, joules: str) -> str:
     if report.port == "device":
-        return f"Not safe: the device was given up to {joules} that nobody put in"
+        return f"Not safe: the device was given up to {joules} that neither hand nor scene put in"
     limit = "the coupling's slack pays for" if report.environment == "active" else "it got"
     return f"Not safe: the scene gave out up to {joules} more than {limit}"
 
 
 def notes(report: AuditReport) -> list[str]:
-    """Returns what goes with the verdict: what stopped the run, what was not checked, the device.
-
-    Args:
-        report: The audit's verdict on a run.
-    """
+    """Returns notes on the verdict: reason of a stop, unchecked parts, and the device condition."""
     if report.verdict == "invalid":
         return []
     told = report.reason.partition("; ")[2]
-    # a run that was passive only because its force was taken away should not look like any other
+    # a run that was passive only because its force was switched off must not look like any other
     return [*([f"{told[:1].upper()}{told[1:]}."] if told else []), *_of_the_device(report)]
 
 
 def is_warned(report: AuditReport) -> bool:
-    """Tells whether a passive run was stopped by the guard, or proves nothing for another hand."""
+    """Returns True for a passive run that was stopped or is not certified for any hand."""
     return report.verdict == "passive" and (report.certified is False or "trip" in report.events)
 
 
@@ -57,7 +53,7 @@ def _of_the_device(report: AuditReport) -> list[str]:
     if report.certified:
         return ["The device bears this coupling, in any hand."]
     if report.certified is None:
-        return ["Whether the device bears this coupling in any hand is not known."]
+        return ["It is not known if the device bears this coupling in any hand."]
     return [
         f"The device does not bear this coupling: {'; '.join(report.conditions)}. This run stayed "
         "passive; another one need not."

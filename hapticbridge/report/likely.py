@@ -1,4 +1,4 @@
-"""Which of the known causes made a run active."""
+"""Search for the likely cause."""
 
 from __future__ import annotations
 
@@ -10,12 +10,7 @@ from hapticbridge.report.in_environment import cause_in_environment
 
 
 def likely_cause(evidence: Evidence, report: AuditReport) -> Cause | None:
-    """Returns why a run became active; None if it did not.
-
-    Args:
-        evidence: Of the run.
-        report: The audit's verdict on it.
-    """
+    """Returns the likely cause of an active run; None for any other run."""
     window = window_before(evidence, report)
     if window is None:
         return None

@@ -1,4 +1,4 @@
-"""The picture of the ticks around the moment at which a port became active."""
+"""Plot of the ticks around a fault."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from hapticbridge.report.evidence import Evidence
 from hapticbridge.report.panels import bounded
 
 ZOOM = 60
-"""Ticks before and after the moment that its picture shows."""
+"""Number of ticks shown before and after the moment."""
 
 
 def draw_moment(evidence: Evidence, report: AuditReport) -> Figure:
     """Draws the ticks around the one at which a port became active.
 
     Args:
-        evidence: Of the run.
-        report: The audit's verdict ``active``, with a tick that the run has.
+        evidence: Evidence of the run.
+        report: The audit's verdict ``active``, with a tick of the run.
     """
     tick = report.tick or 0
     around = slice(max(0, tick - ZOOM), tick + ZOOM + 1)

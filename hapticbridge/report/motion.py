@@ -1,4 +1,4 @@
-"""The picture of force and pose."""
+"""Plot of force and pose."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ def draw_motion(evidence: Evidence) -> Figure:
     for axes, label in (
         (force, "force on\nthe tool (N)"),
         (torque, "torque on\nthe tool (mN m)"),
-        (way, "way from\nthe start (mm)"),
-        (turn, "turned from\nthe start (°)"),
+        (way, "displacement\n(mm)"),
+        (turn, "rotation\n(°)"),
     ):
         axes.set_ylabel(label)
         widen(axes)

@@ -1,4 +1,4 @@
-"""The page of a recorded run: verdict, what was run, curves, and the moment of a fault."""
+"""HTML page of a recorded run: verdict, setup, curves, and the moment of a fault."""
 
 from __future__ import annotations
 
@@ -36,14 +36,14 @@ from hapticbridge.report.timing import activities, draw_timing
 
 
 def telling_time(recording: Recording, report: AuditReport) -> float:
-    """Returns when a picture tells most of a run: at its fault, or at the largest force, in s.
+    """Returns the time in s of the fault, or else of the largest force.
 
     Args:
-        recording: What was judged.
+        recording: The recording.
         report: The audit's verdict on it.
 
     Raises:
-        RecordingError: The recording holds no tick, or does not tell its period.
+        RecordingError: The recording has no tick or no period.
     """
     if not len(recording.ticks):
         raise RecordingError(f"'{recording.path}' holds no tick")
@@ -57,13 +57,13 @@ def telling_time(recording: Recording, report: AuditReport) -> float:
 def write_report(
     recording: Recording, report: AuditReport, path: Path, scene: bytes | None = None
 ) -> None:
-    """Writes one self-contained HTML page, of less than 1 MB however long the run was.
+    """Writes one self-contained HTML page of less than 1 MB, for any length of run.
 
     Args:
-        recording: What was judged.
+        recording: The recording.
         report: The audit's verdict on it.
-        path: Where to; an existing file is replaced.
-        scene: A picture of the scene as PNG, if there is one; ``telling_time`` says when.
+        path: The file; an existing one is replaced.
+        scene: PNG picture of the scene at ``telling_time``, or None.
 
     Raises:
         RecordingError: The page cannot be written, or not under this name.
@@ -96,7 +96,7 @@ def write_report(
 
 
 def _bare_curves(recording: Recording) -> str:
-    """Returns the curves of a run whose data sheet is damaged; nothing where its numbers are."""
+    """Returns the curves of a run with a damaged data sheet; empty if they cannot be drawn."""
     try:
         return inline_svg(draw_recording(recording))
     except RecordingError:
@@ -104,7 +104,7 @@ def _bare_curves(recording: Recording) -> str:
 
 
 def _drawn(evidence: Evidence, report: AuditReport) -> dict[str, Any]:
-    """Returns what the page tells of a run whose numbers can be drawn."""
+    """Returns the parts of a page that need evidence."""
     lateness = evidence.lateness
     is_timed = bool(lateness.any())
     return {
@@ -120,10 +120,10 @@ def _drawn(evidence: Evidence, report: AuditReport) -> dict[str, Any]:
 
 
 def moment_of(evidence: Evidence, report: AuditReport) -> dict[str, Any] | None:
-    """Returns when a port became active, by how much then and at most, and why; None if none did.
+    """Returns time, energy and cause of an active run's fault; None for any other run.
 
     Args:
-        evidence: Of the run.
+        evidence: Evidence of the run.
         report: The audit's verdict on it.
     """
     cause = likely_cause(evidence, report)

@@ -1,4 +1,4 @@
-"""What the pictures of a page share."""
+"""Elements shared by a page's plots."""
 
 from __future__ import annotations
 
@@ -11,30 +11,31 @@ from hapticbridge.report.curves import decimated
 Array = NDArray[np.float64]
 
 BINS = 400
-"""Points per curve of a page: each is two pixels of its width. More makes the page larger: at 400
-that of ten minutes has half a megabyte."""
+"""Number of bins per curve on a page; each is two pixels wide. With 400, the page of a ten-minute
+run has half a megabyte."""
 
 
 UNITS = ((1.0, "J"), (1e-3, "mJ"), (1e-6, "µJ"), (1e-9, "nJ"))
-"""What an energy is drawn in; below a nanojoule there is rounding only."""
+"""Units of energy on plots; below a nanojoule there is only rounding."""
 
 LEAST_SPAN = 1e-3
-"""Of a panel, in its own unit; rounding would otherwise fill it and look like a motion."""
+"""Smallest range of a panel's axis, in its own unit. A smaller range would magnify rounding
+noise."""
 
 
 def curve(axes: Axes, time: Array, values: Array, **style: object) -> None:
-    """Draws a curve without losing a peak, however long it is."""
+    """Draws a curve of any length without losing a peak."""
     axes.plot(*decimated(time, values, BINS), **style)  # type: ignore[arg-type]
 
 
 def energy_unit(*energies: Array) -> tuple[float, str]:
-    """Returns the unit that shows energies in J as numbers of a few digits: its size and name."""
+    """Returns size and name of the unit that shows energies in J with few digits."""
     largest = max(float(np.abs(energy).max(initial=0.0)) for energy in energies)
     return next((unit for unit in UNITS if largest >= unit[0]), UNITS[-1])
 
 
 def bounded(axes: Axes, time: Array, energy: Array, allowed: Array, label: str) -> None:
-    """Draws an energy in J, and what it may be at most."""
+    """Draws an energy in J and its bound."""
     size, unit = energy_unit(energy, allowed)
     curve(axes, time, energy / size, color="#1a5fb4", label=label)
     curve(axes, time, allowed / size, color="#b3261e", ls="--", label="allowed at most")
@@ -43,7 +44,7 @@ def bounded(axes: Axes, time: Array, energy: Array, allowed: Array, label: str) 
 
 
 def widen(axes: Axes) -> None:
-    """Sees to it that rounding does not fill a panel and look like a signal."""
+    """Enforces a minimum axis range so that rounding noise is not magnified."""
     low, high = axes.get_ylim()
     if high - low < LEAST_SPAN:
         middle = 0.5 * (low + high)

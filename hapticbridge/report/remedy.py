@@ -1,4 +1,4 @@
-"""Which stiffness, damping or rate a device would bear, for a run that it did not."""
+"""Stiffness, damping or rate that a device would bear."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ from hapticbridge.certificate import run_conditions
 from hapticbridge.report.evidence import Evidence
 
 HALVINGS = 40
-"""Of an interval in which a limit is sought: the printed three digits need a third of them."""
+"""Number of bisections of a limit; the printed three digits need a third of them."""
 
 FASTEST = 20_000.0
-"""Hz; a rate beyond what a loop of this package reaches is no remedy."""
+"""Largest rate in Hz that is proposed; loops of this package reach no higher one."""
 
 
 def what_would_do(evidence: Evidence, *, is_late: bool = False) -> str:
-    """Says what to change so that the device condition holds, as a user would type it.
+    """Returns changes that satisfy the device condition, as a user would type them.
 
-    Stiffness and damping are those that are asked for, not the law's B'; each is changed alone.
-    What does not help by itself is left out.
+    Stiffness and damping are the requested ones, not the law's B'. Each is changed alone; a change
+    that does not help alone is left out.
 
     Args:
-        evidence: Of the run; the device's damping is known.
-        is_late: Whether a delay is the cause: a faster loop does not shorten it.
+        evidence: Evidence of the run; the device's damping is known.
+        is_late: True if a delay is the cause, which a faster loop does not shorten.
     """
     found = []
     for axis, units in _UNITS.items():
@@ -47,17 +47,17 @@ def what_would_do(evidence: Evidence, *, is_late: bool = False) -> str:
 
 
 _UNITS = {"": ("N/m", "N s/m"), "rotational ": ("N m/rad", "N m s/rad")}
-_ROUNDING = 1e-9  # of a limit found by halving, which must not cost it a digit
+_ROUNDING = 1e-9  # relative; keeps a limit found by bisection from losing a digit
 
 
 def _holds(evidence: Evidence, axis: str, part: str, share: float) -> bool:
-    """Tells whether the condition on a kind of axis holds with a share of what was asked for.
+    """Returns True if the condition on a kind of axis holds after one quantity is reduced.
 
     Args:
-        evidence: Of the run.
+        evidence: Evidence of the run.
         axis: A key of ``_UNITS``.
-        part: What is changed alone: ``stiffness``, ``damping`` or ``period``.
-        share: Of it.
+        part: Quantity changed alone: ``stiffness``, ``damping`` or ``period``.
+        share: Share of the quantity that remains.
     """
     worst, felt, method = evidence.worst, evidence.asked, evidence.method
     period = worst.period * (share if part == "period" else 1.0)
@@ -72,7 +72,7 @@ def _holds(evidence: Evidence, axis: str, part: str, share: float) -> bool:
 
 
 def _largest(holds: Callable[[float], bool]) -> float:
-    """Returns the largest share in (0, 1) that holds, where all smaller ones do; 0 where none."""
+    """Returns the largest share in (0, 1) up to which all shares hold; 0 if none does."""
     low, high = 0.0, 1.0
     if not holds(1e-6):
         return 0.0
@@ -83,12 +83,12 @@ def _largest(holds: Callable[[float], bool]) -> float:
 
 
 def _down(value: float) -> str:
-    """Formats a limit with three digits, never above it."""
+    """Formats a limit with three digits, rounded down."""
     return _three_digits(value * (1 + _ROUNDING), math.floor)
 
 
 def _up(value: float) -> str:
-    """Formats a limit with three digits, never below it."""
+    """Formats a limit with three digits, rounded up."""
     return _three_digits(value * (1 - _ROUNDING), math.ceil)
 
 

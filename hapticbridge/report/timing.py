@@ -1,4 +1,4 @@
-"""The picture of how late ticks began, and of when limiter and controller were at work."""
+"""Plot of lateness and of active limits."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ FLAGS = (
     (TickFlag.STALE_SAMPLE, "old sample"),
     (TickFlag.OVERRUN, "late tick"),
 )
-"""Flags that a page shows over time, and their names there."""
+"""Flags shown over time, and their labels."""
 
 
 def activities(evidence: Evidence) -> list[tuple[str, Flags]]:
-    """Returns what a page shows over time: names, and in which ticks it was so, (n,)."""
+    """Returns labels, and the ticks in which each was on, (n,)."""
     ticks, guarding = evidence.ticks, evidence.parameters.guarding
     found = [(name, has_flag(ticks, flag)) for flag, name in FLAGS]
     is_stale = has_flag(ticks, TickFlag.STALE_SAMPLE)
@@ -37,17 +37,17 @@ def activities(evidence: Evidence) -> list[tuple[str, Flags]]:
     if guarding.stale_ticks:
         fades = run_lengths(is_stale, 0) > guarding.stale_ticks
     trips = [event.get("tick") for event in evidence.events if event.get("event") == "trip"]
-    # the tick that trips is often not recorded: the last one before it stands for it
+    # the tick that trips is often not recorded; the last recorded one stands for it
     is_tripped = np.zeros_like(is_stale)
     is_tripped[[min(max(t, 0), len(ticks) - 1) for t in trips if isinstance(t, int)]] = True
     return [*found, ("faded: no samples", fades), ("tripped", is_tripped)]
 
 
 def draw_timing(evidence: Evidence) -> Figure:
-    """Draws how late ticks began, and when limiter, controller and the like were at work.
+    """Draws the lateness of ticks, and when limiter and controller were active.
 
-    In simulated time no tick is late, and without a controller at work nothing is injected: those
-    panels are then left out.
+    Panels without content are left out: lateness in simulated time, injected damping without an
+    active controller.
     """
     kinds = (("injected_damping", "N s/m"), ("injected_rotational_damping", "N m s/rad"))
     injected = [(evidence.ticks[f], unit) for f, unit in kinds if evidence.ticks[f].any()]
@@ -80,7 +80,7 @@ def _draw_lateness(axes: Axes, evidence: Evidence) -> None:
     lateness = 1e6 * evidence.lateness
     period = 1e6 * evidence.parameters.period
     axes.hist(lateness, bins=80, color="#1a5fb4", log=True, label="ticks")
-    # a stall of seconds would otherwise push the line of one period out of sight
+    # after a stall of seconds the line of one period would not be visible
     if lateness.max() > 0.2 * period:
         axes.axvline(period, color="#b3261e", ls="--", label="one period: a deadline is missed")
     axes.set_xlabel("lateness: start of a tick after its deadline (µs)")
@@ -89,7 +89,7 @@ def _draw_lateness(axes: Axes, evidence: Evidence) -> None:
 
 
 def _stretches(is_on: NDArray[np.bool_], time: Array) -> list[tuple[float, float]]:
-    """Returns from when to when something was on; shorter pauses than a bin are closed."""
+    """Returns start and end times of active stretches; pauses shorter than a bin are closed."""
     size = -(-len(is_on) // BINS)
     starts = np.arange(0, len(is_on), size)
     any_on = np.logical_or.reduceat(is_on, starts)

@@ -1,4 +1,4 @@
-"""Which geoms touched while the environment created energy: the run is simulated again for it."""
+"""Geoms that touched while energy was created."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from hapticbridge.recording.reader import BLOCK
 from hapticbridge.report.evidence import Evidence
 
 Pairs = dict[frozenset[int], float]
-"""Pairs of geoms, and the share of the energy that came in ticks in which they touched."""
+"""Share of the energy created while two geoms touched, by pair."""
 
 
 def touched_pairs(
     evidence: Evidence, report: AuditReport, window: slice, gained: NDArray[np.float64]
 ) -> Pairs | None:
-    """Returns which geoms touched, those of most energy first; None where nobody can tell.
+    """Returns the geoms that touched, those with most energy first; None if unknown.
 
-    A record counts contacts and does not name them, so the run is simulated again up to there.
+    A record counts contacts without naming them, so the run is simulated again up to the window.
 
     Args:
-        evidence: Of the run.
-        report: The audit's verdict on it, which says whether it can be simulated again.
-        window: Ticks to look at.
-        gained: What the environment created in each of them, (n,) in J.
+        evidence: Evidence of the run.
+        report: The audit's verdict on it, with the result of the re-simulation.
+        window: Ticks to inspect.
+        gained: Energy created in the environment in each of them, (n,) in J.
     """
     if not report.resimulation or report.resimulation.startswith(("not", "disagrees")):
         return None

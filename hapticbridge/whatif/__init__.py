@@ -1,11 +1,10 @@
-"""What if: a recorded hand, felt again through a changed bridge.
+"""Repetition of a recorded run through a changed bridge.
 
-It stands to the right of both the bridge, which it runs, and the audit, which judges all runs alike
-and must never import the bridge. Read ``what_if`` first: it takes a run apart (``recorded``, with
-its scene ``unpacked`` and its numbers ``exact``), makes ``changes``, and lets it ``repeat`` what
-happened: ``again`` with the recorded motion, and with a model hand (``hands``) that has the
-recorded hand's ``intent``. The ``outcome`` is told ``side_by_side``, as a ``picture`` or as a
-``page``.
+The package runs the bridge and the audit. The audit judges all runs alike, so it never imports the
+bridge. Read ``what_if`` first. It takes a run apart (``recorded``, ``unpacked``, ``exact``),
+applies ``changes``, and lets ``repeat`` run it: with the recorded motion (``again``), and with a
+model hand (``hands``) that follows the recorded hand's ``intent``. ``side_by_side``, ``picture``
+and ``page`` present the ``outcome``.
 """
 
 from hapticbridge.whatif.changes import changes_from as changes_from

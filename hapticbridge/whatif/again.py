@@ -1,10 +1,4 @@
-"""A recorded motion as a device, and recorded times as a clock.
-
-The motion is followed whatever the changed bridge does. That is exact, and no hand: a stiffer wall
-is pressed in as far as the softer one was. The data sheet stays that of the recorded device, so
-that guard and controller do what they would do with it. Where nothing is changed, and with the
-recorded times, such a run is the recorded one in every bit.
-"""
+"""Recorded motion as a device, and recorded times as a clock."""
 
 from __future__ import annotations
 
@@ -23,11 +17,13 @@ _STALE = int(TickFlag.STALE_SAMPLE)
 
 
 class RecordedClock:
-    """The times of a recording, tick by tick; reading and writing are told by its device.
+    """Clock that replays the times of a recording.
+
+    Its device reports reading and writing.
 
     Args:
-        ticks: The recorded rows, ``TICK_DTYPE``.
-        period: The recorded loop's in s.
+        ticks: Recorded rows, ``TICK_DTYPE``.
+        period: Recorded period in s.
     """
 
     name = SimulatedClock.name
@@ -43,34 +39,34 @@ class RecordedClock:
         self._tick, self._now = -1, 0
 
     def start(self, period_ns: int) -> None:
-        """Does nothing: the times are known."""
+        """Does nothing; the times are recorded."""
 
     def wait(self) -> tuple[int, int, int]:
-        """Goes on to the next recorded tick; see ``Clock.wait``."""
+        """Advances to the next recorded tick; see ``Clock.wait``."""
         self._tick = min(self._tick + 1, len(self._rows) - 1)
         deadline, self._now, skipped, *_ = self._rows[self._tick]
         return deadline, self._now, skipped
 
     def now(self) -> int:
-        """Returns the recorded time of what was done last."""
+        """Returns the recorded time of the latest action."""
         return self._now
 
     def note_read(self) -> None:
-        """Takes notice that the device was read."""
+        """Notes that the device was read."""
         self._now = self._rows[self._tick][3]
 
     def note_written(self) -> None:
-        """Takes notice that the wrench was sent."""
+        """Notes that the wrench was sent."""
         if self._tick >= 0:
             self._now = self._rows[self._tick][4]
 
 
 class Outside:
-    """Recorded buttons, and which samples were old, at the times of a loop of another rate.
+    """Recorded buttons and stale samples, resampled to another rate.
 
     Args:
-        ticks: The recorded rows, ``TICK_DTYPE``.
-        period: The recorded loop's in s.
+        ticks: Recorded rows, ``TICK_DTYPE``.
+        period: Recorded period in s.
     """
 
     def __init__(self, ticks: NDArray[np.void], period: float) -> None:
@@ -79,7 +75,7 @@ class Outside:
         self._rows: Iterator[int] = iter(())
 
     def start(self, period: float) -> None:
-        """Begins at the first tick of a loop of this period in s."""
+        """Starts at the first tick of a loop with this period in s."""
         share, last = period / self._period, len(self._pressed) - 1
 
         def rows() -> Iterator[int]:
@@ -91,10 +87,10 @@ class Outside:
         self._rows = rows()
 
     def read(self, sample: NDArray[np.void]) -> int:
-        """Puts the buttons of the next tick into a sample; after the last they stay as they are.
+        """Puts the next tick's buttons into a sample; after the last tick they stay.
 
         Returns:
-            ``STALE_SAMPLE`` where that sample was old, else 0.
+            ``STALE_SAMPLE`` for a stale sample, else 0.
         """
         row = next(self._rows)
         sample["buttons"] = self._pressed[row]
@@ -102,14 +98,19 @@ class Outside:
 
 
 class RecordedMotion(ReplayDevice):
-    """The recorded samples, one a tick, from where the device was before the first one.
+    """Device that replays the recorded samples, one per tick.
+
+    The motion is prescribed at any force, which is exact but no hand: it presses as deep into a
+    stiffer wall as into the recorded one. The data sheet is the recorded device's, so that guard
+    and controller act as with it. With recorded times and unchanged settings, the run equals the
+    recorded one in every bit.
 
     Args:
-        ticks: The recorded rows, ``TICK_DTYPE``, at least two.
-        clock: Of the run.
-        period: The recorded loop's in s.
+        ticks: Recorded rows, ``TICK_DTYPE``, at least two.
+        clock: Clock of the run.
+        period: Recorded period in s.
         start: Device pose (7,) before the first tick.
-        info: The recorded device's.
+        info: Data sheet of the recorded device.
 
     Raises:
         DeviceError: See ``ReplayDevice``.
@@ -129,28 +130,30 @@ class RecordedMotion(ReplayDevice):
         self._news = iter((ticks["flags"] & _STALE).tolist())
 
     def start(self, period: float) -> NDArray[np.void]:
-        """See ``Device.start``."""
+        """Implements ``Device.start``."""
         return placed(super().start(period), self._before)
 
     def read(self, sample: NDArray[np.void]) -> int:
-        """See ``Device.read``."""
+        """Implements ``Device.read``."""
         super().read(sample)
         self._clock.note_read()
         return next(self._news, 0)
 
     def write(self, wrench: NDArray[np.float64]) -> None:
-        """Ignores the wrench: the motion is prescribed."""
+        """Ignores the wrench; the motion is prescribed."""
         self._clock.note_written()
 
 
 class ResampledMotion(TrajectoryDevice):
-    """The recorded motion at another rate, linear between the samples and by slerp.
+    """Device that replays the recorded motion at another rate.
+
+    Positions are interpolated linearly, orientations by slerp.
 
     Args:
-        ticks: The recorded rows, ``TICK_DTYPE``, at least two.
-        period: The recorded loop's in s.
+        ticks: Recorded rows, ``TICK_DTYPE``, at least two.
+        period: Recorded period in s.
         start: Device pose (7,) before the first tick.
-        info: The recorded device's.
+        info: Data sheet of the recorded device.
     """
 
     def __init__(
@@ -163,21 +166,21 @@ class ResampledMotion(TrajectoryDevice):
         self._outside = Outside(ticks, period)
 
     def start(self, period: float) -> NDArray[np.void]:
-        """See ``Device.start``."""
+        """Implements ``Device.start``."""
         self._outside.start(period)
         return placed(super().start(period), self._before)
 
     def read(self, sample: NDArray[np.void]) -> int:
-        """See ``Device.read``."""
+        """Implements ``Device.read``."""
         before = self._last
         super().read(sample)
         self._last = sample[["position", "quaternion"]].tobytes()
         flags = self._outside.read(sample)
-        return flags if self._last == before else 0  # what has moved is new
+        return flags if self._last == before else 0  # a changed pose is a new sample
 
 
 def placed(sample: NDArray[np.void], pose: tuple[float, ...]) -> NDArray[np.void]:
-    """Returns a sample at a pose (7,), with the buttons of another."""
+    """Returns a sample at a pose (7,), with the buttons of another sample."""
     there = np.zeros(1, SAMPLE_DTYPE)
     there["buttons"] = sample["buttons"]
     there["position"][0], there["quaternion"][0] = pose[:3], pose[3:]
@@ -185,5 +188,5 @@ def placed(sample: NDArray[np.void], pose: tuple[float, ...]) -> NDArray[np.void
 
 
 def _unattended(info: DeviceInfo, own: DeviceInfo) -> DeviceInfo:
-    """Returns the recorded data sheet, for a device that nobody holds and whose motion ends."""
+    """Returns the recorded data sheet without motors, with the duration of the replay."""
     return replace(info, is_real=False, duration=own.duration)

@@ -1,4 +1,4 @@
-"""What may be changed, by name, and what it was."""
+"""Settings of a run that may be changed, by name."""
 
 from __future__ import annotations
 
@@ -24,28 +24,28 @@ UNITS = {
     "contact_stiffness": "N/m",
     "controller": "",
 }
-"""What may be changed beside the scene's own parameters, with units."""
+"""Settings that may be changed besides the scene's parameters, with units."""
 
 GAINS = tuple(field.name for field in fields(Coupling))
-"""K and B of translation, then of rotation."""
+"""Names of K and B of translation, then of rotation."""
 
 Value = float | int | str
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Settings:
-    """What decides a run beside scene, device and limits.
+    """Settings of a run besides scene, device and limits.
 
     Attributes:
-        coupling: K and B as asked for: what should be felt.
-        method: How the tool is rendered.
+        coupling: Requested K and B.
+        method: Rendering method.
         rate: Ticks per second.
         substeps: MuJoCo steps per tick.
         scale: Handle motion per device motion.
         force_scale: Force on the device per force on the tool.
         contact_stiffness: K_c in N/m of method ``direct``; None takes the coupling's.
         scene: Values of the scene's parameters, by name.
-        controller: Passivity controller by name; None: what the bridge chooses for the device.
+        controller: Passivity controller by name; None takes the bridge's choice for the device.
     """
 
     coupling: Coupling
@@ -59,7 +59,7 @@ class Settings:
     controller: str | None = None
 
     def value(self, name: str) -> Value | None:
-        """Returns what a name of ``UNITS`` or of the scene stands for."""
+        """Returns the value of a setting or scene parameter."""
         if name in GAINS:
             return float(getattr(self.coupling, name))
         if name == "method":
@@ -72,19 +72,19 @@ class Settings:
         return self.scene[name]
 
     def changed(self, changes: Mapping[str, Value]) -> Settings:
-        """Returns the settings with changes in the place of what was.
+        """Returns the settings with changes applied.
 
-        ``scale`` alone changes the scale of the force with it, where both were one: power stays
-        equal on both sides. A contact stiffness goes with the method that knows one.
+        If both scales were equal, a new ``scale`` also changes ``force_scale``, so that power stays
+        equal on both sides. A contact stiffness is dropped if the new method has none.
 
         Raises:
-            RecordingError: A name is unknown, or its value cannot be one.
+            RecordingError: A name is unknown, or its value is not valid.
             CouplingError: A gain is out of range.
         """
         known = {*UNITS, *self.scene}
         if unknown := [name for name in changes if name not in known]:
             raise RecordingError(
-                f"'{unknown[0]:.60}' cannot be changed; what can: {choices(UNITS)}; of the scene: "
+                f"'{unknown[0]:.60}' cannot be changed; choices: {choices(UNITS)}; of the scene: "
                 f"{choices(self.scene)}"
             )
         given = {name: _checked(name, value) for name, value in changes.items()}
@@ -110,10 +110,10 @@ class Settings:
 
 
 def changes_from(words: Iterable[str]) -> dict[str, Value]:
-    """Returns changes from words such as ``stiffness=3000`` and ``method=explicit``.
+    """Parses changes such as ``stiffness=3000`` and ``method=explicit``.
 
     Raises:
-        RecordingError: A word is not a name and a value, or a name comes twice.
+        RecordingError: A word is not a name and a value, or a name occurs twice.
     """
     changes: dict[str, Value] = {}
     for word in words:
@@ -130,7 +130,7 @@ def changes_from(words: Iterable[str]) -> dict[str, Value]:
 
 
 def _checked(name: str, value: Value) -> Value:
-    """Returns a value of the kind that its name asks for; the range is the run's to check."""
+    """Converts a value to the type of its setting; the bridge checks its range."""
     named: dict[str, Collection[object]] = {"method": METHODS, "controller": CONTROLLERS}
     if name in named:
         if value not in named[name]:

@@ -1,4 +1,4 @@
-"""Going back from a number that a run was computed with to the one that was asked for."""
+"""Exact inversion of a floating-point function."""
 
 from __future__ import annotations
 
@@ -6,24 +6,23 @@ import math
 from collections.abc import Callable
 
 NEIGHBOURS = 8
-"""Doubles on either side of a guess that are tried. A product and a sum are off by two at most;
-more would cost time alone."""
+"""Number of doubles tried on either side of a guess. A product and a sum are off by two at most;
+more would only cost time."""
 
 
 def that_gives(wanted: float, function: Callable[[float], float], guess: float) -> float:
-    """Returns the double at or beside a guess for which a function gives exactly what is wanted.
+    """Returns the input near a guess whose computed value equals the wanted one bit for bit.
 
-    A recording keeps T and B', not the rate and the B that were asked for; 1/T and B' + K T/2, put
-    in again, may end one digit in the last place beside T and B', and nothing is then repeated to
-    the bit.
+    A recording holds T and B', not the requested rate and B. Recomputed from 1/T and B' + K T/2, T
+    and B' may differ in the last digit, and the repetition would no longer be exact.
 
     Args:
-        wanted: What the function must give.
-        function: From what was asked for to what was computed with.
-        guess: Its inverse, to rounding.
+        wanted: Value to be reproduced.
+        function: Function from the input to the value.
+        guess: Approximate input.
 
     Returns:
-        The guess itself where no neighbour does better.
+        The input, or the guess if no neighbour gives the value.
     """
     up = down = guess
     for _ in range(NEIGHBOURS + 1):

@@ -1,8 +1,4 @@
-"""A model hand that moves the recorded device when a run is simulated again.
-
-It gives way, as the recorded motion (``again``) does not; what it wants follows from the recording
-(``intent``).
-"""
+"""Model hand that holds the recorded device in a repetition."""
 
 from __future__ import annotations
 
@@ -22,16 +18,18 @@ Array = NDArray[np.float64]
 
 
 def missing_for_closed_loop(info: DeviceInfo) -> str:
-    """Returns why a device's motion cannot be simulated, or nothing."""
+    """Returns the reason why a device's motion cannot be simulated, or empty."""
     if info.is_prescribed:
-        return "the recorded motion was prescribed: no device answered to the force"
+        return "the recorded motion was prescribed, so no device responded to the force"
     needed = {"mass": info.mass, "damping": info.damping}
     if info.turns:
         needed["rotational_inertia"] = info.rotational_inertia
         needed["rotational_damping"] = info.rotational_damping
     unknown = [name.replace("_", " ") for name, value in needed.items() if value is None]
     if unknown:
-        return f"the device's {' and '.join(unknown)} unknown: 'hapticbridge identify' measures it"
+        return (
+            f"unknown {' and '.join(unknown)} of the device; measure with 'hapticbridge identify'"
+        )
     return ""
 
 
@@ -57,7 +55,7 @@ class IdentifiedDevice(SimulatedDevice):
         super().__init__(
             mass=info.mass or 0.0,
             damping=info.damping or 0.0,
-            # without rotation nothing turns, whatever the inertia
+            # without rotational axes the inertia has no effect
             rotational_inertia=info.rotational_inertia or 1e-4,
             rotational_damping=info.rotational_damping or 0.0,
             hand=hand,
@@ -75,7 +73,7 @@ class IdentifiedDevice(SimulatedDevice):
         self.info = replace(info, is_real=False, duration=float(self._motion[-1, 0]))
 
     def start(self, period: float, parts: int = 1) -> NDArray[np.void]:
-        """See ``SimulatedDevice.start``; the hand may pull from the start on."""
+        """Implements ``SimulatedDevice.start``; the hand may pull from the start on."""
         self._delay = delay_ticks(self.info, period) or 0  # in ticks of this loop
         sample = super().start(period, parts)
         self._outside.start(period)
@@ -85,19 +83,19 @@ class IdentifiedDevice(SimulatedDevice):
         return self._there(sample)
 
     def read(self, sample: NDArray[np.void]) -> int:
-        """See ``SimulatedDevice.read``."""
+        """Implements ``SimulatedDevice.read``."""
         flags = super().read(sample)
-        # buttons alone: this device is never silent
+        # buttons only; this device always has new samples
         self._outside.read(sample)
         self._there(sample)
         return flags
 
     def write(self, wrench: Array) -> None:
-        """See ``SimulatedDevice.write``; what the device has no axis for does nothing."""
+        """Implements ``SimulatedDevice.write``; components without a device axis have no effect."""
         super().write(wrench * self._felt)
 
     def _there(self, sample: NDArray[np.void]) -> NDArray[np.void]:
-        """Moves a sample that counts from the start to where the recorded device was."""
+        """Moves a sample from coordinates relative to the start to the device's coordinates."""
         sample["position"][0] += self._start[:3]
         turned = Rotation.from_quat(sample["quaternion"][0], scalar_first=True) * self._origin
         sample["quaternion"][0] = turned.as_quat(canonical=True, scalar_first=True)

@@ -28,8 +28,9 @@ from hapticbridge.device.lateness import delay_ticks
 Array = NDArray[np.float64]
 
 INTENT = 8e-3
-"""Standard deviation in s of the Gaussian that smooths what the hand wants: it halves what moves at
-23 Hz, beyond what an arm does on purpose. Longer loses fast strokes, shorter keeps noise."""
+"""Standard deviation in s of the Gaussian that smooths the hand's intended motion. It halves motion
+at 23 Hz, faster than an arm moves on purpose. A longer one loses fast strokes, a shorter one keeps
+noise."""
 
 
 def intended(

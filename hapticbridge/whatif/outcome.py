@@ -1,4 +1,4 @@
-"""What came of a what-if: runs side by side."""
+"""Result of a what-if."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ from hapticbridge.recording import Recording
 from hapticbridge.whatif.changes import Value
 
 RECORDED, PRESCRIBED, CLOSED = "recorded", "prescribed", "closed loop"
-"""The runs: as recorded; the recorded motion, and a model hand, through the changed bridge."""
+"""Names of the runs: the recorded one; the recorded motion, and a model hand, through the changed
+bridge."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,12 +25,12 @@ class WhatIfRun:
 
     Attributes:
         name: ``recorded``, ``prescribed`` or ``closed loop``.
-        report: What the audit says of it.
+        report: The audit's verdict.
         peaks: Largest force and torque on tool and device in N and N m, and largest distance of
             handle and tool in m, by name.
-        trip: Why the guard stopped it, or nothing.
+        trip: Reason of the guard's stop, or empty.
         period: T in s.
-        recording: Of it; that of a changed run is in memory alone.
+        recording: Its recording; that of a changed run exists in memory only.
     """
 
     name: str
@@ -41,21 +42,21 @@ class WhatIfRun:
 
     @property
     def ticks(self) -> NDArray[np.void]:
-        """Its records, ``TICK_DTYPE``."""
+        """Records, ``TICK_DTYPE``."""
         return self.recording.ticks
 
 
 @dataclass(frozen=True, slots=True)
 class WhatIf:
-    """A recorded run, and the same hand through a changed bridge.
+    """A recorded run beside its repetitions through a changed bridge.
 
     Attributes:
         path: The recording.
         changes: Name, unit, and the value before and after.
-        runs: As recorded, prescribed, and, where the device is known, closed loop.
-        hand_error: How far the model hand is off the recorded motion where nothing is changed, root
-            of the mean square in m; NaN without closed loop. It is what the closed loop is worth.
-        notes: What to know of these runs, a sentence each.
+        runs: Recorded, prescribed and, for a known device, closed loop.
+        hand_error: RMS distance in m of the model hand from the recorded motion with unchanged
+            settings: the accuracy of the closed loop. NaN without closed loop.
+        notes: Notes on the runs, one sentence each.
     """
 
     path: Path
@@ -66,11 +67,11 @@ class WhatIf:
 
     @property
     def exit_code(self) -> int:
-        """The worst of the changed runs: 0 if all are passive, untripped and not uncertified."""
+        """Largest exit code of the changed runs; a trip counts as 1."""
         return max(max(run.report.exit_code, int(bool(run.trip))) for run in self.runs[1:])
 
     def to_json(self) -> str:
-        """Returns it as one JSON object, without the ticks."""
+        """Returns the result as one JSON object, without the ticks."""
         values = {
             "path": str(self.path),
             "changes": [

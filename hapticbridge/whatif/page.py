@@ -1,4 +1,4 @@
-"""The page of a what-if: the recorded run and the changed ones, side by side."""
+"""Page of a what-if: the recorded run beside the changed ones."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from hapticbridge.whatif.side_by_side import changes, rows, sentences
 
 
 def write_what_if(found: WhatIf, path: Path, scene: bytes | None = None) -> None:
-    """Writes one self-contained HTML page, of less than 1 MB however long the run was.
+    """Writes one self-contained HTML page of less than 1 MB, for any length of run.
 
     Args:
-        found: What came of the what-if.
-        path: Where to; an existing file is replaced.
-        scene: A picture of the recorded scene as PNG, if there is one.
+        found: Result of the what-if.
+        path: The file; an existing one is replaced.
+        scene: PNG picture of the recorded scene, or None.
 
     Raises:
         RecordingError: The page cannot be written, or not under this name.
     """
     try:
         drawn = inline_svg(figure_of(found, BINS))
-    except RecordingError:  # a run of numbers that cannot be drawn still has a verdict
+    except RecordingError:  # a run that cannot be drawn still has a verdict
         drawn = ""
     write_page(
         path,
@@ -47,7 +47,6 @@ def write_what_if(found: WhatIf, path: Path, scene: bytes | None = None) -> None
 
 
 def _told(run: WhatIfRun) -> dict[str, Any]:
-    """Returns what the page tells of one run."""
     evidence, report = Evidence.of(run.recording), run.report
     return {
         "name": run.name,

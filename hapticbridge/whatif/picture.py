@@ -1,4 +1,4 @@
-"""The picture of a what-if: force, position and energies of all runs over time."""
+"""Plot of a what-if."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from hapticbridge.whatif.outcome import WhatIf
 from hapticbridge.whatif.side_by_side import changes
 
 _STYLES = (("#555555", "-", 2.2), ("#1a5fb4", "-", 1.1), ("#b3261e", "--", 1.1))
-"""Colour, line and width in points per run; the recorded one is behind the others."""
+"""Colour, line and width in points of each run; the recorded one lies behind the others."""
 
 
 def figure_of(found: WhatIf, bins: int = BINS) -> Figure:
-    """Draws the force on the device, the way of the handle, and what both ports gave.
+    """Draws force on the device, handle displacement, and the energies of both ports over time.
 
     Args:
-        found: What came of the what-if.
-        bins: Points per curve, as ``decimated`` takes them.
+        found: Result of the what-if.
+        bins: Number of bins per curve, see ``decimated``.
 
     Raises:
-        RecordingError: A run holds nothing, or a number beyond what can be drawn.
+        RecordingError: A run holds a number that cannot be drawn.
     """
     figure = new_figure(8, 11)
     panels = figure.subplots(4, 1, sharex=True)
@@ -78,10 +78,10 @@ def figure_of(found: WhatIf, bins: int = BINS) -> Figure:
 
 
 def draw_what_if(found: WhatIf, path: Path) -> None:
-    """Writes ``figure_of`` to a picture.
+    """Writes ``figure_of`` to a picture file.
 
     Raises:
         RecordingError: It cannot be drawn.
-        HapticBridgeError: The file's ending is no picture format, or it cannot be written.
+        HapticBridgeError: The file's extension is no picture format, or it cannot be written.
     """
     write_picture(figure_of(found), path)

@@ -1,4 +1,4 @@
-"""A recorded run, taken apart so that a bridge can run it again with something changed."""
+"""A recorded run, taken apart for repetition with changes."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ from hapticbridge.whatif.unpacked import unpack_scene
 
 @dataclass(frozen=True, slots=True)
 class RecordedRun:
-    """What a recording says about its run.
+    """Description of a run from its recording.
 
     Attributes:
-        recording: It, with its ticks.
-        parameters: Of the run.
+        recording: The recording with its ticks.
+        parameters: Run parameters.
         info: The device.
-        settings: What may be changed.
-        scene_file: The scene's file, written again from what the recording carries.
+        settings: Settings that may be changed.
+        scene_file: The scene's main file, unpacked from the recording.
     """
 
     recording: Recording
@@ -54,11 +54,11 @@ class RecordedRun:
         """Takes a recording apart.
 
         Args:
-            recording: What was read.
-            folder: Gets the scene's files.
+            recording: The recording.
+            folder: Folder for the scene's files.
 
         Raises:
-            RecordingError: The recording does not tell its run, or carries no scene.
+            RecordingError: The recording does not describe its run, or carries no scene.
         """
         parameters = parameters_of(recording.meta)
         method = method_named(recording.meta["method"])
@@ -83,17 +83,17 @@ class RecordedRun:
 
     @property
     def is_absolute(self) -> bool:
-        """Whether the device's poses were poses in the scene."""
+        """True if the device's poses were poses in the scene."""
         p = self.parameters
         is_nowhere = p.device_origin == p.handle_origin == IDENTITY_POSE
         return is_nowhere and not p.guarding.reseats
 
     @property
     def limits(self) -> Limits:
-        """Of the run, times in s."""
+        """Limits of the run, times in s."""
         p, guarding = self.parameters, self.parameters.guarding
         most = p.force_limit * p.period
-        rise = 0.0  # where it may step
+        rise = 0.0  # steps are allowed
         if guarding.force_rise < math.inf:
             rise = that_gives(guarding.force_rise, lambda s: most / s, most / guarding.force_rise)
         return Limits(
@@ -109,20 +109,20 @@ class RecordedRun:
 
     @property
     def clutch(self) -> int | None:
-        """Number of the button, from 0, that let the device move without the handle."""
+        """Number of the clutch button, from 0; None without one."""
         return _button(self.parameters.guarding.clutch)
 
     @property
     def dead_man(self) -> int | None:
-        """Number of the button that had to be held for any force."""
+        """Number of the button that had to be held for any force; None without one."""
         return _button(self.parameters.guarding.dead_man)
 
     @property
     def seat(self) -> tuple[float, ...]:
-        """Device pose (7,) that the handle's counts from in the first tick.
+        """Device pose (7,) that corresponds to the handle's start pose in the first tick.
 
-        Where the device moved before it, that re-seated the coupling: what it had moved until then
-        is not to be seen in the scene.
+        A device that moved before the first tick re-anchored the coupling, so its earlier motion
+        does not appear in the scene.
         """
         first = self.recording.ticks[0]
         if not int(first["flags"]) & int(TickFlag.RESEATED):
@@ -131,7 +131,7 @@ class RecordedRun:
 
     @property
     def trip(self) -> str:
-        """Why the guard stopped the run, or nothing."""
+        """Reason of the guard's stop, or empty."""
         trips = [e for e in self.recording.events if e.get("event") == "trip"]
         return str(trips[0].get("reason", "unknown")) if trips else ""
 
@@ -145,13 +145,13 @@ class RecordedRun:
         # a default that is set may differ from the file's number in its last digit
         values = {n: v for n, v in settings.scene.items() if defaults.get(n) != v}
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # told when it was recorded
+            warnings.simplefilter("ignore", UserWarning)  # reported during the recorded run
             return load_scene(self.scene_file, self.parameters.grip, **values)
 
     def is_scene_as_recorded(self) -> bool:
-        """Whether the attached sources give the very model that was recorded.
+        """Returns True if the attached sources compile to the recorded model.
 
-        They do not where a program changed the model after it was loaded.
+        They do not if a program changed the model after loading.
         """
         scene, settings = self.scene(self.settings), self.settings
         step = settings.rate, settings.substeps, settings.method
@@ -161,7 +161,7 @@ class RecordedRun:
 
 
 def _asked_for(used: Coupling, method: Method, step: float) -> Coupling:
-    """Returns the coupling of which a method makes this one, to the bit: what should be felt."""
+    """Returns the requested coupling that a method turns into this law's coupling, to the bit."""
     felt = method.rendered(used, step)
 
     def made(name: str, value: float) -> float:
@@ -175,7 +175,7 @@ def _asked_for(used: Coupling, method: Method, step: float) -> Coupling:
 
 
 def _controller(info: DeviceInfo, parameters: RunParameters, method: Method) -> str | None:
-    """Returns the run's passivity controller; None if it is what a bridge chooses by itself."""
+    """Returns the run's passivity controller; None if it is the bridge's default."""
     p = parameters
     scales = p.scale, p.force_scale
     needed = needed_on_axes(info, p.coupling, p.period, *scales, p.laws, method)

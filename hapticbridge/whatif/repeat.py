@@ -1,4 +1,4 @@
-"""Runs a bridge through what happened in a recorded run: its inputs, commands and pauses."""
+"""Repetition of a run's inputs, commands and pauses."""
 
 from __future__ import annotations
 
@@ -25,21 +25,21 @@ from hapticbridge.whatif.changes import GAINS, Settings
 from hapticbridge.whatif.recorded import RecordedRun
 
 _BY_STATE = (STRETCHED, TWISTED, GAVE_ENERGY)
-"""Trips for what the tick before left behind, whatever the sample: that tick can be repeated."""
+"""Trips caused by the state after the previous tick, at any sample; that tick can be repeated."""
 
 Event = Mapping[str, Any]
 
 
 class Repetition:
-    """One run again, with some settings.
+    """One repetition of a run with given settings.
 
     Args:
-        run: What was recorded.
-        settings: Of the bridge.
+        run: The recorded run.
+        settings: Settings of the bridge.
 
     Attributes:
-        settings: Of the bridge.
-        warned: What the scene was warned of, a sentence each.
+        settings: Settings of the bridge.
+        warned: Warnings about the scene, one sentence each.
     """
 
     def __init__(self, run: RecordedRun, settings: Settings) -> None:
@@ -82,13 +82,13 @@ class Repetition:
                 self._repeat(bridge)
             except SafetyTrip as error:
                 trip = str(error)
-        # where the scene was unpacked to tells nobody anything
+        # the temporary path of the unpacked scene means nothing to the reader
         told = [str(each.message).replace(str(run.scene_file), "") for each in caught]
         self.warned = tuple(dict.fromkeys(text.removeprefix("scene '': ") for text in told))
         return bridge.period, trip
 
     def _repeat(self, bridge: Bridge) -> None:
-        """Runs as long as was recorded, with what was done from outside at its times."""
+        """Runs for the recorded number of ticks, with recorded actions at their times."""
         due = deque(
             (math.ceil(int(event["tick"]) * self._per_tick - 1e-9), event)
             for each in self._run.recording.events
@@ -116,7 +116,7 @@ class Repetition:
             bridge.run(bridge.period, on_tick)
 
     def _ends(self) -> list[int]:
-        """Returns the ticks before which the recorded run paused, and the last."""
+        """Returns the ticks at which the recorded run paused, and the end."""
         events = self._run.recording.events
         pauses = [int(e["tick"]) for e in events if e.get("event") == "resume"]
         return [*pauses, len(self._run.recording.ticks)]
@@ -126,7 +126,7 @@ class Repetition:
         return self._run.trip in [trip_reason(code, last) for code in _BY_STATE]
 
     def _repeated(self, event: Event) -> Event | None:
-        """Returns what to do for a recorded event under these settings, or nothing."""
+        """Returns the action that repeats a recorded event under these settings, or None."""
         name = event.get("event")
         if name == "coupling":
             return self._coupling(event) if self.keeps_couplings else None
@@ -136,18 +136,18 @@ class Repetition:
 
     @property
     def keeps_couplings(self) -> bool:
-        """Whether changes of the coupling in mid-run are repeated: not where one is set instead."""
+        """True if recorded changes of the coupling are repeated; a new coupling replaces them."""
         old, new = self._run.settings.coupling, self.settings.coupling
         is_kept = (old.stiffness, old.damping) == (new.stiffness, new.damping)
         return is_kept and self.settings.method.has_law
 
     @property
     def keeps_resets(self) -> bool:
-        """Whether resets are repeated: a tool without mass is where the hand is."""
+        """True if resets are repeated; a massless tool has nothing to reset."""
         return self.settings.method.has_coupling
 
     def _coupling(self, event: Event) -> Event:
-        """Returns a change of the coupling that is felt alike under these settings."""
+        """Returns a change to the same effective coupling under these settings."""
         old, new, period = self._run.settings, self.settings, 1.0 / self.settings.rate
         if replace(new, scene=old.scene, controller=old.controller) == old:
             return event

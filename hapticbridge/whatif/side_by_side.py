@@ -1,4 +1,4 @@
-"""The runs of a what-if as rows of a table: a name, and a text per run."""
+"""Table of a what-if's runs."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Row = tuple[str, tuple[str, ...]]
 
 
 def rows(found: WhatIf) -> Iterator[Row]:
-    """Yields what is told of all runs, in the order of ``found.runs``."""
+    """Yields a name and a text per run, in the order of ``found.runs``."""
     runs = found.runs
     yield "verdict", tuple(f"{r.report.words}, tripped" if r.trip else r.report.words for r in runs)
     for name in runs[0].peaks:
@@ -29,13 +29,13 @@ def rows(found: WhatIf) -> Iterator[Row]:
 
 
 def changes(found: WhatIf) -> Iterator[tuple[str, str, str]]:
-    """Yields what was changed: name, and the value before and after with its unit."""
+    """Yields each change: name, and the value before and after with its unit."""
     for name, unit, before, after in found.changes:
         yield name, f"{_told(before)} {unit}".rstrip(), f"{_told(after)} {unit}".rstrip()
 
 
 def sentences(run: WhatIfRun) -> Iterator[str]:
-    """Yields what else is to be said of a run: why it is not passive, and why it was stopped."""
+    """Yields the reasons why a run is not passive and why it was stopped."""
     if run.report.verdict != "passive":
         yield run.report.reason
     if run.trip:

@@ -1,4 +1,4 @@
-"""The scene's own files, as a recording carries them, in a folder again."""
+"""Scene files of a recording."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from hapticbridge.recording import Recording
 
 
 def unpack_scene(recording: Recording, folder: Path) -> Path:
-    """Writes the files of the scene that a recording carries; returns the main one.
+    """Writes a recording's scene files to a folder; returns the main file.
 
     Args:
-        recording: What was read.
-        folder: Where to; made if missing. Nothing is written outside it.
+        recording: The recording.
+        folder: Target folder, created if missing. Nothing is written outside it.
 
     Raises:
         RecordingError: The recording carries no scene, or files that cannot be written there.
@@ -24,7 +24,7 @@ def unpack_scene(recording: Recording, folder: Path) -> Path:
         if not name.startswith(SOURCE_PREFIX):
             continue
         inner = PurePosixPath(name.removeprefix(SOURCE_PREFIX))
-        # a recording from elsewhere must not write beside the folder
+        # a foreign recording must not write outside the folder
         if inner.is_absolute() or ".." in inner.parts or "\\" in name or ":" in name:
             raise RecordingError(
                 f"the attachment {name!r:.80} would lie outside the scene's folder"
@@ -39,5 +39,5 @@ def unpack_scene(recording: Recording, folder: Path) -> Path:
             ) from None
         main = main or path
     if main is None:
-        raise RecordingError(f"{recording.path} carries no scene: nothing can be simulated again")
+        raise RecordingError(f"{recording.path} carries no scene, so it cannot be simulated again")
     return main

@@ -1,4 +1,4 @@
-"""Runs a recorded hand through a changed bridge, and sets the runs side by side."""
+"""Repetition of a recorded run through a changed bridge, beside the original."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def what_if(
     tell(0, 4, "auditing what was recorded")
     report = audit(path, strict=strict)
     if report.verdict == "invalid":
-        raise RecordingError(f"what is invalid cannot be simulated again: {report.reason}")
+        raise RecordingError(f"an invalid recording cannot be simulated again: {report.reason}")
     recording = read_recording(path)
     with TemporaryDirectory(prefix="hapticbridge-") as name:
         folder = Path(name)
@@ -66,7 +66,7 @@ def what_if(
 
 
 class _Experiment:
-    """Runs one recorded run in variations."""
+    """Repetitions of one recorded run."""
 
     def __init__(
         self,
@@ -85,15 +85,15 @@ class _Experiment:
         self._concerns: dict[str, None] = {}
 
     def changed(self, changes: Mapping[str, Value]) -> WhatIf:
-        """Returns all runs."""
+        """Runs all repetitions and returns the result."""
         run, settings = self._run, self._run.settings
         new = settings.changed(changes)
         is_changed = new != settings
         notes = []
         if not run.is_scene_as_recorded():
             notes.append(
-                "the attached scene does not give the recorded model: a program changed it after "
-                "it was loaded, or it was compiled elsewhere; these runs are without that change"
+                "the attached scene does not compile to the recorded model: a program changed it "
+                "after loading, or it was compiled elsewhere; these runs lack that change"
             )
         runs = [self._as_recorded()]
         self._tell(1, 4, "the recorded motion")
@@ -102,7 +102,7 @@ class _Experiment:
             notes.append(self._agreement())
         notes.extend(_unrepeated(run, Repetition(run, new)))
         if runs[0].trip:
-            notes.append("what was recorded ends in a trip: these runs end there, too")
+            notes.append("the recorded run ends in a trip, so these runs end there too")
         hand_error = math.nan
         if missing := missing_for_closed_loop(run.info):
             notes.append(f"no closed loop: {missing}")
@@ -114,7 +114,7 @@ class _Experiment:
             runs.append(self._closed(new) if is_changed else same)
             notes.append(
                 f"with nothing changed the model hand is {1e3 * hand_error:.3g} mm off the "
-                "recorded motion (root mean square); how it gives way to changed forces is assumed"
+                "recorded motion (root mean square); its response to changed forces is assumed"
             )
         told = tuple(
             (name, UNITS.get(name, ""), settings.value(name), new.value(name)) for name in changes
@@ -161,7 +161,7 @@ class _Experiment:
         return self._folder / "run.mcap"
 
     def _agreement(self) -> str:
-        """Says whether the run that was just made is the recorded one."""
+        """Compares the prescribed run with the recorded one."""
         found = compare(self._run.recording.path, self._path)
         if found.first is None and not any(found.alone):
             return "with nothing changed the prescribed run is the recorded one in every bit"
@@ -169,28 +169,28 @@ class _Experiment:
             return f"with nothing changed the prescribed run has {found.ticks[1]} ticks"
         first = found.first
         return (
-            f"with nothing changed the prescribed run parts from the recorded one at tick "
-            f"{first.ticks[0]} in {first.column}, by {first.size:.3g} {first.unit}"
+            f"with nothing changed the prescribed run differs from the recorded one from tick "
+            f"{first.ticks[0]} on, in {first.column}, by {first.size:.3g} {first.unit}"
         )
 
 
 def _unrepeated(run: RecordedRun, repetition: Repetition) -> Iterator[str]:
-    """Says what these runs have not of the recorded one."""
+    """Yields sentences on parts of the recorded run that these runs do not repeat."""
     counts = Counter(event.get("event") for event in run.recording.events)
     if counts["coupling"] and not repetition.keeps_couplings:
         yield (
-            f"the coupling was changed {counts['coupling']} times when it was recorded; here it is "
-            "one all the time"
+            f"the coupling was changed {counts['coupling']} times in the recorded run; here it is "
+            "constant"
         )
     if counts["reset"] and not repetition.keeps_resets:
-        yield f"{counts['reset']} resets when it was recorded, none here: there is nothing to reset"
+        yield f"{counts['reset']} resets in the recorded run, none here: there is nothing to reset"
     flags = run.recording.ticks["flags"]
     is_resampled = repetition.settings.rate != run.settings.rate
     if missed := int(np.count_nonzero(flags & int(TickFlag.OVERRUN))):
         here = "none in these runs" if is_resampled else "none in the closed loop"
         yield (
-            f"late ticks: {missed} when it was recorded, {here}: what the hand did "
-            "meanwhile it does there in one tick"
+            f"late ticks: {missed} in the recorded run, {here}: the hand's motion meanwhile "
+            "falls into one tick there"
         )
     if is_resampled:
         yield (
