@@ -212,7 +212,7 @@ class Run:
             controller=self.controller,
             clutch=self.clutch,
             dead_man=self.dead_man,
-            live=not self.as_json,
+            live=not self.as_json and (err.is_terminal or not self.fast),
             onlooker=window,
             realtime=self.realtime or None,
         )
