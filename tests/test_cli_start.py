@@ -1,17 +1,75 @@
-"""The first seconds of a command, in which everything is imported."""
+"""Start of a command: what is imported for it, its entry in the table, and what ends it early."""
 
 from __future__ import annotations
 
+import importlib
+import inspect
 import os
-import signal
+import re
 import subprocess
 import sys
+from dataclasses import fields
+from typing import Any
 
 import pytest
+from cli_cases import Called
 
-from hapticbridge.signals import leaving_on_interrupt
+from hapticbridge.cli.main import COMMANDS
 
-COMMAND = [sys.executable, "-m", "hapticbridge", "scenes"]
+HEAVY = frozenset(
+    {"numpy", "mujoco", "numba", "llvmlite", "scipy", "matplotlib", "tyro", "rich", "mcap"}
+)
+"""Packages that neither the version nor the top-level help needs."""
+
+NOT_FOR_A_RUN = frozenset(
+    {
+        "matplotlib",
+        "scipy.signal",
+        "scipy.spatial",
+        "scipy.stats",
+        "scipy.optimize",
+        "jinja2",
+        "PIL",
+        "viser",
+        "websockets",
+        "usb",
+        "hid",
+        "dask",
+        "pyarrow",
+        "h5py",
+        "hapticbridge.device.discovery",
+        "hapticbridge.device.falcon",
+        "hapticbridge.device.forcedimension",
+        "hapticbridge.device.haply",
+        "hapticbridge.device.pid",
+        "hapticbridge.device.rawhid",
+        "hapticbridge.device.spacemouse",
+        "hapticbridge.device.transport",
+        "hapticbridge.audit.report",
+        "hapticbridge.check",
+        "hapticbridge.doctor",
+        "hapticbridge.film",
+        "hapticbridge.identify",
+        "hapticbridge.mechanics",
+        "hapticbridge.picture",
+        "hapticbridge.report",
+        "hapticbridge.study",
+        "hapticbridge.view.server",
+        "hapticbridge.whatif",
+    }
+)
+"""Packages and modules that a run with the simulated device, without view, does not need."""
+
+LOADED = """
+import sys
+from hapticbridge.cli import main
+try:
+    code = main(sys.argv[1:])
+finally:
+    print("loaded:", *sys.modules, file=sys.stderr)
+sys.exit(code)
+"""
+"""Runs a command and lists the modules that are imported by its end."""
 
 INTERRUPTED = """
 import builtins, os, signal, sys
@@ -33,32 +91,99 @@ sys.exit(main(["scenes"]))
 """Ctrl-C in the middle of the imports."""
 
 
+def loaded_by(*arguments: str) -> set[str]:
+    """Returns the modules that a command imports."""
+    command = [sys.executable, "-c", LOADED, *arguments]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    return set(done.stderr.split("loaded:")[1].split())
+
+
+def command_class(name: str) -> Any:
+    module = importlib.import_module(f"hapticbridge.cli.{COMMANDS[name].module}")
+    return getattr(module, name.capitalize())
+
+
+@pytest.mark.parametrize("flag", ["--version", "--help"])
+def test_version_and_help_import_nothing_heavy(flag: str) -> None:
+    assert not HEAVY & loaded_by(flag)
+
+
+def test_a_run_imports_nothing_that_it_does_not_use() -> None:
+    loaded = loaded_by("run", "point_mass", "--fast", "--duration", "0.01")
+    assert "hapticbridge.bridge" in loaded
+    assert not NOT_FOR_A_RUN & loaded
+
+
+@pytest.mark.parametrize("name", sorted(NOT_FOR_A_RUN - {"viser", "dask", "hid"}))
+def test_what_a_run_must_not_import_exists(name: str) -> None:
+    """A module that was renamed would no longer be watched."""
+    assert importlib.util.find_spec(name) is not None
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_the_table_has_the_summary_of_each_command(name: str) -> None:
+    documentation = inspect.getdoc(command_class(name))
+    assert documentation is not None
+    assert documentation.splitlines()[0] == COMMANDS[name].summary
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_first_options_are_options(name: str) -> None:
+    command = command_class(name)
+    options = [field.name for field in fields(command)]
+    first = getattr(command, "FIRST_OPTIONS", options)
+    assert set(first) <= set(options)
+    assert len(first) <= 12
+
+
+def test_the_top_level_help_fits_one_screen(call: Called) -> None:
+    code, out, _ = call("--help")
+    lines = out.splitlines()
+    assert code == 0
+    assert len(lines) < 24  # the prompt has the last line
+    assert max(map(len, lines)) < 80
+    for name, entry in COMMANDS.items():
+        assert re.search(rf"^  {name} +{re.escape(entry.summary)}$", out, flags=re.MULTILINE)
+
+
+def test_a_long_help_has_two_parts(call: Called) -> None:
+    code, out, _ = call("run", "--help")
+    assert code == 0
+    assert "--record PATH" in out and "--clutch" not in out
+    more = re.search(r"(\d+) more options: hapticbridge run --help-all", out)
+    assert more is not None
+    code, every, _ = call("run", "--help-all")
+    assert code == 0
+    assert "--record PATH" in every and "--clutch INT" in every and "more options" not in every
+    flags = [set(re.findall(r"^. (--[a-z-]+)", text, flags=re.MULTILINE)) for text in (out, every)]
+    assert flags[0] < flags[1]
+    assert len(flags[1]) - len(flags[0]) == int(more[1])
+
+
+@pytest.mark.parametrize(
+    ("word", "sentence"),
+    [
+        ("exprot", "error: there is no command 'exprot'; did you mean 'export'?"),
+        ("xyz", "error: there is no command 'xyz'; 'hapticbridge --help' lists the commands"),
+        ("--fast", "error: there is no option '--fast'; 'hapticbridge --help' lists the commands"),
+    ],
+)
+def test_a_wrong_command_is_one_sentence(word: str, sentence: str, call: Called) -> None:
+    assert call(word) == (2, "", sentence + "\n")
+
+
 @pytest.mark.parametrize("value", ["nonsense", "[red]\n"])
 def test_a_renderer_that_mujoco_does_not_know_is_one_sentence(value: str) -> None:
+    command = [sys.executable, "-m", "hapticbridge", "scenes"]
     environment = os.environ | {"MUJOCO_GL": value}
-    done = subprocess.run(COMMAND, env=environment, capture_output=True, text=True, check=False)
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout) == (2, "")
     (line,) = done.stderr.splitlines()
     assert line.startswith(f"error: the environment variable MUJOCO_GL is {value!r}")
     assert "'disable'" in line
 
 
-def test_ctrl_c_while_it_imports_is_silence_and_exit_code_130() -> None:
+def test_ctrl_c_while_it_imports_is_exit_code_130_without_a_traceback() -> None:
     command = [sys.executable, "-c", INTERRUPTED]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stdout, done.stderr) == (130, "", "")
-
-
-def test_whoever_has_set_sigint_to_something_else_keeps_it() -> None:
-    def kept(_number: int, _frame: object) -> None: ...
-
-    before = signal.signal(signal.SIGINT, kept)
-    try:
-        with leaving_on_interrupt(130):
-            assert signal.getsignal(signal.SIGINT) is kept
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-        with leaving_on_interrupt(130):
-            assert signal.getsignal(signal.SIGINT) is not signal.default_int_handler
-        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
-    finally:
-        signal.signal(signal.SIGINT, before)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "interrupted\n")

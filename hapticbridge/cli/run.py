@@ -216,7 +216,7 @@ class Run:
             clutch=self.clutch,
             dead_man=self.dead_man,
             mark=self.mark,
-            live=not self.as_json,
+            live=not self.as_json and (err.is_terminal or not self.fast),
             onlooker=window,
             realtime=self.realtime or None,
         )
