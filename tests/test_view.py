@@ -47,11 +47,10 @@ from page_client import PATIENCE, hand, said
 from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 
+from hapticbridge.view.geometry import Tendons
 from hapticbridge.view.process import LiveRun, run_of
-from hapticbridge.view.props import props_of
 from hapticbridge.view.replay import Replay, Theatre, contacts_of
 from hapticbridge.view.sight import Sight
-from hapticbridge.view.tendons import Tendons
 
 # viser's threads and sockets end with the process
 pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
@@ -134,30 +133,6 @@ def test_late_ticks_are_seen_however_short(floor: Path) -> None:
     trace = Trace()
     trace.add(rows, 0.0)
     assert trace.curves()[1][-1].tolist() == [251.0]
-
-
-def test_every_shape_is_drawn_at_its_size(tmp_path: Path) -> None:
-    shapes = {
-        "box": ("0.1 0.2 0.3", (0.1, 0.2, 0.3)),
-        "sphere": ("0.1", (0.1, 0.1, 0.1)),
-        "ellipsoid": ("0.1 0.2 0.3", (0.1, 0.2, 0.3)),
-        "capsule": ("0.1 0.2", (0.1, 0.1, 0.3)),
-        "cylinder": ("0.1 0.2", (0.1, 0.1, 0.2)),
-        "plane": ("0.1 0.2 1", (0.1, 0.2, 0.0)),
-    }
-    geoms = "".join(
-        f'<geom type="{kind}" size="{size}" rgba="1 0 0 0.5"/>'
-        for kind, (size, _) in shapes.items()
-    )
-    hidden = '<geom size="1" group="3"/><geom size="1" rgba="1 1 1 0"/>'
-    text = f"<mujoco><worldbody>{geoms}{hidden}</worldbody></mujoco>"
-    props = props_of(mujoco.MjModel.from_xml_string(text))
-    assert len(props) == len(shapes)
-    for prop, (_, half) in zip(props, shapes.values(), strict=True):
-        corners = prop.triangles.reshape(-1, 3)
-        np.testing.assert_allclose(corners.max(axis=0), half, rtol=0.02, atol=1e-9)
-        np.testing.assert_allclose(corners.min(axis=0), np.negative(half), rtol=0.02, atol=1e-9)
-        assert prop.skin.image.tolist() == [[[255, 0, 0, 128]]]
 
 
 class Watcher:

@@ -13,11 +13,9 @@ from numpy.typing import NDArray
 from hapticbridge.felt import coupling_sentences, is_always_held
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.rendering import method_named
-from hapticbridge.view.absent import left_out
+from hapticbridge.view.geometry import NOT_DRAWN, Tendons, props_of
 from hapticbridge.view.ghost import LONGEST_ARROW, Ghost, linear
-from hapticbridge.view.props import props_of
 from hapticbridge.view.sight import Sight
-from hapticbridge.view.tendons import Tendons
 from hapticbridge.view.trace import PLOTS
 
 Array = NDArray[np.float64]
@@ -143,9 +141,14 @@ class Page:
             body: scene.add_frame(f"/body{body}", show_axes=False) for body in range(model.nbody)
         }
         for index, prop in enumerate(props_of(model)):
-            scene.add_glb(
+            red, green, blue = np.round(255.0 * prop.colour[:3]).astype(int).tolist()
+            scene.add_mesh_simple(
                 f"/body{prop.body}/geom{index}",
-                prop.glb(),
+                np.asarray(prop.mesh.vertices),
+                np.asarray(prop.mesh.faces),
+                color=(red, green, blue),
+                opacity=float(prop.colour[3]) if prop.colour[3] < 1.0 else None,
+                side="double",
                 position=prop.place,
                 wxyz=prop.turn,
             )
@@ -207,6 +210,5 @@ def _told(model: mujoco.MjModel, parameters: RunParameters, facts: dict[str, str
         parameters.substeps,
         is_always_held=is_always_held(model, parameters.grip),
     )
-    lines = [f"Method **{method.name}**, {1 / parameters.period:g} Hz", *sentences]
-    lines += left_out(model, parameters.grip)
+    lines = [f"Method **{method.name}**, {1 / parameters.period:g} Hz", *sentences, NOT_DRAWN]
     return "  \n".join(lines)

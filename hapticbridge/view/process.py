@@ -27,10 +27,10 @@ from hapticbridge.recording import RecordingFile, Ring
 from hapticbridge.recording.snapshot import Snapshot
 from hapticbridge.view.address import Address
 from hapticbridge.view.controls import SHARED, Controls, Outlet, allowance_of
+from hapticbridge.view.geometry import Tendons
 from hapticbridge.view.page import Page
 from hapticbridge.view.server import serve
 from hapticbridge.view.sight import Sight
-from hapticbridge.view.tendons import Tendons
 from hapticbridge.view.trace import Trace
 
 FRAME = 1 / 30

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.view.tendons import Tendons
+from hapticbridge.view.geometry import Tendons
 
 Array = NDArray[np.float64]
 

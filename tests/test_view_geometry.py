@@ -1,0 +1,411 @@
+"""Shapes on the page: where MuJoCo has them, and the ghost, the spring and the arrow."""
+
+from __future__ import annotations
+
+import warnings
+from types import SimpleNamespace
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+pytest.importorskip("viser", reason="needs the extra 'view'")
+
+import trimesh
+
+from hapticbridge.view.geometry import (
+    MOST_SAMPLES,
+    MOST_TIMES,
+    SHELL,
+    Prop,
+    Surfaces,
+    Tendons,
+    coil,
+    enlargement,
+    props_of,
+    shell,
+    terrain,
+)
+from hapticbridge.view.ghost import FARTHEST, LONGEST_ARROW, Ghost, linear
+from hapticbridge.view.sight import Sight
+
+Array = NDArray[np.float64]
+
+RX, RY, RZ, BASE = 0.3, 0.2, 0.1, 0.05
+
+FIELD = """<mujoco>
+  <asset><hfield name="hills" nrow="{rows}" ncol="{columns}" size="0.3 0.2 0.1 0.05"/></asset>
+  <worldbody><geom type="hfield" hfield="hills" pos="0.5 -0.2 0.1" euler="0 0 30"/></worldbody>
+</mujoco>"""
+
+TORUS = """<mujoco>
+  <extension>
+    <plugin plugin="mujoco.sdf.torus">
+      <instance name="torus">
+        <config key="radius1" value="0.35"/>
+        <config key="radius2" value="0.15"/>
+      </instance>
+    </plugin>
+  </extension>
+  <asset><mesh name="torus"><plugin instance="torus"/></mesh></asset>
+  <worldbody><geom type="sdf" mesh="torus"><plugin instance="torus"/></geom></worldbody>
+</mujoco>"""
+
+PULLED = """<mujoco>
+  <worldbody>
+    <site name="a" pos="0 0 1"/>
+    <geom name="wheel" type="cylinder" size="0.1 0.1" pos="0.3 0 0.8" euler="90 0 0"/>
+    <body pos="0.6 0 0.5">
+      <joint name="lift" type="slide" axis="0 0 1"/>
+      <geom size="0.05"/>
+      <site name="b"/>
+    </body>
+  </worldbody>
+  <tendon>
+    <spatial name="hidden" width="0.01" group="3"><site site="a"/><site site="b"/></spatial>
+    <spatial name="straight" width="0.02" rgba="1 0 0 1"><site site="a"/><site site="b"/></spatial>
+    <fixed name="nowhere"><joint joint="lift" coef="1"/></fixed>
+    <spatial name="around"><site site="a"/><geom geom="wheel"/><site site="b"/></spatial>
+    <spatial name="in two" width="0.01">
+      <site site="a"/><site site="b"/><pulley divisor="2"/><site site="b"/><site site="a"/>
+    </spatial>
+  </tendon>
+</mujoco>"""
+
+
+def hills(rows: int, columns: int) -> tuple[mujoco.MjModel, Prop]:
+    """A field without any symmetry, and what is drawn of it."""
+    model = mujoco.MjModel.from_xml_string(FIELD.format(rows=rows, columns=columns))
+    model.hfield_data[:] = np.random.default_rng(4).uniform(size=rows * columns)
+    [prop] = props_of(model)
+    return model, prop
+
+
+def world(prop: Prop) -> Array:
+    turn = np.zeros(9)
+    mujoco.mju_quat2Mat(turn, prop.turn)
+    return np.asarray(prop.mesh.triangles @ turn.reshape(3, 3).T + prop.place)
+
+
+def first_hit(corners: Array, point: Array, way: Array) -> float:
+    """Returns how far the first of triangles is along a ray, or −1 as MuJoCo says for none."""
+    edges = [corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]]
+    systems = np.stack([*edges, np.broadcast_to(-way, edges[0].shape)], axis=2)
+    is_met = np.abs(np.linalg.det(systems)) > 1e-12
+    solved = np.linalg.solve(systems[is_met], (point - corners[is_met, 0])[..., None])
+    u, v, far = solved[..., 0].T
+    is_hit = (u >= 0) & (v >= 0) & (u + v <= 1) & (far > 0)
+    return float(far[is_hit].min()) if is_hit.any() else -1.0
+
+
+@pytest.mark.parametrize(("rows", "columns"), [(2, 2), (3, 7), (8, 5)])
+def test_a_ray_from_any_side_meets_the_field_where_mujocos_ray_does(
+    rows: int, columns: int
+) -> None:
+    model, prop = hills(rows, columns)
+    data, corners = mujoco.MjData(model), world(prop)
+    mujoco.mj_forward(model, data)
+    random, met = np.random.default_rng(5), 0
+    for _ in range(200):
+        point = prop.place + random.normal(size=3)
+        way = prop.place + random.uniform(-0.25, 0.25, 3) - point
+        way /= np.linalg.norm(way)
+        theirs = mujoco.mj_ray(model, data, point, way, None, 1, -1, np.zeros(1, np.int32))
+        assert first_hit(corners, point, way) == pytest.approx(theirs, abs=1e-6)
+        met += theirs > 0
+    assert met > 50
+
+
+def test_every_sample_stands_at_its_row_and_column() -> None:
+    model, prop = hills(3, 4)
+    samples = model.hfield_data.reshape(3, 4)
+    corners = {tuple(corner) for corner in np.round(prop.mesh.triangles.reshape(-1, 3), 6)}
+    for row, y in enumerate((-RY, 0.0, RY)):
+        for column, x in enumerate((-RX, -RX / 3, RX / 3, RX)):
+            z = RZ * float(samples[row, column])
+            assert tuple(np.round((x, y, z), 6)) in corners
+    assert {corner[2] for corner in corners if corner[2] < 0} == {-BASE}
+
+
+def test_a_field_is_closed_and_its_outside_is_outside() -> None:
+    model, prop = hills(4, 6)
+    one, two, three = np.moveaxis(prop.mesh.triangles, 1, 0)
+    # of a closed surface the areas cancel, and the volume is that of the prisms under the samples
+    np.testing.assert_allclose(np.cross(two - one, three - one).sum(axis=0), 0.0, atol=1e-12)
+    volume = np.einsum("ij,ij->", one, np.cross(two, three)) / 6
+    s = RZ * model.hfield_data.reshape(4, 6).astype(float)
+    low, across = s[:-1, :-1] + s[1:, 1:], s[:-1, 1:] + s[1:, :-1]
+    cell = 4 * RX * RY / 15
+    assert volume == pytest.approx(cell * (low / 3 + across / 6 + BASE).sum(), rel=1e-6)
+
+
+def test_the_facets_that_a_tool_feels_are_seen() -> None:
+    _, prop = hills(6, 6)
+    flat = prop.mesh.face_normals[:, None].repeat(3, axis=1)
+    smooth = np.asarray(prop.mesh.vertex_normals)[prop.mesh.faces]
+    assert np.abs(smooth - flat).max() < 1e-6
+
+
+def test_of_a_fine_field_samples_are_left_out_but_never_its_edge() -> None:
+    model, _ = hills(MOST_SAMPLES, 5)
+    assert len(terrain(model, 0)) > 2 * 4 * (MOST_SAMPLES - 1)
+    model, prop = hills(MOST_SAMPLES + 1, 5)
+    corners = prop.mesh.triangles.reshape(-1, 3)
+    assert len(np.unique(corners[:, 1])) == MOST_SAMPLES // 2 + 1
+    np.testing.assert_allclose(corners.max(axis=0)[:2], (RX, RY))
+    np.testing.assert_allclose(corners.min(axis=0), (-RX, -RY, -BASE))
+    last = RZ * model.hfield_data.reshape(-1, 5)[-1]
+    edge = {round(float(z), 6) for _, y, z in corners if y == RY}
+    assert {round(float(z), 6) for z in last[[0, 2, 4]]} <= edge
+
+
+def test_a_signed_distance_field_is_drawn_where_the_distance_is_zero() -> None:
+    [prop] = props_of(mujoco.MjModel.from_xml_string(TORUS))
+    x, y, z = prop.mesh.triangles.reshape(-1, 3).T
+    off = np.hypot(np.hypot(x, y) - 0.35, z) - 0.15
+    assert np.abs(off).max() < 2e-3  # MuJoCo's triangles are 5 mm
+    one, two, three = np.moveaxis(prop.mesh.triangles, 1, 0)
+    area = 0.5 * np.linalg.norm(np.cross(two - one, three - one), axis=1).sum()
+    assert area == pytest.approx(4 * np.pi**2 * 0.35 * 0.15, rel=5e-3)
+
+
+def test_tendons_run_where_mujoco_measures_them() -> None:
+    model = mujoco.MjModel.from_xml_string(PULLED)
+    data, tendons = mujoco.MjData(model), Tendons(model)
+    np.testing.assert_allclose(tendons.widths, 2 * model.tendon_width[[1, 3, 4]])
+    np.testing.assert_allclose(tendons.colours[0], (1, 0, 0, 1))
+    for lift in (0.0, -0.05):
+        data.qpos[0] = lift
+        mujoco.mj_kinematics(model, data)
+        straight, around, halves = (np.array(each, float) for each in tendons.pieces(data))
+        ends = np.array([[0, 0, 1], [0.6, 0, 0.5 + lift]])
+        np.testing.assert_allclose(straight, ends[None], atol=1e-6)
+        np.testing.assert_allclose(halves, np.stack([ends, ends[::-1]]), atol=1e-6)
+        # joined, from site to site, along the wheel and never inside of it
+        np.testing.assert_allclose(around[1:, 0], around[:-1, 1], atol=1e-6)
+        np.testing.assert_allclose(np.stack([around[0, 0], around[-1, 1]]), ends, atol=1e-6)
+        from_axis = np.hypot(around[..., 0] - 0.3, around[..., 2] - 0.8)
+        assert from_axis.min() == pytest.approx(0.1, abs=2e-3)
+        mujoco.mj_forward(model, data)
+        length = np.linalg.norm(around[:, 1] - around[:, 0], axis=1).sum()
+        assert length == pytest.approx(data.ten_length[model.tendon("around").id], rel=2e-3)
+
+
+def test_a_scene_without_tendons_has_none() -> None:
+    model = mujoco.MjModel.from_xml_string("<mujoco/>")
+    assert Tendons(model).pieces(mujoco.MjData(model)) == ()
+
+
+def test_every_shape_is_drawn_at_its_size() -> None:
+    shapes = {
+        "box": ("0.1 0.2 0.3", (0.1, 0.2, 0.3)),
+        "sphere": ("0.1", (0.1, 0.1, 0.1)),
+        "ellipsoid": ("0.1 0.2 0.3", (0.1, 0.2, 0.3)),
+        "capsule": ("0.1 0.2", (0.1, 0.1, 0.3)),
+        "cylinder": ("0.1 0.2", (0.1, 0.1, 0.2)),
+        "plane": ("0.1 0.2 1", (0.1, 0.2, 0.0)),
+    }
+    geoms = "".join(
+        f'<geom type="{kind}" size="{size}" rgba="1 0 0 0.5"/>'
+        for kind, (size, _) in shapes.items()
+    )
+    hidden = '<geom size="1" group="3"/><geom size="1" rgba="1 1 1 0"/>'
+    text = f"<mujoco><worldbody>{geoms}{hidden}</worldbody></mujoco>"
+    props = props_of(mujoco.MjModel.from_xml_string(text))
+    assert len(props) == len(shapes)
+    for prop, (_, half) in zip(props, shapes.values(), strict=True):
+        corners = prop.mesh.triangles.reshape(-1, 3)
+        np.testing.assert_allclose(corners.max(axis=0), half, rtol=0.02, atol=1e-9)
+        np.testing.assert_allclose(corners.min(axis=0), np.negative(half), rtol=0.02, atol=1e-9)
+        np.testing.assert_allclose(prop.colour, (1, 0, 0, 0.5))
+
+
+def test_a_geom_has_its_own_colour_or_its_materials_and_of_a_texture_the_mean() -> None:
+    model = mujoco.MjModel.from_xml_string("""<mujoco>
+      <asset>
+        <texture name="t" type="2d" builtin="checker" width="8" height="8"
+          rgb1="1 0 0" rgb2="0 0 1"/>
+        <texture name="c" type="cube" builtin="flat" width="8" height="48" rgb1="0 0.4 0" rgb2="0 0.4 0"/>
+        <material name="plain" rgba="0.2 0.4 0.6 1"/>
+        <material name="checker" texture="t" rgba="1 1 0.5 1"/>
+        <material name="cube" texture="c" rgba="1 1 1 0.25"/>
+      </asset>
+      <worldbody>
+        <geom size="1"/>
+        <geom size="1" material="plain"/>
+        <geom size="1" material="plain" rgba="1 0 0 1"/>
+        <geom size="1" material="checker"/>
+        <geom size="1" material="cube"/>
+      </worldbody>
+    </mujoco>""")
+    expected = [
+        (0.5, 0.5, 0.5, 1),
+        (0.2, 0.4, 0.6, 1),
+        (1, 0, 0, 1),
+        (0.5, 0, 0.25, 1),
+        (0, 0.4, 0, 0.25),
+    ]
+    np.testing.assert_allclose([prop.colour for prop in props_of(model)], expected, atol=3e-3)
+
+
+def test_round_surfaces_are_round_and_edges_are_sharp() -> None:
+    geoms = '<geom type="sphere" size="0.1"/><geom type="box" size="0.1 0.1 0.1"/>'
+    model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{geoms}</worldbody></mujoco>")
+    ball, box = (prop.mesh for prop in props_of(model))
+    np.testing.assert_allclose(ball.vertex_normals, ball.vertices / 0.1, atol=0.02)
+    along = np.abs(box.vertex_normals).max(axis=1)
+    np.testing.assert_allclose(along, 1.0)  # each along one axis
+
+
+TOOL = """<mujoco>
+  <statistic extent="1"/>
+  <worldbody>
+    <geom type="plane" size="1 1 0.1"/>
+    <body pos="0.3 0 0.5" euler="0 30 0">
+      <freejoint/>
+      <geom type="box" size="0.05 0.06 0.2"/>
+      <body pos="0 0 0.25"><geom size="0.05"/></body>
+      <geom type="box" size="0.9 0.9 0.9" group="3"/>
+      <site name="grip" pos="0 0 0.1" euler="20 0 0"/>
+    </body>
+  </worldbody>
+</mujoco>"""
+
+
+class Canvas:
+    """Takes what is drawn."""
+
+    def __getattr__(self, _: str) -> Any:
+        return lambda name, *_, **__: self.__dict__.setdefault(name, SimpleNamespace())
+
+
+def sight(handle: tuple[float, float, float], force: tuple[float, float, float]) -> Sight:
+    one, nothing = np.array([1.0, 0, 0, 0]), np.zeros((0, 3))
+    return Sight(
+        time=0.0,
+        places=nothing,
+        turns=np.zeros((0, 4)),
+        handle=np.array(handle),
+        handle_turn=one,
+        grip=np.zeros(3),
+        force=np.array(force),
+        contact_places=nothing,
+        contact_forces=nothing,
+    )
+
+
+def test_the_ghost_is_all_of_the_tool_that_is_seen_and_a_little_larger() -> None:
+    model = mujoco.MjModel.from_xml_string(TOOL)
+    found = shell(model, "grip")
+    # back from the grip's frame to the tool's
+    turn = np.zeros(9)
+    mujoco.mju_quat2Mat(turn, model.site_quat[0])
+    corners = found.vertices @ turn.reshape(3, 3).T + model.site_pos[0]
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    np.testing.assert_allclose(high[:2], (0.05, 0.06), atol=SHELL)
+    assert (high[:2] > (0.05, 0.06)).all()
+    assert high[2] == pytest.approx(0.3 + SHELL, abs=1e-3)
+    assert low[2] == pytest.approx(-0.2 - SHELL / np.sqrt(3), abs=5e-3)
+
+
+def test_a_tool_that_nobody_sees_has_a_ghost_all_the_same() -> None:
+    bare = TOOL.replace('size="0.05 0.06 0.2"', 'size="0.05 0.06 0.2" group="3"')
+    bare = bare.replace('<geom size="0.05"/>', '<geom size="0.05" group="3"/>')
+    ball = shell(mujoco.MjModel.from_xml_string(bare), "grip")
+    assert np.linalg.norm(ball.vertices, axis=1).max() == pytest.approx(2 * SHELL, rel=0.01)
+
+
+@pytest.mark.parametrize("stretch", [1e-4, 0.4])
+def test_spring_and_arrow_point_to_where_the_hand_is_pulled(stretch: float) -> None:
+    canvas: Any = Canvas()
+    ghost = Ghost(canvas, mujoco.MjModel.from_xml_string(TOOL), "grip")
+    seen = sight((0, 0, -stretch), (0, 0, -5.0))  # pushed down, the tool is above
+    ghost.show(seen, 10.0)
+    line = canvas.__dict__["/coupling"].points
+    start, end = line[0, 0], line[-1, 1]
+    np.testing.assert_allclose(canvas.__dict__["/handle"].position, seen.handle)
+    if stretch == 0.4:  # which can be seen: from handle to tool
+        assert ghost.times == 1
+        np.testing.assert_allclose(start, seen.handle, atol=1e-6)
+        np.testing.assert_allclose(end, seen.grip, atol=1e-6)
+    else:
+        assert ghost.times == MOST_TIMES
+        # out of the box, which is turned by 20 degrees, on its side of 0.06 m or at its end
+        out = min((0.06 + SHELL) / np.sin(np.radians(20)), 0.2 + SHELL + 0.05)
+        assert 0.1 < start[2] - seen.handle[2] <= out
+        np.testing.assert_allclose(end - start, (0, 0, ghost.times * stretch), atol=1e-6)
+    tail, tip = canvas.__dict__["/force in the hand"].points[0]
+    np.testing.assert_allclose(tail, end, atol=1e-6)
+    np.testing.assert_allclose(tip - tail, (0, 0, 0.5 * LONGEST_ARROW), atol=1e-6)
+
+
+def test_the_spring_is_pale_at_rest_and_red_at_the_largest_force() -> None:
+    canvas: Any = Canvas()
+    ghost = Ghost(canvas, mujoco.MjModel.from_xml_string(TOOL), "grip")
+    found = []
+    for strength in (0.0, 10.0):
+        ghost.show(sight((0, 0, 1e-3), (0, 0, strength)), 10.0)
+        found.append(canvas.__dict__["/coupling"].colors[0, 0].tolist())
+    (red, green, blue), (full_red, full_green, _) = found
+    assert min(red, green, blue) > 100
+    assert blue > red
+    assert full_red > 3 * full_green
+
+
+def test_the_way_out_is_to_the_last_surface() -> None:
+    balls = [trimesh.creation.icosphere(subdivisions=4, radius=radius) for radius in (0.5, 1.0)]
+    balls[1].apply_translation((0, 0, 3.0))
+    triangles = np.concatenate([ball.triangles for ball in balls])
+    both = Surfaces(triangles)
+    assert both.way_out(np.array([0.0, 0, 1])) == pytest.approx(4.0, rel=1e-3)
+    for along in ((1, 0, 0), (0, 0, -1), (0.6, 0.0, -0.8)):
+        assert both.way_out(np.array(along, float)) == pytest.approx(0.5, rel=5e-3)
+    assert Surfaces(balls[1].triangles).way_out(np.array([1.0, 0, 0])) == 0.0
+
+
+def test_a_surface_seen_edge_on_or_without_area_is_not_in_the_way() -> None:
+    edge_on = [[0.0, 0, 1], [0, 0, 2], [0, 1, 2]]
+    no_area = [[0.0, 0, 1], [0, 0, 1], [1, 0, 1]]
+    found = Surfaces(np.array([edge_on, no_area]))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert found.way_out(np.array([0.0, 0, 1])) == 0.0
+
+
+@given(st.floats(1e-9, 10.0), st.floats(0.0, 10.0))
+def test_a_stretch_is_drawn_as_long_as_there_is_room_in_round_numbers(
+    room: float, stretch: float
+) -> None:
+    times = enlargement(room, stretch)
+    assert str(times).rstrip("0") in {"1", "2", "5"}
+    assert times <= MOST_TIMES
+    assert times == 1 or times * stretch <= room * (1 + 1e-6)
+    assert times == MOST_TIMES or 2.5 * times * stretch > room * (1 - 1e-6)
+
+
+def test_the_longest_stretch_so_far_decides() -> None:
+    ghost = Ghost(Canvas(), mujoco.MjModel.from_xml_string(TOOL), "grip")
+    seen = []
+    for stretch in (1e-3, FARTHEST / 20, 1e-3):
+        ghost.allow(stretch)
+        seen.append(ghost.times)
+    assert seen == [200, 20, 20]
+
+
+@given(st.tuples(*[st.floats(-1, 1)] * 6))
+def test_a_spring_is_one_line_from_end_to_end(ends: tuple[float, ...]) -> None:
+    start, end = np.array(ends[:3]), np.array(ends[3:])
+    line = coil(start, end, 0.01)
+    np.testing.assert_allclose(line[0, 0], start, atol=1e-9)
+    np.testing.assert_allclose(line[-1, 1], end, atol=1e-9)
+    np.testing.assert_allclose(line[1:, 0], line[:-1, 1])
+
+
+def test_colours_of_lines_are_shares_of_light() -> None:
+    # IEC 61966-2-1: half of the light is 188, a fifth 124
+    assert linear((255, 0, 0)) == (255, 0, 0)
+    assert linear((188, 124, 10)) == pytest.approx((128, 51, 1), abs=1)
