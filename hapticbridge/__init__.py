@@ -13,11 +13,11 @@ what stays of a run and ``audit`` the second opinion on it. Imports go one way, 
 from typing import TYPE_CHECKING
 
 from hapticbridge.audit import audit as audit  # beside it stands the package of that name
-from hapticbridge.on_demand import on_demand
+from hapticbridge.lazy import lazy_exports
 
 if TYPE_CHECKING:
-    from hapticbridge import mechanics as mechanics
-    from hapticbridge import passivity as passivity
+    from hapticbridge import theory as mechanics
+    from hapticbridge import theory as passivity
     from hapticbridge.audit import AuditReport as AuditReport
     from hapticbridge.bridge import Bridge as Bridge
     from hapticbridge.clock import RealClock as RealClock
@@ -38,11 +38,11 @@ if TYPE_CHECKING:
     from hapticbridge.scene import scene_names as scene_names
     from hapticbridge.summary import Summary as Summary
 else:
-    __getattr__, __dir__, __all__ = on_demand(
+    __getattr__, __dir__, __all__ = lazy_exports(
         __name__,
         {
-            "mechanics": "hapticbridge.mechanics",
-            "passivity": "hapticbridge.passivity",
+            "mechanics": "hapticbridge.theory",
+            "passivity": "hapticbridge.theory",
             "AuditReport": "hapticbridge.audit",
             "Bridge": "hapticbridge.bridge",
             "RealClock": "hapticbridge.clock",

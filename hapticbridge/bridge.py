@@ -16,15 +16,15 @@ import mujoco
 import numpy as np
 
 from hapticbridge.clock import slept_ns
-from hapticbridge.commanded import Commanded
 from hapticbridge.errors import DeviceError, HapticBridgeError, SafetyTrip
 from hapticbridge.guard import trip_reason
-from hapticbridge.kernel.ahead import can_split
 from hapticbridge.kernel.codes import BAD_RESULT, HALF_DONE, OK, RING_FULL
+from hapticbridge.kernel.tick import can_split
 from hapticbridge.realtime import Grant, real_time, warn_of_refusals
+from hapticbridge.record import TickFlag
+from hapticbridge.session import Commanded
 from hapticbridge.signals import stopping_on_signals
 from hapticbridge.summary import Summary
-from hapticbridge.tick import TickFlag
 
 SUSPENDED_NS = 50_000_000
 """A sleep of the machine longer than this ends the run: nobody knows what became of the hand, of

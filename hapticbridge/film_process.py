@@ -17,11 +17,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
-from hapticbridge.audit.rerun import Rerun, obstacle
+from hapticbridge.audit.replay import Resimulator, obstacle
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.kernel.parameters import RunParameters
-from hapticbridge.provenance import parameters_of
 from hapticbridge.recording import RecordingFile, Timeline, open_recording
+from hapticbridge.run_description import parameters_of
 
 PLACE = 1e-4
 """Largest distance in m of the tool, simulated again, from its record. It is less than a pixel.
@@ -97,7 +97,7 @@ class Stage:
         if reason:
             raise RecordingError(f"'{path}' cannot be drawn: {reason}")
         self.parameters: RunParameters = parameters_of(self.recording.meta)
-        self._run = Rerun(self.recording, self.parameters)
+        self._run = Resimulator(self.recording, self.parameters)
         self.model = self._run.model
         self.data = mujoco.MjData(self.model)
         self._rest = self.recording.blocks()

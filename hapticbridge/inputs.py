@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from hapticbridge.errors import SceneError, choices
-from hapticbridge.kernel.names import COUPLING_ACTUATORS, HANDLE
+from hapticbridge.kernel.codes import COUPLING_ACTUATORS, HANDLE
 
 Write = tuple[str, int, list[float]]
 """Field of ``mjData``, index of the first number in it, and the numbers."""

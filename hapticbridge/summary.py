@@ -3,19 +3,190 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Literal
 
+import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.certificate import condition_sentences, is_run_certified, run_conditions
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo
-from hapticbridge.felt import coupling_sentences
+from hapticbridge.kernel.codes import COUPLING_ACTUATORS, LOSSLESS
+from hapticbridge.kernel.lossless import tree_of_tool
 from hapticbridge.kernel.parameters import RunParameters
-from hapticbridge.ledger import Ledger
+from hapticbridge.record import TickFlag
 from hapticbridge.rendering import Method
+from hapticbridge.theory.compensation import IMPLICIT_LAG, effective_damping
+
+# Sentences on the effective coupling and its law.
+
+
+def is_always_held(model: mujoco.MjModel, grip: str) -> bool:
+    """Returns True if a lossless coupling stays implicit because the tool is never free.
+
+    Args:
+        model: The compiled scene with its handle.
+        grip: Name of the site on the tool.
+
+    References:
+        ``kernel.tree.ToolTree.is_never_free`` lists the causes.
+    """
+    own = [model.actuator(name).id for name in COUPLING_ACTUATORS]
+    return tree_of_tool(model, int(model.site(grip).bodyid[0]), own).is_never_free
+
+
+def was_always_held(ticks: NDArray[np.void]) -> bool:
+    """Returns True if no record of a run was lossless; False without records."""
+    return was_never_lossless(len(ticks), int(np.bitwise_or.reduce(ticks["flags"])))
+
+
+def was_never_lossless(count: int, flags: int) -> bool:
+    """Returns True if no record was lossless, by the number of records and their combined flags."""
+    return count > 0 and not flags & int(TickFlag.MIDPOINT)
+
+
+def coupling_sentences(
+    used: Coupling, method: Method, period: float, substeps: int, *, is_always_held: bool = False
+) -> tuple[str, ...]:
+    """Describes effective and law coupling: translation, then rotation if it has a spring.
+
+        B = B' + adds K h,    h = T / substeps        (away from contact, to first order in h)
+
+    A hand feels K and B. The law uses a smaller B' if the integration adds damping by itself, and
+    the device condition b >= K T/2 + B' counts B'.
+
+    Args:
+        used: K and B' of the law.
+        method: The rendering method; without a coupling law there are no sentences.
+        period: T in s.
+        substeps: MuJoCo steps per tick.
+        is_always_held: True if the tool of a lossless coupling is never free. The coupling is then
+            always implicit and adds the implicit form's damping. No effect on other methods.
+    """
+    if not method.has_law:
+        return ()
+    kinds = [("K", "B", used.stiffness, used.damping, "N/m", "N s/m")]
+    if used.rotational_stiffness > 0:
+        rotation = used.rotational_stiffness, used.rotational_damping
+        kinds.append(("K_r", "B_r", *rotation, "N m/rad", "N m s/rad"))
+    name, adds = method.name, method.adds
+    if is_always_held and method.scheme == LOSSLESS:
+        name, adds = f"{name}, here always implicit,", IMPLICIT_LAG
+    return tuple(_sentence(name, adds, period / substeps, substeps, *kind) for kind in kinds)
+
+
+def _sentence(
+    name: str,
+    adds: float | None,
+    step: float,
+    substeps: int,
+    spring: str,
+    damper: str,
+    stiffness: float,
+    damping: float,
+    spring_unit: str,
+    damper_unit: str,
+) -> str:
+    start = f"{spring} = {stiffness:.4g} {spring_unit}, {damper} ="
+    if adds is None:
+        return f"{start} {damper}' = {damping:.4g} {damper_unit} ({name} uses it as asked)"
+    felt = effective_damping(stiffness, damping, step, adds)
+    parts = substeps / adds
+    added = ("KT" if spring == "K" else f"{spring} T") + (f"/{parts:g}" if parts != 1 else "")
+    return (
+        f"{start} {felt:.4g} {damper_unit} felt ({name} adds {added} to its {damper}' = "
+        f"{damping:.4g})"
+    )
+
+
+# Energies metered by the kernel, and the environment's verdict.
+
+Environment = Literal["strict", "within slack", "active"]
+
+
+@dataclass(frozen=True, slots=True)
+class Ledger:
+    """Energies of a run in J; all but the storage are cumulative since its start.
+
+    E_k = S_k − S_{k−1} − (works of all ports in tick k). The environment has released no more
+    energy than it received while Σ E_k <= 0 (BC97 (14)). The device stays safe while Σ E_k stays
+    below the slack, Σ ½‖δx_k‖²_{K+B/T} and its rotational counterpart.
+
+    Attributes:
+        kinetic: Present kinetic energy.
+        potential: Present potential energy of gravity and springs.
+        coupling_work: Work of the coupling on the tool, Σ f_k·δx_k + τ_k·δφ_k.
+        actuator_work: Work of the scene's own actuators.
+        external_work: Work of applied forces, gravity compensation, moved mocap bodies and resets.
+        tuning_work: Work on the coupling's spring by commands that changed it (``kernel.tuning``).
+        environment_energy: Σ E_k: energy created (> 0) or dissipated (< 0) by the simulation.
+        device_energy: Energy given to the device by the wrenches sent.
+        slack: Bound of Σ E_k up to which the guarantee holds.
+        slack_share: Largest share of the slack used so far; 0 if always strict.
+        first_unstrict: First tick at which (14) did not hold, or None.
+        first_active: First tick at which the slack was exceeded, or None.
+        first_kick: First tick at which a device without a coupling law had received more than its
+            damping dissipates and the scene released, or None.
+    """
+
+    kinetic: float
+    potential: float
+    coupling_work: float
+    actuator_work: float
+    external_work: float
+    tuning_work: float
+    environment_energy: float
+    device_energy: float
+    slack: float
+    slack_share: float
+    first_unstrict: int | None
+    first_active: int | None
+    first_kick: int | None
+
+    @classmethod
+    def of(cls, state: NDArray[np.void]) -> Ledger:
+        """Reads the ledger from the kernel's state (``STATE_DTYPE``, one element)."""
+        values = {name: float(state[name][0]) for name in _ENERGIES}
+        ticks = [int(state[name][0]) for name in _TICKS]
+        unstrict, active, kick = (tick if tick >= 0 else None for tick in ticks)
+        return cls(**values, first_unstrict=unstrict, first_active=active, first_kick=kick)
+
+    @property
+    def environment(self) -> Environment:
+        """``strict`` if (14) always held, ``within slack`` or ``active``."""
+        if self.first_active is not None:
+            return "active"
+        return "strict" if self.first_unstrict is None else "within slack"
+
+    @property
+    def fault(self) -> tuple[int, str] | None:
+        """Tick and port of the first fault, ``environment`` or ``device``; None if passive."""
+        faults = ((self.first_active, "environment"), (self.first_kick, "device"))
+        found = [(tick, port) for tick, port in faults if tick is not None]
+        return min(found) if found else None
+
+    def energies(self) -> dict[str, float]:
+        """Returns the energies by name, in J."""
+        return {name: value for name, value in asdict(self).items() if name in _ENERGIES[:-1]}
+
+
+_ENERGIES = (
+    "kinetic",
+    "potential",
+    "coupling_work",
+    "actuator_work",
+    "external_work",
+    "tuning_work",
+    "environment_energy",
+    "device_energy",
+    "slack",
+    "slack_share",
+)
+
+_TICKS = ("first_unstrict", "first_active", "first_kick")
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,21 +11,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.audit import AuditReport, audit
-from hapticbridge.audit.balance import Balance
-from hapticbridge.audit.interventions import Interventions
-from hapticbridge.audit.reached import Reached
+from hapticbridge.audit.energy import EnergyBalance, Reached
+from hapticbridge.audit.events import RunEvents
 from hapticbridge.bridge import Bridge
 from hapticbridge.clock import SimulatedClock
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import AXES, Device, DeviceInfo
 from hapticbridge.guard import Limits
-from hapticbridge.kernel.guarding import UNGUARDED
-from hapticbridge.kernel.parameters import RunParameters
-from hapticbridge.provenance import MODEL_ATTACHMENT, STARTS, meta_start
+from hapticbridge.kernel.parameters import UNGUARDED, RunParameters
+from hapticbridge.record import SAMPLE_DTYPE, TICK_DTYPE
 from hapticbridge.recording import Attachment, Recording, RecordingWriter
+from hapticbridge.run_description import MODEL_ATTACHMENT, STARTS, meta_start
 from hapticbridge.scene import Scene
 from hapticbridge.summary import Summary
-from hapticbridge.tick import SAMPLE_DTYPE, TICK_DTYPE
 
 COUPLING = Coupling(
     stiffness=2400.0, damping=0.5, rotational_stiffness=2.4, rotational_damping=5e-4
@@ -50,11 +48,11 @@ TAP = """t,x,y,z,qw,qx,qy,qz
 """A hand that taps the mouth of the hole in every direction, off centre and tilted."""
 
 
-def balance_of(recording: Recording, parameters: RunParameters) -> Balance:
+def balance_of(recording: Recording, parameters: RunParameters) -> EnergyBalance:
     """Returns the balance of a whole recording from where its metadata says that it began."""
     starts = {name: meta_start(recording.meta, name) for name in STARTS}
     home = np.array(starts["tool_start"])
-    return Balance.of(
+    return EnergyBalance.of(
         recording.ticks,
         parameters,
         Reached.at_start(
@@ -63,7 +61,7 @@ def balance_of(recording: Recording, parameters: RunParameters) -> Balance:
             home,
             starts["start_kinetic"][0] + starts["start_potential"][0],
         ),
-        Interventions.of(recording.events, parameters, home),
+        RunEvents.of(recording.events, parameters, home),
     )
 
 

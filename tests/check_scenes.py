@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 from outside_scenes import hand_rows
 
-from hapticbridge.check.case import Case, open_case
-from hapticbridge.check.faults import Fault
-from hapticbridge.check.rules import find_faults
+from hapticbridge.check.case import SceneUnderCheck, open_case
+from hapticbridge.check.fault import Fault
+from hapticbridge.check.run_faults import find_faults
 from hapticbridge.scene import read_scene, scene_path
 
 MAIN = """<mujoco model="bench">
@@ -215,7 +215,7 @@ GOOD_CONTACT = '<default><geom solref="0.002 1" solimp="0.9 0.95 0.001"/></defau
 KEY = f'<key name="home" qpos="{START}"/>'
 
 
-def case_of(scene: Path, **options: object) -> Case:
+def case_of(scene: Path, **options: object) -> SceneUnderCheck:
     return open_case(read_scene(scene), **options)  # type: ignore[arg-type] # by the test
 
 

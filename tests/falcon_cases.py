@@ -9,7 +9,7 @@ from emulated.handle import Handle
 from emulated.virtual_usb import VirtualClock, VirtualLink, VirtualTime
 
 from hapticbridge.device import SimulatedDevice
-from hapticbridge.device.falcon.driver import FalconDevice
+from hapticbridge.device.falcon.device import FalconDevice
 
 PERIOD = 1e-3
 PERIOD_NS = 1_000_000

@@ -7,8 +7,8 @@ from typing import Any
 from emulated.haply_service import HaplyService, VirtualLink, VirtualTime
 
 from hapticbridge.device import SimulatedDevice
-from hapticbridge.device.haply.driver import HaplyDevice
-from hapticbridge.device.haply.finding import opened as open_on
+from hapticbridge.device.haply.device import HaplyDevice
+from hapticbridge.device.haply.device import opened as open_on
 
 PERIOD = 1e-3
 

@@ -21,13 +21,12 @@ from scipy.spatial.transform import Rotation
 from hapticbridge.coupling import Coupling
 from hapticbridge.kernel.codes import OK
 from hapticbridge.kernel.parameters import RunParameters
-from hapticbridge.kernel.simulation import simulate
-from hapticbridge.kernel.state import Binding
-from hapticbridge.kernel.step import after_step, before_step
-from hapticbridge.ledger import Ledger
+from hapticbridge.kernel.state import BoundKernel
+from hapticbridge.kernel.tick import after_step, before_step, simulate
+from hapticbridge.record import SAMPLE_DTYPE, TICK_DTYPE
 from hapticbridge.rendering import prepare
 from hapticbridge.scene import Scene, load_scene
-from hapticbridge.tick import SAMPLE_DTYPE, TICK_DTYPE
+from hapticbridge.summary import Ledger
 
 Array: TypeAlias = NDArray[np.float64]
 OnTick: TypeAlias = Callable[[int, Any], None]
@@ -92,7 +91,7 @@ class Run:
 
     scene: Scene
     parameters: RunParameters
-    binding: Binding
+    binding: BoundKernel
     ticks: NDArray[np.void]
     tool_start: Array
     handle_start: Array
@@ -161,14 +160,14 @@ def bind(
     substeps: int = 1,
     device_start: tuple[float, ...] = IDENTITY,
     **changes: Any,
-) -> tuple[Binding, RunParameters]:
+) -> tuple[BoundKernel, RunParameters]:
     """Prepares a scene for ``implicit`` and binds the kernel to it, without force limits."""
     prepare(scene, coupling, period, substeps)
     parameters = unlimited(scene, coupling, period, substeps, device_start, **changes)
-    return Binding(scene.model, scene.data, parameters), parameters
+    return BoundKernel(scene.model, scene.data, parameters), parameters
 
 
-def run_of(scene: Scene, binding: Binding, parameters: RunParameters) -> Run:
+def run_of(scene: Scene, binding: BoundKernel, parameters: RunParameters) -> Run:
     """Returns a run without ticks: call it before the first one."""
     state = binding.state[0]
     return Run(

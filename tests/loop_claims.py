@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import hapticbridge as hb
-from hapticbridge.tick import CLOCK_FIELDS, TickFlag
+from hapticbridge.record import CLOCK_FIELDS, TickFlag
 
 
 def peg_went_in_a_tick_late(summary: hb.Summary, recording: Path) -> NDArray[np.void]:

@@ -9,12 +9,12 @@ from kernel_runs import Array, unlimited
 from scipy.spatial.transform import Rotation
 
 from hapticbridge.coupling import Coupling
-from hapticbridge.kernel.simulation import simulate
-from hapticbridge.kernel.state import Binding
-from hapticbridge.ledger import Ledger
+from hapticbridge.kernel.state import BoundKernel
+from hapticbridge.kernel.tick import simulate
+from hapticbridge.record import SAMPLE_DTYPE, TICK_DTYPE
 from hapticbridge.rendering import METHODS, prepare
 from hapticbridge.scene import Scene, load_scene
-from hapticbridge.tick import SAMPLE_DTYPE, TICK_DTYPE
+from hapticbridge.summary import Ledger
 
 LOSSLESS = METHODS["lossless"]
 T = 1e-3
@@ -55,12 +55,12 @@ def scene_of(xml: str, folder: Path) -> Scene:
     return load_scene(path)
 
 
-def bound(scene: Scene, method: str, asked: Coupling, period: float) -> Binding:
+def bound(scene: Scene, method: str, asked: Coupling, period: float) -> BoundKernel:
     """Returns a kernel bound to a scene at its start, rendering what is asked for."""
     used = METHODS[method].used(asked, period)
     prepare(scene, asked, period, 1, METHODS[method], warns=False)
     parameters = unlimited(scene, used, period, scheme=METHODS[method].scheme)
-    return Binding(scene.model, scene.data, parameters)
+    return BoundKernel(scene.model, scene.data, parameters)
 
 
 def led(

@@ -12,7 +12,7 @@ import hapticbridge as hb
 from hapticbridge.audit import AuditReport
 from hapticbridge.device import SimulatedDevice, TrajectoryDevice
 from hapticbridge.guard import Limits
-from hapticbridge.kernel.guarding import UNGUARDED
+from hapticbridge.kernel.parameters import UNGUARDED
 from hapticbridge.scene import Scene
 
 NEVER = 1e9

@@ -9,8 +9,8 @@ from emulated.pid_layouts import ODD, USUAL, Report
 from emulated.pid_model import PidStick
 
 from hapticbridge.device import SimulatedDevice
-from hapticbridge.device.pid.driver import PidDevice, open_pid
-from hapticbridge.device.plugged import tell_nobody
+from hapticbridge.device.family import ignore_message
+from hapticbridge.device.pid.device import PidDevice, open_pid
 
 PERIOD = 1e-3
 
@@ -34,4 +34,4 @@ def opened(model: PidStick | None = None, **options: object) -> tuple[PidDevice,
     model = model or PidStick(SimulatedDevice())
     seam = HidSeam(model)
     seam.advance(0.0)
-    return open_pid({**SCALE, **options}, tell_nobody, seam), model, seam
+    return open_pid({**SCALE, **options}, ignore_message, seam), model, seam

@@ -6,9 +6,8 @@ from emulated.hid_seam import HidSeam
 from emulated.rawhid_model import Claims, RawHid
 
 from hapticbridge.device import SimulatedDevice
-from hapticbridge.device.plugged import tell_nobody
-from hapticbridge.device.rawhid.driver import RawHidDevice
-from hapticbridge.device.rawhid.finding import open_rawhid
+from hapticbridge.device.family import ignore_message
+from hapticbridge.device.rawhid.device import RawHidDevice, open_rawhid
 
 PERIOD = 1e-3
 
@@ -17,7 +16,7 @@ def opened(model: RawHid | None = None, **options: object) -> tuple[RawHidDevice
     """Returns the driver, opened; the device; and what it is plugged into."""
     model = model or RawHid(SimulatedDevice())
     seam = HidSeam(model)
-    return open_rawhid(options, tell_nobody, seam, lambda: seam.now), model, seam
+    return open_rawhid(options, ignore_message, seam, lambda: seam.now), model, seam
 
 
 def paddle() -> RawHid:

@@ -8,8 +8,8 @@ import numpy as np
 from mcap.reader import SeekingReader
 from numpy.typing import NDArray
 
+from hapticbridge.record import TICK_DTYPE
 from hapticbridge.recording import Attachment, RecordingWriter
-from hapticbridge.tick import TICK_DTYPE
 
 EPOCH = 1_700_000_000_000_000_000
 

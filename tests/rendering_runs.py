@@ -12,11 +12,11 @@ from scipy.spatial.transform import Rotation
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import AXES, DeviceInfo
 from hapticbridge.guard import Limits
-from hapticbridge.kernel.simulation import simulate
-from hapticbridge.kernel.state import Binding
-from hapticbridge.rendering import contact_stiffness_of, method_named, prepare
+from hapticbridge.kernel.state import BoundKernel
+from hapticbridge.kernel.tick import simulate
+from hapticbridge.record import SAMPLE_DTYPE, TICK_DTYPE
+from hapticbridge.rendering import method_named, prepare, resolve_contact_stiffness
 from hapticbridge.scene import Scene
-from hapticbridge.tick import SAMPLE_DTYPE, TICK_DTYPE
 
 FREE_MASS = """
 <mujoco>
@@ -71,10 +71,10 @@ def rendered(
         substeps=substeps,
         scheme=chosen.scheme,
         felt=felt,
-        contact_stiffness=contact_stiffness_of(chosen, coupling, contact_stiffness),
+        contact_stiffness=resolve_contact_stiffness(chosen, coupling, contact_stiffness),
         **changes,
     )
-    binding = Binding(scene.model, scene.data, parameters)
+    binding = BoundKernel(scene.model, scene.data, parameters)
     run = run_of(scene, binding, parameters)
     rows = np.zeros(len(samples), TICK_DTYPE)
     done = simulate(binding.state, samples, binding.row, rows)

@@ -17,8 +17,8 @@ from hapticbridge.bridge import Bridge
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Hand, SimulatedDevice
 from hapticbridge.guard import Limits
+from hapticbridge.record import TickFlag
 from hapticbridge.recording import Recording
-from hapticbridge.tick import TickFlag
 
 LOOSE = Coupling(stiffness=2000, damping=0.2, rotational_stiffness=2, rotational_damping=5e-4)
 

@@ -14,19 +14,17 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from hapticbridge.audit import audit
-from hapticbridge.audit.differences import turn_between
+from hapticbridge.audit.motion import turn_between
 from hapticbridge.bridge import Bridge
 from hapticbridge.clock import SimulatedClock
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import SafetyTrip
-from hapticbridge.provenance import (
-    parameters_of,
-)
+from hapticbridge.record import CLOCK_FIELDS, TICK_DTYPE
 from hapticbridge.recording import Recording, read_recording
 from hapticbridge.rendering import METHODS
+from hapticbridge.run_description import parameters_of
 from hapticbridge.scene import scene_names
-from hapticbridge.scene.library import scene_path
-from hapticbridge.tick import CLOCK_FIELDS, TICK_DTYPE
+from hapticbridge.scene.load import scene_path
 
 AUDIT = Path(__file__).resolve().parent.parent / "hapticbridge" / "audit"
 
@@ -232,14 +230,14 @@ def imports_of(path: Path) -> set[str]:
 def test_audit_shares_no_arithmetic_with_the_loop() -> None:
     for path in AUDIT.glob("*.py"):
         assert not [name for name in imports_of(path) if "bridge.bridge" in name], path
-        assert not [name for name in imports_of(path) if name.startswith("hapticbridge.ledger")]
+        assert not [name for name in imports_of(path) if name.startswith("hapticbridge.summary")]
     for own in ("balance.py", "device_port.py"):
         names = {name for name in imports_of(AUDIT / own) if name.startswith("hapticbridge")}
         others = {name for name in names if not name.startswith("hapticbridge.audit.")}
-        data = {"hapticbridge.kernel.parameters.RunParameters", "hapticbridge.tick.TickFlag"}
+        data = {"hapticbridge.kernel.parameters.RunParameters", "hapticbridge.record.TickFlag"}
         assert others <= data  # no function
     for path in (AUDIT / "balance.py", AUDIT / "verdict.py"):
-        compiled = ("hapticbridge.kernel.step", "hapticbridge.kernel.simulation")
+        compiled = ("hapticbridge.kernel.tick", "hapticbridge.kernel.tick")
         assert not [n for n in imports_of(path) if n.startswith(compiled)]
 
 

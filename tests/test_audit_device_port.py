@@ -12,14 +12,13 @@ from audit_cases import ScriptedDevice, balance_of, recorded
 from random_hands import random_motion
 
 from hapticbridge.audit import audit
-from hapticbridge.audit.balance import Balance
-from hapticbridge.audit.device_port import kept_behind_a_law
+from hapticbridge.audit.energy import EnergyBalance, stored_in_coupling
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import SimulatedDevice
 from hapticbridge.guard import Limits
 from hapticbridge.kernel.parameters import RunParameters
-from hapticbridge.provenance import parameters_of
 from hapticbridge.recording import read_recording
+from hapticbridge.run_description import parameters_of
 
 T = 1e-3
 HOME = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
@@ -56,7 +55,7 @@ def test_the_balance_is_the_identity_behind_the_bound(change: float) -> None:
     e, de = h - x, d - moved
     force = k[:, None] * e + b[:, None] / T * de
     still = np.zeros((count, 3))
-    parts, held = kept_behind_a_law(
+    parts, held = stored_in_coupling(
         RUN,
         gains=(np.concatenate([gains[:1], gains[:-1]]), gains),
         pulled=(e + moved, still),
@@ -98,7 +97,7 @@ def kept(
     none = np.zeros((count, 3))
     coupling = run.coupling
     gains = np.tile([coupling.stiffness, coupling.damping, 0.0, 0.0], (count, 1))
-    parts, held = kept_behind_a_law(
+    parts, held = stored_in_coupling(
         run,
         gains=(gains, gains),
         pulled=(e, none),
@@ -144,7 +143,7 @@ def test_half_the_force_is_half_the_energy(tmp_path: Path) -> None:
     np.testing.assert_allclose(lost[1], 0.5 * lost[0], rtol=1e-9, atol=1e-15)
 
 
-def balance(path: Path, damping: float | None = None, rotational: float = 1.0) -> Balance:
+def balance(path: Path, damping: float | None = None, rotational: float = 1.0) -> EnergyBalance:
     """Returns a recording's balance, as if its device had this damping."""
     recording = read_recording(path)
     parameters = replace(

@@ -18,9 +18,9 @@ from hapticbridge.audit import audit
 from hapticbridge.bridge import Bridge
 from hapticbridge.errors import RecordingError
 from hapticbridge.export import export
+from hapticbridge.record import CLOCK_FIELDS, TickFlag
 from hapticbridge.recording import Recording, read_recording, repair
-from hapticbridge.scene.library import scene_path
-from hapticbridge.tick import CLOCK_FIELDS, TickFlag
+from hapticbridge.scene.load import scene_path
 
 
 @pytest.mark.parametrize("lost", [slice(70, 71), slice(0, 3), slice(50, 150)])

@@ -20,15 +20,15 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from hapticbridge.audit import audit
-from hapticbridge.provenance import (
+from hapticbridge.recording import Recording, read_recording, repair
+from hapticbridge.recording.format import Digest
+from hapticbridge.run_description import (
     MODEL_ATTACHMENT,
     STATE_ATTACHMENT,
     compiled_model,
     processor,
     versions,
 )
-from hapticbridge.recording import Recording, read_recording, repair
-from hapticbridge.recording.format import Digest
 
 DEVICE_POSE = ("device_position", "device_quaternion")
 

@@ -312,7 +312,7 @@ def test_a_table_that_cannot_be_written_is_refused_before_anything_is_audited(
     def never(*_: object, **__: object) -> None:
         raise AssertionError("audited")
 
-    monkeypatch.setattr("hapticbridge.cli.judge.audit_all", never)
+    monkeypatch.setattr("hapticbridge.cli.audit.audit_all", never)
     for name in ("table.xls", "no/table.csv"):
         code, _, err = call("audit", runs, "--table", runs / name)
         assert (code, err.count("error:")) == (2, 1)

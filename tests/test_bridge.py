@@ -17,9 +17,9 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.device import open_device
 from hapticbridge.errors import DeviceError, HapticBridgeError, SceneError
 from hapticbridge.guard import Limits
+from hapticbridge.record import CLOCK_FIELDS, TICK_DTYPE, TickFlag
 from hapticbridge.recording import read_recording
 from hapticbridge.scene import load_scene
-from hapticbridge.tick import CLOCK_FIELDS, TICK_DTYPE, TickFlag
 
 
 def payloads(path: Path) -> NDArray[np.void]:

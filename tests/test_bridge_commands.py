@@ -18,7 +18,7 @@ from hapticbridge.audit import audit
 from hapticbridge.bridge import Bridge
 from hapticbridge.clock import SimulatedClock
 from hapticbridge.commands import Command, Couple, Mark, Reset, Switch
-from hapticbridge.commands.change import tuning_ticks
+from hapticbridge.commands.execution import tuning_ticks
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import CommandError, DeviceError, RecordingError, SafetyTrip
 from hapticbridge.guard import Limits

@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 from hapticbridge.audit import audit
 from hapticbridge.bridge import Bridge
 from hapticbridge.errors import DeviceError, DeviceLost, HapticBridgeError, SafetyTrip
+from hapticbridge.record import TickFlag
 from hapticbridge.recording import Recorder, Ring, read_recording
-from hapticbridge.recording import stream as stream_module
-from hapticbridge.tick import TickFlag
+from hapticbridge.recording import recorder as stream_module
 
 PATIENCE = 30.0
 

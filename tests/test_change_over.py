@@ -11,15 +11,13 @@ from kernel_runs import Array
 from lossless_runs import T, bound, led, tapping
 
 from hapticbridge.coupling import Coupling
-from hapticbridge.device.trajectory.motion import pose_at
-from hapticbridge.device.trajectory.motion_csv import read_motion
+from hapticbridge.device.trajectory import pose_at, read_motion
 from hapticbridge.kernel.codes import OK
-from hapticbridge.kernel.simulation import simulate
-from hapticbridge.kernel.step import after_step, before_step
-from hapticbridge.ledger import Ledger
+from hapticbridge.kernel.tick import after_step, before_step, simulate
+from hapticbridge.record import SAMPLE_DTYPE, TICK_DTYPE, TickFlag
 from hapticbridge.rendering import METHODS
 from hapticbridge.scene import load_scene, scene_path
-from hapticbridge.tick import SAMPLE_DTYPE, TICK_DTYPE, TickFlag
+from hapticbridge.summary import Ledger
 
 # --- without it -----------------------------------------------------------------------------------
 

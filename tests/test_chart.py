@@ -15,7 +15,7 @@ from chart_cases import FakeRun, small_chart
 
 from hapticbridge.cli import main
 from hapticbridge.errors import StudyError
-from hapticbridge.kernel.scheme import DIRECT, LOSSLESS
+from hapticbridge.kernel.codes import DIRECT, LOSSLESS
 from hapticbridge.rendering import METHODS
 from hapticbridge.study.chart import (
     Chart,

@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import StudyError
-from hapticbridge.mechanics import ImpactBody, resolve_impact
 from hapticbridge.scene import load_scene
 from hapticbridge.study.chart import driven_mass, rod_impact, sliding_block, spinning_body
 from hapticbridge.study.chart.peg import COUPLING as PEG_COUPLING
@@ -25,6 +24,7 @@ from hapticbridge.study.chart.peg_path import (
     peg_path,
 )
 from hapticbridge.study.chart.rigid_peg import CLEARANCE, gaps, resting_peg
+from hapticbridge.theory.impact import ImpactBody, resolve_impact
 
 GRID = 4e-3
 

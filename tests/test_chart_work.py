@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from scipy.spatial import ConvexHull
 
-from hapticbridge.check.growth import Spread
+from hapticbridge.check.cost import TimingStats
 from hapticbridge.cli import main
 from hapticbridge.errors import StudyError
 from hapticbridge.study.chart.files import prepared_files
@@ -102,7 +102,7 @@ def made_up() -> WorkChart:
     """Returns a chart in which the time of a tick is known."""
 
     def point(family: str, variant: str, size: int, seconds: float) -> Work:
-        spread = Spread(100, seconds, seconds)
+        spread = TimingStats(100, seconds, seconds)
         return Work(family, variant, size, 0, 0, 6, spread, seconds, seconds, 0.5 / seconds)
 
     points = [point("bodies", USUAL.name, size, 1e-5 * size) for size in (1, 10, 100)]

@@ -9,10 +9,18 @@ import mujoco
 import numpy as np
 import pytest
 
-from hapticbridge.check.cost import BRIDGE, REST, STAGES, TICK_SHARE, Cost, measure_cost
-from hapticbridge.check.drawing import draw_cost
-from hapticbridge.check.growth import Spread, growth_of
-from hapticbridge.check.motion import samples_of
+from hapticbridge.check.case import samples_of
+from hapticbridge.check.cost import (
+    BRIDGE,
+    REST,
+    STAGES,
+    TICK_SHARE,
+    Cost,
+    TimingStats,
+    draw_cost,
+    growth_of,
+    measure_cost,
+)
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Motion
 from hapticbridge.errors import SceneError
@@ -186,7 +194,7 @@ def test_line_of_growth_is_the_planted_one_where_rare_counts_are_left_out() -> N
 
 
 def test_spread_of_a_hundred_times() -> None:
-    spread = Spread.of(np.arange(101.0))
+    spread = TimingStats.of(np.arange(101.0))
     assert (spread.ticks, spread.median, spread.p99) == (101, 50.0, 99.0)
 
 

@@ -21,9 +21,9 @@ from check_scenes import (
 from outside_scenes import hand_rows, mjcf
 
 from hapticbridge.check.case import open_case
-from hapticbridge.check.contact_stiffness import depth_under
-from hapticbridge.check.faults import Fault, length, weight
-from hapticbridge.check.rules import find_faults
+from hapticbridge.check.fault import Fault, length, weight
+from hapticbridge.check.physics import depth_under
+from hapticbridge.check.run_faults import find_faults
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import DeviceError, SceneError
 from hapticbridge.scene import read_scene, scene_names, scene_path

@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 from outside_scenes import scene_file
 from scipy.spatial.transform import Rotation
 
-from hapticbridge.check.draft import Draft, Setting
-from hapticbridge.check.felt import FORCE_FLOOR, LEVER, WEBER, felt_error
 from hapticbridge.check.lean import find_lean
+from hapticbridge.check.perception import FORCE_FLOOR, LEVER, WEBER, felt_error
+from hapticbridge.check.version import SceneVariant, Setting
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Motion
 from hapticbridge.errors import HapticBridgeError, SceneError
+from hapticbridge.record import TICK_DTYPE
 from hapticbridge.scene import read_scene
-from hapticbridge.tick import TICK_DTYPE
 
 
 def records(
@@ -56,7 +56,7 @@ def test_spring_seven_percent_stiffer_is_one_just_noticeable_difference(tmp_path
           <joint type="slide" axis="1 0 0" stiffness="{stiffness!r}"/>
           <geom size="0.01" mass="0.01"/><site name="grip"/></body></worldbody></mujoco>"""
         source = read_scene(scene_file(tmp_path, text))
-        done.append(Draft(source, "grip", Setting(coupling)).rehearsed(Motion(time, path)))
+        done.append(SceneVariant(source, "grip", Setting(coupling)).rehearsed(Motion(time, path)))
     felt = felt_error(done[0].records, done[1].records)
     # 10 g swing with 0.05 N at most beside 3.8 N, and damping adds as little
     assert felt.felt == pytest.approx(1.0, abs=0.01)

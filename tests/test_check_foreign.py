@@ -10,15 +10,15 @@ from check_scenes import GOOD_CONTACT, GOOD_OPTION, case_of, faults_of, kinds, w
 from outside_scenes import FREE_TOOL, mjcf
 
 from hapticbridge.check import lean
-from hapticbridge.check.draft import Draft, Setting, name_everything
-from hapticbridge.check.faults import Fault, number
+from hapticbridge.check.fault import Fault, number
 from hapticbridge.check.inventory import take_inventory
-from hapticbridge.check.places import Place
-from hapticbridge.check.simplifications import OTHER_MOTIONS, Simplification
-from hapticbridge.check.trial import MAY_GO
+from hapticbridge.check.lean import MAY_GO
+from hapticbridge.check.simplify import OTHER_MOTIONS, Simplification
+from hapticbridge.check.source_map import Place
+from hapticbridge.check.version import SceneVariant, Setting, name_everything
 from hapticbridge.check.witness import witness
 from hapticbridge.cli import main
-from hapticbridge.cli.check_words import MOST_NAMED, print_faults
+from hapticbridge.cli.check import MOST_NAMED, print_faults
 from hapticbridge.cli.main import USAGE_ERROR
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Motion
@@ -97,7 +97,7 @@ def test_floor_under_a_flex_is_not_called_idle(tmp_path: Path) -> None:
     inventory = take_inventory(case.model, "grip", case.places, case.observation)
     assert inventory.flexes == 1
     assert not inventory.idle
-    draft = Draft(case.source, "grip", Setting(case.coupling))
+    draft = SceneVariant(case.source, "grip", Setting(case.coupling))
     assert "floor" in witness(draft, case.motion).near_geoms
 
 
@@ -147,7 +147,7 @@ def test_what_has_no_name_is_called_after_its_body() -> None:
 def test_saving_that_is_gone_when_measured_again_is_noise(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, again: float, is_taken: bool
 ) -> None:
-    def relax(draft: Draft) -> bool:
+    def relax(draft: SceneVariant) -> bool:
         draft.spec.option.tolerance = 1e-6
         return True
 
@@ -170,7 +170,7 @@ def test_saving_that_is_gone_when_measured_again_is_noise(
 def test_what_another_motion_may_miss_is_taken_last(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def edit(draft: Draft) -> bool:
+    def edit(draft: SceneVariant) -> bool:
         draft.spec.option.tolerance *= 2.0
         return True
 

@@ -18,9 +18,9 @@ from hapticbridge.check.inventory import (
     Inventory,
     take_inventory,
 )
-from hapticbridge.check.places import Places
+from hapticbridge.check.source_map import Places
 from hapticbridge.scene import read_scene, scene_names, scene_path
-from hapticbridge.scene.contact_check import meeting_pairs
+from hapticbridge.scene.contacts import meeting_pairs
 
 
 def inventory_of(scene: Path) -> Inventory:

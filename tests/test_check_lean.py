@@ -18,38 +18,37 @@ from outside_scenes import mjcf, obj_bytes, scene_file
 from over_modelled import ITERATIONS, TRIANGLES, VISUALS, over_modelled_peg
 
 from hapticbridge.check import lean
-from hapticbridge.check.draft import Draft, Setting, name_everything
-from hapticbridge.check.felt import felt_error
-from hapticbridge.check.freedoms import freedom_simplifications
-from hapticbridge.check.lean import Lean, find_lean
-from hapticbridge.check.lean_file import write_lean
-from hapticbridge.check.lean_picture import draw_lean
-from hapticbridge.check.lean_table import lean_facts, write_table
-from hapticbridge.check.motion import motion_for
-from hapticbridge.check.shapes import shape_simplifications
-from hapticbridge.check.side_by_side import CHUNKS, Stage, one_pass, processor_costs
-from hapticbridge.check.simplifications import contact_simplifications
-from hapticbridge.check.trial import IS_FELT, MAY_GO, Judge
+from hapticbridge.check.case import motion_for
+from hapticbridge.check.cost import CHUNKS, Stage, one_pass, processor_costs
+from hapticbridge.check.lean import IS_FELT, MAY_GO, Judge, Lean, find_lean
+from hapticbridge.check.lean_output import draw_lean, lean_facts, write_lean, write_table
+from hapticbridge.check.perception import felt_error
+from hapticbridge.check.simplify import (
+    contact_simplifications,
+    freedom_simplifications,
+    shape_simplifications,
+)
+from hapticbridge.check.version import SceneVariant, Setting, name_everything
 from hapticbridge.check.witness import witness
 from hapticbridge.cli import main
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Motion
 from hapticbridge.errors import SceneError
-from hapticbridge.picture import write_picture
+from hapticbridge.plotting import write_picture
 from hapticbridge.scene import load_scene, read_scene, scene_names
-from hapticbridge.scene.contact_check import meeting_pairs
+from hapticbridge.scene.contacts import meeting_pairs
 
 COUPLING = Coupling(2400.0, 0.5, 2.4, 5e-4)
 
 Capsys = pytest.CaptureFixture[str]
 
 
-def counted(*drafts: Draft) -> tuple[float, ...]:
+def counted(*drafts: SceneVariant) -> tuple[float, ...]:
     """Counts what each version models, so that no test hangs on a clock."""
     return tuple(_count(draft) for draft in drafts)
 
 
-def _count(draft: Draft) -> float:
+def _count(draft: SceneVariant) -> float:
     model = draft.compiled().model
     colliding = [g for g in range(model.ngeom) if model.geom_contype[g]]
     meshes = {int(model.geom_dataid[g]) for g in colliding} - {-1}
@@ -61,7 +60,7 @@ def _count(draft: Draft) -> float:
     return float(work) / draft.setting.period
 
 
-def planted(first: Draft, second: Draft, _: Motion) -> tuple[float, float]:
+def planted(first: SceneVariant, second: SceneVariant, _: Motion) -> tuple[float, float]:
     one, other = counted(first, second)
     return one, other
 
@@ -175,19 +174,19 @@ def planar(sideways: float = 0.0) -> Motion:
 PLANAR = "'tool' slides along xz and turns about y"
 
 
-def free_draft(tmp_path: Path, extra: str = "", body: str = TOOL) -> Draft:
+def free_draft(tmp_path: Path, extra: str = "", body: str = TOOL) -> SceneVariant:
     text = mjcf('<option gravity="0 0 0"/>', body=body).replace("</mujoco>", f"{extra}</mujoco>")
     source = read_scene(scene_file(tmp_path, text))
     name_everything(source.spec)
-    return Draft(source, "grip", Setting(COUPLING))
+    return SceneVariant(source, "grip", Setting(COUPLING))
 
 
-def freedoms(draft: Draft, motion: Motion) -> dict[str, Callable[[Draft], bool]]:
+def freedoms(draft: SceneVariant, motion: Motion) -> dict[str, Callable[[SceneVariant], bool]]:
     seen = witness(draft, motion)
     return {each.name: each.edit for each in freedom_simplifications(draft, seen)}
 
 
-def felt_of(draft: Draft, motion: Motion, name: str) -> float:
+def felt_of(draft: SceneVariant, motion: Motion, name: str) -> float:
     changed = draft.copy()
     assert freedoms(draft, motion)[name](changed)
     before, after = (each.rehearsed(motion).records for each in (draft, changed))
@@ -364,14 +363,14 @@ def test_table_picture_and_facts_hold_every_trial_by_name(found: Lean, tmp_path:
 def test_processor_time_of_more_work_is_more_and_both_are_positive() -> None:
     """No time is asserted: a hundred substeps are simply more than one."""
     source = read_scene("virtual_wall")
-    light = Draft(source, "grip", Setting(COUPLING))
-    heavy = Draft(source, "grip", Setting(COUPLING, substeps=100))
+    light = SceneVariant(source, "grip", Setting(COUPLING))
+    heavy = SceneVariant(source, "grip", Setting(COUPLING, substeps=100))
     costs = processor_costs(light, heavy, own_motion("virtual_wall", 0.1))
     assert 0.0 < costs[0] < costs[1]
 
 
 def test_motion_is_timed_whole_and_as_it_is_rehearsed() -> None:
-    draft = Draft(read_scene("virtual_wall"), "grip", Setting(COUPLING))
+    draft = SceneVariant(read_scene("virtual_wall"), "grip", Setting(COUPLING))
     motion = own_motion("virtual_wall", 1.2)
     stages = [Stage(draft, motion) for _ in range(2)]
     for _ in range(2):  # the second time from the start again
@@ -399,7 +398,7 @@ def test_shipped_scenes_model_nothing_that_may_go(name: str) -> None:
     """
     source = read_scene(name)
     name_everything(source.spec)
-    draft, motion = Draft(source, "grip", Setting(COUPLING)), own_motion(name, speed=3.0)
+    draft, motion = SceneVariant(source, "grip", Setting(COUPLING)), own_motion(name, speed=3.0)
     judge = Judge(draft, motion, 0.1, 2.0, planted)
     seen, trials = witness(draft, motion), []
     for each in (

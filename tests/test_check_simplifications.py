@@ -13,19 +13,8 @@ from outside_scenes import mjcf, scene_file
 from over_modelled import tessellated_box
 from scipy.spatial.transform import Rotation
 
-from hapticbridge.check.draft import Draft, Setting, name_everything
-from hapticbridge.check.freedoms import freedom_simplifications
-from hapticbridge.check.motion import motion_for
-from hapticbridge.check.observation import quiet
-from hapticbridge.check.primitive import best_primitive, signed_distance
-from hapticbridge.check.shapes import shape_simplifications
-from hapticbridge.check.simplifications import (
-    Simplification,
-    contact_simplifications,
-    rate_simplifications,
-    solver_simplifications,
-)
-from hapticbridge.check.trial import (
+from hapticbridge.check.case import motion_for
+from hapticbridge.check.lean import (
     CREATES,
     IS_FELT,
     LEAST_SAVING,
@@ -34,8 +23,20 @@ from hapticbridge.check.trial import (
     SAVES_NOTHING,
     WARNS,
     Judge,
-    Trial,
+    VariantVerdict,
 )
+from hapticbridge.check.observe import quiet
+from hapticbridge.check.simplify import (
+    Simplification,
+    best_primitive,
+    contact_simplifications,
+    freedom_simplifications,
+    rate_simplifications,
+    shape_simplifications,
+    signed_distance,
+    solver_simplifications,
+)
+from hapticbridge.check.version import SceneVariant, Setting, name_everything
 from hapticbridge.check.witness import CLEARANCE, witness
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Motion
@@ -70,19 +71,19 @@ TWIST = through(DOWN, (0.4, (0, 0, -0.004), (0, 0, 0.4)))
 ROLL = through(DOWN, (0.4, (0, 0, -0.004), (0.4, 0, 0)))
 
 
-def half_price(first: Draft, second: Draft, _: Motion) -> tuple[float, float]:
+def half_price(first: SceneVariant, second: SceneVariant, _: Motion) -> tuple[float, float]:
     """Calls every change a saving, so that only what is felt decides."""
     texts = [draft.spec.copy().to_xml() for draft in (first, second)]  # to_xml compiles in place
     return 1.0, 1.0 if texts[0] == texts[1] else 0.5
 
 
-def draft_of(tmp_path: Path, text: str, setting: Setting | None = None) -> Draft:
+def draft_of(tmp_path: Path, text: str, setting: Setting | None = None) -> SceneVariant:
     source = read_scene(scene_file(tmp_path, text))
     name_everything(source.spec)
-    return Draft(source, "grip", setting or Setting(COUPLING))
+    return SceneVariant(source, "grip", setting or Setting(COUPLING))
 
 
-def all_of(draft: Draft, motion: Motion) -> dict[str, Simplification]:
+def all_of(draft: SceneVariant, motion: Motion) -> dict[str, Simplification]:
     seen = witness(draft, motion)
     every = [
         *contact_simplifications(seen),
@@ -95,8 +96,8 @@ def all_of(draft: Draft, motion: Motion) -> dict[str, Simplification]:
 
 
 def tried(
-    draft: Draft, motion: Motion, name: str, budget: float = 1.0, damping: float = 2.0
-) -> Trial | None:
+    draft: SceneVariant, motion: Motion, name: str, budget: float = 1.0, damping: float = 2.0
+) -> VariantVerdict | None:
     """Returns how a simplification was judged; None where there was nothing to change."""
     with quiet():
         judge = Judge(draft, motion, budget, damping, half_price)
@@ -192,10 +193,10 @@ def test_motion_that_a_scene_does_not_survive_is_refused(tmp_path: Path) -> None
     assert witness(draft_of(tmp_path, mjcf(OPTION, body=tool.format("1"))), up).near == set()
 
 
-def shipped(name: str) -> tuple[Draft, Motion]:
+def shipped(name: str) -> tuple[SceneVariant, Motion]:
     source = read_scene(name)
     name_everything(source.spec)
-    draft = Draft(source, "grip", Setting(COUPLING))
+    draft = SceneVariant(source, "grip", Setting(COUPLING))
     motion = motion_for(draft.compiled())
     assert motion is not None
     return draft, motion

@@ -18,14 +18,17 @@ from check_scenes import (
 )
 from outside_scenes import hand_rows, mjcf
 
-from hapticbridge.check.constraint_faults import creep_speed
 from hapticbridge.check.contact_faults import inertia_of
-from hapticbridge.check.contact_stiffness import constraint_stiffness, depth_under
-from hapticbridge.check.faults import length, number, weight
-from hapticbridge.check.geometry_faults import dent_of, mesh_of
-from hapticbridge.check.inertia import body_inertia, joint_inertia
+from hapticbridge.check.fault import length, number, weight
+from hapticbridge.check.model_faults import creep_speed, dent_of, mesh_of
+from hapticbridge.check.physics import (
+    body_inertia,
+    constraint_stiffness,
+    depth_under,
+    joint_inertia,
+)
 from hapticbridge.scene import scene_path
-from hapticbridge.scene.contact_check import settings_among
+from hapticbridge.scene.contacts import settings_among
 
 SINKS = [
     ("0.002 1", "0.9 0.95 0.001 0.5 2", 0.1),

@@ -17,10 +17,10 @@ from hapticbridge import bridge as bridge_module
 from hapticbridge.audit import audit
 from hapticbridge.cli import main
 from hapticbridge.errors import SafetyTrip
+from hapticbridge.record import TICK_DTYPE
 from hapticbridge.recording import read_recording, repair
 from hapticbridge.scene import scene_names
-from hapticbridge.scene.library import scene_path
-from hapticbridge.tick import TICK_DTYPE
+from hapticbridge.scene.load import scene_path
 
 COMMANDS = ("run", "audit", "scenes", "check", "export", "compare", "repair")
 
@@ -338,7 +338,7 @@ def test_strict_is_passed_on(call: Called, run_file: Path, monkeypatch: pytest.M
         seen.append(strict)
         return audit(path, strict=strict)
 
-    monkeypatch.setattr("hapticbridge.cli.judge.audit", judged)
+    monkeypatch.setattr("hapticbridge.cli.audit.audit", judged)
     call("audit", run_file, "--strict")
     call("audit", run_file)
     assert seen == [True, False]

@@ -13,19 +13,21 @@ from emulated.pid_model import PidStick
 from hapticbridge import Bridge, SimulatedClock
 from hapticbridge.cli import devices as command
 from hapticbridge.device.discovery import RULES_FILE, plugged_devices, udev_rules
-from hapticbridge.device.families import DRIVERS, all_families
-from hapticbridge.device.forcedimension.library import VARIABLE
-from hapticbridge.device.haply import finding as haply
-from hapticbridge.device.pid import effects
-from hapticbridge.device.plugged import (
+from hapticbridge.device.family import (
     RULES_COMMAND,
-    Family,
-    Plugged,
+    Driver,
+    FoundDevice,
     access_problem,
     permission_problem,
 )
-from hapticbridge.device.silence import watchdog_time
-from hapticbridge.device.transport import hid_search, usb_bus, usb_search
+from hapticbridge.device.force_dimension.dhd import VARIABLE
+from hapticbridge.device.haply import device as haply
+from hapticbridge.device.pid import device as effects
+from hapticbridge.device.registry import DRIVERS, all_families
+from hapticbridge.device.transport import hid as hid_search
+from hapticbridge.device.transport import usb as usb_bus
+from hapticbridge.device.transport import usb as usb_search
+from hapticbridge.device.watchdog import watchdog_time
 from hapticbridge.errors import DeviceError
 
 
@@ -69,7 +71,7 @@ class Nothing:
 
 
 def test_what_a_device_calls_itself_cannot_steer_a_terminal() -> None:
-    plugged = Plugged(
+    plugged = FoundDevice(
         family="rawhid",
         name="a\x1b[31mb\n",
         serial="\x071\u202e2",
@@ -121,8 +123,8 @@ def test_who_stands_still_reads_what_becomes_of_each_devices_force(call: Called)
     assert "stays on" in told["falcon"]
 
 
-def vars_of(device: Plugged) -> dict[str, object]:
-    return {name: getattr(device, name) for name in Plugged.__dataclass_fields__}
+def vars_of(device: FoundDevice) -> dict[str, object]:
+    return {name: getattr(device, name) for name in FoundDevice.__dataclass_fields__}
 
 
 def test_a_spacenavigator_without_a_node_is_listed_with_the_module_it_wants(
@@ -139,8 +141,8 @@ def test_a_spacenavigator_without_a_node_is_listed_with_the_module_it_wants(
     assert "Teensyduino RawHID" not in out  # it has a node: hidapi lists it, where it is there
 
 
-def listed(problem: str | None, serial: str = "") -> Plugged:
-    return Plugged(
+def listed(problem: str | None, serial: str = "") -> FoundDevice:
+    return FoundDevice(
         family="rawhid", name="[red]Te\x1bensy", serial=serial, path="/dev/hidraw0", vendor=0x16C0,
         product=0x0486, transport="hid", problem=problem,
     )  # fmt: skip
@@ -161,7 +163,7 @@ def listed(problem: str | None, serial: str = "") -> Plugged:
     ],
 )
 def test_it_says_what_to_do_next(
-    call: Called, monkeypatch: pytest.MonkeyPatch, plugged: list[Plugged], words: str
+    call: Called, monkeypatch: pytest.MonkeyPatch, plugged: list[FoundDevice], words: str
 ) -> None:
     monkeypatch.setattr(command, "plugged_devices", lambda: plugged)
     code, out, _ = call("devices")
@@ -250,7 +252,7 @@ def test_the_bus_is_read_without_opening_anything(bus: Path) -> None:
     "family", [f for f in all_families() if f.find is None], ids=lambda family: family.name
 )
 def test_running_on_a_device_that_is_not_there_is_one_sentence_that_helps(
-    call: Called, family: Family, bus: Path
+    call: Called, family: Driver, bus: Path
 ) -> None:
     code, out, err = call("run", "peg_in_hole", "--device", family.name)
     assert (code, out) == (2, "")
@@ -331,12 +333,12 @@ def test_how_often_a_device_is_asked_is_read_where_the_kernel_shows_it(
 
 @pytest.mark.parametrize("family", all_families(), ids=lambda family: family.name)
 def test_hardware_and_fast_are_refused_together_before_anything_is_opened(
-    call: Called, monkeypatch: pytest.MonkeyPatch, family: Family
+    call: Called, monkeypatch: pytest.MonkeyPatch, family: Driver
 ) -> None:
     def opened(*_: object, **__: object) -> None:
         raise AssertionError("it was opened first, and its user asked to home it")
 
-    for module in ("hapticbridge.cli.run", "hapticbridge.arrangement"):
+    for module in ("hapticbridge.cli.run", "hapticbridge.options"):
         monkeypatch.setattr(f"{module}.device_for", opened)
     code, out, err = call("run", "point_mass", "--fast", "--device", f"{family.name}:serial=1")
     assert (code, out) == (2, "")

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from cli_cases import Called
 
-from hapticbridge.device.transport import usb_search
+from hapticbridge.device.transport import usb as usb_search
 
 
 @pytest.mark.parametrize(

@@ -15,8 +15,8 @@ from bridge_runs import still, sway
 from cli_cases import Called
 
 from hapticbridge.bridge import Bridge
-from hapticbridge.opened import Opened
 from hapticbridge.recording import read_recording
+from hapticbridge.session import Opened
 
 SIGNALS = pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
 

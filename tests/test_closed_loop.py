@@ -18,12 +18,13 @@ from hapticbridge.device import Hand, Motion, SimulatedDevice, random_hand
 from hapticbridge.device.simulated.hand import HAND_RANGES
 from hapticbridge.errors import DeviceError, StudyError
 from hapticbridge.guard import Limits
-from hapticbridge.passivity import SampledLoop, WorstHand, minimum_damping
+from hapticbridge.record import CLOCK_FIELDS, TICK_DTYPE
 from hapticbridge.rendering import METHODS
 from hapticbridge.scene import load_scene
 from hapticbridge.study.closed_loop import ClosedLoop, LoopOutcome
 from hapticbridge.study.jitter import PARTS, Timing
-from hapticbridge.tick import CLOCK_FIELDS, TICK_DTYPE
+from hapticbridge.theory.bounds import minimum_damping
+from hapticbridge.theory.sampled_loop import SampledLoop, WorstHand
 
 T = 1e-3
 COUPLING = Coupling(2000, 0.5, 2, 5e-4)

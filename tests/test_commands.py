@@ -10,19 +10,19 @@ from audit_cases import COUPLING, ScriptedDevice
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hapticbridge.certificate import needed_on_axes
+from hapticbridge.certificate import required_axis_damping
 from hapticbridge.commands import (
-    Allowance,
     Command,
     CommandQueue,
     Couple,
+    CouplingLimits,
     Mark,
     Reset,
     Switch,
     command_of,
 )
 from hapticbridge.commands.command import LONGEST_LINE, Stop, line_of
-from hapticbridge.commands.queue import INTERVAL, MOST_WAITING, RESET_INTERVAL
+from hapticbridge.commands.execution import INTERVAL, MOST_WAITING, RESET_INTERVAL
 from hapticbridge.errors import CommandError
 from hapticbridge.guard import Limits
 from hapticbridge.rendering import method_named
@@ -32,8 +32,10 @@ INFO = ScriptedDevice(lambda _: (0, 0, 0, 1, 0, 0, 0)).info
 """b = 2 N s/m: BC97 (6) gives K <= 2 b/T = 4000 N/m at B' = 0."""
 
 
-def allowance(method: str = "implicit", scale: float = 1.0, **changes: float | None) -> Allowance:
-    return Allowance(
+def allowance(
+    method: str = "implicit", scale: float = 1.0, **changes: float | None
+) -> CouplingLimits:
+    return CouplingLimits(
         info=replace(INFO, **changes),  # type: ignore[arg-type] # numbers of a device alone
         method=method_named(method),
         start=COUPLING,
@@ -274,7 +276,7 @@ def test_what_is_needed_is_what_the_certificate_says(substeps: int, delay: float
     for stiffness, damping in ((200.0, 0.0), (1000.0, 0.7), (3000.0, 0.1)):
         used = allowed.used(allowed.felt(Couple(stiffness, damping), COUPLING))
         laws = allowed.method.laws(substeps)
-        said = needed_on_axes(allowed.info, used, T, 1.0, 1.0, laws, allowed.method)[0]
+        said = required_axis_damping(allowed.info, used, T, 1.0, 1.0, laws, allowed.method)[0]
         need = allowed.translation.needed(stiffness, damping)
         if substeps == 1 and not delay:
             assert need == pytest.approx(said, rel=1e-9)

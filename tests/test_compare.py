@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from hapticbridge.compare import compare
 from hapticbridge.errors import RecordingError
+from hapticbridge.record import TickFlag
 from hapticbridge.recording import read_recording, reader
-from hapticbridge.tick import TickFlag
 
 
 @pytest.fixture(scope="module")

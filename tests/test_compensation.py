@@ -9,9 +9,14 @@ from hypothesis import strategies as st
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import CouplingError
-from hapticbridge.mechanics import drive_mass
-from hapticbridge.passivity import WorstHand, felt_damping, law_damping, needed_for_felt
-from hapticbridge.passivity.compensation import largest_felt_damping
+from hapticbridge.theory.compensation import (
+    effective_damping,
+    largest_felt_damping,
+    law_damping,
+    needed_for_felt,
+)
+from hapticbridge.theory.rigid_body import drive_mass
+from hapticbridge.theory.sampled_loop import WorstHand
 
 T = 1e-3
 LAGS = {"implicit": 1.0, "midpoint": 0.5}
@@ -94,7 +99,7 @@ def test_formulas_of_the_theory_where_nothing_is_clipped() -> None:
     assert needed_for_felt(1000.0, 5.0, T, 1.0) == pytest.approx(5.0 - 0.5)  # B − KT/2
     assert needed_for_felt(1000.0, 5.0, T, 0.5) == pytest.approx(5.0)  # B
     assert needed_for_felt(2400.0, 0.5, T, 0.5) == pytest.approx(1.2)  # clipped: KT/2
-    assert felt_damping(2400.0, 0.0, T, 0.5) == pytest.approx(1.2)
+    assert effective_damping(2400.0, 0.0, T, 0.5) == pytest.approx(1.2)
     assert law_damping(1000.0, 5.0, T, 0.5) == pytest.approx(4.5)
 
 
@@ -105,7 +110,7 @@ def test_a_mass_decays_as_fast_as_the_felt_damping_says(scheme: str) -> None:
     rates = []
     for period in (1e-3, 5e-4):
         damping = law_damping(1000.0, 5.0, period, lag)
-        coupling = Coupling(1000.0, felt_damping(1000.0, damping, period, lag), 0, 0)
+        coupling = Coupling(1000.0, effective_damping(1000.0, damping, period, lag), 0, 0)
         assert coupling.damping == pytest.approx(5.0)
         handle = np.zeros(round(1.0 / period) + 1)
         motion = drive_mass(coupling, 1.0, handle, period, scheme, position=0.01)  # type: ignore[arg-type] # one of the schemes

@@ -15,9 +15,14 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.errors import SceneError
 from hapticbridge.rendering import METHODS, prepare
 from hapticbridge.scene import load_scene, scene_names
-from hapticbridge.scene.contact_check import check_contacts, contact_settings
-from hapticbridge.scene.contact_concerns import contact_concerns, suggested_solref
-from hapticbridge.scene.contact_rule import SUGGESTED, contact_numbers
+from hapticbridge.scene.contacts import (
+    SUGGESTED,
+    check_contacts,
+    contact_concerns,
+    contact_numbers,
+    contact_settings,
+    suggested_solref,
+)
 
 H = 1e-3
 SOLIMP = (0.9, 0.95, 0.001)

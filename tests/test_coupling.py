@@ -31,8 +31,8 @@ from scipy.spatial.transform import Rotation
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import CouplingError
-from hapticbridge.kernel.step import after_step, before_step
-from hapticbridge.tick import TICK_DTYPE
+from hapticbridge.kernel.tick import after_step, before_step
+from hapticbridge.record import TICK_DTYPE
 
 MASS = 0.1
 STIFF = Coupling(2000.0, 2.0, 2.0, 2e-3)

@@ -34,12 +34,12 @@ from hapticbridge.device import (
     SimulatedDevice,
     open_device,
 )
-from hapticbridge.device.pid.driver import open_pid
-from hapticbridge.device.plugged import tell_nobody
-from hapticbridge.device.rawhid.finding import open_rawhid
-from hapticbridge.device.spacemouse.driver import open_spacemouse
+from hapticbridge.device.family import ignore_message
+from hapticbridge.device.pid.device import open_pid
+from hapticbridge.device.rawhid.device import open_rawhid
+from hapticbridge.device.spacemouse import open_spacemouse
 from hapticbridge.errors import DeviceError
-from hapticbridge.tick import SAMPLE_DTYPE, TICK_DTYPE
+from hapticbridge.record import SAMPLE_DTYPE, TICK_DTYPE
 
 PERIOD = 1e-3
 TICKS = 300
@@ -71,7 +71,7 @@ def ticking(model: Callable[[], HidDevice], opener: Callable[..., Device]) -> De
 
     def build() -> tuple[Device, HidSeam]:
         seam = HidSeam(model())
-        return opener({}, tell_nobody, seam), seam
+        return opener({}, ignore_message, seam), seam
 
     return Ticking(build)
 

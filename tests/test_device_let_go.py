@@ -7,11 +7,12 @@ from dataclasses import replace
 import pytest
 from cli_cases import Called
 
-from hapticbridge import arrangement
+from hapticbridge import options as arrangement
 from hapticbridge.bridge import Bridge
 from hapticbridge.cli import run
-from hapticbridge.device import SimulatedDevice, library
-from hapticbridge.device.falcon.finding import FAMILY
+from hapticbridge.device import SimulatedDevice
+from hapticbridge.device import registry as library
+from hapticbridge.device.falcon.device import FAMILY
 from hapticbridge.errors import DeviceError
 from hapticbridge.guard import Limits
 

@@ -13,9 +13,9 @@ from scipy.integrate import quad, solve_ivp
 from scipy.spatial.transform import Rotation
 
 from hapticbridge.device import Hand, Motion, SimulatedDevice
-from hapticbridge.device.trajectory.motion import lissajous
+from hapticbridge.device.trajectory import lissajous
 from hapticbridge.errors import DeviceError
-from hapticbridge.tick import SAMPLE_DTYPE
+from hapticbridge.record import SAMPLE_DTYPE
 
 Array = NDArray[np.float64]
 

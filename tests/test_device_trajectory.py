@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation, Slerp
 from hapticbridge.device import Motion, ReplayDevice, TrajectoryDevice, open_device, read_motion
 from hapticbridge.device.base import Device
 from hapticbridge.errors import DeviceError, RecordingError
+from hapticbridge.record import SAMPLE_DTYPE, TICK_DTYPE
 from hapticbridge.recording import RecordingWriter
-from hapticbridge.tick import SAMPLE_DTYPE, TICK_DTYPE
 
 Array = NDArray[np.float64]
 PERIOD = 1e-3

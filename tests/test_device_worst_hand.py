@@ -8,8 +8,8 @@ import pytest
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Hand, SimulatedDevice
 from hapticbridge.errors import DeviceError
-from hapticbridge.passivity import SampledLoop, WorstHand
-from hapticbridge.tick import SAMPLE_DTYPE
+from hapticbridge.record import SAMPLE_DTYPE
+from hapticbridge.theory.sampled_loop import SampledLoop, WorstHand
 
 T = 1e-3
 

@@ -14,14 +14,14 @@ import numpy as np
 import pytest
 
 from hapticbridge.cli import main
-from hapticbridge.device.plugged import Plugged
-from hapticbridge.doctor import cyclictest, diagnosis, machine
-from hapticbridge.doctor.diagnosis import diagnose, judged
-from hapticbridge.doctor.machine import Finding, System, findings
-from hapticbridge.doctor.wakeups import bare_turn
+from hapticbridge.device.family import FoundDevice
 from hapticbridge.errors import HapticBridgeError
 from hapticbridge.realtime import Grant, Lateness, real_time, stolen_time
-from hapticbridge.realtime.remedies import CONTAINER, SHELL
+from hapticbridge.realtime import doctor as cyclictest
+from hapticbridge.realtime import doctor as diagnosis
+from hapticbridge.realtime import doctor as machine
+from hapticbridge.realtime.doctor import Finding, System, bare_turn, diagnose, findings, judged
+from hapticbridge.realtime.realtime import CONTAINER, SHELL
 
 GRANTED = (Grant("scheduling", True, "SCHED_FIFO at priority 80"),)
 
@@ -147,7 +147,7 @@ def test_what_one_shell_may_is_also_said_for_good(tmp_path: Path) -> None:
 def test_devices_that_may_not_be_opened_are_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    device = Plugged(
+    device = FoundDevice(
         family="falcon",
         name="Falcon",
         serial="",

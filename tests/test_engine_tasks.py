@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from engine_tasks import COUPLING
 
-from hapticbridge.device.trajectory.motion import Motion
+from hapticbridge.device.trajectory import Motion
 from hapticbridge.errors import StudyError
 from hapticbridge.pose import quaternion_exp
 from hapticbridge.scene import Scene, load_scene

@@ -23,10 +23,8 @@ from engine_tasks import (
 from scipy.spatial.transform import Rotation
 
 from hapticbridge.coupling import Coupling
-from hapticbridge.device.trajectory.motion import Motion
+from hapticbridge.device.trajectory import Motion
 from hapticbridge.errors import StudyError
-from hapticbridge.mechanics import drive_mass, integrate_rotation
-from hapticbridge.mechanics.coupled_mass import CoupledScheme
 from hapticbridge.pose import quaternion_exp
 from hapticbridge.study.engines import (
     Body,
@@ -39,6 +37,7 @@ from hapticbridge.study.engines import (
     composed,
     engine_names,
 )
+from hapticbridge.theory.rigid_body import CoupledScheme, drive_mass, integrate_rotation
 
 NOTHING = (0.0, 0.0, 0.0)
 SINGLE_PRECISION = {"physx", "physx_spring"}

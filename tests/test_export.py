@@ -16,11 +16,9 @@ from cli_cases import Called
 from recording_cases import EPOCH, META, random_rows, write
 
 from hapticbridge.errors import RecordingError
-from hapticbridge.export import export
-from hapticbridge.export.csv_file import sidecar_of
-from hapticbridge.export.hdf5 import Hdf5Sink
+from hapticbridge.export import Hdf5Sink, export, sidecar_of
+from hapticbridge.record import TICK_DTYPE
 from hapticbridge.recording import open_recording, reader
-from hapticbridge.tick import TICK_DTYPE
 
 pq: Any = importlib.import_module("pyarrow.parquet")
 

@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 from hapticbridge.audit import audit
 from hapticbridge.bridge import Bridge
 from hapticbridge.device import SimulatedDevice, device_for
-from hapticbridge.device.falcon.driver import FalconDevice
-from hapticbridge.device.trajectory.motion import Motion
+from hapticbridge.device.falcon.device import FalconDevice
+from hapticbridge.device.trajectory import Motion
 from hapticbridge.errors import DeviceError, DeviceLost, SafetyTrip
+from hapticbridge.record import SAMPLE_DTYPE, TickFlag
 from hapticbridge.recording import read_recording
 from hapticbridge.scene import load_scene
-from hapticbridge.tick import SAMPLE_DTYPE, TickFlag
 
 STALE = int(TickFlag.STALE_SAMPLE)
 

@@ -10,9 +10,9 @@ import pytest
 from falcon_cases import Bench
 
 from hapticbridge.device import SimulatedDevice
-from hapticbridge.device.falcon import start as falcon_start
-from hapticbridge.device.falcon.boot import read_firmware
-from hapticbridge.device.falcon.driver import FalconDevice
+from hapticbridge.device.falcon import protocol as falcon_start
+from hapticbridge.device.falcon.device import FalconDevice
+from hapticbridge.device.falcon.protocol import read_firmware
 from hapticbridge.errors import DeviceError, DeviceLost
 
 PROGRAM = bytes(np.random.default_rng(6).integers(0, 256, 7914, np.uint8))

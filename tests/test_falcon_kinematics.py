@@ -20,8 +20,9 @@ from hapticbridge.device.falcon.kinematics import (
     ZERO_ANGLE,
     forward,
     inverse,
+    jacobian,
+    thigh_torques,
 )
-from hapticbridge.device.falcon.statics import jacobian, thigh_torques
 
 MIDDLE = np.array([0.0, 0.0, 0.125])
 

@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hapticbridge.device.falcon.packets import ReplyStream, Request, encode
+from hapticbridge.device.falcon.protocol import ReplyStream, Request, encode
 
 STATUS = b"\x01\x60"
 

@@ -14,15 +14,14 @@ import pytest
 from emulated.dhd_stub import CALL, OMEGA3, OMEGA6, SIGMA7, Stub
 
 from hapticbridge.device import open_device
-from hapticbridge.device.forcedimension import finding as forcedimension
-from hapticbridge.device.forcedimension.driver import ForceDimensionDevice
-from hapticbridge.device.forcedimension.library import VARIABLE, Dhd
-from hapticbridge.device.forcedimension.models import MODELS, quaternion_of
-from hapticbridge.device.plugged import Plugged
-from hapticbridge.device.transport import usb_search
+from hapticbridge.device.family import FoundDevice
+from hapticbridge.device.force_dimension import device as forcedimension
+from hapticbridge.device.force_dimension.device import ForceDimensionDevice
+from hapticbridge.device.force_dimension.dhd import MODELS, VARIABLE, Dhd, quaternion_of
+from hapticbridge.device.transport import usb as usb_search
 from hapticbridge.errors import DeviceError, DeviceLost
 from hapticbridge.pose import quaternion_log
-from hapticbridge.tick import SAMPLE_DTYPE, TickFlag
+from hapticbridge.record import SAMPLE_DTYPE, TickFlag
 
 PERIOD = 1e-3
 WRENCH = np.array([1.0, -0.5, 0.3, 0.01, -0.02, 0.005])
@@ -291,7 +290,7 @@ def test_the_library_is_named_by_option_variable_or_found(
     monkeypatch.setattr(ctypes.util, "find_library", lambda name: stub.file)
     assert stub.file in forcedimension.medium()
     monkeypatch.setattr(ctypes.util, "find_library", lambda name: None)
-    monkeypatch.setattr("hapticbridge.device.forcedimension.library.NAMES", {})
+    monkeypatch.setattr("hapticbridge.device.force_dimension.dhd.NAMES", {})
     assert "was not found: install the SDK of forcedimension.com" in forcedimension.medium()
     with pytest.raises(DeviceError, match="name its file with library=FILE"):
         open_device("forcedimension")
@@ -315,7 +314,7 @@ def test_another_library_is_told_from_dhd(tmp_path: Path) -> None:
 def test_without_the_library_a_device_on_the_bus_is_listed_with_what_it_wants(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    plugged = Plugged(
+    plugged = FoundDevice(
         family="forcedimension", name="omega", serial="", path="/dev/bus/usb/001/002",
         vendor=0x1451, product=0x402, transport="usb", problem=None,
     )  # fmt: skip

@@ -16,17 +16,17 @@ from scipy.spatial.transform import Rotation
 from test_bridge_commands import FLOOR
 
 from hapticbridge.audit import audit
-from hapticbridge.audit.controlled import capped_sum
+from hapticbridge.audit.guard import capped_sum
 from hapticbridge.bridge import Bridge
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import SimulatedDevice
-from hapticbridge.guard import guarding_for, limits_for
-from hapticbridge.kernel.account import keep_account
-from hapticbridge.kernel.guarding import DAMPER, ENVIRONMENT
-from hapticbridge.kernel.layout import STATE_DTYPE
-from hapticbridge.passivity import WorstHand
+from hapticbridge.guard import guard_parameters_for, limits_for
+from hapticbridge.kernel.parameters import DAMPER, ENVIRONMENT
+from hapticbridge.kernel.passivity_controller import observe_energy
+from hapticbridge.kernel.state import STATE_DTYPE
+from hapticbridge.record import CLOCK_FIELDS, TICK_DTYPE, TickFlag
 from hapticbridge.recording import read_recording
-from hapticbridge.tick import CLOCK_FIELDS, TICK_DTYPE, TickFlag
+from hapticbridge.theory.sampled_loop import WorstHand
 
 T = 1e-3
 WORST = WorstHand(2.0, np.pi / T, T)
@@ -167,7 +167,7 @@ def rubbed_then_shaken(tick: int) -> tuple[float, ...]:
 def test_what_an_environment_burnt_does_not_pay_for_all_that_it_creates_later(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("hapticbridge.guard.guarding.SURPLUS", 1e-4)
+    monkeypatch.setattr("hapticbridge.guard.SURPLUS", 1e-4)
     scene, path = tmp_path / "floor.xml", tmp_path / "run.mcap"
     scene.write_text(FLOOR)
     device, coupling = ScriptedDevice(rubbed_then_shaken), Coupling(2000.0, 0.5, 1.0, 5e-4)
@@ -194,15 +194,15 @@ def slack_of(rows: NDArray[np.void], linear: float, angular: float) -> NDArray[n
 def test_a_device_with_too_little_damping_is_credited_with_half_of_it() -> None:
     info = SimulatedDevice().info
     limits = limits_for(info, None)
-    enough = guarding_for(info, limits, T, needed=(2.0, 2e-3))
+    enough = guard_parameters_for(info, limits, T, needed=(2.0, 2e-3))
     assert (enough.credit, enough.rotational_credit) == (2.0, 2e-3)
-    short = guarding_for(info, limits, T, needed=(2.1, 1e-3))
+    short = guard_parameters_for(info, limits, T, needed=(2.1, 1e-3))
     assert (short.credit, short.rotational_credit) == (1.0, 2e-3)
     assert (enough.controller, short.controller) == (ENVIRONMENT, DAMPER)
-    light = guarding_for(SimulatedDevice(mass=1e-3).info, limits, T)
+    light = guard_parameters_for(SimulatedDevice(mass=1e-3).info, limits, T)
     assert light.most_damping == pytest.approx(1.0)  # m/T, below b
     assert light.most_rotational_damping == 2e-3  # b, below I/T
-    slight = guarding_for(SimulatedDevice(rotational_inertia=1e-6).info, limits, T)
+    slight = guard_parameters_for(SimulatedDevice(rotational_inertia=1e-6).info, limits, T)
     assert slight.most_rotational_damping == pytest.approx(1e-3)
     assert slight.most_damping == 2.0
 
@@ -241,7 +241,7 @@ def test_an_hour_of_dissipation_pays_for_no_more_than_the_surplus(axis: int) -> 
         motion = np.zeros(6)
         motion[axis] = by
         x, y, z, rx, ry, rz = motion.tolist()
-        keep_account(state, (x, y, z), (rx, ry, rz), T)
+        observe_energy(state, (x, y, z), (rx, ry, rz), T)
 
     for _ in range(1000):
         move(1e-3)  # the hand pushes in 2 mJ each time
@@ -263,11 +263,11 @@ def test_an_hour_in_a_dissipating_scene_pays_for_no_more_than_the_surplus_either
     nothing = (0.0, 0.0, 0.0)
     for burnt in (1.0, 2.0, 3.0):
         state["environment_energy"] = -burnt
-        keep_account(state, nothing, nothing, T)
+        observe_energy(state, nothing, nothing, T)
     assert state["excess"][0] == -0.05
     state["environment_energy"] += 0.06
     state["slack"] += 0.002
-    keep_account(state, nothing, nothing, T)
+    observe_energy(state, nothing, nothing, T)
     assert state["excess"][0] == pytest.approx(0.008)
 
 

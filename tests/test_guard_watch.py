@@ -23,17 +23,17 @@ from faults.catalogue import FAULTS, PUSHER
 from faults.rig import Outcome, Rig
 from numpy.typing import NDArray
 
+from hapticbridge import guard as start_module
 from hapticbridge.audit import audit
 from hapticbridge.bridge import Bridge
 from hapticbridge.clock import RealClock, SimulatedClock
 from hapticbridge.commands import Switch
-from hapticbridge.device.last_word import LastWord
+from hapticbridge.device.watchdog import ForceOffGuardian
 from hapticbridge.errors import DeviceError, HapticBridgeError, SafetyTrip
-from hapticbridge.guard import UNLIMITED, Limits, guarding_for, wait_until_still
-from hapticbridge.guard import start as start_module
-from hapticbridge.kernel.guarding import UNGUARDED, Guarding
+from hapticbridge.guard import UNLIMITED, Limits, guard_parameters_for, wait_until_still
+from hapticbridge.kernel.parameters import UNGUARDED, GuardParameters
+from hapticbridge.record import SAMPLE_DTYPE, TickFlag
 from hapticbridge.recording import read_recording
-from hapticbridge.tick import SAMPLE_DTYPE, TickFlag
 
 LIMIT = 10.0
 CLUTCH, RESEATED = int(TickFlag.CLUTCH), int(TickFlag.RESEATED)
@@ -347,7 +347,7 @@ def test_a_run_that_is_told_to_end_while_an_absolute_device_strays_is_no_trip() 
 def test_what_the_guard_is_not_is_refused(options: dict[str, Any], message: str) -> None:
     info = ScriptedDevice(lambda _k: (0,) * 7).info
     with pytest.raises(DeviceError, match=message):
-        guarding_for(info, Limits(force=10.0, torque=0.5), 1e-3, **options)
+        guard_parameters_for(info, Limits(force=10.0, torque=0.5), 1e-3, **options)
 
 
 @pytest.mark.parametrize(
@@ -361,14 +361,14 @@ def test_limits_that_cannot_be_are_refused(change: dict[str, float]) -> None:
 
 def test_a_guard_reads_back_as_it_was_written() -> None:
     info = ScriptedDevice(lambda _k: (0,) * 7).info
-    guarding = guarding_for(info, Limits(force=10.0, torque=0.5), 1e-3, clutch=2)
-    assert Guarding.from_json(guarding.to_json()) == guarding
-    assert Guarding.from_json(UNGUARDED.to_json()) == UNGUARDED
+    guarding = guard_parameters_for(info, Limits(force=10.0, torque=0.5), 1e-3, clutch=2)
+    assert GuardParameters.from_json(guarding.to_json()) == guarding
+    assert GuardParameters.from_json(UNGUARDED.to_json()) == UNGUARDED
     older = {k: v for k, v in json.loads(guarding.to_json()).items() if k != "reach"}
-    assert Guarding.from_json(json.dumps(older)) == guarding
+    assert GuardParameters.from_json(json.dumps(older)) == guarding
     for text in ("", "{}", "[1]", guarding.to_json().replace("0.05", '"x"')):
         with pytest.raises(HapticBridgeError, match="guard"):
-            Guarding.from_json(text)
+            GuardParameters.from_json(text)
     assert not UNLIMITED.rise
 
 
@@ -409,7 +409,7 @@ def test_a_killed_process_still_says_zero_and_one_that_closed_does_not(
     if has_forked:
         os.kill(int(holder), signal.SIGKILL)
     process.stdout.close()
-    word = LastWord(str(quiet), b"\0zero")
+    word = ForceOffGuardian(str(quiet), b"\0zero")
     word.close()
     word.close()
     assert quiet.read_bytes() == b""

@@ -14,14 +14,15 @@ from haply_cases import PERIOD, Bench
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hapticbridge.device import SimulatedDevice, open_device, silence
-from hapticbridge.device.haply import finding as haply
+from hapticbridge.device import SimulatedDevice, open_device
+from hapticbridge.device import watchdog as silence
+from hapticbridge.device.haply import device as haply
 from hapticbridge.device.haply import messages
-from hapticbridge.device.haply.driver import FORCE_LIMIT, MOST_UNDER_WAY, HaplyDevice
-from hapticbridge.device.trajectory.motion import Motion
+from hapticbridge.device.haply.device import FORCE_LIMIT, MOST_UNDER_WAY, HaplyDevice
+from hapticbridge.device.trajectory import Motion
 from hapticbridge.device.transport import websocket as transport
 from hapticbridge.errors import DeviceError, DeviceLost
-from hapticbridge.tick import SAMPLE_DTYPE, TickFlag
+from hapticbridge.record import SAMPLE_DTYPE, TickFlag
 
 FORCE = np.array([0.4, -0.3, 0.2, 9.0, 9.0, 9.0])
 

@@ -14,9 +14,11 @@ from hapticbridge.device.transport.hid_descriptor import (
     INPUT,
     LONGEST_DESCRIPTOR,
     OUTPUT,
+    Layout,
+    element,
     fields_of,
+    place_of,
 )
-from hapticbridge.device.transport.hid_layout import Layout, element, place_of
 from hapticbridge.errors import DeviceError
 
 KINDS = {IN: INPUT, OUT: OUTPUT, MODEL_FEATURE: FEATURE}

@@ -10,8 +10,8 @@ from scipy.integrate import solve_ivp
 from hapticbridge.clock import SimulatedClock
 from hapticbridge.device import SimulatedDevice
 from hapticbridge.identify import Estimate, Identification, fit_axis, identify
-from hapticbridge.identify.resolution import step_of
-from hapticbridge.tick import TickFlag
+from hapticbridge.identify.identify import step_of
+from hapticbridge.record import TickFlag
 
 PERIOD = 1e-3
 

@@ -12,9 +12,9 @@ from hapticbridge.clock import SimulatedClock
 from hapticbridge.device import Hand, Motion, SimulatedDevice
 from hapticbridge.errors import IdentificationError
 from hapticbridge.identify import AxisFit, Estimate, identify
-from hapticbridge.identify.identification import duration_at
-from hapticbridge.identify.measured_profile import measured_profile
-from hapticbridge.identify.weak_form import noise_of
+from hapticbridge.identify.fit import noise_of
+from hapticbridge.identify.identify import duration_at
+from hapticbridge.identify.profile import measured_profile
 
 PERIOD = 1e-3
 STILL = Motion([0.0, 100.0], np.zeros((2, 3)))

@@ -34,14 +34,12 @@ from scipy.spatial.transform import Rotation
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import HapticBridgeError, SceneError
-from hapticbridge.kernel import native
+from hapticbridge.kernel import mujoco_c as native
 from hapticbridge.kernel.codes import BAD_RESULT, BAD_SAMPLE, OK
 from hapticbridge.kernel.handle import handle_pose
-from hapticbridge.kernel.publish import HEAD, TAIL, publish
-from hapticbridge.kernel.simulation import simulate
-from hapticbridge.kernel.step import after_step, before_step
+from hapticbridge.kernel.tick import HEAD, TAIL, after_step, before_step, publish, simulate
+from hapticbridge.record import TICK_DTYPE, TickFlag
 from hapticbridge.scene import load_scene
-from hapticbridge.tick import TICK_DTYPE, TickFlag
 
 TURNED = (0.3, -0.2, 0.1, 0.5, 0.5, -0.5, 0.5)
 

@@ -11,14 +11,16 @@ import pytest
 from hapticbridge.bridge import Bridge
 from hapticbridge.certificate import (
     NEEDED_SHARE,
+    damping_for_delay,
     default_coupling,
+    delay_ticks,
     device_conditions,
+    felt_period,
     is_certified,
 )
 from hapticbridge.clock import SimulatedClock
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo, SimulatedDevice
-from hapticbridge.device.lateness import damping_for_delay, delay_ticks, felt_period
 from hapticbridge.errors import DeviceError
 from hapticbridge.rendering import default_method
 

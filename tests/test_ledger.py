@@ -38,7 +38,7 @@ from ledger_scenes import ARM, GRAVITY, MASSES, ROPE, SLIDER, SOLID, Witness
 from scipy.spatial.transform import Rotation
 
 from hapticbridge.coupling import Coupling
-from hapticbridge.kernel.meter import ENERGY_TOLERANCE
+from hapticbridge.kernel.ledger import ENERGY_TOLERANCE
 
 
 def test_joint_spring_stores_what_the_coupling_puts_in() -> None:

@@ -13,15 +13,17 @@ from rendering_runs import FREE_MASS
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.kernel.codes import OK
-from hapticbridge.kernel.state import Binding
-from hapticbridge.kernel.step import after_step, before_step
+from hapticbridge.kernel.state import BoundKernel
+from hapticbridge.kernel.tick import after_step, before_step
+from hapticbridge.record import SAMPLE_DTYPE, TICK_DTYPE, TickFlag
 from hapticbridge.scene import Scene
-from hapticbridge.tick import SAMPLE_DTYPE, TICK_DTYPE, TickFlag
 
 ASKED = Coupling(2400.0, 3.0, 2.4, 0.003)
 
 
-def stepped(binding: Binding, scene: Scene, ticks: int, user: Callable[[int], None]) -> np.ndarray:
+def stepped(
+    binding: BoundKernel, scene: Scene, ticks: int, user: Callable[[int], None]
+) -> np.ndarray:
     """Steps a scene whose handle stands still, tick by tick, with a user's inputs before each."""
     sample, rows = np.zeros(1, SAMPLE_DTYPE), np.zeros(ticks, TICK_DTYPE)
     sample["quaternion"][:, 0] = 1.0

@@ -19,7 +19,7 @@ from hapticbridge.device import Hand, Motion, SimulatedDevice
 from hapticbridge.errors import StudyError
 from hapticbridge.rendering import METHODS
 from hapticbridge.scene import load_scene
-from hapticbridge.scene.contact_rule import SUGGESTED
+from hapticbridge.scene.contacts import SUGGESTED
 from hapticbridge.study.maps import contact, contact_methods, contact_search
 from hapticbridge.study.maps.contact import CONTACT, evaluate, points
 from hapticbridge.study.maps.contact_agreement import agreement, exceptions

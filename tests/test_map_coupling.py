@@ -16,11 +16,6 @@ from matplotlib.axes import Axes
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import SimulatedDevice
 from hapticbridge.errors import StudyError
-from hapticbridge.passivity import (
-    environment_minimum_damping,
-    maximum_stiffness,
-    minimum_damping,
-)
 from hapticbridge.rendering import METHODS
 from hapticbridge.study.maps import MapFiles, run_map
 from hapticbridge.study.maps.bound_of_method import limit_by_6, needed_by_6, used_damping
@@ -37,6 +32,8 @@ from hapticbridge.study.maps.coupling_runs import (
 from hapticbridge.study.maps.rigs import free_tool_and_wall
 from hapticbridge.study.maps.stability_map import Point
 from hapticbridge.study.maps.verdicts import MISSING
+from hapticbridge.theory.bounds import maximum_stiffness, minimum_damping
+from hapticbridge.theory.virtual_mass import environment_minimum_damping
 
 
 def cell(method: str, stiffness: float, damping: float) -> Point:

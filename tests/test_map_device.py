@@ -15,7 +15,6 @@ from map_tables import Row, without_rows, written
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import SimulatedDevice
 from hapticbridge.errors import StudyError
-from hapticbridge.passivity import quantization_limit
 from hapticbridge.rendering import METHODS
 from hapticbridge.scene import load_scene
 from hapticbridge.study.closed_loop import LoopOutcome
@@ -38,6 +37,7 @@ from hapticbridge.study.maps.device_runs import (
 )
 from hapticbridge.study.maps.rigs import set_tool_mass
 from hapticbridge.study.maps.stability_map import Point, run_map
+from hapticbridge.theory.device_limits import quantization_limit
 
 
 @pytest.mark.parametrize(

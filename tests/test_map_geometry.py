@@ -15,7 +15,6 @@ from map_tables import Row, without_rows, written
 
 from hapticbridge.device import Hand, Motion, SimulatedDevice
 from hapticbridge.errors import StudyError
-from hapticbridge.passivity import minimum_damping
 from hapticbridge.rendering import METHODS
 from hapticbridge.scene import load_scene
 from hapticbridge.study.maps.fitting_peg import (
@@ -42,6 +41,7 @@ from hapticbridge.study.maps.geometry_runs import (
 )
 from hapticbridge.study.maps.stability_map import Point, run_map
 from hapticbridge.study.maps.verdicts import MISSING, VERDICTS
+from hapticbridge.theory.bounds import minimum_damping
 
 
 def test_the_printed_limit_is_its_own_inverse() -> None:

@@ -15,7 +15,6 @@ from map_tables import Row, without_rows, written
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import SimulatedDevice
 from hapticbridge.errors import StudyError
-from hapticbridge.passivity import SampledLoop, WorstHand
 from hapticbridge.rendering import METHODS
 from hapticbridge.scene import Scene, load_scene
 from hapticbridge.study.jitter import PARTS, Timing
@@ -39,6 +38,7 @@ from hapticbridge.study.maps.rate_runs import (
 )
 from hapticbridge.study.maps.rigs import set_tool_mass
 from hapticbridge.study.maps.stability_map import Point, run_map
+from hapticbridge.theory.sampled_loop import SampledLoop, WorstHand
 
 
 def point(name: str, period: float, delay: int) -> Point:

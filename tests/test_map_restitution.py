@@ -17,7 +17,6 @@ from map_tables import Row, without_rows, written
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Motion, TrajectoryDevice
 from hapticbridge.errors import StudyError
-from hapticbridge.mechanics import ImpactBody
 from hapticbridge.scene import Scene
 from hapticbridge.study.maps.falling_rod import (
     APPROACH,
@@ -35,6 +34,7 @@ from hapticbridge.study.maps.rigs import scene_of
 from hapticbridge.study.maps.stability_map import Point, run_map
 from hapticbridge.study.maps.verdicts import MISSING
 from hapticbridge.study.sweep import sweep
+from hapticbridge.theory.impact import ImpactBody
 
 GAINING: Point = {
     "setting": "bouncy, implicitfast",

@@ -15,8 +15,6 @@ from map_tables import Row, without_rows, written
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import SimulatedDevice
 from hapticbridge.errors import StudyError
-from hapticbridge.passivity import SampledLoop, environment_minimum_damping, minimum_mass
-from hapticbridge.passivity.virtual_mass import Integrator
 from hapticbridge.scene import Scene, load_scene
 from hapticbridge.study.maps.free_tool import felt, least_mass, worst_angle
 from hapticbridge.study.maps.rigs import set_tool_mass
@@ -36,6 +34,8 @@ from hapticbridge.study.maps.tool_mass_runs import (
     predicted_limit,
     worst_hand,
 )
+from hapticbridge.theory.sampled_loop import SampledLoop
+from hapticbridge.theory.virtual_mass import Integrator, environment_minimum_damping, minimum_mass
 
 TWINS: dict[str, Integrator] = {"implicit": "implicit", "explicit": "semi_implicit"}
 

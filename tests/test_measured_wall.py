@@ -7,8 +7,9 @@ import pytest
 
 from hapticbridge.clock import SimulatedClock
 from hapticbridge.device import SimulatedDevice
-from hapticbridge.identify.wall import MeasuredLimit, measure_limit, try_wall
-from hapticbridge.passivity import WorstHand, free_device_stiffness
+from hapticbridge.identify.z_width import MeasuredLimit, measure_limit, try_wall
+from hapticbridge.theory.device_limits import free_device_stiffness
+from hapticbridge.theory.sampled_loop import WorstHand
 
 PERIOD = 1e-3
 

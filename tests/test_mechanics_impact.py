@@ -10,8 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from hapticbridge.errors import MechanicsError
-from hapticbridge.mechanics import ImpactBody, Mode, resolve_impact
-from hapticbridge.mechanics.impact import Law
+from hapticbridge.theory.impact import ImpactBody, Law, Mode, resolve_impact
 
 Array = NDArray[np.float64]
 LAWS: tuple[Law, ...] = ("newton", "poisson", "stronge")

@@ -10,9 +10,13 @@ from numpy.typing import NDArray
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import MechanicsError
-from hapticbridge.mechanics import drive_mass, exact_mass_response, integrate_particle
-from hapticbridge.mechanics.coupled_mass import CoupledScheme
-from hapticbridge.mechanics.particle import Scheme
+from hapticbridge.theory.rigid_body import (
+    CoupledScheme,
+    Scheme,
+    drive_mass,
+    exact_mass_response,
+    integrate_particle,
+)
 
 T = 1e-3
 COUPLING = Coupling(1000, 5, 0, 0)

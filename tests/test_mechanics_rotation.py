@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
 from hapticbridge.errors import MechanicsError
-from hapticbridge.mechanics import integrate_rotation
-from hapticbridge.mechanics.particle import Scheme
+from hapticbridge.theory.rigid_body import Scheme, integrate_rotation
 
 ALL: tuple[Scheme, ...] = ("explicit", "semi_implicit", "implicit", "midpoint")
 INERTIA = np.array([1.5e-3, 3.63e-3, 4.53e-3])

@@ -10,7 +10,7 @@ from kernel_runs import Array
 from lossless_runs import T, led, scene_of
 
 from hapticbridge.coupling import Coupling
-from hapticbridge.tick import TickFlag
+from hapticbridge.record import TickFlag
 
 ASKED = Coupling(2400.0, 3.0, 1.0, 0.003)
 OUT_AND_BACK: Array = np.concatenate([np.linspace(0, 0.02, 300), np.linspace(0.02, 0, 300)])

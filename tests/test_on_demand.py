@@ -11,7 +11,7 @@ import pytest
 
 import hapticbridge as hb
 import hapticbridge.audit.report
-from hapticbridge.on_demand import on_demand
+from hapticbridge.lazy import lazy_exports
 
 PACKAGE = Path(__file__).parents[1] / "hapticbridge"
 
@@ -41,7 +41,9 @@ def test_audit_is_the_function_although_a_package_has_its_name() -> None:
 
 
 def test_a_module_of_the_package_is_found_and_a_wrong_name_is_not() -> None:
-    find, names, public = on_demand("hapticbridge", {"Motion": "hapticbridge.device"}, ("audit",))
+    find, names, public = lazy_exports(
+        "hapticbridge", {"Motion": "hapticbridge.device"}, ("audit",)
+    )
     assert find("device") is sys.modules["hapticbridge.device"]
     assert find("Motion") is sys.modules["hapticbridge.device"].Motion
     assert names() == public == ["Motion", "audit"]

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import CouplingError
-from hapticbridge.passivity import maximum_stiffness, minimum_damping, stiffest_coupling
+from hapticbridge.theory.bounds import maximum_stiffness, minimum_damping, stiffest_coupling
 
 T = 1e-3
 positive = st.floats(1e-6, 1e6)

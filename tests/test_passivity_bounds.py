@@ -14,20 +14,21 @@ from scipy import signal
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import CouplingError
-from hapticbridge.passivity import (
-    CouplingGrid,
+from hapticbridge.theory.bounds import (
     coupled_stability_limit,
-    damping_spectrum,
-    damping_spectrum_of,
-    environment_minimum_damping,
     matrix_margin,
     maximum_stiffness,
     minimum_damping,
-    minimum_mass,
-    quantization_limit,
 )
-from hapticbridge.passivity.transfer import Discretization
-from hapticbridge.passivity.virtual_mass import FORCE_DELAY, Integrator
+from hapticbridge.theory.device_limits import quantization_limit
+from hapticbridge.theory.spectrum import damping_spectrum, damping_spectrum_of
+from hapticbridge.theory.transfer import CouplingGrid, Discretization
+from hapticbridge.theory.virtual_mass import (
+    FORCE_DELAY,
+    Integrator,
+    environment_minimum_damping,
+    minimum_mass,
+)
 
 T = 1e-3
 SCHEMES: tuple[Discretization, ...] = ("backward", "tustin")

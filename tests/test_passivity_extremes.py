@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hapticbridge import mechanics as m
-from hapticbridge import passivity as p
+from hapticbridge import theory as m
+from hapticbridge import theory as p
 from hapticbridge.arguments import LARGEST, SMALLEST
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import CouplingError, HapticBridgeError, MechanicsError

@@ -11,16 +11,10 @@ from hypothesis import strategies as st
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import CouplingError
-from hapticbridge.passivity import (
-    CouplingGrid,
-    damping_spectrum,
-    minimum_damping,
-    worst_frequency,
-    z_width,
-)
-from hapticbridge.passivity.grid import MOST_DELAY
-from hapticbridge.passivity.transfer import Discretization
-from hapticbridge.passivity.wall import search_grid
+from hapticbridge.theory.bounds import minimum_damping, worst_frequency
+from hapticbridge.theory.spectrum import damping_spectrum, search_grid
+from hapticbridge.theory.transfer import MOST_DELAY, CouplingGrid, Discretization
+from hapticbridge.theory.z_width import z_width
 
 T = 1e-3
 SCHEMES: tuple[Discretization, ...] = ("backward", "tustin")

@@ -12,13 +12,13 @@ from hypothesis import strategies as st
 from pid_cases import LAYOUTS, NEWTONS, PERIOD, SCALE, TRAVEL, opened
 
 from hapticbridge.device import SimulatedDevice, open_device
-from hapticbridge.device.pid import driver, sheet
-from hapticbridge.device.pid.driver import PidDevice, open_pid
-from hapticbridge.device.pid.effects import LIFE, RESTART
-from hapticbridge.device.plugged import tell_nobody
+from hapticbridge.device.family import ignore_message
+from hapticbridge.device.pid import device as driver
+from hapticbridge.device.pid import device as sheet
+from hapticbridge.device.pid.device import LIFE, RESTART, PidDevice, open_pid
 from hapticbridge.device.profile import Profile, Quantity
 from hapticbridge.errors import DeviceError, DeviceLost
-from hapticbridge.tick import SAMPLE_DTYPE, TickFlag
+from hapticbridge.record import SAMPLE_DTYPE, TickFlag
 
 
 class LastWordDouble:
@@ -284,15 +284,15 @@ def test_a_profile_says_the_scale_and_no_other_goes_with_its_numbers(
     monkeypatch.setattr(sheet, "profile_of", profile_of)
     model = PidStick()
     model.place = (1.0, 0.0)
-    device = open_pid({"damping": 1.0, "newtons": 7.0}, tell_nobody, HidSeam(model))
+    device = open_pid({"damping": 1.0, "newtons": 7.0}, ignore_message, HidSeam(model))
     assert asked == [("pid", "P1", device.info.name)]
     assert device.info.force_limit == 7.0
     assert device.start(PERIOD)["position"][0, 0] == pytest.approx(0.025)
     with pytest.raises(DeviceError, match=r"newtons = 3\.0: .* was measured with 7, .* leave out"):
-        open_pid({"newtons": 3.0}, tell_nobody, HidSeam(model))
+        open_pid({"newtons": 3.0}, ignore_message, HidSeam(model))
     with pytest.raises(DeviceError, match=r"travel = 0\.1: .* was measured with 0\.05"):
-        open_pid({"travel": 0.1}, tell_nobody, HidSeam(model))
-    other = open_pid({"newtons": 3.0, "profile": "none"}, tell_nobody, HidSeam(model))
+        open_pid({"travel": 0.1}, ignore_message, HidSeam(model))
+    other = open_pid({"newtons": 3.0, "profile": "none"}, ignore_message, HidSeam(model))
     assert other.info.force_limit == 3.0
 
 
@@ -309,7 +309,7 @@ def test_a_profile_says_the_scale_and_no_other_goes_with_its_numbers(
 )
 def test_options_that_cannot_be_are_refused(options: dict[str, object], words: str) -> None:
     with pytest.raises(DeviceError, match=words):
-        open_pid(options, tell_nobody, HidSeam(PidStick()))
+        open_pid(options, ignore_message, HidSeam(PidStick()))
 
 
 def test_options_on_the_command_line_are_checked_before_anything_is_opened() -> None:

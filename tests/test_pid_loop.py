@@ -13,14 +13,14 @@ from pid_cases import LAYOUTS, NEWTONS, PERIOD, TRAVEL, opened
 
 import hapticbridge as hb
 from hapticbridge.device import SimulatedDevice
-from hapticbridge.device.pid import sheet
-from hapticbridge.device.pid.driver import open_pid
-from hapticbridge.device.plugged import tell_nobody
+from hapticbridge.device.family import ignore_message
+from hapticbridge.device.pid import device as sheet
+from hapticbridge.device.pid.device import open_pid
 from hapticbridge.device.profile import read_profile
 from hapticbridge.errors import SafetyTrip
 from hapticbridge.identify import identify
-from hapticbridge.identify.measured_profile import measured_profile
-from hapticbridge.tick import TickFlag
+from hapticbridge.identify.profile import measured_profile
+from hapticbridge.record import TickFlag
 
 MASS, DAMPING, WIDE = 0.25, 4.0, 0.12
 SCENE = "planar_peg"
@@ -138,7 +138,7 @@ def test_what_was_identified_holds_with_the_scale_that_it_was_identified_with(
     monkeypatch.setattr(sheet, "profile_of", lambda device, serial, model: None)
     mechanics = SimulatedDevice(hand=None, mass=0.3, damping=2.0)
     seam = HidSeam(PidStick(mechanics, newtons=NEWTONS, travel=TRAVEL))
-    device = open_pid({}, tell_nobody, seam)
+    device = open_pid({}, ignore_message, seam)
     result = identify(device, DrivingClock(seam), period=PERIOD, axes=("x",), duration=5.0)
     device.close()
     # N per m, and per m/s, in the assumed units of both

@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pid_cases import LAYOUTS, MOUSE, opened
 
+from hapticbridge.device.pid.device import Stick
 from hapticbridge.device.pid.reports import (
     DISABLE,
     ENABLE,
@@ -23,8 +24,7 @@ from hapticbridge.device.pid.reports import (
     PidReports,
     has_force_feedback,
 )
-from hapticbridge.device.pid.stick import Stick
-from hapticbridge.device.transport.hid_layout import Layout
+from hapticbridge.device.transport.hid_descriptor import Layout
 from hapticbridge.errors import DeviceError
 
 JOYSTICK = bytes.fromhex("0501 0904 a101 0930 0931 1581 257f 7508 9502 8102 c0")

@@ -16,11 +16,11 @@ from hapticbridge.audit import audit
 from hapticbridge.bridge import Bridge
 from hapticbridge.errors import SafetyTrip
 from hapticbridge.guard import Limits
-from hapticbridge.kernel.ahead import can_split, is_sound
-from hapticbridge.kernel.scheme import COUPLED, DIRECT, WELD
+from hapticbridge.kernel.codes import COUPLED, DIRECT, WELD
+from hapticbridge.kernel.tick import can_split, is_sound
+from hapticbridge.record import TICK_DTYPE
 from hapticbridge.recording import read_recording
 from hapticbridge.rendering import METHODS
-from hapticbridge.tick import TICK_DTYPE
 
 TICKS = 400
 

@@ -10,14 +10,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hapticbridge.device import SimulatedDevice
-from hapticbridge.device.forcedimension.models import MODELS
-from hapticbridge.device.profile import LOWER_END, UNITS, Profile, Quantity, read_profile
-from hapticbridge.device.profile_search import (
+from hapticbridge.device.force_dimension.dhd import MODELS
+from hapticbridge.device.profile import (
+    LOWER_END,
     SHIPPED,
+    UNITS,
+    Profile,
+    Quantity,
     modelled,
     profile_named,
     profile_of,
     profiles,
+    read_profile,
 )
 from hapticbridge.errors import DeviceError
 

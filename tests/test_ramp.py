@@ -19,10 +19,9 @@ from hapticbridge.bridge import Bridge
 from hapticbridge.commands import Couple
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import SafetyTrip
-from hapticbridge.guard import USUAL_ENERGY, Limits
-from hapticbridge.guard.guarding import RAMP_ENERGY
+from hapticbridge.guard import RAMP_ENERGY, USUAL_ENERGY, Limits
+from hapticbridge.record import TickFlag
 from hapticbridge.recording import Recording, read_recording
-from hapticbridge.tick import TickFlag
 
 T, RAMP = 1e-3, 500
 K, B_DEVICE = 2000.0, 2.0

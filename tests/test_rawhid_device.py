@@ -14,13 +14,12 @@ from rawhid_cases import PERIOD, opened, paddle
 from scipy.spatial.transform import Rotation
 
 from hapticbridge.device import SimulatedDevice
-from hapticbridge.device.data_sheet import AXES
-from hapticbridge.device.plugged import tell_nobody
-from hapticbridge.device.rawhid.driver import RawHidDevice
-from hapticbridge.device.rawhid.finding import open_rawhid
-from hapticbridge.device.silence import SILENCE
+from hapticbridge.device.base import AXES
+from hapticbridge.device.family import ignore_message
+from hapticbridge.device.rawhid.device import RawHidDevice, open_rawhid
+from hapticbridge.device.watchdog import SILENCE
 from hapticbridge.errors import DeviceError, DeviceLost
-from hapticbridge.tick import SAMPLE_DTYPE, TickFlag
+from hapticbridge.record import SAMPLE_DTYPE, TickFlag
 
 STALE = int(TickFlag.STALE_SAMPLE)
 PUSH = np.array([1.0, 2.0, 3.0, 0.01, 0.02, 0.03])
@@ -103,10 +102,10 @@ def test_another_teensy_interface_and_another_serial_are_not_taken_for_it() -> N
         opened(Serial())
     first, second = RawHid(serial="A"), RawHid(serial="B")
     with pytest.raises(DeviceError, match=r"2 devices 'rawhid' .* one of 'A', 'B'"):
-        open_rawhid({}, tell_nobody, HidSeam(first, second))
+        open_rawhid({}, ignore_message, HidSeam(first, second))
     with pytest.raises(DeviceError, match="no device 'rawhid' has serial 'C'; plugged in: 'A', "):
-        open_rawhid({"serial": "C"}, tell_nobody, HidSeam(first, second))
-    open_rawhid({"serial": "B"}, tell_nobody, HidSeam(first, second)).start(PERIOD)
+        open_rawhid({"serial": "C"}, ignore_message, HidSeam(first, second))
+    open_rawhid({"serial": "B"}, ignore_message, HidSeam(first, second)).start(PERIOD)
     assert first.commands == 0
 
 

@@ -13,8 +13,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hapticbridge.device.rawhid import driver
-from hapticbridge.device.rawhid.frame import (
+from hapticbridge.device.rawhid import device as driver
+from hapticbridge.device.rawhid.protocol import (
     Numbers,
     State,
     Status,

@@ -11,9 +11,9 @@ from emulated.rawhid_model import crc
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hapticbridge.device.data_sheet import AXES
-from hapticbridge.device.rawhid import driver
-from hapticbridge.device.rawhid.frame import (
+from hapticbridge.device.base import AXES
+from hapticbridge.device.rawhid import device as driver
+from hapticbridge.device.rawhid.protocol import (
     FRAME_BYTES,
     Numbers,
     State,

@@ -14,8 +14,8 @@ from rawhid_cases import opened, paddle
 import hapticbridge as hb
 from hapticbridge.device import SimulatedDevice
 from hapticbridge.errors import DeviceError, SafetyTrip
+from hapticbridge.record import TickFlag
 from hapticbridge.scene import scene_path
-from hapticbridge.tick import TickFlag
 
 
 def guided() -> RawHid:

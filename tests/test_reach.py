@@ -16,12 +16,11 @@ from cli_cases import Called
 
 from hapticbridge.audit import audit
 from hapticbridge.device import DeviceInfo
-from hapticbridge.device.profile import Profile
-from hapticbridge.device.profile_search import SHIPPED, profile_named, profiles
+from hapticbridge.device.profile import SHIPPED, Profile, profile_named, profiles
 from hapticbridge.errors import DeviceError
 from hapticbridge.guard import Limits
+from hapticbridge.record import TickFlag
 from hapticbridge.recording import read_recording
-from hapticbridge.tick import TickFlag
 
 REACH = 0.02
 HOME = 0.01

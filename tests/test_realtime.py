@@ -27,14 +27,20 @@ from hapticbridge.realtime import (
     check_pace,
     lateness_of,
     memory_at_rest,
-    pace,
     real_time,
     wants_real_time,
     warn_of_refusals,
 )
-from hapticbridge.realtime import grants as asked
-from hapticbridge.realtime.pace import BESIDE_THE_STEP, SPARE, rate_for
-from hapticbridge.realtime.remedies import CONTAINER, PRIORITY, SHELL
+from hapticbridge.realtime import realtime as asked
+from hapticbridge.realtime import realtime as pace
+from hapticbridge.realtime.realtime import (
+    BESIDE_THE_STEP,
+    CONTAINER,
+    PRIORITY,
+    SHELL,
+    SPARE,
+    rate_for,
+)
 from hapticbridge.recording import read_recording
 from hapticbridge.rendering import METHODS, prepare
 from hapticbridge.scene import load_scene

@@ -16,9 +16,9 @@ from mcap.reader import NonSeekingReader
 from numpy.typing import NDArray
 
 from hapticbridge.errors import RecordingError
+from hapticbridge.record import TICK_DTYPE, TickFlag
 from hapticbridge.recording import Attachment, Recorder, Ring, read_recording, repair
-from hapticbridge.recording.live import LiveLine, RunState
-from hapticbridge.tick import TICK_DTYPE, TickFlag
+from hapticbridge.recording.recorder_process import LiveLine, RunState
 
 META = {"method": "implicit", "device": "{}"}
 # larger than what a pipe takes at once

@@ -24,11 +24,11 @@ from mcap_ros2.decoder import DecoderFactory
 from recording_cases import EPOCH, FILES, META, chunk_ends, random_rows, same, write
 
 from hapticbridge.errors import RecordingError
+from hapticbridge.record import TICK_DTYPE
 from hapticbridge.recording import Attachment, RecordingWriter, read_recording, repair
 from hapticbridge.recording import format as layout
-from hapticbridge.recording.output import RESERVE
 from hapticbridge.recording.reader import _joined
-from hapticbridge.tick import TICK_DTYPE
+from hapticbridge.recording.writer import RESERVE
 
 
 @given(

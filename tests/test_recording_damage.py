@@ -17,9 +17,9 @@ from mcap.writer import Writer
 from recording_cases import EPOCH, FILES, chunk_ends, random_rows, same
 
 from hapticbridge.errors import RecordingError
+from hapticbridge.record import TICK_DTYPE
 from hapticbridge.recording import read_recording
-from hapticbridge.recording.fields import DamageError, Fields
-from hapticbridge.tick import TICK_DTYPE
+from hapticbridge.recording.container import DamageError, Fields
 
 
 def rewritten(path: Path, output: Path, change: Callable[[str, Any], Any]) -> None:

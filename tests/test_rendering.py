@@ -25,8 +25,8 @@ from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import DeviceError, HapticBridgeError, SceneError
 from hapticbridge.kernel.codes import OK
 from hapticbridge.kernel.parameters import RunParameters
-from hapticbridge.kernel.state import Binding
-from hapticbridge.kernel.step import after_step, before_step
+from hapticbridge.kernel.state import BoundKernel
+from hapticbridge.kernel.tick import after_step, before_step
 from hapticbridge.recording import read_recording
 from hapticbridge.rendering import IMPLICIT, METHODS, method_named, prepare
 
@@ -58,7 +58,7 @@ def test_compiled_advance_equals_the_python_binding(name: str, substeps: int) ->
     run = rendered(name, COUPLING, samples, TURNED_TOOL, substeps=substeps)
     scene = load(TURNED_TOOL)
     prepare(scene, COUPLING, T, substeps, method)
-    binding = Binding(scene.model, scene.data, run.parameters)
+    binding = BoundKernel(scene.model, scene.data, run.parameters)
     for k in range(len(samples)):
         for substep in range(substeps):
             assert before_step(binding.state, samples[k : k + 1], binding.row, substep, T) == OK

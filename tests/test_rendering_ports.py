@@ -17,8 +17,8 @@ from hapticbridge.bridge import Bridge
 from hapticbridge.clock import SimulatedClock
 from hapticbridge.errors import SceneError
 from hapticbridge.kernel.codes import OK
-from hapticbridge.kernel.state import Binding
-from hapticbridge.kernel.step import after_step, before_step
+from hapticbridge.kernel.state import BoundKernel
+from hapticbridge.kernel.tick import after_step, before_step
 from hapticbridge.rendering import method_named, prepare
 
 
@@ -56,7 +56,7 @@ def test_ports_of_a_separate_arm_close_to_its_dissipation(method: str) -> None:
     chosen = method_named(method)
     prepare(scene, COUPLING, T, 1, chosen)
     parameters = unlimited(scene, COUPLING, scheme=chosen.scheme)
-    binding = Binding(scene.model, scene.data, parameters)
+    binding = BoundKernel(scene.model, scene.data, parameters)
     still, left, speed = samples_of(np.zeros((1, 3))), 0.0, 0.0
     for k in range(200):
         scene.data.ctrl[0 if scene.model.actuator(0).name == "m" else -1] = 0.0

@@ -16,7 +16,7 @@ from rendering_runs import (
 from scipy.spatial.transform import Rotation
 
 from hapticbridge.audit import audit
-from hapticbridge.certificate import needed_damping
+from hapticbridge.certificate import required_damping
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import CouplingError
 from hapticbridge.recording import read_recording
@@ -68,24 +68,24 @@ def test_torque_over_substeps_is_the_mean_of_the_single_laws(substeps: int) -> N
 
 
 def test_needed_damping_with_one_law_is_that_of_the_theory_and_grows_with_the_delay() -> None:
-    assert needed_damping(COUPLING, T) == pytest.approx(3.0, rel=1e-12)
+    assert required_damping(COUPLING, T) == pytest.approx(3.0, rel=1e-12)
     undamped = Coupling(2000.0, 0.0, 2.0, 0.0)
-    needed = [needed_damping(undamped, T, n) for n in (1, 2, 4, 8)]
+    needed = [required_damping(undamped, T, n) for n in (1, 2, 4, 8)]
     # s = 1/2 of the slack may be used; strictly it would be K T n / 2
     assert needed == pytest.approx([1.0, 2.5, 6.25, 14.125], rel=1e-4)
     damped = Coupling(2000.0, 2.0, 2.0, 2e-3)
-    assert [needed_damping(damped, T, n) for n in (2, 4, 8)] == pytest.approx(
+    assert [required_damping(damped, T, n) for n in (2, 4, 8)] == pytest.approx(
         [2.6429, 2.4423, 2.3350], abs=1e-4
     )
-    assert needed_damping(damped, T, 4, "rotation") == pytest.approx(2.4423e-3, abs=1e-7)
+    assert required_damping(damped, T, 4, "rotation") == pytest.approx(2.4423e-3, abs=1e-7)
     with pytest.raises(CouplingError, match="substeps"):
-        needed_damping(damped, T, 0)
+        required_damping(damped, T, 0)
 
 
 def test_needed_damping_bounds_random_motions_behind_substeps() -> None:
     """The inequality that defines it holds for motions that return to rest, and fails below."""
     coupling, n = Coupling(2000.0, 1.0, 0.0, 0.0), 4
-    needed = needed_damping(coupling, T, n)
+    needed = required_damping(coupling, T, n)
     rng = np.random.default_rng(3)
     k_, b_ = coupling.stiffness, coupling.damping * n / T
     for _ in range(50):

@@ -26,8 +26,8 @@ from hapticbridge.clock import SimulatedClock
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import SceneError
 from hapticbridge.kernel.codes import OK
-from hapticbridge.kernel.state import Binding
-from hapticbridge.kernel.step import after_step, before_step
+from hapticbridge.kernel.state import BoundKernel
+from hapticbridge.kernel.tick import after_step, before_step
 from hapticbridge.recording import read_recording
 from hapticbridge.rendering import METHODS, check_prepared, method_named, prepare
 from hapticbridge.scene import load_scene
@@ -40,7 +40,7 @@ def test_wrench_of_the_weld_is_what_moves_the_tool() -> None:
     run = rendered("weld", COUPLING, samples, TURNED_TOOL)
     assert felt == run.parameters.felt
     model, data = scene.model, scene.data
-    binding = Binding(model, data, run.parameters)
+    binding = BoundKernel(model, data, run.parameters)
     jacobian = np.zeros((6, model.nv))
     for k in range(len(samples)):
         assert before_step(binding.state, samples[k : k + 1], binding.row, 0, T) == OK

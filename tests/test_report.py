@@ -20,13 +20,12 @@ from report_runs import Made
 
 from hapticbridge.audit import audit
 from hapticbridge.errors import HapticBridgeError, RecordingError
-from hapticbridge.kernel.guarding import TANK, Guarding
-from hapticbridge.quantity import quantity
+from hapticbridge.kernel.parameters import TANK, GuardParameters
+from hapticbridge.record import TickFlag
 from hapticbridge.recording import Recording, read_recording
 from hapticbridge.report import plot_recording, write_report
-from hapticbridge.report.curves import decimated
-from hapticbridge.report.energies import draw_energies
-from hapticbridge.report.evidence import Evidence
+from hapticbridge.report.cause import likely_cause
+from hapticbridge.report.evidence import Evidence, decimated
 from hapticbridge.report.facts import (
     MOST_EVENTS,
     MOST_INPUTS,
@@ -34,12 +33,17 @@ from hapticbridge.report.facts import (
     guard_facts,
     head_facts,
 )
-from hapticbridge.report.lead import is_warned, notes
-from hapticbridge.report.likely import likely_cause
-from hapticbridge.report.motion import draw_motion
-from hapticbridge.report.panels import BINS, LEAST_SPAN, energy_unit
-from hapticbridge.report.timing import activities, draw_timing
-from hapticbridge.tick import TickFlag
+from hapticbridge.report.page import is_warned, notes
+from hapticbridge.report.plots import (
+    BINS,
+    LEAST_SPAN,
+    activities,
+    draw_energies,
+    draw_motion,
+    draw_timing,
+    energy_unit,
+)
+from hapticbridge.units import format_si
 
 pytestmark = pytest.mark.filterwarnings("ignore:scene '.*floor.xml'")
 
@@ -167,8 +171,8 @@ def test_what_the_guard_did_is_drawn_and_told(run_file: Path, tmp_path: Path) ->
 
 def test_the_page_tells_everything_that_the_guard_was_set_to(run_file: Path) -> None:
     evidence = evidence_of(read_recording(run_file))
-    names = [field.name for field in fields(Guarding)]
-    guarding = Guarding(**dict.fromkeys(names, 1))  # type: ignore[arg-type] # any number will do
+    names = [field.name for field in fields(GuardParameters)]
+    guarding = GuardParameters(**dict.fromkeys(names, 1))  # type: ignore[arg-type] # any number will do
     told = guard_facts(
         replace(evidence, parameters=replace(evidence.parameters, guarding=guarding))
     )
@@ -230,7 +234,7 @@ def test_the_page_says_first_how_much_when_where_why_and_what_to_change(
     write_report(recording, report, page)
     text = html.unescape(page.read_text(encoding="utf-8"))
     first = text[text.index("<section") : text.index("</section>")]
-    most = quantity(float((energy - allowed)[worst]), "J")
+    most = format_si(float((energy - allowed)[worst]), "J")
     assert cause is not None
     assert report.tick is not None
     for told in (
@@ -238,7 +242,7 @@ def test_the_page_says_first_how_much_when_where_why_and_what_to_change(
         f"from {1e-3 * (report.tick + 1):.3f} s on (tick {report.tick})",
         f"most at {1e-3 * (worst + 1):.3f} s (tick {worst})",
         f"<td>{port}: ",
-        f"{quantity(report.joules, 'J')} at first, {most} at most",
+        f"{format_si(report.joules, 'J')} at first, {most} at most",
         f"<strong>{cause.kind}</strong>. ",
         cause.evidence[1:],
         cause.remedy[1:],

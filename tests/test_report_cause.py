@@ -14,12 +14,11 @@ from audit_cases import rewritten
 from report_runs import Made
 
 from hapticbridge.audit import AuditReport
+from hapticbridge.record import TickFlag
 from hapticbridge.recording import Recording, read_recording
 from hapticbridge.rendering import method_named
+from hapticbridge.report.cause import likely_cause, what_would_do
 from hapticbridge.report.evidence import Evidence
-from hapticbridge.report.likely import likely_cause
-from hapticbridge.report.remedy import what_would_do
-from hapticbridge.tick import TickFlag
 
 pytestmark = pytest.mark.filterwarnings("ignore:scene '.*(floor|fan).xml'")
 

@@ -17,7 +17,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hapticbridge.errors import HapticBridgeError
-from hapticbridge.passivity import stability_limit
 from hapticbridge.study.folder import prepared_folder
 from hapticbridge.study.paper import (
     damper,
@@ -33,6 +32,7 @@ from hapticbridge.study.paper import (
 from hapticbridge.study.paper.check import Check, Relation
 from hapticbridge.study.paper.page import PAGE, number
 from hapticbridge.study.paper.walk import STEPS
+from hapticbridge.theory.sampled_loop import stability_limit
 
 SCRIPT = Path(__file__).parents[1] / "scripts" / "reproduce_paper"
 EQUATIONS = (1, 2, 4, 5, 6, 7, 11, 13, 14, 15, 16, 17, 18, 19)

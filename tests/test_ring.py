@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from hapticbridge.errors import RecordingError
+from hapticbridge.record import TICK_DTYPE
 from hapticbridge.recording import HEAD, TAIL, Ring
-from hapticbridge.tick import TICK_DTYPE
 
 
 def numbered(start: int, stop: int) -> NDArray[np.void]:

@@ -13,12 +13,11 @@ from hapticbridge.audit import audit
 from hapticbridge.bridge import Bridge
 from hapticbridge.commands import Couple
 from hapticbridge.film_process import Stage
+from hapticbridge.record import TICK_DTYPE
 from hapticbridge.recording import Recording, Timeline, due_times, read_recording
 from hapticbridge.report import telling_time
-from hapticbridge.report.curves import draw_recording
-from hapticbridge.report.evidence import Evidence
-from hapticbridge.report.motion import draw_motion
-from hapticbridge.tick import TICK_DTYPE
+from hapticbridge.report.evidence import Evidence, draw_recording
+from hapticbridge.report.plots import draw_motion
 
 T = 1e-3
 STALLS = {20: 30, 60: 1}

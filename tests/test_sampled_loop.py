@@ -12,16 +12,15 @@ from hypothesis import strategies as st
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import CouplingError
-from hapticbridge.passivity import (
+from hapticbridge.theory.bounds import minimum_damping
+from hapticbridge.theory.sampled_loop import (
     SampledLoop,
     WorstHand,
-    environment_minimum_damping,
-    minimum_damping,
-    minimum_mass,
+    decays,
     stability_limit,
+    threshold,
 )
-from hapticbridge.passivity.stability import decays, threshold
-from hapticbridge.passivity.virtual_mass import Integrator
+from hapticbridge.theory.virtual_mass import Integrator, environment_minimum_damping, minimum_mass
 
 PERIODS = (2e-3, 1e-3, 2.5e-4)
 SHARE = 1e-3  # the bound and the run agree within 0.1 %

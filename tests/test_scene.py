@@ -16,7 +16,7 @@ from scene_cases import HINGE_TOOL, refusal, refusal_of
 from scipy.spatial.transform import Rotation
 
 import hapticbridge as hb
-from hapticbridge.kernel.names import COUPLING_ACTUATORS
+from hapticbridge.kernel.codes import COUPLING_ACTUATORS
 from hapticbridge.scene import load_scene, scene_names, scene_path
 
 

@@ -16,7 +16,7 @@ from outside_scenes import (
 )
 from scene_cases import GRIPPED, ticks
 
-from hapticbridge.kernel.names import COUPLING_ACTUATORS
+from hapticbridge.kernel.codes import COUPLING_ACTUATORS
 from hapticbridge.scene import load_scene
 
 

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 import hapticbridge as hb
 from hapticbridge.cli import main
-from hapticbridge.provenance import compiled_model
+from hapticbridge.run_description import compiled_model
 from hapticbridge.scene import (
     Parameter,
     load_scene,

@@ -17,7 +17,7 @@ from outside_scenes import (
 )
 from scene_cases import RICH
 
-from hapticbridge.provenance import compiled_model
+from hapticbridge.run_description import compiled_model
 from hapticbridge.scene import load_scene
 from hapticbridge.scene.source import read_elements
 

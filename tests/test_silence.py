@@ -4,26 +4,26 @@ from __future__ import annotations
 
 import pytest
 
-from hapticbridge.device.silence import SILENCE, SilenceWatch
+from hapticbridge.device.watchdog import SILENCE, SilenceDetector
 
 PERIOD = 1e-3
 
 
 def test_a_device_is_silent_just_after_fifty_milliseconds_without_a_sample() -> None:
-    watch = SilenceWatch(3.0)
+    watch = SilenceDetector(3.0)
     verdicts = [watch.is_silent(3.0 + PERIOD * k, is_new=False) for k in range(1, 60)]
     assert verdicts.index(True) == pytest.approx(SILENCE / PERIOD, abs=1)
     assert all(verdicts[verdicts.index(True) :])
 
 
 def test_one_sample_begins_the_count_anew() -> None:
-    watch = SilenceWatch(0.0)
+    watch = SilenceDetector(0.0)
     for k in range(1, 200):
         assert not watch.is_silent(PERIOD * k, is_new=k % 45 == 0)
 
 
 def test_a_loop_that_was_away_does_not_take_the_device_for_silent() -> None:
-    watch = SilenceWatch(0.0)
+    watch = SilenceDetector(0.0)
     assert not watch.is_silent(0.04, is_new=False)
     assert not watch.is_silent(0.04 + 2.0 * SILENCE, is_new=False)
     # and the count goes on from there
@@ -35,7 +35,7 @@ def test_a_loop_that_was_away_does_not_take_the_device_for_silent() -> None:
 def test_a_loop_was_away_when_it_came_later_than_its_period_by_more_than_the_silence(
     period: float,
 ) -> None:
-    watch = SilenceWatch(0.0, period)
+    watch = SilenceDetector(0.0, period)
     watch.is_silent(1.0, is_new=True)
     assert not watch.was_away(1.0 + period + 0.99 * SILENCE)
     assert watch.was_away(1.0 + period + 1.01 * SILENCE)

@@ -18,12 +18,20 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 import hapticbridge as hb
-from hapticbridge.device import library
-from hapticbridge.device.plugged import Tell, tell_nobody
-from hapticbridge.device.spacemouse.driver import FAMILY, HELD, SpaceMouseDevice, open_spacemouse
-from hapticbridge.device.spacemouse.reports import Buttons, Deflection, decoded, share
+from hapticbridge.device import registry as library
+from hapticbridge.device.family import Notify, ignore_message
+from hapticbridge.device.spacemouse import (
+    FAMILY,
+    HELD,
+    Buttons,
+    Deflection,
+    SpaceMouseDevice,
+    decoded,
+    open_spacemouse,
+    share,
+)
 from hapticbridge.errors import DeviceError, DeviceLost, SafetyTrip
-from hapticbridge.tick import SAMPLE_DTYPE
+from hapticbridge.record import SAMPLE_DTYPE
 
 PERIOD = 1e-3
 counts = st.integers(-32768, 32767)
@@ -34,7 +42,7 @@ def opened(
 ) -> tuple[SpaceMouseDevice, SpaceMouse, HidSeam]:
     model = model or SpaceMouse()
     seam = HidSeam(model)
-    return open_spacemouse(options, tell_nobody, seam), model, seam
+    return open_spacemouse(options, ignore_message, seam), model, seam
 
 
 def run(device: SpaceMouseDevice, seam: HidSeam, ticks: int) -> Any:
@@ -262,7 +270,7 @@ def test_the_command_line_says_that_there_is_nothing_to_certify(
 ) -> None:
     seam = HidSeam(SpaceMouse())
 
-    def open_it(options: Mapping[str, object], tell: Tell) -> SpaceMouseDevice:
+    def open_it(options: Mapping[str, object], tell: Notify) -> SpaceMouseDevice:
         return open_spacemouse(options, tell, seam)
 
     family = replace(FAMILY, open=open_it)

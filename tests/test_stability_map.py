@@ -12,7 +12,7 @@ import pytest
 
 from hapticbridge.cli import main
 from hapticbridge.errors import StudyError
-from hapticbridge.picture import new_figure
+from hapticbridge.plotting import new_figure
 from hapticbridge.study.maps import MAPS
 from hapticbridge.study.maps.stability_map import Finding, Point, StabilityMap, run_map
 from hapticbridge.study.maps.verdicts import VERDICTS, draw_verdicts, verdict_numbers

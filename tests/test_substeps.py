@@ -11,16 +11,16 @@ from kernel_runs import T
 from rendering_runs import FREE_MASS, rendered, sway
 
 from hapticbridge.bridge import Bridge
-from hapticbridge.certificate import default_coupling, device_conditions, needed_damping
+from hapticbridge.certificate import default_coupling, device_conditions, required_damping
 from hapticbridge.clock import SimulatedClock
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import SimulatedDevice
 from hapticbridge.errors import CouplingError, HapticBridgeError
-from hapticbridge.mechanics import exact_mass_response
-from hapticbridge.passivity import WorstHand
 from hapticbridge.rendering import METHODS, default_method
 from hapticbridge.scene import load_scene
 from hapticbridge.study.closed_loop import ClosedLoop, LoopOutcome
+from hapticbridge.theory.rigid_body import exact_mass_response
+from hapticbridge.theory.sampled_loop import WorstHand
 
 COUPLING = Coupling(2400.0, 0.5, 2.4, 5e-4)
 KNOCK = np.array([1e-4, 0, 0, 0, 0, 0])
@@ -72,7 +72,7 @@ def test_error_of_a_free_mass_falls_with_the_number_of_substeps(laws: int, perce
 
 
 def test_damping_that_substeps_need_is_what_is_printed() -> None:
-    needed = [needed_damping(COUPLING, T, n) for n in (1, 2, 4, 8)]
+    needed = [required_damping(COUPLING, T, n) for n in (1, 2, 4, 8)]
     assert needed == pytest.approx([1.70, 1.63, 1.90, 2.42], abs=6e-3)
 
 
@@ -82,7 +82,7 @@ def test_strict_environments_need_less_than_the_form_grants() -> None:
         found = [worst(laws, mass)[0] for mass in masses]
         assert found[0] == pytest.approx(wall, abs=6e-3)
         assert max(found) == pytest.approx(most, abs=6e-3)
-        assert max(found) <= needed_damping(COUPLING, T, laws) * (1 + 1e-9)
+        assert max(found) <= required_damping(COUPLING, T, laws) * (1 + 1e-9)
 
 
 @pytest.mark.parametrize(("laws", "mass"), [(4, 0.05), (8, 0.05)])
@@ -110,7 +110,7 @@ def test_worst_hand_behind_substeps_diverges_below_the_limit_and_not_above(
     below, above = run(0.9 * limit), run(1.05 * limit)
     assert (below.is_stable, above.is_stable) == (False, True)
     assert below.environment == above.environment == "strict"
-    assert run(needed_damping(COUPLING, T, laws)).is_stable
+    assert run(required_damping(COUPLING, T, laws)).is_stable
 
 
 @pytest.mark.parametrize("laws", [1, 2, 4, 8, 32])
@@ -142,7 +142,7 @@ def test_substeps_out_of_range_are_refused_in_one_sentence_wherever_they_enter(
     with pytest.raises(HapticBridgeError, match=r"substeps is .* whole number"):
         Bridge("point_mass", substeps=substeps)
     with pytest.raises(CouplingError, match=r"substeps is .* whole number"):
-        needed_damping(COUPLING, T, substeps)
+        required_damping(COUPLING, T, substeps)
     with pytest.raises(CouplingError, match=r"substeps is .* whole number"):
         default_coupling(SimulatedDevice().info, T, laws=substeps)
     with pytest.raises(HapticBridgeError, match=r"substeps is .* whole number"):

@@ -9,12 +9,12 @@ import pytest
 from numpy.typing import NDArray
 
 from hapticbridge.errors import CouplingError
-from hapticbridge.passivity import (
-    maximum_stiffness,
+from hapticbridge.theory.bounds import maximum_stiffness
+from hapticbridge.theory.transmission_line import (
+    Termination,
     transmission_line_spectrum,
     transmission_line_stiffness,
 )
-from hapticbridge.passivity.transmission_line import Termination
 
 PERIOD = 1e-3
 

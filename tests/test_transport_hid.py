@@ -13,16 +13,15 @@ from emulated.hid_seam import HidSeam
 from emulated.spacemouse_model import SpaceMouse
 from emulated.usb_device import StallError
 
-from hapticbridge.device.plugged import Family, Plugged, UsbId
-from hapticbridge.device.rawhid.finding import open_rawhid
+from hapticbridge.device.family import Driver, FoundDevice, UsbId
+from hapticbridge.device.rawhid.device import open_rawhid
+from hapticbridge.device.transport import hid as hid_search
 from hapticbridge.device.transport import hid as transport_hid
-from hapticbridge.device.transport import hid_search
-from hapticbridge.device.transport.hex_log import VARIABLE, HexLog
-from hapticbridge.device.transport.hid import QUEUE, HidLink
-from hapticbridge.device.transport.hid_search import HidApi, find
+from hapticbridge.device.transport.hid import QUEUE, HidApi, HidLink, find
+from hapticbridge.device.transport.trace import VARIABLE, HexLog
 from hapticbridge.errors import DeviceError, DeviceLost
 
-ECHO = Family(
+ECHO = Driver(
     name="echo",
     about="answers",
     ids=(UsbId(EchoHid.vendor, EchoHid.product, "Echo"),),
@@ -259,7 +258,7 @@ def test_the_log_holds_what_went_over_the_wire(
 def test_a_log_that_is_full_keeps_the_newest_and_says_what_it_dropped(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("hapticbridge.device.transport.hex_log.MOST_LINES", 2)
+    monkeypatch.setattr("hapticbridge.device.transport.trace.MOST_LINES", 2)
     log = HexLog(tmp_path / "wire.log")
     for i in range(5):
         log.add(">", bytes([i]))
@@ -342,7 +341,7 @@ def test_without_hidapi_nothing_is_found_and_opening_says_so(
     monkeypatch.setattr(hid_search, "hid_api", lambda: None)
     monkeypatch.setattr(transport_hid, "hid_api", lambda: None)
     assert find(ECHO) == []
-    plugged = Plugged(
+    plugged = FoundDevice(
         family="echo", name="Echo", serial="", path="/x", vendor=1, product=2, transport="hid",
         problem=None,
     )  # fmt: skip
@@ -368,7 +367,7 @@ def test_hidapi_is_the_hidraw_module_where_there_is_one(monkeypatch: pytest.Monk
 def test_a_read_through_the_real_module_of_a_node_that_is_not_there_is_refused() -> None:
     api: HidApi | None = hid_search.hid_api()
     assert api is not None
-    plugged = Plugged(
+    plugged = FoundDevice(
         family="rawhid", name="none", serial="", path="/dev/hidraw99", vendor=1, product=2,
         transport="hid", problem=None,
     )  # fmt: skip

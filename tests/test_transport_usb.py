@@ -18,16 +18,13 @@ from emulated.handle import Handle
 from emulated.pyusb_backend import PyusbBackend
 
 from hapticbridge.device import SimulatedDevice
-from hapticbridge.device.falcon.boot import READ_FROM, WRITE_TO, enter_run_mode
-from hapticbridge.device.falcon.driver import FalconDevice
-from hapticbridge.device.falcon.finding import FAMILY, open_falcon
-from hapticbridge.device.falcon.packets import SIZE, encode
-from hapticbridge.device.plugged import tell_nobody
-from hapticbridge.device.transport.hex_log import HexLog
-from hapticbridge.device.transport.usb import UsbLink
-from hapticbridge.device.transport.usb_search import find, libusb
+from hapticbridge.device.falcon.device import FAMILY, FalconDevice, open_falcon
+from hapticbridge.device.falcon.protocol import READ_FROM, SIZE, WRITE_TO, encode, enter_run_mode
+from hapticbridge.device.family import ignore_message
+from hapticbridge.device.transport.trace import HexLog
+from hapticbridge.device.transport.usb import UsbLink, find, libusb
 from hapticbridge.errors import DeviceError, DeviceLost
-from hapticbridge.tick import SAMPLE_DTYPE
+from hapticbridge.record import SAMPLE_DTYPE
 
 LONGEST = 5.0  # s, far beyond what anything here takes, for waits that end by themselves
 
@@ -138,7 +135,7 @@ def test_a_device_that_may_not_be_opened_is_listed_with_its_remedy() -> None:
     assert plugged.problem is not None
     assert "no permission to open /dev/bus/usb/001/001" in plugged.problem
     with pytest.raises(DeviceError, match="no permission to open"):
-        open_falcon({}, tell_nobody, host)
+        open_falcon({}, ignore_message, host)
 
 
 @pytest.mark.parametrize(
@@ -160,17 +157,17 @@ def test_why_a_device_cannot_be_claimed_is_said(opened: Open, number: int, words
 def test_the_kernels_driver_is_sent_away() -> None:
     host = Host(falcon())
     host.is_bound = True
-    open_falcon({}, tell_nobody, host).close()
+    open_falcon({}, ignore_message, host).close()
     assert host.detached == 1
 
 
 def test_of_two_the_serial_number_chooses() -> None:
     host = Host(falcon("A1"), falcon("B2"))
     with pytest.raises(DeviceError, match=r"2 devices 'falcon' are plugged in; .* 'A1', 'B2'"):
-        open_falcon({}, tell_nobody, host)
+        open_falcon({}, ignore_message, host)
     with pytest.raises(DeviceError, match="'falcon' has serial 'C3'"):
-        open_falcon({"serial": "C3"}, tell_nobody, host)
-    open_falcon({"serial": "B2"}, tell_nobody, host).close()
+        open_falcon({"serial": "C3"}, ignore_message, host)
+    open_falcon({"serial": "B2"}, ignore_message, host).close()
 
 
 @pytest.mark.parametrize(
@@ -186,7 +183,7 @@ def test_a_bad_option_is_refused_before_the_device_is_touched(
     options: dict[str, object], words: str
 ) -> None:
     with pytest.raises(DeviceError, match=words):
-        open_falcon(options, tell_nobody, Host())
+        open_falcon(options, ignore_message, Host())
 
 
 def test_packets_come_whole_and_as_they_are(opened: Open) -> None:
@@ -272,7 +269,7 @@ def test_the_log_holds_every_byte_and_is_written_at_the_end(opened: Open, tmp_pa
 
 def test_a_falcon_runs_over_threads_on_the_wall_clock() -> None:
     model = falcon()
-    device = open_falcon({"damping": 1.5}, tell_nobody, Host(model))
+    device = open_falcon({"damping": 1.5}, ignore_message, Host(model))
     assert isinstance(device, FalconDevice)
     assert device.info.rate is not None
     sample, fresh = device.start(1e-3), 0

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import usb.backend.libusb1 as pyusb
 
-from hapticbridge.device.transport.usb_context import UsbContext
+from hapticbridge.device.transport.usb import UsbContext
 
 
 class Library:

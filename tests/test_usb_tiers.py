@@ -12,8 +12,8 @@ from emulated.guest import NO_KERNEL, GuestRun, has_pidff, kernel, run_in_guest
 from emulated.parting import MOST_NAMED, parting, repeated
 from emulated.tiers import JOBS, Claim, Job, claims_of, main
 
+from hapticbridge.record import COLUMNS, TICK_DTYPE
 from hapticbridge.recording.writer import RecordingWriter
-from hapticbridge.tick import COLUMNS, TICK_DTYPE
 
 
 @pytest.mark.parametrize("job", JOBS, ids=lambda job: job.name)

@@ -19,14 +19,13 @@ from hapticbridge.commands import Command, Couple, Reset, Switch
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo, Hand
 from hapticbridge.errors import HapticBridgeError, RecordingError
-from hapticbridge.provenance import SOURCE_PREFIX
+from hapticbridge.record import TICK_DTYPE
 from hapticbridge.recording import read_recording
+from hapticbridge.run_description import SOURCE_PREFIX
 from hapticbridge.scene import load_scene
-from hapticbridge.tick import TICK_DTYPE
 from hapticbridge.whatif import WhatIf, WhatIfRun, changes_from, what_if
-from hapticbridge.whatif.intent import intended
 from hapticbridge.whatif.recorded import RecordedRun
-from hapticbridge.whatif.repeat import Repetition
+from hapticbridge.whatif.replayed_hand import Repetition, intended
 
 DURATION = 0.4
 

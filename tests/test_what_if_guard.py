@@ -16,8 +16,8 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.device import SimulatedDevice
 from hapticbridge.errors import RecordingError, SafetyTrip
 from hapticbridge.guard import Limits
+from hapticbridge.record import TickFlag
 from hapticbridge.recording import read_recording
-from hapticbridge.tick import TickFlag
 from hapticbridge.whatif import what_if
 from hapticbridge.whatif.recorded import RecordedRun
 

@@ -19,7 +19,7 @@ from PIL import Image
 from report_runs import Made
 
 from hapticbridge.errors import RecordingError
-from hapticbridge.tick import TICK_DTYPE
+from hapticbridge.record import TICK_DTYPE
 from hapticbridge.whatif import WhatIf, what_if, write_what_if
 
 
@@ -133,7 +133,7 @@ def test_the_command_writes_the_page_and_judges_strictly(
     made_active: WhatIf, tmp_path: Path, call: Called, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # drawn for pages of one run, too, and tested there
-    monkeypatch.setattr("hapticbridge.cli.judge.still", lambda *_: b"a picture")
+    monkeypatch.setattr("hapticbridge.cli.audit.still", lambda *_: b"a picture")
     page = tmp_path / "page.html"
     change = ("--what-if", "method=explicit", "--what-if", "stiffness=9000")
     code, out, err = call("audit", made_active.path, *change, "--report", page, "--strict")

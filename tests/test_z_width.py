@@ -14,18 +14,12 @@ from hapticbridge.certificate import default_coupling
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import open_device
 from hapticbridge.errors import CouplingError
-from hapticbridge.passivity import (
-    CouplingGrid,
-    damping_spectrum,
-    free_device_damping,
-    free_device_stiffness,
-    minimum_damping,
-    worst_frequency,
-    z_width,
-)
-from hapticbridge.passivity.free_device import _plant
-from hapticbridge.passivity.z_width import ANY_HAND, NO_LIMIT_CYCLES, WALL, WITHOUT_HAND
 from hapticbridge.rendering import default_method
+from hapticbridge.theory.bounds import minimum_damping, worst_frequency
+from hapticbridge.theory.device_limits import _plant, free_device_damping, free_device_stiffness
+from hapticbridge.theory.spectrum import damping_spectrum
+from hapticbridge.theory.transfer import CouplingGrid
+from hapticbridge.theory.z_width import ANY_HAND, NO_LIMIT_CYCLES, WALL, WITHOUT_HAND, z_width
 
 T = 1e-3
 

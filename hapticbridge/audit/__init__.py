@@ -12,13 +12,13 @@ the events; ``report`` is what comes out.
 from typing import TYPE_CHECKING
 
 from hapticbridge.audit.ask import audit as audit
-from hapticbridge.on_demand import on_demand
+from hapticbridge.lazy import lazy_exports
 
 if TYPE_CHECKING:
     from hapticbridge.audit.report import AuditReport as AuditReport
     from hapticbridge.audit.report import verdict_words as verdict_words
 else:
-    __getattr__, __dir__, __all__ = on_demand(
+    __getattr__, __dir__, __all__ = lazy_exports(
         __name__,
         {
             "AuditReport": "hapticbridge.audit.report",

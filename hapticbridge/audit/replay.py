@@ -2,16 +2,268 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
+from collections import deque
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
+import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.audit.attached_scene import FOREIGN_TOLERANCE, is_same_processor
-from hapticbridge.audit.rerun import Rerun, obstacle
+from hapticbridge.commands import CHANGES as COMMANDED
+from hapticbridge.commands import EventApplier
+from hapticbridge.errors import HapticBridgeError, RecordingError
+from hapticbridge.inputs import apply_writes
+from hapticbridge.kernel.codes import COUPLING_ACTUATORS
 from hapticbridge.kernel.parameters import RunParameters
+from hapticbridge.kernel.state import BoundKernel
+from hapticbridge.kernel.tick import simulate_recorded
+from hapticbridge.record import CLOCK_FIELDS, SAMPLE_DTYPE, TICK_DTYPE, TickFlag
 from hapticbridge.recording import RecordingFile
-from hapticbridge.tick import CLOCK_FIELDS, TICK_DTYPE, TickFlag
+from hapticbridge.rendering import check_prepared, method_named
+from hapticbridge.run_description import (
+    MODEL_ATTACHMENT,
+    STARTS,
+    STATE_ATTACHMENT,
+    meta_start,
+    processor,
+    restore_state,
+    start_of,
+    versions,
+)
+
+# The scene that a recording carries, held against what its metadata say of it.
+
+FOREIGN_TOLERANCE = 1e-9
+"""Allowed difference, relative to a field's largest value, where the processor differs: other
+vector instructions round differently. Larger would hide tampering, smaller would refuse honest
+recordings."""
+
+
+def attached_model(recording: RecordingFile, parameters: RunParameters) -> mujoco.MjModel:
+    """Loads the attached model, which must be that of the metadata.
+
+    Raises:
+        RecordingError: It is not, or cannot be loaded.
+    """
+    content = recording.attachments[MODEL_ATTACHMENT]
+    if hashlib.sha256(content).hexdigest() != recording.meta.get("scene_sha256"):
+        raise RecordingError("the attached model is not the one of scene_sha256")
+    try:
+        model = mujoco.MjModel.from_binary_path(
+            MODEL_ATTACHMENT, assets={MODEL_ATTACHMENT: content}
+        )
+    except ValueError as error:
+        raise RecordingError(f"the attached model cannot be loaded: {error}") from None
+    for name in (*COUPLING_ACTUATORS, parameters.grip):
+        kind = mujoco.mjtObj.mjOBJ_SITE if name == parameters.grip else mujoco.mjtObj.mjOBJ_ACTUATOR
+        if mujoco.mj_name2id(model, kind, name) < 0:
+            raise RecordingError(f"the attached model has no '{name}'")
+    method = method_named(recording.meta.get("method", ""))
+    step = parameters.period / parameters.substeps
+    forces, torques = method.gains(parameters.coupling, step)
+    for axis, name in enumerate(COUPLING_ACTUATORS):
+        actuator_id = model.actuator(name).id
+        factor, stiffness, damping = forces if axis < 3 else torques
+        bias = model.actuator_biasprm[actuator_id].tolist()
+        gain = float(model.actuator_gainprm[actuator_id, 0])
+        if (bias[1], bias[2], gain) != (-stiffness, -damping, factor):
+            raise RecordingError(
+                f"the attached model's coupling has K = {-bias[1]!r}, B = {gain!r} in {name}, "
+                f"the metadata say {stiffness!r}, {factor!r}"
+            )
+    try:
+        check_prepared(model, parameters, method)
+    except HapticBridgeError as error:
+        raise RecordingError(f"the attached model does not fit the metadata: {error}") from None
+    if model.opt.timestep != parameters.period / parameters.substeps:
+        raise RecordingError(
+            f"the attached model's timestep is {model.opt.timestep!r} s, the metadata's period "
+            f"{parameters.period!r} s with {parameters.substeps} substeps"
+        )
+    return model
+
+
+def check_start(recording: RecordingFile, state: NDArray[np.void]) -> None:
+    """Refuses metadata that do not repeat the start of the attached scene.
+
+    Raises:
+        RecordingError: They do not.
+    """
+    for name in STARTS:
+        recorded = meta_start(recording.meta, name)
+        present = start_of(state, name)
+        if not np.allclose(recorded, present, rtol=FOREIGN_TOLERANCE, atol=FOREIGN_TOLERANCE) or (
+            is_same_processor(recording) and recorded != present
+        ):
+            raise RecordingError(
+                f"metadata '{name}' is {recorded}, the attached scene starts with {present}"
+            )
+
+
+def is_same_processor(recording: RecordingFile) -> bool:
+    """Returns whether a run was recorded on this model of processor, as far as it says."""
+    try:
+        return bool(json.loads(recording.meta["host"])["processor"] == processor())
+    except (KeyError, TypeError, ValueError, RecursionError):
+        return True
+
+
+# A recorded run, simulated again: the whole scene at every tick, not only what was recorded.
+
+DECISIVE = ("hapticbridge", "mujoco", "numba")
+"""Packages whose versions must match for a run to be repeated to the bit."""
+
+_CHANGES = ("input", "resume", *COMMANDED)
+"""Events that change what the next ticks compute."""
+
+
+class Resimulator:
+    """Simulates a recorded device motion again, through what the recording carries.
+
+    Args:
+        recording: What is simulated again, without an ``obstacle``. Its events are taken as they
+            fall due; more may be told with ``note``.
+        parameters: Of the recorded run.
+
+    Attributes:
+        model: The attached scene.
+        data: Its state after the last tick that was simulated.
+        binding: The kernel's state bound to both.
+        done: How many ticks that are.
+        is_over: Whether a sample or a result was not finite, so that nothing follows.
+
+    Raises:
+        RecordingError: The attachments contradict the metadata, so the file was changed.
+    """
+
+    def __init__(self, recording: RecordingFile, parameters: RunParameters) -> None:
+        self._changes: deque[Mapping[str, Any]] = deque()
+        self._resumed: list[Any] = []
+        for event in recording.events:
+            self.note(event)
+        self._changed = self._read_ns = 0
+        self.done, self.is_over = 0, False
+        self.model = model = attached_model(recording, parameters)
+        self.data = data = mujoco.MjData(model)
+        # an error inside the C symbol would end the process, so MuJoCo takes its first step in
+        # Python
+        self._start = start = recording.attachments[STATE_ATTACHMENT]
+        method = method_named(recording.meta.get("method", ""))
+        restore_state(model, data, start)
+        method.step(model, data)
+        restore_state(model, data, start)
+        self.binding = BoundKernel(model, data, parameters)
+        self._commands = EventApplier(self.binding, model, data, method, parameters, start)
+        check_start(recording, self.binding.state)
+
+    @property
+    def slack(self) -> float:
+        """What the environment may have created by now, in J."""
+        return float(self.binding.state["slack"][0])
+
+    def note(self, event: Mapping[str, Any]) -> None:
+        """Takes an event of a run that still goes on; those that change nothing are passed over."""
+        if event.get("event") in _CHANGES:
+            self._changes.append(event)
+        if event.get("event") == "resume":
+            self._resumed.append(event.get("tick"))
+
+    def add(self, ticks: NDArray[np.void]) -> NDArray[np.void]:
+        """Simulates the next ticks.
+
+        Args:
+            ticks: Their records, ``TICK_DTYPE``, at least one; only what came from outside is used.
+
+        Returns:
+            Records as simulated; fewer where it ``is_over``.
+
+        Raises:
+            RecordingError: An event among them is damaged.
+        """
+        samples = np.zeros(len(ticks), SAMPLE_DTYPE)
+        samples["position"], samples["quaternion"] = (
+            ticks["device_position"],
+            ticks["device_quaternion"],
+        )
+        samples["buttons"] = ticks["buttons"]
+        outside = ticks["flags"] & int(TickFlag.STALE_SAMPLE | TickFlag.RESEATED)
+        elapsed = self._elapsed(ticks)
+        rows = np.zeros(len(ticks), TICK_DTYPE)
+        done = 0
+        while done < len(ticks) and not self.is_over:
+            end = len(ticks)
+            if self._changes:
+                end = min(self._due(self._changes[0]) - self.done, end)
+            if end < done:  # in a run that goes on, news may be slower than records
+                raise RecordingError(f"an event before tick {self.done + done} came after it")
+            state, row, part = self.binding.state, self.binding.row, slice(done, end)
+            count = simulate_recorded(
+                state, samples[part], outside[part], elapsed[part], row, rows[part]
+            )
+            self.is_over = count < end - done
+            done += count
+            if self._changes and done == end < len(ticks):
+                self._apply(self._changes.popleft())
+        self.done += done
+        return rows[:done]
+
+    def finish(self) -> None:
+        """Applies the events after the last tick.
+
+        Raises:
+            RecordingError: One of them is damaged.
+        """
+        while self._changes and not self.is_over:
+            self._due(self._changes[0])
+            self._apply(self._changes.popleft())
+
+    def _elapsed(self, ticks: NDArray[np.void]) -> NDArray[np.float64]:
+        """Returns the times between two readings in s, as the live loop counted them."""
+        read = ticks["read_ns"]
+        before = np.concatenate([[self._read_ns], read[:-1]])
+        before[np.isin(ticks["tick"], self._resumed)] = 0
+        self._read_ns = int(read[-1])
+        return np.asarray(1e-9 * (read - before))
+
+    def _due(self, event: Mapping[str, Any]) -> int:
+        tick = event.get("tick")
+        if not isinstance(tick, int) or tick < self._changed:
+            raise RecordingError(f"event '{event['event']}' names tick {tick!r}, out of order")
+        return tick
+
+    def _apply(self, event: Mapping[str, Any]) -> None:
+        self._changed = int(event["tick"])
+        if event["event"] == "resume":
+            self.binding.resume()
+            return
+        if event["event"] in COMMANDED:
+            self._commands.apply(event)
+            return
+        try:
+            apply_writes(self.data, event.get("writes", []))
+        except (HapticBridgeError, TypeError, ValueError) as error:
+            raise RecordingError(
+                f"event 'input' at tick {event.get('tick')} is damaged: {error}"
+            ) from None
+
+
+def obstacle(recording: RecordingFile) -> str:
+    """Returns why a run cannot be simulated again here, or nothing."""
+    try:
+        recorded = dict(json.loads(recording.meta.get("versions", "")))
+    except (ValueError, TypeError, RecursionError):
+        return "the metadata name no versions"
+    present = versions()
+    for name in DECISIVE:
+        if recorded.get(name) != present[name]:
+            return f"recorded with {name} {recorded.get(name, 'unknown')}, here is {present[name]}"
+    missing = [n for n in (MODEL_ATTACHMENT, STATE_ATTACHMENT) if n not in recording.attachments]
+    return f"the file has no attachment '{missing[0]}'" if missing else ""
+
 
 NOT_RUN = "not re-simulated"
 
@@ -69,7 +321,7 @@ class Resimulation:
         self._largest = dict.fromkeys(_COMPARED, 0.0)
         self._obstacle = obstacle(recording)
         if not self._obstacle:
-            self._run = Rerun(recording, parameters)
+            self._run = Resimulator(recording, parameters)
 
     def add(self, ticks: NDArray[np.void]) -> None:
         """Simulates the next records, ``TICK_DTYPE``, at least one.

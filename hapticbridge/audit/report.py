@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from hapticbridge.jsonable import jsonable
+from hapticbridge.files import finite_or_null
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +72,7 @@ class AuditReport:
     def to_json(self) -> str:
         """Returns the report as one JSON object; a number that is not finite becomes null."""
         values = asdict(self) | {"path": str(self.path), "margin": self.margin}
-        return json.dumps(jsonable(values), indent=2, allow_nan=False)
+        return json.dumps(finite_or_null(values), indent=2, allow_nan=False)
 
     @property
     def exit_code(self) -> int:

@@ -9,12 +9,12 @@ from itertools import chain
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.audit.interventions import Interventions
-from hapticbridge.audit.watched import Seen, Watch
+from hapticbridge.audit.events import RunEvents
+from hapticbridge.audit.guard import Seen, Watch
+from hapticbridge.kernel.guard import DEVICE_BUTTONS
 from hapticbridge.kernel.parameters import RunParameters
-from hapticbridge.kernel.watch import DEVICE_BUTTONS
+from hapticbridge.record import CLOCK_FIELDS, TICK_DTYPE, TickFlag
 from hapticbridge.recording import RecordingFile
-from hapticbridge.tick import CLOCK_FIELDS, TICK_DTYPE, TickFlag
 
 TOLERANCE = 1e-9
 """Relative difference, and absolute one in SI units, between a recorded number and its second
@@ -64,7 +64,7 @@ def file_fault(recording: RecordingFile) -> Fault | None:
 
 
 def structure_fault(
-    blocks: Iterable[NDArray[np.void]], parameters: RunParameters, outside: Interventions
+    blocks: Iterable[NDArray[np.void]], parameters: RunParameters, outside: RunEvents
 ) -> Fault | None:
     """Returns the first thing that makes records no plausible ones of a run.
 
@@ -109,7 +109,7 @@ def _first(is_wrong: NDArray[np.bool_], start: int, text: str, port: str) -> Fau
 
 
 def _command_faults(
-    ticks: NDArray[np.void], count: int, outside: Interventions
+    ticks: NDArray[np.void], count: int, outside: RunEvents
 ) -> Iterator[Fault | None]:
     """Holds the bits of commands in the records against the events that set them."""
     wrong = (ticks["buttons"] & ~DEVICE_BUTTONS) != outside.buttons(ticks["tick"])

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Iterator
-from dataclasses import replace
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -12,30 +12,268 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.audit.balance import Balance
-from hapticbridge.audit.ending import how_it_ended
-from hapticbridge.audit.interventions import Interventions
-from hapticbridge.audit.judgement import Judgement
-from hapticbridge.audit.physics import physics_fault
-from hapticbridge.audit.reached import Reached
+from hapticbridge.audit.energy import EnergyBalance, Reached
+from hapticbridge.audit.events import RunEvents
+from hapticbridge.audit.guard import has_flag
 from hapticbridge.audit.replay import Replay, Resimulation
 from hapticbridge.audit.report import AuditReport
-from hapticbridge.audit.structure import Fault, file_fault, structure_fault
+from hapticbridge.audit.structure import TOLERANCE, Fault, file_fault, structure_fault
 from hapticbridge.certificate import (
     condition_sentences,
     damping_margin,
+    delay_ticks,
     is_run_certified,
     run_conditions,
 )
 from hapticbridge.device import DeviceInfo
-from hapticbridge.device.lateness import delay_ticks
 from hapticbridge.errors import HapticBridgeError, RecordingError
-from hapticbridge.felt import coupling_sentences, was_never_lossless
 from hapticbridge.guard import Limits, limits_for
 from hapticbridge.kernel.parameters import RunParameters
-from hapticbridge.provenance import STARTS, meta_start, parameters_of
+from hapticbridge.record import UNITS, TickFlag
 from hapticbridge.recording import RecordingFile, open_recording
 from hapticbridge.rendering import Method, method_named
+from hapticbridge.run_description import STARTS, meta_start, parameters_of
+from hapticbridge.summary import coupling_sentences, was_never_lossless
+
+# How a recorded run ended, where it was not as it was asked to.
+
+
+def how_it_ended(events: Sequence[Mapping[str, Any]]) -> str:
+    """Returns a clause that names the event which ended the run; empty for an ordinary end.
+
+    Args:
+        events: The recording's.
+    """
+    clauses = []
+    for event in events:
+        name, reason = event.get("event"), event.get("reason")
+        if name == "trip":
+            clauses.append(f"the guard tripped at tick {event.get('tick')}: {_short(reason)}")
+        elif name == "bridge_died":
+            clauses.append(f"the bridge died after tick {event.get('tick')}")
+        elif name == "recorder_died":
+            clauses.append("the recorder died in mid-run")
+        elif name == "suspended":
+            clauses.append(f"the machine was asleep for {event.get('seconds', 0):.3g} s")
+        elif name == "stop" and event.get("signal"):
+            clauses.append(f"stopped by {event['signal']} at tick {event.get('tick')}")
+        elif name == "stop" and reason not in ("duration", "signal", "caller", None, ""):
+            clauses.append(f"stopped by {_short(reason)}")
+    has_trip = any(event.get("event") == "trip" for event in events)
+    if has_trip:  # what is raised then is the same in other words
+        clauses = [clause for clause in clauses if not clause.startswith("stopped by")]
+    return "; ".join(clauses)
+
+
+def _short(reason: object) -> str:
+    """Returns the text of a reason without the tick that it begins with, as a file may hold it."""
+    text = str(reason)
+    head, mark, rest = text.partition(": ")
+    return rest[:200] if mark and head.startswith("tick ") else text[:200]
+
+
+# Was the environment passive, and the device's port: the verdict on energies, block by block.
+
+_RECORDED = ("kinetic", "potential", "actuator_work", "external_work")
+
+
+@dataclass(frozen=True, slots=True)
+class _Excess:
+    """When a limit was first exceeded, and by how many joules."""
+
+    tick: int
+    joules: float
+
+
+@dataclass(slots=True)
+class PassivityVerdict:
+    """Gathers what decides the verdict while a recording passes by.
+
+    Attributes:
+        is_watched: Whether the device's port is judged by what happened. A device that meets its
+            condition needs no watch behind a coupling law: that is the proof.
+        energies: Energies after the newest tick, in J.
+        slack_share: Largest share of the slack that was used.
+        commanded: What commands gave to the coupling by the newest tick, in J.
+    """
+
+    is_watched: bool
+    energies: dict[str, float] = field(default_factory=dict)
+    slack_share: float = 0.0
+    commanded: float = 0.0
+    _unstrict: _Excess | None = None
+    _active: _Excess | None = None
+    _kicked: _Excess | None = None
+
+    def add(self, ticks: NDArray[np.void], balance: EnergyBalance) -> None:
+        """Adds records, at least one, and their balance."""
+        created = balance.environment_energy
+        rounding = TOLERANCE * (1 + balance.throughput)
+        unstrict = created > rounding
+        allowed = balance.slack + rounding
+        self.slack_share = max(
+            self.slack_share, float(np.max(np.where(unstrict, created / allowed, 0.0)))
+        )
+        start = int(ticks["tick"][0])
+        self._unstrict = self._unstrict or _first(unstrict, created, start)
+        self._active = self._active or _first(created > allowed, created - balance.slack, start)
+        if self.is_watched:
+            kicked = balance.kicked > rounding
+            self._kicked = self._kicked or _first(kicked, balance.kicked, start)
+        self.commanded = float(balance.commanded[-1])
+        last = ticks[-1]
+        self.energies = {name: float(last[name]) for name in _RECORDED} | {
+            "coupling_work": float(balance.coupling_work[-1]),
+            "environment_energy": float(created[-1]),
+            "device_energy": float(balance.device_energy[-1]),
+            "slack": float(balance.slack[-1]),
+        }
+
+    def findings(self, *, strict: bool) -> dict[str, Any]:
+        """Returns the fields of ``AuditReport`` that say what the energies mean.
+
+        Args:
+            strict: Accept only (14) itself.
+        """
+        unstrict, active, kicked = self._unstrict, self._active, self._kicked
+        if kicked is not None and not (active is not None and active.tick <= kicked.tick):
+            return {
+                "verdict": "active",
+                "environment": "within slack" if unstrict else "strict",
+                "reason": f"from tick {kicked.tick} the device is given {kicked.joules:.3g} J more "
+                "than its damping burns and scene and coupling give up",
+                "tick": kicked.tick,
+                "port": "device",
+                "joules": kicked.joules,
+                "slack_share": self.slack_share,
+            }
+        if unstrict is None:
+            # within rounding it may be above zero; + 0.0 for zero itself, which has a sign
+            lost = max(-self.energies["environment_energy"], 0.0) + 0.0
+            return {
+                "verdict": "passive",
+                "environment": "strict",
+                "reason": f"the environment never gave out more than it got ({lost:.3g} J "
+                "dissipated)",
+            }
+        if active is None and not strict:
+            return {
+                "verdict": "passive",
+                "environment": "within slack",
+                "reason": "energy was created at times, within the slack that the coupling leaves "
+                f"({self.slack_share:.0%} of it used)",
+                "slack_share": self.slack_share,
+            }
+        excess = active or unstrict
+        limit = "its slack" if active else "(14), asked for strictly"
+        return {
+            "verdict": "active",
+            "environment": "active" if active else "within slack",
+            "reason": f"from tick {excess.tick} the environment exceeds {limit} by "
+            f"{excess.joules:.3g} J",
+            "tick": excess.tick,
+            "port": "environment",
+            "joules": excess.joules,
+            "slack_share": self.slack_share,
+        }
+
+
+def _first(is_beyond: NDArray[np.bool_], joules: NDArray[np.float64], start: int) -> _Excess | None:
+    """Returns the first of these ticks that is beyond a limit; ``start`` is the first one."""
+    if not is_beyond.any():
+        return None
+    at = int(np.argmax(is_beyond))
+    return _Excess(start + at, float(joules[at]))
+
+
+# Do the records agree with their second computation: wrench law, poses, energies.
+
+CONTROLLED_TOLERANCE = 1e-5
+"""Relative difference while the passivity controller acts: it divides a small debt by a squared
+small velocity, which takes five digits of a sum's rounding. The re-simulation tells the rest."""
+
+
+def physics_fault(ticks: NDArray[np.void], balance: EnergyBalance) -> Fault | None:
+    """Returns the earliest disagreement between records and their second computation.
+
+    Args:
+        ticks: Records without gaps, ``TICK_DTYPE``.
+        balance: What their poses and wrenches say by themselves.
+    """
+    start = int(ticks["tick"][0])
+    vectors = (
+        ("handle_position", balance.handle_position, "m", "device pose and scale"),
+        ("wrench_on_tool", balance.wrench_on_tool, "N or N m", "coupling law and poses"),
+        ("wrench_on_device", balance.wrench_on_device, "N or N m", "wrench on the tool and limits"),
+    )
+    faults = []
+    for name, expected, unit, by in vectors:
+        difference = np.abs(ticks[name] - expected).max(axis=1)
+        allowed = TOLERANCE * (1 + np.abs(expected).max(axis=1))
+        if name == "wrench_on_device":
+            is_active = has_flag(ticks, TickFlag.CONTROLLER_ACTIVE)
+            allowed = np.where(is_active, allowed * CONTROLLED_TOLERANCE / TOLERANCE, allowed)
+        faults.append(_first_fault(name, start, difference, allowed, unit, by))
+    faults.append(
+        _first_fault(
+            "handle_quaternion",
+            start,
+            balance.handle_turn,
+            np.full(len(ticks), TOLERANCE),
+            "rad",
+            "device pose",
+        )
+    )
+    energies = (
+        ("coupling_work", balance.coupling_work, balance.throughput),
+        ("device_energy", balance.device_energy, balance.device_throughput),
+        ("environment_energy", balance.environment_energy, balance.throughput),
+    )
+    for name, joules, throughput in energies:
+        difference = np.abs(ticks[name] - joules)
+        scale = throughput + np.abs(ticks["potential"])
+        faults.append(
+            _first_fault(
+                name,
+                start,
+                difference,
+                TOLERANCE * (1 + scale),
+                "J",
+                "recorded poses and wrenches",
+            )
+        )
+    is_off = (ticks["flags"] & int(TickFlag.CONTROLLER_ACTIVE)) == 0
+    for kind, name in enumerate(("injected_damping", "injected_rotational_damping")):
+        unit = UNITS[name]
+        damping = np.where(is_off, np.abs(ticks[name]), 0.0)
+        faults.append(_first_fault(name, start, damping, np.zeros(len(ticks)), unit, "flags"))
+        expected = balance.injected_damping[:, kind]
+        allowed = CONTROLLED_TOLERANCE * (1 + np.abs(expected))
+        wrong = np.abs(ticks[name] - expected)
+        faults.append(_first_fault(name, start, wrong, allowed, unit, "poses and energies"))
+    found = [fault for fault in faults if fault is not None]
+    return min(found, key=lambda fault: fault.tick or 0) if found else None
+
+
+def _first_fault(
+    name: str,
+    start: int,
+    difference: NDArray[np.float64],
+    allowed: NDArray[np.float64],
+    unit: str,
+    by: str,
+) -> Fault | None:
+    wrong = ~(difference <= allowed)  # also where a sum overflowed to NaN
+    if not wrong.any():
+        return None
+    at = int(np.argmax(wrong))
+    tick, amount = start + at, float(difference[at])
+    return Fault(
+        f"{name} of tick {tick} is {amount:.3g} {unit} off what {by} give",
+        tick,
+        name,
+        amount if unit == "J" else 0.0,
+    )
 
 
 @np.errstate(all="ignore")  # numbers of a damaged file overflow; what comes out is then a fault
@@ -61,7 +299,7 @@ def verdict_on(path: str | Path, *, strict: bool) -> AuditReport:
             parameters, device_damping=burning, device_rotational_damping=rotational
         )
         home = np.array(meta_start(recording.meta, "tool_start"))
-        outside = Interventions.of(recording.events, parameters, home)
+        outside = RunEvents.of(recording.events, parameters, home)
         facts |= _device_facts(info, parameters, outside.worst(info, method), method, recording)
         rendered = facts["rendered"]
         facts["rendered"] = rendered + outside.sentences()
@@ -176,7 +414,7 @@ class _Passed:
         self, recording: RecordingFile, parameters: RunParameters, *, is_watched: bool
     ) -> None:
         self._recording, self._parameters = recording, parameters
-        self.judgement, self.duration = Judgement(is_watched), 0.0
+        self.judgement, self.duration = PassivityVerdict(is_watched), 0.0
         # the complaint of the re-simulation waits until the records themselves have been judged
         self._error: RecordingError | None = None
         try:
@@ -184,7 +422,7 @@ class _Passed:
         except RecordingError as error:
             self._error = error
 
-    def by(self, outside: Interventions, late: int) -> Fault | None:
+    def by(self, outside: RunEvents, late: int) -> Fault | None:
         """Looks at every tick; returns the earliest fault of the records themselves.
 
         Args:
@@ -201,7 +439,7 @@ class _Passed:
         fault = None
         late = min(late, self._recording.count)
         for ticks, following in _with_following(self._recording.blocks(), late):
-            balance = Balance.of(ticks, self._parameters, reached, outside, late, following)
+            balance = EnergyBalance.of(ticks, self._parameters, reached, outside, late, following)
             reached = balance.reached
             self.judgement.add(ticks, balance)
             self.duration = 1e-9 * float(ticks["deadline_ns"][-1])

@@ -13,15 +13,68 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.certificate import default_coupling
-from hapticbridge.check.motion import motion_for, samples_of
-from hapticbridge.check.observation import Observation, observe, quiet
-from hapticbridge.check.places import Places
+from hapticbridge.check.observe import Observation, observe, quiet
+from hapticbridge.check.source_map import Places
 from hapticbridge.coupling import Coupling
-from hapticbridge.device import DeviceInfo, Motion, SimulatedDevice
-from hapticbridge.device.trajectory.motion import lissajous
+from hapticbridge.device import DeviceInfo, Motion, SimulatedDevice, TrajectoryDevice, read_motion
+from hapticbridge.device.trajectory import lissajous
 from hapticbridge.errors import DeviceError, SceneError
+from hapticbridge.record import SAMPLE_DTYPE
+from hapticbridge.recording import read_recording
 from hapticbridge.rendering import default_method
 from hapticbridge.scene import Scene, SceneSource, compile_scene
+
+# Motion for a check: the scene's own hand path, a file of poses, or a recording.
+
+RECORDING = ".mcap"
+
+
+def motion_for(scene: Scene, path: str | Path | None = None) -> Motion | None:
+    """Returns the handle's motion relative to its first pose.
+
+    Args:
+        scene: The scene under check.
+        path: CSV file (``t,x,y,z[,qw,qx,qy,qz]``) or recording; None takes ``NAME.csv`` beside the
+            scene.
+
+    Returns:
+        The motion; None if no file was named and none lies beside the scene.
+
+    Raises:
+        DeviceError: The file is not a motion.
+        RecordingError: The file is not a recording.
+    """
+    if path is None:
+        beside = scene.path.with_suffix(".csv")
+        return read_motion(beside).relative() if beside.is_file() else None
+    if Path(path).suffix != RECORDING:
+        return read_motion(path).relative()
+    recording = read_recording(path)
+    ticks = recording.ticks
+    try:
+        period = float(recording.meta["period_s"])
+    except (KeyError, ValueError):
+        raise DeviceError(f"{path}: the recording does not say its period (period_s)") from None
+    # the handle's pose already includes scale and axes; the device's does not
+    return Motion(
+        ticks["tick"] * period, ticks["handle_position"], ticks["handle_quaternion"]
+    ).relative()
+
+
+def samples_of(motion: Motion, period: float) -> NDArray[np.void]:
+    """Samples the motion as the loop would, one ``SAMPLE_DTYPE`` per period T in s.
+
+    Raises:
+        DeviceError: The period is not finite and > 0.
+    """
+    device = TrajectoryDevice(motion)
+    sample = device.start(period)
+    samples = np.zeros(int(motion.duration / period) + 1, SAMPLE_DTYPE)
+    for k in range(samples.size):
+        device.read(sample)
+        samples[k] = sample[0]
+    return samples
+
 
 DEFAULT_PERIOD = 1e-3
 """Tick period T in s. It is the default of ``hapticbridge run``."""
@@ -42,7 +95,7 @@ fingertip."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Case:
+class SceneUnderCheck:
     """A scene under check.
 
     Attributes:
@@ -101,7 +154,7 @@ def open_case(
     workspace: float = LARGEST_WORKSPACE,
     motion: str | Path | None = None,
     progress: Callable[[int, int], None] | None = None,
-) -> Case:
+) -> SceneUnderCheck:
     """Compiles a scene and leads it through its motion.
 
     Args:
@@ -133,7 +186,7 @@ def open_case(
         chosen, name = _default_motion(), "the default hand motion: slow, 1 cm about each axis"
     samples = samples_of(chosen, period)
     places = Places(source, scene.model)
-    case = Case(
+    case = SceneUnderCheck(
         source=source,
         scene=scene,
         places=places,

@@ -7,15 +7,23 @@ from collections.abc import Iterator
 import mujoco
 import numpy as np
 
-from hapticbridge.check.case import Case
-from hapticbridge.check.clearance import clearances
-from hapticbridge.check.contact_stiffness import constraint_stiffness, depth_under
-from hapticbridge.check.faults import Fault, length, number, others
-from hapticbridge.check.inertia import body_inertia
-from hapticbridge.check.places import Place
-from hapticbridge.scene.contact_check import ContactSetting, settings_among, tool_geoms
-from hapticbridge.scene.contact_concerns import SOFT_STEPS, contact_concerns
-from hapticbridge.scene.contact_rule import REFERENCE_STEPS, ROUNDING, contact_numbers
+from hapticbridge.check.case import SceneUnderCheck
+from hapticbridge.check.fault import Fault, length, number, others
+from hapticbridge.check.observe import clearances
+from hapticbridge.check.physics import body_inertia, constraint_stiffness, depth_under
+from hapticbridge.check.source_map import Place
+from hapticbridge.scene.checks import MAXIMUM_START_PENETRATION
+from hapticbridge.scene.compile import START_KEYFRAME
+from hapticbridge.scene.contacts import (
+    REFERENCE_STEPS,
+    ROUNDING,
+    SOFT_STEPS,
+    ContactSetting,
+    contact_concerns,
+    contact_numbers,
+    settings_among,
+    tool_geoms,
+)
 
 LEAST_PUSH = 1.0
 """Smallest force in N that contacts are tested with: a light touch. A motion without contact does
@@ -28,7 +36,7 @@ _LEAST_FRICTION = float(mujoco.mjMINMU)
 _TYPICAL_INERTIA = 0.1  # kg; for pairs of which neither side moves by itself
 
 
-def contact_faults(case: Case) -> Iterator[Fault]:
+def contact_faults(case: SceneUnderCheck) -> Iterator[Fault]:
     """Yields faults of the tool's possible contacts and of every contact in the motion."""
     model, option = case.model, case.model.opt
     meetings = case.observation.meetings if case.observation else {}
@@ -68,7 +76,7 @@ def contact_faults(case: Case) -> Iterator[Fault]:
             )
 
 
-def push_of(case: Case) -> float:
+def push_of(case: SceneUnderCheck) -> float:
     """Returns the force in N that contacts are tested with.
 
     It is the largest coupling force in the motion, at least ``LEAST_PUSH`` and at most the device's
@@ -78,7 +86,7 @@ def push_of(case: Case) -> float:
     return min(max(largest, LEAST_PUSH), max(case.info.force_limit, LEAST_PUSH))
 
 
-def _rooms(case: Case, pairs: list[tuple[int, int]]) -> dict[tuple[int, int], float]:
+def _rooms(case: SceneUnderCheck, pairs: list[tuple[int, int]]) -> dict[tuple[int, int], float]:
     if case.observation is None:
         return {}
     is_tool = tool_geoms(case.model, case.scene.grip)
@@ -87,7 +95,7 @@ def _rooms(case: Case, pairs: list[tuple[int, int]]) -> dict[tuple[int, int], fl
 
 
 def _soft(
-    case: Case,
+    case: SceneUnderCheck,
     setting: ContactSetting,
     pairs: list[tuple[int, int]],
     push: float,
@@ -131,7 +139,7 @@ def _soft(
     return Fault(kind, place, sentence, change + also)
 
 
-def inertia_of(case: Case, pair: tuple[int, int], setting: ContactSetting) -> float:
+def inertia_of(case: SceneUnderCheck, pair: tuple[int, int], setting: ContactSetting) -> float:
     """Returns the smallest effective inertia in kg that the contact of two geoms had in the motion.
 
     For geoms that did not meet it follows from the bodies' centres at the start: 1/m = Σ 1/m_i. The
@@ -165,7 +173,7 @@ def _edges(model: mujoco.MjModel, setting: ContactSetting) -> float:
     return (setting.condim - 1) / (friction**2 * (1 + friction**2))
 
 
-def _place(case: Case, pair: tuple[int, int], *, is_soft: bool) -> tuple[Place, str]:
+def _place(case: SceneUnderCheck, pair: tuple[int, int], *, is_soft: bool) -> tuple[Place, str]:
     """Returns the place to change a contact's setting, and a note on a second place to change.
 
     An explicit pair comes first, then the geom with the higher priority. Otherwise it is the geom
@@ -196,7 +204,7 @@ def _softness(solref: np.ndarray) -> float:
     return 1.0 / np.sqrt(-first) if first < 0 else np.inf
 
 
-def pair_names(case: Case, pairs: list[tuple[int, int]]) -> str:
+def pair_names(case: SceneUnderCheck, pairs: list[tuple[int, int]]) -> str:
     """Returns the names of the first pair of geoms, and the number of further pairs."""
     first, second = (case.places.geom(geom).element for geom in pairs[0])
     return f"{first} with {second}{others(len(pairs) - 1)}"
@@ -204,3 +212,75 @@ def pair_names(case: Case, pairs: list[tuple[int, int]]) -> str:
 
 def _numbers(values: tuple[float, ...]) -> str:
     return f'"{" ".join(f"{value:g}" for value in values)}"'
+
+
+# Faults of contacts at the start, and of contact margins.
+
+
+def margin_faults(case: SceneUnderCheck) -> Iterator[Fault]:
+    """Yields geoms and pairs whose contacts push before they touch."""
+    model, places = case.model, case.places
+    meeting = {geom for first, second, _ in settings_among(model) for geom in (first, second)}
+    found = [(places.geom(geom), float(model.geom_margin[geom])) for geom in sorted(meeting)]
+    found += [(places.pair(p), float(model.pair_margin[p])) for p in range(model.npair)]
+    for place, margin in found:
+        if margin > 0:
+            yield Fault(
+                "margin",
+                place,
+                f"{place.element} has a margin of {1e3 * margin:g} mm: it pushes that far before "
+                "it is touched, and the force jumps where it begins",
+                'margin="0"',
+            )
+
+
+def start_faults(case: SceneUnderCheck) -> Iterator[Fault]:
+    """Yields starts that are not finite, and overlapping geoms, whose energy is not metered."""
+    case.scene.reset()
+    model, data = case.model, case.scene.data
+    beyond = [
+        name
+        for name in ("qpos", "qvel", "qacc")
+        if not np.all(np.abs(getattr(data, name)) <= mujoco.mjMAXVAL)
+    ]
+    if beyond:
+        yield Fault(
+            "start not finite",
+            case.places.named("key", START_KEYFRAME),
+            f"at the start {' and '.join(beyond)} are not finite or beyond {mujoco.mjMAXVAL:g}",
+            "numbers of this scene's size",
+        )
+    seen = set()
+    for contact in data.contact:
+        first, second = (int(geom) for geom in contact.geom)
+        if (
+            first < 0
+            or second < 0
+            or (first, second) in seen
+            or contact.dist >= -MAXIMUM_START_PENETRATION
+        ):
+            continue
+        seen.add((first, second))
+        mover = second if model.body_treeid[model.geom_bodyid[second]] >= 0 else first
+        body = int(model.geom_bodyid[mover])
+        out = -contact.dist * contact.frame[:3] * (1 if mover == second else -1)
+        yield Fault(
+            "starts in contact",
+            case.places.geom(mover),
+            f"{pair_names(case, [(first, second)])} overlap by {length(-contact.dist)} at the "
+            f"start; more than {length(MAXIMUM_START_PENETRATION)} release energy that is not "
+            "metered",
+            _moved_out(case, body, out),
+        )
+
+
+def _moved_out(case: SceneUnderCheck, body: int, out: np.ndarray) -> str:
+    model = case.model
+    by = " ".join(f"{value:.4g}" for value in 1e3 * out)
+    has_home = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_KEY, START_KEYFRAME) >= 0
+    name = model.body(body).name or body
+    if has_home or model.body_parentid[body] != 0:
+        start = "keyframe 'home'" if has_home else "its pos"
+        return f"move body '{name}' in {start} by {by} mm"
+    position = " ".join(f"{value:.6g}" for value in model.body_pos[body] + 1.01 * out)
+    return f"pos=\"{position}\" in body '{name}' (moved by {by} mm)"

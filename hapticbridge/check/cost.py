@@ -2,25 +2,94 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import mujoco
 import numpy as np
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from hapticbridge.check.growth import Growth, Spread, growth_of
-from hapticbridge.check.rehearsal import not_finite, rehearsal_parameters
+from hapticbridge.check.observe import not_finite, rehearsal_parameters
+from hapticbridge.check.version import SceneVariant
 from hapticbridge.coupling import Coupling
+from hapticbridge.device import Motion
+from hapticbridge.errors import SceneError
 from hapticbridge.jit import direct
 from hapticbridge.kernel.codes import OK
-from hapticbridge.kernel.publish import publish
-from hapticbridge.kernel.state import Binding
-from hapticbridge.kernel.step import after_step, before_step
+from hapticbridge.kernel.state import BoundKernel
+from hapticbridge.kernel.tick import after_step, before_step, publish, simulate
+from hapticbridge.plotting import new_figure
+from hapticbridge.record import TICK_DTYPE
 from hapticbridge.recording import TAIL, Ring
-from hapticbridge.recording.stream import NOBODY_READS
+from hapticbridge.recording.recorder import NOBODY_READS
 from hapticbridge.scene import Scene
+
+# Statistics of tick times.
+
+LEAST_GROUP = 20
+"""Smallest number of ticks with one count whose median is used."""
+
+
+@dataclass(frozen=True, slots=True)
+class TimingStats:
+    """Distribution of tick times, in s.
+
+    Attributes:
+        ticks: Number of ticks.
+        median: Median; nan without ticks.
+        p99: 99th percentile; nan without ticks.
+    """
+
+    ticks: int
+    median: float
+    p99: float
+
+    @classmethod
+    def of(cls, times: NDArray[np.float64]) -> TimingStats:
+        """Computes the distribution of times in s."""
+        if not times.size:
+            return cls(0, float("nan"), float("nan"))
+        return cls(int(times.size), float(np.median(times)), float(np.percentile(times, 99)))
+
+
+@dataclass(frozen=True, slots=True)
+class Growth:
+    """Growth of the tick's time with the number of constraint rows or contacts.
+
+    Attributes:
+        steps: For each count: the count, the number of ticks, and their median time in s.
+        base: Time in s at count zero, from a least-squares line through the medians; None with
+            fewer than two medians.
+        per_one: Additional time in s per row or contact; None with fewer than two medians.
+    """
+
+    steps: tuple[tuple[int, int, float], ...]
+    base: float | None
+    per_one: float | None
+
+
+def growth_of(counts: NDArray[np.int64], times: NDArray[np.float64]) -> Growth:
+    """Returns the median time by count, and a line weighted by the number of ticks.
+
+    Args:
+        counts: Shape (n,).
+        times: Shape (n,), in s.
+    """
+    steps = []
+    for count in np.unique(counts).tolist():
+        those = times[counts == count]
+        if those.size >= LEAST_GROUP:
+            steps.append((int(count), int(those.size), float(np.median(those))))
+    if len(steps) < 2:
+        return Growth(tuple(steps), None, None)
+    x, n, y = (np.array(column, dtype=np.float64) for column in zip(*steps, strict=True))
+    slope, base = np.polyfit(x, y, 1, w=np.sqrt(n))
+    return Growth(tuple(steps), float(base), float(slope))
+
 
 _TIMER = mujoco.mjtTimer
 STAGES: dict[str, int] = {
@@ -69,9 +138,9 @@ class Cost:
         by_rows: Growth with the number of constraint rows.
     """
 
-    free: Spread
-    contact: Spread
-    all_ticks: Spread
+    free: TimingStats
+    contact: TimingStats
+    all_ticks: TimingStats
     stages: dict[str, tuple[float, float]]
     highest_rate: float
     by_contacts: Growth
@@ -121,8 +190,8 @@ def measure_cost(
     told(PASSES + 1)
     time_of, contacts_of = np.concatenate(ticks), np.concatenate(contacts)
     is_free = contacts_of == 0
-    free, contact = Spread.of(time_of[is_free]), Spread.of(time_of[~is_free])
-    all_ticks = Spread.of(time_of)
+    free, contact = TimingStats.of(time_of[is_free]), TimingStats.of(time_of[~is_free])
+    all_ticks = TimingStats.of(time_of)
     medians = {
         name: (_median(times[touching == 0]), _median(times[touching > 0]))
         for name, times in stages.items()
@@ -148,7 +217,7 @@ def _time_ticks(
     clock: Callable[[], int],
 ) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64]]:
     """Returns time in s, contacts and constraint rows of every tick."""
-    binding = Binding(scene.model, scene.data, rehearsal_parameters(scene, coupling, period))
+    binding = BoundKernel(scene.model, scene.data, rehearsal_parameters(scene, coupling, period))
     state, row, ring = binding.state, binding.row, Ring.local(_RING)
     ring.cursors[TAIL] = NOBODY_READS
     before = direct(before_step, state, samples[:1], row, 0, period)
@@ -180,7 +249,7 @@ def _time_stages(
     scene: Scene, samples: NDArray[np.void], coupling: Coupling, period: float
 ) -> tuple[dict[str, NDArray[np.float64]], NDArray[np.int64]]:
     """Returns the time in s of every stage of every step by MuJoCo's timers, and the contacts."""
-    binding = Binding(scene.model, scene.data, rehearsal_parameters(scene, coupling, period))
+    binding = BoundKernel(scene.model, scene.data, rehearsal_parameters(scene, coupling, period))
     state, row, model, data = binding.state, binding.row, scene.model, scene.data
     spent = np.zeros((samples.size, int(_TIMER.mjNTIMER)))
     contacts = np.zeros(samples.size, np.int64)
@@ -200,3 +269,154 @@ def _time_stages(
 
 def _median(times: NDArray[np.float64]) -> float:
     return float(np.median(times)) if times.size else float("nan")
+
+
+# Plot of a scene's cost.
+
+_FREE, _CONTACT, _LINE = "tab:blue", "tab:orange", "0.3"
+_LEAST_SHARE = 0.01  # of the tick; smaller stages are not drawn
+
+
+def _known(seconds: float) -> float:
+    return seconds if math.isfinite(seconds) else 0.0
+
+
+def draw_cost(cost: Cost, title: str) -> Figure:
+    """Draws the stages of a tick and its growth with constraint rows."""
+    figure = new_figure(8.0, 4.4)
+    figure.suptitle(f"{title} (rate: p99 within {100 * TICK_SHARE:g} % of the period)")
+    stages, growth = figure.subplots(1, 2, width_ratios=(1.25, 1.0))
+    whole = max(_known(cost.free.median), _known(cost.contact.median))
+    drawn = {
+        name: times
+        for name, times in cost.stages.items()
+        if name == BRIDGE or max(map(_known, times)) >= _LEAST_SHARE * whole
+    }
+    places = range(len(drawn))
+    kinds = ((0, "out of contact", cost.free, _FREE), (1, "in contact", cost.contact, _CONTACT))
+    for k, label, spread, colour in kinds:
+        if spread.ticks:
+            stages.barh(
+                [place + 0.2 * (2 * k - 1) for place in places],
+                [1e6 * times[k] for times in drawn.values()],
+                height=0.38,
+                color=colour,
+                label=f"{label}: {1e6 * spread.median:.3g} µs, p99 {1e6 * spread.p99:.3g} µs",
+            )
+    stages.set_yticks(list(places), list(drawn))
+    stages.invert_yaxis()
+    stages.set_xlabel("median time per tick in µs")
+    stages.set_title("where it goes", fontsize="medium")
+    figure.legend(fontsize="small", loc="outside lower left", ncols=2)
+
+    steps = cost.by_rows.steps
+    growth.plot(
+        [rows for rows, _, _ in steps],
+        [1e6 * seconds for _, _, seconds in steps],
+        "o",
+        color=_LINE,
+        label="median of a tick",
+    )
+    base, per_one = cost.by_rows.base, cost.by_rows.per_one
+    if base is not None and per_one is not None:
+        ends = [steps[0][0], steps[-1][0]]
+        growth.plot(
+            ends,
+            [1e6 * (base + per_one * rows) for rows in ends],
+            color=_LINE,
+            label=f"{1e6 * base:.3g} µs + {1e6 * per_one:.2g} µs per row",
+        )
+    growth.set_xlabel("constraint rows in the tick")
+    growth.set_ylabel("median time per tick in µs")
+    growth.set_ylim(0.0, 1.15e6 * max(seconds for _, _, seconds in steps))
+    rate = math.floor(cost.highest_rate)
+    growth.set_title(f"how it grows; up to {rate:,} Hz", fontsize="medium")
+    growth.legend(fontsize="small", loc="lower right")
+    return figure
+
+
+# Costs of two versions measured side by side.
+
+CHUNKS = 40
+"""Number of stretches into which a motion is cut. The two versions take turns after each, so that a
+disturbance of the machine slows both. More stretches cost 20 µs each."""
+
+REPEATS = 5
+"""Largest number of passes. The work is equal in each and disturbances only add time, so each
+stretch counts with its smallest time. Beside six other processes on two cores, a scene measured
+against itself came out within 1 %; the median scattered twice as much."""
+
+PATIENCE = 0.6
+"""Processor time in s after which a comparison stops with fewer passes."""
+
+CostMeter: TypeAlias = Callable[[SceneVariant, SceneVariant, Motion], tuple[float, float]]
+"""Returns the processor time in s of each of two versions per second of motion."""
+
+
+def processor_costs(
+    first: SceneVariant, second: SceneVariant, motion: Motion
+) -> tuple[float, float]:
+    """Measures the processor time of two versions in s per second of motion.
+
+    It covers MuJoCo's step and the bridge's arithmetic, by the thread's own clock. The first pass
+    is a warm-up and is dropped if there are at least three.
+
+    Raises:
+        SceneError: A version does not compile, or a result is not finite.
+    """
+    stages = [Stage(draft, motion) for draft in (first, second)]
+    passes: list[NDArray[np.float64]] = []
+    start = time.thread_time()
+    while len(passes) <= REPEATS:
+        passes.append(one_pass(stages))
+        if (time.thread_time() - start) * (1 + 1 / len(passes)) > PATIENCE:
+            break
+    kept = passes[1:] if len(passes) > 2 else passes
+    seconds = np.min(kept, axis=0).sum(axis=1)
+    return float(seconds[0] / motion.duration), float(seconds[1] / motion.duration)
+
+
+class Stage:
+    """A version of a scene that runs through a motion in stretches.
+
+    Attributes:
+        rows: Records of the run, ``TICK_DTYPE``.
+    """
+
+    def __init__(self, draft: SceneVariant, motion: Motion) -> None:
+        """Compiles the scene; call ``reset`` before the first stretch."""
+        self._scene = draft.compiled()
+        self._setting = draft.setting
+        self._samples = draft.samples(motion)
+        self.rows = np.zeros(self._samples.size, TICK_DTYPE)
+        self._edges = np.linspace(0, self._samples.size, CHUNKS + 1).astype(int)
+
+    def reset(self) -> None:
+        """Resets the scene."""
+        setting = self._setting
+        parameters = rehearsal_parameters(
+            self._scene, setting.coupling, setting.period, setting.substeps
+        )
+        self._binding = BoundKernel(self._scene.model, self._scene.data, parameters)
+
+    def run(self, chunk: int) -> float:
+        """Runs one stretch; returns its processor time in s.
+
+        Raises:
+            SceneError: A result is not finite.
+        """
+        binding, part = self._binding, slice(self._edges[chunk], self._edges[chunk + 1])
+        rows = self.rows[part]
+        start = time.thread_time()
+        done = simulate(binding.state, self._samples[part], binding.row, rows)
+        seconds = time.thread_time() - start
+        if done < rows.size:
+            raise SceneError(f"scene '{self._scene.name}' is not finite within the motion")
+        return seconds
+
+
+def one_pass(stages: list[Stage]) -> NDArray[np.float64]:
+    """Runs all versions through the whole motion in turns; returns s by version and stretch."""
+    for stage in stages:
+        stage.reset()
+    return np.array([[stage.run(chunk) for stage in stages] for chunk in range(CHUNKS)]).T

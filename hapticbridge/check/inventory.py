@@ -8,11 +8,10 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.check.observation import ROW_KINDS, Observation
-from hapticbridge.check.places import Place, Places
-from hapticbridge.check.reach import reached_trees
-from hapticbridge.kernel.names import COUPLING_ACTUATORS, HANDLE
-from hapticbridge.scene.contact_check import meeting_pairs
+from hapticbridge.check.observe import ROW_KINDS, Observation, reached_trees
+from hapticbridge.check.source_map import Place, Places
+from hapticbridge.kernel.codes import COUPLING_ACTUATORS, HANDLE
+from hapticbridge.scene.contacts import meeting_pairs
 
 VISUAL = "only visual"
 TOOL = "of the tool"

@@ -12,23 +12,164 @@ from dataclasses import dataclass, replace
 
 from hapticbridge.arguments import Arguments
 from hapticbridge.certificate import UNKNOWN_DAMPING
-from hapticbridge.check.draft import Draft, Setting, name_everything
-from hapticbridge.check.freedoms import freedom_simplifications
-from hapticbridge.check.observation import quiet
-from hapticbridge.check.shapes import shape_simplifications
-from hapticbridge.check.side_by_side import CostMeter, processor_costs
-from hapticbridge.check.simplifications import (
+from hapticbridge.check.cost import CostMeter, processor_costs
+from hapticbridge.check.observe import Playback, quiet
+from hapticbridge.check.perception import FeltError, felt_error
+from hapticbridge.check.simplify import (
     OTHER_MOTIONS,
     Simplification,
     contact_simplifications,
+    freedom_simplifications,
     rate_simplifications,
+    shape_simplifications,
     solver_simplifications,
 )
-from hapticbridge.check.trial import FAILS, MAY_GO, SAVES_NOTHING, Judge, Trial
+from hapticbridge.check.version import SceneVariant, Setting, name_everything
 from hapticbridge.check.witness import witness
 from hapticbridge.device import Motion
 from hapticbridge.errors import HapticBridgeError, SceneError
 from hapticbridge.scene import SceneSource
+
+# Judgement of one version of a scene.
+
+LEAST_SAVING = 0.05
+"""Share of the cost that a simplification must save, without unit. On a busy machine a scene
+measured against itself differs by at most 1 %; where it differs by more, three times that
+difference counts. A larger share keeps more of the scene."""
+
+CLEARLY_MORE = 1.2
+"""Cost relative to the version to beat, without unit, above which a single run decides."""
+
+_ROUNDING = 1e-9  # relative, of a sum of products
+
+_ENVIRONMENTS = ("strict", "within slack", "active")
+
+MAY_GO, IS_FELT, SAVES_NOTHING = "may go", "is felt", "saves nothing"
+CREATES, WARNS, NOT_BORNE, FAILS = "creates energy", "MuJoCo warns", "device too weak", "fails"
+
+
+@dataclass(frozen=True, slots=True)
+class VariantVerdict:
+    """A version of a scene compared with the original.
+
+    Attributes:
+        name: Name of the simplification.
+        sentence: Description of the edit, or reason of the failure.
+        verdict: ``MAY_GO``, or the reason against it: one of the constants of this module.
+        loses: Further loss, see ``Simplification``.
+        cost: Processor time relative to the original, without unit. It comes from a single run if
+            the version is refused for another reason; None if it failed.
+        felt: Perceptible difference; None if it failed.
+        environment: ``strict``, ``within slack`` or ``active``.
+        warnings: Number of MuJoCo's warnings.
+        needed_damping: b in N s/m that a device needs at this version's rate.
+    """
+
+    name: str
+    sentence: str
+    verdict: str
+    loses: str = ""
+    cost: float | None = None
+    felt: FeltError | None = None
+    environment: str = ""
+    warnings: int = 0
+    needed_damping: float = 0.0
+
+
+class Judge:
+    """Comparison of versions of one scene in one motion.
+
+    Attributes:
+        original: The scene as it was read.
+        motion: Motion of the handle.
+        budget: Allowed felt error in just noticeable differences.
+        device_damping: b of the device in N s/m.
+        rehearsal: Rehearsal of the original.
+        seconds: Processor time of the original in s per second of motion.
+        least_saving: Share of the cost that counts as a saving, without unit.
+    """
+
+    def __init__(
+        self,
+        original: SceneVariant,
+        motion: Motion,
+        budget: float,
+        device_damping: float,
+        cost: CostMeter,
+    ) -> None:
+        """Rehearses the original and measures its cost against itself.
+
+        Raises:
+            SceneError: It does not compile, or a result is not finite.
+        """
+        self.original, self.motion = original, motion
+        self.budget, self.device_damping = budget, device_damping
+        self._cost = cost
+        self.rehearsal = original.rehearsed(motion)
+        first, second = cost(original, original.copy(), motion)
+        self.seconds = 0.5 * (first + second)
+        self.least_saving = max(LEAST_SAVING, 3.0 * abs(second / first - 1.0))
+
+    def judge(
+        self,
+        name: str,
+        sentence: str,
+        draft: SceneVariant,
+        base: SceneVariant | None = None,
+        share: float = 1.0,
+        loses: str = "",
+        *,
+        is_last_word: bool = False,
+    ) -> VariantVerdict:
+        """Judges if a version may replace the original.
+
+        Args:
+            name: Name of the change.
+            sentence: Description of the change.
+            draft: The version.
+            base: Version that it must be cheaper than; None takes the original.
+            share: Cost of ``base`` relative to the original, without unit.
+            loses: Further loss, see ``Simplification``.
+            is_last_word: True measures the cost thoroughly even if a single run shows no saving.
+
+        Raises:
+            SceneError: The version does not compile, or a result is not finite.
+        """
+        done = draft.rehearsed(self.motion)
+        felt = felt_error(self.rehearsal.records, done.records)
+        needed = draft.setting.needed_damping
+        verdict = self._refusal(done, felt, needed)
+        cost = done.seconds / (self.seconds * self.motion.duration)
+        if not verdict and not is_last_word and cost > CLEARLY_MORE * share:
+            verdict = SAVES_NOTHING
+        if not verdict:  # a refused version needs no thorough measurement
+            before, after = self._cost(base or self.original, draft, self.motion)
+            verdict = MAY_GO if after <= (1.0 - self.least_saving) * before else SAVES_NOTHING
+            cost = share * after / before
+        return VariantVerdict(
+            name=name,
+            sentence=sentence,
+            verdict=verdict,
+            loses=loses,
+            cost=cost,
+            felt=felt,
+            environment=done.environment,
+            warnings=done.warnings,
+            needed_damping=needed,
+        )
+
+    def _refusal(self, done: Playback, felt: FeltError, needed: float) -> str:
+        """Returns the reason against a version regardless of its cost; empty if there is none."""
+        ranks = [_ENVIRONMENTS.index(each.environment) for each in (done, self.rehearsal)]
+        bearable = max(self.device_damping, self.original.setting.needed_damping)
+        if done.warnings > self.rehearsal.warnings:
+            return WARNS
+        if ranks[0] > ranks[1]:
+            return CREATES
+        if needed > bearable * (1.0 + _ROUNDING):
+            return NOT_BORNE
+        return IS_FELT if felt.felt > self.budget else ""
+
 
 Progress = Callable[[int, int, str], None]
 """Called with the steps done, the largest possible number of steps, and the name of the present
@@ -60,13 +201,13 @@ class Lean:
     """
 
     judge: Judge
-    draft: Draft
-    alone: tuple[Trial, ...]
-    together: tuple[Trial, ...]
-    result: Trial
+    draft: SceneVariant
+    alone: tuple[VariantVerdict, ...]
+    together: tuple[VariantVerdict, ...]
+    result: VariantVerdict
 
     @property
-    def removable(self) -> tuple[Trial, ...]:
+    def removable(self) -> tuple[VariantVerdict, ...]:
         """Simplifications that pass alone and lose nothing else; a lean scene has none."""
         return tuple(trial for trial in self.alone if trial.verdict == MAY_GO and not trial.loses)
 
@@ -107,13 +248,13 @@ def find_lean(
         )
     spec = source.spec.copy()
     name_everything(spec)
-    original = Draft(replace(source, spec=spec), grip, setting)
+    original = SceneVariant(replace(source, spec=spec), grip, setting)
     with quiet():
         judge = Judge(original, motion, budget, damping, cost)
         return _search(judge, _simplifications(original, motion), progress)
 
 
-def _simplifications(original: Draft, motion: Motion) -> list[Simplification]:
+def _simplifications(original: SceneVariant, motion: Motion) -> list[Simplification]:
     seen = witness(original, motion)
     return [
         *contact_simplifications(seen),
@@ -156,8 +297,8 @@ def _search(judge: Judge, simpler: list[Simplification], progress: Progress | No
 
 
 def _tried(
-    judge: Judge, each: Simplification, base: Draft, share: float = 1.0
-) -> tuple[Draft, Trial] | None:
+    judge: Judge, each: Simplification, base: SceneVariant, share: float = 1.0
+) -> tuple[SceneVariant, VariantVerdict] | None:
     """Applies a simplification to a version; returns None if there is nothing to change."""
     draft = base.copy()
     try:
@@ -166,4 +307,4 @@ def _tried(
         return draft, judge.judge(each.name, each.sentence, draft, base, share, each.loses)
     except (HapticBridgeError, ValueError) as error:  # MuJoCo raises ValueError
         reason = " ".join(str(error).split())
-        return draft, Trial(each.name, reason, FAILS, each.loses)
+        return draft, VariantVerdict(each.name, reason, FAILS, each.loses)

@@ -7,10 +7,86 @@ from collections.abc import Iterator
 import mujoco
 import numpy as np
 
-from hapticbridge.check.case import Case
-from hapticbridge.check.faults import Fault, number
-from hapticbridge.check.observation import Observation
-from hapticbridge.scene.contact_concerns import suggested_solref
+from hapticbridge.check.case import SceneUnderCheck
+from hapticbridge.check.contact_faults import contact_faults, margin_faults, start_faults
+from hapticbridge.check.fault import Fault, number
+from hapticbridge.check.model_faults import constraint_faults, geometry_faults, mass_faults
+from hapticbridge.check.observe import Observation
+from hapticbridge.errors import choices
+from hapticbridge.scene.checks import check_model
+from hapticbridge.scene.compile import START_KEYFRAME
+from hapticbridge.scene.contacts import suggested_solref
+
+# Faults of a scene's options that the bridge overrides.
+
+_SAME_STEP = 1e-9  # relative: 0.001 as 1/1000
+
+
+def option_faults(case: SceneUnderCheck) -> Iterator[Fault]:
+    """Yields options that the bridge replaces, and concerns from loading the scene.
+
+    The scene runs, but not as it did in a viewer; the remedy writes down the options that it runs
+    with.
+    """
+    option, places = case.source.spec.option, case.places
+    if option.integrator != mujoco.mjtIntegrator.mjINT_DISCRETE:
+        name = str(mujoco.mjtIntegrator(option.integrator).name).removeprefix("mjINT_")
+        yield Fault(
+            "integrator",
+            places.option("integrator"),
+            f"the scene has integrator {name}, under which a coupling is not passive; it runs "
+            "under 'discrete'",
+            places.option_change("integrator", "discrete"),
+        )
+    if option.solver != mujoco.mjtSolver.mjSOL_NEWTON:
+        name = str(mujoco.mjtSolver(option.solver).name).removeprefix("mjSOL_")
+        yield Fault(
+            "solver",
+            places.option("solver"),
+            f"the scene has solver {name}; it runs with Newton's",
+            places.option_change("solver", "Newton"),
+        )
+    if not option.enableflags & mujoco.mjtEnableBit.mjENBL_DIAGEXACT:
+        yield Fault(
+            "diagexact",
+            places.flag(),
+            "flag diagexact is not set; it runs with it, because contacts that share a body "
+            "create energy without",
+            'diagexact="enable"'
+            if places.flag().element == "<flag>"
+            else '<flag diagexact="enable"/> in <option>',
+        )
+    step = float(option.timestep)
+    if not case.is_rate_given and abs(step - case.period) > _SAME_STEP * case.period:
+        yield Fault(
+            "time step",
+            places.option("timestep"),
+            f"the scene has a time step of {1e3 * step:g} ms; it runs at {1e3 * case.period:g} ms, "
+            f"one step per tick at {1 / case.period:g} Hz, and its contacts change with it",
+            f"{places.option_change('timestep', f'{case.period:g}')}, or check with --rate "
+            f"{1 / step:g}",
+        )
+    told = [*case.source.concerns, *check_model(case.model, case.scene.grip)]
+    for concern in told:
+        if "integrator" not in concern:
+            attribute = "wind" if concern.startswith("wind") else "surfacevel"
+            place = places.with_attribute(attribute) or places.option(attribute)
+            yield Fault("unmetered work", place, concern, f"remove {attribute}")
+
+
+def keyframe_faults(case: SceneUnderCheck) -> Iterator[Fault]:
+    """Yields a fault if the scene has keyframes but no start among them."""
+    names = [str(key.name) for key in case.source.spec.keys]
+    if names and START_KEYFRAME not in names:
+        listed = choices(name for name in names if name)
+        yield Fault(
+            "keyframe",
+            case.places.named("key", names[0]),
+            f"the scene has keyframes ({listed}), but none is called '{START_KEYFRAME}': it starts "
+            "from the joints' zeros instead",
+            f'name="{START_KEYFRAME}"',
+        )
+
 
 ITERATIONS = 100
 """MuJoCo's default limit of solver iterations. Newton's solver takes 1 to 8 in the shipped
@@ -21,7 +97,7 @@ LITTLE_DAMPING = 0.001
 all of it from a bare lever of 36 g; a hand that turns the lever at 1 rad/s feels 1 mN m."""
 
 
-def run_faults(case: Case) -> Iterator[Fault]:
+def run_faults(case: SceneUnderCheck) -> Iterator[Fault]:
     """Yields faults that occurred during the motion."""
     seen, option = case.observation, case.places.option
     if seen is None:
@@ -52,7 +128,7 @@ def run_faults(case: Case) -> Iterator[Fault]:
         yield _energy_created(case, seen)
 
 
-def _energy_created(case: Case, seen: Observation) -> Fault:
+def _energy_created(case: SceneUnderCheck, seen: Observation) -> Fault:
     """Names the contact with the largest force; the meter cannot tell which created energy."""
     used = f"{number(100 * seen.slack_share)} % of the coupling's slack, which covers it"
     if seen.environment == "active":
@@ -71,7 +147,7 @@ def _energy_created(case: Case, seen: Observation) -> Fault:
     )
 
 
-def _created_without_contact(case: Case, sentence: str) -> Fault:
+def _created_without_contact(case: SceneUnderCheck, sentence: str) -> Fault:
     """Names the tool's joints: their axes turn within a step, the only other source of energy."""
     model = case.model
     tree = model.body_treeid[model.site(case.scene.grip).bodyid[0]]
@@ -82,3 +158,24 @@ def _created_without_contact(case: Case, sentence: str) -> Fault:
         change = f'damping="{LITTLE_DAMPING:g}" or more there, or slower springs and actuators'
         place = case.places.joint(int(mine[0]))
     return Fault("energy created", place, sentence, change)
+
+
+# Rules by which a scene is judged.
+
+RULES = (
+    option_faults,
+    keyframe_faults,
+    mass_faults,
+    geometry_faults,
+    start_faults,
+    contact_faults,
+    margin_faults,
+    constraint_faults,
+    run_faults,
+)
+"""Functions that yield the faults of one subject, in the best order for mending."""
+
+
+def find_faults(case: SceneUnderCheck) -> tuple[Fault, ...]:
+    """Returns all faults of a scene from ``open_case``; the scene is reset."""
+    return tuple(fault for rule in RULES for fault in rule(case))

@@ -8,14 +8,14 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.check.draft import Draft
-from hapticbridge.check.frames import pose_in, rotation_vector
-from hapticbridge.check.rehearsal import not_finite, rehearsal_parameters
+from hapticbridge.check.observe import not_finite, rehearsal_parameters
+from hapticbridge.check.physics import pose_in, rotation_vector
+from hapticbridge.check.version import SceneVariant
 from hapticbridge.device import Motion
-from hapticbridge.kernel.simulation import simulate
-from hapticbridge.kernel.state import Binding
-from hapticbridge.scene.contact_check import meeting_pairs
-from hapticbridge.tick import TICK_DTYPE
+from hapticbridge.kernel.state import BoundKernel
+from hapticbridge.kernel.tick import simulate
+from hapticbridge.record import TICK_DTYPE
+from hapticbridge.scene.contacts import meeting_pairs
 
 CLEARANCE = 2e-3
 """Distance in m that geoms must keep throughout to count as never meeting. A larger value
@@ -32,7 +32,7 @@ Pair = frozenset[str]
 
 
 @dataclass(slots=True)
-class Witness:
+class MotionTrace:
     """Motion trace, by name.
 
     Attributes:
@@ -59,7 +59,7 @@ class Witness:
         return {name for pair in self.near for name in pair}
 
 
-def witness(draft: Draft, motion: Motion) -> Witness:
+def witness(draft: SceneVariant, motion: Motion) -> MotionTrace:
     """Leads a scene through a motion tick by tick and records its trace.
 
     Args:
@@ -72,10 +72,10 @@ def witness(draft: Draft, motion: Motion) -> Witness:
     scene, setting = draft.compiled(), draft.setting
     model, data = scene.model, scene.data
     parameters = rehearsal_parameters(scene, setting.coupling, setting.period, setting.substeps)
-    binding = Binding(model, data, parameters)
+    binding = BoundKernel(model, data, parameters)
     samples = draft.samples(motion)
     row = np.zeros(1, TICK_DTYPE)
-    seen = Witness(start=_joint_values(model, data), pose=_poses(model, data))
+    seen = MotionTrace(start=_joint_values(model, data), pose=_poses(model, data))
     pairs = np.array([pair[:2] for pair in meeting_pairs(model)], np.intp).reshape(-1, 2)
     names = [model.geom(g).name for g in range(model.ngeom)]
     seen.possible = {frozenset((names[a], names[b])) for a, b in pairs}

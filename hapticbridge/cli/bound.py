@@ -14,15 +14,15 @@ from hapticbridge.cli.terminal import out, plain, print_json, write_figure
 from hapticbridge.cli.zwidth import DEFAULT_RATE, next_command
 from hapticbridge.clock import period_of
 from hapticbridge.coupling import Coupling
-from hapticbridge.passivity.compensation import largest_felt_damping, law_damping
-from hapticbridge.passivity.grid import scalar
-from hapticbridge.picture import check_ending
+from hapticbridge.plotting import check_ending
 from hapticbridge.rendering import default_method
 from hapticbridge.study.theory import (
     Alternative,
     alternatives,
     draw_alternatives,
 )
+from hapticbridge.theory.compensation import largest_felt_damping, law_damping
+from hapticbridge.theory.transfer import scalar
 
 
 @dataclass(frozen=True, slots=True)

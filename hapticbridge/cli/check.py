@@ -2,35 +2,298 @@
 
 from __future__ import annotations
 
+import math
+import re
+import shlex
+import textwrap
+from collections import Counter
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, ClassVar
 
+import numpy as np
 import tyro
 from matplotlib.figure import Figure
+from rich.table import Table
 
 from hapticbridge.certificate import default_coupling
-from hapticbridge.check.case import DEFAULT_PERIOD, LARGEST_WORKSPACE, Case, open_case
-from hapticbridge.check.cost import Cost, measure_cost
-from hapticbridge.check.drawing import draw_cost
-from hapticbridge.check.faults import Fault
-from hapticbridge.check.inventory import Inventory, take_inventory
-from hapticbridge.check.lean import Lean, checked_budget
-from hapticbridge.check.lean_file import check_target, write_lean
-from hapticbridge.check.lean_picture import draw_lean
-from hapticbridge.check.lean_table import check_table, lean_facts, write_table
-from hapticbridge.check.observation import quiet
-from hapticbridge.check.rules import find_faults
-from hapticbridge.check.trial import MAY_GO, SAVES_NOTHING, Trial
-from hapticbridge.cli.check_lean import look_for_lean, print_lean, print_written
-from hapticbridge.cli.check_words import print_case, print_cost, print_faults, print_inventory
-from hapticbridge.cli.terminal import err, plain, print_json, progress
+from hapticbridge.check.case import DEFAULT_PERIOD, LARGEST_WORKSPACE, SceneUnderCheck, open_case
+from hapticbridge.check.cost import TICK_SHARE, Cost, Growth, TimingStats, draw_cost, measure_cost
+from hapticbridge.check.fault import Fault, length
+from hapticbridge.check.inventory import MEETS_TOOL, Inventory, take_inventory
+from hapticbridge.check.lean import (
+    MAY_GO,
+    SAVES_NOTHING,
+    Lean,
+    VariantVerdict,
+    checked_budget,
+    find_lean,
+)
+from hapticbridge.check.lean_output import (
+    check_table,
+    check_target,
+    draw_lean,
+    lean_facts,
+    write_lean,
+    write_table,
+)
+from hapticbridge.check.observe import quiet
+from hapticbridge.check.run_faults import find_faults
+from hapticbridge.check.simplify import OTHER_MOTIONS
+from hapticbridge.check.version import Setting
+from hapticbridge.cli.terminal import err, out, plain, print_json, progress
 from hapticbridge.clock import period_of
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import SimulatedDevice
 from hapticbridge.errors import SceneError
-from hapticbridge.picture import check_ending, write_picture
+from hapticbridge.plotting import check_ending, write_picture
 from hapticbridge.scene import read_scene, settings_from
+from hapticbridge.units import format_si
+
+# How ``hapticbridge check --lean`` looks for less, and says what it found.
+
+_HEADINGS = ("alone", "cost", "JND", "force, RMS", "peak", "torque, RMS", "tool off by")
+"""Of the table; JND: felt error in just noticeable differences."""
+
+_ROUNDING = 1e-9  # N and N m; what is below is how the computer adds
+
+
+def look_for_lean(case: SceneUnderCheck, budget: float) -> Lean:
+    """Tries what could go, with progress on stderr.
+
+    Raises:
+        SceneError: The scene cannot be run as it is, or the budget is out of range.
+    """
+    with progress("leaner") as show:
+        damping = case.info.damping or 0.0
+        return find_lean(
+            case.source,
+            case.scene.grip,
+            case.motion,
+            Setting(case.coupling, case.period),
+            budget=budget,
+            device_damping=damping / case.scale**2,
+            progress=show,
+        )
+
+
+def print_lean(lean: Lean) -> None:
+    """Prints what could go, and how far it leads together."""
+    judge = lean.judge
+    tick = 1e6 * judge.seconds * judge.original.setting.period
+    out.print(
+        f"\n[bold]What could go[/] (felt up to {judge.budget:g} just noticeable differences; "
+        f"the scene as it is: {tick:.3g} µs a tick)"
+    )
+    rows = [_numbers(trial) for trial in (*lean.alone, *lean.together)]
+    ends = [_verdict(trial) for trial in lean.alone] + [plain(t.loses) for t in lean.together]
+    widths = [max(map(len, column)) for column in zip(_HEADINGS, *rows, strict=True)]
+    for number, (row, end) in enumerate(zip([_HEADINGS, *rows], ["", *ends], strict=True)):
+        if number == len(lean.alone) + 1:
+            out.print("  [bold]together, in order[/]")
+        cells = [cell.rjust(width) for cell, width in zip(row, widths, strict=True)]
+        cells[0] = row[0].ljust(widths[0])
+        out.print(f"  {plain('  '.join(cells))}  {end}".rstrip())
+    for trial in lean.alone:
+        if trial.felt is None:
+            out.print(f"  {plain(trial.name)}: {plain(trial.sentence)}")
+    if not lean.together:
+        out.print("  [green]nothing may go: the scene is lean[/]")
+        return
+    if any(trial.loses == OTHER_MOTIONS for trial in lean.together):
+        out.print(
+            "  [yellow]another motion may miss what this one did not need[/]: judge it by one that "
+            "does all that the hand will do"
+        )
+    setting = lean.draft.setting
+    if setting != judge.original.setting:
+        out.print(
+            f"  at {1 / setting.period:.4g} Hz, {setting.substeps} substep(s) a tick: the device "
+            f"needs {lean.result.needed_damping:.3g} N s/m of damping"
+        )
+    cost = lean.result.cost or 1.0
+    out.print(f"  all together: {100 * cost:.0f} % of the cost, {1 / cost:.2g} times as fast")
+
+
+def print_written(lean: Lean, written: VariantVerdict, path: Path, *, is_quiet: bool) -> None:
+    """Prints what the written scene is like, read back, and how to run it."""
+    felt = 0.0 if written.felt is None else written.felt.felt
+    cost = written.cost or 1.0
+    err.print(
+        f"wrote {plain(str(path))}: read back, {100 * cost:.0f} % of the cost, felt {felt:.2g} JND"
+    )
+    if is_quiet:
+        return
+    setting, asked = lean.draft.setting, lean.judge.original.setting
+    command = f"hapticbridge run {shlex.quote(str(path))}"
+    if lean.draft.grip != "grip":
+        command += f" --grip {shlex.quote(lean.draft.grip)}"
+    if setting.period != asked.period:
+        command += f" --rate {1 / setting.period:g}"
+    out.print(f"next: {plain(command)}")
+
+
+def _verdict(trial: VariantVerdict) -> str:
+    colour = "green" if trial.verdict == MAY_GO else "bright_black"
+    loses = f" {plain(trial.loses)}" if trial.verdict == MAY_GO and trial.loses else ""
+    return f"[{colour}]{trial.verdict}{loses}[/]"
+
+
+def _numbers(trial: VariantVerdict) -> list[str]:
+    felt = trial.felt
+    if felt is None or trial.cost is None:
+        return [trial.name, *["-"] * 6]
+    return [
+        trial.name,
+        f"{100 * trial.cost:.0f} %",
+        f"{felt.felt:.3f}",
+        *(
+            format_si(0.0 if value < _ROUNDING else value, unit)
+            for value, unit in (
+                (felt.force_rms, "N"),
+                (felt.force_peak, "N"),
+                (felt.torque_rms, "N m"),
+            )
+        ),
+        f"{1e6 * felt.position_peak:.0f} µm",
+    ]
+
+
+# How ``hapticbridge check`` says what it found.
+
+MOST_NAMED = 4
+"""How many things of a kind are named before the rest is counted."""
+
+_SHOWN = 0.01  # s/s; a stage that takes less of the tick is left out
+_GLUE = "\x00"  # in place of a space at which a line is not to end
+_WIDTH = 96  # letters of a line of text below a fault
+
+
+def print_case(case: SceneUnderCheck) -> None:
+    """Prints what is checked, and how."""
+    extent = 1e3 * np.ptp(case.motion.table[:, 1:4], axis=0)
+    size = " x ".join(f"{edge:.3g}" for edge in extent)
+    out.print(f"[bold]{plain(case.scene.name)}[/]  {plain(str(case.source.path))}")
+    out.print(
+        f"  motion: {plain(case.motion_name)}, {case.motion.duration:.3g} s, {size} mm; "
+        f"coupling: {case.coupling.stiffness:.4g} N/m, {case.coupling.damping:.3g} N s/m felt, "
+        f"{1 / case.period:.4g} Hz"
+    )
+
+
+def print_inventory(inventory: Inventory) -> None:
+    """Prints what the scene models."""
+    out.print("\n[bold]What it models[/]")
+    mass = inventory.tool_mass
+    uses = ", ".join(f"{count} {use}" for use, count in inventory.geoms.items() if count)
+    lines = {
+        "bodies": f"{inventory.bodies}, {inventory.moving_bodies} of them moving",
+        "degrees of freedom": f"{inventory.degrees_of_freedom}, "
+        f"{inventory.tool_degrees_of_freedom} of them the tool's "
+        + (f"({mass:.3g} kg)" if mass >= 0.1 else f"({1e3 * mass:.3g} g)"),
+        "geoms": ": ".join(filter(None, (str(sum(inventory.geoms.values())), uses))),
+    }
+    if inventory.triangles:
+        lines["meshes that collide"] = f"{inventory.triangles} triangles of their hulls"
+    met = "" if inventory.met_pairs is None else f", {inventory.met_pairs} did"
+    lines["pairs that can touch"] = f"{inventory.possible_pairs}{met}"
+    for kind, (largest, median) in (inventory.rows or {}).items():
+        if largest:
+            lines[f"{kind} rows"] = f"at most {largest} in a step, median {median:g}"
+    if inventory.stiffness is not None:
+        least, most = (f"{1e-3 * stiffness:.3g}" for stiffness in inventory.stiffness)
+        lines["contact stiffness"] = (
+            f"{least} to {most} kN/m at the tool, which sank in by {length(inventory.deepest)}"
+        )
+    is_met = inventory.rows is None or inventory.geoms[MEETS_TOOL] > 0
+    if inventory.possible_pairs and not inventory.flexes and not is_met:
+        lines["contact"] = (
+            "the tool touches nothing in this motion, so what contact costs is unknown;\n"
+            f"{'':23}lead it to where it does: --motion hand.csv (t,x,y,z in s and m)"
+        )
+    for kind in ("actuators", "equalities", "tendons", "flexes"):
+        if count := getattr(inventory, kind):
+            lines[kind] = str(count)
+    for name, words in lines.items():
+        out.print(f"  {name:<21}{words}")
+    reasons: dict[str, list[str]] = {}
+    for idle in inventory.idle:
+        reasons.setdefault(idle.reason, []).append(idle.place.element)
+    if reasons:
+        out.print("  cannot be felt")
+    for reason, names in reasons.items():
+        more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
+        out.print(f"    {reason}: {plain(', '.join(names[:MOST_NAMED]))}{more}")
+
+
+def print_cost(cost: Cost | None) -> None:
+    """Prints what the scene costs on this machine."""
+    out.print("\n[bold]What it costs[/] (µs on this machine, now)")
+    if cost is None:
+        out.print("  not measured: the motion did not end")
+        return
+    table = Table("", "out of contact", "in contact", box=None, pad_edge=False, padding=(0, 2))
+    for column in table.columns[1:]:
+        column.justify = "right"
+    table.add_row("  whole tick, median", _micro(cost.free.median), _micro(cost.contact.median))
+    table.add_row("  99 of 100 below", _micro(cost.free.p99), _micro(cost.contact.p99))
+    for name, times in cost.stages.items():
+        if any(t >= _SHOWN * whole for t, whole in zip(times, _medians(cost), strict=True)):
+            table.add_row(f"    {name}", *map(_micro, times))
+    out.print(table)
+    for unit, growth in (("contact", cost.by_contacts), ("constraint row", cost.by_rows)):
+        if sentence := _growth(growth, unit):
+            out.print(f"  {sentence}")
+    out.print(
+        f"  highest rate: {cost.highest_rate:,.0f} Hz, where 99 of 100 ticks leave "
+        f"{100 * (1 - TICK_SHARE):g} % of the period to the device and to late wake-ups"
+    )
+
+
+def print_faults(faults: tuple[Fault, ...]) -> None:
+    """Prints each fault with its place and the change that mends it."""
+    if not faults:
+        out.print("\n[bold]What is wrong[/]\n  [green]nothing found[/]")
+        return
+    out.print(f"\n[bold]What is wrong[/]: [yellow]{len(faults)} found[/]")
+    seen: Counter[str] = Counter()
+    for number, fault in enumerate(faults, 1):
+        seen[fault.kind] += 1
+        if seen[fault.kind] > MOST_NAMED:
+            continue
+        out.print(
+            f"  {number:>2} [yellow]{plain(fault.kind)}[/]  {plain(str(fault.place))}",
+        )
+        # what stands in quotes is to be copied: it stays on one line
+        whole = re.sub(r'"[^"]*"', lambda quoted: quoted[0].replace(" ", _GLUE), fault.sentence)
+        for line in textwrap.wrap(whole, _WIDTH):
+            out.print(f"     {plain(line.replace(_GLUE, ' '))}")
+        out.print(f"     [green]write:[/] {plain(fault.change)}")
+    for kind, count in seen.items():
+        if count > MOST_NAMED:
+            out.print(f"  and {count - MOST_NAMED} more of '{plain(kind)}': --json lists all")
+
+
+def _medians(cost: Cost) -> tuple[float, float]:
+    return tuple(_known(spread) for spread in (cost.free, cost.contact))  # type: ignore[return-value] # two
+
+
+def _known(spread: TimingStats) -> float:
+    return spread.median if spread.ticks else math.inf
+
+
+def _micro(seconds: float) -> str:
+    return f"{1e6 * seconds:.2f}" if math.isfinite(seconds) else "-"
+
+
+def _growth(growth: Growth, unit: str) -> str:
+    if growth.base is None or growth.per_one is None:
+        return ""
+    most = growth.steps[-1]
+    return (
+        f"grows by {1e6 * growth.per_one:.2g} µs per {unit}: {1e6 * growth.base:.3g} µs with none, "
+        f"{1e6 * most[2]:.3g} µs with {most[0]}"
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,7 +413,7 @@ class Check:
         is_worse = written is not None and written.verdict not in (MAY_GO, SAVES_NOTHING)
         return 1 if faults or is_worse or (is_lean_asked and lean is None) else 0
 
-    def _looked_for(self, case: Case, budget: float) -> Lean | None:
+    def _looked_for(self, case: SceneUnderCheck, budget: float) -> Lean | None:
         """Looks for what could go; None, and a sentence, where the scene must be mended first."""
         try:
             return look_for_lean(case, budget)
@@ -158,7 +421,7 @@ class Check:
             err.print(f"what could go cannot be said: {plain(str(error))}")
             return None
 
-    def _told(self, lean: Lean) -> Trial | None:
+    def _told(self, lean: Lean) -> VariantVerdict | None:
         """Prints and writes what was found; returns the written scene's trial."""
         if not self.as_json:
             print_lean(lean)
@@ -184,14 +447,14 @@ class Check:
         return coupling
 
 
-def _picture(case: Case, cost: Cost | None, lean: Lean | None) -> Figure | None:
+def _picture(case: SceneUnderCheck, cost: Cost | None, lean: Lean | None) -> Figure | None:
     if lean is not None:
         return draw_lean(lean, case.scene.name)
     return None if cost is None else draw_cost(cost, f"{case.scene.name}: what a tick costs")
 
 
 def _facts(
-    case: Case, inventory: Inventory, faults: tuple[Fault, ...], cost: Cost | None
+    case: SceneUnderCheck, inventory: Inventory, faults: tuple[Fault, ...], cost: Cost | None
 ) -> dict[str, object]:
     return {
         "scene": str(case.source.path),

@@ -9,8 +9,8 @@ import tyro
 
 from hapticbridge.cli.terminal import out, plain, print_json
 from hapticbridge.device.discovery import RULES_FILE, blind_spots, plugged_devices, udev_rules
-from hapticbridge.device.families import all_families
-from hapticbridge.device.plugged import RULES_COMMAND, Plugged
+from hapticbridge.device.family import RULES_COMMAND, FoundDevice
+from hapticbridge.device.registry import all_families
 from hapticbridge.errors import HapticBridgeError
 
 
@@ -69,13 +69,13 @@ class Devices:
         return 0
 
 
-def _specification(first: Plugged, plugged: list[Plugged]) -> str:
+def _specification(first: FoundDevice, plugged: list[FoundDevice]) -> str:
     """Returns what to type for a device; its serial where there are more like it."""
     is_only = sum(device.family == first.family for device in plugged) == 1
     return first.family if is_only else f"{first.family}:serial={first.serial or first.path}"
 
 
-def _facts(plugged: list[Plugged], unseen: list[str]) -> dict[str, Any]:
+def _facts(plugged: list[FoundDevice], unseen: list[str]) -> dict[str, Any]:
     return {
         "supported": [
             {

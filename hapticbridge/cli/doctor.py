@@ -10,7 +10,7 @@ import tyro
 from rich.table import Table
 
 from hapticbridge.cli.terminal import out, plain, print_json, progress
-from hapticbridge.doctor import Diagnosis, diagnose
+from hapticbridge.realtime.doctor import Diagnosis, diagnose
 
 _MARKS = {True: "[green]good[/green]", False: "[yellow]mend[/yellow]", None: "note"}
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, TextIO
 from rich.console import Console
 from rich.markup import escape
 
-from hapticbridge.jsonable import jsonable
+from hapticbridge.files import finite_or_null
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -103,7 +103,7 @@ def progress(words: str) -> Iterator[Callable[..., None]]:
 
 def write_figure(figure: Figure, path: Path) -> None:
     """Writes a picture and says so on stderr."""
-    from hapticbridge.picture import write_picture  # noqa: PLC0415 - imports matplotlib
+    from hapticbridge.plotting import write_picture  # noqa: PLC0415 - imports matplotlib
 
     with err.status("drawing …"):
         write_picture(figure, path)
@@ -112,4 +112,4 @@ def write_figure(figure: Figure, path: Path) -> None:
 
 def print_json(facts: object) -> None:
     """Prints facts as JSON on stdout, with null in place of numbers that JSON does not have."""
-    out.print_json(json.dumps(jsonable(facts), allow_nan=False))
+    out.print_json(json.dumps(finite_or_null(facts), allow_nan=False))

@@ -9,6 +9,7 @@ from typing import Annotated
 import tyro
 from rich.table import Table
 
+from hapticbridge.certificate import delay_ticks
 from hapticbridge.cli.terminal import (
     err,
     out,
@@ -20,15 +21,14 @@ from hapticbridge.cli.terminal import (
 )
 from hapticbridge.clock import RealClock, SimulatedClock, period_of
 from hapticbridge.device import AXES, Device, DeviceInfo, open_device
-from hapticbridge.device.lateness import delay_ticks
 from hapticbridge.errors import HapticBridgeError, choices
-from hapticbridge.felt import coupling_sentences
-from hapticbridge.identify.measured_width import MeasuredWidth, measure_width, measured_points
-from hapticbridge.passivity import ZWidth, z_width
-from hapticbridge.picture import check_ending
+from hapticbridge.identify.z_width import MeasuredWidth, measure_width, measured_points
+from hapticbridge.plotting import check_ending
 from hapticbridge.rendering import default_method
 from hapticbridge.signals import interrupting_on_signals
 from hapticbridge.study.theory import draw_z_width, recommended
+from hapticbridge.summary import coupling_sentences
+from hapticbridge.theory.z_width import ZWidth, z_width
 
 DEFAULT_RATE = 1000.0
 """Hz; what 'hapticbridge run' takes by itself, so that it need not be told."""

@@ -5,9 +5,7 @@ the device bears, ``operator`` does it between two ticks, and ``change`` is what
 that the audit repeats.
 """
 
-from hapticbridge.commands.allowance import Allowance as Allowance
-from hapticbridge.commands.change import CHANGES as CHANGES
-from hapticbridge.commands.change import Repeater as Repeater
+from hapticbridge.commands.allowed import CouplingLimits as CouplingLimits
 from hapticbridge.commands.command import Command as Command
 from hapticbridge.commands.command import Couple as Couple
 from hapticbridge.commands.command import Mark as Mark
@@ -15,5 +13,7 @@ from hapticbridge.commands.command import Repeat as Repeat
 from hapticbridge.commands.command import Reset as Reset
 from hapticbridge.commands.command import Switch as Switch
 from hapticbridge.commands.command import command_of as command_of
-from hapticbridge.commands.operator import Operator as Operator
-from hapticbridge.commands.queue import CommandQueue as CommandQueue
+from hapticbridge.commands.execution import CHANGES as CHANGES
+from hapticbridge.commands.execution import CommandExecutor as CommandExecutor
+from hapticbridge.commands.execution import CommandQueue as CommandQueue
+from hapticbridge.commands.execution import EventApplier as EventApplier

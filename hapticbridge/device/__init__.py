@@ -5,21 +5,21 @@ and ``trajectory``, which need no hardware, then a real driver; ``rawhid`` is th
 ones stand on ``transport``, which carries their bytes and finds them. ``families`` is the table of
 their drivers, ``discovery`` lists those that are plugged in; ``library`` opens one by its
 ``specification`` and fills in its sheet from a ``profile`` (``profile_search``). What all share is
-in ``lateness``, ``silence`` and ``last_word``.
+in ``lateness_above_baseline``, ``silence`` and ``last_word``.
 """
 
+from hapticbridge.device.base import AXES as AXES
+from hapticbridge.device.base import DATA_SHEET_UNITS as DATA_SHEET_UNITS
 from hapticbridge.device.base import Device as Device
-from hapticbridge.device.data_sheet import AXES as AXES
-from hapticbridge.device.data_sheet import DATA_SHEET_UNITS as DATA_SHEET_UNITS
-from hapticbridge.device.data_sheet import DeviceInfo as DeviceInfo
-from hapticbridge.device.library import device_for as device_for
-from hapticbridge.device.library import open_device as open_device
-from hapticbridge.device.simulated.driver import SimulatedDevice as SimulatedDevice
+from hapticbridge.device.base import DeviceInfo as DeviceInfo
+from hapticbridge.device.registry import device_for as device_for
+from hapticbridge.device.registry import open_device as open_device
+from hapticbridge.device.simulated.device import SimulatedDevice as SimulatedDevice
+from hapticbridge.device.simulated.device import scene_hand as scene_hand
 from hapticbridge.device.simulated.hand import DEFAULT_HAND as DEFAULT_HAND
 from hapticbridge.device.simulated.hand import Hand as Hand
 from hapticbridge.device.simulated.hand import random_hand as random_hand
-from hapticbridge.device.simulated.scene_hand import scene_hand as scene_hand
-from hapticbridge.device.trajectory.driver import ReplayDevice as ReplayDevice
-from hapticbridge.device.trajectory.driver import TrajectoryDevice as TrajectoryDevice
-from hapticbridge.device.trajectory.motion import Motion as Motion
-from hapticbridge.device.trajectory.motion_csv import read_motion as read_motion
+from hapticbridge.device.trajectory import Motion as Motion
+from hapticbridge.device.trajectory import ReplayDevice as ReplayDevice
+from hapticbridge.device.trajectory import TrajectoryDevice as TrajectoryDevice
+from hapticbridge.device.trajectory import read_motion as read_motion

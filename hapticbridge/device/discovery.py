@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-from hapticbridge.device.families import all_families
-from hapticbridge.device.plugged import Family, Plugged, UsbId
-from hapticbridge.device.transport import hid_search, usb_search
+from hapticbridge.device.family import Driver, FoundDevice, UsbId
+from hapticbridge.device.registry import all_families
+from hapticbridge.device.transport import hid as hid_search
+from hapticbridge.device.transport import usb as usb_search
 
 RULES_FILE = "/etc/udev/rules.d/70-hapticbridge.rules"
 """Where the rules go. The number must be below 73: ``73-seat-late.rules`` is what turns the tag
 ``uaccess`` into a permission, and rules are read in the order of their names."""
 
 
-def plugged_devices() -> list[Plugged]:
+def plugged_devices() -> list[FoundDevice]:
     """Lists every device of every family that is plugged in; empty where there is no USB."""
     return [device for family in all_families() for device in plugged_of(family)]
 
 
-def plugged_of(family: Family) -> list[Plugged]:
+def plugged_of(family: Driver) -> list[FoundDevice]:
     """Lists a family's devices that are plugged in, with what keeps each from being opened."""
     if family.find is not None:
         return family.find()
@@ -72,7 +73,7 @@ def udev_rules() -> str:
     return "\n".join(lines) + "\n"
 
 
-def _ids_plugged_in(family: Family) -> tuple[UsbId, ...]:
+def _ids_plugged_in(family: Driver) -> tuple[UsbId, ...]:
     """Returns the products of a family that are plugged in, each once."""
     found = {(one.vendor, one.product): one.name for one in plugged_of(family)}
     return tuple(UsbId(*numbers, name) for numbers, name in sorted(found.items()))

@@ -7,8 +7,8 @@ stores the result for later runs. ``wall`` and ``swing`` try virtual walls on th
 ``measured_width`` compares them with theory.
 """
 
-from hapticbridge.identify.axis_fit import AxisFit as AxisFit
-from hapticbridge.identify.estimate import Estimate as Estimate
+from hapticbridge.identify.fit import AxisFit as AxisFit
+from hapticbridge.identify.fit import Estimate as Estimate
 from hapticbridge.identify.fit import fit_axis as fit_axis
-from hapticbridge.identify.identification import Identification as Identification
-from hapticbridge.identify.identification import identify as identify
+from hapticbridge.identify.identify import Identification as Identification
+from hapticbridge.identify.identify import identify as identify

@@ -2,14 +2,339 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass
+
 import numpy as np
+from numpy.polynomial import Polynomial
 from numpy.typing import NDArray
+from scipy.stats import t as student
 
 from hapticbridge.errors import IdentificationError
-from hapticbridge.identify.axis_fit import AxisFit
-from hapticbridge.identify.estimate import Estimate, half_widths, solved
 from hapticbridge.identify.excitation import stretch
-from hapticbridge.identify.weak_form import Windows, noise_of, windows
+
+# Least squares with jackknife intervals.
+
+CONFIDENCE = 0.95
+"""Probability, without unit, that the true value lies within the interval."""
+
+BLOCKS = 12
+"""Number of parts of the run, left out in turn to measure the scatter of the result. With more, a
+part would be shorter than the slowest swing and no longer independent."""
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """A number with its interval of ``CONFIDENCE``.
+
+    Attributes:
+        value: Estimate in SI units.
+        half_width: Largest excess of the true value over ``value``, in the unit of ``value``.
+        below: Additional lower width of the interval, >= 0. It covers effects too small to be
+            detected that would make the true value smaller.
+    """
+
+    value: float
+    half_width: float
+    below: float = 0.0
+
+    @property
+    def least(self) -> float:
+        """Lower end of the interval."""
+        return self.value - self.half_width - self.below
+
+    @property
+    def most(self) -> float:
+        """Upper end of the interval."""
+        return self.value + self.half_width
+
+    @property
+    def is_seen(self) -> bool:
+        """Significance: true if the interval excludes zero."""
+        return self.least > 0.0 or self.most < 0.0
+
+    def told(self) -> str:
+        """Returns the value and its interval as text, rounded to the significant digits."""
+        value = self.value
+        if self.half_width > 0.0:
+            value = round(value, -math.floor(math.log10(self.half_width))) + 0.0  # no −0
+        up, down = f"{self.half_width:.1g}", f"{self.half_width + self.below:.1g}"
+        return f"{value:.4g} ± {up}" if up == down else f"{value:.4g} +{up} −{down}"
+
+
+def solved(columns: Array, right: Array) -> Array:
+    """Returns the least-squares factors x of columns · x = right.
+
+    Args:
+        columns: Shape (n, k).
+        right: Shape (n,).
+    """
+    scale = np.linalg.norm(columns, axis=0)
+    scale[scale == 0.0] = 1.0
+    return np.asarray(np.linalg.lstsq(columns / scale, right, rcond=None)[0] / scale)
+
+
+def half_widths(columns: Array, right: Array) -> Array:
+    """Returns the half-widths of the least-squares factors by a jackknife over ``BLOCKS`` parts.
+
+    Its only assumption is that distant rows have independent errors.
+
+    Args:
+        columns: Shape (n, k), in the order of time, n >= ``BLOCKS``.
+        right: Shape (n,).
+
+    References:
+        Efron & Stein 1981, *The jackknife estimate of variance*.
+    """
+    block = np.arange(len(right)) * BLOCKS // len(right)
+    without = np.array([solved(columns[block != j], right[block != j]) for j in range(BLOCKS)])
+    spread = np.sum((without - without.mean(axis=0)) ** 2, axis=0) * (BLOCKS - 1) / BLOCKS
+    return np.asarray(np.sqrt(spread) * student.ppf(0.5 + 0.5 * CONFIDENCE, BLOCKS - 1))
+
+
+# Identified parameters of one device axis.
+
+
+@dataclass(frozen=True, slots=True)
+class AxisFit:
+    """Identified parameters of one device axis.
+
+    Attributes:
+        mass: M in kg (rotation: kg m²).
+        damping: b in N s/m (N m s/rad).
+        friction: Coulomb friction f_c in N (N m).
+        offset: Constant force c in N (N m): weight, or an offset of the motor.
+        delay: Time in s from a write to its effect in a sample, beyond the hold.
+        spring: Stiffness k in N/m (N m/rad) that explains the remainder, as of a hand or a cable.
+        drag: b_2 in N s²/m² (N m s²/rad²) of a drag b_2 v |v| beside b v, as of oil. It belongs to
+            the law if its interval excludes zero.
+        drag_speed: Speed v in m/s (rad/s) at which ``damping`` is taken, as (b v + b_2 v |v|)/v. It
+            is chosen so that ``damping`` is the smallest over the observed speeds: 0, or the
+            largest speed if b_2 < 0.
+        lost_gain: Share of the force above half of its maximum that had no effect, without unit: 0
+            for a good motor, 1 for one that saturates there.
+        unexplained: RMS force in N (N m) left by the law and by the position's noise and rounding.
+        force: RMS of the applied force in N (N m).
+        window: Length of the windows in s.
+        count: Number of windows.
+    """
+
+    mass: Estimate
+    damping: Estimate
+    friction: Estimate
+    offset: Estimate
+    delay: Estimate
+    spring: Estimate
+    drag: Estimate
+    drag_speed: float
+    lost_gain: Estimate
+    unexplained: float
+    force: float
+    window: float
+    count: int
+
+    def resistance(self, speed: Array) -> Array:
+        """Returns b v + b_2 v |v| + f_c sign(v) in N (N m), with b_2 only if it is significant.
+
+        Args:
+            speed: v in m/s (rad/s).
+        """
+        bend = self.drag.value * (np.abs(speed) - self.drag_speed) if self.drag.is_seen else 0.0
+        return np.asarray(
+            (self.damping.value + bend) * speed + self.friction.value * np.sign(speed)
+        )
+
+
+# Weak form of the equation of motion of one axis.
+
+_BUMP = Polynomial([0.0, 4.0, -4.0]) ** 6
+"""Bump φ over a window of unit length, 1 in its middle. The ends of a window cause an error in sums
+of φ'' x that resembles damping. With the 4th power it was 0.06 % of force over speed at 40 samples
+a window and 1.5 % at 16; with the 6th 0.003 % and 0.17 %. Higher powers use less of a window."""
+
+LEAST_SAMPLES = 24
+"""Smallest number of periods in a window. The error of the sums is then below 0.03 %
+(``_BUMP``)."""
+
+OVERLAP = 4
+"""Number of windows that begin within one window length. More use the samples slightly better,
+because neighbours share their errors. Fewer skip part of the run."""
+
+_PARTS = 8
+"""Number of parts of a window that must all show motion, so that sticking inside it is detected."""
+
+_SPANS = 12
+"""Number of parts of a window over which the speed is taken for the drag. More amplify the rounding
+of the position. Fewer smooth the drag: by 0.6 % with twelve, if half a swing fills the window."""
+
+_MEDIAN = 0.6745
+"""Median magnitude of a normal deviate divided by its RMS, without unit."""
+
+_ROUNDING = 0.4
+"""Largest noise that counts as rounding, as a share of the resolution, without unit. Rounding gives
+1/√12 = 0.29."""
+
+_SURE = 2.0
+"""Multiple of its own RMS by which a difference of two means must exceed zero, without unit."""
+
+LEAST_STEPS = 6
+"""Smallest number of steps of resolution that a window must cross. Noise counts as a step of √12
+times its RMS. Below this number rounding is no longer small beside the motion."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Windows:
+    """Equations of all windows in which an axis keeps one direction of motion.
+
+    Attributes:
+        columns: Factors of M, b, f_c, c and of a change of d, shape (n, 5).
+        right: ∫φ F(t − d), in N s, shape (n,).
+        begin: First sample of each window, shape (n,).
+        position: ∫φ x, in m s, shape (n,): the column of a spring.
+        drag: ∫φ x' |x'|, in m²/s, shape (n,): the column of a drag that grows with speed squared.
+        excess: ∫φ e(t − d), in N s, shape (n,): the column of a saturating motor. e is the part of
+            F above half of its largest distance from its median.
+        noise_share: Share of the position's noise and rounding in the squares of the columns of M
+            and b, the larger of the two. Least squares underestimate the factor by this share.
+        mass_noise: RMS of noise and rounding in the column of M, in m/s.
+    """
+
+    columns: Array
+    right: Array
+    begin: NDArray[np.int64]
+    position: Array
+    drag: Array
+    excess: Array
+    noise_share: float
+    mass_noise: float
+
+
+def windows(
+    position: Array,
+    force: Array,
+    period: float,
+    length: float,
+    resolution: float,
+    delay: float,
+    noise: float = 0.0,
+) -> Windows:
+    """Returns the equation of motion of a run, averaged over windows without differentiation.
+
+    A free axis under a force F that acts with a delay d obeys
+
+        M x'' + b x' + f_c sign(x') + c = F(t − d)
+
+    with a constant c (weight, an offset of the motor). It is multiplied by a bump φ(t) that
+    vanishes with its derivatives at both ends of a window. Integration by parts then gives an
+    equation that is linear in M, b, f_c and c:
+
+        M ∫φ'' x − b ∫φ' x + f_c s ∫φ + c ∫φ = ∫φ F(t − d)
+
+    s = ±1 is the direction of motion, so only windows with one direction are used. F is held over
+    each period, so its integral is exact. The integrals of x are sums over the samples. x'' jumps
+    at the samples together with F. The leading error of such a sum, of second order in T,
+    nevertheless telescopes to zero, because x and x' are continuous. The remaining error is of
+    fourth order.
+
+    Args:
+        position: x in m (or an angle in rad) at the samples, shape (n,).
+        force: F in N (or N m), held from each sample to the next, shape (n,).
+        period: T in s.
+        length: Length of a window in s; at least ``LEAST_SAMPLES`` periods.
+        resolution: Step of the position in m, 0 if it is exact.
+        delay: d in s, from a write until the force acts, >= 0.
+        noise: RMS of the position's noise in m, beyond its rounding; 0: none.
+    """
+    count = max(round(length / period), LEAST_SAMPLES)
+    length = count * period
+    nodes = np.arange(count + 1) / count
+    trapezoid = np.full(count + 1, period)
+    trapezoid[[0, -1]] *= 0.5
+    first, second = _BUMP.deriv(1)(nodes) / length, _BUMP.deriv(2)(nodes) / length**2
+    late = delay / period
+    held = int(np.ceil(late))  # periods before the window whose force acts within it
+    grid = np.arange(-held, count + 1)
+    # F(t − d) of sample k acts from (k + late) T to (k + 1 + late) T: the bump's area in between
+    inside = np.clip((grid + late) / count, 0.0, 1.0)
+    weight = np.diff(_BUMP.integ()(inside)) * length
+    slope = np.diff(_BUMP(inside))  # ∫φ' over the same spans
+    area = float(_BUMP.integ()(1.0)) * length
+    step = max(count // OVERLAP, 1)
+    begin = np.arange(held, len(position) - count, step)
+    x = np.lib.stride_tricks.sliding_window_view(position, count + 1)[begin]
+    # remove a constant weight first; otherwise the excess would be the force itself
+    swing = force - np.median(force)
+    half = 0.5 * float(np.abs(swing).max())
+    excess = np.sign(swing) * np.maximum(np.abs(swing) - half, 0.0)
+    f, e = (
+        np.lib.stride_tricks.sliding_window_view(values, count + held)[begin - held]
+        for values in (force, excess)
+    )
+    trembling = math.sqrt(noise**2 + resolution**2 / 12.0)
+    direction = _direction(x, trembling)
+    moves = direction != 0.0
+    x, f, e = x[moves], f[moves], e[moves]
+    begin, direction = begin[moves], direction[moves]
+    x = x - x[:, :1]  # ∫φ' and ∫φ'' vanish, so the offset only adds rounding
+    of_mass, of_damping = trapezoid * second, -trapezoid * first
+    columns = np.stack(
+        [
+            x @ of_mass,
+            x @ of_damping,
+            direction * area,
+            np.full(len(begin), area),
+            -(f @ slope),
+        ],
+        axis=1,
+    )
+    bump = _BUMP(nodes) * trapezoid
+    absolute = position[begin] * area + x @ bump
+    # RMS of noise and rounding in the two columns
+    column_noise = trembling * np.linalg.norm([of_mass, of_damping], axis=1)
+    squares = np.mean(columns[:, :2] ** 2, axis=0) if len(begin) else np.ones(2)
+    share = float(np.max(column_noise**2 / np.maximum(squares, 1e-300)))
+    # the mean speed over a span belongs to the span's middle
+    span = max(count // _SPANS, 1)
+    speed = (x[:, span:] - x[:, :-span]) / (span * period)
+    middle = (np.arange(count + 1 - span) + 0.5 * span) / count
+    drag = (speed * np.abs(speed)) @ (_BUMP(middle) * period)
+    return Windows(
+        columns, f @ weight, begin, absolute, drag, e @ weight, share, float(column_noise[0])
+    )
+
+
+def noise_of(position: Array, resolution: float) -> float:
+    """Returns the RMS of a position's noise in m, 0 if rounding explains it.
+
+    Sixth differences remove a smooth motion and multiply the RMS of white noise by √924. Their
+    median ignores the few ticks in which friction reverses.
+
+    Args:
+        position: x in m at the samples, shape (n,); NaN without a sample.
+        resolution: Step of the position in m, 0 if it is exact.
+    """
+    differences = np.diff(position, 6)
+    differences = differences[np.isfinite(differences)]
+    if not len(differences):
+        return 0.0
+    noise = float(np.median(np.abs(differences))) / (_MEDIAN * np.sqrt(924.0))
+    return noise if noise > _ROUNDING * resolution + 1e-9 else 0.0
+
+
+def _direction(x: Array, trembling: float) -> Array:
+    """Returns ±1 for windows that keep one direction, 0 for others.
+
+    The means of successive parts must all move that way, by more than noise and rounding. Single
+    steps may go back, as joint encoders make them do in Cartesian space.
+    """
+    edges = np.linspace(0, x.shape[1], _PARTS + 1).astype(np.int64)
+    lengths = np.diff(edges)
+    steps = np.diff(np.add.reduceat(x, edges[:-1], axis=1) / lengths, axis=1)
+    margin = _SURE * trembling * np.sqrt(2.0 / lengths.min())
+    is_long = np.abs(x[:, -1] - x[:, 0]) >= LEAST_STEPS * np.sqrt(12.0) * trembling
+    up, down = (steps > margin).all(axis=1), (steps < -margin).all(axis=1)
+    return np.where(is_long, up.astype(np.float64) - down.astype(np.float64), 0.0)
+
 
 Array = NDArray[np.float64]
 

@@ -6,20 +6,177 @@ here a chunk comes out as one block of bytes, and a fault becomes a sentence.
 
 from __future__ import annotations
 
+import os
 import struct
+import threading
 import zlib
 from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
 from typing import TypeAlias
 
 import zstandard
 from mcap.opcode import Opcode
 from mcap.writer import MCAP0_MAGIC
 
-from hapticbridge.recording.fields import DamageError, Fields
-from hapticbridge.recording.file_bytes import FileBytes
+from hapticbridge.errors import RecordingError
+
+# A file's bytes by their places, read when they are asked for.
+
+WINDOW = 1 << 20
+"""Bytes that are read at once where a long stretch is only looked through: larger takes more
+memory, smaller more calls."""
+
+
+class FileBytes:
+    """A file as a sequence of bytes that is never in memory as a whole.
+
+    It is not mapped into memory: a bridge that records to the same file anew would cut it, and to
+    touch a mapped page behind the end ends the process. Slices may be read from several threads.
+
+    Args:
+        path: A regular file.
+
+    Raises:
+        RecordingError: It cannot be read.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._lock = threading.Lock()
+        try:
+            if path.exists() and not path.is_file():
+                kind = "a folder" if path.is_dir() else "not a regular file"
+                if path.is_dir() and not os.access(path, os.R_OK | os.X_OK):
+                    kind = "a folder that cannot be read"
+                raise RecordingError(f"cannot read the recording {path}: it is {kind}")
+            self._size = path.stat().st_size
+            self._file = path.open("rb", buffering=0)
+        except (OSError, ValueError) as error:
+            raise self._refusal(error) from error
+
+    def __enter__(self) -> FileBytes:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self._file.close()
+
+    def __len__(self) -> int:
+        return self._size
+
+    def __getitem__(self, places: slice) -> bytes:
+        """Returns the bytes of a slice without a step.
+
+        Raises:
+            RecordingError: They cannot be read, or the file became shorter meanwhile.
+        """
+        start, stop, _ = places.indices(self._size)
+        wanted = max(stop - start, 0)
+        pieces = bytearray()
+        try:
+            with self._lock:
+                self._file.seek(start)
+                # a read may return less than was asked for
+                while len(pieces) < wanted and (piece := self._file.read(wanted - len(pieces))):
+                    pieces += piece
+        except OSError as error:
+            raise self._refusal(error) from error
+        if len(pieces) < wanted:
+            raise RecordingError(f"the recording {self._path} became shorter while it was read")
+        return bytes(pieces)
+
+    def checksum(self, start: int, stop: int) -> int:
+        """Returns the CRC-32 of a stretch."""
+        crc = 0
+        for at in range(start, stop, WINDOW):
+            crc = zlib.crc32(self[at : min(at + WINDOW, stop)], crc)
+        return crc
+
+    def is_zero_from(self, start: int) -> bool:
+        """Tells whether nothing but zeros stands behind a place."""
+        return not any(any(self[at : at + WINDOW]) for at in range(start, self._size, WINDOW))
+
+    def _refusal(self, error: Exception) -> RecordingError:
+        reason = getattr(error, "strerror", None) or error
+        return RecordingError(f"cannot read the recording {self._path}: {reason}")
+
+
+# The fields of one MCAP record, read in order; a record that lies about its size is damaged.
+
+
+class DamageError(Exception):
+    """A record does not hold what its kind holds; never leaves this package."""
+
+
+class Fields:
+    """Reads the fields of one record in order.
+
+    Args:
+        data: The bytes that hold the record's body.
+        start: Where the body starts.
+        stop: Where it ends.
+    """
+
+    def __init__(self, data: bytes | FileBytes, start: int, stop: int) -> None:
+        self._data, self._position, self._stop = data, start, stop
+
+    @property
+    def is_at_end(self) -> bool:
+        """Whether nothing is left."""
+        return self._position >= self._stop
+
+    def raw(self, size: int) -> bytes:
+        """Returns the next bytes.
+
+        Raises:
+            DamageError: The record is shorter. So it is with all that is read of it.
+        """
+        start = self._position
+        if size > self._stop - start:
+            raise DamageError("it is shorter than its fields")
+        self._position = start + size
+        return self._data[start : start + size]
+
+    def number(self, size: int) -> int:
+        """Returns the next unsigned number of 2, 4 or 8 bytes."""
+        return int.from_bytes(self.raw(size), "little")
+
+    def text(self) -> str:
+        """Returns the next text.
+
+        Raises:
+            DamageError: It is not UTF-8, or cut.
+        """
+        try:
+            return self.raw(self.number(4)).decode()
+        except UnicodeDecodeError as error:
+            raise DamageError("its text is not UTF-8") from error
+
+    def mapping(self) -> dict[str, str]:
+        """Returns the next map of texts.
+
+        Raises:
+            DamageError: A key is there twice, a text is not UTF-8, or it is cut.
+        """
+        size = self.number(4)
+        inner = Fields(self._data, self._position, self._position + size)
+        self.raw(size)
+        entries: dict[str, str] = {}
+        while not inner.is_at_end:
+            key = inner.text()
+            if key in entries:
+                raise DamageError(f"it holds '{key}' twice")
+            entries[key] = inner.text()
+        return entries
+
 
 MAGIC = MCAP0_MAGIC
 """How an MCAP file starts and ends."""

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.errors import RecordingError
-from hapticbridge.recording.ring_memory import attached, created, memory_folder
+from hapticbridge.recording.ring import attached, created, memory_folder
 
 SEQUENCE, NUMBER, CONTACTS = 0, 1, 2
 """Indices into ``Snapshot.head``: the sequence, odd while the loop writes; the number of the

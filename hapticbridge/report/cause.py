@@ -2,11 +2,31 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from collections import defaultdict
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Literal
 
+import numpy as np
+from numpy.typing import NDArray
+
 from hapticbridge.audit import AuditReport
+from hapticbridge.audit.motion import turn_between
+from hapticbridge.audit.replay import Resimulator
+from hapticbridge.certificate import (
+    DampingCondition,
+    delay_ticks,
+    felt_period,
+    required_damping,
+    run_conditions,
+)
+from hapticbridge.errors import RecordingError
+from hapticbridge.record import TickFlag
+from hapticbridge.recording.reader import BLOCK
 from hapticbridge.report.evidence import Evidence
+from hapticbridge.scene.contacts import check_contacts, geom_name
 
 Kind = Literal[
     "method", "contact setting", "inputs", "delay", "rate", "damping", "quantisation", "unknown"
@@ -44,3 +64,414 @@ def window_before(evidence: Evidence, report: AuditReport) -> slice | None:
         return None
     begin = report.tick + 1 - round(WINDOW / evidence.parameters.period)
     return slice(max(0, begin), report.tick + 1)
+
+
+# Stiffness, damping or rate that a device would bear.
+
+HALVINGS = 40
+"""Number of bisections of a limit; the printed three digits need a third of them."""
+
+FASTEST = 20_000.0
+"""Largest rate in Hz that is proposed; loops of this package reach no higher one."""
+
+
+def what_would_do(evidence: Evidence, *, is_late: bool = False) -> str:
+    """Returns changes that satisfy the device condition, as a user would type them.
+
+    Stiffness and damping are the requested ones, not the law's B'. Each is changed alone; a change
+    that does not help alone is left out.
+
+    Args:
+        evidence: Evidence of the run; the device's damping is known.
+        is_late: True if a delay is the cause, which a faster loop does not shorten.
+    """
+    found = []
+    for axis, units in _SETTING_UNITS.items():
+        if _holds(evidence, axis, "period", 1.0):
+            continue
+        name = axis.replace(" ", "_")
+        for part, unit in zip(("stiffness", "damping"), units, strict=True):
+            share = _largest(partial(_holds, evidence, axis, part))
+            if share:
+                value = share * getattr(evidence.asked, f"{name}{part}")
+                found.append(f"lower the {axis}{part} to {_down(value)} {unit}")
+    period = evidence.parameters.period
+    slowest = period * FASTEST
+    if not is_late and evidence.info.rate is None and slowest > 1:
+        share = min(_largest(partial(_holds, evidence, axis, "period")) for axis in _SETTING_UNITS)
+        if share and 1 / share < slowest:
+            found.append(f"raise the rate to {_up(1 / (share * period))} Hz")
+    return ", or ".join(found) or "lower stiffness and damping together"
+
+
+_SETTING_UNITS = {"": ("N/m", "N s/m"), "rotational ": ("N m/rad", "N m s/rad")}
+_ROUNDING = 1e-9  # relative; keeps a limit found by bisection from losing a digit
+
+
+def _holds(evidence: Evidence, axis: str, part: str, share: float) -> bool:
+    """Returns True if the condition on a kind of axis holds after one quantity is reduced.
+
+    Args:
+        evidence: Evidence of the run.
+        axis: A key of ``_SETTING_UNITS``.
+        part: Quantity changed alone: ``stiffness``, ``damping`` or ``period``.
+        share: Share of the quantity that remains.
+    """
+    worst, felt, method = evidence.worst, evidence.asked, evidence.method
+    period = worst.period * (share if part == "period" else 1.0)
+    if part != "period":
+        name = f"{axis.replace(' ', '_')}{part}"
+        felt = replace(felt, **{name: share * getattr(felt, name)})
+    used = method.used(felt, period / worst.substeps)
+    changed = replace(worst, coupling=used, period=period)
+    kind = "rotation" if axis else "translation"
+    conditions = run_conditions(evidence.info, changed, method)
+    return all(c.holds is not False for c in conditions if c.axis == kind)
+
+
+def _largest(holds: Callable[[float], bool]) -> float:
+    """Returns the largest share in (0, 1) up to which all shares hold; 0 if none does."""
+    low, high = 0.0, 1.0
+    if not holds(1e-6):
+        return 0.0
+    for _ in range(HALVINGS):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if holds(middle) else (low, middle)
+    return low
+
+
+def _down(value: float) -> str:
+    """Formats a limit with three digits, rounded down."""
+    return _three_digits(value * (1 + _ROUNDING), math.floor)
+
+
+def _up(value: float) -> str:
+    """Formats a limit with three digits, rounded up."""
+    return _three_digits(value * (1 - _ROUNDING), math.ceil)
+
+
+def _three_digits(value: float, rounded: Callable[[float], int]) -> str:
+    digit = 10.0 ** (math.floor(math.log10(value)) - 2)
+    return f"{rounded(value / digit) * digit:.6g}"
+
+
+# Causes of unpaid energy at the device.
+
+COUNTED = 2.0
+"""Largest step in multiples of the device's resolution, without unit. A smaller step between two
+samples comes from the encoder and not from the hand."""
+
+FEWEST_REPEATS = 0.02
+"""Share of samples beyond expectation that must repeat an older one to count as a cause, without
+unit. One in fifty is jitter between two clocks."""
+
+
+def cause_at_device(evidence: Evidence, window: slice) -> Cause:
+    """Returns the likely cause of unpaid energy at the device.
+
+    Args:
+        evidence: Evidence of the run.
+        window: Ticks that lead to the moment.
+    """
+    method = evidence.method
+    hazard = Cause("method", f"method '{method.name}': {method.hazard}", SAFE_METHOD)
+    if not method.has_law:
+        return hazard
+    conditions = run_conditions(evidence.info, evidence.worst, method)
+    failing = [condition for condition in conditions if condition.holds is False]
+    if found := _delayed(evidence, failing):
+        return found
+    if not failing and (found := _timing(evidence, window)):
+        return found
+    if counts := _counted(evidence, window):
+        others = f", or {what_would_do(evidence)}" if failing else ""
+        return Cause("quantisation", counts, f"take a finer encoder or more friction{others}")
+    if failing:
+        return _overloaded(evidence, failing)
+    return hazard if method.hazard else _unexplained(evidence)
+
+
+def _told(failing: list[DampingCondition]) -> str:
+    return "; ".join(
+        f"{c.axis}: the device's damping is {c.available:g} {_UNITS[c.axis]}, the coupling needs "
+        f"{c.needed:.4g}"
+        for c in failing
+    )
+
+
+_UNITS = {"translation": "N s/m", "rotation": "N m s/rad"}
+
+
+def _delayed(evidence: Evidence, failing: list[DampingCondition]) -> Cause | None:
+    """Returns a delay as the cause if the device could bear the coupling without it."""
+    worst, info = evidence.worst, evidence.info
+    late, own = delay_ticks(info, worst.period) or 0, info.damping or 0.0
+    prompt = worst.scale * worst.force_scale
+    prompt *= required_damping(worst.coupling, felt_period(info, worst.period), worst.laws)
+    if not late or not failing or own < prompt:
+        return None
+    return Cause(
+        "delay",
+        f"{prompt:.3g} N s/m of damping would bear the coupling without delay, the device has "
+        f"{own:.3g}; its samples are {late} ticks old; {_told(failing)}",
+        f"shorten the delay, or {what_would_do(evidence, is_late=True)}",
+    )
+
+
+def _overloaded(evidence: Evidence, failing: list[DampingCondition]) -> Cause:
+    """Returns too stiff a spring for the rate, or too strong a damper, as the cause."""
+    worst, own = evidence.worst, evidence.info.damping or 0.0
+    damper = worst.scale * worst.force_scale * evidence.asked.damping
+    if failing[0].axis == "translation" and damper >= own:
+        return Cause(
+            "damping",
+            f"{_told(failing)}; its damper alone needs {damper:.4g} at any rate",
+            what_would_do(evidence),
+        )
+    return Cause("rate", f"{_told(failing)}: it is too stiff for its rate", what_would_do(evidence))
+
+
+def _unexplained(evidence: Evidence) -> Cause:
+    if evidence.info.delay is None:
+        return Cause(
+            "unknown",
+            "damping, deadlines and resolution do not explain it; the device's delay is not known",
+            "measure the device with 'hapticbridge identify'",
+        )
+    return Cause(
+        "unknown",
+        "damping, delay, deadlines and resolution do not explain it",
+        "lower the stiffness, and measure the device with 'hapticbridge identify'",
+    )
+
+
+def _timing(evidence: Evidence, window: slice) -> Cause | None:
+    """Returns missed deadlines or repeated samples as the cause; the device bears the coupling."""
+    flags = evidence.ticks["flags"][window]
+    missed = int(np.count_nonzero(flags & int(TickFlag.OVERRUN)))
+    span = len(flags) * evidence.parameters.period
+    if missed:
+        return Cause(
+            "rate",
+            f"ticks late by a period or more in the {span:.2g} s before: {missed}, so that the "
+            "wrench was held longer than the coupling allows",
+            "lower the rate or the load of the machine ('hapticbridge doctor')",
+        )
+    repeated = float(np.mean((flags & int(TickFlag.STALE_SAMPLE)) != 0))
+    # a device slower than the loop repeats each sample until its next one
+    own = evidence.info.rate
+    expected = max(0.0, 1.0 - own * evidence.parameters.period) if own else 0.0
+    if repeated > expected + FEWEST_REPEATS:
+        return Cause(
+            "delay",
+            f"{repeated:.0%} of the samples in the {span:.2g} s before repeated an older one, "
+            f"{expected:.0%} are expected: the force followed an older position of the handle",
+            "mend the link to the device, or lower the rate to what it delivers",
+        )
+    return None
+
+
+def _counted(evidence: Evidence, window: slice) -> str:
+    """Describes encoder steps as the cause; empty if they did not bring most of the energy.
+
+    An unstable coupling passes through small steps too, but gains its energy after the swings have
+    grown. So the energy from the window to the worst moment counts.
+    """
+    info, worst = evidence.info, evidence.worst
+    if not info.resolution:
+        return ""
+    rub = (
+        worst.scale
+        * info.resolution
+        * (worst.coupling.stiffness / 2 + worst.coupling.damping / worst.period)
+    )
+    if info.friction is not None and info.friction >= rub:
+        return ""
+    span = slice(window.start, max(window.stop, int(np.argmax(evidence.kicked)) + 1))
+    gained = np.diff(evidence.kicked, prepend=0.0)[span].clip(min=0.0)
+    steps = _largest_steps(evidence.ticks["device_position"], span) / info.resolution
+    total = float(gained.sum())
+    share = float(gained[steps <= COUNTED].sum()) / total if total > 0 else 0.0
+    if share < MOST or not math.isfinite(share):
+        return ""
+    has = "unknown" if info.friction is None else f"{info.friction:g} N"
+    return (
+        f"{share:.0%} of the energy came in ticks whose motion was {COUNTED:g} steps of the "
+        f"device's resolution ({info.resolution:g} m) or less; to hold still between steps takes a "
+        f"friction of K D/2 + B' D/T = {rub:.3g} N, the device's is {has}"
+    )
+
+
+def _largest_steps(position: NDArray[np.float64], span: slice) -> NDArray[np.float64]:
+    """Returns the largest step of any axis into each tick, in m; 0 for the first tick of a run."""
+    before = position[max(span.start - 1, 0) : span.stop]
+    steps = np.abs(np.diff(before, axis=0)).max(axis=1, initial=0.0)
+    missing = span.stop - span.start - len(steps)
+    return np.concatenate([np.zeros(missing), steps])
+
+
+# Geoms that touched while energy was created.
+
+Pairs = dict[frozenset[int], float]
+"""Share of the energy created while two geoms touched, by pair."""
+
+
+def touched_pairs(
+    evidence: Evidence, report: AuditReport, window: slice, gained: NDArray[np.float64]
+) -> Pairs | None:
+    """Returns the geoms that touched, those with most energy first; None if unknown.
+
+    A record counts contacts without naming them, so the run is simulated again up to the window.
+
+    Args:
+        evidence: Evidence of the run.
+        report: The audit's verdict on it, with the result of the re-simulation.
+        window: Ticks to inspect.
+        gained: Energy created in the environment in each of them, (n,) in J.
+    """
+    if not report.resimulation or report.resimulation.startswith(("not", "disagrees")):
+        return None
+    ticks, total = evidence.ticks, float(gained.sum())
+    found: defaultdict[frozenset[int], float] = defaultdict(float)
+    try:
+        run = Resimulator(evidence.recording, evidence.parameters)
+        for begin in range(0, window.start, BLOCK):
+            run.add(ticks[begin : min(begin + BLOCK, window.start)])
+        for tick, energy in zip(range(window.start, window.stop), gained.tolist(), strict=True):
+            run.add(ticks[tick : tick + 1])
+            contact = run.data.contact
+            touching = contact.geom[contact.efc_address >= 0].tolist()
+            for pair in {frozenset(geoms) for geoms in touching}:
+                found[pair] += energy / total if total > 0 else 0.0
+    except RecordingError:
+        return None
+    return dict(sorted(found.items(), key=lambda item: -item[1]))
+
+
+# Causes of energy created in the environment.
+
+FAST_TURN = 0.02
+"""Rotation of the tool in rad per tick above which its gyroscopic torque is suspected. At 1 kHz, 50
+rad/s created 0.05 J in a second under a coupling of translation alone (measured). A smaller value
+suspects hands, which turn at 10 rad/s; a larger one misses such cases."""
+
+_SOFTER = "lower the stiffness, raise the rate, or make the contacts softer"
+
+
+def cause_in_environment(evidence: Evidence, report: AuditReport, window: slice) -> Cause:
+    """Returns the likely cause of energy created in the environment.
+
+    Args:
+        evidence: Evidence of the run.
+        report: The audit's verdict on it.
+        window: Ticks that lead to the moment.
+    """
+    method = evidence.method
+    gained = np.diff(evidence.created, prepend=0.0)[window].clip(min=0.0)
+    touches = (evidence.ticks["contacts"] > 0)[window]
+    share = float(gained[touches].sum() / gained.sum()) if gained.sum() > 0 else 0.0
+    where = f"{share:.0%} of the energy created until then came in ticks with contact"
+    pairs = touched_pairs(evidence, report, window, gained) if share >= MOST else None
+    if pairs:
+        where += _named(evidence, pairs)
+    if (moved := _moved_bodies(evidence, window)) and _can_push(evidence, pairs, share):
+        return Cause(
+            "inputs",
+            f"mocap bodies were moved {moved} times in the {WINDOW:g} s before; {where}; MuJoCo "
+            "damps their contacts and welds against rest, so a fast move creates energy",
+            "move them slower",
+        )
+    if share < MOST:
+        return _without_contact(evidence, window, where)
+    if concerns := _concerns(evidence, pairs):
+        told, _, remedy = concerns[0].rpartition("; write ")
+        return Cause("contact setting", f"{where}; {told}", f"write {remedy}")
+    if method.hazard:
+        return Cause(
+            "method",
+            f"{where}, whose setting is as recommended; method '{method.name}': {method.hazard}",
+            SAFE_METHOD,
+        )
+    hard = "a light tool on a stiff coupling is the hard case"
+    return Cause("contact setting", f"{where}; {hard}", _SOFTER)
+
+
+def _without_contact(evidence: Evidence, window: slice, where: str) -> Cause:
+    method, turned = evidence.method, _largest_turn(evidence, window)
+    if method.hazard:
+        return Cause("method", f"{where}; method '{method.name}': {method.hazard}", SAFE_METHOD)
+    if turned > FAST_TURN:
+        return Cause(
+            "rate",
+            f"{where}; the tool turned by up to {turned:.2g} rad a tick "
+            f"({turned / evidence.parameters.period:.3g} rad/s), and MuJoCo takes the gyroscopic "
+            "torque from the start of a step",
+            "raise the rate, or turn the tool slower",
+        )
+    return Cause(
+        "unknown",
+        f"{where}; method '{method.name}' is not known to create energy without contact",
+        "try a higher rate with 'hapticbridge audit FILE --what-if rate=…'",
+    )
+
+
+def _largest_turn(evidence: Evidence, window: slice) -> float:
+    """Returns the largest rotation of the tool in one tick, in rad."""
+    quaternion = evidence.ticks["tool_quaternion"][max(window.start - 1, 0) : window.stop + 1]
+    return float(
+        np.linalg.norm(turn_between(quaternion[:-1], quaternion[1:]), axis=1).max(initial=0.0)
+    )
+
+
+def _named(evidence: Evidence, pairs: Pairs) -> str:
+    pair, share = next(iter(pairs.items()))
+    if evidence.model is None:
+        return ""
+    touching = " touched ".join(geom_name(evidence.model, geom) for geom in sorted(pair))
+    more = f" ({len(pairs) - 1} other pairs touched, too)" if len(pairs) > 1 else ""
+    return f", {share:.0%} while {touching}{more}"
+
+
+def _concerns(evidence: Evidence, pairs: Pairs | None) -> list[str]:
+    """Returns concerns about the contacts that touched; about all contacts if unknown."""
+    if evidence.model is None:
+        return []
+    only = None if pairs is None else list(pairs)
+    return check_contacts(evidence.model, evidence.parameters.grip, only=only)
+
+
+def _can_push(evidence: Evidence, pairs: Pairs | None, share: float) -> bool:
+    """Returns True if a mocap body held or touched anything while the energy was created."""
+    model = evidence.model
+    if model is None:
+        return True
+    if model.neq and share < MOST:  # a weld pulls without contact
+        return True
+    if share < MOST or pairs is None:
+        return share >= MOST
+    is_driven = model.body_mocapid[model.body_rootid[model.geom_bodyid]] >= 0
+    return any(is_driven[geom] for pair in pairs for geom in pair)
+
+
+def _moved_bodies(evidence: Evidence, window: slice) -> int:
+    return sum(
+        event.get("event") == "input"
+        and isinstance(event.get("tick"), int)
+        and window.start <= event["tick"] < window.stop
+        and "mocap_"
+        in str(event.get("writes"))  # as text, because a damaged event may have any shape
+        for event in evidence.events
+    )
+
+
+# Search for the likely cause.
+
+
+def likely_cause(evidence: Evidence, report: AuditReport) -> Cause | None:
+    """Returns the likely cause of an active run; None for any other run."""
+    window = window_before(evidence, report)
+    if window is None:
+        return None
+    if report.port == "device":
+        return cause_at_device(evidence, window)
+    return cause_in_environment(evidence, report, window)

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from hapticbridge.audit import AuditReport
 from hapticbridge.device import DATA_SHEET_UNITS
 from hapticbridge.guard import CONTROLLERS
-from hapticbridge.quantity import quantity
+from hapticbridge.record import TickFlag
 from hapticbridge.report.evidence import Evidence
-from hapticbridge.tick import TickFlag
+from hapticbridge.units import format_si
 
 Facts = list[tuple[str, str]]
 
@@ -85,7 +85,7 @@ _GUARD = {
     "clutch": "(mask of buttons)",
     "dead_man": "(mask of buttons)",
 }
-"""Guard settings on a page, with units; see ``kernel.guarding.Guarding``."""
+"""Guard settings on a page, with units; see ``kernel.guarding.GuardParameters``."""
 
 
 def json_object(text: str) -> dict[str, Any]:
@@ -154,7 +154,7 @@ def head_facts(report: AuditReport, evidence: Evidence) -> Facts:
         ("method", f"{evidence.method.name}, {1 / parameters.period:g} Hz"),
         *(("coupling", sentence) for sentence in report.rendered[:1]),
         ("ran", f"{report.duration:.3f} s, {report.ticks} ticks, {in_time}"),
-        ("largest force", f"{quantity(force, 'N')}, {quantity(torque, 'N m')} on the device"),
+        ("largest force", f"{format_si(force, 'N')}, {format_si(torque, 'N m')} on the device"),
         ("controller", _controlled(evidence)),
     ]
     borne = {True: "bears the coupling", False: "does not bear it", None: "not judged"}
@@ -187,7 +187,7 @@ def _controlled(evidence: Evidence) -> str:
 def balance_of(report: AuditReport) -> str:
     """Returns the energies at the end of a run; those of rounding are left out."""
     told = [
-        f"{_spaced(name)} {quantity(energy, 'J')}"
+        f"{_spaced(name)} {format_si(energy, 'J')}"
         for name, energy in report.energies.items()
         if abs(energy) > ROUNDING
     ]

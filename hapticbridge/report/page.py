@@ -8,15 +8,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jinja2 import Environment, PackageLoader, select_autoescape
 
 from hapticbridge.audit import AuditReport
 from hapticbridge.errors import RecordingError
-from hapticbridge.picture import inline_svg
-from hapticbridge.provenance import meta_float
+from hapticbridge.files import atomic_write
+from hapticbridge.plotting import inline_svg
 from hapticbridge.recording import Recording, due_times
-from hapticbridge.report.curves import draw_recording
-from hapticbridge.report.energies import draw_energies
-from hapticbridge.report.evidence import Evidence
+from hapticbridge.report.cause import likely_cause
+from hapticbridge.report.evidence import Evidence, draw_recording
 from hapticbridge.report.facts import (
     balance_of,
     device_facts,
@@ -27,12 +27,113 @@ from hapticbridge.report.facts import (
     run_facts,
     software_facts,
 )
-from hapticbridge.report.html import write_page
-from hapticbridge.report.lead import PLACES, is_warned, lead_sentence, notes
-from hapticbridge.report.likely import likely_cause
-from hapticbridge.report.moment import draw_moment
-from hapticbridge.report.motion import draw_motion
-from hapticbridge.report.timing import activities, draw_timing
+from hapticbridge.report.plots import (
+    activities,
+    draw_energies,
+    draw_moment,
+    draw_motion,
+    draw_timing,
+)
+from hapticbridge.run_description import meta_float
+from hapticbridge.units import format_si
+
+# Self-contained HTML pages.
+
+PAGES = (".html", ".htm")
+"""Allowed extensions of a page; browsers show others as text."""
+
+
+def check_page_name(path: Path) -> None:
+    """Checks that a page can be written under a name, before anything is computed for it.
+
+    Raises:
+        RecordingError: The extension is not one of ``PAGES``, or the folder does not exist.
+    """
+    if path.suffix.lower() not in PAGES:
+        raise RecordingError(f"'{path}' does not end like a page; endings: {', '.join(PAGES)}")
+    if not path.absolute().parent.is_dir():
+        raise RecordingError(f"cannot write '{path}': its folder does not exist")
+
+
+def write_page(path: Path, template: str, **told: object) -> None:
+    """Writes a page; an existing file is replaced.
+
+    Args:
+        path: The file.
+        template: Name of a file in ``hapticbridge/templates``.
+        told: The template's variables.
+
+    Raises:
+        RecordingError: The page cannot be written, or not under this name.
+    """
+    check_page_name(path)
+    environment = Environment(
+        loader=PackageLoader("hapticbridge", "templates"), autoescape=select_autoescape()
+    )
+    environment.filters["quantity"] = format_si
+    page = environment.get_template(template).render(told)
+    try:
+        with atomic_write(path) as draft:
+            draft.write_text(page, encoding="utf-8")
+    except OSError as error:
+        raise RecordingError(f"cannot write '{path}': {error.strerror}") from None
+
+
+# First sentences of a page.
+
+PLACES = {
+    "environment": "environment: the simulated scene, as the tool meets it",
+    "device": "device: the handle in the hand",
+}
+"""Descriptions of the ports for readers new to them."""
+
+
+def lead_sentence(report: AuditReport, worst: float | None) -> str:
+    """Returns the main result of a run in one sentence.
+
+    Args:
+        report: The audit's verdict on it.
+        worst: Largest energy beyond the bound, in J; None if unknown.
+    """
+    if report.verdict == "invalid":
+        return f"This recording proves nothing: {report.reason}"
+    if report.verdict == "active" and worst is not None:
+        return _too_much(report, format_si(worst, "J"))
+    return report.reason.partition("; ")[0]
+
+
+def _too_much(report: AuditReport, joules: str) -> str:
+    if report.port == "device":
+        return f"Not safe: the device was given up to {joules} that neither hand nor scene put in"
+    limit = "the coupling's slack pays for" if report.environment == "active" else "it got"
+    return f"Not safe: the scene gave out up to {joules} more than {limit}"
+
+
+def notes(report: AuditReport) -> list[str]:
+    """Returns notes on the verdict: reason of a stop, unchecked parts, and the device condition."""
+    if report.verdict == "invalid":
+        return []
+    told = report.reason.partition("; ")[2]
+    # a run that was passive only because its force was switched off must not look like any other
+    return [*([f"{told[:1].upper()}{told[1:]}."] if told else []), *_of_the_device(report)]
+
+
+def is_warned(report: AuditReport) -> bool:
+    """Returns True for a passive run that was stopped or is not certified for any hand."""
+    return report.verdict == "passive" and (report.certified is False or "trip" in report.events)
+
+
+def _of_the_device(report: AuditReport) -> list[str]:
+    if report.verdict != "passive":
+        return []
+    if report.certified:
+        return ["The device bears this coupling, in any hand."]
+    if report.certified is None:
+        return ["It is not known if the device bears this coupling in any hand."]
+    return [
+        f"The device does not bear this coupling: {'; '.join(report.conditions)}. This run stayed "
+        "passive; another one need not."
+    ]
 
 
 def telling_time(recording: Recording, report: AuditReport) -> float:

@@ -9,17 +9,17 @@ measured rule for contacts that generate energy. ``methods`` and ``weld`` serve 
 comparison.
 """
 
-from hapticbridge.scene.custom import custom_numbers as custom_numbers
-from hapticbridge.scene.custom import custom_text as custom_text
-from hapticbridge.scene.library import scene_names as scene_names
-from hapticbridge.scene.library import scene_path as scene_path
+from hapticbridge.scene.compile import custom_numbers as custom_numbers
+from hapticbridge.scene.compile import custom_text as custom_text
 from hapticbridge.scene.load import SceneSource as SceneSource
 from hapticbridge.scene.load import compile_scene as compile_scene
 from hapticbridge.scene.load import load_scene as load_scene
 from hapticbridge.scene.load import plain_model as plain_model
 from hapticbridge.scene.load import read_scene as read_scene
-from hapticbridge.scene.parameter_file import Parameter as Parameter
-from hapticbridge.scene.parameter_file import scene_parameters as scene_parameters
+from hapticbridge.scene.load import scene_names as scene_names
+from hapticbridge.scene.load import scene_path as scene_path
+from hapticbridge.scene.parameters import Parameter as Parameter
+from hapticbridge.scene.parameters import scene_parameters as scene_parameters
 from hapticbridge.scene.parameters import settings_from as settings_from
 from hapticbridge.scene.scene import Scene as Scene
 from hapticbridge.scene.source import SourceFile as SourceFile

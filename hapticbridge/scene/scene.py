@@ -10,11 +10,10 @@ import numpy as np
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import SceneError
-from hapticbridge.kernel.names import COUPLING_ACTUATORS, WELD_NAME
-from hapticbridge.scene.compiler import compiled
+from hapticbridge.kernel.codes import COUPLING_ACTUATORS, WELD_NAME
+from hapticbridge.scene.compile import compiled, go_to_start
+from hapticbridge.scene.handle import add_weld, carry_over, set_weld_gains
 from hapticbridge.scene.source import SourceFile
-from hapticbridge.scene.start import go_to_start
-from hapticbridge.scene.weld import add_weld, carry_over, set_weld_gains
 
 
 @dataclass(slots=True)

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from html import unescape
 from pathlib import Path
 
-from hapticbridge.scene.parameter_file import parameters_file
+from hapticbridge.scene.parameters import parameters_file
 
 _FILE_ATTRIBUTES = (
     "file",

@@ -14,7 +14,7 @@ import numpy as np
 
 from hapticbridge.audit import audit
 from hapticbridge.errors import RecordingError, StudyError, choices
-from hapticbridge.jsonable import jsonable
+from hapticbridge.files import finite_or_null
 from hapticbridge.study.points import Value
 from hapticbridge.study.sweep import sweep
 from hapticbridge.study.table import Interrupted, Table, check_format
@@ -181,7 +181,7 @@ def write_audits(table: Table, path: Path) -> None:
     values = {name: column.tolist() for name, column in columns.items()}
     rows = [dict(zip(values, row, strict=True)) for row in zip(*values.values(), strict=True)]
     try:
-        path.write_text(json.dumps(jsonable(rows), indent=1, allow_nan=False) + "\n", "utf-8")
+        path.write_text(json.dumps(finite_or_null(rows), indent=1, allow_nan=False) + "\n", "utf-8")
     except OSError as error:
         raise StudyError(f"{path}: cannot be written ({error.strerror})") from None
 

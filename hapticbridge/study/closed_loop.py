@@ -18,21 +18,20 @@ from numpy.typing import NDArray
 from hapticbridge.arguments import Arguments
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import SimulatedDevice
-from hapticbridge.device.simulated.handheld import STATE_DTYPE as DEVICE_DTYPE
-from hapticbridge.device.simulated.handheld import next_sample
+from hapticbridge.device.simulated.dynamics import STATE_DTYPE as DEVICE_DTYPE
+from hapticbridge.device.simulated.dynamics import next_sample
 from hapticbridge.errors import StudyError
 from hapticbridge.jit import compiled_for_threads, direct
 from hapticbridge.kernel.codes import OK
-from hapticbridge.kernel.layout import STATE_DTYPE
-from hapticbridge.kernel.state import Binding
-from hapticbridge.kernel.step import advance, after_step, before_step
-from hapticbridge.ledger import Ledger
-from hapticbridge.passivity.stability import decays
+from hapticbridge.kernel.state import STATE_DTYPE, BoundKernel
+from hapticbridge.kernel.tick import advance, after_step, before_step
+from hapticbridge.options import run_parameters
+from hapticbridge.record import SAMPLE_DTYPE, TICK_DTYPE
 from hapticbridge.rendering import Method, prepare
 from hapticbridge.scene import Scene
 from hapticbridge.study.jitter import PARTS, Timing
-from hapticbridge.tick import SAMPLE_DTYPE, TICK_DTYPE
-from hapticbridge.workspace import run_parameters
+from hapticbridge.summary import Ledger
+from hapticbridge.theory.sampled_loop import decays
 
 LEVER = 0.05
 """Length in m that turns a torque into a force, so that one signal shows both diverge: half the
@@ -150,7 +149,7 @@ class ClosedLoop:
             substeps=substeps,
             info=device.info,
         )
-        binding = Binding(scene.model, scene.data, parameters)
+        binding = BoundKernel(scene.model, scene.data, parameters)
         if knock is not None:
             device.displace(knock)
         intervals = (

@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 from hapticbridge.errors import StudyError
-from hapticbridge.extras import optional_module
+from hapticbridge.files import import_extra
 from hapticbridge.study.workers import IN_FLIGHT, Workers
 
 _PATIENCE = 3.0
@@ -25,7 +25,7 @@ class ClusterWorkers(Workers):
     """
 
     def __init__(self, scheduler: str) -> None:
-        distributed = optional_module("distributed", "a scheduler", "cluster", StudyError, "dask")
+        distributed = import_extra("distributed", "a scheduler", "cluster", StudyError, "dask")
         try:
             # asked beforehand, because a client that was refused takes 10 s to be given up, and
             # ends in a traceback; in a thread of its own, because this one may run a loop already

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.errors import StudyError, choices
-from hapticbridge.extras import optional_module
+from hapticbridge.files import import_extra
 from hapticbridge.study.points import Point, Value
 
 FORMATS = ("csv", "parquet")
@@ -156,7 +156,7 @@ def pyarrow(module: str = "pyarrow") -> Any:
     Raises:
         StudyError: It is not installed.
     """
-    return optional_module(module, "Parquet", "tables", StudyError)
+    return import_extra(module, "Parquet", "tables", StudyError)
 
 
 def csv_bytes(columns: Mapping[str, Sequence[Value | None]]) -> bytes:

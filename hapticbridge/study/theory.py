@@ -11,17 +11,14 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from hapticbridge.coupling import Coupling
-from hapticbridge.passivity import (
-    ZWidth,
-    damping_spectrum,
-    minimum_damping,
-    transmission_line_spectrum,
-    worst_frequency,
-)
-from hapticbridge.passivity.compensation import felt_damping
-from hapticbridge.passivity.transfer import Discretization
-from hapticbridge.picture import new_figure
+from hapticbridge.plotting import new_figure
 from hapticbridge.rendering import COMPENSATED, IMPLICIT, Method, default_method
+from hapticbridge.theory.bounds import minimum_damping, worst_frequency
+from hapticbridge.theory.compensation import effective_damping
+from hapticbridge.theory.spectrum import damping_spectrum
+from hapticbridge.theory.transfer import Discretization
+from hapticbridge.theory.transmission_line import transmission_line_spectrum
+from hapticbridge.theory.z_width import ZWidth
 
 _Array = NDArray[np.float64]
 
@@ -102,7 +99,7 @@ def alternatives(felt: Coupling, period: float, filter_time: float) -> tuple[Alt
 
     def by(method: Method) -> Alternative:
         used = method.used(felt, period)
-        shown = felt_damping(used.stiffness, used.damping, period, method.adds or 0.0)
+        shown = effective_damping(used.stiffness, used.damping, period, method.adds or 0.0)
         name = f"method {method.name}: B = {shown:.4g} felt, B' = {used.damping:.4g}"
         return way(name, law=used)
 

@@ -18,16 +18,16 @@ from typing import Any
 
 import viser
 
-from hapticbridge.commands import Allowance, Command, Couple, Mark, Reset, Switch
+from hapticbridge.commands import Command, Couple, CouplingLimits, Mark, Reset, Switch
+from hapticbridge.commands.allowed import UNITS
 from hapticbridge.commands.command import Stop, line_of
-from hapticbridge.commands.queue import INTERVAL
-from hapticbridge.commands.span import UNITS
+from hapticbridge.commands.execution import INTERVAL
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import CommandError
 from hapticbridge.guard import Limits
-from hapticbridge.provenance import parameters_of
 from hapticbridge.rendering import method_named
+from hapticbridge.run_description import parameters_of
 from hapticbridge.view.sliders import SYMBOLS, Sliders, by_hand
 
 SHARED = "**Anyone with this address can watch this run, stop it, and move the device.**"
@@ -40,7 +40,7 @@ STILL = 0.5
 """In s: for so long after the last touch a slider is not put anywhere; it may be in a hand."""
 
 
-def allowance_of(metadata: Mapping[str, str]) -> Allowance:
+def allowance_of(metadata: Mapping[str, str]) -> CouplingLimits:
     """Returns what the device of a run allows, from the run's metadata."""
     parameters, method = parameters_of(metadata), method_named(metadata["method"])
     info, guarding = DeviceInfo.from_json(metadata["device"]), parameters.guarding
@@ -50,7 +50,7 @@ def allowance_of(metadata: Mapping[str, str]) -> Allowance:
         stretch=guarding.stretch / parameters.scale,
         angle=guarding.angle,
     )
-    return Allowance(
+    return CouplingLimits(
         info=info,
         method=method,
         start=method.rendered(parameters.coupling, parameters.period / parameters.substeps),
@@ -112,7 +112,7 @@ class Controls:
     """
 
     def __init__(
-        self, server: viser.ViserServer, allowance: Allowance, ask: Callable[[Command], None]
+        self, server: viser.ViserServer, allowance: CouplingLimits, ask: Callable[[Command], None]
     ) -> None:
         self._allowance, self._ask = allowance, ask
         self._touched = 0.0

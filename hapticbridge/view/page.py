@@ -10,9 +10,9 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from hapticbridge.felt import coupling_sentences, is_always_held
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.rendering import method_named
+from hapticbridge.summary import coupling_sentences, is_always_held
 from hapticbridge.view.geometry import NOT_DRAWN, Tendons, props_of
 from hapticbridge.view.ghost import LONGEST_ARROW, Ghost, linear
 from hapticbridge.view.sight import Sight

@@ -19,12 +19,12 @@ from typing import IO, Any
 import mujoco
 import numpy as np
 
-from hapticbridge.audit.attached_scene import attached_model
+from hapticbridge.audit.replay import attached_model
 from hapticbridge.errors import HapticBridgeError
 from hapticbridge.film_process import LEAST_REFERENCE
-from hapticbridge.provenance import parameters_of
 from hapticbridge.recording import RecordingFile, Ring
 from hapticbridge.recording.snapshot import Snapshot
+from hapticbridge.run_description import parameters_of
 from hapticbridge.view.address import Address
 from hapticbridge.view.controls import SHARED, Controls, Outlet, allowance_of
 from hapticbridge.view.geometry import Tendons

@@ -8,7 +8,7 @@ from typing import Any
 
 import viser
 
-from hapticbridge.commands.span import UNITS, Span
+from hapticbridge.commands.allowed import UNITS, AxisCouplingLimits
 
 FINENESS = 1e-3
 """Least step of a slider as a share of its largest value, rounded down to a power of ten: finer is
@@ -35,7 +35,9 @@ class Sliders:
         span: Likewise.
     """
 
-    def __init__(self, gui: viser.GuiApi, span: Span, want: Callable[[], None]) -> None:
+    def __init__(
+        self, gui: viser.GuiApi, span: AxisCouplingLimits, want: Callable[[], None]
+    ) -> None:
         self.span = span
         stiffness, damping = span.gains(span.start)
         self._steps = (

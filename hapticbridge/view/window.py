@@ -16,7 +16,7 @@ from typing import IO, cast
 
 from hapticbridge.commands import Command, command_of
 from hapticbridge.commands.command import LONGEST_LINE
-from hapticbridge.commands.queue import INTERVAL
+from hapticbridge.commands.execution import INTERVAL
 from hapticbridge.errors import CommandError, HapticBridgeError
 from hapticbridge.recording import Attachment
 from hapticbridge.view.address import Address
@@ -46,7 +46,7 @@ def check_view() -> None:
 
 
 class Window:
-    """Starts the process of the live view; an ``Onlooker`` of a bridge.
+    """Starts the process of the live view; an ``RingObserver`` of a bridge.
 
     Whatever becomes of it, the loop goes on: records are read from the ring without a word to the
     bridge, and events leave through a thread of their own.

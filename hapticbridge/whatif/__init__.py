@@ -7,9 +7,9 @@ model hand (``hands``) that follows the recorded hand's ``intent``. ``side_by_si
 and ``page`` present the ``outcome``.
 """
 
-from hapticbridge.whatif.changes import changes_from as changes_from
-from hapticbridge.whatif.outcome import WhatIf as WhatIf
-from hapticbridge.whatif.outcome import WhatIfRun as WhatIfRun
+from hapticbridge.whatif.page import draw_what_if as draw_what_if
 from hapticbridge.whatif.page import write_what_if as write_what_if
-from hapticbridge.whatif.picture import draw_what_if as draw_what_if
+from hapticbridge.whatif.settings import changes_from as changes_from
+from hapticbridge.whatif.what_if import WhatIf as WhatIf
+from hapticbridge.whatif.what_if import WhatIfRun as WhatIfRun
 from hapticbridge.whatif.what_if import what_if as what_if

@@ -3,18 +3,140 @@
 from __future__ import annotations
 
 import base64
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from matplotlib.figure import Figure
+
 from hapticbridge.errors import RecordingError
-from hapticbridge.picture import inline_svg
-from hapticbridge.report.evidence import Evidence
-from hapticbridge.report.html import write_page
-from hapticbridge.report.page import moment_of
-from hapticbridge.report.panels import BINS
-from hapticbridge.whatif.outcome import WhatIf, WhatIfRun
-from hapticbridge.whatif.picture import figure_of
-from hapticbridge.whatif.side_by_side import changes, rows, sentences
+from hapticbridge.plotting import inline_svg, new_figure, write_picture
+from hapticbridge.recording import due_times
+from hapticbridge.report import DRAWABLE, decimated
+from hapticbridge.report.evidence import BINS, Evidence
+from hapticbridge.report.page import moment_of, write_page
+from hapticbridge.report.plots import BINS as PLOT_BINS
+from hapticbridge.units import format_si
+from hapticbridge.whatif.what_if import WhatIf, WhatIfRun
+
+# Table of a what-if's runs.
+
+_PEAK_UNITS = {"force": "N", "torque": "N m", "stretch": "m"}
+
+Row = tuple[str, tuple[str, ...]]
+
+
+def rows(found: WhatIf) -> Iterator[Row]:
+    """Yields a name and a text per run, in the order of ``found.runs``."""
+    runs = found.runs
+    yield "verdict", tuple(f"{r.report.words}, tripped" if r.trip else r.report.words for r in runs)
+    for name in runs[0].peaks:
+        unit = _PEAK_UNITS[name.split()[0]]
+        yield f"peak {name}", tuple(format_si(run.peaks[name], unit) for run in runs)
+    for name in runs[0].report.energies:
+        joules = [run.report.energies.get(name, 0.0) for run in runs]
+        if any(joules):
+            yield name.replace("_", " "), tuple(format_si(e, "J") for e in joules)
+    yield "slack used", tuple(f"{run.report.slack_share:.0%}" for run in runs)
+    yield "device bears it", tuple(map(_certified, runs))
+    yield "ran", tuple(f"{run.report.duration:.3f} s" for run in runs)
+
+
+def changes(found: WhatIf) -> Iterator[tuple[str, str, str]]:
+    """Yields each change: name, and the value before and after with its unit."""
+    for name, unit, before, after in found.changes:
+        yield name, f"{_row_text(before)} {unit}".rstrip(), f"{_row_text(after)} {unit}".rstrip()
+
+
+def sentences(run: WhatIfRun) -> Iterator[str]:
+    """Yields the reasons why a run is not passive and why it was stopped."""
+    if run.report.verdict != "passive":
+        yield run.report.reason
+    if run.trip:
+        yield f"tripped: {run.trip}"
+
+
+def _certified(run: WhatIfRun) -> str:
+    return {True: "yes", False: "no", None: "not judged"}[run.report.certified]
+
+
+def _row_text(value: object) -> str:
+    return f"{value:.6g}" if isinstance(value, float) else "none" if value is None else str(value)
+
+
+# Plot of a what-if.
+
+_STYLES = (("#555555", "-", 2.2), ("#1a5fb4", "-", 1.1), ("#b3261e", "--", 1.1))
+"""Colour, line and width in points of each run; the recorded one lies behind the others."""
+
+
+def figure_of(found: WhatIf, bins: int = BINS) -> Figure:
+    """Draws force on the device, handle displacement, and the energies of both ports over time.
+
+    Args:
+        found: Result of the what-if.
+        bins: Number of bins per curve, see ``decimated``.
+
+    Raises:
+        RecordingError: A run holds a number that cannot be drawn.
+    """
+    figure = new_figure(8, 11)
+    panels = figure.subplots(4, 1, sharex=True)
+    origin = found.runs[0].ticks["handle_position"][0]
+    for run, (colour, line, width) in zip(found.runs, _STYLES, strict=False):
+        ticks = run.ticks
+        if not len(ticks):
+            continue
+        time = due_times(ticks, run.period)
+        drawn = (
+            np.linalg.norm(ticks["wrench_on_device"][:, :3], axis=1),
+            1e3 * np.linalg.norm(ticks["handle_position"] - origin, axis=1),
+            1e3 * ticks["environment_energy"],
+            1e3 * ticks["device_energy"],
+        )
+        for axes, values in zip(panels, drawn, strict=True):
+            if not (np.abs(values) < DRAWABLE).all():
+                raise RecordingError(f"the run '{run.name}' holds numbers that cannot be drawn")
+            axes.plot(
+                *decimated(time, values, bins), color=colour, ls=line, lw=width, label=run.name
+            )
+    labels = (
+        "force on the device (N)",
+        "handle's distance from its start (mm)",
+        "energy that the environment\ncreated (+) or dissipated (−) (mJ)",
+        "energy that the device was\ngiven (+) or gave (−) (mJ)",
+    )
+    for axes, label in zip(panels, labels, strict=True):
+        axes.set_ylabel(label)
+        axes.grid(alpha=0.3)
+        axes.margins(x=0.01)
+    for axes in panels[2:]:
+        axes.axhline(0.0, color="black", lw=0.6)
+    panels[-1].set_xlabel("time (s)")
+    # above the curves, not on them
+    panels[0].legend(
+        loc="lower right", bbox_to_anchor=(1, 1), fontsize="small", ncols=3, frameon=False
+    )
+    told = ", ".join(f"{name} {old} → {new}" for name, old, new in changes(found))
+    title = f"{found.path.name}, what if {told or 'nothing is changed'}"
+    figure.suptitle(
+        "".join(letter if letter.isprintable() else "�" for letter in title),
+        fontsize="medium",
+        parse_math=False,
+        wrap=True,
+    )
+    return figure
+
+
+def draw_what_if(found: WhatIf, path: Path) -> None:
+    """Writes ``figure_of`` to a picture file.
+
+    Raises:
+        RecordingError: It cannot be drawn.
+        HapticBridgeError: The file's extension is no picture format, or it cannot be written.
+    """
+    write_picture(figure_of(found), path)
 
 
 def write_what_if(found: WhatIf, path: Path, scene: bytes | None = None) -> None:
@@ -29,7 +151,7 @@ def write_what_if(found: WhatIf, path: Path, scene: bytes | None = None) -> None
         RecordingError: The page cannot be written, or not under this name.
     """
     try:
-        drawn = inline_svg(figure_of(found, BINS))
+        drawn = inline_svg(figure_of(found, PLOT_BINS))
     except RecordingError:  # a run that cannot be drawn still has a verdict
         drawn = ""
     write_page(

@@ -6,29 +6,91 @@ import hashlib
 import json
 import math
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
-from hapticbridge.certificate import needed_on_axes
+from hapticbridge.certificate import required_axis_damping
 from hapticbridge.clock import period_of
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import HapticBridgeError, RecordingError
-from hapticbridge.guard import CONTROLLERS, Limits, guarding_for
+from hapticbridge.guard import CONTROLLERS, Limits, guard_parameters_for
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.pose import IDENTITY_POSE
-from hapticbridge.provenance import (
-    compiled_model,
-    parameters_of,
-)
+from hapticbridge.record import TickFlag
 from hapticbridge.recording import Recording
 from hapticbridge.rendering import Method, method_named, prepare
+from hapticbridge.run_description import SOURCE_PREFIX, compiled_model, parameters_of
 from hapticbridge.scene import Scene, load_scene, scene_parameters
-from hapticbridge.tick import TickFlag
-from hapticbridge.whatif.changes import Settings
-from hapticbridge.whatif.exact import that_gives
-from hapticbridge.whatif.unpacked import unpack_scene
+from hapticbridge.whatif.settings import Settings
+
+# Exact inversion of a floating-point function.
+
+NEIGHBOURS = 8
+"""Number of doubles tried on either side of a guess. A product and a sum are off by two at most;
+more would only cost time."""
+
+
+def invert_exactly(wanted: float, function: Callable[[float], float], guess: float) -> float:
+    """Returns the input near a guess whose computed value equals the wanted one bit for bit.
+
+    A recording holds T and B', not the requested rate and B. Recomputed from 1/T and B' + K T/2, T
+    and B' may differ in the last digit, and the repetition would no longer be exact.
+
+    Args:
+        wanted: Value to be reproduced.
+        function: Function from the input to the value.
+        guess: Approximate input.
+
+    Returns:
+        The input, or the guess if no neighbour gives the value.
+    """
+    up = down = guess
+    for _ in range(NEIGHBOURS + 1):
+        for candidate in (up, down):
+            if function(candidate) == wanted:
+                return candidate
+        up, down = math.nextafter(up, math.inf), math.nextafter(down, -math.inf)
+    return guess
+
+
+# Scene files of a recording.
+
+
+def unpack_scene(recording: Recording, folder: Path) -> Path:
+    """Writes a recording's scene files to a folder; returns the main file.
+
+    Args:
+        recording: The recording.
+        folder: Target folder, created if missing. Nothing is written outside it.
+
+    Raises:
+        RecordingError: The recording carries no scene, or files that cannot be written there.
+    """
+    main: Path | None = None
+    for name, data in recording.attachments.items():
+        if not name.startswith(SOURCE_PREFIX):
+            continue
+        inner = PurePosixPath(name.removeprefix(SOURCE_PREFIX))
+        # a foreign recording must not write outside the folder
+        if inner.is_absolute() or ".." in inner.parts or "\\" in name or ":" in name:
+            raise RecordingError(
+                f"the attachment {name!r:.80} would lie outside the scene's folder"
+            )
+        path = folder / inner
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(data)
+        except (OSError, ValueError) as error:
+            raise RecordingError(
+                f"the attachment {name!r:.80} cannot be unpacked: {error}"
+            ) from None
+        main = main or path
+    if main is None:
+        raise RecordingError(f"{recording.path} carries no scene, so it cannot be simulated again")
+    return main
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +133,7 @@ class RecordedRun:
         settings = Settings(
             coupling=_asked_for(parameters.coupling, method, step),
             method=method,
-            rate=that_gives(parameters.period, period_of, 1.0 / parameters.period),
+            rate=invert_exactly(parameters.period, period_of, 1.0 / parameters.period),
             substeps=parameters.substeps,
             scale=parameters.scale,
             force_scale=parameters.force_scale,
@@ -95,13 +157,17 @@ class RecordedRun:
         most = p.force_limit * p.period
         rise = 0.0  # steps are allowed
         if guarding.force_rise < math.inf:
-            rise = that_gives(guarding.force_rise, lambda s: most / s, most / guarding.force_rise)
+            rise = invert_exactly(
+                guarding.force_rise, lambda s: most / s, most / guarding.force_rise
+            )
         return Limits(
             force=p.force_limit,
             torque=p.torque_limit,
             rise=rise,
             ramp=p.ramp_ticks * p.period,
-            stretch=that_gives(guarding.stretch, lambda m: m * p.scale, guarding.stretch / p.scale),
+            stretch=invert_exactly(
+                guarding.stretch, lambda m: m * p.scale, guarding.stretch / p.scale
+            ),
             angle=guarding.angle,
             energy=guarding.energy,
             reach=guarding.reach,
@@ -168,7 +234,7 @@ def _asked_for(used: Coupling, method: Method, step: float) -> Coupling:
         return float(getattr(method.used(replace(felt, **{name: value}), step), name))
 
     asked = {
-        name: that_gives(getattr(used, name), partial(made, name), getattr(felt, name))
+        name: invert_exactly(getattr(used, name), partial(made, name), getattr(felt, name))
         for name in ("damping", "rotational_damping")
     }
     return replace(felt, **asked)
@@ -178,9 +244,9 @@ def _controller(info: DeviceInfo, parameters: RunParameters, method: Method) -> 
     """Returns the run's passivity controller; None if it is the bridge's default."""
     p = parameters
     scales = p.scale, p.force_scale
-    needed = needed_on_axes(info, p.coupling, p.period, *scales, p.laws, method)
+    needed = required_axis_damping(info, p.coupling, p.period, *scales, p.laws, method)
     limits = Limits(force=p.force_limit, torque=p.torque_limit)
-    usual = guarding_for(info, limits, p.period, needed=needed, scale=p.scale)
+    usual = guard_parameters_for(info, limits, p.period, needed=needed, scale=p.scale)
     if usual.controller == p.guarding.controller:
         return None
     return next(name for name, code in CONTROLLERS.items() if code == p.guarding.controller)

@@ -16,7 +16,7 @@ from usb_tiers.benches import DAMPING, FRICTION, MASS, falcon
 from emulated.guest import CHECKOUT
 from emulated.virtual_usb import VirtualClock, VirtualLink, VirtualTime
 from hapticbridge.bridge import Bridge
-from hapticbridge.device.falcon.driver import FalconDevice
+from hapticbridge.device.falcon.device import FalconDevice
 from hapticbridge.jit import cache_folder
 
 _LONG_ENOUGH = 0.01

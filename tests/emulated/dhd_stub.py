@@ -15,8 +15,8 @@ import pytest
 from numpy.typing import NDArray
 
 from hapticbridge.device import Motion
-from hapticbridge.device.forcedimension.driver import ForceDimensionDevice
-from hapticbridge.device.forcedimension.library import Dhd
+from hapticbridge.device.force_dimension.device import ForceDimensionDevice
+from hapticbridge.device.force_dimension.dhd import Dhd
 
 SOURCE = Path(__file__).with_name("dhd_stub.c")
 OMEGA3, OMEGA6, SIGMA7 = 33, 34, 104

@@ -8,7 +8,7 @@ from typing import Any
 from emulated.hid_device import HidDevice
 from emulated.timed import Timed
 from emulated.usb_device import StallError
-from hapticbridge.device.transport.hid_search import HidHandle
+from hapticbridge.device.transport.hid import HidHandle
 
 
 class HidSeam:

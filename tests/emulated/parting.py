@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 import hapticbridge as hb
 from emulated.guest import GuestRun
-from hapticbridge.tick import COLUMNS, Column
+from hapticbridge.record import COLUMNS, Column
 
 MOST_NAMED = 8
 """How many columns are named: those in the first record that differs, before the rest is counted.

@@ -26,8 +26,8 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.device.simulated.hand import DEFAULT_HAND, Hand
 from hapticbridge.errors import DeviceError, DeviceLost
 from hapticbridge.guard import Limits
-from hapticbridge.passivity import WorstHand
 from hapticbridge.recording.ring import HEAD, TAIL
+from hapticbridge.theory.sampled_loop import WorstHand
 from hapticbridge.view.address import Address
 from hapticbridge.view.window import Window
 
@@ -329,7 +329,7 @@ def _full_ring(rig: Rig) -> None:
     """The recorder stands still for 1 s behind a ring of 0.2 s."""
 
     def around(stack: ExitStack) -> None:
-        stack.enter_context(patch("hapticbridge.recording.stream.RING_SECONDS", 0.2))
+        stack.enter_context(patch("hapticbridge.recording.recorder.RING_SECONDS", 0.2))
 
     def act(bridge: Bridge, tick: int) -> None:
         recorder, cursors = bridge._stream.recorder, bridge._stream.cursors

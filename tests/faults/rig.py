@@ -16,11 +16,11 @@ from hapticbridge.bridge import Bridge
 from hapticbridge.clock import SimulatedClock
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import SimulatedDevice
-from hapticbridge.device.trajectory.motion import Motion
+from hapticbridge.device.trajectory import Motion
 from hapticbridge.errors import HapticBridgeError
 from hapticbridge.guard import Limits
+from hapticbridge.record import SAMPLE_DTYPE, TickFlag
 from hapticbridge.recording import read_recording
-from hapticbridge.tick import SAMPLE_DTYPE, TickFlag
 
 PERIOD = 1e-3
 CAUSE = 1500

@@ -16,8 +16,8 @@ from faults.catalogue import FAULTS, PUSHED, RING_FULL, Fault
 from faults.rig import CAUSE, Outcome, Rig
 from hapticbridge.audit import audit
 from hapticbridge.guard import USUAL_ENERGY
+from hapticbridge.record import TickFlag
 from hapticbridge.recording import read_recording
-from hapticbridge.tick import TickFlag
 
 LIMIT, MOST_ENERGY = 10.0, 0.05
 """In N, of the rig, and in J, beyond what the hand put in."""

@@ -20,8 +20,8 @@ from test_bridge_commands import FLOOR, swaying
 from hapticbridge.audit import audit
 from hapticbridge.bridge import Bridge
 from hapticbridge.clock import SimulatedClock
+from hapticbridge.record import TICK_DTYPE
 from hapticbridge.recording import read_recording
-from hapticbridge.tick import TICK_DTYPE
 from hapticbridge.view.address import Address
 from hapticbridge.view.window import Window
 

@@ -14,7 +14,7 @@ import usb.util
 from emulated.echo import VENDOR, EchoHid, EchoUsb
 from emulated.emulator_process import EmulatorProcess
 
-from hapticbridge.device.transport.usb_search import libusb
+from hapticbridge.device.transport.usb import libusb
 from usb_tiers.conftest import IS_TIME_VIRTUAL, Plug
 from usb_tiers.waiting import wait_for
 

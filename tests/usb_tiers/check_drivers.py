@@ -17,7 +17,7 @@ import hapticbridge as hb
 from hapticbridge.device import Device
 from hapticbridge.device.discovery import plugged_devices
 from hapticbridge.errors import DeviceError, DeviceLost, SafetyTrip
-from hapticbridge.tick import SAMPLE_DTYPE
+from hapticbridge.record import SAMPLE_DTYPE
 from usb_tiers.benches import (
     DAMPING,
     FALCON,

@@ -70,6 +70,6 @@ def no_spin(monkeypatch: pytest.MonkeyPatch) -> None:
 def _patience(monkeypatch: pytest.MonkeyPatch) -> None:
     """Bears silent devices for longer on the wall clock: a busy machine stalls their processes."""
     if not IS_TIME_VIRTUAL:
-        monkeypatch.setattr("hapticbridge.device.falcon.driver.SILENCE", 5.0)
-        monkeypatch.setattr("hapticbridge.device.silence.SILENCE", 5.0)
+        monkeypatch.setattr("hapticbridge.device.falcon.device.SILENCE", 5.0)
+        monkeypatch.setattr("hapticbridge.device.watchdog.SILENCE", 5.0)
         monkeypatch.setattr("hapticbridge.device.transport.hid.LONGEST_WRITE", 5.0)

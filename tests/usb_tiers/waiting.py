@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import TypeVar
 
 from hapticbridge.device.discovery import plugged_devices
-from hapticbridge.device.plugged import Plugged
+from hapticbridge.device.family import FoundDevice
 
 _Found = TypeVar("_Found")
 
@@ -26,6 +26,6 @@ def wait_for(look: Callable[[], _Found], seconds: float = 10.0) -> _Found:
     return found
 
 
-def usable_devices() -> list[Plugged]:
+def usable_devices() -> list[FoundDevice]:
     """Lists what can be opened: the kernel tells of a device before its node is there."""
     return [device for device in plugged_devices() if device.problem is None]

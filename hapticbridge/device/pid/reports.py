@@ -14,8 +14,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from hapticbridge.device.transport.hid_descriptor import FEATURE, OUTPUT, Field
-from hapticbridge.device.transport.hid_layout import (
+from hapticbridge.device.transport.hid_descriptor import (
+    FEATURE,
+    OUTPUT,
+    Field,
     Layout,
     Place,
     as_number,

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hapticbridge.arguments import Arguments
-from hapticbridge.device.data_sheet import checked_number
+from hapticbridge.device.base import checked_number
 from hapticbridge.errors import DeviceError
 
 

@@ -10,7 +10,7 @@ References:
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
 from hapticbridge.errors import DeviceError
@@ -215,3 +215,154 @@ def _fields(state: _State, kind: int, flags: int) -> list[Field]:
             exponent=exponent,
         )
     ]
+
+
+# A HID device's reports by usage: where a value is, how it is read, and how it is written.
+
+WIDEST = 32
+"""Bits of the widest value that is read or written; the standard's own limit."""
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """One element of a field: where a single value lies.
+
+    Attributes:
+        field: What it belongs to.
+        offset: Its first bit, the byte of the report's number counted.
+    """
+
+    field: Field
+    offset: int
+
+    @property
+    def mask(self) -> int:
+        """As many ones as it has bits."""
+        return (1 << self.field.size) - 1
+
+    def read(self, report: int) -> int:
+        """Returns the logical value in a report.
+
+        Args:
+            report: Its bytes as one number, the lowest first, the report's number among them.
+        """
+        value = report >> self.offset & self.mask
+        is_negative = self.field.minimum < 0 and value >> (self.field.size - 1)
+        return value - (1 << self.field.size) if is_negative else value
+
+    def bits(self, value: int) -> int:
+        """Returns a logical value, kept within its range, as a report with only that in it."""
+        field = self.field
+        return (min(max(value, field.minimum), field.maximum) & self.mask) << self.offset
+
+    def share(self, share: float) -> int:
+        """Returns the logical value at a share of the range, 0: least, 1: most."""
+        return self.field.minimum + round(share * (self.field.maximum - self.field.minimum))
+
+
+class Layout:
+    """All reports of a device, as its descriptor has them.
+
+    Args:
+        descriptor: The report descriptor.
+
+    Attributes:
+        fields: All of them, padding too.
+        is_numbered: Whether reports begin with their number.
+
+    Raises:
+        DeviceError: The descriptor is none.
+    """
+
+    def __init__(self, descriptor: bytes) -> None:
+        self.fields = fields_of(descriptor)
+        self.is_numbered = any(field.report for field in self.fields)
+
+    def within(self, kind: int, collection: int) -> list[Field]:
+        """Returns the fields of a kind inside a collection of that usage, of its first report."""
+        inside = [
+            field
+            for field in self.fields
+            if field.kind == kind and collection in field.collections and field.size <= WIDEST
+        ]
+        return [field for field in inside if field.report == inside[0].report]
+
+    def length(self, kind: int, report: int) -> int:
+        """Returns how many bytes a report has, its number counted."""
+        ends = [
+            field.offset + field.size * field.count
+            for field in self.fields
+            if (field.kind, field.report) == (kind, report)
+        ]
+        return 1 + (max(ends, default=0) + 7) // 8
+
+
+def place_of(fields: list[Field], usage: int) -> Place | None:
+    """Returns where the value of a usage lies: the first variable element that has it."""
+    for field in fields:
+        if field.is_variable and usage in field.usages[: field.count]:
+            return element(field, field.usages.index(usage))
+    return None
+
+
+def element(field: Field, index: int) -> Place:
+    """Returns a field's element by its index, from 0."""
+    return Place(field, 8 + field.offset + index * field.size)
+
+
+def chosen_bits(fields: list[Field], usage: int) -> int | None:
+    """Returns the bits that choose a usage among others; None where it is none of them.
+
+    In an array the element's value says which, counted from its least value in the order of the
+    descriptor; elsewhere each choice is a flag of its own.
+    """
+    for field in fields:
+        if usage not in field.usages:
+            continue
+        if not field.is_variable:
+            return element(field, 0).bits(field.minimum + field.usages.index(usage))
+        if field.usages.index(usage) < field.count:
+            place = element(field, field.usages.index(usage))
+            return place.bits(field.maximum)
+    return None
+
+
+def chosen_usage(fields: list[Field], report: int) -> int | None:
+    """Returns which usage a report chooses, the other way round; None where it chooses none."""
+    for field in fields:
+        if field.usages and not field.is_variable:
+            index = element(field, 0).read(report) - field.minimum
+            return field.usages[index] if 0 <= index < len(field.usages) else None
+        for index, usage in enumerate(field.usages[: field.count]):
+            if element(field, index).read(report):
+                return usage
+    return None
+
+
+def composed(number: int, length: int, bits: int) -> bytes:
+    """Returns a report of a number and a length with these bits in it."""
+    return (number | bits).to_bytes(length, "little")
+
+
+def as_number(layout: Layout, report: bytes) -> int:
+    """Returns a report that came as one number, with a zero in the place of a missing number."""
+    return int.from_bytes(report if layout.is_numbered else b"\0" + report, "little")
+
+
+def filled(places: Mapping[Place, int]) -> int:
+    """Returns the bits of several values together."""
+    bits = 0
+    for place, value in places.items():
+        bits |= place.bits(value)
+    return bits
+
+
+def required(found: Place | None, name: str) -> Place:
+    """Returns what was found.
+
+    Raises:
+        DeviceError: Nothing was; names it.
+    """
+    if found is None:
+        raise DeviceError(f"its reports lack {name}")
+    return found

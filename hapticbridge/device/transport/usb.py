@@ -9,15 +9,292 @@ import sys
 import threading
 import time
 from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
+import libusb_package
+import usb.backend.libusb1
+import usb.backend.libusb1 as pyusb
 import usb.core
 import usb.util
 
-from hapticbridge.device.plugged import Family, Plugged, permission_problem
-from hapticbridge.device.transport.hex_log import HexLog
-from hapticbridge.device.transport.usb_search import devices_of, libusb, node_of
+from hapticbridge.device.family import Driver, FoundDevice, access_problem, permission_problem
+from hapticbridge.device.transport.trace import HexLog
 from hapticbridge.errors import DeviceError, DeviceLost
+
+# What the kernel says is on the USB bus, read from sysfs: needs no libusb and no permission.
+
+BUS = Path("/sys/bus/usb/devices")
+"""Where Linux lists what is plugged in; absent on a machine without USB and on other systems."""
+
+NODES = Path("/dev/bus/usb")
+"""Where libusb opens a device: a folder per bus, a node per device."""
+
+
+@dataclass(frozen=True, slots=True)
+class OnTheBus:
+    """One device on the USB bus.
+
+    Attributes:
+        vendor: 16 bits.
+        product: 16 bits.
+        name: Its product string, empty where it has none.
+        serial: Its serial number, likewise.
+        node: What libusb opens.
+        has_hidraw: Whether any of its interfaces has a hidraw node.
+    """
+
+    vendor: int
+    product: int
+    name: str
+    serial: str
+    node: Path
+    has_hidraw: bool
+
+
+def on_the_bus(bus: Path | None = None) -> list[OnTheBus]:
+    """Lists the devices on the USB bus, in the order of their places on it.
+
+    Args:
+        bus: The folder of sysfs that lists them; None takes ``BUS``.
+
+    Returns:
+        Empty where there is no bus. A device that goes away meanwhile is left out.
+    """
+    folder = BUS if bus is None else bus
+    found = []
+    try:
+        entries = sorted(folder.iterdir())
+    except OSError:
+        return []
+    for entry in entries:
+        try:
+            numbers = [
+                int(_text(entry / name), base)
+                for name, base in (("idVendor", 16), ("idProduct", 16), ("busnum", 10))
+            ]
+            device = int(_text(entry / "devnum"))
+        except (OSError, ValueError):
+            continue  # an interface and not a device, or one that has just gone
+        vendor, product, number = numbers
+        found.append(
+            OnTheBus(
+                vendor=vendor,
+                product=product,
+                name=_text_or_nothing(entry / "product"),
+                serial=_text_or_nothing(entry / "serial"),
+                node=NODES / f"{number:03d}" / f"{device:03d}",
+                has_hidraw=any(entry.glob("*/*/hidraw/hidraw*")),
+            )
+        )
+    return found
+
+
+def members(
+    family: Driver, devices: Iterable[OnTheBus], problem: Callable[[OnTheBus], str | None]
+) -> list[FoundDevice]:
+    """Returns those of a family, as they are listed.
+
+    Args:
+        family: Which.
+        devices: What is on the bus.
+        problem: Says why a device cannot be opened; None where it can.
+    """
+    return [
+        FoundDevice(
+            family=family.name,
+            name=device.name or model,
+            serial=device.serial,
+            path=str(device.node),
+            vendor=device.vendor,
+            product=device.product,
+            transport=family.transport,
+            problem=problem(device),
+        )
+        for device in devices
+        if (model := family.model(device.vendor, device.product)) is not None
+    ]
+
+
+def _text(path: Path) -> str:
+    return path.read_text(encoding="utf-8", errors="replace").strip()
+
+
+def _text_or_nothing(path: Path) -> str:
+    try:
+        return _text(path)
+    except OSError:
+        return ""
+
+
+# A libusb context that ends after what belongs to it, in whatever order Python lets go of them.
+#
+# pyusb lets each of its objects free what it holds. Where a context and its devices go together
+# as part of a cycle (an exception with its frames is one), Python finalizes them in any order,
+# and to unreference a device or to close it after ``libusb_exit`` is an access to freed memory.
+
+
+class _Users:
+    """Counts what needs a context; the last one ends it."""
+
+    def __init__(self) -> None:
+        self.count = 1  # the context itself
+        self.end: Any = None
+
+    def release(self) -> None:
+        self.count -= 1
+        if not self.count:
+            self.end()
+
+
+class _Device(pyusb._Device):  # type: ignore[misc] # pyusb has no types
+    def __init__(self, device: Any, users: _Users) -> None:
+        self._users = users
+        users.count += 1
+        super().__init__(device)
+
+    def _finalize_object(self) -> None:
+        super()._finalize_object()
+        self._users.release()
+
+
+class _Devices(pyusb._DevIterator):  # type: ignore[misc] # likewise
+    def __init__(self, context: Any, users: _Users) -> None:
+        self._users = users
+        users.count += 1
+        super().__init__(context)
+
+    def __iter__(self) -> Iterator[_Device]:
+        for index in range(self.num_devs):
+            yield _Device(self.dev_list[index], self._users)
+
+    def _finalize_object(self) -> None:
+        super()._finalize_object()
+        self._users.release()
+
+
+class UsbContext(pyusb._LibUSB):  # type: ignore[misc] # likewise
+    """pyusb's backend, with a context of its own.
+
+    Args:
+        library: libusb, as pyusb has loaded it.
+
+    Raises:
+        usb.core.USBError: libusb cannot begin.
+    """
+
+    def __init__(self, library: Any) -> None:
+        super().__init__(library)
+        self._users = _Users()
+        context = self.ctx
+        self._users.end = lambda: library.libusb_exit(context)
+
+    def _finalize_object(self) -> None:
+        if hasattr(self, "_users"):  # else there is no context
+            self._users.release()
+
+    def enumerate_devices(self) -> _Devices:
+        """Lists what is plugged in."""
+        return _Devices(self.ctx, self._users)
+
+    def open_device(self, device: Any) -> Any:
+        """Opens a device; the context lives until it is closed."""
+        handle = super().open_device(device)
+        self._users.count += 1
+        return handle
+
+    def close_device(self, handle: Any) -> None:
+        """Closes a device."""
+        super().close_device(handle)
+        self._users.release()
+
+
+# Which USB devices are plugged in, as libusb and the kernel tell it.
+
+
+def libusb() -> Any:
+    """Returns a fresh libusb context for pyusb, or None where there is no libusb or no USB.
+
+    Fresh, because an old one does not hear of devices plugged in later where udev does not run.
+    The system's libusb is preferred to the one of ``libusb-package``.
+    """
+    module = usb.backend.libusb1
+    for find_library in (None, libusb_package.find_library):
+        try:
+            if module.get_backend(find_library=find_library) is not None:
+                # pyusb offers no way to a second context
+                return UsbContext(module._lib)
+        except (usb.core.USBError, OSError):
+            continue
+    return None
+
+
+def find(family: Driver, backend: Any = None) -> list[FoundDevice]:
+    """Lists the family's devices that are plugged in, with what keeps each from being opened.
+
+    On Linux the kernel tells, without a device's being opened, which a running loop would feel;
+    elsewhere libusb is asked.
+
+    Args:
+        family: What to look for.
+        backend: A pyusb backend to ask; None takes kernel or libusb.
+
+    Returns:
+        One entry per device, in the order of their places on the bus.
+    """
+    listed = [] if backend is not None else members(family, on_the_bus(), _problem)
+    source = libusb() if backend is None and not listed else backend
+    return listed if source is None else [_described(family, d) for d in devices_of(family, source)]
+
+
+def _problem(device: OnTheBus) -> str | None:
+    if libusb() is None:
+        return "libusb cannot be loaded; reinstall the package 'libusb-package'"
+    return access_problem(str(device.node))
+
+
+def devices_of(family: Driver, backend: Any) -> list[Any]:
+    """Returns pyusb's devices that are of a family, in the order of their places on the bus."""
+    try:
+        devices: Iterable[Any] = usb.core.find(find_all=True, backend=backend)
+        known = [d for d in devices if family.model(d.idVendor, d.idProduct) is not None]
+    except (usb.core.USBError, NotImplementedError):  # the second: libusb cannot list them here
+        return []
+    return sorted(known, key=node_of)
+
+
+def node_of(device: Any) -> str:
+    """Returns where Linux keeps the device of pyusb: what tells two of a model apart."""
+    return str(NODES / f"{device.bus or 0:03d}" / f"{device.address or 0:03d}")
+
+
+def _described(family: Driver, device: Any) -> FoundDevice:
+    node, problem, texts = node_of(device), None, ["", ""]
+    try:
+        device.get_active_configuration()  # opens it; reading texts would hide why it cannot
+        texts = [
+            usb.util.get_string(device, index) or "" if index else ""
+            for index in (device.iProduct, device.iSerialNumber)
+        ]
+    except usb.core.USBError as error:
+        problem = permission_problem(node) if error.errno == errno.EACCES else None
+    except (ValueError, NotImplementedError):
+        pass  # it has no texts, or libusb cannot open it here (as pyusb says that)
+    finally:
+        usb.util.dispose_resources(device)
+    return FoundDevice(
+        family=family.name,
+        name=texts[0] or family.model(device.idVendor, device.idProduct) or family.name,
+        serial=texts[1],
+        path=node,
+        vendor=device.idVendor,
+        product=device.idProduct,
+        transport="usb",
+        problem=problem,
+    )
+
 
 PACKET = 64
 """Bytes per bulk packet on full speed. Reads ask for one packet each, so that they end with it."""
@@ -76,8 +353,8 @@ class UsbLink:
     @classmethod
     def open(
         cls,
-        plugged: Plugged,
-        family: Family,
+        plugged: FoundDevice,
+        family: Driver,
         *,
         read_from: int,
         write_to: int,

@@ -9,7 +9,7 @@ import sys
 import time
 from typing import Any, Protocol
 
-from hapticbridge.device.transport.hex_log import HexLog
+from hapticbridge.device.transport.trace import HexLog
 from hapticbridge.device.transport.usb import SWITCH_INTERVAL
 from hapticbridge.errors import DeviceError, DeviceLost
 

@@ -8,7 +8,7 @@ from functools import cache
 
 import numpy as np
 
-from hapticbridge.check.observation import quiet
+from hapticbridge.check.observe import quiet
 from hapticbridge.errors import HapticBridgeError, StudyError
 from hapticbridge.study.chart.convergence import Order, convergence_orders
 from hapticbridge.study.chart.engine_run import EngineRun, PeerWork

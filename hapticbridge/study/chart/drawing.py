@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
-from hapticbridge.picture import new_figure
+from hapticbridge.plotting import new_figure
 from hapticbridge.study.chart.chart import Chart
 from hapticbridge.study.chart.convergence import Order
 from hapticbridge.study.chart.measurement import Measurement

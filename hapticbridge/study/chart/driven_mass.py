@@ -10,14 +10,14 @@ from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
 from hapticbridge.coupling import Coupling
-from hapticbridge.mechanics.coupled_mass import exact_mass_response
+from hapticbridge.record import TICK_DTYPE
 from hapticbridge.scene import load_scene
 from hapticbridge.study.chart.engine_run import PeerWork, work_of
 from hapticbridge.study.chart.scene_run import Stage, Stages, Take
 from hapticbridge.study.chart.score import Score, diverged, score_of
 from hapticbridge.study.chart.staged import Staged
 from hapticbridge.study.chart.workload import Panel
-from hapticbridge.tick import TICK_DTYPE
+from hapticbridge.theory.rigid_body import exact_mass_response
 
 MASS, INERTIA = 0.1, 9e-6
 """Of the ball in ``models/point_mass`` in kg, and about any axis in kg m²."""

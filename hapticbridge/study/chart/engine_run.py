@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Motion
 from hapticbridge.errors import HapticBridgeError, StudyError
+from hapticbridge.record import TICK_DTYPE
 from hapticbridge.rendering import METHODS
 from hapticbridge.scene import Scene
 from hapticbridge.study.chart.scene_run import Judge, Path, Take
@@ -20,7 +21,6 @@ from hapticbridge.study.chart.setting import Setting
 from hapticbridge.study.engines.base import Engine, Simulation
 from hapticbridge.study.engines.from_scene import task_from_scene
 from hapticbridge.study.engines.task import Pose, Task, Velocity, composed
-from hapticbridge.tick import TICK_DTYPE
 
 HELD = METHODS["explicit"]
 """How engines get the coupling: a force that is computed after a step and held in the next. Those

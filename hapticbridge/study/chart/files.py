@@ -13,9 +13,9 @@ from typing import Any
 from matplotlib.figure import Figure
 
 from hapticbridge.errors import StudyError
-from hapticbridge.jsonable import jsonable
-from hapticbridge.picture import write_picture
-from hapticbridge.provenance import versions
+from hapticbridge.files import finite_or_null
+from hapticbridge.plotting import write_picture
+from hapticbridge.run_description import versions
 from hapticbridge.study.chart.chart import Chart
 from hapticbridge.study.chart.drawing import draw_chart
 from hapticbridge.study.chart.page import chart_page
@@ -166,5 +166,5 @@ def summary_of(chart: Chart) -> dict[str, Any]:
         "panels": panels,
         "points": points,
     }
-    found: dict[str, Any] = jsonable(said)
+    found: dict[str, Any] = finite_or_null(said)
     return found

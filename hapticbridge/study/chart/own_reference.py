@@ -7,14 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.check.felt import felt_error
+from hapticbridge.check.perception import felt_error
 from hapticbridge.errors import HapticBridgeError, StudyError
-from hapticbridge.kernel.simulation import simulate
+from hapticbridge.kernel.tick import simulate
+from hapticbridge.record import TICK_DTYPE
 from hapticbridge.rendering import METHODS, Method
 from hapticbridge.study.chart.scene_run import Stage, Stages, Take
 from hapticbridge.study.chart.score import NAN, Score, diverged, score_of
 from hapticbridge.study.chart.setting import OWN, Setting
-from hapticbridge.tick import TICK_DTYPE
 
 REFINEMENT = 32
 """How many times smaller the reference's step is than the smallest step of the chart."""

@@ -8,6 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from hapticbridge.coupling import Coupling
+from hapticbridge.record import TICK_DTYPE
 from hapticbridge.scene import Scene, load_scene
 from hapticbridge.study.chart.engine_run import PeerWork, work_of
 from hapticbridge.study.chart.own_reference import REFINEMENT, OwnReferences
@@ -17,7 +18,6 @@ from hapticbridge.study.chart.scene_run import Stage, Stages, Take
 from hapticbridge.study.chart.score import Score, diverged, score_of
 from hapticbridge.study.chart.staged import Staged
 from hapticbridge.study.chart.workload import Panel
-from hapticbridge.tick import TICK_DTYPE
 
 SETTLED = Panel(
     "settled",

@@ -9,9 +9,8 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 
-from hapticbridge.check.felt import WEBER
+from hapticbridge.check.perception import WEBER
 from hapticbridge.coupling import Coupling
-from hapticbridge.mechanics import Impact, ImpactBody, resolve_impact
 from hapticbridge.pose import quaternion_exp
 from hapticbridge.scene import Scene
 from hapticbridge.study.chart.engine_run import PeerWork
@@ -22,6 +21,7 @@ from hapticbridge.study.chart.staged import Staged
 from hapticbridge.study.chart.workload import Panel
 from hapticbridge.study.engines.task import Body, Pose, Shape, Task, Velocity
 from hapticbridge.study.maps.rigs import scene_of
+from hapticbridge.theory.impact import Impact, ImpactBody, resolve_impact
 
 MASS, LENGTH = 0.1, 0.2
 """Of a uniform rod, in kg and m: a light tool."""

@@ -7,12 +7,13 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.check.motion import motion_for
+from hapticbridge.check.case import motion_for
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Motion
-from hapticbridge.device.trajectory.motion import pose_at
+from hapticbridge.device.trajectory import pose_at
 from hapticbridge.errors import StudyError
-from hapticbridge.kernel.simulation import simulate
+from hapticbridge.kernel.tick import simulate
+from hapticbridge.record import TICK_DTYPE
 from hapticbridge.rendering import IMPLICIT
 from hapticbridge.scene import load_scene
 from hapticbridge.study.chart.engine_run import PeerWork
@@ -22,7 +23,6 @@ from hapticbridge.study.chart.score import Score
 from hapticbridge.study.chart.setting import Setting
 from hapticbridge.study.chart.staged import Staged
 from hapticbridge.study.chart.workload import Panel
-from hapticbridge.tick import TICK_DTYPE
 
 COUPLING = Coupling(1000.0, 1.0, 1.0, 1e-3)
 """K = 1000 N/m and B = 1 N s/m: what the default simulated device (b = 2 N s/m) certifies at 1 kHz,

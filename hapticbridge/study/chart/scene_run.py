@@ -11,16 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.coupling import Coupling
-from hapticbridge.kernel.scheme import WELD
-from hapticbridge.kernel.simulation import simulate
-from hapticbridge.kernel.state import Binding
-from hapticbridge.ledger import Ledger
+from hapticbridge.kernel.codes import WELD
+from hapticbridge.kernel.state import BoundKernel
+from hapticbridge.kernel.tick import simulate
+from hapticbridge.options import run_parameters
+from hapticbridge.record import SAMPLE_DTYPE, TICK_DTYPE
 from hapticbridge.rendering import prepare
 from hapticbridge.scene import Scene
 from hapticbridge.study.chart.score import Score, Verdict
 from hapticbridge.study.chart.setting import Setting, ShippedOptions
-from hapticbridge.tick import SAMPLE_DTYPE, TICK_DTYPE
-from hapticbridge.workspace import run_parameters
+from hapticbridge.summary import Ledger
 
 Path = Callable[[NDArray[np.float64]], tuple[NDArray[np.float64], NDArray[np.float64]]]
 """The handle's motion: times in s, shape (n,), to positions in m, (n, 3), and quaternions (n, 4),
@@ -145,7 +145,7 @@ class Stage:
                 judge(self._take(setting, binding, rows[:done], samples.size))
         return seconds
 
-    def bound(self, setting: Setting, start: Start | None = None) -> Binding:
+    def bound(self, setting: Setting, start: Start | None = None) -> BoundKernel:
         """Puts the scene to its start, and binds it for the compiled loop.
 
         Raises:
@@ -164,9 +164,11 @@ class Stage:
         parameters = run_parameters(
             scene, self.coupling, method, first, period=period, felt=felt, substeps=setting.substeps
         )
-        return Binding(scene.model, scene.data, parameters)
+        return BoundKernel(scene.model, scene.data, parameters)
 
-    def _take(self, setting: Setting, binding: Binding, rows: NDArray[np.void], ticks: int) -> Take:
+    def _take(
+        self, setting: Setting, binding: BoundKernel, rows: NDArray[np.void], ticks: int
+    ) -> Take:
         warnings = self._scene.data.warning
         ended = ""
         if rows.size < ticks:

@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.check.felt import felt_error
+from hapticbridge.check.perception import felt_error
 
 Verdict = Literal[
     "strict", "within slack", "active", "lost contact", "diverged", "failed", "not metered"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from hapticbridge.errors import StudyError
-from hapticbridge.kernel.scheme import DIRECT, LOSSLESS
+from hapticbridge.kernel.codes import DIRECT, LOSSLESS
 from hapticbridge.rendering import METHODS, Method, method_named
 from hapticbridge.study.chart.setting import CONTACTS, SHIPPED, Setting
 

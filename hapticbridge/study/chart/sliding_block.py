@@ -11,6 +11,7 @@ from scipy.linalg import expm
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Motion
 from hapticbridge.errors import StudyError
+from hapticbridge.record import TICK_DTYPE
 from hapticbridge.scene import Scene
 from hapticbridge.study.chart.engine_run import PeerWork, motion_along
 from hapticbridge.study.chart.scene_run import Stage, Stages, Take
@@ -19,7 +20,6 @@ from hapticbridge.study.chart.staged import Staged
 from hapticbridge.study.chart.workload import Panel
 from hapticbridge.study.engines.task import Body, Pose, Shape, Task
 from hapticbridge.study.maps.rigs import scene_of
-from hapticbridge.tick import TICK_DTYPE
 
 MASS = 0.2
 """In kg."""

@@ -9,10 +9,10 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.check.felt import FORCE_FLOOR, LEVER, tool_angles
+from hapticbridge.check.perception import FORCE_FLOOR, LEVER, tool_angles
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import StudyError
-from hapticbridge.mechanics import integrate_rotation
+from hapticbridge.record import TICK_DTYPE
 from hapticbridge.scene import Scene
 from hapticbridge.study.chart.engine_run import PeerWork, work_of
 from hapticbridge.study.chart.scene_run import Stage, Stages, Take
@@ -21,7 +21,7 @@ from hapticbridge.study.chart.staged import Staged
 from hapticbridge.study.chart.workload import Panel
 from hapticbridge.study.engines.task import Velocity
 from hapticbridge.study.maps.rigs import free_body, scene_of
-from hapticbridge.tick import TICK_DTYPE
+from hapticbridge.theory.rigid_body import integrate_rotation
 
 MASS = 0.3
 """In kg."""

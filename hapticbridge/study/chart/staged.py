@@ -8,7 +8,7 @@ from typing import ClassVar
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import StudyError
-from hapticbridge.kernel.scheme import DIRECT, WELD
+from hapticbridge.kernel.codes import DIRECT, WELD
 from hapticbridge.study.chart.scene_run import SceneRun, Stages, Take
 from hapticbridge.study.chart.score import Score
 from hapticbridge.study.chart.setting import Setting

@@ -11,13 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.check.cost import WARM_UP
-from hapticbridge.check.rehearsal import rehearsal_parameters
+from hapticbridge.check.observe import rehearsal_parameters
 from hapticbridge.jit import direct
-from hapticbridge.kernel.state import Binding
-from hapticbridge.kernel.step import after_step, before_step
+from hapticbridge.kernel.state import BoundKernel
+from hapticbridge.kernel.tick import after_step, before_step
+from hapticbridge.record import SAMPLE_DTYPE
 from hapticbridge.scene import Scene
 from hapticbridge.study.chart.scene_motion import COUPLING
-from hapticbridge.tick import SAMPLE_DTYPE
 
 PERIOD = 1e-3
 """T in s."""
@@ -73,7 +73,7 @@ def tick_times(scene: Scene, variant: Variant, clock: Callable[[], int]) -> NDAr
     model, data = scene.model, scene.data
     with _flags(model, variant):
         parameters = rehearsal_parameters(scene, COUPLING, PERIOD)
-        binding = Binding(model, data, parameters)
+        binding = BoundKernel(model, data, parameters)
         state, row = binding.state, binding.row
         samples = np.zeros(TICKS, SAMPLE_DTYPE)
         phase = 2 * np.pi * 5.0 * PERIOD * np.arange(1.0, TICKS + 1)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.provenance import processor
+from hapticbridge.run_description import processor
 from hapticbridge.study.chart.workload import Run
 
 REPEATS = 7

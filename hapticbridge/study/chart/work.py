@@ -9,8 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.check.cost import TICK_SHARE
-from hapticbridge.check.growth import Spread
+from hapticbridge.check.cost import TICK_SHARE, TimingStats
 from hapticbridge.scene import Scene
 from hapticbridge.study.chart.tick_times import USUAL, VARIANTS, Variant, tick_times
 from hapticbridge.study.chart.timing import machine, one_core
@@ -47,7 +46,7 @@ class Work:
     contacts: int
     rows: int
     freedoms: int
-    time: Spread
+    time: TimingStats
     low: float
     high: float
     rate: float
@@ -167,7 +166,7 @@ def measure_work(
         progress(rounds * len(jobs), rounds * len(jobs))
     points = []
     for index, (family, variant, size) in enumerate(jobs):
-        spread = Spread.of(np.concatenate(times[index]))
+        spread = TimingStats.of(np.concatenate(times[index]))
         medians = [float(np.median(each)) for each in times[index]]
         contacts, rows, freedoms = counts[index]
         points.append(

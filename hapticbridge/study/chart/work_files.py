@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from hapticbridge.check.cost import TICK_SHARE
-from hapticbridge.picture import new_figure
+from hapticbridge.plotting import new_figure
 from hapticbridge.study.chart.files import PICTURES, csv_text, write_files
 from hapticbridge.study.chart.tick_times import USUAL, VARIANTS
 from hapticbridge.study.chart.work import Growth, Work, WorkChart

@@ -7,9 +7,9 @@ import numpy as np
 
 from hapticbridge.arguments import Array
 from hapticbridge.coupling import Coupling
-from hapticbridge.device.trajectory.motion import Motion
+from hapticbridge.device.trajectory import Motion
 from hapticbridge.errors import StudyError
-from hapticbridge.kernel.names import COUPLING_ACTUATORS
+from hapticbridge.kernel.codes import COUPLING_ACTUATORS
 from hapticbridge.pose import add, canonical, cross, product, rotated, subtract
 from hapticbridge.scene import Scene
 from hapticbridge.study.engines.task import (

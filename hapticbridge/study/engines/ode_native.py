@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from hapticbridge.arguments import Array
 from hapticbridge.errors import StudyError
 from hapticbridge.jit import compiled
-from hapticbridge.kernel.native import floats
+from hapticbridge.kernel.mujoco_c import floats
 from hapticbridge.pose import Vector
 
 _NAMES = ("libode.so.8", "libode.so.6", "libode.so", "libode.dylib")

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from hapticbridge.arguments import Arguments
 from hapticbridge.coupling import Coupling
-from hapticbridge.device.trajectory.motion import Motion, pose_at
+from hapticbridge.device.trajectory import Motion, pose_at
 from hapticbridge.errors import StudyError, choices
 from hapticbridge.pose import (
     Quaternion,

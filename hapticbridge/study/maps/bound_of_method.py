@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hapticbridge.passivity import maximum_stiffness
 from hapticbridge.rendering import METHODS
+from hapticbridge.theory.bounds import maximum_stiffness
 
 
 def used_damping(

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.scene.contact_rule import (
+from hapticbridge.scene.contacts import (
     HEAVY_SLACK_STEPS,
     SLACK_STEPS,
     STRICT_STEPS,

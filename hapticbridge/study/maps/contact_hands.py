@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from hapticbridge.device import Hand, Motion
-from hapticbridge.device.trajectory.motion_csv import read_motion
+from hapticbridge.device.trajectory import read_motion
 from hapticbridge.scene import scene_path
 from hapticbridge.study.maps.rigs import swinging
 

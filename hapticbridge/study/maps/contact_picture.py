@@ -14,8 +14,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
-from hapticbridge.picture import new_figure
-from hapticbridge.scene.contact_rule import contact_numbers
+from hapticbridge.plotting import new_figure
+from hapticbridge.scene.contacts import contact_numbers
 from hapticbridge.study.maps.contact_agreement import LINES, is_in, verdicts
 from hapticbridge.study.maps.contact_methods import HANDS, draw_methods
 from hapticbridge.study.maps.contact_search import draw_search

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import mujoco
 
-from hapticbridge.scene.contact_rule import ContactNumbers, contact_numbers
+from hapticbridge.scene.contacts import ContactNumbers, contact_numbers
 
 PERIOD = 1e-3
 """T in s, of every run of the map."""

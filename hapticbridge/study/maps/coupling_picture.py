@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from hapticbridge.picture import new_figure
+from hapticbridge.plotting import new_figure
 from hapticbridge.rendering import METHODS
 from hapticbridge.study.maps.bound_of_method import law_in_words, needed_by_6, used_damping
 from hapticbridge.study.maps.coupling_runs import (

@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import SimulatedDevice
-from hapticbridge.passivity import WorstHand
 from hapticbridge.rendering import METHODS
 from hapticbridge.study.closed_loop import ClosedLoop, LoopOutcome
 from hapticbridge.study.maps.bisection import largest_stable
@@ -18,6 +17,7 @@ from hapticbridge.study.maps.rigs import free_tool_and_wall, loop_in, swinging, 
 from hapticbridge.study.maps.stability_map import Point
 from hapticbridge.study.maps.verdicts import verdict_numbers
 from hapticbridge.study.table import Table
+from hapticbridge.theory.sampled_loop import WorstHand
 
 PERIOD = 1e-3
 """T in s."""

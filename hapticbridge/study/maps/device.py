@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import SimulatedDevice
-from hapticbridge.passivity import quantization_limit
 from hapticbridge.study.maps.device_picture import draw
 from hapticbridge.study.maps.device_runs import (
     DAMPERS,
@@ -36,6 +35,7 @@ from hapticbridge.study.maps.device_runs import (
 from hapticbridge.study.maps.stability_map import Finding, Point, StabilityMap, computed
 from hapticbridge.study.maps.verdicts import MISSING
 from hapticbridge.study.table import Table
+from hapticbridge.theory.device_limits import quantization_limit
 
 SMALLEST = 1e-4
 """Deviation in per cent below which rounding alone is left, and nothing smaller is quoted."""

@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import SimulatedDevice
 from hapticbridge.guard import UNLIMITED
-from hapticbridge.passivity import WorstHand
 from hapticbridge.rendering import METHODS
 from hapticbridge.study.closed_loop import LoopOutcome
 from hapticbridge.study.maps.rigs import loop_in
+from hapticbridge.theory.sampled_loop import WorstHand
 
 PERIOD = 1e-3
 """T in s."""

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hapticbridge.errors import StudyError, choices
-from hapticbridge.passivity.spectrum import needed_for_fixed_environment
+from hapticbridge.theory.spectrum import needed_for_fixed_environment
 
 NAMES = ("implicit", "lossless", "implicitfast", "explicit", "explicit:rk4")
 """Methods that have a theory here."""

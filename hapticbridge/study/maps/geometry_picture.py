@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from hapticbridge.picture import new_figure
+from hapticbridge.plotting import new_figure
 from hapticbridge.study.maps.bound_of_method import law_in_words
 from hapticbridge.study.maps.fitting_peg import (
     DEVICE_DAMPING,

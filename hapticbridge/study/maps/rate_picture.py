@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
-from hapticbridge.picture import new_figure
+from hapticbridge.plotting import new_figure
 from hapticbridge.study.maps.bound_of_method import law_in_words
 from hapticbridge.study.maps.palette import THEORY_COLOUR
 from hapticbridge.study.maps.rate_runs import (

@@ -15,13 +15,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Hand, SimulatedDevice
-from hapticbridge.passivity import SampledLoop, WorstHand, maximum_stiffness, minimum_damping
 from hapticbridge.rendering import METHODS
 from hapticbridge.study.closed_loop import LoopOutcome
 from hapticbridge.study.jitter import PARTS, Timing
 from hapticbridge.study.maps.bisection import WIDTH, largest_stable
 from hapticbridge.study.maps.rigs import STILL, wall_loop
 from hapticbridge.study.maps.stability_map import Point
+from hapticbridge.theory.bounds import maximum_stiffness, minimum_damping
+from hapticbridge.theory.sampled_loop import SampledLoop, WorstHand
 
 THEORY_WIDTH = WIDTH / 100
 """Relative width of the search for what theory says: far below that of a measurement."""

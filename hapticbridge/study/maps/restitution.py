@@ -10,8 +10,6 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from hapticbridge.mechanics import ImpactBody, resolve_impact
-from hapticbridge.mechanics.impact import Law
 from hapticbridge.study.maps.falling_rod import (
     APPROACH,
     INERTIA,
@@ -26,6 +24,7 @@ from hapticbridge.study.maps.restitution_picture import COLOURS, SLIDE, Summary,
 from hapticbridge.study.maps.stability_map import Finding, Point, StabilityMap, computed
 from hapticbridge.study.maps.verdicts import MISSING
 from hapticbridge.study.table import Table
+from hapticbridge.theory.impact import ImpactBody, Law, resolve_impact
 
 RESTITUTION_LAWS: tuple[Law, ...] = ("newton", "poisson", "stronge")
 

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from hapticbridge.picture import new_figure
+from hapticbridge.plotting import new_figure
 from hapticbridge.study.maps.falling_rod import APPROACH, LENGTH, MASS
 from hapticbridge.study.maps.palette import THEORY_COLOUR
 from hapticbridge.study.maps.verdicts import say_missing

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from hapticbridge.device import Motion
 from hapticbridge.scene import Scene, load_scene
-from hapticbridge.scene.library import scene_path
+from hapticbridge.scene.load import scene_path
 from hapticbridge.study.closed_loop import ClosedLoop
 
 STILL = Motion([0.0, 1.0], np.zeros((2, 3)))

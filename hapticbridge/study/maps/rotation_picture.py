@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from hapticbridge.picture import new_figure
+from hapticbridge.plotting import new_figure
 from hapticbridge.study.maps.palette import METHOD_COLOURS, THEORY_COLOUR
 from hapticbridge.study.maps.rotation_runs import HARD, LINES, METHODS_SHOWN, SOFT
 from hapticbridge.study.maps.tumbling import (

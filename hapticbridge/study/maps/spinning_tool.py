@@ -14,17 +14,17 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from hapticbridge.coupling import Coupling
-from hapticbridge.kernel.simulation import simulate
-from hapticbridge.kernel.state import Binding
-from hapticbridge.ledger import Ledger
+from hapticbridge.kernel.state import BoundKernel
+from hapticbridge.kernel.tick import simulate
+from hapticbridge.options import run_parameters
 from hapticbridge.pose import IDENTITY_POSE
+from hapticbridge.record import SAMPLE_DTYPE, TICK_DTYPE
 from hapticbridge.rendering import METHODS, prepare
 from hapticbridge.scene import Scene
 from hapticbridge.study.maps.bisection import largest_stable
 from hapticbridge.study.maps.rigs import free_body, loop_in, scene_of
 from hapticbridge.study.maps.tumbling import INERTIA, MIDDLE, OBLIQUE, PERIOD, TICKS
-from hapticbridge.tick import SAMPLE_DTYPE, TICK_DTYPE
-from hapticbridge.workspace import run_parameters
+from hapticbridge.summary import Ledger
 
 MASS = 0.3
 """In kg."""
@@ -103,7 +103,7 @@ def spin(
     parameters = run_parameters(scene, coupling, chosen, first, period=PERIOD, felt=felt)
     # the grip is where the device would be without the angle, not where it starts
     parameters = replace(parameters, device_origin=IDENTITY_POSE)
-    binding = Binding(scene.model, scene.data, parameters)
+    binding = BoundKernel(scene.model, scene.data, parameters)
     records = np.zeros(TICKS, TICK_DTYPE)
     done = _run(binding, samples, records)
     return _read(binding, records[:done])
@@ -154,7 +154,7 @@ def _set_spin(scene: Scene, omega: NDArray[np.float64]) -> None:
     mujoco.mj_forward(scene.model, scene.data)
 
 
-def _run(binding: Binding, samples: NDArray[np.void], records: NDArray[np.void]) -> int:
+def _run(binding: BoundKernel, samples: NDArray[np.void], records: NDArray[np.void]) -> int:
     for first in range(0, TICKS, CHUNK):
         part = slice(first, first + CHUNK)
         done = simulate(binding.state, samples[part], binding.row, records[part])
@@ -163,7 +163,7 @@ def _run(binding: Binding, samples: NDArray[np.void], records: NDArray[np.void])
     return TICKS
 
 
-def _read(binding: Binding, records: NDArray[np.void]) -> Spin:
+def _read(binding: BoundKernel, records: NDArray[np.void]) -> Spin:
     ledger = Ledger.of(binding.state)
     handle = Rotation.from_quat(records["handle_quaternion"][:, [1, 2, 3, 0]])
     tool = Rotation.from_quat(records["tool_quaternion"][:, [1, 2, 3, 0]])

@@ -12,8 +12,8 @@ from typing import Any
 from matplotlib.figure import Figure
 
 from hapticbridge.errors import StudyError
-from hapticbridge.jsonable import jsonable
-from hapticbridge.picture import write_picture
+from hapticbridge.files import finite_or_null
+from hapticbridge.plotting import write_picture
 from hapticbridge.study.sweep import sweep
 from hapticbridge.study.table import Table
 
@@ -153,7 +153,7 @@ def run_map(
         "paragraph": finding.paragraph,
         "boundary": finding.boundary,
     }
-    text = json.dumps(jsonable(said), indent=2, allow_nan=False)
+    text = json.dumps(finite_or_null(said), indent=2, allow_nan=False)
     try:
         files["json"].write_text(text + "\n", encoding="utf-8")
     except OSError as error:

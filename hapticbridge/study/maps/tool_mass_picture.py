@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from hapticbridge.picture import new_figure
+from hapticbridge.plotting import new_figure
 from hapticbridge.study.maps.bound_of_method import limit_by_6
 from hapticbridge.study.maps.free_tool import least_mass, worst_angle
 from hapticbridge.study.maps.palette import THEORY_COLOUR

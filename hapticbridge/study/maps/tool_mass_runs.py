@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import SimulatedDevice
-from hapticbridge.passivity import WorstHand
 from hapticbridge.rendering import METHODS
 from hapticbridge.study.closed_loop import LoopOutcome
 from hapticbridge.study.maps.bisection import WIDTH, largest_stable
@@ -19,6 +18,7 @@ from hapticbridge.study.maps.free_tool import felt, worst_angle
 from hapticbridge.study.maps.rigs import loop_in, set_tool_mass, swinging
 from hapticbridge.study.maps.stability_map import Point
 from hapticbridge.study.table import Table
+from hapticbridge.theory.sampled_loop import WorstHand
 
 PERIOD = 1e-3
 """T in s."""

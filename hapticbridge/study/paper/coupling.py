@@ -7,16 +7,13 @@ from numpy.typing import NDArray
 from scipy import signal
 
 from hapticbridge.coupling import Coupling
-from hapticbridge.passivity import (
-    SampledLoop,
-    damping_spectrum_of,
-    minimum_damping,
-    stability_limit,
-)
-from hapticbridge.passivity.transfer import coupling_transfer
 from hapticbridge.study.paper.check import Check
 from hapticbridge.study.paper.drawing import panels
 from hapticbridge.study.paper.section import Curve, Section
+from hapticbridge.theory.bounds import minimum_damping
+from hapticbridge.theory.sampled_loop import SampledLoop, stability_limit
+from hapticbridge.theory.spectrum import damping_spectrum_of
+from hapticbridge.theory.transfer import coupling_transfer
 
 PERIOD = 1e-3
 """T in s."""

@@ -5,12 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from hapticbridge.coupling import Coupling
-from hapticbridge.passivity import (
-    SampledLoop,
-    damping_spectrum,
-    maximum_stiffness,
-    stability_limit,
-)
 from hapticbridge.study.paper.check import Check
 from hapticbridge.study.paper.coupling import (
     COUPLING,
@@ -26,6 +20,9 @@ from hapticbridge.study.paper.drawing import panels
 from hapticbridge.study.paper.energy_identity import identity_residual
 from hapticbridge.study.paper.in_mujoco import wall_limit
 from hapticbridge.study.paper.section import Curve, Section, Table
+from hapticbridge.theory.bounds import maximum_stiffness
+from hapticbridge.theory.sampled_loop import SampledLoop, stability_limit
+from hapticbridge.theory.spectrum import damping_spectrum
 
 SHORT = 1e-3
 """How far before Nyquist (7) is looked at, in rad."""

@@ -6,12 +6,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.coupling import Coupling
-from hapticbridge.passivity import SampledLoop, maximum_stiffness, stability_limit
-from hapticbridge.passivity.spectrum import needed_for_fixed_environment
-from hapticbridge.passivity.transfer import angles, coupling_transfer
 from hapticbridge.study.paper.check import Check
 from hapticbridge.study.paper.drawing import panels
 from hapticbridge.study.paper.section import Curve, Section
+from hapticbridge.theory.bounds import maximum_stiffness
+from hapticbridge.theory.sampled_loop import SampledLoop, stability_limit
+from hapticbridge.theory.spectrum import needed_for_fixed_environment
+from hapticbridge.theory.transfer import angles, coupling_transfer
 
 PERIOD = 1e-3
 """T in s."""

@@ -5,11 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.mechanics import integrate_particle
-from hapticbridge.mechanics.particle import ParticleMotion, Scheme
 from hapticbridge.study.paper.check import Check
 from hapticbridge.study.paper.drawing import panels
 from hapticbridge.study.paper.section import Curve, Section
+from hapticbridge.theory.rigid_body import ParticleMotion, Scheme, integrate_particle
 
 PERIOD = 1e-3
 """T in s."""

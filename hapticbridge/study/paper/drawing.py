@@ -5,7 +5,7 @@ from __future__ import annotations
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from hapticbridge.picture import new_figure
+from hapticbridge.plotting import new_figure
 
 
 def panels(rows: int, *, height: float, columns: int = 1) -> tuple[Figure, tuple[Axes, ...]]:

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from hapticbridge.mechanics import integrate_rotation
-from hapticbridge.mechanics.particle import Scheme
 from hapticbridge.study.paper.check import Check
 from hapticbridge.study.paper.discrete_passivity import (
     COLOURS,
@@ -16,6 +14,7 @@ from hapticbridge.study.paper.discrete_passivity import (
 )
 from hapticbridge.study.paper.drawing import panels
 from hapticbridge.study.paper.section import Curve, Section
+from hapticbridge.theory.rigid_body import Scheme, integrate_rotation
 
 INERTIA = (1.5e-3, 3.63e-3, 4.53e-3)
 """A box of 15 cm in kg m², turned about its middle axis, which is the unstable one."""

@@ -6,11 +6,10 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from hapticbridge.mechanics import Impact, ImpactBody, resolve_impact
-from hapticbridge.mechanics.impact import Law
 from hapticbridge.study.paper.check import Check
 from hapticbridge.study.paper.drawing import panels
 from hapticbridge.study.paper.section import Curve, Section, Table
+from hapticbridge.theory.impact import Impact, ImpactBody, Law, resolve_impact
 
 ROD = ImpactBody(1.0, 1 / 12, np.array([-0.5, -0.5]) / np.sqrt(2))
 """A uniform rod of 1 kg and 1 m at 45°, hit at its lower tip."""

@@ -11,14 +11,13 @@ from numpy.typing import NDArray
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import SceneError
 from hapticbridge.kernel.codes import OK
-from hapticbridge.kernel.state import Binding
-from hapticbridge.kernel.step import after_step, before_step
-from hapticbridge.passivity import WorstHand
-from hapticbridge.passivity.stability import threshold
+from hapticbridge.kernel.state import BoundKernel
+from hapticbridge.kernel.tick import after_step, before_step
+from hapticbridge.options import run_parameters
+from hapticbridge.record import SAMPLE_DTYPE, TICK_DTYPE
 from hapticbridge.rendering import IMPLICIT, prepare
 from hapticbridge.scene import load_scene
-from hapticbridge.tick import SAMPLE_DTYPE, TICK_DTYPE
-from hapticbridge.workspace import run_parameters
+from hapticbridge.theory.sampled_loop import WorstHand, threshold
 
 _Array = NDArray[np.float64]
 
@@ -69,7 +68,7 @@ class ImplicitMass:
             scene, coupling, IMPLICIT, self._sample, period=period, felt=None
         )
         self._scene, self._period = scene, period
-        self._binding = Binding(scene.model, scene.data, parameters)
+        self._binding = BoundKernel(scene.model, scene.data, parameters)
 
     def tick(self, handle: float) -> NDArray[np.void]:
         """Moves the handle to a position in m and returns the tick's record, shape (1,).

@@ -6,9 +6,9 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from hapticbridge.coupling import Coupling
-from hapticbridge.passivity import CouplingGrid, SampledLoop, minimum_mass
-from hapticbridge.passivity.stability import threshold
-from hapticbridge.passivity.virtual_mass import Integrator
+from hapticbridge.theory.sampled_loop import SampledLoop, threshold
+from hapticbridge.theory.transfer import CouplingGrid
+from hapticbridge.theory.virtual_mass import Integrator, minimum_mass
 
 NAMES: dict[Integrator, str] = {
     "implicit": "implicit Euler, j = 0",

@@ -9,7 +9,7 @@ from pathlib import Path
 from jinja2 import Environment, PackageLoader, select_autoescape
 
 from hapticbridge.errors import HapticBridgeError
-from hapticbridge.picture import inline_svg, write_picture
+from hapticbridge.plotting import inline_svg, write_picture
 from hapticbridge.study.paper.check import Check
 from hapticbridge.study.paper.section import Section
 

@@ -5,19 +5,16 @@ from __future__ import annotations
 import numpy as np
 
 from hapticbridge.coupling import Coupling
-from hapticbridge.passivity import (
-    SampledLoop,
-    WorstHand,
-    damping_spectrum,
-    maximum_stiffness,
-    stability_limit,
-    transmission_line_spectrum,
-    transmission_line_stiffness,
-)
-from hapticbridge.passivity.stability import threshold
 from hapticbridge.study.paper.check import Check
 from hapticbridge.study.paper.drawing import panels
 from hapticbridge.study.paper.section import Curve, Section, Table
+from hapticbridge.theory.bounds import maximum_stiffness
+from hapticbridge.theory.sampled_loop import SampledLoop, WorstHand, stability_limit, threshold
+from hapticbridge.theory.spectrum import damping_spectrum
+from hapticbridge.theory.transmission_line import (
+    transmission_line_spectrum,
+    transmission_line_stiffness,
+)
 
 PERIOD = 1e-3
 """T in s."""

@@ -7,19 +7,13 @@ from collections.abc import Callable
 import numpy as np
 
 from hapticbridge.coupling import Coupling
-from hapticbridge.passivity import (
-    SampledLoop,
-    WorstHand,
-    environment_minimum_damping,
-    minimum_mass,
-    stability_limit,
-)
-from hapticbridge.passivity.virtual_mass import Integrator
 from hapticbridge.study.paper.check import Check
 from hapticbridge.study.paper.drawing import panels
 from hapticbridge.study.paper.in_mujoco import AppliedForceMass, ImplicitMass, limit_of
 from hapticbridge.study.paper.least_mass import NAMES, draw_least_mass, least_stable_mass
 from hapticbridge.study.paper.section import Curve, Section, Table
+from hapticbridge.theory.sampled_loop import SampledLoop, WorstHand, stability_limit
+from hapticbridge.theory.virtual_mass import Integrator, environment_minimum_damping, minimum_mass
 
 PERIOD = 1e-3
 """T in s."""

@@ -9,11 +9,12 @@ from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
 from hapticbridge.coupling import Coupling
-from hapticbridge.passivity import SampledLoop, WorstHand, minimum_damping, stability_limit
 from hapticbridge.study.paper.check import Check
 from hapticbridge.study.paper.drawing import panels
 from hapticbridge.study.paper.in_mujoco import HEAVY, ImplicitMass, decays, hold
 from hapticbridge.study.paper.section import Curve, Section
+from hapticbridge.theory.bounds import minimum_damping
+from hapticbridge.theory.sampled_loop import SampledLoop, WorstHand, stability_limit
 
 PERIOD = 1e-3
 """T in s."""

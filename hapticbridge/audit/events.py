@@ -1,0 +1,173 @@
+"""What was done to a run from outside while it went on, tick by tick, from its events alone.
+
+The second reading of those events: ``commands.change`` applies them one after the other to the
+kernel, here they become arrays over ticks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticbridge.certificate import required_axis_damping
+from hapticbridge.commands.execution import bits_in, coupling_in, tuning_ticks
+from hapticbridge.coupling import Coupling
+from hapticbridge.device import DeviceInfo
+from hapticbridge.errors import RecordingError
+from hapticbridge.kernel.parameters import RunParameters
+from hapticbridge.rendering import Method
+
+Array = NDArray[np.float64]
+
+_REACHES = 2**62
+
+
+@dataclass(frozen=True, slots=True)
+class RunEvents:
+    """Pauses, resets, switches and couplings of a run.
+
+    Attributes:
+        parameters: Of the run as it began.
+        home: Tool pose (7,) to which a reset puts tool and handle.
+        resumed: Ticks at which the run went on after a pause without force.
+        resets: Ticks before which the scene was put back to its start.
+        couplings: What the coupling was or became, K and B' of the law, in order.
+    """
+
+    parameters: RunParameters
+    home: Array
+    resumed: Array = field(default_factory=lambda: np.zeros(0))
+    resets: Array = field(default_factory=lambda: np.zeros(0))
+    couplings: tuple[Coupling, ...] = ()
+    _began: Array = field(default_factory=lambda: np.zeros(0))
+    _switched: tuple[Array, NDArray[np.int64]] = field(
+        default_factory=lambda: (np.zeros(0), np.zeros(0, np.int64))
+    )
+
+    @classmethod
+    def of(
+        cls, events: Iterable[Mapping[str, Any]], parameters: RunParameters, home: Array
+    ) -> RunEvents:
+        """Reads events.
+
+        Args:
+            events: Of a recording, in order.
+            parameters: Of the run as it began.
+            home: Tool pose (7,) before its first tick.
+
+        Raises:
+            RecordingError: One of them is damaged.
+        """
+        told: dict[str, list[Mapping[str, Any]]] = {
+            name: [] for name in ("resume", "reset", "coupling", "switch")
+        }
+        for event in events:
+            if event.get("event") in told:
+                told[str(event["event"])].append(event)
+        ticks = {name: np.array([_tick(e) for e in of], float) for name, of in told.items()}
+        return cls(
+            parameters=parameters,
+            home=home,
+            resumed=ticks["resume"],
+            resets=ticks["reset"],
+            couplings=(
+                parameters.coupling,
+                *(coupling_in(event, parameters) for event in told["coupling"]),
+            ),
+            _began=ticks["coupling"],
+            _switched=(ticks["switch"], np.array([bits_in(e) for e in told["switch"]], np.int64)),
+        )
+
+    def laws(self, numbers: NDArray[np.int64]) -> Array:
+        """Returns K, B', K_r, B'_r in some ticks, (n, 4)."""
+        goals = np.array([_gains(c) for c in (self.parameters.coupling, *self.couplings[1:])])
+        length = tuning_ticks(self.parameters.period)
+        value, gone = np.tile(goals[0], (len(numbers), 1)), goals[0]
+        for index, (begin, goal) in enumerate(zip(self._began, goals[1:], strict=True)):
+            later = self._began[index + 1] if index + 1 < len(self._began) else _REACHES
+            share = np.clip((numbers - begin + 1.0) / length, 0.0, 1.0)[:, None]
+            value = np.where(share > 0, gone + share * (goal - gone), value)
+            gone = gone + min(max((later - begin) / length, 0.0), 1.0) * (goal - gone)
+        return value
+
+    def buttons(self, numbers: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Returns the bits of ``buttons`` that commands set in some ticks."""
+        at, bits = self._switched
+        last = np.searchsorted(at, numbers, side="right") - 1
+        return np.concatenate([[0], bits])[last + 1]
+
+    def is_reset(self, numbers: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Returns which of some ticks began with a reset."""
+        return np.isin(numbers, self.resets)
+
+    def sentences(self, given: float | None = None) -> tuple[str, ...]:
+        """Returns what is to be said of a coupling that was changed, if it was.
+
+        Args:
+            given: What that gave to what is felt, in J; None while it is not known.
+        """
+        count = len(self.couplings) - 1
+        if count < 1:
+            return ()
+        began, last = self.couplings[0], self.couplings[-1]
+        turning = (
+            ""
+            if last.rotational_stiffness == began.rotational_stiffness
+            else (f", K_r = {last.rotational_stiffness:g} N m/rad")
+        )
+        return (
+            f"so it began; commands changed the coupling {count} times, last to K = "
+            f"{last.stiffness:g} N/m{turning}, B' = {last.damping:g} N s/m used"
+            + ("" if given is None else f", which gave the coupling {given:.3g} J"),
+        )
+
+    def worst(self, info: DeviceInfo, method: Method) -> RunParameters:
+        """Returns the run's parameters with the coupling that asks most of the device.
+
+        In translation and in rotation each; what is asked is convex in the coupling, so that none
+        between two of them asks for more.
+        """
+        parameters = self.parameters
+        if len(self.couplings) < 2:
+            return parameters
+        needs = [
+            required_axis_damping(
+                info,
+                coupling,
+                parameters.period,
+                parameters.scale,
+                parameters.force_scale,
+                parameters.laws,
+                method,
+            )
+            for coupling in self.couplings
+        ]
+        linear, angular = (
+            self.couplings[int(np.argmax([need[axis] for need in needs]))] for axis in (0, 1)
+        )
+        coupling = replace(
+            linear,
+            rotational_stiffness=angular.rotational_stiffness,
+            rotational_damping=angular.rotational_damping,
+        )
+        return replace(parameters, coupling=coupling)
+
+
+def _tick(event: Mapping[str, Any]) -> int:
+    tick = event.get("tick")
+    if not isinstance(tick, int) or isinstance(tick, bool) or not 0 <= tick < _REACHES:
+        raise RecordingError(f"event '{event.get('event')}' names tick {tick!r}")
+    return tick
+
+
+def _gains(coupling: Coupling) -> tuple[float, ...]:
+    return (
+        coupling.stiffness,
+        coupling.damping,
+        coupling.rotational_stiffness,
+        coupling.rotational_damping,
+    )

@@ -1,0 +1,438 @@
+"""Device conditions and their verdict."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cache
+from typing import Literal
+
+import numpy as np
+
+from hapticbridge.coupling import Coupling
+from hapticbridge.device import DeviceInfo
+from hapticbridge.device.base import DeviceInfo
+from hapticbridge.errors import CouplingError
+from hapticbridge.kernel.parameters import SLACK_SHARE, RunParameters, checked_substeps
+from hapticbridge.rendering import Method, default_method
+from hapticbridge.theory.bounds import minimum_damping, stiffest_coupling
+
+# What a device's own rate and the age of its samples ask of its damping, beyond the loop's.
+
+_WHOLE = 1e-9  # of a tick: a delay that is this little above whole ticks is as many
+
+
+def felt_period(info: DeviceInfo, period: float) -> float:
+    """Returns for how long in s a device feels one wrench: a loop's period, or its own if longer.
+
+    Args:
+        info: The device; one whose motion is prescribed feels nothing.
+        period: The loop's, in s.
+    """
+    if info.rate is None or info.is_prescribed:
+        return period
+    own = 1.0 / info.rate
+    return own if own > period * (1.0 + _WHOLE) else period
+
+
+def delay_ticks(info: DeviceInfo, period: float) -> int | None:
+    """Returns after how many whole ticks a wrench answers a sample; None where that is unknown.
+
+    Args:
+        info: The device.
+        period: The loop's, in s.
+    """
+    if info.delay is None:
+        return None
+    return max(0, math.ceil(info.delay / felt_period(info, period) - _WHOLE))
+
+
+def damping_for_delay(
+    info: DeviceInfo,
+    coupling: Coupling,
+    period: float,
+    axis: Literal["translation", "rotation"] = "translation",
+) -> float:
+    """Returns how much more damping b the delay asks for, in N s/m or N m s/rad.
+
+        Δb = max(0, sup_θ [(K T/2) sin((2d + 1)θ/2)/sin(θ/2) − B cos((d + 1)θ)] − (K T/2 + B))
+
+    d the delay in ticks, T the period that is felt; for B = 0 it is K d T. With it the device bears
+    a wall behind the coupling, which is necessary. For any scene no finite damping is enough, so
+    nobody can certify a device with a delay. An unknown delay adds nothing, and certifies nothing.
+
+    Args:
+        info: The device.
+        coupling: K and B of the law.
+        period: The loop's, in s.
+        axis: Which gains to take.
+
+    Raises:
+        CouplingError: The delay is longer than 50 ticks.
+
+    References:
+        Colgate & Schenkel 1997 (fixed environment).
+    """
+    ticks = delay_ticks(info, period)
+    if not ticks:
+        return 0.0
+    felt = felt_period(info, period)
+    late = minimum_damping(coupling, felt, delay=ticks, axis=axis)
+    return max(0.0, late - minimum_damping(coupling, felt, axis=axis))
+
+
+# Device damping required by a coupling.
+
+LOWEST_FREQUENCY, FREQUENCIES = 3e-3, 60
+"""Lowest frequency in rad per tick, and number of frequencies, of the search for the damping that
+substeps need. In all cases tried the maximum lies at one end: at Nyquist, or at the limit towards
+rest, which 3e-3 approximates to 1e-5."""
+
+
+@cache
+def required_damping(
+    coupling: Coupling,
+    period: float,
+    laws: int = 1,
+    axis: Literal["translation", "rotation"] = "translation",
+) -> float:
+    """Returns the damping b that a device needs behind a coupling, in N s/m or N m s/rad.
+
+    K and B are those of the law (``Method.used``), not the effective ones. With one law per tick b
+    = K T/2 + B. With n laws per tick the handle moves by an n-th of its step for each, and the mean
+    wrench is sent. There is no closed form; b is the smallest value for which
+
+        Σ_k f̄_k·δh_{k+1} + (b/T) ‖δh_k‖² − Σ_i f_i·δx_i − ½ s ‖δx_i‖²_{K + nB/T} >= 0,
+        f_i = K e_i + (nB/T) δe_i,   e = h − x
+
+    for every motion. The share s = ``SLACK_SHARE`` = ½ of the slack may be used; with one law it is
+    the whole slack. The search finds b frequency by frequency as the smallest value of a quadratic
+    form over the n deflections e_i. For B = 0, b grows with n (for strict environments it is K T
+    n/2, because the mean comes late); for B > K T it falls towards B.
+
+    The form is sufficient for any environment within its share of the slack; strict environments
+    need less. Example: default coupling (K = 2400 N/m, B = 0.5 N s/m, 1 kHz) at n = 2, 4, 8. The
+    form gives 1.63, 1.90, 2.42 N s/m; a wall needs 1.30, 1.60, 1.75; the worst free tool of 1 to
+    0.01 kg needs 1.29, 1.65, 2.03.
+
+    Args:
+        coupling: K and B of the law.
+        period: T of the device in s.
+        laws: n, 1 to ``MOST_SUBSTEPS``.
+        axis: Kind of axis.
+
+    Raises:
+        CouplingError: n or the period is out of range.
+
+    References:
+        Brown & Colgate 1997, eq. (6), for n = 1.
+    """
+    if checked_substeps(laws, CouplingError) == 1:
+        return float(minimum_damping(coupling, period, axis=axis))
+    is_linear = axis == "translation"
+    k = coupling.stiffness if is_linear else coupling.rotational_stiffness
+    b = (coupling.damping if is_linear else coupling.rotational_damping) * laws / period
+    if k == 0.0:
+        return float(b * period / laws)
+    identity, ones = np.eye(laws), np.full(laws, 1.0 / laws)
+    most = 0.0
+    for theta in np.geomspace(LOWEST_FREQUENCY, np.pi, FREQUENCIES):
+        z = np.exp(1j * theta)
+        difference = identity - np.eye(laws, k=-1) + 0j
+        difference[0, -1] -= 1 / z  # last deflection of the previous tick
+        law = k * identity + b * difference
+        form = law.conj().T @ difference
+        slack = 0.5 * SLACK_SHARE * (k + b)
+        form = 0.5 * (form + form.conj().T) - slack * difference.conj().T @ difference
+        linear = 0.5 * law.conj().T @ ((z - 1) * ones) + slack * difference.conj().T @ ones
+        gained = np.vdot(linear, np.linalg.solve(form, linear)).real + slack / laws
+        most = max(most, float(gained))
+    return most * period
+
+
+def required_damping_with_substeps(
+    info: DeviceInfo,
+    coupling: Coupling,
+    period: float,
+    laws: int,
+    axis: Literal["translation", "rotation"] = "translation",
+) -> float:
+    """Returns the damping needed by a device with its own rate and delay."""
+    needed = required_damping(coupling, felt_period(info, period), laws, axis)
+    return needed + damping_for_delay(info, coupling, period, axis)
+
+
+# Default coupling of a device.
+
+UNKNOWN_DAMPING, UNKNOWN_ROTATIONAL_DAMPING = 2.0, 2e-3
+"""Damping in N s/m and N m s/rad assumed for a device of unknown damping: that of the default
+simulated device. Larger values give a stiffer default coupling that is safe on fewer devices."""
+
+UNKNOWN_REAL_DAMPING, UNKNOWN_REAL_ROTATIONAL_DAMPING = 0.2, 2e-4
+"""Damping in N s/m and N m s/rad assumed for a device with motors of unknown damping. It is a tenth
+of ``UNKNOWN_DAMPING``: the low end of estimates for desktop devices, because almost no maker
+publishes it."""
+
+NEEDED_SHARE = 0.85
+"""Share of the device's damping that the default coupling needs, without unit. K T/2 + B at 80 % of
+the bound with B = b/4 is 0.6 b + 0.25 b. A larger share is stiffer and leaves less for an error in
+b."""
+
+
+def assumed_damping(info: DeviceInfo) -> tuple[float, float]:
+    """Returns the device's damping in N s/m and N m s/rad, or the assumed values.
+
+    Unknown or zero damping becomes ``UNKNOWN_DAMPING``, or ``UNKNOWN_REAL_DAMPING`` with motors.
+    """
+    linear = info.damping or (UNKNOWN_REAL_DAMPING if info.is_real else UNKNOWN_DAMPING)
+    angular = info.rotational_damping or (
+        UNKNOWN_REAL_ROTATIONAL_DAMPING
+        if info.is_real and info.turns
+        else UNKNOWN_ROTATIONAL_DAMPING
+    )
+    return linear, angular
+
+
+def default_coupling(
+    info: DeviceInfo,
+    period: float,
+    scale: float = 1.0,
+    force_scale: float = 1.0,
+    laws: int = 1,
+    method: Method | None = None,
+) -> Coupling:
+    """Returns the stiffest coupling that is safe on a device: 80 % of the bound, B' = b / 4.
+
+    The result is the requested coupling: K and B = B' + the method's own damping, so that the law
+    uses B' without clipping. It needs 85 % of b. If several laws per tick or a delay need more, K
+    and B' are lowered together to meet it, separately for each kind of axis; ``required_damping`` is
+    linear in both.
+
+    Args:
+        info: The device; unknown damping is replaced as in ``assumed_damping``.
+        period: T in s.
+        scale: Handle motion per device motion.
+        force_scale: Force on the device per force on the tool.
+        laws: Evaluations of the wrench per tick (substeps).
+        method: Rendering method; None takes ``rendering.default_method``.
+
+    Raises:
+        CouplingError: The number of laws, a scale or the period is out of range.
+    """
+    for name, value in (("scale", scale), ("force_scale", force_scale)):
+        if not math.isfinite(value) or value <= 0:
+            raise CouplingError(f"{name} is {value!r}; it must be finite and > 0")
+    damping, rotational = assumed_damping(info)
+    damping /= scale * force_scale
+    rotational *= scale / force_scale
+    coupling = stiffest_coupling(damping, rotational, felt_period(info, period))
+    checked_substeps(laws, CouplingError)
+    method = default_method(laws) if method is None else method
+    if laws == 1 and not delay_ticks(info, period):
+        return method.rendered(coupling, period)
+    shrink = min(
+        1.0, NEEDED_SHARE * damping / required_damping_with_substeps(info, coupling, period, laws)
+    )
+    needed = required_damping(coupling, period, laws, "rotation")
+    if info.turns:
+        needed = required_damping_with_substeps(info, coupling, period, laws, "rotation")
+    shrink_rotation = min(1.0, NEEDED_SHARE * rotational / needed)
+    shrunk = Coupling(
+        stiffness=shrink * coupling.stiffness,
+        damping=shrink * coupling.damping,
+        rotational_stiffness=shrink_rotation * coupling.rotational_stiffness,
+        rotational_damping=shrink_rotation * coupling.rotational_damping,
+    )
+    return method.rendered(shrunk, period / laws)
+
+
+@dataclass(frozen=True, slots=True)
+class DampingCondition:
+    """The device condition b >= scale · force_scale · (K T / 2 + B') on one kind of axis.
+
+    Attributes:
+        axis: ``translation`` or ``rotation``.
+        needed: Right-hand side in N s/m (rotation: N m s/rad).
+        available: The device's damping b; None if unknown.
+        remedy: Change that helps if the condition fails.
+        delay: Ticks from a sample to the wrench that answers it, 0 at best; None if unknown.
+    """
+
+    axis: str
+    needed: float
+    available: float | None
+    remedy: str = "lower stiffness or damping, or raise the rate"
+    delay: int | None = 0
+
+    @property
+    def holds(self) -> bool | None:
+        """True if the device has enough damping; None if that is unknown."""
+        return None if self.available is None else self.available >= self.needed
+
+    def sentence(self) -> str:
+        """Describes the condition, with the remedy if it fails."""
+        unit = "N s/m" if self.axis == "translation" else "N m s/rad"
+        if self.available is None:
+            return (
+                f"{self.axis}: device damping unknown, {self.needed:g} {unit} needed; "
+                "'hapticbridge identify' measures it"
+            )
+        relation = ">=" if self.holds else "<"
+        text = f"{self.axis}: device damping {self.available:g} {relation} {self.needed:g} {unit}"
+        if not self.holds:
+            return f"{text}; {self.remedy}"
+        if self.delay is None:
+            return f"{text}, if it answers without delay, which is unknown"
+        late = f", for a wall behind a delay of {self.delay} ticks: no bound holds for any scene"
+        return f"{text}{late}" if self.delay else text
+
+
+def device_conditions(
+    info: DeviceInfo,
+    coupling: Coupling,
+    period: float,
+    scale: float,
+    force_scale: float,
+    laws: int = 1,
+    method: Method | None = None,
+) -> tuple[DampingCondition, ...]:
+    """Returns the condition for each kind of axis of a device with known translational damping.
+
+    For the device, the coupling is scale · force_scale times as stiff in translation. Angles are
+    not scaled, so the factor for rotation is force_scale / scale. The device's own rate and delay
+    count (``device.lateness_above_baseline``).
+
+    Args:
+        info: The device.
+        coupling: K and B' of the law, not the effective coupling.
+        period: T in s.
+        scale: Handle motion per device motion.
+        force_scale: Force on the device per force on the tool.
+        laws: Evaluations of the wrench per tick (substeps).
+        method: Rendering method, which decides the remedy; None for one that uses the damping as
+            requested.
+
+    References:
+        Brown & Colgate 1997, eq. (6); sufficient for any environment that satisfies (14).
+    """
+    conditions = []
+    if info.damping is not None:
+        delay = delay_ticks(info, period)
+        needed = scale * force_scale * required_damping_with_substeps(info, coupling, period, laws)
+        remedy = _remedy(method, coupling.damping)
+        conditions.append(DampingCondition("translation", needed, info.damping, remedy, delay))
+        if info.turns:
+            needed = (
+                force_scale
+                / scale
+                * required_damping_with_substeps(info, coupling, period, laws, "rotation")
+            )
+            remedy = _remedy(method, coupling.rotational_damping)
+            conditions.append(
+                DampingCondition("rotation", needed, info.rotational_damping, remedy, delay)
+            )
+    return tuple(conditions)
+
+
+def required_axis_damping(
+    info: DeviceInfo,
+    coupling: Coupling,
+    period: float,
+    scale: float,
+    force_scale: float,
+    laws: int,
+    method: Method,
+) -> tuple[float, float]:
+    """Returns the damping that a coupling needs, in N s/m and N m s/rad; 0 without a condition.
+
+    Arguments are those of ``device_conditions``.
+    """
+    if not method.has_coupling:
+        return 0.0, 0.0
+    conditions = device_conditions(info, coupling, period, scale, force_scale, laws, method)
+    needed = {condition.axis: condition.needed for condition in conditions}
+    return needed.get("translation", 0.0), needed.get("rotation", 0.0)
+
+
+def _remedy(method: Method | None, used: float) -> str:
+    """Returns the change that lowers the required damping.
+
+    For a method that subtracts its own damping, a softer spring or a shorter period raises B' by as
+    much as it saves, or more. While B' > 0, only a lower B helps.
+    """
+    if method is None or method.lag == 0.0:
+        return "lower stiffness or damping, or raise the rate"
+    return "lower the damping" if used > 0 else "lower the stiffness, or raise the rate"
+
+
+def run_conditions(
+    info: DeviceInfo, parameters: RunParameters, method: Method
+) -> tuple[DampingCondition, ...]:
+    """Returns the device conditions of a run; none for a prescribed motion or without a coupling.
+
+    A weld is judged by its measured stiffness and damping.
+    """
+    if info.is_prescribed or not method.has_coupling:
+        return ()
+    return device_conditions(
+        info,
+        parameters.felt or parameters.coupling,
+        parameters.period,
+        parameters.scale,
+        parameters.force_scale,
+        parameters.laws,
+        method,
+    )
+
+
+def condition_sentences(
+    info: DeviceInfo, parameters: RunParameters, method: Method
+) -> tuple[str, ...]:
+    """Returns sentences on the device conditions, or on geometry for a method without a coupling.
+
+    Without a coupling, two contacts of stiffness K_c on opposite sides of a tool, L apart, act as a
+    rotational spring of ½ K_c L² about the middle. They are stable only for L <= 2 √(b_θ/(T K_c)).
+
+    References:
+        Brown & Colgate 1997, eq. (1).
+    """
+    sentences = [condition.sentence() for condition in run_conditions(info, parameters, method)]
+    if method.has_coupling or info.is_prescribed:
+        return tuple(sentences)
+    if info.rotational_damping is None or not info.turns:
+        return ("geometry decides: no coupling bounds what contacts do to the device",)
+    damping = info.rotational_damping * parameters.scale / parameters.force_scale
+    length = 2.0 * math.sqrt(damping / (parameters.period * parameters.contact_stiffness))
+    return (
+        f"geometry decides: two contacts of {parameters.contact_stiffness:g} N/m on opposite sides "
+        f"of the tool need L <= 2 sqrt(b_theta/(T K_c)) = {length:.3g} m between them",
+    )
+
+
+def is_run_certified(conditions: tuple[DampingCondition, ...], method: Method) -> bool | None:
+    """Returns ``is_certified``, but None instead of True for a method without a coupling law.
+
+    For a weld b >= KT/2 + B' with its measured K and B is necessary, but not proven sufficient.
+    """
+    verdict = is_certified(conditions)
+    return None if verdict and not method.has_law else verdict
+
+
+def is_certified(conditions: tuple[DampingCondition, ...]) -> bool | None:
+    """Returns True if all conditions hold; None if one is unknown or a delay forbids a proof."""
+    held = {condition.holds for condition in conditions}
+    is_late = any(condition.delay != 0 for condition in conditions)
+    return False if False in held else None if None in held or not held or is_late else True
+
+
+def damping_margin(conditions: tuple[DampingCondition, ...]) -> float | None:
+    """Returns the smallest share of the device's damping that is left, 1 − needed / b.
+
+    It is negative if more is needed than available; None if no damping is known.
+    """
+    shares = [
+        1.0 - condition.needed / condition.available if condition.available else -math.inf
+        for condition in conditions
+        if condition.available is not None
+    ]
+    return min(shares, default=None)

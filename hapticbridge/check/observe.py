@@ -1,0 +1,456 @@
+"""Observation of a scene's contacts, constraint rows and energies during a motion."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticbridge.coupling import Coupling
+from hapticbridge.errors import SceneError
+from hapticbridge.jit import direct
+from hapticbridge.kernel.codes import OK
+from hapticbridge.kernel.parameters import RunParameters
+from hapticbridge.kernel.state import BoundKernel
+from hapticbridge.kernel.tick import after_step, before_step, simulate
+from hapticbridge.pose import IDENTITY_POSE
+from hapticbridge.record import TICK_DTYPE
+from hapticbridge.rendering import default_method, prepare
+from hapticbridge.scene import Scene
+from hapticbridge.summary import Ledger
+
+# Clearance of the tool between opposite walls.
+
+FARTHEST = 2e-3
+"""Distance in m beyond which two geoms do not form a clearance. Fits are tenths of it; anything
+farther away belongs to another part of the scene."""
+
+OPPOSITE = -0.95
+"""Cosine between the directions to two walls below which they count as opposite; 18 degrees from
+straight."""
+
+_WITHOUT_DISTANCE = [int(mujoco.mjtGeom.mjGEOM_HFIELD), int(mujoco.mjtGeom.mjGEOM_SDF)]
+
+_NO_DIRECTION = 1e-9  # m; two points nearer than this have no direction between them
+
+
+def clearances(
+    model: mujoco.MjModel,
+    pairs: list[tuple[int, int]],
+    is_tool: NDArray[np.bool_],
+    postures: NDArray[np.float64],
+) -> dict[tuple[int, int], float]:
+    """Returns the clearance per side between the tool and the geoms around it, in m.
+
+    Between two geoms in opposite directions the tool can move by the sum of its distances from
+    them; the clearance per side is half of it. Each pair of walls counts with its largest sum over
+    all postures, because a tilted tool has less room. Each geom counts with its smallest clearance.
+
+    Args:
+        model: The compiled scene.
+        pairs: Geoms that may collide; at least one of each pair belongs to the tool.
+        is_tool: True for each geom of the tool.
+        postures: ``qpos`` of each posture, shape (n, nq).
+
+    Returns:
+        Clearance by pair; pairs that form no clearance are absent.
+    """
+    data, segment = mujoco.MjData(model), np.zeros(6)
+    known = ~np.isin(model.geom_type, _WITHOUT_DISTANCE)
+    candidates = np.array([p for p in pairs if known[list(p)].all()], np.int64).reshape(-1, 2)
+    rooms: dict[tuple[tuple[int, int], tuple[int, int]], float] = {}
+    for posture in postures:
+        data.qpos[:] = posture
+        mujoco.mj_kinematics(model, data)
+        near: list[tuple[tuple[int, int], float, NDArray[np.float64]]] = []
+        for first, second in candidates[_may_be_near(model, data, candidates)].tolist():
+            distance = mujoco.mj_geomDistance(model, data, first, second, FARTHEST, segment)
+            direction = segment[3:] - segment[:3]
+            length = float(np.linalg.norm(direction))
+            if distance >= FARTHEST or length < _NO_DIRECTION:
+                continue
+            away = direction / length * np.sign(distance) * (1 if is_tool[first] else -1)
+            near.append(((first, second), distance, away))
+        for k, (pair, distance, away) in enumerate(near):
+            for other, there, towards in near[:k]:
+                if float(away @ towards) < OPPOSITE:
+                    both = (pair, other)
+                    rooms[both] = max(rooms.get(both, 0.0), 0.5 * (distance + there))
+    found: dict[tuple[int, int], float] = {}
+    for both, room in rooms.items():
+        for pair in both:
+            if room > 0.0:
+                found[pair] = min(found.get(pair, np.inf), room)
+    return found
+
+
+def _may_be_near(
+    model: mujoco.MjModel, data: mujoco.MjData, pairs: NDArray[np.int64]
+) -> NDArray[np.bool_]:
+    """Selects the pairs whose bounding spheres come within ``FARTHEST``."""
+    first, second = pairs.T
+    reach = np.where(model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE, np.inf, model.geom_rbound)
+    apart = np.linalg.norm(data.geom_xpos[first] - data.geom_xpos[second], axis=1)
+    return np.asarray(apart <= reach[first] + reach[second] + FARTHEST, dtype=bool)
+
+
+# Kinematic trees joined to the tool.
+
+
+def reached_trees(model: mujoco.MjModel, tool: int, met: set[tuple[int, int]]) -> set[int]:
+    """Returns the kinematic trees that can influence the tool's tree, including it.
+
+    Contacts, equality constraints and tendons join trees. In a scene with flexes all trees count.
+
+    Args:
+        model: The compiled scene.
+        tool: The tool's kinematic tree.
+        met: Ids of the geoms that met.
+    """
+    if model.nflex:  # contacts of a flex are not listed by geom
+        return set(range(model.ntree))
+    tree = model.body_treeid
+    links = [{int(tree[model.geom_bodyid[geom]]) for geom in pair} for pair in met]
+    links += [
+        _trees_of_equality(model, equality)
+        for equality in range(model.neq)
+        if model.eq_active0[equality]
+    ]
+    links += [_trees_of_tendon(model, tendon) for tendon in range(model.ntendon)]
+    links = [link - {-1} for link in links]
+    reached = {tool}
+    while new := {t for link in links if link & reached for t in link} - reached:
+        reached |= new
+    return reached
+
+
+def _trees_of_equality(model: mujoco.MjModel, equality: int) -> set[int]:
+    kind, objects = mujoco.mjtEq, (model.eq_obj1id[equality], model.eq_obj2id[equality])
+    form, tree = int(model.eq_type[equality]), model.body_treeid
+    ids = [int(each) for each in objects if each >= 0]
+    if form == kind.mjEQ_JOINT:
+        return {int(tree[model.jnt_bodyid[each]]) for each in ids}
+    if form == kind.mjEQ_TENDON:
+        return {t for each in ids for t in _trees_of_tendon(model, each)}
+    if form not in (kind.mjEQ_CONNECT, kind.mjEQ_WELD):  # a flex has many bodies
+        return set(range(model.ntree))
+    if model.eq_objtype[equality] == mujoco.mjtObj.mjOBJ_SITE:
+        ids = [int(model.site_bodyid[each]) for each in ids]
+    return {int(tree[each]) for each in ids}
+
+
+def _trees_of_tendon(model: mujoco.MjModel, tendon: int) -> set[int]:
+    wrap, tree = mujoco.mjtWrap, model.body_treeid
+    bodies = {
+        wrap.mjWRAP_JOINT: model.jnt_bodyid,
+        wrap.mjWRAP_SITE: model.site_bodyid,
+        wrap.mjWRAP_SPHERE: model.geom_bodyid,
+        wrap.mjWRAP_CYLINDER: model.geom_bodyid,
+    }
+    start = int(model.tendon_adr[tendon])
+    parts = range(start, start + int(model.tendon_num[tendon]))
+    return {
+        int(tree[bodies[kind][model.wrap_objid[part]]])
+        for part in parts
+        if (kind := mujoco.mjtWrap(int(model.wrap_type[part]))) in bodies
+    }
+
+
+# Rehearsal of a scene under a motion.
+
+_UNLIMITED = 1e30
+"""Force limit in N and torque limit in N m without effect, because the full force is compared."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Playback:
+    """Result of a scene under a motion.
+
+    Attributes:
+        records: One per tick, ``TICK_DTYPE``; ``wrench_on_tool`` is the wrench that the hand would
+            feel.
+        environment: ``strict``, ``within slack`` or ``active``.
+        slack_share: Largest share of the slack that was used, without unit.
+        fault: Tick and port of the first fault, or None.
+        warnings: Number of MuJoCo's warnings.
+        seconds: Processor time of the run in s: MuJoCo's step and the bridge's arithmetic.
+    """
+
+    records: NDArray[np.void]
+    environment: str
+    slack_share: float
+    fault: tuple[int, str] | None
+    warnings: int
+    seconds: float
+
+
+def rehearse(
+    scene: Scene,
+    samples: NDArray[np.void],
+    coupling: Coupling,
+    period: float,
+    substeps: int = 1,
+) -> Playback:
+    """Runs the scene from its start as the bridge would, one tick per sample.
+
+    The hand does not yield: the handle follows the motion at any force. Two versions of a scene can
+    therefore be compared tick by tick.
+
+    Args:
+        scene: Changed in place: reset, with the coupling's gains and the time step set.
+        samples: Poses relative to the first, ``SAMPLE_DTYPE``, from ``samples_of``.
+        coupling: Requested K and B.
+        period: T in s.
+        substeps: MuJoCo steps per tick.
+
+    Raises:
+        SceneError: A value is out of range, or a result is not finite; the message names the tick.
+    """
+    parameters = rehearsal_parameters(scene, coupling, period, substeps)
+    binding = BoundKernel(scene.model, scene.data, parameters)
+    rows = np.zeros(samples.size, TICK_DTYPE)
+    start = time.thread_time()
+    done = simulate(binding.state, samples, binding.row, rows)
+    seconds = time.thread_time() - start
+    if done < samples.size:
+        raise not_finite(scene, done, samples.size)
+    ledger = Ledger.of(binding.state)
+    return Playback(
+        records=rows,
+        environment=ledger.environment,
+        slack_share=ledger.slack_share,
+        fault=ledger.fault,
+        warnings=sum(int(warning.number) for warning in scene.data.warning),
+        seconds=seconds,
+    )
+
+
+def not_finite(scene: Scene, tick: int, ticks: int) -> SceneError:
+    """Returns the error for a motion that became not finite at a tick."""
+    return SceneError(
+        f"scene '{scene.name}' is not finite after tick {tick} of {ticks} of the motion"
+    )
+
+
+def rehearsal_parameters(
+    scene: Scene, coupling: Coupling, period: float, substeps: int = 1
+) -> RunParameters:
+    """Resets a scene for the default method, and returns the parameters for ``BoundKernel``.
+
+    Raises:
+        SceneError: A value is out of range.
+    """
+    method = default_method(substeps)
+    prepare(scene, coupling, period, substeps, method, warns=False)
+    # an error inside the C function would end the process; the first step in Python raises instead
+    mujoco.mj_step(scene.model, scene.data)
+    scene.reset()
+    return RunParameters(
+        grip=scene.grip,
+        period=period,
+        substeps=substeps,
+        coupling=method.used(coupling, period / substeps),
+        force_limit=_UNLIMITED,
+        torque_limit=_UNLIMITED,
+        ramp_ticks=0,
+        device_origin=IDENTITY_POSE,
+        handle_origin=scene.grip_pose(),
+        device_start=IDENTITY_POSE,
+        scheme=method.scheme,
+    )
+
+
+_TYPE = mujoco.mjtConstraint
+ROW_KINDS: dict[str, tuple[int, ...]] = {
+    "contact": (
+        int(_TYPE.mjCNSTR_CONTACT_FRICTIONLESS),
+        int(_TYPE.mjCNSTR_CONTACT_PYRAMIDAL),
+        int(_TYPE.mjCNSTR_CONTACT_ELLIPTIC),
+    ),
+    "friction loss": (int(_TYPE.mjCNSTR_FRICTION_DOF), int(_TYPE.mjCNSTR_FRICTION_TENDON)),
+    "limit": (int(_TYPE.mjCNSTR_LIMIT_JOINT), int(_TYPE.mjCNSTR_LIMIT_TENDON)),
+    "equality": (int(_TYPE.mjCNSTR_EQUALITY),),
+}
+"""Kinds of constraint rows in the words of MJCF, and MuJoCo's types."""
+
+_PYRAMIDAL = int(_TYPE.mjCNSTR_CONTACT_PYRAMIDAL)
+
+LEAST_FORCE = 0.05
+"""Normal force in N above which a contact's stiffness is kept; a smaller force is not felt."""
+
+POSTURES = 100
+"""Approximate number of postures kept; a motion of 8 s passes a hole in more than two of them."""
+
+PROGRESS_EVERY = 500
+"""Ticks between two calls of ``progress``."""
+
+
+@dataclass(slots=True)
+class Meeting:
+    """Contacts of two geoms over a motion.
+
+    Attributes:
+        ticks: Number of ticks in contact.
+        deepest: Largest penetration in m; negative if they never overlapped.
+        force: Largest normal force in N of one contact.
+        inertia: Smallest effective inertia in kg at a contact, with the coupling's share h B' + h²
+            K; inf if no contact carried ``LEAST_FORCE``.
+        softest: Smallest stiffness in N/m of such a contact; inf without one.
+        stiffest: Largest stiffness in N/m of such a contact; 0 without one.
+    """
+
+    ticks: int = 0
+    deepest: float = -np.inf
+    force: float = 0.0
+    inertia: float = np.inf
+    softest: float = np.inf
+    stiffest: float = 0.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Observation:
+    """Result of a motion.
+
+    Attributes:
+        meetings: Contacts by the ids of two geoms, the smaller first.
+        postures: ``qpos`` at times spread over the motion, shape (n, nq).
+        rows: Number of constraint rows in each tick, by kind.
+        force: Norm of the force on the tool in each tick, in N.
+        full_ticks: Number of ticks in which the solver stopped at its iteration limit.
+        warnings: Number of MuJoCo's warnings by text.
+        environment: ``strict``, ``within slack`` or ``active``.
+        slack_share: Largest share of the slack that was used, without unit.
+    """
+
+    meetings: dict[tuple[int, int], Meeting]
+    postures: NDArray[np.float64]
+    rows: dict[str, NDArray[np.int64]]
+    force: NDArray[np.float64]
+    full_ticks: int
+    warnings: dict[str, int] = field(default_factory=dict)
+    environment: str = "strict"
+    slack_share: float = 0.0
+
+
+def observe(
+    scene: Scene,
+    samples: NDArray[np.void],
+    coupling: Coupling,
+    period: float,
+    progress: Callable[[int, int], None] | None = None,
+) -> Observation:
+    """Leads a scene through a motion, as ``rehearse`` does, and inspects every step.
+
+    Args:
+        scene: Changed in place: reset, with the coupling's gains and the time step set.
+        samples: Poses relative to the first, ``SAMPLE_DTYPE``.
+        coupling: K and B.
+        period: T in s.
+        progress: Called with the number of ticks done and the total.
+
+    Raises:
+        SceneError: A value is out of range, or a result is not finite; the message names the tick.
+    """
+    binding = BoundKernel(scene.model, scene.data, rehearsal_parameters(scene, coupling, period))
+    model, data, state, row = scene.model, scene.data, binding.state, binding.row
+    before = direct(before_step, state, samples[:1], row, 0, period)
+    after = direct(after_step, state, row, 0)
+    meetings: dict[tuple[int, int], Meeting] = {}
+    types = np.zeros((samples.size, len(_TYPE.__members__)), np.int64)
+    postures, every = [], max(samples.size // POSTURES, 1)
+    force, full = np.zeros(samples.size), 0
+    for k in range(samples.size):
+        if before(state, samples[k : k + 1], row, 0, period) != OK:
+            raise not_finite(scene, k, samples.size)
+        mujoco.mj_step(model, data)
+        if after(state, row, 0) != OK:
+            raise not_finite(scene, k, samples.size)
+        if data.nefc:
+            counted = np.bincount(data.efc_type)
+            types[k, : counted.size] = counted
+        if data.ncon:
+            _note_contacts(data, model.opt.timestep, meetings)
+        iterations = data.solver_niter[: max(data.nisland, 1)]
+        full += bool(data.nefc) and bool(iterations.max(initial=0) >= model.opt.iterations)
+        force[k] = float(np.linalg.norm(row["wrench_on_tool"][0, :3]))
+        if k % every == 0:
+            postures.append(data.qpos.copy())
+        if progress is not None and k % PROGRESS_EVERY == 0:
+            progress(k, samples.size)
+    ledger = Ledger.of(state)
+    return Observation(
+        meetings=meetings,
+        postures=np.array(postures),
+        rows={kind: types[:, list(those)].sum(axis=1) for kind, those in ROW_KINDS.items()},
+        force=force,
+        full_ticks=full,
+        warnings=_warnings(data),
+        environment=ledger.environment,
+        slack_share=ledger.slack_share,
+    )
+
+
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Suppresses MuJoCo's printed warnings and its file MUJOCO_LOG.TXT; counters still count."""
+    before = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(lambda _message: None)
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(before)
+
+
+def _note_contacts(
+    data: mujoco.MjData, step: float, meetings: dict[tuple[int, int], Meeting]
+) -> None:
+    """Adds the contacts of one step.
+
+    A row's force at rest is a_ref/R. Under ``discrete`` both are divided by one number, which makes
+    the row's own spring and damper implicit in the step h:
+
+        a_ref = −(b v + k d r)/(1 + h b + h² k d),    R = (1 − d)/d A/(1 + h b + h² k d),
+
+    with depth −r, velocity v, MuJoCo's k and b of the row, its impedance d at that depth, and the
+    contact's true inertia 1/A. Its stiffness is therefore f/r = k d/(R (1 + h b + h² k d)). With a
+    pyramidal cone, 2 (dim − 1) rows share the normal force; together they are as stiff as one row
+    with that many times the inertia.
+    """
+    contacts, rows = data.contact, data.efc_type
+    addresses, dims, depths = contacts.efc_address.tolist(), contacts.dim, (-contacts.dist).tolist()
+    seen = set()
+    for k, (one, other) in enumerate(contacts.geom.tolist()):
+        adr = addresses[k]
+        if min(one, other) < 0 or adr < 0:  # a flex, or outside the active distance
+            continue
+        pair = min(one, other), max(one, other)
+        meeting = meetings.setdefault(pair, Meeting())
+        if pair not in seen:
+            seen.add(pair)
+            meeting.ticks += 1
+        count = 2 * (int(dims[k]) - 1) if rows[adr] == _PYRAMIDAL else 1
+        normal = float(data.efc_force[adr : adr + count].sum())
+        meeting.deepest = max(meeting.deepest, depths[k])
+        meeting.force = max(meeting.force, normal)
+        if normal >= LEAST_FORCE:
+            spring, damper, impedance, _ = data.efc_KBIP[adr].tolist()
+            spring *= impedance
+            regular = float(data.efc_R[adr]) * (1.0 + step * damper + step**2 * spring)
+            stiffness = count * spring / regular
+            inertia = count * (1.0 - impedance) / (impedance * regular)
+            meeting.inertia = min(meeting.inertia, inertia)
+            meeting.softest = min(meeting.softest, stiffness)
+            meeting.stiffest = max(meeting.stiffest, stiffness)
+
+
+def _warnings(data: mujoco.MjData) -> dict[str, int]:
+    return {
+        str(mujoco.mju_warningText(kind, warning.lastinfo)): int(warning.number)
+        for kind, warning in enumerate(data.warning)
+        if warning.number
+    }

@@ -1,0 +1,160 @@
+"""Stiffness of MuJoCo's constraints at rest, and penetration under a force."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import mujoco
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hapticbridge.scene.contacts import impedance_at
+
+# Poses and rotations as NumPy arrays, by MuJoCo's functions.
+
+Array = NDArray[np.float64]
+
+IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
+"""Identity quaternion (w, x, y, z)."""
+
+
+def matrix_of(quaternion: ArrayLike) -> Array:
+    """Returns the rotation matrix of a unit quaternion (w, x, y, z)."""
+    matrix = np.zeros(9)
+    mujoco.mju_quat2Mat(matrix, np.asarray(quaternion, dtype=np.float64))
+    return matrix.reshape(3, 3)
+
+
+def quaternion_of(matrix: Array) -> Array:
+    """Returns the unit quaternion (w, x, y, z) of a rotation matrix."""
+    quaternion = np.zeros(4)
+    mujoco.mju_mat2Quat(quaternion, np.ascontiguousarray(matrix).ravel())
+    return quaternion
+
+
+def rotation_vector(start: ArrayLike, now: ArrayLike) -> Array:
+    """Returns the rotation vector in rad from one orientation to another."""
+    inverse, turn, vector = np.zeros(4), np.zeros(4), np.zeros(3)
+    mujoco.mju_negQuat(inverse, np.asarray(start, dtype=np.float64))
+    mujoco.mju_mulQuat(turn, np.asarray(now, dtype=np.float64), inverse)
+    mujoco.mju_quat2Vel(vector, turn, 1.0)
+    return vector
+
+
+def pose_in(frame: Array, pose: Array) -> Array:
+    """Returns a pose in the coordinates of a frame: position in m and quaternion, shape (7,).
+
+    Args:
+        frame: Pose of the frame, shape (7,).
+        pose: Pose in the same coordinates as ``frame``.
+    """
+    position, turn, found = np.zeros(3), np.zeros(4), np.zeros(7)
+    mujoco.mju_negPose(position, turn, frame[:3], frame[3:])
+    mujoco.mju_mulPose(found[:3], found[3:], position, turn, pose[:3], pose[3:])
+    return found
+
+
+# Effective inertia of joints and bodies.
+
+
+def joint_inertia(model: mujoco.MjModel, data: mujoco.MjData, dof: int) -> float:
+    """Returns the inertia in kg (hinge: kg m²) along a degree of freedom: 1/(M⁻¹)_ii.
+
+    The other degrees of freedom move freely; ``data`` must be current (``mj_forward``). Armature is
+    included. MuJoCo's ``dof_invweight0`` and ``body_invweight0`` omit it for simple bodies (alone
+    in their tree, without rotation between their frames). Seen in MuJoCo 4.0: a slide of 0.5 g with
+    0.1 kg of armature has 1/0.0005.
+    """
+    unit, answer = np.zeros((2, 1, model.nv))
+    unit[0, dof] = 1.0
+    mujoco.mj_solveM(model, data, answer, unit)
+    return float(1.0 / answer[0, dof])
+
+
+def body_inertia(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> float:
+    """Returns a body's inertia in kg at its centre of mass, in the most compliant direction.
+
+    1/m is the largest eigenvalue of J M⁻¹ Jᵀ, with the Jacobian J of the centre of mass. Armature
+    is included; ``data`` must be current (``mj_forward``). A body that cannot move has infinite
+    inertia.
+    """
+    if model.nv == 0 or model.body_treeid[body] < 0:
+        return math.inf
+    jacobian = np.zeros((3, model.nv))
+    mujoco.mj_jacBodyCom(model, data, jacobian, None, body)
+    answer = np.zeros_like(jacobian)
+    mujoco.mj_solveM(model, data, answer, jacobian)
+    weight = float(np.linalg.eigvalsh(jacobian @ answer.T)[-1])
+    return 1.0 / weight if weight > 0 else math.inf
+
+
+_ROUNDS = 60
+"""Number of bisections of the depth's bracket; enough for the last bit."""
+
+
+def constraint_stiffness(
+    solref: Sequence[float],
+    solimp: Sequence[float],
+    inertia: float,
+    timestep: float,
+    depth: float = 0.0,
+) -> float:
+    """Returns the stiffness in N/m that a contact, limit or equality constraint has at rest.
+
+        K_c = m k d²/(1 − d),
+        k = min(1/(d_w timeconst dampratio)², 1/(d h²))    or    −solref[0]/d_w²
+
+    m is the inertia at the constraint as MuJoCo computes it, d the impedance at that depth, and d_w
+    the impedance beyond the width of ``solimp``. The second term of the minimum is the limit of the
+    step h (flag ``refsafe``).
+
+    Args:
+        solref: (timeconst in s, dampratio), or (−stiffness in 1/s², −damping in 1/s).
+        solimp: d₀, d_w, width in m, midpoint, power.
+        inertia: m in kg, > 0; kg m² for a hinge, which gives a result in N m/rad.
+        timestep: h in s.
+        depth: Penetration in m, >= 0; rad for a hinge.
+
+    Returns:
+        K_c in N/m: force divided by depth.
+
+    References:
+        MuJoCo's documentation, "Solver parameters"; the tests compare it with runs at rest.
+    """
+    impedance, last = impedance_at(solimp, depth), impedance_at(solimp, math.inf)
+    first, second = float(solref[0]), float(solref[1])
+    if first > 0 and second > 0:
+        spring = min(1.0 / (last * first * second) ** 2, 1.0 / (impedance * timestep**2))
+    else:
+        spring = max(-first, 0.0) / last**2
+    return inertia * spring * impedance**2 / (1.0 - impedance)
+
+
+def depth_under(
+    force: float,
+    solref: Sequence[float],
+    solimp: Sequence[float],
+    inertia: float,
+    timestep: float,
+) -> float:
+    """Returns the penetration in m under a steady force; infinite for zero stiffness.
+
+    It solves F = K_c(r) r for the depth r; K_c depends on r through ``solimp``. Parameters are
+    those of ``constraint_stiffness``; F is in N, or in N m for a hinge.
+    """
+
+    def stiffness(depth: float) -> float:
+        return constraint_stiffness(solref, solimp, inertia, timestep, depth)
+
+    least = min(stiffness(0.0), stiffness(math.inf))
+    if least <= 0.0:
+        return math.inf
+    low, high = 0.0, force / least
+    for _ in range(_ROUNDS):
+        middle = 0.5 * (low + high)
+        if stiffness(middle) * middle < force:
+            low = middle
+        else:
+            high = middle
+    return high

@@ -1,0 +1,313 @@
+"""``hapticbridge audit`` and ``hapticbridge repair``."""
+
+from __future__ import annotations
+
+import json
+import math
+import shlex
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.table import Table
+
+from hapticbridge.audit import AuditReport, audit, verdict_words
+from hapticbridge.cli.terminal import err, out, plain, progress
+from hapticbridge.errors import HapticBridgeError, RecordingError
+from hapticbridge.film import Shot, still
+from hapticbridge.plotting import check_ending
+from hapticbridge.recording import Recording, read_recording, repair
+from hapticbridge.report import check_page_name, plot_recording, telling_time, write_report
+from hapticbridge.study.audits import (
+    UNREADABLE,
+    audit_all,
+    check_table_name,
+    reports_of,
+    worst_exit_code,
+    write_audits,
+)
+from hapticbridge.study.findings import find_recordings
+from hapticbridge.study.table import Interrupted, Table
+from hapticbridge.units import format_si
+from hapticbridge.whatif import WhatIf, changes_from, draw_what_if, what_if, write_what_if
+from hapticbridge.whatif.page import changes, rows, sentences
+
+# How ``hapticbridge audit`` prints a table of many recordings.
+
+_VERDICT_COLOURS = {
+    "passive": "green",
+    "active": "red",
+    "invalid": "magenta",
+    UNREADABLE: "magenta",
+}
+
+
+def print_audits(table: Table) -> None:
+    """Prints a line per recording, worst first, why those fail that do, and how many of each."""
+    verdicts, margins = table.texts("verdict"), table.numbers("margin")
+    columns = [table.texts(name) for name in ("environment", "port", "file", "reason")]
+    durations, cut = table.numbers("duration"), table.numbers("is_cut")
+    codes = table.numbers("exit_code")
+    out.print(f"{'margin':>8}  {'verdict':<22} {'s':>8}  recording")
+    for row, verdict in enumerate(verdicts):
+        environment, port, file, reason = (str(column[row]) for column in columns)
+        margin = "-" if math.isnan(margins[row]) else f"{margins[row]:.3g}"
+        duration = "-" if math.isnan(durations[row]) else f"{durations[row]:.3f}"
+        words = verdict_words(verdict, environment, port)
+        told = f"[{_VERDICT_COLOURS[verdict]}]{words}[/]" + " " * max(22 - len(words), 0)
+        name = plain(file) + (" [yellow](cut)[/]" if cut[row] == 1 else "")
+        out.print(f"{margin:>8}  {told} {duration:>8}  {name}")
+        if codes[row]:
+            out.print(f"{'':>10}{_why(verdict, reason, str(table.texts('certified')[row]))}")
+    counts = Counter(verdicts)
+    told = ", ".join(
+        f"{counts[verdict]} {verdict}" for verdict in _VERDICT_COLOURS if counts[verdict]
+    )
+    out.print(f"{len(table)} recording{'s' if len(table) > 1 else ''}: {told}")
+
+
+def print_unreadable(table: Table) -> None:
+    """Names on stderr what was passed over."""
+    for verdict, reason in zip(table.texts("verdict"), table.texts("reason"), strict=True):
+        if verdict == UNREADABLE:
+            err.print(f"[red]error:[/red] {plain(' '.join(str(reason).splitlines()))}")
+
+
+def _why(verdict: str, reason: str, certified: str) -> str:
+    if verdict == "passive" and certified == "no":
+        return "the device has less damping than the coupling needs"
+    return plain(" ".join(reason.splitlines()))
+
+
+# How ``hapticbridge audit --what-if`` prints runs side by side.
+
+
+def print_what_if(found: WhatIf) -> None:
+    """Prints what was changed, the runs side by side, and what to know of them."""
+    for name, before, after in changes(found):
+        out.print(plain(f"{name}: {before} -> {after}"))
+    table = Table(box=None, pad_edge=False)
+    table.add_column(plain(found.path.name))
+    for run in found.runs:
+        table.add_column(run.name)
+    for name, texts in rows(found):
+        table.add_row(name, *map(plain, texts))
+    out.print(table)
+    for run in found.runs[1:]:
+        for text in sentences(run):
+            out.print(f"{run.name}: {plain(text)}")
+    for condition in found.runs[-1].report.conditions:
+        out.print(plain(condition))
+    for note in found.notes:
+        err.print(f"note: {plain(note)}")
+
+
+SCENE_SIZE = 640, 400
+"""Of the scene's picture on a page, in pixels: some 150 kB of a page's megabyte."""
+
+_USUAL_EVENTS = ("start", "stop", "input")
+_COLOURS = {"passive": "green", "active": "red", "invalid": "magenta"}
+
+
+@dataclass(frozen=True, slots=True)
+class Audit:
+    """Judge recorded runs offline: passive, active or invalid, and why.
+
+    Several recordings, a folder (searched through and through) or a pattern give a table, sorted by
+    the margin: the least share left, of the slack and of the device's damping; negative beyond the
+    limit. What is no recording is named and passed over; Ctrl-C ends with the table of what was
+    judged by then. Exit code 0 if all are passive and no device lacks damping, 1 if not, 2 if a
+    file is no recording; with --what-if it is that of the changed runs.
+
+    Examples:
+        hapticbridge audit run.mcap --plot run.png
+        hapticbridge audit runs/ --jobs 4 --table runs.parquet
+        hapticbridge audit run.mcap --what-if stiffness=3000 --what-if rate=500
+    """
+
+    files: tyro.conf.Positional[tuple[Path, ...]]
+    """Recordings (.mcap), folders of them, or patterns such as 'runs/**/a*.mcap'."""
+    strict: bool = False
+    """Accept only passivity itself, not the slack that the device's damping leaves."""
+    as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
+    """Print the reports as a JSON list."""
+    plot: Path | None = None
+    """Draw force, position and energies into this picture (.png, .svg or .pdf; one file only)."""
+    report: Path | None = None
+    """Write a self-contained page (.html; one file only): verdict, cause, remedy, curves."""
+    table: Path | None = None
+    """Write a row per recording to this file: .parquet (extra 'tables'), .csv or .json."""
+    jobs: int | None = None
+    """Processes for several recordings; by default as many as there are cores, 1: none but this."""
+    scheduler: str | None = None
+    """Address of a dask.distributed scheduler to audit several on (extra 'cluster'), in place of
+    --jobs; its workers must see the files under the same names."""
+
+    what_if: Annotated[
+        tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="NAME=VALUE")
+    ] = ()
+    """Simulate the recorded hand again with this changed, as often as wanted: stiffness, damping,
+    rotational_stiffness, rotational_damping, method, rate, substeps, scale, force_scale,
+    contact_stiffness, controller, or a parameter of the scene. Twice: with the recorded motion,
+    and, where the device is known, with a model hand. --plot and --report show all runs side by
+    side (one file only)."""
+
+    def execute(self) -> int:
+        """Audits; returns the exit code."""
+        if not self.files:
+            raise RecordingError("audit needs at least one recording")
+        if self.plot is not None:
+            check_ending(self.plot)
+        if self.report is not None:
+            check_page_name(self.report)
+        if self.table is not None:
+            check_table_name(self.table)
+        if self.jobs is not None and self.scheduler is not None:
+            raise RecordingError("--jobs and --scheduler exclude each other")
+        files = find_recordings(self.files)
+        if files != list(self.files) or len(files) > 1 or self.table is not None:
+            return self._audit_many(files)
+        if self.jobs is not None or self.scheduler is not None:
+            err.print("note: --jobs and --scheduler are for several recordings; here is one")
+        if self.what_if:
+            return self._ask(files[0])
+        with err.status(f"auditing {plain(str(files[0]))} …"):
+            report = audit(files[0], strict=self.strict)
+        if self.as_json:
+            out.print_json(json.dumps([json.loads(report.to_json())]))
+        else:
+            _print_report(report)
+        if self.plot is not None or self.report is not None:
+            self._draw(report)
+        return report.exit_code
+
+    def _audit_many(self, files: list[Path]) -> int:
+        if self.plot or self.report or self.what_if:
+            raise RecordingError(
+                "--plot, --report and --what-if take one recording at a time, and make no --table"
+            )
+        try:
+            with progress("auditing") as show:
+                table = audit_all(
+                    files,
+                    strict=self.strict,
+                    jobs=self.jobs,
+                    scheduler=self.scheduler,
+                    progress=show,
+                )
+        except Interrupted as stop:
+            self._tell(stop.table)
+            missing = f"{len(files) - len(stop.table)} of {len(files)} recordings were not judged"
+            err.print(f"[yellow]warning:[/yellow] incomplete: {missing}")
+            raise
+        self._tell(table)
+        return worst_exit_code(table)
+
+    def _tell(self, table: Table) -> None:
+        if self.as_json:
+            out.print_json(json.dumps(reports_of(table)))
+            print_unreadable(table)
+        else:
+            print_audits(table)
+        if self.table is not None:
+            write_audits(table, self.table)
+            err.print(f"wrote {plain(str(self.table))}")
+
+    def _ask(self, file: Path) -> int:
+        with progress("what if") as show:
+            found = what_if(file, changes_from(self.what_if), strict=self.strict, progress=show)
+        if self.as_json:
+            out.print_json(found.to_json())
+        else:
+            print_what_if(found)
+        if self.plot is not None:
+            draw_what_if(found, self.plot)
+        if self.report is not None:
+            before = found.runs[0]
+            with err.status("drawing …"):
+                scene = _scene_picture(before.recording, before.report)
+                write_what_if(found, self.report, scene)
+        self._name_written()
+        return found.exit_code
+
+    def _draw(self, report: AuditReport) -> None:
+        recording = read_recording(report.path)
+        with err.status("drawing …"):
+            if self.plot is not None:
+                plot_recording(recording, self.plot)
+            if self.report is not None:
+                write_report(recording, report, self.report, _scene_picture(recording, report))
+        self._name_written()
+
+    def _name_written(self) -> None:
+        for written in (self.plot, self.report):
+            if written is not None:
+                err.print(f"wrote {plain(str(written))}")
+
+
+def _scene_picture(recording: Recording, report: AuditReport) -> bytes | None:
+    """Returns a picture of the scene; nothing where it cannot be drawn, which is no fault of it."""
+    try:
+        at = telling_time(recording, report)
+        return still(report.path, Shot(at=at, width=SCENE_SIZE[0], height=SCENE_SIZE[1]))
+    except (HapticBridgeError, ValueError) as error:
+        err.print(f"no picture of the scene: {plain(str(error))}")
+        return None
+
+
+def _print_report(report: AuditReport) -> None:
+    colour = _COLOURS[report.verdict]
+    out.print(f"{plain(str(report.path))}: [bold {colour}]{report.words}[/]")
+    out.print(f"  {plain(report.reason)}")
+    if report.resimulation.startswith("not"):
+        out.print(f"  [yellow]{plain(report.resimulation)}[/]")
+    elif report.resimulation:
+        out.print(f"  simulated again: {report.resimulation}")
+    for sentence in (*report.rendered[:1], *report.conditions):
+        out.print(f"  {plain(sentence)}")
+    if not report.conditions:
+        out.print(
+            "  device condition b >= KT/2 + B': not applicable, the motion is prescribed or the "
+            "damping unknown"
+        )
+    if report.is_cut:
+        out.print(
+            "  the file is cut: the verdict is on what it holds; "
+            f"'hapticbridge repair {plain(shlex.quote(str(report.path)))} OUTPUT' makes it whole"
+        )
+    told = {name: count for name, count in report.events.items() if name not in _USUAL_EVENTS}
+    if told:
+        listed = ", ".join(f"{name} ({count})" for name, count in told.items())
+        out.print(f"  events: {plain(listed)}")
+    out.print(f"  {report.ticks} ticks, {report.duration:.3f} s")
+    energies = [
+        f"{name.replace('_', ' ')} {format_si(e, 'J')}" for name, e in report.energies.items() if e
+    ]
+    if energies:
+        out.print(f"  {', '.join(energies)}")
+
+
+@dataclass(frozen=True, slots=True)
+class Repair:
+    """Make a whole file of a recording that a crash cut.
+
+    All whole chunks are kept, and an event says what was done.
+
+    Example:
+        hapticbridge repair cut.mcap whole.mcap
+    """
+
+    file: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FILE")]
+    """The cut recording; it is not changed."""
+    output: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="OUTPUT")]
+    """The file to write; it must not exist."""
+
+    def execute(self) -> int:
+        """Repairs; returns the exit code."""
+        with err.status(f"repairing {plain(str(self.file))} …"):
+            mended = repair(self.file, self.output)
+        found = f"{len(mended.ticks)} ticks, {len(mended.events)} events"
+        out.print(f"wrote {plain(str(self.output))}: {found}")
+        return 0

@@ -1,0 +1,155 @@
+"""``hapticbridge export`` and ``hapticbridge compare``."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from hapticbridge.cli.terminal import err, out, plain
+from hapticbridge.compare import Comparison, Difference, compare
+from hapticbridge.export import export, time_of
+from hapticbridge.units import format_si
+
+
+@dataclass(frozen=True, slots=True)
+class Export:
+    """Write a recording as Parquet, CSV or HDF5.
+
+    The table has a row per tick. Parquet keeps units in the columns' metadata, CSV in a file .json
+    beside it, HDF5 in attributes; metadata and events go along. --from and --to cut a piece out of
+    the run; the times of its marks are printed. Exit code 1 if the recording is damaged: what can
+    be read is written.
+
+    Example:
+        hapticbridge export run.mcap --format csv --from 12.5 --to 20 --out grasp.csv
+    """
+
+    file: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FILE")]
+    """The recording."""
+    form: Annotated[Literal["parquet", "csv", "hdf5"], tyro.conf.arg(name="format")]
+    """The format; parquet needs the extra 'tables', hdf5 the extra 'hdf5'."""
+    start: Annotated[float, tyro.conf.arg(name="from", metavar="S")] = -math.inf
+    """First time to write, in s of the run; by default its start."""
+    end: Annotated[float, tyro.conf.arg(name="to", metavar="S")] = math.inf
+    """Time in s of the run before which the last tick lies; by default its end."""
+    out: Path | None = None
+    """File to write; by default the recording's name with .parquet, .csv or .h5."""
+    overwrite: bool = False
+    """Replace the file if it exists."""
+    as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
+    """Print what was written as JSON."""
+
+    def execute(self) -> int:
+        """Exports; returns the exit code."""
+        with err.status(f"exporting {plain(str(self.file))} …"):
+            span = self.start, self.end
+            done = export(self.file, self.form, self.out, span=span, overwrite=self.overwrite)
+        found = done.recording
+        marks = [time_of(event) for event in found.events if event.get("event") == "mark"]
+        if self.as_json:
+            facts = {"files": [str(file) for file in done.files], "ticks": done.ticks}
+            facts |= {"marks": marks, "is_cut": found.is_cut, "damage": done.damage}
+            out.print_json(json.dumps(facts))
+        else:
+            names = ", ".join(plain(str(file)) for file in done.files)
+            out.print(f"wrote {names}: {done.ticks} ticks, {len(done.events)} events")
+            if marks:
+                out.print(f"marks at {', '.join(f'{time:.3f} s' for time in marks)}")
+        if found.is_cut:
+            err.print("[yellow]warning:[/yellow] the recording is cut; this is what it holds")
+        if done.damage:
+            told = plain("; ".join(done.damage))
+            err.print(f"[yellow]warning:[/yellow] the recording is damaged: {told}")
+        return 1 if done.damage else 0
+
+
+@dataclass(frozen=True, slots=True)
+class Compare:
+    """Find the first tick and field where two runs differ.
+
+    Ticks are compared bit by bit, without the times of the clock; runs at different rates where
+    their ticks coincide. Exit code 0 if both are the same run, 1 if not.
+
+    Example:
+        hapticbridge compare before.mcap after.mcap
+    """
+
+    first: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="A")]
+    """A recording."""
+    second: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="B")]
+    """Another one."""
+    as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
+    """Print the comparison as JSON."""
+
+    def execute(self) -> int:
+        """Compares; returns the exit code."""
+        with err.status("comparing …"):
+            found = compare(self.first, self.second)
+        if self.as_json:
+            out.print_json(found.to_json())
+        else:
+            _print(found)
+        for note in found.notes:
+            err.print(f"[yellow]warning:[/yellow] {plain(note)}")
+        return 0 if found.is_same else 1
+
+
+def _print(found: Comparison) -> None:
+    if found.is_same:
+        out.print(f"the same run: {found.compared} ticks are equal in every bit")
+    elif found.first is None:
+        out.print(f"{found.compared} common ticks are equal in every bit")
+    else:
+        first = found.first
+        out.print(
+            f"they part at tick {_ticks(first)} ({first.time:.6g} s) in {first.column}, by "
+            f"{_size(first)}: {first.values[0]!r} and {first.values[1]!r}"
+        )
+    if found.periods[0] != found.periods[1]:
+        rates = " and ".join(f"{1 / period:g} Hz" for period in found.periods)
+        out.print(f"rates {rates}: compared at their {found.compared} common ticks")
+    if found.ticks[0] != found.ticks[1]:
+        out.print(f"{found.ticks[0]} and {found.ticks[1]} ticks long")
+    if any(found.alone):
+        out.print(
+            f"ticks without a partner: {found.alone[0]} of the first, {found.alone[1]} of "
+            "the second"
+        )
+    for name, pair in found.decisive.items():
+        out.print(f"  {name}: {_told(pair[0])} and {_told(pair[1])}")
+    for name, counts in found.events.items():
+        other = ", which say other things" if counts[0] == counts[1] else ""
+        out.print(f"  events '{plain(name)}': {counts[0]} and {counts[1]}{other}")
+    if found.largest:
+        out.print("largest difference per field:")
+        for each in found.largest:
+            out.print(f"  {each.column:24} {_size(each):>12} at tick {_ticks(each)}")
+        for name, pair in found.beside.items():
+            out.print(f"  may explain it: {name} {_told(pair[0])} and {_told(pair[1])}")
+
+
+def _ticks(difference: Difference) -> str:
+    first, second = difference.ticks
+    return str(first) if first == second else f"{first} (of the other: {second})"
+
+
+def _size(difference: Difference) -> str:
+    if difference.size == 0.0:
+        return "the sign of zero"
+    if not math.isfinite(difference.size):
+        return "no number" if any(map(math.isnan, difference.values)) else "infinitely much"
+    if difference.unit == "1":
+        return f"{difference.size:.3g}"
+    return format_si(difference.size, difference.unit)
+
+
+def _told(text: str | None) -> str:
+    """Returns metadata as a line has room for it."""
+    if text is None:
+        return "nothing"
+    return plain(text if len(text) <= 100 else f"{text[:99]}…")

@@ -1,0 +1,1 @@
+"""Force Dimension devices (omega, delta, sigma) through the maker's own library."""

@@ -1,0 +1,340 @@
+"""Force Dimension's omega, delta, sigma and lambda, through the maker's own library.
+
+The library is not part of this project; the user has it from the maker (``library``). Calls
+talk to the device before they return, so a sample is as old as its call and a force acts when its
+call ends: the sheet's delay is what both together take.
+
+The device's frame is the library's: the origin in the middle of the workspace, x towards the user,
+y to the right, z up. A wrist with motors (sigma.7, lambda.7) is three more axes; its orientation
+comes as a matrix (``dhdGetPositionAndOrientationFrame``), because the library's angles are those of
+joints. A wrist without motors (omega.6 and omega.7) is left out: what it turns would put energy
+into the scene that no motor answers for. The maker's gravity compensation is switched on unless
+``gravity=0`` says otherwise: a force that depends on the position alone, so it gives no energy.
+
+No real device has moved under this code yet.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from ctypes import byref, c_double, c_ushort
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticbridge.device.base import (
+    AXES,
+    USUAL_SPEED_LIMIT,
+    DeviceInfo,
+    checked_period,
+    stated_numbers,
+)
+from hapticbridge.device.family import (
+    Driver,
+    FoundDevice,
+    Notify,
+    UsbId,
+    ignore_message,
+    select_device,
+)
+from hapticbridge.device.force_dimension.dhd import (
+    MODELS,
+    MOST_WATCHDOG,
+    SATURATED,
+    TIMEGUARD,
+    WATCHDOG_STEP,
+    Dhd,
+    Model,
+    limits_of,
+    located,
+    quaternion_of,
+)
+from hapticbridge.device.transport import usb as usb_search
+from hapticbridge.device.watchdog import SHORTEST_WATCHDOG, SILENCE, SilenceDetector, watchdog_time
+from hapticbridge.errors import DeviceError, DeviceLost
+from hapticbridge.record import SAMPLE_DTYPE, TickFlag
+
+MEASURED = (
+    "mass", "damping", "rotational_inertia", "rotational_damping", "friction", "resolution",
+)  # fmt: skip
+"""Numbers of the data sheet that nobody knows but who measured them."""
+
+FARTHEST = 10.0
+"""In m: a position beyond is none."""
+
+
+class ForceDimensionDevice:
+    """A device that is open.
+
+    The sheet's ``rate`` is how often a sample was read and a force written, its ``delay`` the time
+    that 95 % of these took (``Dhd.timing``); its limits are the lower ones of what the
+    library says, and of what was asked or is known of the model. The mass that the library knows
+    is the one that its gravity compensation carries: it is told, and is not the inertia felt.
+
+    Args:
+        dhd: The library.
+        index: Which of its devices, from 0.
+        gravity: Whether the maker's gravity compensation is on.
+        numbers: Of the data sheet, by name.
+        tell: Told what the device is and what was set.
+
+    Attributes:
+        effector_mass: What the gravity compensation carries, in kg; None where it is not known.
+        saturated: Writes at which a motor was at its end.
+
+    Raises:
+        DeviceError: It cannot be opened, or a limit that nobody can guess is missing.
+        DeviceLost: It is gone.
+    """
+
+    def __init__(
+        self,
+        dhd: Dhd,
+        index: int = 0,
+        *,
+        gravity: bool = True,
+        numbers: Mapping[str, float] | None = None,
+        tell: Notify = ignore_message,
+    ) -> None:
+        self._dhd = dhd
+        what = f"Force Dimension device {index} cannot be opened"
+        self._id = dhd.require("dhdOpenID", index, what=what)
+        self._is_open, self._is_started = True, False
+        self._place = [c_double() for _ in range(3)]
+        self._frame = (c_double * 9)()
+        self._references = [byref(number) for number in self._place]
+        self.saturated = 0
+        try:
+            kind = dhd.require("dhdGetSystemType", self._id, what=what)
+            model = MODELS.get(kind, Model(f"Force Dimension device of type {kind}"))
+            self._name, self._turns = model.name, model.turns
+            number = c_ushort()
+            is_told = dhd["dhdGetSerialNumber"](byref(number), self._id) >= 0
+            serial = str(number.value) if is_told else ""
+            mass = c_double()
+            is_told = dhd["dhdGetEffectorMass"](byref(mass), self._id) >= 0
+            self.effector_mass = mass.value if is_told and mass.value > 0.0 else None
+            what = f"{self._name}: gravity compensation cannot be set"
+            dhd.require("dhdSetGravityCompensation", int(gravity), self._id, what=what)
+            known = dict(numbers or {})
+            told = [float(dhd[call](self._id)) for call in ("dhdGetMaxForce", "dhdGetMaxTorque")]
+            limits = limits_of(model, told, known)
+            rate, delay = dhd.timing(lambda: (self._get(), self._send((0.0,) * 6)))
+            self.info = DeviceInfo(
+                name=self._name,
+                axes=AXES if self._turns else AXES[:3],
+                **{name: known.get(name) for name in MEASURED},
+                force_limit=limits[0],
+                torque_limit=limits[1],
+                speed_limit=USUAL_SPEED_LIMIT,
+                rate=rate,
+                delay=delay,
+                is_prescribed=False,
+                is_real=True,
+                duration=None,
+                serial=serial,
+            )
+        except BaseException:
+            self.close()
+            raise
+        carried = "unknown" if self.effector_mass is None else f"{self.effector_mass:g} kg"
+        tell(
+            f"{self._name}: limits {limits[0]:g} N"
+            + (f" and {limits[1]:g} N m" if self._turns else "")
+            + f"; gravity compensation {'on' if gravity else 'off'}, end effector {carried}"
+        )
+        self._tell = tell
+        self._sample = np.zeros(1, SAMPLE_DTYPE)
+        self._sample["quaternion"] = (1.0, 0.0, 0.0, 0.0)
+        self._watch = SilenceDetector(dhd.now())
+
+    def start(self, period: float) -> NDArray[np.void]:
+        """Sets the watchdog, switches the motors on without force, and reads the pose.
+
+        Args:
+            period: The loop's period in s, finite and > 0, below what the watchdog bears.
+
+        Raises:
+            DeviceError: The period is not, or the device reports no pose.
+            DeviceLost: It is gone.
+        """
+        longest = MOST_WATCHDOG * WATCHDOG_STEP
+        if checked_period(period) > 0.5 * longest:
+            raise DeviceError(
+                f"{self._name}: its watchdog ends {1e3 * longest:.3g} ms after a force, so the "
+                f"rate must be at least {2.0 / longest:.0f} Hz, not {1 / period:g} Hz"
+            )
+        steps = min(math.ceil(watchdog_time(period) / WATCHDOG_STEP), MOST_WATCHDOG)
+        if not self._dhd.has_watchdog(self._id, steps):
+            self._tell(
+                f"{self._name} has no watchdog ({self._dhd.last_error()}): a program that hangs "
+                "would leave its last force on"
+            )
+        self._send((0.0,) * 6)
+        self._require("dhdEnableForce", 1)
+        self.saturated = 0
+        begin = self._dhd.now()
+        while self._get() == TIMEGUARD:
+            if self._dhd.now() - begin > SILENCE:
+                raise DeviceLost(f"{self._name} gives no fresh sample")
+        self._fill()
+        self._watch = SilenceDetector(self._dhd.now())
+        self._is_started = True
+        return self._sample.copy()
+
+    def read(self, sample: NDArray[np.void]) -> int:
+        """Reads the pose; blocks for as long as the library does.
+
+        Args:
+            sample: Shape (1,), ``SAMPLE_DTYPE``, filled in place.
+
+        Returns:
+            0, or ``TickFlag.STALE_SAMPLE`` where the library had no newer sample.
+
+        Raises:
+            DeviceError: ``start`` has not been called, or what came is no pose.
+            DeviceLost: The library reports an error, or no fresh sample for ``SILENCE``.
+        """
+        if not self._is_started:
+            raise DeviceError(f"{self._name} is read before it was started")
+        is_fresh = self._get() != TIMEGUARD
+        now = self._dhd.now()
+        if is_fresh:
+            self._fill()
+        if self._watch.is_silent(now, is_new=is_fresh):
+            raise DeviceLost(f"{self._name} has given no fresh sample for {1e3 * SILENCE:g} ms")
+        sample[0] = self._sample[0]
+        return 0 if is_fresh else int(TickFlag.STALE_SAMPLE)
+
+    def write(self, wrench: NDArray[np.float64]) -> None:
+        """Commands a wrench, on the axes that have motors.
+
+        Args:
+            wrench: Shape (6,), in the device's frame.
+
+        Raises:
+            DeviceError: It is not finite.
+            DeviceLost: The library reports an error.
+        """
+        values = wrench.tolist()
+        if not all(map(math.isfinite, values)):
+            raise DeviceError(f"{self._name}: a wrench that is not finite was not sent")
+        self.saturated += self._send(values) == SATURATED
+
+    def close(self) -> None:
+        """Commands zero force, switches the motors off and lets the device go."""
+        if not self._is_open:
+            return
+        self._is_open = self._is_started = False
+        for name, arguments in (
+            ("dhdSetForce", (0.0, 0.0, 0.0)),
+            ("dhdEnableForce", (0,)),
+            ("dhdClose", ()),
+        ):
+            self._dhd[name](*arguments, self._id)  # what fails here, its watchdog does
+
+    def _get(self) -> int:
+        if self._turns:
+            name = "dhdGetPositionAndOrientationFrame"
+            return self._require(name, *self._references, self._frame)
+        return self._require("dhdGetPosition", *self._references)
+
+    def _send(self, values: tuple[float, ...] | list[float]) -> int:
+        if self._turns:
+            return self._require("dhdSetForceAndTorque", *values)
+        return self._require("dhdSetForce", *values[:3])
+
+    def _require(self, name: str, *arguments: object) -> int:
+        if (code := int(self._dhd[name](*arguments, self._id))) < 0:
+            raise DeviceLost(f"{self._name} is gone or failed: {self._dhd.last_error()}")
+        return code
+
+    def _fill(self) -> None:
+        x, y, z = (number.value for number in self._place)
+        if not all(abs(value) < FARTHEST for value in (x, y, z)):
+            raise DeviceError(f"{self._name} reports a position that is none: {x}, {y}, {z}")
+        self._sample["position"] = (x, y, z)
+        self._sample["buttons"] = self._dhd["dhdGetButtonMask"](self._id) & 0xFFFF
+        if self._turns:
+            self._sample["quaternion"] = quaternion_of(self._frame[:], self._name)
+
+
+# Force Dimension's devices: finding the maker's library and its devices, and opening one.
+
+_NUMBERS = (*MEASURED, "force_limit", "torque_limit")
+
+
+def open_forcedimension(options: Mapping[str, object], tell: Notify) -> ForceDimensionDevice:
+    """Loads the library and opens one of its devices.
+
+    Args:
+        options: ``library`` (its file), ``serial`` (the device's place in the library's list, from
+            0, where there are several), ``gravity`` (1 or 0), and numbers of the data sheet.
+        tell: Told what the device is and what was set.
+
+    Raises:
+        DeviceError: There is no library or no device, or an option is not valid.
+        DeviceLost: It is gone.
+    """
+    numbers = stated_numbers(options, _NUMBERS)
+    gravity = options.get("gravity", 1.0)
+    if gravity not in (0, 1):
+        raise DeviceError(f"gravity = {gravity!r}: must be 1 (compensated) or 0")
+    dhd = Dhd(located(options.get("library")))
+    device = select_device(FAMILY, _listed(dhd), options.get("serial"))
+    return ForceDimensionDevice(
+        dhd, int(device.path), gravity=bool(gravity), numbers=numbers, tell=tell
+    )
+
+
+def find() -> list[FoundDevice]:
+    """Lists the devices that the library has; without it, those that the kernel knows."""
+    try:
+        return _listed(Dhd(located()))
+    except DeviceError as error:
+        return [replace(device, problem=str(error)) for device in usb_search.find(FAMILY)]
+
+
+def medium() -> str:
+    """Says in a sentence whether the library is there."""
+    try:
+        return f"Force Dimension's library is there: {Dhd(located()).path}"
+    except DeviceError as error:
+        return str(error)
+
+
+def _listed(dhd: Dhd) -> list[FoundDevice]:
+    return [
+        FoundDevice(
+            family="forcedimension",
+            name="Force Dimension device",
+            serial="",
+            path=str(index),
+            vendor=0,
+            product=0,
+            transport="library",
+            problem=None,
+        )
+        for index in range(max(int(dhd["dhdGetDeviceCount"]()), 0))
+    ]
+
+
+FAMILY = Driver(
+    name="forcedimension",
+    about="Force Dimension omega, delta, sigma and lambda through the maker's library (DHD)",
+    ids=(UsbId(0x1451, 0x0402, "Force Dimension omega"),),
+    transport="library",
+    axes="x, y, z; with rx, ry, rz where the wrist has motors",
+    force="what the library says, else 12 N (omega, sigma, lambda) or 20 N (delta)",
+    rate="4 kHz, as the maker says",
+    on_stall=f"its watchdog takes the force away after {1e3 * SHORTEST_WATCHDOG:g} ms; one that "
+    "has none is named when it is started",
+    options=("library", "serial", "gravity", *_NUMBERS),
+    open=open_forcedimension,
+    find=find,
+    medium=medium,
+    sought="a device of Force Dimension's library",
+)
+"""Its products' numbers on the USB bus are not all known; the library finds them by itself."""

@@ -1,0 +1,284 @@
+"""Force Dimension's own library (DHD), loaded at run time: none of it is part of this project.
+
+Signatures, types and codes as the SDK's header ``dhdc.h`` and its public Python bindings have them.
+Every call ends with the device's number. Getters and setters return a negative number where they
+failed, 0, or a positive one as a warning. Each talks to the device before it returns: how long
+that may take is up to the library, and cannot be bounded from here.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import ctypes.util
+import math
+import os
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from ctypes import POINTER, c_byte, c_char_p, c_double, c_int, c_ubyte, c_uint, c_ushort
+from dataclasses import dataclass
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from hapticbridge.device.base import USUAL_TORQUE_LIMIT
+from hapticbridge.errors import DeviceError
+from hapticbridge.pose import Quaternion, canonical
+
+# What Force Dimension's library calls its devices, and what is known of each beforehand.
+
+ROTATION_ERROR = 1e-3
+"""Of R Rᵀ, without unit: more is no rotation, whatever rounded it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Model:
+    """A kind of device.
+
+    Attributes:
+        name: The maker's.
+        turns: Whether its wrist has motors.
+        force: Largest force in N, where the library sets no limit; None where none was found.
+        torque: Largest torque in N m, likewise.
+    """
+
+    name: str
+    turns: bool = False
+    force: float | None = None
+    torque: float | None = None
+
+
+MODELS = {
+    33: Model("omega.3", force=12.0),
+    34: Model("omega.6", force=12.0),
+    36: Model("omega.6 left", force=12.0),
+    35: Model("omega.7", force=12.0),
+    37: Model("omega.7 left", force=12.0),
+    60: Model("Novint Falcon", force=8.0),
+    63: Model("delta.3", force=20.0),
+    104: Model("sigma.7", turns=True, force=12.0, torque=0.4),
+    105: Model("sigma.7 left", turns=True, force=12.0, torque=0.4),
+    108: Model("lambda.7", turns=True, force=12.0),
+    109: Model("lambda.7 left", turns=True, force=12.0),
+    203: Model("lambda.3"),
+    206: Model("sigma.3"),
+}
+"""By ``dhdGetSystemType``: numbers of the SDK's header. Forces and torques are what CHAI3D lets
+programs ask of each; the maker's own figures are as large or larger."""
+
+
+def limits_of(
+    model: Model, told: Sequence[float], asked: Mapping[str, float]
+) -> tuple[float, float]:
+    """Returns the largest force in N and torque in N m that a device may be sent.
+
+    The lower holds of what the library says and of what was asked, or is known of the model.
+
+    Args:
+        model: The device's.
+        told: What the library says of each; it is negative where it sets no limit.
+        asked: Numbers of the data sheet that the user named.
+
+    Raises:
+        DeviceError: Nobody knows.
+    """
+    limits = {"force": 0.0, "torque": USUAL_TORQUE_LIMIT}
+    usual = {"force": model.force, "torque": model.torque}
+    for name, said in zip(limits, told, strict=True):
+        if name == "torque" and not model.turns:
+            continue
+        ends = [asked.get(f"{name}_limit", usual[name]), said if said > 0.0 else None]
+        known = [end for end in ends if end is not None]
+        if not known:
+            raise DeviceError(
+                f"neither the library nor this project knows the largest {name} of {model.name}; "
+                f"name it with {name}_limit="
+            )
+        limits[name] = min(known)
+    return limits["force"], limits["torque"]
+
+
+def quaternion_of(frame: Sequence[float], name: str) -> Quaternion:
+    """Returns the unit quaternion (w, x, y, z) of a rotation matrix.
+
+    Args:
+        frame: Nine numbers, row by row.
+        name: What errors call the device.
+
+    Raises:
+        DeviceError: The matrix is no rotation, or a number in it is not finite.
+    """
+    flat = np.array(frame)
+    matrix = flat.reshape(3, 3)
+    is_finite = bool(np.isfinite(matrix).all())
+    if not is_finite or not (
+        np.abs(matrix @ matrix.T - np.eye(3)).max() < ROTATION_ERROR and np.linalg.det(matrix) > 0
+    ):
+        raise DeviceError(f"{name} reports an orientation that is no rotation")
+    quaternion = np.empty(4)
+    mujoco.mju_mat2Quat(quaternion, flat)
+    w, x, y, z = (quaternion / np.linalg.norm(quaternion)).tolist()
+    return canonical((w, x, y, z))
+
+
+VARIABLE = "HAPTICBRIDGE_DHD"
+"""Environment variable that names the library's file where the option ``library`` does not."""
+
+FRESH, TIMEGUARD, SATURATED = 0, 1, 2
+"""Codes: done; a getter had no newer sample; a motor is at its end."""
+
+MOST_WATCHDOG = 255
+"""Largest watchdog, in steps of ``WATCHDOG_STEP``: its argument is a byte."""
+
+WATCHDOG_STEP = 125e-6
+"""In s."""
+
+TIMING, SHARE = 0.1, 0.95
+"""Time in s for which exchanges are measured, and the share of them that keeps the delay."""
+
+_NUMBERS = POINTER(c_double)
+
+FUNCTIONS: dict[str, tuple[Any, tuple[Any, ...]]] = {
+    "dhdGetDeviceCount": (c_int, ()),
+    "dhdOpenID": (c_int, (c_byte,)),
+    "dhdClose": (c_int, (c_byte,)),
+    "dhdGetSystemType": (c_int, (c_byte,)),
+    "dhdGetSerialNumber": (c_int, (POINTER(c_ushort), c_byte)),
+    "dhdGetMaxForce": (c_double, (c_byte,)),
+    "dhdGetMaxTorque": (c_double, (c_byte,)),
+    "dhdGetEffectorMass": (c_int, (_NUMBERS, c_byte)),
+    "dhdSetGravityCompensation": (c_int, (c_int, c_byte)),
+    "dhdEnableExpertMode": (c_int, ()),
+    "dhdDisableExpertMode": (c_int, ()),
+    "dhdSetWatchdog": (c_int, (c_ubyte, c_byte)),
+    "dhdEnableForce": (c_int, (c_ubyte, c_byte)),
+    "dhdGetPosition": (c_int, (_NUMBERS,) * 3 + (c_byte,)),
+    "dhdGetPositionAndOrientationFrame": (c_int, (_NUMBERS,) * 4 + (c_byte,)),
+    "dhdGetButtonMask": (c_uint, (c_byte,)),
+    "dhdSetForce": (c_int, (c_double,) * 3 + (c_byte,)),
+    "dhdSetForceAndTorque": (c_int, (c_double,) * 6 + (c_byte,)),
+    "dhdGetTime": (c_double, ()),
+    "dhdErrorGetLastStr": (c_char_p, ()),
+}
+"""What is called, with the type of the result and those of the arguments."""
+
+NAMES = {
+    "linux": ("libdrd.so.3", "libdrd.so", "libdhd.so.3", "libdhd.so"),
+    "darwin": ("libdrd.dylib", "libdhd.dylib"),
+    "win32": ("drd64.dll", "dhd64.dll"),
+}
+"""Usual names of its files, by ``sys.platform``. DRD holds all of DHD."""
+
+
+class Dhd:
+    """The library, loaded, with every function that is used bound to its signature.
+
+    Args:
+        path: Its file.
+
+    Raises:
+        DeviceError: It cannot be loaded, or lacks a function.
+    """
+
+    def __init__(self, path: str) -> None:
+        try:
+            library = ctypes.CDLL(path)
+        except OSError as error:
+            reason = " ".join(str(error).split())
+            raise DeviceError(f"the library '{path}' cannot be loaded: {reason}") from None
+        self.path = path
+        self._functions: dict[str, Any] = {}
+        for name, (result, arguments) in FUNCTIONS.items():
+            try:
+                function = getattr(library, name)
+            except AttributeError:
+                raise DeviceError(
+                    f"'{path}' has no {name}: it is not Force Dimension's library, or is older "
+                    "than 3.3"
+                ) from None
+            function.restype, function.argtypes = result, arguments
+            self._functions[name] = function
+
+    def __getitem__(self, name: str) -> Any:
+        """Returns a function of ``FUNCTIONS``."""
+        return self._functions[name]
+
+    def now(self) -> float:
+        """Returns the time in s of the library's own clock."""
+        return float(self["dhdGetTime"]())
+
+    def last_error(self) -> str:
+        """Returns what the library says of its last error."""
+        text = self["dhdErrorGetLastStr"]()
+        return text.decode(errors="replace") if text else "it does not say why"
+
+    def require(self, name: str, *arguments: Any, what: str) -> int:
+        """Calls a function; returns its code, 0 or a warning.
+
+        Args:
+            name: Of ``FUNCTIONS``.
+            *arguments: The function's.
+            what: What could not be done if it fails, for the message.
+
+        Raises:
+            DeviceError: It failed; says what the library says.
+        """
+        code = int(self[name](*arguments))
+        if code < 0:
+            raise DeviceError(f"{what}: {self.last_error()}")
+        return code
+
+    def has_watchdog(self, device: int, steps: int) -> bool:
+        """Sets a device's watchdog; returns False where it has none.
+
+        Args:
+            device: Its number.
+            steps: Of ``WATCHDOG_STEP``, 1 to ``MOST_WATCHDOG``. A force that is this old ends.
+        """
+        self["dhdEnableExpertMode"]()
+        code = int(self["dhdSetWatchdog"](steps, device))
+        self["dhdDisableExpertMode"]()
+        return code >= 0
+
+    def timing(self, exchange: Callable[[], object]) -> tuple[float, float]:
+        """Returns how often an exchange can be made, in Hz, and the time in s that most kept.
+
+        Args:
+            exchange: Reads a sample and writes a force; made for ``TIMING``.
+        """
+        times = []
+        begin = last = self.now()
+        while last - begin < TIMING:
+            exchange()
+            now = self.now()
+            times.append(now - last)
+            last = now
+        times.sort()
+        return len(times) / (last - begin), times[math.ceil(SHARE * len(times)) - 1]
+
+
+def located(library: object = None) -> str:
+    """Returns the library's file.
+
+    Args:
+        library: What the user named; None: the environment variable, else the usual names.
+
+    Raises:
+        DeviceError: None is found; says where to get it and how to name it.
+    """
+    named = library or os.environ.get(VARIABLE)
+    if named:
+        return str(named)
+    for name in ("drd", "dhd"):
+        if (found := ctypes.util.find_library(name)) is not None:
+            return found
+    for name in NAMES.get(sys.platform, ()):
+        try:
+            ctypes.CDLL(name)
+        except OSError:
+            continue
+        return name
+    raise DeviceError(
+        "Force Dimension's library (DHD) was not found: install the SDK of forcedimension.com and "
+        f"name its file with library=FILE or {VARIABLE}"
+    )

@@ -1,0 +1,267 @@
+"""Devices by name, as the command line and scripts ask for them."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import asdict
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from hapticbridge.device.base import Device
+from hapticbridge.device.family import Driver, Notify, ignore_message
+from hapticbridge.device.profile import modelled, profile_named, profile_of
+from hapticbridge.device.simulated.device import SimulatedDevice, scene_hand
+from hapticbridge.device.simulated.hand import Hand
+from hapticbridge.device.trajectory import ReplayDevice, TrajectoryDevice, read_motion
+from hapticbridge.errors import DeviceError, choices
+from hapticbridge.scene import Scene
+
+# Table of the hardware drivers. A driver is imported when one of its devices is asked for.
+
+DRIVERS = {
+    "falcon": "hapticbridge.device.falcon.device",
+    "spacemouse": "hapticbridge.device.spacemouse",
+    "rawhid": "hapticbridge.device.rawhid.device",
+    "pid": "hapticbridge.device.pid.device",
+    "haply": "hapticbridge.device.haply.device",
+    "forcedimension": "hapticbridge.device.force_dimension.device",
+}
+"""Module of each family by the family's name, in the order in which families are listed. The module
+holds the ``Driver`` as ``FAMILY``."""
+
+
+def family_named(name: str) -> Driver | None:
+    """Returns the family that ``open_device`` knows by a name, or None."""
+    if name not in DRIVERS:
+        return None
+    family: Driver = import_module(DRIVERS[name]).FAMILY
+    return family
+
+
+def all_families() -> tuple[Driver, ...]:
+    """Returns every family; imports all drivers."""
+    return tuple(family for name in DRIVERS if (family := family_named(name)) is not None)
+
+
+# ``name=value,name=value``: what a user types after a device's name and a colon.
+
+FILES = ("path",)
+"""Options that take all that comes after them: the file's name, commas too."""
+
+TEXTS = ("hand", "serial", "firmware", "log", "profile", "reverse", "service", "library")
+"""Options that are text up to the next comma; a serial number may have leading zeros."""
+
+WHOLE = ("delay",)
+"""Options that are whole numbers; all others are numbers."""
+
+
+def parsed(device: str, text: str, valid: Iterable[str]) -> dict[str, object]:
+    """Reads what stands after a device's name.
+
+    Args:
+        device: The name.
+        text: Options, separated by commas; may be empty.
+        valid: Options that the device has.
+
+    Raises:
+        DeviceError: A part is no ``name=value``, a name is there twice or unknown, or a value is no
+            number.
+    """
+    names = tuple(valid)
+    values: dict[str, object] = {}
+    while text:
+        name, equals, text = text.partition("=")
+        name = name.strip()
+        if not equals:
+            raise DeviceError(f"'{name}' is no option; options are written name=value")
+        if name in values:
+            raise DeviceError(f"{name} is there twice")
+        refuse_unknown(device, [name], names)
+        if name in FILES:
+            value, text = text, ""
+        else:
+            value, _, text = text.partition(",")
+        values[name] = _value(name, value.strip())
+    return values
+
+
+def _value(name: str, text: str) -> object:
+    if name in FILES or name in TEXTS:
+        return text
+    try:
+        return int(text) if name in WHOLE else float(text)
+    except ValueError:
+        kind = "a whole number" if name in WHOLE else "a number"
+        raise DeviceError(f"{name} = '{text}': must be {kind}") from None
+
+
+def refuse_unknown(device: str, options: Iterable[str], valid: Iterable[str]) -> None:
+    """Refuses an option that a device does not have, by its name.
+
+    Raises:
+        DeviceError: Names the first one, and those that there are.
+    """
+    names = tuple(valid)
+    unknown = [name for name in options if name not in names]
+    if unknown:
+        raise DeviceError(
+            f"unknown option '{unknown[0]}' of the {device} device; there are {choices(names)}"
+        )
+
+
+_MCAP_MAGIC = b"\x89MCAP0\r\n"
+_HAND_PREFIX = "hand_"
+_HAND_OPTIONS = tuple(_HAND_PREFIX + name for name in inspect.signature(Hand).parameters)
+_SIMULATED_OPTIONS = (*inspect.signature(SimulatedDevice).parameters, *_HAND_OPTIONS)
+_LIMITS = ("force_limit", "torque_limit", "speed_limit")
+
+
+def open_device(spec: str, *, tell: Notify = ignore_message, **options: object) -> Device:
+    """Opens a device by what a user would type.
+
+    Specifications are a name, or a name, a colon and what the device needs to know:
+
+    - ``simulated``, ``simulated:damping=5,friction=0.1``: a ``SimulatedDevice`` with these
+      parameters, numbers in SI units. ``hand_mass``, ``hand_damping``, ``hand_stiffness``,
+      ``hand_rotational_inertia``, ``hand_rotational_damping`` and ``hand_rotational_stiffness``
+      change its hand, ``hand=none`` lets it go. ``path=FILE`` comes last: all after it is the
+      file's name.
+    - ``trajectory:FILE``: follows a CSV file (``read_motion``) or repeats the device motion of a
+      recording. All after the colon is the file's name, commas and colons too.
+    - a device that is plugged in, by its family's name (``hapticbridge devices`` lists them), with
+      options that the family has: ``spacemouse:speed=0.1,turn=1,dead_band=0.05``,
+      ``rawhid:serial=12345,damping=2``, ``falcon:firmware=FILE``, ``pid:newtons=4,travel=0.08``,
+      ``haply:serial=049D``, ``forcedimension:library=FILE``. ``serial`` picks one of several,
+      ``log=FILE`` keeps what went over the wire. What its driver does not know comes from the
+      profile of the unit or its kind, or from that of ``profile=NAME`` (or a file, or ``none``).
+
+    Args:
+        spec: The specification.
+        tell: Takes sentences for the user while the device is opened: what to do, how far it is.
+        **options: The same parameters from code. What the specification says goes first; a
+            trajectory takes ``force_limit`` (N), ``torque_limit`` (N m) and ``speed_limit`` (m/s).
+
+    Returns:
+        The device, not yet started. A real one is claimed, so that a missing one is refused at
+        once.
+
+    Raises:
+        DeviceError: The name, an option or a value is not valid, the file is not a motion, or the
+            device is not plugged in or may not be opened.
+        RecordingError: The file is a recording that cannot be read.
+    """
+    name, _, rest = spec.partition(":")
+    if (family := family_named(name)) is not None:
+        valid = tuple(dict.fromkeys((*family.options, "profile")))
+        refuse_unknown(name, options, valid)
+        asked = {**options, **parsed(name, rest, valid)}
+        wanted = asked.get("profile")
+        if "profile" not in family.options:
+            asked.pop("profile", None)
+        chosen = None if wanted in (None, "none") else profile_named(str(wanted))
+        device = family.open(asked, tell)
+        try:
+            if wanted is None:
+                model = device.info.name
+                chosen = profile_of(name, device.info.serial, model)
+                if chosen is None and (models := modelled(name)):
+                    tell(f"there is no profile of '{model}'; there are {choices(models)}")
+            if chosen is not None:
+                device.info = chosen.fill(device.info)
+        except BaseException:
+            device.close()
+            raise
+        return device
+    if name not in _OPENERS:
+        names = choices([*_OPENERS, *DRIVERS])
+        raise DeviceError(f"unknown device '{name}'; there are {names}")
+    return _OPENERS[name](rest, options)
+
+
+def device_for(scene: Scene, spec: str, tell: Notify = ignore_message) -> Device:
+    """Opens a device for a scene; the simulated one does what the scene is there for.
+
+    Its hand is the one that the scene asks for (``scene_hand``) and follows ``NAME.csv`` beside the
+    scene, if there is one. Every option in the specification goes before what the scene says.
+
+    Args:
+        scene: The scene that the device will move in.
+        spec: What ``open_device`` understands.
+        tell: Takes sentences for the user, likewise.
+
+    Raises:
+        DeviceError: See ``open_device``.
+        SceneError: The scene asks for a hand that cannot be.
+    """
+    name, _, rest = spec.partition(":")
+    if name != "simulated":
+        return open_device(spec, tell=tell)
+    options: dict[str, object] = {}
+    if "hand" not in parsed(name, rest, _SIMULATED_OPTIONS):
+        hand = asdict(scene_hand(scene.model, scene.path))
+        options |= {_HAND_PREFIX + field: value for field, value in hand.items()}
+    path = scene.path.with_suffix(".csv")
+    if path.is_file():
+        options["path"] = path
+    return open_device(spec, tell=tell, **options)
+
+
+def _open_simulated(rest: str, options: Mapping[str, object]) -> Device:
+    refuse_unknown("simulated", options, _SIMULATED_OPTIONS)
+    asked = parsed("simulated", rest, _SIMULATED_OPTIONS)
+    parameters: dict[str, Any] = {**options, **asked}
+    changes = {name: parameters.pop(name) for name in _HAND_OPTIONS if name in parameters}
+    if "hand" not in parameters:
+        parameters["hand"] = Hand(
+            **{name.removeprefix(_HAND_PREFIX): value for name, value in changes.items()}
+        )
+    elif changes:
+        raise DeviceError(f"hand and {choices(changes)} exclude each other")
+    if parameters["hand"] == "none":
+        parameters["hand"] = None
+    elif not isinstance(parameters["hand"], Hand | None):
+        raise DeviceError(
+            f"hand = {parameters['hand']!r}: must be 'none'; {choices(_HAND_OPTIONS)} change it"
+        )
+    return SimulatedDevice(**parameters)
+
+
+def _open_trajectory(rest: str, options: Mapping[str, object]) -> Device:
+    refuse_unknown("trajectory", options, _LIMITS)
+    limits: dict[str, Any] = dict(options)
+    if not rest:
+        raise DeviceError("trajectory needs a file: 'trajectory:FILE', a CSV file or a recording")
+    path = Path(rest)
+    if not _is_recording(path):
+        return TrajectoryDevice(read_motion(path), **limits)
+    # devices stand left of recordings and know nothing of files' formats; only whoever asks for a
+    # recording by name needs the reader
+    from hapticbridge.recording import read_recording  # noqa: PLC0415
+
+    recording = read_recording(path)
+    try:
+        period = float(recording.meta["period_s"])
+    except (KeyError, ValueError):
+        raise DeviceError(f"{path}: the recording does not say its period (period_s)") from None
+    return ReplayDevice(recording.ticks, period, name=str(path), **limits)
+
+
+_OPENERS: dict[str, Callable[[str, Mapping[str, object]], Device]] = {
+    "simulated": _open_simulated,
+    "trajectory": _open_trajectory,
+}
+
+
+def _is_recording(path: Path) -> bool:
+    """Tells a recording by its first bytes; by its name if it is too short for them."""
+    if path.suffix == ".mcap":
+        return True
+    try:
+        if not path.is_file():
+            return False
+        with path.open("rb") as file:
+            return file.read(len(_MCAP_MAGIC)) == _MCAP_MAGIC
+    except (OSError, ValueError):
+        return False  # whoever reads it as a motion says why it cannot be

@@ -1,0 +1,360 @@
+"""3Dconnexion SpaceMouse: six axes of input, as a rate of motion; it has no motors."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import struct
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticbridge.device.base import (
+    AXES,
+    USUAL_FORCE_LIMIT,
+    USUAL_TORQUE_LIMIT,
+    DeviceInfo,
+    checked_number,
+    checked_period,
+)
+from hapticbridge.device.family import Driver, Notify, UsbId, select_device
+from hapticbridge.device.transport.hid import HidApi, HidLink, Link, find
+from hapticbridge.device.transport.trace import HexLog
+from hapticbridge.errors import DeviceError
+from hapticbridge.pose import Quaternion, canonical, product, quaternion_exp
+from hapticbridge.record import SAMPLE_DTYPE
+
+# Which products of two vendors are a SpaceMouse, or were called so before.
+#
+# The maker's CadMouse (256f: c650, c651, c654 to c658, c664, c665, c668) are two-dimensional
+# mice and are left out. Source: spacenavd of December 2025 and pyspacemouse of June 2026.
+
+_LOGITECH = {
+    0xC603: "SpaceMouse Plus XT",
+    0xC605: "CadMan",
+    0xC606: "SpaceMouse Classic",
+    0xC621: "Spaceball 5000",
+    0xC623: "SpaceTraveler",
+    0xC625: "SpacePilot",
+    0xC626: "SpaceNavigator",
+    0xC627: "SpaceExplorer",
+    0xC628: "SpaceNavigator for Notebooks",
+    0xC629: "SpacePilot Pro",
+    0xC62B: "SpaceMouse Pro",
+}
+
+_3DCONNEXION = {
+    0xC62E: "SpaceMouse Wireless (cable)",
+    0xC62F: "SpaceMouse Wireless (receiver)",
+    0xC631: "SpaceMouse Pro Wireless (cable)",
+    0xC632: "SpaceMouse Pro Wireless (receiver)",
+    0xC633: "SpaceMouse Enterprise",
+    0xC635: "SpaceMouse Compact",
+    0xC636: "SpaceMouse Module",
+    0xC638: "SpaceMouse Pro Wireless (Bluetooth)",
+    0xC63A: "SpaceMouse Wireless (Bluetooth)",
+    0xC641: "SpaceMouse Module (USB)",
+    0xC652: "Universal Receiver",
+}
+
+IDS = (
+    *(UsbId(0x046D, product, model) for product, model in _LOGITECH.items()),
+    *(UsbId(0x256F, product, model) for product, model in _3DCONNEXION.items()),
+)
+"""All of them: Logitech's own numbers first, then the maker's since it stands alone."""
+
+
+# What a SpaceMouse reports: three layouts that tell themselves apart by number and length.
+
+FULL_SCALE = 350
+"""Counts at full deflection of the puck (spacenavd, 2025). A few more can come and are clamped."""
+
+MOST_BUTTON_BYTES = 6
+"""A SpaceMouse Enterprise has 31 buttons; 48 fit into a record's integer with room to spare."""
+
+LED_ON, LED_OFF = bytes([4, 1]), bytes([4, 0])
+"""Output report 4: the light in the base."""
+
+_TRANSLATION, _ROTATION, _BUTTONS = 1, 2, 3
+"""Numbers of the input reports."""
+_THREE, _SIX = struct.Struct("<3h"), struct.Struct("<6h")
+
+
+class Deflection(NamedTuple):
+    """How far the puck is pushed along or turned about some of its axes.
+
+    The maker's axes: x to the right, y towards the user, z down; rotations about them.
+
+    Attributes:
+        first: Index of the first axis in (x, y, z, rx, ry, rz): 0, or 3 for rotations alone.
+        counts: 3 or 6 signed numbers.
+    """
+
+    first: int
+    counts: tuple[int, ...]
+
+
+class Buttons(NamedTuple):
+    """Which buttons are down.
+
+    Attributes:
+        bits: One bit each; which key is which bit differs from model to model.
+    """
+
+    bits: int
+
+
+def decoded(report: bytes) -> Deflection | Buttons | None:
+    """Reads one report.
+
+    Report 1 is the translation; where it has 13 bytes (wireless models, the receiver, newer
+    firmware) it is translation and rotation. Report 2 is the rotation of older wired models, which
+    send both in pairs. Length tells them apart, not the product: one product was sold with both.
+
+    Args:
+        report: Any bytes, the report's number first.
+
+    Returns:
+        None for what is none of these.
+    """
+    if len(report) < 2:
+        return None
+    number = report[0]
+    if number == _BUTTONS:
+        return Buttons(int.from_bytes(report[1 : 1 + MOST_BUTTON_BYTES], "little"))
+    if number == _TRANSLATION and len(report) >= 1 + _SIX.size:
+        return Deflection(0, _SIX.unpack_from(report, 1))
+    if number in (_TRANSLATION, _ROTATION) and len(report) >= 1 + _THREE.size:
+        return Deflection(3 * (number - 1), _THREE.unpack_from(report, 1))
+    return None
+
+
+def share(count: int, dead_band: float) -> float:
+    """Returns a deflection as a share of full scale, −1 to 1, 0 within the dead band.
+
+    sign(c) · max(0, |c| − d)/(1 − d) with c = count/350 clamped to ±1: continuous at the band's
+    edge, so nothing jumps where the puck leaves it.
+
+    Args:
+        count: As reported.
+        dead_band: d, share of full scale that counts as rest, 0 <= d < 1.
+    """
+    size = min(abs(count) / FULL_SCALE, 1.0)
+    if size <= dead_band:
+        return 0.0
+    return (size - dead_band) / (1.0 - dead_band) * (1.0 if count > 0 else -1.0)
+
+
+SPEED, TURN = 0.05, 0.8
+"""m/s and rad/s at full deflection, unless the user says otherwise: 10 cm, the reach of a desktop
+device, in two seconds, and a quarter of a turn likewise."""
+
+DEAD_BAND = 0.05
+"""Share of full deflection that counts as rest: 17 counts. A hand that pushes along one axis spills
+some per cent into the others, and a worn puck does not return to zero."""
+
+HELD = 0.5
+"""In s. A deflected puck repeats its report some hundred times a second; one that has said nothing
+for this long is out of reach, and must not go on moving the tool. Not verified on hardware."""
+
+# the maker's y points to the user and z down, the bridge's away and up: half a turn about x, which
+# maps rotations as it maps translations
+_TO_BRIDGE = np.array([1.0, -1.0, -1.0, 1.0, -1.0, -1.0])
+
+
+class SpaceMouseDevice:
+    """A handle that moves as long as the puck is pushed, at a speed proportional to it.
+
+        p ← p + v T,   R ← exp(ω T) R
+
+    with v and ω from the deflection beyond the dead band, both in the frame of the base: x to the
+    right, y away from the user, z up. R is composed exactly. The device feels nothing: its motion
+    is prescribed, and what the tool is pushed with is shown and recorded. At rest it sends nothing,
+    which is no sign of its being unplugged.
+
+    Args:
+        link: Reports to and from it, open.
+        name: What it is called.
+        speed: In m/s at full deflection of one axis, > 0.
+        turn: In rad/s, likewise.
+        dead_band: Share of full deflection that counts as rest, 0 to below 1.
+        force_limit: In N, >= 0, for the data sheet: what the recorded wrench is limited to.
+        torque_limit: In N m, >= 0, likewise.
+
+    Raises:
+        DeviceError: A number is out of range.
+    """
+
+    def __init__(
+        self,
+        link: Link,
+        name: str = "spacemouse",
+        *,
+        speed: float = SPEED,
+        turn: float = TURN,
+        dead_band: float = DEAD_BAND,
+        force_limit: float = USUAL_FORCE_LIMIT,
+        torque_limit: float = USUAL_TORQUE_LIMIT,
+    ) -> None:
+        self._link, self._name = link, name
+        speed = checked_number("speed", speed, "m/s", is_positive=True)
+        turn = checked_number("turn", turn, "rad/s", is_positive=True)
+        self._full = _TO_BRIDGE * np.repeat([speed, turn], 3)
+        self._dead_band = checked_number("dead_band", dead_band, "of full deflection")
+        if self._dead_band >= 1.0:
+            raise DeviceError(f"dead_band = {dead_band!r}: must be below 1, which is full scale")
+        self.info = DeviceInfo(
+            name=name,
+            axes=AXES,
+            mass=None,
+            damping=None,
+            rotational_inertia=None,
+            rotational_damping=None,
+            friction=None,
+            resolution=None,
+            force_limit=force_limit,
+            torque_limit=torque_limit,
+            speed_limit=math.sqrt(3.0) * speed,  # all three axes at full deflection
+            rate=None,
+            delay=None,
+            is_prescribed=True,
+            is_real=False,
+            duration=None,
+        )
+        self._period = 0.0
+        self._is_open, self._has_begun = True, False
+        self._to_origin()
+
+    def start(self, period: float) -> NDArray[np.void]:
+        """Puts the handle to the origin, and the light on.
+
+        Args:
+            period: The loop's period in s, finite and > 0.
+
+        Returns:
+            The pose before the first tick, shape (1,), ``SAMPLE_DTYPE``.
+
+        Raises:
+            DeviceError: The period is not.
+            DeviceLost: It is gone.
+        """
+        self._period = checked_period(period)
+        self._link.take()
+        self._to_origin()
+        self._turn((0.0, 0.0, 0.0))  # compiles before the loop
+        self._light(LED_ON)
+        sample = np.zeros(1, SAMPLE_DTYPE)
+        self._fill(sample)
+        return sample
+
+    def read(self, sample: NDArray[np.void]) -> int:
+        """Moves the handle by one period (the first call does not) and reports its pose.
+
+        Args:
+            sample: Shape (1,), ``SAMPLE_DTYPE``, filled in place.
+
+        Returns:
+            0: the pose is that of this tick, whether the puck has spoken or not.
+
+        Raises:
+            DeviceError: ``start`` has not been called.
+            DeviceLost: The device is gone.
+        """
+        if self._period == 0.0:
+            raise DeviceError(f"{self._name} is read before it was started")
+        if self._has_begun:
+            self._silence += self._period
+            if self._silence > HELD:
+                self._rate[:] = 0.0
+            self._position += self._period * self._rate[:3]
+            x, y, z = (self._period * self._rate[3:]).tolist()
+            self._turn((x, y, z))
+        self._has_begun = True
+        for report in self._link.take():
+            self._take(report)
+        self._fill(sample)
+        return 0
+
+    def write(self, wrench: NDArray[np.float64]) -> None:
+        """Ignores the wrench: there is no motor."""
+
+    def close(self) -> None:
+        """Puts the light out and lets the device go."""
+        if self._is_open:
+            self._is_open = False
+            self._light(LED_OFF)
+            self._link.close()
+
+    def _to_origin(self) -> None:
+        self._position, self._rate = np.zeros(3), np.zeros(6)
+        self._quaternion: Quaternion = (1.0, 0.0, 0.0, 0.0)
+        self._buttons, self._silence = 0, 0.0
+        self._has_begun = False
+
+    def _take(self, report: bytes) -> None:
+        news = decoded(report)
+        if isinstance(news, Deflection):
+            last = news.first + len(news.counts)
+            shares = [share(count, self._dead_band) for count in news.counts]
+            self._rate[news.first : last] = self._full[news.first : last] * shares
+            self._silence = 0.0
+        elif isinstance(news, Buttons):
+            self._buttons = news.bits
+
+    def _turn(self, angle: tuple[float, float, float]) -> None:
+        self._quaternion = canonical(product(quaternion_exp(angle), self._quaternion))
+
+    def _fill(self, sample: NDArray[np.void]) -> None:
+        sample[0] = (self._position, self._quaternion, self._buttons)
+
+    def _light(self, report: bytes) -> None:
+        """Switches the light; some models have none, and nothing depends on it."""
+        with contextlib.suppress(DeviceError):
+            self._link.write(report)
+
+
+def open_spacemouse(
+    options: Mapping[str, object], _tell: Notify, api: HidApi | None = None
+) -> SpaceMouseDevice:
+    """Finds and opens a SpaceMouse.
+
+    Args:
+        options: ``serial``, ``log``, and numbers that ``SpaceMouseDevice`` takes.
+        api: hidapi or what stands for it.
+
+    Raises:
+        DeviceError: There is none, it cannot be opened, or a number is out of range.
+    """
+    plugged = select_device(FAMILY, find(FAMILY, api), options.get("serial"))
+    # not overlapped: it is written to only before the loop and after it
+    link = HidLink.open(plugged, api, is_overlapped=False, log=HexLog.asked(options))
+    numbers: dict[str, float] = {
+        key: value  # type: ignore[misc] # checked by the device
+        for key, value in options.items()
+        if key in _NUMBERS
+    }
+    try:
+        device = SpaceMouseDevice(link, plugged.name, **numbers)
+    except BaseException:
+        link.close()
+        raise
+    device.info = replace(device.info, serial=plugged.serial)
+    return device
+
+
+_NUMBERS = ("speed", "turn", "dead_band", "force_limit", "torque_limit")
+
+FAMILY = Driver(
+    name="spacemouse",
+    about="3Dconnexion SpaceMouse and its ancestors: input only, its rate moves the handle",
+    ids=IDS,
+    transport="hid",
+    axes="6, by rate",
+    force="none; shown, not felt",
+    rate="about 125 Hz",
+    options=("serial", "log", *_NUMBERS),
+    open=open_spacemouse,
+)

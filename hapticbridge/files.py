@@ -1,0 +1,82 @@
+"""Atomic file replacement."""
+
+from __future__ import annotations
+
+import importlib
+import math
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+from hapticbridge.errors import HapticBridgeError
+
+# Import of optional packages.
+
+
+def import_extra(
+    module: str, purpose: str, extra: str, error: type[HapticBridgeError], package: str = ""
+) -> Any:
+    """Imports a module of an optional package.
+
+    Args:
+        module: Dotted name of the module.
+        purpose: Feature that needs it, for the message.
+        extra: The project's extra that installs it.
+        error: Exception to raise.
+        package: Name of the package for the user; the module's first part by default.
+
+    Raises:
+        HapticBridgeError: ``error``, with the command that installs the package.
+    """
+    try:
+        return importlib.import_module(module)
+    except ImportError:
+        package = package or module.partition(".")[0]
+        raise error(
+            f"{purpose} needs {package}, which is not installed: "
+            f"pip install 'hapticbridge[{extra}]'"
+        ) from None
+
+
+# JSON without NaN and infinity.
+
+
+def finite_or_null(value: Any) -> Any:
+    """Replaces every number that is not finite by None.
+
+    Args:
+        value: Numbers, text, and nested mappings, lists and tuples of them; tuples become lists.
+    """
+    if isinstance(value, Mapping):
+        return {key: finite_or_null(inner) for key, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [finite_or_null(inner) for inner in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+@contextmanager
+def atomic_write(path: Path) -> Iterator[Path]:
+    """Yields a temporary path; after the block the file replaces the target.
+
+    If writing fails or is interrupted, an existing file is left unchanged and no partial file
+    remains.
+
+    Args:
+        path: The target; a link is followed. An existing path that is not a regular file, such as a
+            pipe or /dev/stdout, is written directly.
+
+    Raises:
+        OSError: The file cannot replace the target.
+    """
+    target = path.resolve()
+    if path.exists() and not path.is_file():
+        yield path
+        return
+    draft = target.with_name(f".draft-{target.name}")
+    try:
+        yield draft
+        draft.replace(target)
+    finally:
+        with suppress(OSError):
+            draft.unlink(missing_ok=True)

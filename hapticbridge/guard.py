@@ -1,0 +1,448 @@
+"""Guard parameters of a run on a given device."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticbridge.certificate import assumed_damping
+from hapticbridge.clock import Clock, RealClock, SimulatedClock
+from hapticbridge.device import Device, DeviceInfo
+from hapticbridge.device.registry import DRIVERS
+from hapticbridge.errors import DeviceError, choices
+from hapticbridge.kernel.codes import BACKWARDS, BAD_SAMPLE, GAVE_ENERGY, JUMPED, STRETCHED, TWISTED
+from hapticbridge.kernel.handle import handle_pose
+from hapticbridge.kernel.parameters import (
+    DAMPER,
+    ENVIRONMENT,
+    MOST_BUTTONS,
+    OFF,
+    TANK,
+    GuardParameters,
+)
+from hapticbridge.pose import canonical
+from hapticbridge.record import SAMPLE_DTYPE
+
+# Limits of the wrench and of the run.
+
+LONGEST_RAMP = 60.0
+"""Longest ramp in s. A larger number is taken for a mistake in the unit."""
+
+USUAL_RISE = 2e-3
+"""Shortest time in s from zero wrench to its limit. A coupling of 2400 N/m produces 10 N in 2 ms at
+2 m/s, faster than a hand taps. A longer time delays true contacts, and delay creates energy; a
+shorter one passes a jump of the scene as a blow."""
+
+USUAL_STRETCH = 0.2
+"""Stretch limit in m of the device's motion; no hand at a desk goes that far from its tool. A
+smaller limit stops users who pull on a stuck tool; a larger one misses a lost tool."""
+
+USUAL_ANGLE = 2.8
+"""Angle limit in rad. At π the coupling's torque changes sign; 160 degrees leave room for one
+tick."""
+
+USUAL_ENERGY = 0.04
+"""Energy limit in J, given to the device beyond the hand's own work: 10 N over 4 mm, a nudge and no
+blow. Detection takes one tick; with the work of 10 N at 1 m/s in it, the sum stays below 0.05 J.
+Scenes whose motors push the hand need more."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Limits:
+    """Limits of the wrench, applied in this order after scale and controller, and of the run.
+
+    Attributes:
+        force: Largest norm of the force in N, > 0; a larger force keeps its direction.
+        torque: Largest norm of the torque in N m, > 0.
+        rise: Shortest time in s from zero to the limits, >= 0; 0 allows steps.
+        ramp: Time in s of the linear rise at the start, 0 to 60. It takes longer if the coupling
+            stores much energy meanwhile (``kernel.ramp``).
+        stretch: Largest distance between handle and grip divided by the scale, in m, > 0. Beyond
+            this and the next two limits the run is stopped.
+        angle: Largest angle between handle and grip in rad, > 0 and < π, or inf.
+        energy: Largest energy in J given to the device beyond the hand's own work, > 0.
+        reach: Largest distance in m of the device from the origin of its frame, the middle of its
+            workspace, > 0. inf means no limit, None the device's own if known. Beyond it the device
+            moves without handle and force, as with a clutch; the run goes on.
+
+    Raises:
+        DeviceError: A value is not finite or out of range.
+    """
+
+    force: float
+    torque: float
+    rise: float = USUAL_RISE
+    ramp: float = 0.5
+    stretch: float = USUAL_STRETCH
+    angle: float = USUAL_ANGLE
+    energy: float = USUAL_ENERGY
+    reach: float | None = None
+
+    def __post_init__(self) -> None:
+        for name, unit in (("force", "N"), ("torque", "N m")):
+            value = getattr(self, name)
+            if not math.isfinite(value) or value <= 0:
+                raise DeviceError(f"{name} limit is {value!r} {unit}; it must be finite and > 0")
+        if not 0 <= self.ramp <= LONGEST_RAMP:
+            raise DeviceError(f"start ramp is {self.ramp!r} s; it must be 0 to {LONGEST_RAMP:g}")
+        if not 0 <= self.rise <= LONGEST_RAMP:
+            raise DeviceError(f"rise is {self.rise!r} s; it must be 0 to {LONGEST_RAMP:g}")
+        for name, unit in (("stretch", "m"), ("energy", "J"), ("reach", "m")):
+            value = getattr(self, name)
+            if value is not None and not value > 0:
+                raise DeviceError(f"{name} limit is {value!r} {unit}; it must be > 0, inf for none")
+        if not (0 < self.angle < math.pi or self.angle == math.inf):
+            raise DeviceError(
+                f"angle limit is {self.angle!r} rad; it must be > 0 and < pi, inf for none"
+            )
+
+    def reach_of(self, info: DeviceInfo) -> float:
+        """Returns the reach in m: the requested one, else the device's own, else inf."""
+        own = math.inf if info.reach is None else info.reach
+        return own if self.reach is None else self.reach
+
+    def ramp_ticks(self, period: float) -> int:
+        """Returns the length of the ramp in ticks of ``period`` seconds."""
+        return round(self.ramp / period)
+
+    def rises(self, period: float) -> tuple[float, float]:
+        """Returns the largest change of force (N) and torque (N m) per tick."""
+        if self.rise == 0:
+            return math.inf, math.inf
+        return self.force * period / self.rise, self.torque * period / self.rise
+
+
+UNLIMITED = Limits(
+    force=1e30,
+    torque=1e30,
+    rise=0.0,
+    ramp=0.0,
+    stretch=math.inf,
+    angle=math.inf,
+    energy=math.inf,
+)
+"""No limits, for simulations without a device; no finite force comes near."""
+
+
+def limits_for(info: DeviceInfo, limits: Limits | None) -> Limits:
+    """Returns the requested limits of a run, or else the device's own.
+
+    Raises:
+        DeviceError: A requested limit exceeds the device's. Any limit is accepted for a prescribed
+            motion, which has no hand.
+    """
+    if limits is None:
+        return Limits(force=info.force_limit, torque=info.torque_limit)
+    own = {"force": (info.force_limit, "N"), "torque": (info.torque_limit, "N m")}
+    for name, (most, unit) in own.items():
+        asked = getattr(limits, name)
+        if asked > most and not info.is_prescribed:
+            raise DeviceError(
+                f"{name} limit is {asked:g} {unit}; the device '{info.name}' bears {most:g} {unit}"
+            )
+    return limits
+
+
+# Checks before force is enabled.
+
+STILL_TIME, PATIENCE = 0.1, 5.0
+"""Time in s for which a real device must be still before force is enabled, and time in s after
+which waiting for it fails. A hand that reaches for a device stays longer than the first."""
+
+STILL_DISTANCE = 1e-3
+"""Largest motion in m within ``STILL_TIME``: 1 cm/s, more than a hand that holds still."""
+
+_NO_FORCE = np.zeros(6)
+
+
+def wait_until_still(
+    device: Device,
+    sample: NDArray[np.void],
+    period: float,
+    clock: Clock,
+    is_over: Callable[[], object] = lambda: False,
+) -> None:
+    """Waits until a device with motors is still; returns at once for any other.
+
+    Zero force is commanded in every period: a Falcon reports its position only in answer to a
+    force, and a device with a watchdog must not find its host silent.
+
+    Args:
+        device: The started device.
+        sample: Shape (1,), ``SAMPLE_DTYPE``; receives the newest sample.
+        period: T in s, at which it is read.
+        clock: Clock of the run. The wait happens only in real time; an injected clock also drives
+            the device, which must not move before the run.
+        is_over: Returns True if the run was stopped meanwhile; the wait then ends.
+
+    Raises:
+        DeviceError: The device keeps moving.
+    """
+    if not device.info.is_real or device.info.is_prescribed or type(clock) is not RealClock:
+        return
+    clock = RealClock()  # a separate one, because the run's time begins with its first tick
+    clock.start(round(1e9 * period))
+    anchor = np.zeros(1, SAMPLE_DTYPE)
+    since = begun = None
+    while not is_over():
+        clock.wait()
+        device.read(sample)
+        device.write(_NO_FORCE)
+        now = clock.now()
+        begun = now if begun is None else begun
+        moved = float(np.linalg.norm(sample["position"][0] - anchor["position"][0]))
+        if since is None or not moved <= STILL_DISTANCE:
+            anchor[0], since = sample[0], now
+        elif now - since >= 1e9 * STILL_TIME:
+            return
+        if now - begun > 1e9 * PATIENCE:
+            raise DeviceError(
+                f"the device '{device.info.name}' has moved for {PATIENCE:g} s; hold it still, "
+                "then start again: force is enabled only at rest"
+            )
+
+
+def refuse_simulated_time(device: DeviceInfo | str, clock: Clock) -> None:
+    """Refuses a simulated clock for a device bound to real time.
+
+    Such a device has motors, or follows a live hand without end and with a delay.
+
+    Args:
+        device: Data sheet, or device string before the device is opened and homed; all hardware is
+            bound to real time.
+        clock: Clock of the run.
+
+    Raises:
+        DeviceError: The device is bound to real time and the clock is simulated.
+    """
+    if isinstance(device, str):
+        name = device.partition(":")[0]
+        is_bound = name in DRIVERS
+    else:
+        name = device.name
+        follows = device.is_prescribed and device.delay != 0.0 and device.duration is None
+        is_bound = device.is_real or follows
+    if is_bound and isinstance(clock, SimulatedClock):
+        raise DeviceError(
+            f"the device '{name}' moves in real time, so the loop cannot run as fast as it "
+            "goes; leave out --fast (in code: the SimulatedClock)"
+        )
+
+
+def refuse_stretched_start(
+    state: NDArray[np.void], sample: NDArray[np.void], limits: Limits
+) -> None:
+    """Refuses a start at which the coupling would already exceed the force limit.
+
+    Args:
+        state: Kernel state (``STATE_DTYPE``, one element) before the first tick.
+        sample: Device sample, shape (1,), ``SAMPLE_DTYPE``.
+        limits: Limits of the run.
+
+    Raises:
+        DeviceError: The message names the handle's distance from the grip, and the grip's position.
+    """
+    s = state[0]
+    x, y, z = sample["position"][0].tolist()
+    quaternion = canonical(tuple(sample["quaternion"][0].tolist()))
+    handle, _ = handle_pose(state, (x, y, z), quaternion)
+    distance = float(np.linalg.norm(np.subtract(handle, s["tool_position"])))
+    force = float(s["stiffness"]) * distance
+    if force > limits.force:
+        raise DeviceError(
+            f"the device's absolute pose puts the handle {1e3 * distance:.3g} mm from the grip, "
+            f"{force:.3g} N at the start; the limit is {limits.force:g} N: start nearer to "
+            f"{np.round(s['tool_position'], 4).tolist()} m or use relative poses"
+        )
+
+
+# Reasons of a guard's stop, in words.
+
+_REASONS = {
+    BAD_SAMPLE: "the device's pose is not finite or not a rotation",
+    JUMPED: "the device's pose jumped farther than the device can move",
+    BACKWARDS: "time ran backwards",
+    STRETCHED: "the tool is farther from the handle than the stretch limit",
+    TWISTED: "the tool is turned from the handle by more than the angle limit",
+    GAVE_ENERGY: "the device was given more energy beyond what the hand put in than the limit",
+}
+_REMEDIES = {
+    JUMPED: "check the motion's unit (m) and its times (s)",
+    STRETCHED: "check the motion's unit (m) and speed, and the tool's mass; with another reach in "
+    "mind raise --stretch-limit",
+    TWISTED: "turn more slowly, or raise --rotational-stiffness if the device bears it",
+    GAVE_ENERGY: "lower --stiffness; if the scene's motors are meant to push the hand, raise "
+    "--energy-limit",
+}
+_DIVERGED = (
+    "the simulation is no longer finite (force, pose or energy); the scene diverged, so lower the "
+    "stiffness or the period"
+)
+
+
+def trip_reason(code: int, tick: int) -> str:
+    """Describes why the kernel refused a tick.
+
+    Args:
+        code: Result of ``before_step`` or ``after_step``, not ``OK``.
+        tick: Number of the tick.
+    """
+    return f"tick {tick}: {_REASONS.get(code, _DIVERGED)}"
+
+
+def with_remedy(reason: str) -> str:
+    """Appends the remedy to a reason, for the message to the user.
+
+    Exception and recording keep the bare reason, because it is compared when the run is repeated.
+
+    Args:
+        reason: Result of ``trip_reason``; any other text is returned unchanged.
+    """
+    for code, remedy in _REMEDIES.items():
+        if reason.endswith(_REASONS[code]):
+            return f"{reason}; {remedy}"
+    return reason
+
+
+CONTROLLERS = {"damper": DAMPER, "environment": ENVIRONMENT, "tank": TANK, "off": OFF}
+"""Passivity controllers by name."""
+
+SURPLUS = 0.05
+"""Energy credit in J that earlier dissipation may provide. A default coupling stores 0.021 J at 10
+N and contacts behind it about as much; their release must not count as activity. A larger credit
+lets a larger kick pass before the controller acts."""
+
+UNCERTIFIED_CREDIT = 0.5
+"""Share of its damping that a device is assumed to dissipate with, if that is less than the
+coupling needs; without unit. With all of it a swing stops growing but does not end; with half, the
+other half ends it. With none the controller would brake free motion."""
+
+STALE_PERIODS = 10
+"""Number of the device's periods without a new sample after which the wrench fades. A smaller
+number makes a device that loses single samples rattle; a larger one holds the force of an old pose
+longer."""
+
+FADE = 0.02
+"""Duration in s of the fading of the wrench. A shorter one feels like a blow, a longer one pushes
+without knowledge of the hand."""
+
+LONGEST_STALL, STALL_PERIODS = 0.05, 5
+"""Longest stall of the loop: 50 ms, or five periods if these are longer. Afterwards the hand's
+position is unknown: at 0.4 m/s it has moved 20 mm."""
+
+RAMP_ENERGY = 0.01
+"""Energy in J that the coupling may store while the wrench rises at full pace (7 N at 2400 N/m),
+and that a start may give to the hand during its ramp. It is a quarter of the energy limit, so that
+a start alone never ends a run. A smaller value slows the rise with a heavy tool."""
+
+JUMP_MARGIN = 2.0
+"""Factor on the data sheet's speed limit, without unit. A late sample followed by a punctual one
+shows up to two periods of motion in one."""
+
+FASTEST_TURN = 300.0
+"""Largest plausible angular velocity in rad/s. A hand turns a stylus at 30; half a turn within a
+tick of 1 kHz is 3000."""
+
+
+def button_mask(button: int | None, what: str) -> int:
+    """Returns the bit of a button; 0 for None.
+
+    Args:
+        button: Number of the button, from 0.
+        what: Purpose of the button, for the message.
+
+    Raises:
+        DeviceError: The number is out of range.
+    """
+    if button is None:
+        return 0
+    if isinstance(button, bool) or not isinstance(button, int) or not 0 <= button < MOST_BUTTONS:
+        raise DeviceError(f"{what} button is {button!r}; it must be 0 to {MOST_BUTTONS - 1}")
+    return 1 << button
+
+
+def guard_parameters_for(
+    info: DeviceInfo,
+    limits: Limits,
+    period: float,
+    *,
+    needed: tuple[float, float] = (0.0, 0.0),
+    scale: float = 1.0,
+    controller: str | None = None,
+    clutch: int | None = None,
+    dead_man: int | None = None,
+    is_absolute: bool = False,
+) -> GuardParameters:
+    """Returns the guard's parameters for a run.
+
+    A device with prescribed motion has no hand; it gets limits, slew and buttons only.
+
+    Args:
+        info: The device. Unknown damping is replaced by ``certificate.assumed_damping``; with
+            unknown mass the clip is b alone.
+        limits: Limits of the run.
+        period: T in s.
+        needed: Damping in N s/m and N m s/rad that the coupling needs
+            (``certificate.device_conditions``). A device that has it counts with all its
+            dissipation, so its energy account stays balanced and the controller idle.
+        scale: Handle motion per device motion.
+        controller: One of ``CONTROLLERS``. None selects ``damper`` for a device with less damping
+            than the coupling needs, else ``environment``. With enough damping the device port needs
+            no controller. A spring turned far beyond the torque limit returns more than the credit
+            covers, and an account of both ports would then blame a passive run.
+        clutch: Button that lets the device move without the handle.
+        dead_man: Button that must be held for any force.
+        is_absolute: True if the device's pose is a pose in the scene; it is then not re-anchored
+            before the first tick.
+
+    Raises:
+        DeviceError: The controller's name or a button is not valid.
+    """
+    if controller is not None and controller not in CONTROLLERS:
+        raise DeviceError(f"unknown controller {controller!r}; choices: {choices(CONTROLLERS)}")
+    buttons = button_mask(clutch, "clutch"), button_mask(dead_man, "dead-man")
+    if buttons[0] and buttons[0] == buttons[1]:
+        raise DeviceError(f"clutch and dead-man are both button {clutch}; they exclude each other")
+    force_rise, torque_rise = limits.rises(period)
+    common = GuardParameters(
+        force_rise=force_rise,
+        torque_rise=torque_rise,
+        fade_ticks=max(round(FADE / period), 1),
+        clutch=buttons[0],
+        dead_man=buttons[1],
+        stretch=limits.stretch * scale,
+        angle=limits.angle,
+        reach=limits.reach_of(info),
+    )
+    if info.is_prescribed:
+        return common
+    linear, angular = assumed_damping(info)
+    credit = [
+        own if own >= asked else UNCERTIFIED_CREDIT * own
+        for own, asked in zip((linear, angular), needed, strict=True)
+    ]
+    is_borne = linear >= needed[0] and angular >= needed[1]
+    own = period if info.rate is None else max(1.0 / info.rate, period)
+    return replace(
+        common,
+        controller=CONTROLLERS[controller or ("environment" if is_borne else "damper")],
+        credit=credit[0],
+        rotational_credit=credit[1],
+        most_damping=min(linear, math.inf if info.mass is None else info.mass / period),
+        most_rotational_damping=min(
+            angular,
+            math.inf if info.rotational_inertia is None else info.rotational_inertia / period,
+        ),
+        surplus=SURPLUS,
+        stale_ticks=math.ceil(STALE_PERIODS * own / period),
+        longest_stall=max(LONGEST_STALL, STALL_PERIODS * period),
+        reseats=not is_absolute,
+        speed=JUMP_MARGIN * info.speed_limit if info.speed_limit > 0 else math.inf,
+        turn_speed=FASTEST_TURN,
+        energy=limits.energy,
+        ramp_energy=RAMP_ENERGY,
+    )

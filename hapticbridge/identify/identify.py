@@ -1,0 +1,413 @@
+"""Identification of a device from about a minute of small motions.
+
+Motion cannot show the origin of a damping. A hand, a glove or a cable that only damps, without
+stiffness and without moving by itself, adds its damping to b in the equation of motion. Such a b is
+too large, which is the unsafe side. ``UNHELD`` states this wherever b is reported.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticbridge.clock import Clock
+from hapticbridge.device import AXES, Device, DeviceInfo
+from hapticbridge.errors import DeviceError, IdentificationError
+from hapticbridge.identify.excitation import (
+    FAR,
+    FAST,
+    OK,
+    SPAN,
+    START_SHARE,
+    STATE_DTYPE,
+    TURNED_FAR,
+    TURNED_FAST,
+    next_wrench,
+    signal,
+    stretch,
+)
+from hapticbridge.identify.fit import AxisFit, Estimate, fit_axis
+from hapticbridge.jit import direct
+from hapticbridge.record import SAMPLE_DTYPE, TickFlag
+
+# Short, safe run that moves one axis of a device and records it.
+
+RUNAWAY = 3.0
+"""Multiple of the allowed travel at which a run is aborted, without unit. Such a device does not
+follow the commanded force, so zero force is the safer command."""
+
+SPEED_MARGIN = 1.5
+"""Multiple of the device's own top speed that counts as a fault, without unit."""
+
+_TOLD_PER_SECOND = 10
+"""Rate of progress reports in Hz."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AxisRun:
+    """Commanded force and measured motion of one axis.
+
+    Attributes:
+        axis: One of ``AXES``.
+        period: T in s.
+        position: Displacement from the start in m or rad, NaN without a new sample, shape (n,).
+        force: Force in N or N m, held from each sample to the next, shape (n,).
+        intervals: Time between ticks in s, shape (n − 1,); exactly T with a simulated clock.
+        stale: Share of ticks without a new sample.
+    """
+
+    axis: str
+    period: float
+    position: Array
+    force: Array
+    intervals: Array
+    stale: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Allowance:
+    """Limits of a run per kind of axis: translation (m, N, m/s), rotation (rad, N m, rad/s).
+
+    Attributes:
+        travel: Distance from the start, to each side.
+        force: Largest force or torque.
+        speed: The device's own top speed.
+    """
+
+    travel: tuple[float, float]
+    force: tuple[float, float]
+    speed: tuple[float, float]
+
+
+def move_axis(
+    device: Device,
+    clock: Clock,
+    axis: str,
+    *,
+    period: float,
+    duration: float,
+    allowance: Allowance,
+    progress: Callable[[float], None] | None = None,
+) -> AxisRun:
+    """Moves one axis of a started device and holds the others; always ends with zero force.
+
+    The force is F = a(t) s(t) − k q − B q̇ − (k/τ)∫q: tones whose amplitude a follows the travel, a
+    spring to the start, a damper, and an integral that takes over a weight.
+
+    Args:
+        device: Device, started at this period.
+        clock: Started clock.
+        axis: One of the device's axes.
+        period: T in s.
+        duration: Length of the run in s.
+        allowance: Limits on travel, force and speed.
+        progress: Called ten times a second with the completed share.
+
+    Raises:
+        IdentificationError: The device moved farther or faster than allowed, or its pose is not
+            finite.
+        DeviceError: The device failed.
+    """
+    ticks, index = round(duration / period), AXES.index(axis)
+    tones = signal(index, ticks, period)
+    state, sample, wrench = np.zeros(1, STATE_DTYPE), np.zeros(1, SAMPLE_DTYPE), np.zeros(6)
+    past = np.zeros((max(round(SPAN / period), 1), 6))
+    s = state[0]
+    s["axis"], s["period"] = index, period
+    s["present"] = [float(name in device.info.axes) for name in AXES]
+    s["force"], s["travel"] = allowance.force, allowance.travel
+    s["farthest"] = RUNAWAY * np.asarray(allowance.travel)
+    s["fastest"] = SPEED_MARGIN * np.asarray(allowance.speed)
+    s["amplitude"] = START_SHARE * allowance.force[index >= 3]
+    compute = direct(next_wrench, state, sample, past, 0.0, 1, wrench)
+    position, force, wakes = np.empty(ticks), np.empty(ticks), np.empty(ticks)
+    told_every, stale, place = max(round(1.0 / (_TOLD_PER_SECOND * period)), 1), 0, s["place"]
+    try:
+        for k in range(ticks):
+            _, wakes[k], skipped = clock.wait()
+            is_new = not device.read(sample) & TickFlag.STALE_SAMPLE and not skipped
+            code = compute(state, sample, past, tones[k], 1 + skipped, wrench)
+            if code != OK:
+                raise IdentificationError(_told(code, s))
+            device.write(wrench)
+            position[k] = place[index] if is_new else np.nan
+            force[k] = wrench[index]
+            stale += not is_new
+            if progress is not None and k % told_every == 0:
+                progress(k / ticks)
+    finally:
+        _silence(device)
+    return AxisRun(axis, period, position, force, 1e-9 * np.diff(wakes), stale / ticks)
+
+
+def _silence(device: Device) -> None:
+    """Commands zero force; the error of a lost device has been raised already."""
+    try:
+        device.write(np.zeros(6))
+    except DeviceError:
+        return
+
+
+def _told(code: int, s: np.void) -> str:
+    turns = code in (TURNED_FAR, TURNED_FAST)
+    part, unit, factor = (slice(3, 6), "rad", 1.0) if turns else (slice(0, 3), "mm", 1e3)
+    if code in (FAR, TURNED_FAR):
+        distance = factor * float(np.linalg.norm(s["place"][part]))
+        return (
+            f"the device moved {distance:.3g} {unit} from where it started, the limit is "
+            f"{factor * s['farthest'][int(turns)]:.3g} {unit}; let go of it, support its weight, "
+            "or allow more travel"
+        )
+    if code in (FAST, TURNED_FAST):
+        step = factor * float(np.linalg.norm(s["place"][part] - s["before"][part]))
+        limit = factor * float(s["fastest"][int(turns)])
+        return (
+            f"the device's pose jumped by {step:.3g} {unit} in a tick, faster than the limit of "
+            f"{limit:.3g} {unit}/s; check its encoders and its connection"
+        )
+    return (
+        "the device's pose is not finite or not a rotation; check its encoders and its connection"
+    )
+
+
+# Position resolution, found from positions.
+
+MOST_STEPS = 2_000_000
+"""Largest number of steps in the travel. A smaller step counts as rounding of a double or a
+float."""
+
+
+def step_of(position: Array) -> float:
+    """Returns the step of a reported position in its unit, 0 if it has none.
+
+    All differences between positions must be multiples of the step. The smallest difference is
+    refined by all of them: Δ = Σ n d / Σ n² over the differences d = n Δ.
+
+    Args:
+        position: Position in m, NaN without a sample.
+    """
+    values = np.unique(position[np.isfinite(position)])
+    if len(values) < 3:
+        return 0.0
+    gaps = np.diff(values)
+    span = float(values[-1] - values[0])
+    gaps = gaps[gaps > span / MOST_STEPS]  # smaller gaps are equal positions rounded differently
+    if not gaps.size:
+        return 0.0
+    step = float(gaps.min())
+    counts = np.rint(gaps / step)
+    if np.abs(gaps / step - counts).max() > 0.02 or len(gaps) < 3:
+        return 0.0
+    step = float(counts @ gaps / (counts @ counts))
+    total = round(span / step)
+    return span / total if math.isclose(span / total, step, rel_tol=1e-3) else 0.0
+
+
+Array = NDArray[np.float64]
+
+UNHELD = "the device is assumed to be free: a hand that only damps cannot be distinguished from it"
+"""Caveat printed with every measured b."""
+
+DURATION = 12.0
+"""Time per axis in s: eight swings of the slowest tone. The half-widths fall with its square
+root."""
+
+TRAVEL = (0.015, 0.3)
+"""Travel to each side in m and rad: a tenth of a desktop device's workspace, and 300 steps of the
+coarsest encoder."""
+
+FORCE_SHARE = 0.5
+"""Share of the device's force limit that the signal may use, without unit."""
+
+UNLIKELY_SPRING = (1.0, 1e-3)
+"""Stiffness in N/m and N m/rad above which the device counts as held. Our choice: simulated free
+devices show less than 0.1, the softest hand tried 3."""
+
+UNEXPLAINED_SHARE = 0.1
+"""Largest unexplained share of the applied force, without unit. A simulated free device leaves 0.02
+at most, a moving hand 0.7; no real device was measured."""
+
+LOST_GAIN = 0.05
+"""Share of the force above half of its maximum whose loss counts as saturation, without unit."""
+
+PRECISION = 0.2
+"""Largest usable half-width of the mass, relative to its value, without unit."""
+
+MOST_STALE = 0.5
+"""Largest share of ticks without a new sample, without unit. Beyond it the loop is too fast for the
+device."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Identification:
+    """Identified mechanics of a device, axis by axis.
+
+    Attributes:
+        info: Data sheet before identification.
+        runs: Commanded force and measured motion per axis.
+        fits: Identified parameters per axis.
+        resolution: Step of the reported position in m; 0 if none was found, None without a
+            translational axis.
+        period: Mean time between ticks in s.
+        period_spread: Standard deviation of the time between ticks in s.
+        period_most: 99.9 % quantile of the time between ticks in s.
+    """
+
+    info: DeviceInfo
+    runs: dict[str, AxisRun]
+    fits: dict[str, AxisFit]
+    resolution: float | None
+    period: float
+    period_spread: float
+    period_most: float
+
+    def of_all(self, name: str, *, turns: bool, most: bool = False) -> Estimate | None:
+        """Returns the estimate over all axes of a kind that lies on the safe side.
+
+        Args:
+            name: A field of ``AxisFit``.
+            turns: True for rotation.
+            most: True if the largest value is the safe one (delay); otherwise the smallest is
+                returned.
+        """
+        fits = [fit for axis, fit in self.fits.items() if (len(axis) == 2) == turns]
+        found: list[Estimate] = [getattr(fit, name) for fit in fits]
+        if not found:
+            return None
+        return max(found, key=lambda e: e.most) if most else min(found, key=lambda e: e.least)
+
+
+def identify(
+    device: Device,
+    clock: Clock,
+    *,
+    period: float,
+    axes: tuple[str, ...] | None = None,
+    duration: float | None = None,
+    travel: tuple[float, float] = TRAVEL,
+    force_share: float = FORCE_SHARE,
+    progress: Callable[[str, float], None] | None = None,
+) -> Identification:
+    """Measures mass, damping, friction, delay and resolution of a free device.
+
+    Each axis moves in turn while weak springs hold the others. Zero force is commanded at the end
+    in every case.
+
+    Args:
+        device: Device that is not started; it is started here, and the caller closes it.
+        clock: Clock that is not started.
+        period: T of the loop in s.
+        axes: Axes to move; None: all axes of the device.
+        duration: Time per axis in s; None: ``duration_at`` the period.
+        travel: Travel to each side, in m and rad.
+        force_share: Share of the device's limits that may be used.
+        progress: Called with the axis and the completed share of its run.
+
+    Raises:
+        IdentificationError: A run is not usable; the message names the reason and the remedy.
+        DeviceError: The device failed.
+    """
+    info = device.info
+    if info.is_prescribed:
+        raise IdentificationError(
+            f"the device '{info.name}' does not react to force, so it has no mechanics to identify"
+        )
+    chosen = info.axes if axes is None else axes
+    allowance = Allowance(
+        travel=travel,
+        force=(force_share * info.force_limit, force_share * info.torque_limit),
+        # rotation is limited to the device's speed at the rim of a handle of 50 mm diameter
+        speed=(info.speed_limit, info.speed_limit / 0.025),
+    )
+    duration = duration_at(period) if duration is None else duration
+    device.start(period)
+    clock.start(round(period * 1e9))
+    runs, fits = {}, {}
+    for axis in chosen:
+        told = None if progress is None else _bound(progress, axis)
+        runs[axis] = run = move_axis(
+            device,
+            clock,
+            axis,
+            period=period,
+            duration=duration,
+            allowance=allowance,
+            progress=told,
+        )
+        fits[axis] = _judged(run, info)
+    intervals = np.concatenate([run.intervals for run in runs.values()])
+    return Identification(
+        info=info,
+        runs=runs,
+        fits=fits,
+        resolution=_resolution(info, runs),
+        period=float(intervals.mean()),
+        # whole nanoseconds, the clock's unit, so that a steady clock gives 0 and not 1e-19 s
+        period_spread=1e-9 * float(np.rint(1e9 * intervals).std()),
+        period_most=float(np.quantile(intervals, 0.999)),
+    )
+
+
+def duration_at(period: float) -> float:
+    """Returns the default time per axis in s: 12, and more below 333 Hz.
+
+    Args:
+        period: T in s.
+    """
+    return DURATION * stretch(period)
+
+
+def _bound(progress: Callable[[str, float], None], axis: str) -> Callable[[float], None]:
+    return lambda share: progress(axis, share)
+
+
+def _judged(run: AxisRun, info: DeviceInfo) -> AxisFit:
+    """Fits a run and refuses untrustworthy results."""
+    turns = len(run.axis) == 2
+    unit, spring_unit = ("N m", "N m/rad") if turns else ("N", "N/m")
+    where = f"axis {run.axis}"
+    if run.stale > MOST_STALE:
+        raise IdentificationError(
+            f"{where}: {run.stale:.0%} of the ticks brought no new sample; choose a rate near the "
+            "device's own"
+        )
+    step = step_of(run.position) or info.resolution or 0.0
+    try:
+        fit = fit_axis(run.position, run.force, run.period, 0.0 if turns else step)
+    except IdentificationError as error:
+        raise IdentificationError(f"{where}: {error}") from None
+    if fit.spring.least > UNLIKELY_SPRING[turns]:
+        raise IdentificationError(
+            f"{where}: a spring of {fit.spring.value:.3g} {spring_unit} holds the device; let go "
+            "of it, or free the cable"
+        )
+    if fit.unexplained > UNEXPLAINED_SHARE * fit.force:
+        raise IdentificationError(
+            f"{where}: {fit.unexplained:.2g} {unit} of the {fit.force:.2g} {unit} that moved it "
+            "were not commanded: let go of it, keep it from touching anything, or lower "
+            "--force-share (its motor may be saturated)"
+        )
+    if fit.lost_gain.least > LOST_GAIN:
+        largest = float(np.abs(run.force).max())
+        raise IdentificationError(
+            f"{where}: {fit.lost_gain.value:.0%} of the force above {0.5 * largest:.2g} {unit} did "
+            f"not act: the motor saturates; lower --force-share"
+        )
+    if not fit.mass.half_width < PRECISION * fit.mass.value:
+        raise IdentificationError(
+            f"{where}: mass {fit.mass.value:.2g} ± {fit.mass.half_width:.2g} is not known well "
+            "enough; allow more travel, more force or more time"
+        )
+    return fit
+
+
+def _resolution(info: DeviceInfo, runs: dict[str, AxisRun]) -> float | None:
+    found = [step_of(run.position) for axis, run in runs.items() if len(axis) == 1]
+    if not found:
+        return None
+    # joint encoders make no even steps in space; then the driver's value is used
+    return max(found) or info.resolution or 0.0

@@ -1,0 +1,301 @@
+"""MuJoCo's C library as the compiled tick sees it: functions by symbol, fields by address.
+
+This is the one place that uses MuJoCo's private ``_address`` and the layout of its structs. The
+layout is taken from the package's own description of them (``mujoco.introspect``) and checked
+against the Python bindings whenever a scene is bound, so another version of MuJoCo is either right
+or refused.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import llvmlite.binding
+import mujoco
+import numba
+import numpy as np
+from mujoco.introspect import ast_nodes, structs
+from numba.core import cgutils, types
+from numba.extending import intrinsic
+from numpy.typing import NDArray
+
+from hapticbridge.errors import SceneError
+from hapticbridge.jit import compiled
+from hapticbridge.kernel.codes import LOSSLESS
+from hapticbridge.kernel.parameters import RunParameters
+
+
+def _library() -> Path:
+    folder = Path(mujoco.__file__).parent
+    for pattern in ("libmujoco.so.*", "libmujoco.*.dylib", "mujoco.dll"):
+        for path in folder.glob(pattern):
+            return path
+    raise SceneError(f"no MuJoCo library lies in {folder.name}/ of the installed package mujoco")
+
+
+# Makes the symbols known to the compiler's linker; the Python bindings use the same library file.
+llvmlite.binding.load_library_permanently(str(_library()))
+
+_ADDRESS = types.intp
+_ON_DATA = types.void(_ADDRESS, _ADDRESS)
+mj_step: Any = types.ExternalFunction("mj_step", _ON_DATA)
+mj_kinematics: Any = types.ExternalFunction("mj_kinematics", _ON_DATA)
+mj_fwd_kinematics: Any = types.ExternalFunction("mj_fwdKinematics", _ON_DATA)
+mj_fwd_position: Any = types.ExternalFunction("mj_fwdPosition", _ON_DATA)
+mj_fwd_velocity: Any = types.ExternalFunction("mj_fwdVelocity", _ON_DATA)
+mj_transmission: Any = types.ExternalFunction("mj_transmission", _ON_DATA)
+mj_sensor_pos: Any = types.ExternalFunction("mj_sensorPos", _ON_DATA)
+mj_sensor_vel: Any = types.ExternalFunction("mj_sensorVel", _ON_DATA)
+mj_com_pos: Any = types.ExternalFunction("mj_comPos", _ON_DATA)
+mj_make_m: Any = types.ExternalFunction("mj_makeM", _ON_DATA)
+mj_energy_pos: Any = types.ExternalFunction("mj_energyPos", _ON_DATA)
+mj_energy_vel: Any = types.ExternalFunction("mj_energyVel", _ON_DATA)
+mj_make_constraint: Any = types.ExternalFunction("mj_makeConstraint", _ON_DATA)
+mj_com_vel: Any = types.ExternalFunction("mj_comVel", _ON_DATA)
+mj_factor_m: Any = types.ExternalFunction("mj_factorM", _ON_DATA)
+mj_passive: Any = types.ExternalFunction("mj_passive", _ON_DATA)
+mj_rne: Any = types.ExternalFunction(
+    "mj_rne", types.void(_ADDRESS, _ADDRESS, types.int32, _ADDRESS)
+)
+mj_mul_m: Any = types.ExternalFunction(
+    "mj_mulM", types.void(_ADDRESS, _ADDRESS, _ADDRESS, _ADDRESS)
+)
+mj_solve_m: Any = types.ExternalFunction(
+    "mj_solveM", types.void(_ADDRESS, _ADDRESS, _ADDRESS, _ADDRESS, types.int32)
+)
+mj_apply_ft: Any = types.ExternalFunction(
+    "mj_applyFT",
+    types.void(_ADDRESS, _ADDRESS, _ADDRESS, _ADDRESS, _ADDRESS, types.int32, _ADDRESS),
+)
+mj_contact_force: Any = types.ExternalFunction(
+    "mj_contactForce", types.void(_ADDRESS, _ADDRESS, types.int32, _ADDRESS)
+)
+
+
+@intrinsic  # type: ignore[untyped-decorator] # numba ships no types
+def _as_pointer(_typing: Any, _address: Any) -> Any:
+    def generate(_context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
+        return builder.inttoptr(arguments[0], cgutils.voidptr_t)
+
+    return types.voidptr(types.intp), generate
+
+
+@intrinsic  # type: ignore[untyped-decorator] # numba ships no types
+def release_fence(_typing: Any) -> Any:
+    """Orders the record's bytes before the cursor that publishes them (release semantics)."""
+
+    def generate(context: Any, builder: Any, _signature: Any, _arguments: Any) -> Any:
+        builder.fence("release")
+        return context.get_dummy_value()
+
+    return types.void(), generate
+
+
+@compiled
+def floats(address: int, count: int) -> NDArray[np.float64]:
+    """Returns ``count`` doubles at an address, as a view."""
+    view: NDArray[np.float64] = numba.carray(_as_pointer(address), count, np.float64)
+    return view
+
+
+@compiled
+def ints(address: int, count: int) -> NDArray[np.int32]:
+    """Returns ``count`` 32-bit integers at an address, as a view."""
+    view: NDArray[np.int32] = numba.carray(_as_pointer(address), count, np.int32)
+    return view
+
+
+@compiled
+def pointer_at(address: int) -> int:
+    """Returns the pointer stored at an address (arrays in MuJoCo's arena move between steps)."""
+    return int(numba.carray(_as_pointer(address), 1, np.int64)[0])
+
+
+_DIVERGED = tuple(
+    int(kind)
+    for kind in (
+        mujoco.mjtWarning.mjWARN_BADQPOS,
+        mujoco.mjtWarning.mjWARN_BADQVEL,
+        mujoco.mjtWarning.mjWARN_BADQACC,
+        mujoco.mjtWarning.mjWARN_BADCTRL,
+    )
+)
+_FIRST_DIVERGED, _LAST_DIVERGED = min(_DIVERGED), max(_DIVERGED)
+
+
+@compiled
+def has_warned(state: NDArray[np.void]) -> bool:
+    """Returns whether MuJoCo found a position, velocity, acceleration or control that is no number.
+
+    It also counts what is larger than mjMAXVAL = 1e10, which is still finite but no motion.
+    """
+    # mjWarningStat: two integers, of which the second counts
+    counts = ints(state[0].warnings, 2 * _LAST_DIVERGED + 2)
+    total = 0
+    for kind in range(_FIRST_DIVERGED, _LAST_DIVERGED + 1):
+        total += counts[2 * kind + 1]
+    return total > 0
+
+
+_SCALARS: dict[str, Any] = {
+    "int": ctypes.c_int,
+    "mjtNum": ctypes.c_double,
+    "mjtByte": ctypes.c_ubyte,
+    "mjtBool": ctypes.c_bool,
+    "mjtSize": ctypes.c_int64,
+    "size_t": ctypes.c_size_t,
+    "uintptr_t": ctypes.c_void_p,
+    "uint64_t": ctypes.c_uint64,
+}
+
+
+def _ctype(declared: Any) -> Any:
+    if isinstance(declared, ast_nodes.PointerType):
+        return ctypes.c_void_p
+    if isinstance(declared, ast_nodes.ArrayType):
+        inner = _ctype(declared.inner_type)
+        for extent in reversed(declared.extents):
+            inner = inner * extent
+        return inner
+    if declared.name in _SCALARS:
+        return _SCALARS[declared.name]
+    if declared.name in structs.STRUCTS:
+        return _struct(declared.name)
+    raise SceneError(
+        f"MuJoCo {mujoco.__version__} uses a type '{declared.name}' whose size is unknown here; "
+        "install a version from constraints.txt"
+    )
+
+
+@cache
+def _struct(name: str) -> Any:
+    fields = [(field.name, _ctype(field.type)) for field in structs.STRUCTS[name].fields]
+    return type(name, (ctypes.Structure,), {"_fields_": fields})
+
+
+def field_address(data: mujoco.MjData, name: str) -> int:
+    """Returns where a field of ``mjData`` lies in memory (for a pointer: of the pointer itself)."""
+    return int(data._address + getattr(_struct("mjData"), name).offset)
+
+
+def contact_layout() -> dict[str, int]:
+    """Returns the size of ``mjContact`` and the offsets of what a tick reads of it, in bytes."""
+    contact = _struct("mjContact")
+    fields = {
+        "distance": "dist",
+        "point": "pos",
+        "frame": "frame",
+        "geoms": "geom",
+        "dim": "dim",
+        "row": "efc_address",
+    }
+    offsets = {name: int(getattr(contact, field).offset) for name, field in fields.items()}
+    return {"size": ctypes.sizeof(contact), **offsets}
+
+
+def addresses(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[int, int]:
+    """Returns the addresses of model and data for the C functions.
+
+    Raises:
+        SceneError: The described layout of ``mjData`` is not that of the library, so the compiled
+            tick would read wrong memory.
+    """
+    view = _struct("mjData").from_address(data._address)
+    agrees = (
+        view.ncon == data.ncon
+        and view.nefc == data.nefc
+        and view.nisland == data.nisland
+        and view.time == data.time
+        and view.qvel == data.qvel.ctypes.data
+        and view.site_xpos == data.site_xpos.ctypes.data
+        and view.mocap_pos == data.mocap_pos.ctypes.data
+        and view.signature == data.signature
+    )
+    if not agrees:
+        raise SceneError(
+            f"MuJoCo {mujoco.__version__} lays out mjData differently from its own description; "
+            "install a version from constraints.txt"
+        )
+    return int(model._address), int(data._address)
+
+
+# Where in a model and its data the tick finds what it needs, and the gains that it starts with.
+
+
+def gains_of(model: mujoco.MjModel, first: int, parameters: RunParameters) -> tuple[float, ...]:
+    """Returns the whole gains of the coupling's actuators: of those that push, then that turn."""
+    if parameters.scheme == LOSSLESS:  # the model may have half of them
+        coupling = parameters.coupling
+        k, b = coupling.stiffness, coupling.damping
+        kr, br = coupling.rotational_stiffness, coupling.rotational_damping
+        return b, k, b, br, kr, br
+    gains: list[float] = []
+    for actuator in (first, first + 3):
+        bias = model.actuator_biasprm[actuator]
+        gains += [float(model.actuator_gainprm[actuator, 0]), -float(bias[1]), -float(bias[2])]
+    return tuple(gains)
+
+
+def bind_addresses(
+    model: mujoco.MjModel, data: mujoco.MjData, state: NDArray[np.void]
+) -> dict[str, NDArray[np.generic]]:
+    """Fills in the addresses and sizes that the tick needs of a model and its data.
+
+    Returns:
+        The arrays that must outlive the state, beside model and data themselves, by name.
+
+    Raises:
+        SceneError: See ``native.addresses``.
+    """
+    state["model"], state["data"] = addresses(model, data)
+    buffer_fields = (
+        "qpos qvel qacc ctrl mocap_pos mocap_quat site_xpos site_xquat xipos ten_length "
+        "qfrc_actuator qfrc_applied qfrc_gravcomp xfrc_applied actuator_force moment_rownnz "
+        "moment_rowadr moment_colind actuator_moment energy solver_niter"
+    )
+    for name in buffer_fields.split():
+        state[name] = getattr(data, name).ctypes.data
+    struct_fields = (
+        "ncon nisland nefmA efm_aid efm_as efm_ak ne nefc efc_type efc_id efc_pos efc_force contact"
+    )
+    for name in struct_fields.split():
+        state[name] = field_address(data, name)
+    state["warnings"] = field_address(data, "warning")
+    state["gainprm"] = model.actuator_gainprm.ctypes.data
+    state["biasprm"] = model.actuator_biasprm.ctypes.data
+
+    # actgravcomp hands a joint's gravity compensation to its actuators; the rest is passive
+    passive = np.ascontiguousarray(
+        1.0 - model.jnt_actgravcomp[model.dof_jntid].astype(np.float64), dtype=np.float64
+    )
+    # what is fixed to a mocap body, or jointed to it, moves with it
+    body_mocap = np.ascontiguousarray(model.body_mocapid[model.body_rootid], dtype=np.int32)
+    # flexes may take more rows than 6 an equality, as many as they have now
+    equality_capacity = max(6 * model.neq, data.ne)
+    owned: dict[str, NDArray[np.generic]] = {
+        "passive_gravcomp_dofs": passive,
+        "body_mocap": body_mocap,
+        "geom_bodyid": np.ascontiguousarray(model.geom_bodyid, dtype=np.int32),
+        "tendon_range": np.ascontiguousarray(model.tendon_range, dtype=np.float64),
+        "scratch": np.zeros(max(model.nv, 1)),
+        "mocap_previous": np.zeros((max(model.nmocap, 1), 7)),
+        "mocap_shift": np.zeros((max(model.nmocap, 1), 6)),
+        "equality_before": np.zeros(max(equality_capacity, 1)),
+        "tendon_before": np.zeros(max(model.ntendon, 1)),
+        "outadr": np.ascontiguousarray(model.actuator_outadr, dtype=np.int32),
+        "outnum": np.ascontiguousarray(model.actuator_outnum, dtype=np.int32),
+    }
+    for name, array in owned.items():
+        state[name] = array.ctypes.data
+
+    for name in ("nq", "nv", "nbody", "ngeom", "nmocap", "ntendon", "nsensor"):
+        state[name] = getattr(model, name)
+    state["equality_capacity"] = equality_capacity
+    for name, value in contact_layout().items():
+        state[f"contact_{name}"] = value
+    state["has_gravity_compensation"] = bool(np.any(model.body_gravcomp))
+    state["has_tendons_or_flexes"] = model.ntendon > 0 or model.nflex > 0
+    return owned

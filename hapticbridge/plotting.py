@@ -1,0 +1,73 @@
+"""Figures and picture files."""
+
+from __future__ import annotations
+
+import io
+import warnings
+from pathlib import Path
+from typing import Any
+
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from hapticbridge.errors import HapticBridgeError
+from hapticbridge.files import atomic_write
+
+ENDINGS = (".pdf", ".png", ".svg")
+"""Extensions of picture files."""
+
+DOTS_PER_INCH = 100
+"""Resolution of a picture file in 1/inch: a figure 8 inches wide has 800 pixels. A larger one makes
+larger files."""
+
+
+def check_ending(path: Path) -> None:
+    """Checks that a picture can be written to a file, before anything is computed for it.
+
+    Raises:
+        HapticBridgeError: The extension is not one of ``ENDINGS``, or the folder does not exist.
+    """
+    if path.suffix.lower() not in ENDINGS:
+        raise HapticBridgeError(
+            f"'{path}' does not end like a picture; endings: {', '.join(ENDINGS)}"
+        )
+    if not path.absolute().parent.is_dir():
+        raise HapticBridgeError(f"cannot write '{path}': its folder does not exist")
+
+
+def new_figure(width: float, height: float) -> Figure:
+    """Returns an empty figure, sizes in inches, that needs no display."""
+    figure = Figure(figsize=(width, height), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def _save(figure: Figure, target: Path | io.StringIO, **options: Any) -> None:
+    with warnings.catch_warnings():
+        # characters missing in the font are drawn as boxes without a warning
+        warnings.filterwarnings("ignore", message="Glyph", category=UserWarning)
+        figure.savefig(target, **options)
+
+
+def write_picture(figure: Figure, path: Path) -> None:
+    """Writes a figure in the format of the file's extension.
+
+    Raises:
+        HapticBridgeError: The extension is no picture format, or the file cannot be written.
+    """
+    check_ending(path)
+    try:
+        with atomic_write(path) as draft:
+            _save(figure, draft, dpi=DOTS_PER_INCH)
+    except OSError as error:
+        raise HapticBridgeError(f"cannot write '{path}': {error.strerror}") from None
+
+
+def inline_svg(figure: Figure) -> str:
+    """Returns a figure as an ``<svg>`` element for a page."""
+    buffer = io.StringIO()
+    # a page needs none of matplotlib's metadata
+    unwanted = dict.fromkeys(("Creator", "Date", "Format", "Type"))
+    _save(figure, buffer, format="svg", metadata=unwanted)
+    text = buffer.getvalue()
+    return text[text.index("<svg") :]

@@ -1,0 +1,289 @@
+"""What a recording says about its run, and the run's parameters read back from it.
+
+Metadata are strings; numbers in them are written so that they read back to the same double.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import platform
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from functools import cache
+from importlib.metadata import version
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticbridge.coupling import Coupling
+from hapticbridge.device import DeviceInfo
+from hapticbridge.errors import HapticBridgeError, RecordingError
+from hapticbridge.kernel.codes import WELD
+from hapticbridge.kernel.parameters import UNGUARDED, GuardParameters, RunParameters
+from hapticbridge.kernel.state import BoundKernel
+from hapticbridge.recording import Attachment
+from hapticbridge.rendering import Method, method_named
+from hapticbridge.scene import Scene
+
+# Where a run starts: MuJoCo's whole state, the compiled model, and what the ledger counts from.
+
+STATE_ATTACHMENT = "start_state.f64"
+
+STARTS = {"handle_start": 7, "tool_start": 7, "start_kinetic": 1, "start_potential": 1}
+"""What the ledger counts from, with its count of numbers: poses in m, energies in J."""
+
+_STORED = {"start_kinetic": "kinetic", "start_potential": "potential"}
+_STATE = mujoco.mjtState.mjSTATE_INTEGRATION
+
+
+def compiled_model(model: mujoco.MjModel) -> bytes:
+    """Returns the bytes of ``mj_saveModel``, the same in every compilation of one scene."""
+    buffer = np.zeros(mujoco.mj_sizeModel(model), dtype=np.uint8)
+    mujoco.mj_saveModel(model, None, buffer)
+    return buffer.tobytes()
+
+
+def start_state(model: mujoco.MjModel, data: mujoco.MjData) -> NDArray[np.float64]:
+    """Returns everything that MuJoCo's next step depends on."""
+    state = np.zeros(mujoco.mj_stateSize(model, _STATE))
+    mujoco.mj_getState(model, data, state, _STATE)
+    return state
+
+
+def restore_state(model: mujoco.MjModel, data: mujoco.MjData, state: bytes) -> None:
+    """Puts data to a start that ``start_state`` returned.
+
+    Raises:
+        RecordingError: The bytes are not a state of this model.
+    """
+    expected = 8 * mujoco.mj_stateSize(model, _STATE)
+    if len(state) != expected:
+        raise RecordingError(
+            f"attachment '{STATE_ATTACHMENT}' has {len(state)} bytes; the attached model needs "
+            f"{expected}"
+        )
+    mujoco.mj_resetData(model, data)
+    mujoco.mj_setState(model, data, np.frombuffer(state, dtype="<f8").astype(np.float64), _STATE)
+    mujoco.mj_forward(model, data)
+    # mj_forward solves once more and would leave another warm start than the run began with
+    mujoco.mj_setState(model, data, np.frombuffer(state, dtype="<f8").astype(np.float64), _STATE)
+
+
+def start_of(state: NDArray[np.void], name: str) -> list[float]:
+    """Returns one of ``STARTS`` from the kernel's state, as long as no tick has run."""
+    if name in _STORED:
+        return [float(state[_STORED[name]][0])]
+    body = name.removesuffix("_start")
+    pose = (*state[f"{body}_position"][0], *state[f"{body}_quaternion"][0])
+    return [float(value) for value in pose]
+
+
+# Numbers of a recording's metadata, read back to the same double or refused in a sentence.
+
+_MOST_TICKS = 2**31
+
+
+def meta_float(meta: Mapping[str, str], name: str) -> float:
+    """Returns a number of the metadata.
+
+    Raises:
+        RecordingError: It is missing, not a number or not finite.
+    """
+    try:
+        value = float(meta[name])
+    except KeyError:
+        raise RecordingError(f"the recording's metadata lack '{name}'") from None
+    except ValueError:
+        raise RecordingError(f"metadata '{name}' is {meta[name]!r:.80}, not a number") from None
+    if not math.isfinite(value):
+        raise RecordingError(f"metadata '{name}' is {value}; it must be finite")
+    return value
+
+
+def meta_numbers(meta: Mapping[str, str], name: str, count: int) -> tuple[float, ...]:
+    """Returns a list of numbers of the metadata.
+
+    Raises:
+        RecordingError: It is missing, or not ``count`` finite numbers.
+    """
+    text = meta.get(name)
+    if text is None:
+        raise RecordingError(f"the recording's metadata lack '{name}'")
+    try:
+        values = tuple(float(value) for value in json.loads(text))
+    except (ValueError, TypeError, OverflowError, RecursionError):
+        values = ()
+    if len(values) != count or not all(math.isfinite(value) for value in values):
+        raise RecordingError(
+            f"metadata '{name}' is {text!r:.80}; it must be {count} finite numbers"
+        )
+    return values
+
+
+def meta_start(meta: Mapping[str, str], name: str) -> list[float]:
+    """Returns one of ``STARTS`` from the metadata.
+
+    Raises:
+        RecordingError: It is missing, or not as many finite numbers.
+    """
+    if STARTS[name] == 1:
+        return [meta_float(meta, name)]
+    return list(meta_numbers(meta, name, STARTS[name]))
+
+
+def meta_count(meta: Mapping[str, str], name: str) -> int:
+    """Returns a count of the metadata.
+
+    Raises:
+        RecordingError: It is missing, not a whole number, or out of range.
+    """
+    value = meta_float(meta, name)
+    if not value.is_integer() or not 0 <= value < _MOST_TICKS:
+        raise RecordingError(f"metadata '{name}' is {value:g}; it must be a whole number >= 0")
+    return int(value)
+
+
+# What a run was computed with: versions of programs, and the processor.
+
+
+def versions() -> dict[str, str]:
+    """Returns the versions that decide whether a run can be repeated to the bit."""
+    packages = ("hapticbridge", "mujoco", "numba", "numpy", "scipy", "mcap")
+    found = {name: _version_of(name) for name in packages}
+    return found | {"python": platform.python_version()}
+
+
+_version_of = cache(version)  # parses the package's metadata: 2 ms each
+
+
+def processor() -> str:
+    """Returns the processor's model, where the system tells it."""
+    try:
+        with open("/proc/cpuinfo", encoding="utf-8") as lines:  # noqa: PTH123 - not a file to keep
+            for line in lines:
+                if line.startswith("model name"):
+                    return line.split(":", 1)[1].strip()
+    except OSError:
+        pass
+    return platform.processor() or platform.machine()
+
+
+MODEL_ATTACHMENT = "model.mjb"
+SOURCE_PREFIX = "scene/"
+
+_MID_RUN = "mid-run"
+"""Metadata ``began`` of a recording of an earlier version that begins while its run goes on."""
+
+_FLOATS = ("scale", "force_scale", "force_limit", "torque_limit", "contact_stiffness")
+_POSES = ("device_origin", "handle_origin", "device_start")
+_GAINS = ("stiffness", "damping", "rotational_stiffness", "rotational_damping")
+
+
+def attachments(scene: Scene) -> list[Attachment]:
+    """Returns the scene's sources, its compiled model and its start, as the recording keeps them.
+
+    Call it after the scene was prepared and reset: gains and timestep are part of the model.
+    """
+    kept = [
+        Attachment(SOURCE_PREFIX + source.name, "application/octet-stream", source.data)
+        for source in scene.sources
+    ]
+    model = compiled_model(scene.model)
+    state = start_state(scene.model, scene.data).astype("<f8").tobytes()
+    kept.append(Attachment(MODEL_ATTACHMENT, "application/octet-stream", model))
+    kept.append(Attachment(STATE_ATTACHMENT, "application/octet-stream", state))
+    return kept
+
+
+def describe_run(
+    scene: Scene,
+    parameters: RunParameters,
+    binding: BoundKernel,
+    *,
+    method: str,
+    device: DeviceInfo,
+    clock: str,
+) -> dict[str, str]:
+    """Returns the recording's metadata; see ``parameters_of`` for the way back."""
+    coupling = parameters.coupling
+    felt = parameters.felt
+    meta = {name: repr(float(getattr(parameters, name))) for name in _FLOATS}
+    meta |= {name: repr(float(getattr(coupling, name))) for name in _GAINS}
+    meta |= {name: json.dumps(getattr(parameters, name)) for name in (*_POSES, "axes")}
+    for name, count in STARTS.items():
+        start = start_of(binding.state, name)
+        meta[name] = json.dumps(start if count > 1 else start[0])
+    return meta | {
+        "period_s": repr(parameters.period),
+        "substeps": str(parameters.substeps),
+        "ramp_ticks": str(parameters.ramp_ticks),
+        "guard": parameters.guarding.to_json(),
+        "method": method,
+        "felt": json.dumps(felt and [getattr(felt, name) for name in _GAINS]),
+        "discretization": method_named(method).discretization,
+        "grip": parameters.grip,
+        "clock": clock,
+        "device": device.to_json(),
+        "scene": scene.name,
+        "scene_file": scene.path.name,
+        "scene_parameters": json.dumps(scene.parameters),
+        "scene_sha256": hashlib.sha256(compiled_model(scene.model)).hexdigest(),
+        "versions": json.dumps(versions(), sort_keys=True),
+        "host": json.dumps(
+            {"system": platform.system(), "machine": platform.machine(), "processor": processor()}
+        ),
+        "started": datetime.now(UTC).isoformat(timespec="seconds"),
+    }
+
+
+def _felt(meta: Mapping[str, str], method: Method) -> Coupling | None:
+    """Returns the coupling that a weld truly was; None for methods that have the one asked for."""
+    if method.scheme != WELD:
+        return None
+    return Coupling(*meta_numbers(meta, "felt", len(_GAINS)))
+
+
+def parameters_of(meta: Mapping[str, str]) -> RunParameters:
+    """Returns the parameters of a recorded run.
+
+    Raises:
+        RecordingError: Something is missing or out of range, or the recording begins in mid-run, as
+            those of earlier versions could.
+    """
+    if meta.get("began") == _MID_RUN:
+        raise RecordingError(
+            "the recording begins in mid-run, which only earlier versions of hapticbridge recorded "
+            "and judge; 'hapticbridge export' still reads its ticks"
+        )
+    try:
+        method = method_named(meta.get("method", ""))
+        device = None if method.has_law else DeviceInfo.from_json(meta.get("device", ""))
+        burning, rotational = (None, None) if device is None else device.burning_damping
+        return RunParameters(
+            grip=meta.get("grip", ""),
+            period=meta_float(meta, "period_s"),
+            substeps=meta_count(meta, "substeps"),
+            coupling=Coupling(**{name: meta_float(meta, name) for name in _GAINS}),
+            ramp_ticks=meta_count(meta, "ramp_ticks"),
+            axes=meta_numbers(meta, "axes", 9),
+            scale=meta_float(meta, "scale"),
+            force_scale=meta_float(meta, "force_scale"),
+            force_limit=meta_float(meta, "force_limit"),
+            torque_limit=meta_float(meta, "torque_limit"),
+            device_origin=meta_numbers(meta, "device_origin", 7),
+            handle_origin=meta_numbers(meta, "handle_origin", 7),
+            device_start=meta_numbers(meta, "device_start", 7),
+            scheme=method.scheme,
+            felt=_felt(meta, method),
+            contact_stiffness=meta_float(meta, "contact_stiffness"),
+            device_damping=burning,
+            device_rotational_damping=rotational,
+            guarding=GuardParameters.from_json(meta["guard"]) if "guard" in meta else UNGUARDED,
+        )
+    except RecordingError:
+        raise
+    except HapticBridgeError as error:
+        raise RecordingError(f"the recording's metadata are out of range: {error}") from None

@@ -1,0 +1,133 @@
+"""Compilation of a scene from the bytes of its files."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+
+import mujoco
+
+from hapticbridge.kernel.codes import HANDLE
+from hapticbridge.scene.source import SourceFile
+
+# Custom texts and numbers of a scene (``<custom>`` in MJCF), by name.
+
+
+def custom_text(model: mujoco.MjModel, name: str) -> str:
+    """Returns the custom text of a name; empty if the scene has none.
+
+    The bridge uses the text ``about``, a sentence that describes the scene.
+    """
+    text_id = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_TEXT, name)
+    if text_id < 0:
+        return ""
+    start, size = model.text_adr[text_id], model.text_size[text_id]
+    return bytes(model.text_data[start : start + size - 1]).decode()
+
+
+def custom_numbers(model: mujoco.MjModel, name: str) -> tuple[float, ...]:
+    """Returns the custom numbers of a name, finite or not; empty if the scene has none.
+
+    The bridge uses ``picture``, the time in s on the hand path at which the scene is drawn. It also
+    uses ``simulated_hand``, the hand that follows the path (``device.simulated.scene_hand``).
+    """
+    number_id = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_NUMERIC, name)
+    if number_id < 0:
+        return ()
+    start, size = model.numeric_adr[number_id], model.numeric_size[number_id]
+    return tuple(model.numeric_data[start : start + size].tolist())
+
+
+# Start of a scene, with the handle at the grip.
+
+START_KEYFRAME = "home"
+"""Name of the keyframe that a scene starts from; without it a scene starts from ``qpos0``."""
+
+
+def go_to_start(model: mujoco.MjModel, data: mujoco.MjData, grip: str) -> None:
+    """Resets the data to the start, with the handle at the grip, and calls ``mj_forward``.
+
+    Args:
+        model: A scene with the handle.
+        data: Changed in place.
+        grip: Name of the site on the tool.
+    """
+    key = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_KEY, START_KEYFRAME)
+    if key >= 0:
+        mujoco.mj_resetDataKeyframe(model, data, key)
+    else:
+        mujoco.mj_resetData(model, data)
+    # the model's own handle pose may be outdated if its start was changed after loading
+    mujoco.mj_kinematics(model, data)
+    handle = model.body_mocapid[model.body(HANDLE).id]
+    data.mocap_pos[handle] = data.site(grip).xpos
+    data.mocap_quat[handle] = data.site_xquat[model.site(grip).id]
+    mujoco.mj_forward(model, data)
+
+
+def seat_handle(model: mujoco.MjModel, grip: str) -> None:
+    """Places the handle at the grip, in ``qpos0`` and in every keyframe of a compiled model.
+
+    Args:
+        model: A scene with the handle; changed in place.
+        grip: Name of the site on the tool.
+    """
+    data = mujoco.MjData(model)
+    body_id, site_id = model.body(HANDLE).id, model.site(grip).id
+    mocap_id = int(model.body_mocapid[body_id])
+    mujoco.mj_kinematics(model, data)
+    model.body_pos[body_id] = data.site_xpos[site_id]
+    model.body_quat[body_id] = data.site_xquat[site_id]
+    for key in range(model.nkey):
+        mujoco.mj_resetDataKeyframe(model, data, key)
+        mujoco.mj_kinematics(model, data)
+        model.key_mpos[key].reshape(-1, 3)[mocap_id] = data.site_xpos[site_id]
+        model.key_mquat[key].reshape(-1, 4)[mocap_id] = data.site_xquat[site_id]
+
+
+def compiled(spec: mujoco.MjSpec, sources: tuple[SourceFile, ...]) -> mujoco.MjModel:
+    """Compiles a scene from the bytes of its files, independent of their folder.
+
+    A compiled model names the files of its meshes and textures. With their paths it would differ
+    from folder to folder, and a recording would reveal the user's folders. Files outside the
+    scene's own folder, and files that only MuJoCo finds, are read from their place.
+    """
+    main, *assets = sources
+    if not assets or "/" in main.name:
+        return spec.compile()
+    portable = spec.copy()
+    portable.modelfiledir = ""
+    portable.assets = {source.name: source.data for source in assets}
+    try:
+        return portable.compile()
+    except ValueError:
+        return spec.compile()
+
+
+def _malformed(match: re.Match[str]) -> str:
+    fault, line, element = match[1].replace("_", " ").lower(), match[2], match[3]
+    where = f" '{element}'" if element else ""
+    return f"line {line} is not well-formed XML ({fault}{where})"
+
+
+_WORDING: tuple[tuple[str, str | Callable[[re.Match[str]], str]], ...] = (
+    (r".*XML_ERROR_(\w+) .*?Line number=(\d+)(?:: XMLElement name=([^\s']+))?.*", _malformed),
+    (r"((XML )?Error|ParseXML): ", ""),
+    (r",? Element name '(.*?)', id (\d+)(, line \d+)?", r" (element '\1', id \2\3)"),
+    (r" Element '(.*?)', line 0", r" (element '\1' of an included file)"),
+    (r" Element '(.*?)', line (\d+)", r" (element '\1', line \2)"),
+    (
+        r"could not find decoder.*",
+        "its name must end in .xml and it must hold MJCF (of a compiled .mjb, the file behind it)",
+    ),
+    (r"(engine error: Could not allocate memory)", r"\1; reduce the numbers in <size>"),
+)
+"""Patterns of MuJoCo's error messages, and their wording after a colon."""
+
+
+def clause(error: Exception) -> str:
+    """Returns MuJoCo's error message, worded to follow a colon."""
+    text = " ".join(str(error).split())
+    for pattern, wording in _WORDING:
+        text = re.sub(pattern, wording, text)
+    return text or type(error).__name__

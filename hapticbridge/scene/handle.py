@@ -1,0 +1,256 @@
+"""Handle and coupling, added to a scene's specification.
+
+The coupling consists of six MuJoCo site actuators from the handle's site to the grip,
+
+    force = −K l − B l̇ + B u
+
+l is the grip's pose in the handle's frame; the control u is the handle's velocity in that frame.
+Under ``integrator="discrete"`` the coupling is implicit in position and velocity and is solved
+together with the contacts.
+"""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticbridge.coupling import Coupling
+from hapticbridge.errors import SceneError, choices
+from hapticbridge.kernel.codes import COUPLING_ACTUATORS, HANDLE, WELD_NAME
+from hapticbridge.scene.compile import go_to_start
+
+# Weld between grip and handle (MuJoCo's equality constraint).
+
+IMPEDANCE = 0.95
+"""Impedance d of the weld, without unit, equal at every displacement (MuJoCo's default reaches 0.95
+at 1 mm). The true stiffness is mass times K/(1 − d), so a value nearer to 1 makes the weld
+stiffer."""
+
+PROBE = 1e-6
+"""Displacement in m, angle in rad and velocity in m/s and rad/s with which the weld is measured.
+The constraint is linear in them as long as sin φ ≈ φ."""
+
+_FLAGS = {
+    "constraint": mujoco.mjtDisableBit.mjDSBL_CONSTRAINT,
+    "equality": mujoco.mjtDisableBit.mjDSBL_EQUALITY,
+}
+
+_NOT_CARRIED = ("name", "text", "tuple", "paths")
+
+
+def add_weld(spec: mujoco.MjSpec, grip: str) -> None:
+    """Adds the equality constraint between the sites of grip and handle."""
+    equality = spec.add_equality(name=WELD_NAME)
+    equality.type = mujoco.mjtEq.mjEQ_WELD
+    equality.objtype = mujoco.mjtObj.mjOBJ_SITE
+    equality.name1, equality.name2 = grip, HANDLE
+    equality.active = True
+    data = np.zeros(len(equality.data))
+    data[6] = data[10] = 1.0  # no rotation between the sites, torque scale 1
+    equality.data = data
+
+
+def set_weld_gains(model: mujoco.MjModel, coupling: Coupling) -> None:
+    """Sets K and B of the weld as its direct ``solref``, one pair for all six axes."""
+    weld_id = model.equality(WELD_NAME).id
+    model.eq_solref[weld_id] = -coupling.stiffness, -coupling.damping
+    model.eq_solimp[weld_id] = IMPEDANCE, IMPEDANCE, 1e-3, 0.5, 2.0
+
+
+def check_weldable(model: mujoco.MjModel, grip: str) -> None:
+    """Refuses disabled equality constraints and a tool that cannot move about all axes.
+
+    If the joints block the axis of a row of the weld, the row has no inertia to yield. MuJoCo makes
+    it rigid (1e18 N/m), and the hand would feel a force that moves nothing.
+
+    Raises:
+        SceneError: Names the disabled flag, or the number of directions that the joints leave free.
+    """
+    for flag, bit in _FLAGS.items():
+        if model.opt.disableflags & bit:
+            raise SceneError(
+                f"the scene disables flag {flag}, and a weld is an equality constraint; enable it, "
+                "or choose another method"
+            )
+    data = mujoco.MjData(model)
+    go_to_start(model, data, grip)
+    jacobian = np.zeros((6, model.nv))
+    mujoco.mj_jacSite(model, data, jacobian[:3], jacobian[3:], model.site(grip).id)
+    free = np.linalg.matrix_rank(jacobian)
+    if free < 6:
+        raise SceneError(
+            "a weld needs a tool that can move along and about all three axes; the joints of grip "
+            f"'{grip}' leave it {free} of 6, and the weld would be rigid along the others"
+        )
+
+
+def carry_over(old: mujoco.MjModel, new: mujoco.MjModel) -> None:
+    """Copies all values between models that differ only by equality constraints.
+
+    A compilation would lose changes made after loading (masses, contact parameters, gains of the
+    scene's own equality constraints). The weld is the last equality row, so the rows before it
+    correspond.
+    """
+    for name in dir(old):
+        if name.startswith(("_", *_NOT_CARRIED)):
+            continue
+        value = getattr(old, name)
+        if not isinstance(value, np.ndarray):
+            continue
+        target = getattr(new, name)
+        if name.startswith("eq_"):
+            count = min(old.neq, new.neq)
+            target[:count] = value[:count]
+        elif value.shape == target.shape:
+            target[...] = value
+    for part in ("opt", "stat"):
+        _copy_values(getattr(old, part), getattr(new, part))
+
+
+def _copy_values(old: object, new: object) -> None:
+    for name in dir(old):
+        if name.startswith("_"):
+            continue
+        value = getattr(old, name)
+        if isinstance(value, np.ndarray):
+            getattr(new, name)[...] = value
+        elif not callable(value):
+            setattr(new, name, value)
+
+
+def measured_weld(model: mujoco.MjModel, grip: str) -> Coupling:
+    """Returns the true stiffness and damping of a weld at the scene's start, from MuJoCo.
+
+    With a fixed tool the constraint's force is λ = D a_ref, where D = d/((1 − d) A). A is the
+    inverse inertia of the row, and a_ref = −b v − k r with the direct solref k = K/d, b = B/d. This
+    gives the static stiffness m K/(1 − d) and damping m B/(1 − d) with m = 1/A. m is the mass for
+    translation through the centre of mass and the inertia for rotation; it is less for a grip off
+    centre. If axes differ, the largest value is returned, because the device must bear it.
+
+    Args:
+        model: A scene that passes ``check_weldable``, with the weld and its gains set.
+        grip: Name of the site on the tool.
+
+    References:
+        MuJoCo documentation, "Computation", section "Constraint model".
+    """
+    data = mujoco.MjData(model)
+    stiffness, damping = np.zeros(6), np.zeros(6)
+    handle = model.body_mocapid[model.body(HANDLE).id]
+    for axis in range(6):
+        go_to_start(model, data, grip)
+        jacobian = np.zeros((6, model.nv))
+        site_id = model.site(grip).id
+        mujoco.mj_jacSite(model, data, jacobian[:3], jacobian[3:], site_id)
+        unit = np.eye(6)[axis]
+        data.qvel[:] = PROBE * np.linalg.pinv(jacobian) @ unit
+        damping[axis] = _static_force(model, data, axis) / PROBE
+        data.qvel[:] = 0.0
+        data.mocap_pos[handle] -= PROBE * unit[:3]
+        turned = np.zeros(4)
+        mujoco.mju_axisAngle2Quat(turned, unit[3:], -PROBE if axis >= 3 else 0.0)
+        orientation = data.mocap_quat[handle].copy()
+        mujoco.mju_mulQuat(data.mocap_quat[handle], turned, orientation)
+        stiffness[axis] = _static_force(model, data, axis) / PROBE
+    return Coupling(
+        stiffness=float(stiffness[:3].max()),
+        damping=max(float(damping[:3].max()), 0.0),
+        rotational_stiffness=max(float(stiffness[3:].max()), 0.0),
+        rotational_damping=max(float(damping[3:].max()), 0.0),
+    )
+
+
+def _static_force(model: mujoco.MjModel, data: mujoco.MjData, axis: int) -> float:
+    """Returns the weld's force for a displacement or velocity along an axis, with a fixed tool."""
+    mujoco.mj_forward(model, data)
+    weld_id = model.equality(WELD_NAME).id
+    is_weld = (data.efc_type[: data.ne] == mujoco.mjtConstraint.mjCNSTR_EQUALITY) & (
+        data.efc_id[: data.ne] == weld_id
+    )
+    rows: NDArray[np.intp] = np.flatnonzero(is_weld)
+    force = -(data.efc_D[rows] * data.efc_aref[rows])[axis]
+    # a rotational row uses half the angle, for force and displacement
+    return float(0.5 * force if axis >= 3 else force)
+
+
+_PREFIX = "hapticbridge_"
+"""Prefix that separates the handle's default class from the scene's classes."""
+
+
+def attach_handle(spec: mujoco.MjSpec, grip: str) -> None:
+    """Adds the mocap body ``handle`` with its site, and the six coupling actuators.
+
+    Args:
+        spec: The user's scene; changed in place.
+        grip: Name of the site on the tool.
+
+    Raises:
+        SceneError: The site does not exist, or the scene uses a name that the bridge adds.
+    """
+    sites = [site.name for site in spec.sites if site.name]
+    if grip not in sites:
+        remedy = (
+            "name one of them (--grip, or grip= in Python)"
+            if sites
+            else f'put <site name="{grip or "grip"}"/> into the tool\'s body'
+        )
+        raise SceneError(
+            f"the scene has no site '{grip}' to grip the tool by; sites: {choices(sites)}; {remedy}"
+        )
+    _refuse_taken("body", HANDLE, [body.name for body in spec.bodies])
+    _refuse_taken("site", HANDLE, sites)
+    for name in COUPLING_ACTUATORS:
+        _refuse_taken("actuator", name, [actuator.name for actuator in spec.actuators])
+    # a weld is added later and identified by its name only
+    _refuse_taken("equality constraint", WELD_NAME, [each.name for each in spec.equalities])
+
+    # in a specification of its own: a <default> of the scene could rotate the handle's site, and
+    # boundmass could give it mass
+    handle_spec = mujoco.MjSpec()
+    handle = handle_spec.worldbody.add_body(name=HANDLE, mocap=True)
+    handle.add_site(name=HANDLE)
+    body = spec.worldbody.add_frame().attach_body(handle, _PREFIX, "")
+    body.name = body.sites[0].name = HANDLE
+    for axis, name in enumerate(COUPLING_ACTUATORS):
+        _add_coupling_actuator(spec, name, axis, grip)
+
+
+def _refuse_taken(kind: str, name: str, taken: list[str]) -> None:
+    if name in taken:
+        raise SceneError(
+            f"the scene already has {kind} '{name}', a name that the bridge adds; rename it"
+        )
+
+
+def _add_coupling_actuator(spec: mujoco.MjSpec, name: str, axis: int, grip: str) -> None:
+    """Adds an actuator with every field set, so that no <default> of the scene applies."""
+    actuator = spec.add_actuator(name=name)
+    gear = np.zeros(6)
+    gear[axis] = 1.0
+    actuator.trntype = mujoco.mjtTrn.mjTRN_SITE
+    actuator.target, actuator.refsite, actuator.slidersite = grip, HANDLE, ""
+    actuator.gear = gear
+    actuator.gaintype, actuator.gainprm = mujoco.mjtGain.mjGAIN_FIXED, np.zeros(10)
+    actuator.biastype, actuator.biasprm = mujoco.mjtBias.mjBIAS_AFFINE, np.zeros(10)
+    actuator.dyntype, actuator.dynprm = mujoco.mjtDyn.mjDYN_NONE, np.eye(10)[0]
+    actuator.actdim, actuator.actearly = -1, False
+    for field in ("actlimited", "ctrllimited", "forcelimited"):
+        setattr(actuator, field, mujoco.mjtLimited.mjLIMITED_FALSE)
+    for field in ("actrange", "ctrlrange", "forcerange", "lengthrange", "velrange", "ffrange"):
+        setattr(actuator, field, np.zeros(2))
+    for field in ("cranklength", "inheritrange", "delay", "armature"):
+        setattr(actuator, field, 0.0)
+    for field in ("nsample", "interp", "group", "ctrlspec"):
+        setattr(actuator, field, 0)
+    actuator.damping = np.zeros(3)
+
+
+def set_options(spec: mujoco.MjSpec) -> None:
+    """Sets the options for an implicit coupling and a known energy of every step."""
+    option = spec.option
+    option.integrator = mujoco.mjtIntegrator.mjINT_DISCRETE
+    option.solver = mujoco.mjtSolver.mjSOL_NEWTON
+    option.enableflags |= mujoco.mjtEnableBit.mjENBL_ENERGY | mujoco.mjtEnableBit.mjENBL_DIAGEXACT
+    # a reset during a run would move the tool unnoticed; the guard trips on non-finite values
+    option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET

@@ -1,0 +1,370 @@
+"""Passivity conditions between coupling, sampling period and device damping."""
+
+from __future__ import annotations
+
+from typing import overload
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hapticbridge.coupling import Coupling
+from hapticbridge.errors import CouplingError
+from hapticbridge.theory.spectrum import needed_for_fixed_environment, wall_supremum
+from hapticbridge.theory.transfer import (
+    Axis,
+    CouplingGrid,
+    Discretization,
+    SampledLaw,
+    checked,
+    coupling_transfer,
+    finite,
+    plain,
+    scalar,
+    together,
+)
+
+# Stability limit of a delayed coupling.
+
+
+def coupled_stability_limit(
+    device_damping: ArrayLike, period: float, *, damping: ArrayLike = 0.0, delay: float = 0.0
+) -> float | NDArray[np.float64]:
+    """Returns the stiffness below which device and coupling are stable against a wall.
+
+        K = (b + B) / (T/2 + t_d),    t_d = delay · T
+
+    This is a design rule for *stability*, which is weaker than passivity: it ignores the hand. It
+    holds for low damping; at B = 20 N s/m and one sample of delay it is 28 % too optimistic. The
+    sign of B is opposite to that in ``minimum_damping``, because a damper helps stability and costs
+    passivity.
+
+    Args:
+        device_damping: b in N s/m, finite and >= 0.
+        period: T in s, finite and > 0.
+        damping: B in N s/m, finite and >= 0.
+        delay: Delay from position to force in samples, >= 0; fractions are allowed.
+
+    Returns:
+        K in N/m, of the broadcast shape of the arguments.
+
+    Raises:
+        CouplingError: An argument is out of range.
+
+    References:
+        Gil et al. 2009.
+    """
+    period = scalar("period", period, "s", positive=True)
+    delay = scalar("delay", delay, "samples")
+    available, own = together(
+        device_damping=checked("device damping", device_damping, "N s/m"),
+        coupling_damping=checked("coupling damping", damping, "N s/m"),
+    )
+    return plain((available + own) / (period * (0.5 + delay)))
+
+
+# Device condition in several dimensions.
+
+SYMMETRY = 1e-9
+"""Largest asymmetry of a matrix that counts as rounding, relative to its largest entry, without
+unit."""
+
+
+def _symmetric(name: str, value: ArrayLike) -> NDArray[np.float64]:
+    matrix = finite(name, value)
+    if matrix.ndim == 0:
+        matrix = matrix.reshape(1, 1)
+    if matrix.ndim < 2 or matrix.shape[-1] != matrix.shape[-2]:
+        raise CouplingError(f"{name} has shape {matrix.shape}; it must be square: (..., n, n)")
+    transposed = np.swapaxes(matrix, -1, -2)
+    if np.abs(matrix - transposed).max() > SYMMETRY * np.abs(matrix).max():
+        raise CouplingError(f"{name} is not symmetric; the condition requires symmetric matrices")
+    return (matrix + transposed) / 2
+
+
+def matrix_margin(
+    stiffness: ArrayLike,
+    damping: ArrayLike,
+    device_damping: ArrayLike,
+    period: float,
+    *,
+    scale: float = 1.0,
+    force_scale: float = 1.0,
+) -> float | NDArray[np.float64]:
+    """Returns the smallest eigenvalue of b − s (K T/2 + B), s = scale · force scale.
+
+    Where it is >= 0, the coupling is passive for any passive hand and any discrete-time passive
+    environment. K and B are constant. If the device's damping depends on the pose, the condition
+    must hold everywhere in the workspace. With entries of different units (translation beside
+    rotation) only the sign has a meaning.
+
+    Args:
+        stiffness: K in N/m, symmetric and positive semidefinite, shape (..., n, n); a number is 1 ×
+            1.
+        damping: B in N s/m, symmetric and positive semidefinite, shape (..., n, n).
+        device_damping: b in N s/m, symmetric, shape (..., n, n).
+        period: T in s, finite and > 0.
+        scale: Handle motion per device motion, > 0.
+        force_scale: Force on the device per force on the tool, > 0.
+
+    Returns:
+        The margin in N s/m, shape (...).
+
+    Raises:
+        CouplingError: A matrix is not square, finite and symmetric, K or B is not positive
+            semidefinite, the shapes do not fit, or a number is out of range.
+
+    References:
+        Brown & Colgate 1997, eq. (6), as a matrix inequality.
+    """
+    period = scalar("period", period, "s", positive=True)
+    factor = scalar("scale", scale, positive=True)
+    factor *= scalar("force scale", force_scale, positive=True)
+    k, b_coupling, b = (
+        _symmetric(name, value)
+        for name, value in (
+            ("stiffness", stiffness),
+            ("damping", damping),
+            ("device damping", device_damping),
+        )
+    )
+    for name, matrix in (("stiffness", k), ("damping", b_coupling)):
+        lowest = np.linalg.eigvalsh(matrix)[..., 0].min()
+        if lowest < -SYMMETRY * np.abs(matrix).max():
+            raise CouplingError(f"{name} has the eigenvalue {lowest:g}; all must be >= 0")
+    shapes = {matrix.shape[-1] for matrix in (k, b_coupling, b)}
+    if len(shapes) > 1:
+        raise CouplingError(f"matrices of sizes {sorted(shapes)} do not fit together")
+    try:
+        difference = b - factor * (k * period / 2 + b_coupling)
+    except ValueError as error:
+        raise CouplingError("the leading shapes of the matrices do not broadcast") from error
+    margin = np.asarray(np.linalg.eigvalsh(difference)[..., 0], dtype=np.float64)
+    return margin if margin.ndim else float(margin)
+
+
+# Frequency at which a coupling requires the most device damping.
+
+SAME = 1e-9
+"""Relative difference, without unit, below which an end of the band counts as the supremum: the
+resolution of the search."""
+
+
+def worst_frequency(
+    coupling: Coupling | CouplingGrid,
+    period: float,
+    *,
+    discretization: Discretization = "backward",
+    delay: int = 0,
+    filter_time: float = 0.0,
+    axis: Axis = "translation",
+) -> float | NDArray[np.float64]:
+    """Returns the frequency at which ``damping_spectrum`` reaches its supremum.
+
+    Without a delay it is Nyquist's, π/T, for every coupling; the spectrum of a spring alone is
+    flat. With a delay, against a wall, a soft damper leaves it at low frequency. A strong damper
+    moves it towards π/((d + 1) T) and its odd multiples.
+
+    Args:
+        coupling: K and B; a ``CouplingGrid`` evaluates many at once.
+        period: T in s, finite and > 0.
+        discretization: Rule that takes the damper's velocity from sampled positions.
+        delay: d, whole samples from position to force, 0 to 50.
+        filter_time: τ in s of a first-order low-pass behind the damper, >= 0.
+        axis: Kind of axis, which selects the pair of K and B.
+
+    Returns:
+        ω in rad/s, shaped like the coupling: 0.0 if the supremum is the limit for ω → 0, π/T if it
+        is reached at Nyquist or infinite there. Accurate to about 1e-7 of π/T, because the spectrum
+        is flat at its top. Of several equal maxima any one.
+
+    Raises:
+        CouplingError: An argument is out of range or unknown.
+
+    References:
+        Brown & Colgate 1997, eqs. (6), (7); Colgate & Schenkel 1997 (wall).
+    """
+    law = SampledLaw.of(coupling, period, discretization, delay, filter_time, axis)
+    k, b, period, samples, tau, is_ringing = law
+    if samples == 0:
+        return plain(np.full(k.shape, np.pi / period))
+    # both rules agree for a spring alone, and the backward difference is finite at Nyquist
+    scheme: Discretization = "backward" if is_ringing else discretization
+    top, angle = wall_supremum(k, b, period, scheme, samples, tau)
+    # limit at ω → 0: K T/2 − B plus d T K for the delay
+    at_zero = (samples + 0.5) * k * period - b
+    nyquist = np.asarray(np.pi)
+    transfer = coupling_transfer(k, b, period, nyquist, scheme, tau) * (-1.0) ** samples
+    at_end = needed_for_fixed_environment(transfer, period, nyquist)
+    close = SAME * (k * period * (samples + 1) + b)
+    angle = np.where(at_zero >= top - close, 0.0, angle)
+    angle = np.where(at_end >= np.maximum(top, at_zero) - close, np.pi, angle)
+    if is_ringing:
+        angle = np.where(b > 0, np.pi, angle)
+    return plain(np.asarray(angle / period))
+
+
+STIFFNESS_MARGIN = 0.8
+"""Stiffness of a default coupling divided by the largest passive stiffness, without unit. The rest
+covers what is uncertain about a device: its true damping, friction and timing. A value nearer to 1
+feels stiffer and leaves less margin."""
+
+DAMPING_SHARE = 0.25
+"""Damping of a default coupling divided by the device's damping, without unit. A larger value damps
+the tool better against the handle and leaves less stiffness, because K ∝ b − B."""
+
+
+@overload
+def minimum_damping(
+    coupling: Coupling,
+    period: float,
+    *,
+    discretization: Discretization = ...,
+    delay: int = ...,
+    filter_time: float = ...,
+    axis: Axis = ...,
+) -> float: ...
+
+
+@overload
+def minimum_damping(
+    coupling: CouplingGrid,
+    period: float,
+    *,
+    discretization: Discretization = ...,
+    delay: int = ...,
+    filter_time: float = ...,
+    axis: Axis = ...,
+) -> float | NDArray[np.float64]: ...
+
+
+def minimum_damping(
+    coupling: Coupling | CouplingGrid,
+    period: float,
+    *,
+    discretization: Discretization = "backward",
+    delay: int = 0,
+    filter_time: float = 0.0,
+    axis: Axis = "translation",
+) -> float | NDArray[np.float64]:
+    """Returns the device damping above which a coupling is passive.
+
+        backward     b > K T/2 + B                     low-passed: K T/2 + B T/(T + 2τ)
+        tustin       b > K T/2 for B = 0, else inf     low-passed: K T/2 + B T/(2τ)
+
+    Without a delay the bound is necessary. It is sufficient for any passive hand and any
+    environment that is discrete-time passive (14). With a low-pass, sufficiency is shown for linear
+    hands and environments only.
+
+    With a delay of d samples the bound holds against a **wall**, that is for a tool that does not
+    move:
+
+        b > (K T/2) sin((2d + 1)θ/2)/sin(θ/2) − B cos((d + 1)θ)  for all θ;  B = 0: K (T/2 + d T)
+
+    The coupling's damper may lower this bound. For a *general* environment behind a delayed
+    coupling no damping suffices, so no bound exists (see ``damping_spectrum_of`` of C z⁻ᵈ).
+
+    Args:
+        coupling: K, B and their rotational counterparts; a ``CouplingGrid`` evaluates many at once.
+        period: T in s, finite and > 0: duration for which the device holds a wrench.
+        discretization: Rule that takes the damper's velocity from sampled positions.
+        delay: d, whole samples from position to force, 0 to 50.
+        filter_time: τ in s, >= 0, of a first-order low-pass behind the damper, discretised by the
+            same rule.
+        axis: Kind of axis, which selects the pair of K and B.
+
+    Returns:
+        The bound on b in N s/m (rotation: N m s/rad), shaped like the coupling. It is inf for
+        Tustin's damper without low-pass at any delay, because its gain at Nyquist is infinite.
+
+    Raises:
+        CouplingError: An argument is out of range, or the axis or discretization is unknown.
+
+    References:
+        Brown & Colgate 1997, eqs. (6), (7); Colgate & Schenkel 1997 (wall).
+    """
+    law = SampledLaw.of(coupling, period, discretization, delay, filter_time, axis)
+    stiffness, damping, period, delay, filter_time, unbounded = law
+    if delay:
+        # without low-pass, Tustin's bound is finite only for B = 0, where both rules agree
+        scheme: Discretization = "backward" if unbounded else discretization
+        needed, _ = wall_supremum(stiffness, damping, period, scheme, delay, filter_time)
+    else:
+        if unbounded:
+            share = 1.0
+        elif discretization == "tustin":
+            share = period / (2 * filter_time)
+        else:
+            share = period / (period + 2 * filter_time)
+        needed = stiffness * period / 2 + damping * share
+    if unbounded:
+        needed = np.where(damping > 0, np.inf, needed)
+    return plain(np.asarray(needed))
+
+
+@overload
+def maximum_stiffness(device_damping: float, period: float, damping: float = 0.0) -> float: ...
+
+
+@overload
+def maximum_stiffness(
+    device_damping: ArrayLike, period: ArrayLike, damping: ArrayLike = 0.0
+) -> float | NDArray[np.float64]: ...
+
+
+def maximum_stiffness(
+    device_damping: ArrayLike, period: ArrayLike, damping: ArrayLike = 0.0
+) -> float | NDArray[np.float64]:
+    """Returns the largest passive stiffness, K = 2 (b − B) / T.
+
+    Args:
+        device_damping: b in N s/m, finite and > 0.
+        period: T in s, finite and > 0.
+        damping: B in N s/m, finite, 0 <= B < b.
+
+    Returns:
+        K in N/m, of the broadcast shape of the arguments. The stiffness of a coupling must stay
+        below it.
+
+    Raises:
+        CouplingError: An argument is out of range; for B >= b no stiffness is passive.
+
+    References:
+        Brown & Colgate 1997, eq. (6) solved for K.
+    """
+    available, step, spent = together(
+        device_damping=checked("device damping", device_damping, "N s/m", positive=True),
+        period=checked("period", period, "s", positive=True),
+        coupling_damping=checked("coupling damping", damping, "N s/m"),
+    )
+    if (spent >= available).any():
+        worst = np.argmax(spent - available)
+        raise CouplingError(
+            f"coupling damping {spent.flat[worst]:g} N s/m is not below the device's "
+            f"{available.flat[worst]:g} N s/m, so no stiffness is passive; lower the damping"
+        )
+    return plain(2 * (available - spent) / step)
+
+
+def stiffest_coupling(damping: float, rotational_damping: float, period: float) -> Coupling:
+    """Returns the default coupling of a device: 80 % of the largest stiffness at B = b/4.
+
+        B = b / 4,    K = 0.8 · 2 (b − B) / T        for translation and for rotation
+
+    Args:
+        damping: b in N s/m as seen in the scene (divided by scale · force scale), > 0.
+        rotational_damping: b_r in N m s/rad as seen in the scene, > 0.
+        period: T in s, finite and > 0.
+
+    Raises:
+        CouplingError: An argument is not finite or not positive.
+    """
+    damping = scalar("device damping", damping, "N s/m", positive=True)
+    rotational_damping = scalar("device damping", rotational_damping, "N m s/rad", positive=True)
+    translation, rotation = DAMPING_SHARE * damping, DAMPING_SHARE * rotational_damping
+    return Coupling(
+        stiffness=STIFFNESS_MARGIN * maximum_stiffness(damping, period, translation),
+        damping=translation,
+        rotational_stiffness=STIFFNESS_MARGIN
+        * maximum_stiffness(rotational_damping, period, rotation),
+        rotational_damping=rotation,
+    )

@@ -1,0 +1,323 @@
+"""Device damping required at each frequency, for any transfer function.
+
+Notation: θ = ωT, u = 1 − e^{−jθ}. Because u / (1 − cos θ) = 1 + j cot(θ/2), both conditions need
+only the real and imaginary parts of a transfer function and cot(θ/2). They lose no digits at low
+frequency.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hapticbridge.arguments import LARGEST, shown
+from hapticbridge.coupling import Coupling
+from hapticbridge.errors import CouplingError
+from hapticbridge.theory.transfer import (
+    Axis,
+    CouplingGrid,
+    Discretization,
+    SampledLaw,
+    angles,
+    coupling_transfer,
+    plain,
+    scalar,
+)
+
+if TYPE_CHECKING:
+    from scipy import signal
+
+
+Transfer = Callable[[NDArray[np.complex128]], Any]
+"""Transfer function of z, from the handle's position in m to the force in N."""
+
+
+def needed_for_any_environment(
+    transfer: NDArray[np.complex128], period: float, theta: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Returns (T/2)(1 − cos θ) / Re{(1 − e^{−jθ})/C}; inf where the real part is not positive.
+
+    This is the requirement for the worst hand together with the worst discrete-time passive
+    environment behind the coupling.
+
+    References:
+        Brown & Colgate 1997, eq. (2).
+    """
+    power = transfer.real + transfer.imag / np.tan(theta / 2)
+    size = np.abs(transfer) ** 2
+    with np.errstate(divide="ignore", invalid="ignore"):
+        needed = period / 2 * size / power
+    # a coupling without force requires no damping
+    return np.where(size == 0, 0.0, np.where(power > 0, needed, np.inf))
+
+
+def needed_for_fixed_environment(
+    transfer: NDArray[np.complex128], period: float, theta: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Returns (T/2) Re{(1 − e^{−jθ}) H} / (1 − cos θ) for a response H at the device.
+
+    References:
+        Colgate & Schenkel 1997, necessary and sufficient for any passive hand.
+    """
+    needed: NDArray[np.float64] = period / 2 * (transfer.real - transfer.imag / np.tan(theta / 2))
+    return needed
+
+
+def damping_spectrum(
+    coupling: Coupling | CouplingGrid,
+    period: float,
+    frequency: ArrayLike,
+    *,
+    discretization: Discretization = "backward",
+    delay: int = 0,
+    filter_time: float = 0.0,
+    axis: Axis = "translation",
+) -> NDArray[np.float64]:
+    """Returns the device damping that a coupling requires at each frequency.
+
+        delay = 0:   b(ω) = (T/2)(1 − cos ωT) / Re{(1 − e^{−jωT}) / C}        any environment
+        delay = d:   b(ω) = (T/2) Re{(1 − e^{−jωT}) C e^{−jdωT}} / (1 − cos ωT)        a wall
+
+    ``minimum_damping`` is the supremum over 0 < ω <= π/T. With a delay the environment is a wall,
+    that is a tool that does not move. Behind a delayed coupling no damping suffices for *every*
+    passive environment; ``damping_spectrum_of`` of C z⁻ᵈ is inf there. Against a wall the
+    coupling's damper can help, so values may be negative.
+
+    Args:
+        coupling: K and B, shape S.
+        period: T in s, finite and > 0.
+        frequency: ω in rad/s, 0 < ω <= π/T, shape F.
+        discretization: Rule that takes the damper's velocity from sampled positions.
+        delay: d, whole samples from position to force, 0 to 50.
+        filter_time: τ in s of a first-order low-pass behind the damper, >= 0.
+        axis: Kind of axis, which selects the pair of K and B.
+
+    Returns:
+        b in N s/m (rotation: N m s/rad), shape S + F; inf where none suffices.
+
+    Raises:
+        CouplingError: An argument is out of range.
+
+    References:
+        Brown & Colgate 1997, eqs. (2), (4), (5); Colgate & Schenkel 1997.
+    """
+    law = SampledLaw.of(coupling, period, discretization, delay, filter_time, axis)
+    period, delay, filter_time = law.period, law.delay, law.filter_time
+    theta = angles(frequency, period)
+    stiffness, damping = (
+        value.reshape(value.shape + (1,) * theta.ndim) for value in (law.stiffness, law.damping)
+    )
+    transfer = coupling_transfer(stiffness, damping, period, theta, discretization, filter_time)
+    if delay:
+        return needed_for_fixed_environment(transfer * np.exp(-1j * delay * theta), period, theta)
+    needed = needed_for_any_environment(transfer, period, theta)
+    if law.rings:
+        # tan(π/2) is finite in floating point; the limit at Nyquist is not
+        needed = np.where((theta == np.pi) & (damping > 0), np.inf, needed)
+    return needed
+
+
+def damping_spectrum_of(
+    transfer: Transfer | signal.dlti, period: float, frequency: ArrayLike
+) -> float | NDArray[np.float64]:
+    """Returns the device damping that any coupling requires at each frequency.
+
+        b(ω) = (T/2)(1 − cos ωT) / Re{(1 − e^{−jωT}) / C(e^{jωT})}
+
+    The result holds for every passive hand and every discrete-time passive environment.
+
+    Args:
+        transfer: C from h − x in m to the force on the tool in N: a callable of an array of complex
+            z, or a discrete ``scipy.signal`` system whose ``dt`` is the period or True.
+        period: T in s, finite and > 0.
+        frequency: ω in rad/s, 0 < ω <= π/T, any shape.
+
+    Returns:
+        b in N s/m, shaped like the frequency; inf where no damping suffices.
+
+    Raises:
+        CouplingError: An argument is out of range, the system is continuous or has another period,
+            or C is not finite at a frequency.
+
+    References:
+        Brown & Colgate 1997, eq. (2).
+    """
+    period = scalar("period", period, "s", positive=True)
+    theta = angles(frequency, period)
+    z = np.exp(1j * theta)
+    value = transfer(z) if callable(transfer) else _value_of_system(transfer, period, z)
+    try:
+        given = np.asarray(value)
+    except (TypeError, ValueError):  # for example rows of different lengths
+        given = np.empty(0, dtype=object)
+    if given.dtype.kind not in "iufc":
+        raise CouplingError(f"transfer returned {shown(value)}; it must return numbers in N/m")
+    response: NDArray[np.complex128] = given.astype(np.complex128)
+    if response.shape not in {(), theta.shape}:
+        raise CouplingError(
+            f"transfer returned shape {response.shape}; it must have z's shape {theta.shape}"
+        )
+    if not (np.abs(response) <= LARGEST**2).all():
+        raise CouplingError("the transfer function is not finite at one of the frequencies")
+    return plain(needed_for_any_environment(response, period, theta))
+
+
+def _value_of_system(
+    system: signal.dlti, period: float, z: NDArray[np.complex128]
+) -> NDArray[np.complex128]:
+    """Returns the transfer function of a discrete ``scipy.signal`` system, evaluated at z."""
+    from scipy import signal  # noqa: PLC0415 - takes 0.6 s; who passes such a system has it
+
+    if isinstance(system, signal.lti):
+        raise CouplingError(
+            "the transfer function is continuous in time; discretise it, for example with "
+            "scipy.signal.cont2discrete"
+        )
+    if not isinstance(system, signal.dlti):
+        raise CouplingError(
+            f"transfer is {shown(system)}; it must be a callable of z or a scipy.signal system"
+        )
+    if system.dt is not True and not np.isclose(system.dt, period, rtol=1e-9, atol=0):
+        raise CouplingError(
+            f"the transfer function is sampled every {system.dt:g} s, not every {period:g} s"
+        )
+    rational = system.to_tf()
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):  # a pole is refused
+        value: NDArray[np.complex128] = np.polyval(rational.num, z) / np.polyval(rational.den, z)
+    return value
+
+
+# Supremum over frequency of the damping that a delayed coupling requires against a wall.
+
+_Array = NDArray[np.float64]
+
+POINTS_PER_RIPPLE = 16
+"""Grid points per ripple of the spectrum, which has d + 1 ripples, without unit. The golden section
+that follows needs every maximum bracketed. More points only take longer."""
+
+LOWEST_ANGLE = 1e-6
+"""θ in rad at which the search starts. The spectrum is even in θ, so its limit at 0 is missed by a
+share of about (d θ)² and (τθ/T)². That is 1e-9 up to a delay or low-pass of 30 samples."""
+
+POINTS_PER_SEGMENT = 8
+"""Grid cells that share one refinement, without unit: half a ripple, which has one maximum."""
+
+GOLDEN_STEPS = 32
+"""Golden-section steps, without unit: 0.618^32 = 2e-7 of a grid cell. The spectrum is flat at its
+top, so the value there is exact to 1e-15 of itself. More steps would only compare rounding."""
+
+BATCH = 100_000
+"""Values computed at once: about a megabyte, and enough that the overhead of NumPy calls is
+negligible."""
+
+_RATIO = (np.sqrt(5) - 1) / 2
+
+
+def wall_supremum(
+    stiffness: _Array,
+    damping: _Array,
+    period: float,
+    scheme: Discretization,
+    delay: int,
+    filter_time: float,
+) -> tuple[_Array, _Array]:
+    """Returns the supremum over 0 < θ <= π of (T/2) Re{(1 − e^{−jθ}) C e^{−jdθ}} / (1 − cos θ).
+
+    The grid is even in θ and, with a low-pass, also in log θ down to its corner. The best cell of
+    every half ripple is refined by golden section, because ripples can be equally high.
+
+    Args:
+        stiffness: K in N/m.
+        damping: B in N s/m, of the shape of the stiffness.
+        period: T in s.
+        scheme: Discretization of the damper; must be finite at Nyquist.
+        delay: d in samples.
+        filter_time: τ in s.
+
+    Returns:
+        The supremum in N s/m, and the θ in rad of its first occurrence, to about 1e-7.
+    """
+    grid = search_grid(delay, filter_time / period)
+    # indices of the points of each segment; neighbouring segments share their ends
+    firsts = np.arange(0, grid.size - 1, POINTS_PER_SEGMENT)
+    points = np.minimum(firsts[:, None] + np.arange(POINTS_PER_SEGMENT + 1), grid.size - 1)
+    batch = max(1, BATCH // max(1, stiffness.size * points.shape[1]))
+    # one axis for the segments of a batch
+    k, b = stiffness[..., None], damping[..., None]
+
+    def needed(theta: _Array) -> _Array:
+        more = (1,) * (theta.ndim - k.ndim)
+        transfer = coupling_transfer(
+            k.reshape(k.shape + more), b.reshape(b.shape + more), period, theta, scheme, filter_time
+        )
+        delayed = transfer * np.exp(-1j * delay * theta)
+        return needed_for_fixed_environment(delayed, period, theta)
+
+    best = np.full(stiffness.shape, -np.inf)
+    place = np.full(stiffness.shape, grid[0])
+    for first in range(0, len(points), batch):
+        values, angles = _refined(needed, grid, points[first : first + batch], k.shape[:-1])
+        highest = values.argmax(axis=-1)[..., None]
+        value, angle = (
+            np.take_along_axis(array, highest, -1)[..., 0] for array in (values, angles)
+        )
+        place = np.where(value > best, angle, place)
+        best = np.maximum(best, value)
+    return best, place
+
+
+def search_grid(delay: int, lag: float) -> _Array:
+    """Returns the grid of angles in rad, ascending, that brackets the maxima.
+
+    Args:
+        delay: d in samples.
+        lag: τ/T, without unit.
+    """
+    grid = np.linspace(LOWEST_ANGLE, np.pi, POINTS_PER_RIPPLE * (delay + 1) + 1)
+    # Start at a hundredth of the corner, but stay a factor of two away from both ends of the
+    # first cell: points crowded there could differ by rounding alone.
+    corner = max(1e-2 / lag, 2.0 * LOWEST_ANGLE) if lag > 0 else np.inf
+    if corner < 0.5 * grid[1]:
+        low = np.geomspace(corner, grid[1], POINTS_PER_RIPPLE)
+        grid = np.concatenate([grid[:1], low[:-1], grid[1:]])
+    return grid
+
+
+def _refined(
+    needed: Callable[[_Array], _Array],
+    grid: _Array,
+    points: NDArray[np.intp],
+    shape: tuple[int, ...],
+) -> tuple[_Array, _Array]:
+    """Returns the largest value around the best grid point of each segment, and its θ."""
+    index = (1,) * len(shape)
+    theta = np.broadcast_to(grid[points], (*index, *points.shape))
+    at_points = needed(theta)
+    top = at_points.argmax(axis=-1)
+    best = np.take_along_axis(at_points, top[..., None], -1)[..., 0]
+    middle = points[np.arange(len(points)), top]
+    place = grid[middle]
+    lower = grid[np.maximum(middle - 1, 0)]
+    upper = grid[np.minimum(middle + 1, grid.size - 1)]
+    width = _RATIO * (upper - lower)
+    left, right = upper - width, lower + width
+    at_left, at_right = needed(left), needed(right)
+    for _ in range(GOLDEN_STEPS):
+        rising = at_right > at_left
+        lower, upper = np.where(rising, left, lower), np.where(rising, upper, right)
+        width = _RATIO * (upper - lower)
+        # one of the two inner points is kept, the other is new
+        fresh = np.where(rising, lower + width, upper - width)
+        value = needed(fresh)
+        left, right = np.where(rising, right, fresh), np.where(rising, fresh, left)
+        at_left, at_right = (
+            np.where(rising, at_right, value),
+            np.where(rising, value, at_left),
+        )
+    for value, inner in ((at_left, left), (at_right, right)):
+        better = value > best
+        best, place = np.where(better, value, best), np.where(better, inner, place)
+    return best, place

@@ -1,0 +1,265 @@
+"""Sampled and discretised coupling as a transfer function of z."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, fields
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hapticbridge.arguments import LARGEST, SMALLEST, Arguments, shown
+from hapticbridge.coupling import Coupling
+from hapticbridge.errors import CouplingError
+
+# Arrays of couplings, and argument checks shared by all bounds.
+
+Axis = Literal["translation", "rotation"]
+"""Kind of axis; it selects the pair of K and B."""
+
+MOST_DELAY = 50
+"""Largest delay in samples: 50 ms at 1 kHz, where a coupling is too soft to be useful. The time to
+compute a bound grows with its square."""
+
+MOST_SAMPLES = 10**8
+"""Largest length of a run or series in samples: a day at 1 kHz, which still fits into memory."""
+
+_ARGUMENTS = Arguments(CouplingError)
+# a frequency is an angle divided by a period, so its range is squared
+_FREQUENCIES = Arguments(CouplingError, SMALLEST**2, LARGEST**2)
+
+
+def checked(
+    name: str, value: ArrayLike, unit: str = "", *, positive: bool = False
+) -> NDArray[np.float64]:
+    """Returns numbers as an array, all finite and >= 0 (> 0 if positive).
+
+    Raises:
+        CouplingError: A value is not a number or out of range.
+    """
+    return _ARGUMENTS.numbers(name, value, unit, least=0, is_open=positive)
+
+
+def scalar(name: str, value: float, unit: str = "", *, positive: bool = False) -> float:
+    """Returns one number, finite and >= 0 (> 0 if positive), or raises CouplingError."""
+    return _ARGUMENTS.number(name, value, unit, least=0, is_open=positive)
+
+
+def frequencies(value: ArrayLike) -> NDArray[np.float64]:
+    """Returns frequencies in rad/s as an array, all finite and > 0, or raises CouplingError."""
+    return _FREQUENCIES.numbers("frequency", value, "rad/s", least=0, is_open=True)
+
+
+def finite(name: str, value: ArrayLike, unit: str = "") -> NDArray[np.float64]:
+    """Returns finite numbers of any sign as an array, or raises CouplingError."""
+    return _ARGUMENTS.numbers(name, value, unit)
+
+
+def whole(name: str, value: int, least: int = 0, most: int = MOST_SAMPLES) -> int:
+    """Returns a whole number of samples in [least, most], or raises CouplingError."""
+    return _ARGUMENTS.whole(name, value, "samples", least=least, most=most)
+
+
+def delayed_by(value: int) -> int:
+    """Returns a delay of 0 to ``MOST_DELAY`` samples, or raises CouplingError."""
+    return whole("delay", value, most=MOST_DELAY)
+
+
+def one_of(name: str, value: str, valid: Iterable[str]) -> str:
+    """Returns the value if it is one of the valid names, or raises CouplingError."""
+    return _ARGUMENTS.one_of(name, value, valid)
+
+
+def together(**arrays: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+    """Broadcasts arrays to one shape, or raises CouplingError."""
+    shape = _ARGUMENTS.shape(**arrays)
+    return [np.broadcast_to(array, shape) for array in arrays.values()]
+
+
+def plain(array: NDArray[np.float64]) -> float | NDArray[np.float64]:
+    """Returns a float for an array without dimensions, and any other array unchanged."""
+    return array if array.ndim else float(array)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CouplingGrid:
+    """Couplings in arrays, for maps over thousands; the fields broadcast as in NumPy.
+
+    The bounds of this package accept it in place of a ``Coupling``; a bridge does not. The fields
+    are kept as read-only arrays.
+
+    Attributes:
+        stiffness: K in N/m, finite and > 0.
+        damping: B in N s/m, finite and >= 0.
+        rotational_stiffness: K_r in N m/rad, finite and >= 0.
+        rotational_damping: B_r in N m s/rad, finite and >= 0.
+
+    Raises:
+        CouplingError: A value is not finite or out of range, or the shapes do not broadcast.
+    """
+
+    stiffness: ArrayLike
+    damping: ArrayLike = 0.0
+    rotational_stiffness: ArrayLike = 0.0
+    rotational_damping: ArrayLike = 0.0
+
+    def __post_init__(self) -> None:
+        arrays = {}
+        for field in fields(self):
+            name = f"coupling {field.name}"
+            value = getattr(self, field.name)
+            array = checked(name, value, positive=field.name == "stiffness").copy()
+            array.flags.writeable = False
+            object.__setattr__(self, field.name, array)
+            arrays[field.name] = array
+        together(**arrays)
+
+
+_OF_ROTATION = ("rotational_stiffness", "rotational_damping")
+
+
+def spring_and_damper(
+    coupling: Coupling | CouplingGrid, axis: Axis = "translation"
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Returns K and B of one kind of axis, broadcast to one shape.
+
+    Raises:
+        CouplingError: The axis is unknown, the coupling has a wrong type, or a value is out of
+            range.
+    """
+    is_translation = one_of("axis", axis, ("translation", "rotation")) == "translation"
+    if not isinstance(coupling, Coupling | CouplingGrid):
+        raise CouplingError(
+            f"coupling is {shown(coupling)}; it must be a Coupling or a CouplingGrid"
+        )
+    names = ("stiffness", "damping") if is_translation else _OF_ROTATION
+    if isinstance(coupling, Coupling):
+        # Coupling has no upper limit and accepts fractions.Fraction, so convert and check here
+        stiffness, damping = (
+            checked(f"coupling {name}", float(getattr(coupling, name)), positive=is_first)
+            for name, is_first in zip(names, (is_translation, False), strict=True)
+        )
+        return stiffness, damping
+    stiffness, damping = together(**{name: getattr(coupling, name) for name in names})
+    return stiffness, damping
+
+
+def single(coupling: Coupling) -> tuple[float, float]:
+    """Returns K and B in translation of one coupling.
+
+    Raises:
+        CouplingError: The argument is not a ``Coupling``, or a value is out of range.
+    """
+    if not isinstance(coupling, Coupling):
+        raise CouplingError(f"coupling is {shown(coupling)}; it must be one Coupling")
+    stiffness, damping = spring_and_damper(coupling)
+    return float(stiffness), float(damping)
+
+
+Discretization = Literal["backward", "tustin"]
+"""Rule that takes the damper's velocity from sampled positions."""
+
+DISCRETIZATIONS = ("backward", "tustin")
+
+_NYQUIST_ROUNDING = 1e-12
+"""Relative distance from π/T that counts as rounding, without unit. (π/T)·T may differ from π, and
+a hand has no reactance exactly at Nyquist."""
+
+
+def angles(frequency: ArrayLike, period: float) -> NDArray[np.float64]:
+    """Returns θ = ωT for frequencies in 0 < ω <= π/T.
+
+    Raises:
+        CouplingError: A frequency is not finite, not positive, or above Nyquist's.
+    """
+    theta = frequencies(frequency) * period
+    if theta.max() > np.pi * (1 + _NYQUIST_ROUNDING):
+        raise CouplingError(
+            f"frequency {theta.max() / period:g} rad/s is above {np.pi / period:g} rad/s, "
+            "half the sampling rate; choose 0 < frequency <= pi / period"
+        )
+    return np.where(theta > np.pi * (1 - _NYQUIST_ROUNDING), np.pi, theta)
+
+
+def coupling_transfer(
+    stiffness: NDArray[np.float64],
+    damping: NDArray[np.float64],
+    period: float,
+    theta: NDArray[np.float64],
+    discretization: Discretization,
+    filter_time: float,
+) -> NDArray[np.complex128]:
+    """Returns C(e^{jθ}) of a spring and a low-passed damper, without delay.
+
+        backward:  C = K + B w / (T + τ w),      w = 1 − z⁻¹
+        tustin:    C = K + B w / (T/2 + τ w),    w = (1 − z⁻¹)/(1 + z⁻¹) = j tan(θ/2)
+
+    Args:
+        stiffness: K in N/m, broadcast against θ.
+        damping: B in N s/m.
+        period: T in s.
+        theta: θ in rad.
+        discretization: Rule for the damper and its filter.
+        filter_time: τ in s of the first-order low-pass behind the damper; 0: none.
+
+    Raises:
+        CouplingError: The discretization is unknown.
+
+    References:
+        Brown & Colgate 1997, eqs. (4) and (5).
+    """
+    if one_of("discretization", discretization, DISCRETIZATIONS) == "backward":
+        # 2 sin²(θ/2) equals 1 − cos θ without cancellation
+        difference = 2 * np.sin(theta / 2) ** 2 + 1j * np.sin(theta)
+        step = period
+    else:
+        difference = 1j * np.tan(theta / 2)
+        step = period / 2
+    transfer: NDArray[np.complex128] = stiffness + damping * (
+        difference / (step + filter_time * difference)
+    )
+    return transfer
+
+
+class SampledLaw(NamedTuple):
+    """Validated arguments of a bound.
+
+    Attributes:
+        stiffness: K in N/m, shaped like the coupling.
+        damping: B in N s/m, shaped like the coupling.
+        period: T in s.
+        delay: d in samples.
+        filter_time: τ in s.
+        rings: True for Tustin's damper without low-pass, whose gain is infinite at Nyquist.
+    """
+
+    stiffness: NDArray[np.float64]
+    damping: NDArray[np.float64]
+    period: float
+    delay: int
+    filter_time: float
+    rings: bool
+
+    @classmethod
+    def of(
+        cls,
+        coupling: Coupling | CouplingGrid,
+        period: float,
+        discretization: Discretization,
+        delay: int,
+        filter_time: float,
+        axis: Axis,
+    ) -> SampledLaw:
+        """Validates the arguments of a bound.
+
+        Raises:
+            CouplingError: An argument is out of range, or the axis or discretization is unknown.
+        """
+        period = scalar("period", period, "s", positive=True)
+        filter_time = scalar("filter time", filter_time, "s")
+        delay = delayed_by(delay)
+        stiffness, damping = spring_and_damper(coupling, axis)
+        one_of("discretization", discretization, DISCRETIZATIONS)
+        rings = discretization == "tustin" and filter_time == 0
+        return cls(stiffness, damping, period, delay, filter_time, rings)

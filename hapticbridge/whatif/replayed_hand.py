@@ -1,0 +1,549 @@
+"""Model hand that holds the recorded device in a repetition."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections import deque
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter1d
+from scipy.signal import lfilter
+from scipy.spatial.transform import Rotation
+
+from hapticbridge.bridge import Bridge
+from hapticbridge.certificate import delay_ticks
+from hapticbridge.clock import Clock, SimulatedClock
+from hapticbridge.commands import CHANGES as COMMANDED
+from hapticbridge.commands.execution import coupling_in, tuning_ticks
+from hapticbridge.device import AXES, Device, DeviceInfo, Hand, Motion
+from hapticbridge.device.simulated.device import SimulatedDevice
+from hapticbridge.device.trajectory import ReplayDevice, TrajectoryDevice
+from hapticbridge.errors import SafetyTrip
+from hapticbridge.guard import trip_reason
+from hapticbridge.kernel.codes import GAVE_ENERGY, STRETCHED, TWISTED
+from hapticbridge.record import SAMPLE_DTYPE, TickFlag
+from hapticbridge.whatif.recorded import RecordedRun
+from hapticbridge.whatif.settings import GAINS, Settings
+
+# Recorded motion as a device, and recorded times as a clock.
+
+_STALE = int(TickFlag.STALE_SAMPLE)
+
+
+class RecordedClock:
+    """Clock that replays the times of a recording.
+
+    Its device reports reading and writing.
+
+    Args:
+        ticks: Recorded rows, ``TICK_DTYPE``.
+        period: Recorded period in s.
+    """
+
+    name = SimulatedClock.name
+    is_lossless = True
+
+    def __init__(self, ticks: NDArray[np.void], period: float) -> None:
+        deadline = ticks["deadline_ns"]
+        late = (ticks["flags"] & int(TickFlag.OVERRUN)) != 0
+        between = np.diff(deadline, prepend=0) // round(1e9 * period) - 1
+        skipped = np.where(late, np.maximum(between, 1), 0)
+        columns = deadline, ticks["wake_ns"], skipped, ticks["read_ns"], ticks["write_ns"]
+        self._rows = list(zip(*(column.tolist() for column in columns), strict=True))
+        self._tick, self._now = -1, 0
+
+    def start(self, period_ns: int) -> None:
+        """Does nothing; the times are recorded."""
+
+    def wait(self) -> tuple[int, int, int]:
+        """Advances to the next recorded tick; see ``Clock.wait``."""
+        self._tick = min(self._tick + 1, len(self._rows) - 1)
+        deadline, self._now, skipped, *_ = self._rows[self._tick]
+        return deadline, self._now, skipped
+
+    def now(self) -> int:
+        """Returns the recorded time of the latest action."""
+        return self._now
+
+    def note_read(self) -> None:
+        """Notes that the device was read."""
+        self._now = self._rows[self._tick][3]
+
+    def note_written(self) -> None:
+        """Notes that the wrench was sent."""
+        if self._tick >= 0:
+            self._now = self._rows[self._tick][4]
+
+
+class Outside:
+    """Recorded buttons and stale samples, resampled to another rate.
+
+    Args:
+        ticks: Recorded rows, ``TICK_DTYPE``.
+        period: Recorded period in s.
+    """
+
+    def __init__(self, ticks: NDArray[np.void], period: float) -> None:
+        self._pressed, self._period = ticks["buttons"].copy(), period
+        self._stale = ticks["flags"] & _STALE
+        self._rows: Iterator[int] = iter(())
+
+    def start(self, period: float) -> None:
+        """Starts at the first tick of a loop with this period in s."""
+        share, last = period / self._period, len(self._pressed) - 1
+
+        def rows() -> Iterator[int]:
+            tick = 0
+            while True:
+                yield min(int(tick * share + 1e-9), last)  # a period in decimals is rounded
+                tick += 1
+
+        self._rows = rows()
+
+    def read(self, sample: NDArray[np.void]) -> int:
+        """Puts the next tick's buttons into a sample; after the last tick they stay.
+
+        Returns:
+            ``STALE_SAMPLE`` for a stale sample, else 0.
+        """
+        row = next(self._rows)
+        sample["buttons"] = self._pressed[row]
+        return int(self._stale[row])
+
+
+class RecordedMotion(ReplayDevice):
+    """Device that replays the recorded samples, one per tick.
+
+    The motion is prescribed at any force, which is exact but no hand: it presses as deep into a
+    stiffer wall as into the recorded one. The data sheet is the recorded device's, so that guard
+    and controller act as with it. With recorded times and unchanged settings, the run equals the
+    recorded one in every bit.
+
+    Args:
+        ticks: Recorded rows, ``TICK_DTYPE``, at least two.
+        clock: Clock of the run.
+        period: Recorded period in s.
+        start: Device pose (7,) before the first tick.
+        info: Data sheet of the recorded device.
+
+    Raises:
+        DeviceError: See ``ReplayDevice``.
+    """
+
+    def __init__(
+        self,
+        ticks: NDArray[np.void],
+        clock: RecordedClock,
+        period: float,
+        start: tuple[float, ...],
+        info: DeviceInfo,
+    ) -> None:
+        super().__init__(ticks, period)
+        self.info = _unattended(info, self.info)
+        self._clock, self._before = clock, start
+        self._news = iter((ticks["flags"] & _STALE).tolist())
+
+    def start(self, period: float) -> NDArray[np.void]:
+        """Implements ``Device.start``."""
+        return placed(super().start(period), self._before)
+
+    def read(self, sample: NDArray[np.void]) -> int:
+        """Implements ``Device.read``."""
+        super().read(sample)
+        self._clock.note_read()
+        return next(self._news, 0)
+
+    def write(self, wrench: NDArray[np.float64]) -> None:
+        """Ignores the wrench; the motion is prescribed."""
+        self._clock.note_written()
+
+
+class ResampledMotion(TrajectoryDevice):
+    """Device that replays the recorded motion at another rate.
+
+    Positions are interpolated linearly, orientations by slerp.
+
+    Args:
+        ticks: Recorded rows, ``TICK_DTYPE``, at least two.
+        period: Recorded period in s.
+        start: Device pose (7,) before the first tick.
+        info: Data sheet of the recorded device.
+    """
+
+    def __init__(
+        self, ticks: NDArray[np.void], period: float, start: tuple[float, ...], info: DeviceInfo
+    ) -> None:
+        times = period * np.arange(len(ticks))
+        super().__init__(Motion(times, ticks["device_position"], ticks["device_quaternion"]))
+        self.info = _unattended(info, self.info)
+        self._before, self._last = start, b""
+        self._outside = Outside(ticks, period)
+
+    def start(self, period: float) -> NDArray[np.void]:
+        """Implements ``Device.start``."""
+        self._outside.start(period)
+        return placed(super().start(period), self._before)
+
+    def read(self, sample: NDArray[np.void]) -> int:
+        """Implements ``Device.read``."""
+        before = self._last
+        super().read(sample)
+        self._last = sample[["position", "quaternion"]].tobytes()
+        flags = self._outside.read(sample)
+        return flags if self._last == before else 0  # a changed pose is a new sample
+
+
+def placed(sample: NDArray[np.void], pose: tuple[float, ...]) -> NDArray[np.void]:
+    """Returns a sample at a pose (7,), with the buttons of another sample."""
+    there = np.zeros(1, SAMPLE_DTYPE)
+    there["buttons"] = sample["buttons"]
+    there["position"][0], there["quaternion"][0] = pose[:3], pose[3:]
+    return there
+
+
+def _unattended(info: DeviceInfo, own: DeviceInfo) -> DeviceInfo:
+    """Returns the recorded data sheet without motors, with the duration of the replay."""
+    return replace(info, is_real=False, duration=own.duration)
+
+
+# Where a recorded hand wanted to be.
+#
+# A recorded hand cannot be known, only what it did. Two things can be made of the force that it
+# must have applied, f = m a + b v − w (m and b the device's, w the wrench that it was sent).
+# Applied again as it was, as a function of time, it is the force of a hand without stiffness and
+# damping: a millinewton too much at the start, and it drifts away without end. So it is taken
+# for that of a hand as in ``device.Hand``, a measured arm or the one that the scene asks for,
+# which pulls with spring and damper towards where its owner wants to be. Where that is, p,
+# follows from the motion,
+#
+# b_h p' + k_h p = (m + m_h) a + (b + b_h) v + k_h x − w + f_c sign(v),
+#
+# so that the hand would have moved as recorded. What is assumed is how it gives way to other
+# forces than the recorded ones. p is smoothed: a person's intent is slow, and the second
+# derivative of rounded positions is noise.
+
+INTENT = 8e-3
+"""Standard deviation in s of the Gaussian that smooths the hand's intended motion. It halves motion
+at 23 Hz, faster than an arm moves on purpose. A longer one loses fast strokes, a shorter one keeps
+noise."""
+
+
+def intended(
+    info: DeviceInfo,
+    hand: Hand,
+    ticks: NDArray[np.void],
+    period: float,
+    start: tuple[float, ...],
+) -> Array:
+    """Returns where the hand wanted to be, as a ``Motion.table`` counted from the start.
+
+    Rotation follows the same law with rotation vectors from the start's orientation in the place of
+    positions: exact about one axis, and good as long as angles stay well below π.
+
+    Args:
+        info: The device.
+        hand: Who is taken to have held it.
+        ticks: The recorded rows.
+        period: Of the recorded loop, in s.
+        start: Device pose (7,) before the first tick.
+    """
+    origin = Rotation.from_quat(np.array(start[3:]), scalar_first=True)
+    turned = Rotation.from_quat(ticks["device_quaternion"], scalar_first=True) * origin.inv()
+    wrench = _held(ticks["wrench_on_device"], delay_ticks(info, period) or 0)
+    wanted = [
+        _wanted(moved, force, period, (m + m_h, b + b_h, b_h, k_h, friction))
+        for moved, force, m, m_h, b, b_h, k_h, friction in (
+            (
+                ticks["device_position"] - np.array(start[:3]),
+                wrench[:, :3],
+                info.mass or 0.0,
+                hand.mass,
+                info.damping or 0.0,
+                hand.damping,
+                hand.stiffness,
+                info.friction or 0.0,
+            ),
+            (
+                turned.as_rotvec(),
+                wrench[:, 3:] * float(info.turns),
+                info.rotational_inertia or 1e-4,
+                hand.rotational_inertia,
+                info.rotational_damping or 0.0,
+                hand.rotational_damping,
+                hand.rotational_stiffness,
+                0.0,
+            ),
+        )
+    ]
+    table = np.column_stack(
+        [
+            period * np.arange(len(ticks)),
+            wanted[0],
+            Rotation.from_rotvec(wanted[1]).as_quat(canonical=True, scalar_first=True),
+        ]
+    )
+    return np.ascontiguousarray(table)
+
+
+def _held(wrench: Array, delay: int) -> Array:
+    """Returns the mean of the wrenches that acted before and after each sample."""
+    acting = np.concatenate([np.zeros((delay + 1, 6)), wrench])
+    return np.asarray(0.5 * (acting[: len(wrench)] + acting[1 : len(wrench) + 1]))
+
+
+def _wanted(
+    moved: Array,
+    force: Array,
+    period: float,
+    law: tuple[float, float, float, float, float],
+) -> Array:
+    """Solves b_h p' + k_h p = M a + β v + k_h x − w + f_c sign(v) for p, by the bilinear rule.
+
+    It is stable, and at half the rate, where central differences are noise, it answers nothing.
+    """
+    inertia, damping, hand_damping, stiffness, friction = law
+    padded = np.concatenate([moved[:1], moved, moved[-1:]])
+    velocity = (padded[2:] - padded[:-2]) / (2 * period)
+    acceleration = (padded[2:] - 2 * moved + padded[:-2]) / period**2
+    pull = inertia * acceleration + damping * velocity + stiffness * moved - force
+    pull += friction * np.sign(velocity)
+    if hand_damping == 0.0:  # one that only weighs something wants nothing
+        wanted = pull / stiffness if stiffness else moved
+    else:
+        pole = 2 * hand_damping / period + stiffness
+        # the filter starts as if what is wanted had always been where it is at the start
+        first = pull[:1] / stiffness if stiffness else moved[:1]
+        rest = first - pull[:1] / pole
+        wanted, _ = lfilter([1.0, 1.0], [pole, 2 * stiffness - pole], pull, axis=0, zi=rest)
+    return np.asarray(gaussian_filter1d(wanted, INTENT / period, axis=0, mode="nearest"))
+
+
+# Repetition of a run's inputs, commands and pauses.
+
+_BY_STATE = (STRETCHED, TWISTED, GAVE_ENERGY)
+"""Trips caused by the state after the previous tick, at any sample; that tick can be repeated."""
+
+Event = Mapping[str, Any]
+
+
+class Repetition:
+    """One repetition of a run with given settings.
+
+    Args:
+        run: The recorded run.
+        settings: Settings of the bridge.
+
+    Attributes:
+        settings: Settings of the bridge.
+        warned: Warnings about the scene, one sentence each.
+    """
+
+    def __init__(self, run: RecordedRun, settings: Settings) -> None:
+        self._run, self.settings = run, settings
+        self._per_tick = 1.0
+        self.warned: tuple[str, ...] = ()
+
+    def into(self, path: Path, device: Device, clock: Clock) -> tuple[float, str]:
+        """Runs into a file; returns the period in s, and why the guard stopped it or nothing.
+
+        Raises:
+            HapticBridgeError: The changed bridge is refused; the message says why.
+        """
+        run, settings = self._run, self.settings
+        bridge = Bridge(
+            run.scene(settings),
+            device,
+            settings.coupling,
+            rate=settings.rate,
+            substeps=settings.substeps,
+            method=settings.method.name,
+            contact_stiffness=settings.contact_stiffness,
+            recording=path,
+            clock=clock,
+            scale=settings.scale,
+            force_scale=settings.force_scale,
+            axes=np.array(run.parameters.axes),
+            absolute=run.is_absolute,
+            limits=run.limits,
+            controller=settings.controller,
+            clutch=run.clutch,
+            dead_man=run.dead_man,
+        )
+        self._per_tick = run.parameters.period / bridge.period
+        trip = ""
+        with warnings.catch_warnings(record=True) as caught, ExitStack() as stack:
+            warnings.simplefilter("always", UserWarning)
+            stack.enter_context(bridge)
+            try:
+                self._repeat(bridge)
+            except SafetyTrip as error:
+                trip = str(error)
+        # the temporary path of the unpacked scene means nothing to the reader
+        told = [str(each.message).replace(str(run.scene_file), "") for each in caught]
+        self.warned = tuple(dict.fromkeys(text.removeprefix("scene '': ") for text in told))
+        return bridge.period, trip
+
+    def _repeat(self, bridge: Bridge) -> None:
+        """Runs for the recorded number of ticks, with recorded actions at their times."""
+        due = deque(
+            (math.ceil(int(event["tick"]) * self._per_tick - 1e-9), event)
+            for each in self._run.recording.events
+            if (event := self._repeated(each))
+        )
+
+        def on_tick(tick: int) -> None:
+            commands = []
+            while due and due[0][0] <= tick:
+                event = due.popleft()[1]
+                if event["event"] == "input":
+                    bridge.repeat_input(event["writes"])
+                else:
+                    commands.append(event)
+            if commands:
+                bridge.repeat_commands(commands)
+
+        done = 0
+        for end in self._ends():
+            count = round(end * self._per_tick) - done
+            if count > 0:
+                bridge.run(count * bridge.period, on_tick)
+                done += count
+        if self._was_tripped_by_state():
+            bridge.run(bridge.period, on_tick)
+
+    def _ends(self) -> list[int]:
+        """Returns the ticks at which the recorded run paused, and the end."""
+        events = self._run.recording.events
+        pauses = [int(e["tick"]) for e in events if e.get("event") == "resume"]
+        return [*pauses, len(self._run.recording.ticks)]
+
+    def _was_tripped_by_state(self) -> bool:
+        last = len(self._run.recording.ticks)
+        return self._run.trip in [trip_reason(code, last) for code in _BY_STATE]
+
+    def _repeated(self, event: Event) -> Event | None:
+        """Returns the action that repeats a recorded event under these settings, or None."""
+        name = event.get("event")
+        if name == "coupling":
+            return self._coupling(event) if self.keeps_couplings else None
+        if name == "reset" and not self.keeps_resets:
+            return None
+        return event if name in ("input", *COMMANDED) else None
+
+    @property
+    def keeps_couplings(self) -> bool:
+        """True if recorded changes of the coupling are repeated; a new coupling replaces them."""
+        old, new = self._run.settings.coupling, self.settings.coupling
+        is_kept = (old.stiffness, old.damping) == (new.stiffness, new.damping)
+        return is_kept and self.settings.method.has_law
+
+    @property
+    def keeps_resets(self) -> bool:
+        """True if resets are repeated; a massless tool has nothing to reset."""
+        return self.settings.method.has_coupling
+
+    def _coupling(self, event: Event) -> Event:
+        """Returns a change to the same effective coupling under these settings."""
+        old, new, period = self._run.settings, self.settings, 1.0 / self.settings.rate
+        if replace(new, scene=old.scene, controller=old.controller) == old:
+            return event
+        law = coupling_in(event, self._run.parameters)
+        felt = old.method.rendered(law, self._run.parameters.period / old.substeps)
+        kept = {name: getattr(new.coupling, name) for name in GAINS[2:]}
+        used = new.method.used(replace(felt, **kept), period / new.substeps)
+        return {**event, **asdict(used), "ticks": tuning_ticks(period)}
+
+
+Array = NDArray[np.float64]
+
+
+def missing_for_closed_loop(info: DeviceInfo) -> str:
+    """Returns the reason why a device's motion cannot be simulated, or empty."""
+    if info.is_prescribed:
+        return "the recorded motion was prescribed, so no device responded to the force"
+    needed = {"mass": info.mass, "damping": info.damping}
+    if info.turns:
+        needed["rotational_inertia"] = info.rotational_inertia
+        needed["rotational_damping"] = info.rotational_damping
+    unknown = [name.replace("_", " ") for name, value in needed.items() if value is None]
+    if unknown:
+        return (
+            f"unknown {' and '.join(unknown)} of the device; measure with 'hapticbridge identify'"
+        )
+    return ""
+
+
+class IdentifiedDevice(SimulatedDevice):
+    """The recorded device as its data sheet knows it, in a model hand that wants what it wanted.
+
+    Args:
+        info: The recorded device, with mass and damping (``missing_for_closed_loop``).
+        hand: Who holds it.
+        ticks: The recorded rows, ``TICK_DTYPE``, at least three.
+        period: The recorded loop's in s.
+        start: Device pose (7,) before the first tick, where it is held still until then.
+    """
+
+    def __init__(
+        self,
+        info: DeviceInfo,
+        hand: Hand,
+        ticks: NDArray[np.void],
+        period: float,
+        start: tuple[float, ...],
+    ) -> None:
+        super().__init__(
+            mass=info.mass or 0.0,
+            damping=info.damping or 0.0,
+            # without rotational axes the inertia has no effect
+            rotational_inertia=info.rotational_inertia or 1e-4,
+            rotational_damping=info.rotational_damping or 0.0,
+            hand=hand,
+            resolution=info.resolution or 0.0,
+            friction=info.friction or 0.0,
+            force_limit=info.force_limit,
+            torque_limit=info.torque_limit,
+            speed_limit=info.speed_limit,
+        )
+        self._motion = intended(info, hand, ticks, period, start)
+        self._start = np.array(start)
+        self._origin = Rotation.from_quat(self._start[3:], scalar_first=True)
+        self._outside = Outside(ticks, period)
+        self._felt = np.array([axis in info.axes for axis in AXES], dtype=np.float64)
+        self.info = replace(info, is_real=False, duration=float(self._motion[-1, 0]))
+
+    def start(self, period: float, parts: int = 1) -> NDArray[np.void]:
+        """Implements ``SimulatedDevice.start``; the hand may pull from the start on."""
+        self._delay = delay_ticks(self.info, period) or 0  # in ticks of this loop
+        sample = super().start(period, parts)
+        self._outside.start(period)
+        state = self._states[0]
+        state["target_position"] = self._motion[0, 1:4]
+        state["target_quaternion"] = self._motion[0, 4:]
+        return self._there(sample)
+
+    def read(self, sample: NDArray[np.void]) -> int:
+        """Implements ``SimulatedDevice.read``."""
+        flags = super().read(sample)
+        # buttons only; this device always has new samples
+        self._outside.read(sample)
+        self._there(sample)
+        return flags
+
+    def write(self, wrench: Array) -> None:
+        """Implements ``SimulatedDevice.write``; components without a device axis have no effect."""
+        super().write(wrench * self._felt)
+
+    def _there(self, sample: NDArray[np.void]) -> NDArray[np.void]:
+        """Moves a sample from coordinates relative to the start to the device's coordinates."""
+        sample["position"][0] += self._start[:3]
+        turned = Rotation.from_quat(sample["quaternion"][0], scalar_first=True) * self._origin
+        sample["quaternion"][0] = turned.as_quat(canonical=True, scalar_first=True)
+        return sample
