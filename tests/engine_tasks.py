@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from hapticbridge.coupling import Coupling
 from hapticbridge.device.trajectory.motion import Motion
 from hapticbridge.errors import StudyError
+from hapticbridge.lab.engines import Body, Engine, Shape, Simulation, Task, open_engine
 from hapticbridge.mechanics import exact_mass_response
-from hapticbridge.study.engines import Body, Engine, Shape, Simulation, Task, open_engine
 
 COUPLING = Coupling(
     stiffness=1000.0, damping=5.0, rotational_stiffness=2.0, rotational_damping=2e-3

@@ -53,7 +53,7 @@ NOT_FOR_A_RUN = frozenset(
         "hapticbridge.mechanics",
         "hapticbridge.picture",
         "hapticbridge.report",
-        "hapticbridge.study",
+        "hapticbridge.lab",
         "hapticbridge.view.server",
         "hapticbridge.whatif",
     }

@@ -7,10 +7,10 @@ import pytest
 from engine_stand_in import StandIn
 from engine_tasks import AMPLITUDE, COUPLING, MASS, driven_error, driven_mass, driven_path, opened
 
+from hapticbridge.lab.engines import Body, Pose, Task, composed
+from hapticbridge.lab.engines.base import Engine
 from hapticbridge.mechanics import drive_mass
 from hapticbridge.pose import quaternion_exp
-from hapticbridge.study.engines import Body, Pose, Task, composed
-from hapticbridge.study.engines.base import Engine
 
 
 def test_a_held_coupling_drives_a_mass_as_the_held_scheme_says() -> None:

@@ -25,10 +25,7 @@ from scipy.spatial.transform import Rotation
 from hapticbridge.coupling import Coupling
 from hapticbridge.device.trajectory.motion import Motion
 from hapticbridge.errors import StudyError
-from hapticbridge.mechanics import drive_mass, integrate_rotation
-from hapticbridge.mechanics.coupled_mass import CoupledScheme
-from hapticbridge.pose import quaternion_exp
-from hapticbridge.study.engines import (
+from hapticbridge.lab.engines import (
     Body,
     Contacts,
     Engine,
@@ -39,6 +36,9 @@ from hapticbridge.study.engines import (
     composed,
     engine_names,
 )
+from hapticbridge.mechanics import drive_mass, integrate_rotation
+from hapticbridge.mechanics.coupled_mass import CoupledScheme
+from hapticbridge.pose import quaternion_exp
 
 NOTHING = (0.0, 0.0, 0.0)
 SINGLE_PRECISION = {"physx", "physx_spring"}

@@ -13,7 +13,7 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.errors import CouplingError, HapticBridgeError
 from hapticbridge.passivity import damping_spectrum_of, z_width
 from hapticbridge.picture import ENDINGS, check_ending, inline_svg, new_figure, write_picture
-from hapticbridge.study.theory import alternatives, draw_alternatives, draw_z_width
+from hapticbridge.theory_plots import alternatives, draw_alternatives, draw_z_width
 
 T = 1e-3
 

@@ -16,11 +16,11 @@ from hapticbridge.clock import SimulatedClock
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import SimulatedDevice
 from hapticbridge.errors import CouplingError, HapticBridgeError
+from hapticbridge.lab.closed_loop import ClosedLoop, LoopOutcome
 from hapticbridge.mechanics import exact_mass_response
 from hapticbridge.passivity import WorstHand
 from hapticbridge.rendering import METHODS, default_method
 from hapticbridge.scene import load_scene
-from hapticbridge.study.closed_loop import ClosedLoop, LoopOutcome
 
 COUPLING = Coupling(2400.0, 0.5, 2.4, 5e-4)
 KNOCK = np.array([1e-4, 0, 0, 0, 0, 0])

@@ -18,11 +18,7 @@ from hapticbridge.passivity.compensation import largest_felt_damping, law_dampin
 from hapticbridge.passivity.grid import scalar
 from hapticbridge.picture import check_ending
 from hapticbridge.rendering import default_method
-from hapticbridge.study.theory import (
-    Alternative,
-    alternatives,
-    draw_alternatives,
-)
+from hapticbridge.theory_plots import Alternative, alternatives, draw_alternatives
 
 
 @dataclass(frozen=True, slots=True)

@@ -31,7 +31,7 @@ from hapticbridge.identify.measured_profile import measured_profile
 from hapticbridge.identify.picture import draw_identification
 from hapticbridge.picture import check_ending
 from hapticbridge.signals import interrupting_on_signals
-from hapticbridge.study.theory import draw_z_width
+from hapticbridge.theory_plots import draw_z_width
 
 
 @dataclass(frozen=True, slots=True)

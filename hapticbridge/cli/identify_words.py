@@ -17,7 +17,7 @@ from hapticbridge.identify.identification import UNHELD
 from hapticbridge.passivity import ZWidth, z_width
 from hapticbridge.quantity import quantity
 from hapticbridge.rendering import default_method
-from hapticbridge.study.theory import recommended
+from hapticbridge.theory_plots import recommended
 
 
 def safe_width(result: Identification) -> ZWidth | None:

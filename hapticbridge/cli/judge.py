@@ -11,6 +11,14 @@ from typing import Annotated
 import tyro
 
 from hapticbridge.audit import AuditReport, audit
+from hapticbridge.audit.batch import (
+    audit_all,
+    check_table_name,
+    find_recordings,
+    reports_of,
+    worst_exit_code,
+    write_audits,
+)
 from hapticbridge.cli.judge_many import print_audits, print_unreadable
 from hapticbridge.cli.judge_what_if import print_what_if
 from hapticbridge.cli.terminal import err, out, plain, progress
@@ -20,15 +28,7 @@ from hapticbridge.picture import check_ending
 from hapticbridge.quantity import quantity
 from hapticbridge.recording import Recording, read_recording, repair
 from hapticbridge.report import check_page_name, plot_recording, telling_time, write_report
-from hapticbridge.study.audits import (
-    audit_all,
-    check_table_name,
-    reports_of,
-    worst_exit_code,
-    write_audits,
-)
-from hapticbridge.study.findings import find_recordings
-from hapticbridge.study.table import Interrupted, Table
+from hapticbridge.sweep.results import Interrupted, Table
 from hapticbridge.whatif import changes_from, draw_what_if, what_if, write_what_if
 
 SCENE_SIZE = 640, 400

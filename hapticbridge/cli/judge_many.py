@@ -6,9 +6,9 @@ import math
 from collections import Counter
 
 from hapticbridge.audit import verdict_words
+from hapticbridge.audit.batch import UNREADABLE
 from hapticbridge.cli.terminal import err, out, plain
-from hapticbridge.study.audits import UNREADABLE
-from hapticbridge.study.table import Table
+from hapticbridge.sweep.results import Table
 
 _COLOURS = {"passive": "green", "active": "red", "invalid": "magenta", UNREADABLE: "magenta"}
 
