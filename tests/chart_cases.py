@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from hapticbridge.lab.chart import Chart, Extent, measure_chart, open_workload
+from hapticbridge.lab.chart.chart import Cost, Measurement
+from hapticbridge.lab.chart.setting import SHIPPED, Setting
+from hapticbridge.lab.chart.workload import Score, Verdict
 from hapticbridge.rendering import METHODS
-from hapticbridge.study.chart import Chart, Extent, measure_chart, open_workload
-from hapticbridge.study.chart.measurement import Measurement
-from hapticbridge.study.chart.score import Score, Verdict
-from hapticbridge.study.chart.setting import SHIPPED, Setting
-from hapticbridge.study.chart.timing import Cost
 
 
 def made_up(

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from hapticbridge.lab.engines import Contacts, Pose, Setting, Task, Velocity
+from hapticbridge.lab.engines.from_scene import HeldSimulation
 from hapticbridge.pose import Vector, add, canonical, product, quaternion_exp, scaled
-from hapticbridge.study.engines import Contacts, Pose, Setting, Task, Velocity
-from hapticbridge.study.engines.held import HeldSimulation
 
 
 class StandIn:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from hapticbridge.study.maps.stability_map import Point
-from hapticbridge.study.table import Outcome, Table, table_of
+from hapticbridge.lab.maps.base import Point
+from hapticbridge.sweep.results import Outcome, Table, table_of
 
 Row = tuple[Point, Mapping[str, float | int | str | bool] | str]
 """A point, and what was computed there; a text is why it failed."""

@@ -7,8 +7,8 @@ from scipy.spatial.transform import Rotation
 
 from hapticbridge.certificate import default_coupling
 from hapticbridge.device import Hand, Motion, SimulatedDevice
+from hapticbridge.lab.closed_loop import ClosedLoop, LoopOutcome
 from hapticbridge.rendering import default_method
-from hapticbridge.study.closed_loop import ClosedLoop, LoopOutcome
 
 T = 1e-3
 REACH, ANGLE = 0.03, np.radians(45.0)

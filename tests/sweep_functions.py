@@ -11,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from hapticbridge.study.points import Point, Value, grid
-from hapticbridge.study.sweep import sweep
+from hapticbridge.sweep.points import Point, Value, grid
+from hapticbridge.sweep.sweep import sweep
 
 LAST_IS_DONE = threading.Event()
 COUNTED = grid(n=range(12), gain=[0.1])

@@ -10,10 +10,9 @@ from typing import Any
 import numpy as np
 import sweep_functions as functions
 
-from hapticbridge.study.points import grid
-from hapticbridge.study.sweep import sweep
-from hapticbridge.study.table import Table
-from hapticbridge.study.workers import InThisProcess
+from hapticbridge.sweep.points import grid
+from hapticbridge.sweep.results import Table
+from hapticbridge.sweep.sweep import InThisProcess, sweep
 
 POINTS = grid(stiffness=[1000, 3000.0, 1e4 / 3], damping=np.linspace(0.1, 0.3, 3), tool="peg")
 

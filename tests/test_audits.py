@@ -18,19 +18,21 @@ from audit_cases import recorded, rewritten, tapped
 from cli_cases import Called
 
 from hapticbridge.audit import AuditReport, audit
-from hapticbridge.coupling import Coupling
-from hapticbridge.errors import RecordingError, StudyError
-from hapticbridge.recording import read_recording
-from hapticbridge.study import processes
-from hapticbridge.study.audits import (
+from hapticbridge.audit.batch import (
     audit_all,
     audit_point,
     check_table_name,
+    find_recordings,
     reports_of,
     worst_exit_code,
 )
-from hapticbridge.study.findings import find_recordings
+from hapticbridge.coupling import Coupling
+from hapticbridge.errors import RecordingError, StudyError
+from hapticbridge.recording import read_recording
 
+# their packages hold functions of these names
+batch = importlib.import_module("hapticbridge.audit.batch")
+sweep = importlib.import_module("hapticbridge.sweep.sweep")
 WEAK = Coupling(stiffness=1000, damping=0.9, rotational_stiffness=1, rotational_damping=9e-4)
 STIFF = Coupling(stiffness=6000, damping=0.5, rotational_stiffness=1, rotational_damping=9e-4)
 
@@ -190,8 +192,8 @@ def test_jobs_are_processes_at_most(monkeypatch: pytest.MonkeyPatch, runs: Path)
             counts.append(count)
             raise OSError("no processes in this test")
 
-    monkeypatch.setattr(processes, "ProcessPoolExecutor", Counting)
-    monkeypatch.setattr(processes, "cores", lambda: 64)
+    monkeypatch.setattr(sweep, "ProcessPoolExecutor", Counting)
+    monkeypatch.setattr(sweep, "cores", lambda: 64)
     files = find_recordings([runs])
     for jobs, expected in ((3, 3), (50, len(files))):
         with pytest.raises(OSError, match="no processes"):
@@ -213,7 +215,7 @@ def test_a_worker_that_fails_is_a_row_and_no_end(
             raise MemoryError("too large")
         return audit(path, strict=strict)
 
-    monkeypatch.setattr("hapticbridge.study.audits.audit", broken)
+    monkeypatch.setattr(batch, "audit", broken)
     table = audit_all([runs / "a" / "tap.mcap", runs / "stiff.mcap"], jobs=1)
     assert list(table.texts("verdict")) == ["unreadable", "passive"]
     assert "too large" in table.texts("reason")[0]
@@ -227,7 +229,7 @@ def test_strict_reaches_every_recording(runs: Path, monkeypatch: pytest.MonkeyPa
         seen.append(strict)
         return audit(path, strict=strict)
 
-    monkeypatch.setattr("hapticbridge.study.audits.audit", judged)
+    monkeypatch.setattr(batch, "audit", judged)
     for strict in (True, False):
         audit_point({"file": str(runs / "stiff.mcap")}, strict=strict)
     assert seen == [True, False]
@@ -268,7 +270,7 @@ def test_ctrl_c_leaves_the_table_of_what_was_judged(
             raise KeyboardInterrupt
         return audit(path, strict=strict)
 
-    monkeypatch.setattr("hapticbridge.study.audits.audit", interrupted)
+    monkeypatch.setattr(batch, "audit", interrupted)
     target = tmp_path / "all.json"
     code, out, err = call("audit", runs, "--jobs", 1, "--table", target)
     assert code == 130

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hapticbridge.errors import StudyError
-from hapticbridge.study.maps.bisection import Bracket, agreement, largest_stable, per_cent
+from hapticbridge.lab.maps.base import Bracket, agreement, largest_stable, per_cent
 
 
 @given(limit=st.floats(0.011, 90.0), width=st.floats(1e-6, 0.1))

@@ -16,8 +16,7 @@ from chart_cases import FakeRun, small_chart
 from hapticbridge.cli import main
 from hapticbridge.errors import StudyError
 from hapticbridge.kernel.codes import DIRECT, LOSSLESS
-from hapticbridge.rendering import METHODS
-from hapticbridge.study.chart import (
+from hapticbridge.lab.chart import (
     Chart,
     Extent,
     chosen_methods,
@@ -28,9 +27,9 @@ from hapticbridge.study.chart import (
     settings_for,
     write_chart,
 )
-from hapticbridge.study.chart.front import pareto_front
-from hapticbridge.study.chart.setting import CONTACTS, SHIPPED, Setting
-from hapticbridge.study.chart.timing import interleaved_costs, one_core
+from hapticbridge.lab.chart.chart import interleaved_costs, one_core, pareto_front
+from hapticbridge.lab.chart.setting import CONTACTS, SHIPPED, Setting
+from hapticbridge.rendering import METHODS
 
 
 def test_front_is_what_no_other_point_beats() -> None:

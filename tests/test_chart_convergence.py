@@ -9,19 +9,17 @@ import numpy as np
 import pytest
 from chart_cases import made_up
 
+from hapticbridge.lab.chart import contact_bodies, free_bodies, measure_chart
+from hapticbridge.lab.chart.catalogue import Extent, open_workload
+from hapticbridge.lab.chart.chart import convergence_orders
+from hapticbridge.lab.chart.peg import COUPLING as PEG_COUPLING
+from hapticbridge.lab.chart.peg import PegInHole
+from hapticbridge.lab.chart.scene_run import COUPLING, OwnReferences
+from hapticbridge.lab.chart.setting import Setting
+from hapticbridge.lab.chart.workload import Score, Workload
+from hapticbridge.lab.maps.base import set_tool_mass
 from hapticbridge.rendering import METHODS
 from hapticbridge.scene import Scene, load_scene
-from hapticbridge.study.chart import driven_mass, measure_chart, rod_impact, spinning_body
-from hapticbridge.study.chart.catalogue import Extent, open_workload
-from hapticbridge.study.chart.convergence import convergence_orders
-from hapticbridge.study.chart.own_reference import OwnReferences
-from hapticbridge.study.chart.peg import COUPLING as PEG_COUPLING
-from hapticbridge.study.chart.peg import PegInHole
-from hapticbridge.study.chart.scene_motion import COUPLING
-from hapticbridge.study.chart.score import Score
-from hapticbridge.study.chart.setting import Setting
-from hapticbridge.study.chart.workload import Workload
-from hapticbridge.study.maps.rigs import set_tool_mass
 
 GRID = 4e-3
 FINE = (5e-4, 2.5e-4, 1.25e-4)
@@ -124,23 +122,23 @@ def test_wrong_mass_shows_as_a_worse_point(monkeypatch: pytest.MonkeyPatch) -> N
 
     def heavier(name: str) -> Scene:
         scene = load_scene(name)
-        set_tool_mass(scene.model, "tool", 1.1 * driven_mass.MASS)
+        set_tool_mass(scene.model, "tool", 1.1 * free_bodies.DRIVEN_MASS)
         mujoco.mj_setConst(scene.model, scene.data)
         return scene
 
-    monkeypatch.setattr(driven_mass, "load_scene", heavier)
-    wrong = score(driven_mass.DrivenMass(COUPLING, GRID, FINE[-1]), "explicit", 5e-4)
+    monkeypatch.setattr(free_bodies, "load_scene", heavier)
+    wrong = score(free_bodies.DrivenMass(COUPLING, GRID, FINE[-1]), "explicit", 5e-4)
     assert wrong.felt > 5 * right.felt
     assert wrong.felt > 1
 
 
 def test_coupling_that_would_turn_the_spinning_body_is_refused() -> None:
     with pytest.raises(Exception, match="free to turn"):
-        spinning_body.SpinningBody(COUPLING, GRID, FINE[-1])
+        free_bodies.SpinningBody(COUPLING, GRID, FINE[-1])
 
 
 def test_methods_without_dynamics_of_the_tool_can_neither_spin_nor_fall() -> None:
-    falling = rod_impact.RodImpact(rod_impact.COUPLING, GRID)
+    falling = contact_bodies.RodImpact(contact_bodies.ROD_COUPLING, GRID)
     for name in ("weld", "direct"):
         with pytest.raises(Exception, match="lets no tool turn"):
             spinning().run(Setting(METHODS[name], 1e-3))
@@ -149,7 +147,7 @@ def test_methods_without_dynamics_of_the_tool_can_neither_spin_nor_fall() -> Non
 
 
 def test_rod_that_meets_a_damped_contact_is_nearer_to_an_impact_without_rebound() -> None:
-    workload = rod_impact.RodImpact(rod_impact.COUPLING, GRID)
+    workload = contact_bodies.RodImpact(contact_bodies.ROD_COUPLING, GRID)
     key = workload.panels[0].key
     shipped = workload.run(Setting(METHODS["implicit"], 1e-3)).scores()[key]
     damped = workload.run(Setting(METHODS["implicit"], 1e-3, contact="damped")).scores()[key]

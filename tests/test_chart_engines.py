@@ -15,28 +15,36 @@ from engine_tasks import engine_or_skip
 from matplotlib.container import ErrorbarContainer
 
 from hapticbridge.errors import StudyError
-from hapticbridge.rendering import METHODS
-from hapticbridge.study.chart import (
+from hapticbridge.lab.chart import (
     Extent,
+    contact_bodies,
     measure_chart,
     open_workload,
     peer_settings,
-    rod_impact,
 )
-from hapticbridge.study.chart import chart as chart_module
-from hapticbridge.study.chart.chart import Chart
-from hapticbridge.study.chart.drawing import CEILING, draw_chart, drawn_cost
-from hapticbridge.study.chart.engine_run import EngineRun, PeerWork
-from hapticbridge.study.chart.files import summary_of, table_of
-from hapticbridge.study.chart.page import chart_page
-from hapticbridge.study.chart.score import Score
-from hapticbridge.study.chart.setting import Setting
-from hapticbridge.study.chart.timing import interleaved_costs
-from hapticbridge.study.chart.workload import Workload
-from hapticbridge.study.engines.base import Engine, Simulation
-from hapticbridge.study.engines.base import Setting as EngineSetting
-from hapticbridge.study.engines.library import engine_names, open_engine
-from hapticbridge.study.engines.task import Task, composed
+from hapticbridge.lab.chart import chart as chart_module
+from hapticbridge.lab.chart.chart import Chart, interleaved_costs
+from hapticbridge.lab.chart.engine_run import EngineRun, PeerWork
+from hapticbridge.lab.chart.output import (
+    CEILING,
+    chart_page,
+    draw_chart,
+    drawn_cost,
+    summary_of,
+    table_of,
+)
+from hapticbridge.lab.chart.setting import Setting
+from hapticbridge.lab.chart.workload import Score, Workload
+from hapticbridge.lab.engines.base import (
+    Engine,
+    Simulation,
+    Task,
+    composed,
+    engine_names,
+    open_engine,
+)
+from hapticbridge.lab.engines.base import Setting as EngineSetting
+from hapticbridge.rendering import METHODS
 
 GRID, FINE = 4e-3, 1e-3
 
@@ -174,16 +182,16 @@ def test_rod_taps_the_floor_in_another_engine_and_a_wrong_mass_shows() -> None:
 
 
 def test_free_rod_begins_where_the_rod_of_the_plane_does() -> None:
-    scene = rod_impact.rod_scene()
-    for angle in rod_impact.ANGLES:
-        rod_impact.falls_at(angle)(scene)
-        task = rod_impact.free_fall(angle)
+    scene = contact_bodies.rod_scene()
+    for angle in contact_bodies.ANGLES:
+        contact_bodies.falls_at(angle)(scene)
+        task = contact_bodies.free_fall(angle)
         tip = composed(task.start, task.body.shapes[0].pose)
         assert tip.position == pytest.approx(scene.data.geom("tip").xpos, abs=1e-12)
         assert composed(task.start, task.grip).position == pytest.approx(
             scene.data.site("grip").xpos, abs=1e-12
         )
-        assert task.start_velocity.linear == (rod_impact.SLIDE, 0.0, -rod_impact.APPROACH)
+        assert task.start_velocity.linear == (contact_bodies.SLIDE, 0.0, -contact_bodies.APPROACH)
         # about the axis that the plane's rod turns about, the moments are the same
         assert task.body.inertia[1] == pytest.approx(scene.model.body("rod").inertia[1])
 

@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 from chart_cases import made_up, small_chart
 
-from hapticbridge.study.chart import Chart
-from hapticbridge.study.chart.drawing import draw_chart
-from hapticbridge.study.chart.measurement import Measurement
-from hapticbridge.study.chart.page import chart_page
+from hapticbridge.lab.chart import Chart
+from hapticbridge.lab.chart.chart import Measurement
+from hapticbridge.lab.chart.output import chart_page, draw_chart
 
 
 @pytest.fixture(scope="module")

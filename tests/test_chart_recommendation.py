@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from chart_cases import made_up
 
-from hapticbridge.study.chart.recommendation import recommendation, recommended
+from hapticbridge.lab.chart.output import recommendation, recommended
 
 
 def test_cheapest_sound_point_is_recommended_and_the_more_accurate_of_equal_costs() -> None:

@@ -11,19 +11,21 @@ from scipy.spatial.transform import Rotation
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import StudyError
-from hapticbridge.scene import load_scene
-from hapticbridge.study.chart import driven_mass, rod_impact, sliding_block, spinning_body
-from hapticbridge.study.chart.peg import COUPLING as PEG_COUPLING
-from hapticbridge.study.chart.peg_path import (
+from hapticbridge.lab.chart import contact_bodies, free_bodies
+from hapticbridge.lab.chart.peg import (
+    CLEARANCE,
     DURATION,
     HOME,
     JUDGED,
     POSES,
     RAMP,
     end_of_hold,
+    gaps,
     peg_path,
+    resting_peg,
 )
-from hapticbridge.study.chart.rigid_peg import CLEARANCE, gaps, resting_peg
+from hapticbridge.lab.chart.peg import COUPLING as PEG_COUPLING
+from hapticbridge.scene import load_scene
 from hapticbridge.theory.impact import ImpactBody, resolve_impact
 
 GRID = 4e-3
@@ -35,7 +37,7 @@ GRID = 4e-3
 def test_driven_mass_in_closed_form_is_what_dop853_integrates(
     stiffness: float, damping: float, mass: float
 ) -> None:
-    omega = 2 * np.pi * driven_mass.FREQUENCY
+    omega = 2 * np.pi * free_bodies.FREQUENCY
 
     def rate(time: float, state: np.ndarray) -> list[float]:
         stretch = 1 - np.cos(omega * time) - state[0]
@@ -49,7 +51,7 @@ def test_driven_mass_in_closed_form_is_what_dop853_integrates(
     found = solve_ivp(
         rate, (0.0, times[-1]), [0.0, 0.0], "DOP853", t_eval=times, rtol=1e-11, atol=1e-13
     ).y
-    position, force = driven_mass.exact_response(stiffness, damping, mass, GRID, count)
+    position, force = free_bodies.exact_response(stiffness, damping, mass, GRID, count)
     np.testing.assert_allclose(position, found[0], atol=1e-9)
     stretch = 1 - np.cos(omega * times) - found[0]
     law = stiffness * stretch + damping * (omega * np.sin(omega * times) - found[1])
@@ -59,13 +61,13 @@ def test_driven_mass_in_closed_form_is_what_dop853_integrates(
 def test_driven_mass_is_that_of_the_scene() -> None:
     model = load_scene("point_mass").model
     tool = model.body("tool")
-    assert float(tool.mass[0]) == pytest.approx(driven_mass.MASS)
-    np.testing.assert_allclose(tool.inertia, driven_mass.INERTIA, rtol=1e-6)
+    assert float(tool.mass[0]) == pytest.approx(free_bodies.DRIVEN_MASS)
+    np.testing.assert_allclose(tool.inertia, free_bodies.DRIVEN_INERTIA, rtol=1e-6)
 
 
 def test_midpoint_rule_at_a_tiny_step_is_what_dop853_integrates() -> None:
-    by_midpoint = spinning_body.exact_orientations(GRID, 50)
-    moments = np.array(spinning_body.INERTIA)
+    by_midpoint = free_bodies.exact_orientations(GRID, 50)
+    moments = np.array(free_bodies.SPINNING_INERTIA)
 
     def rate(_time: float, state: np.ndarray) -> np.ndarray:
         # Euler's equations and q' = ½ q ⊗ ω
@@ -74,7 +76,7 @@ def test_midpoint_rule_at_a_tiny_step_is_what_dop853_integrates() -> None:
         return np.concatenate([[-0.5 * u @ omega], 0.5 * (w * omega + np.cross(u, omega)), turning])
 
     times = GRID * np.arange(1, 51)
-    start = [1.0, 0.0, 0.0, 0.0, *spinning_body.SPIN]
+    start = [1.0, 0.0, 0.0, 0.0, *free_bodies.SPIN]
     found = solve_ivp(
         rate, (0.0, times[-1]), start, "DOP853", t_eval=times, rtol=1e-12, atol=1e-13
     ).y[:4]
@@ -86,27 +88,33 @@ def test_midpoint_rule_at_a_tiny_step_is_what_dop853_integrates() -> None:
 
 def test_reference_of_the_spin_wants_a_grid_that_it_meets() -> None:
     with pytest.raises(StudyError, match="is no multiple of the reference's"):
-        spinning_body.exact_orientations(GRID / 3001, 2)
+        free_bodies.exact_orientations(GRID / 3001, 2)
 
 
 def test_impulses_of_the_falling_rod_are_those_of_every_law() -> None:
-    angle = np.array(rod_impact.ANGLES)
+    angle = np.array(contact_bodies.ANGLES)
     arm = np.stack(
         [
-            -rod_impact.LENGTH / 2 * np.cos(angle),
-            -rod_impact.LENGTH / 2 * np.sin(angle) - rod_impact.TIP,
+            -contact_bodies.LENGTH / 2 * np.cos(angle),
+            -contact_bodies.LENGTH / 2 * np.sin(angle) - contact_bodies.TIP,
         ],
         axis=-1,
     )
-    rod = ImpactBody(rod_impact.MASS, rod_impact.INERTIA, arm)
+    rod = ImpactBody(contact_bodies.ROD_MASS, contact_bodies.INERTIA, arm)
     for law in ("newton", "poisson", "stronge"):
         found = resolve_impact(
-            rod, [rod_impact.SLIDE, -rod_impact.APPROACH], rod_impact.FRICTION, 0.0, law
+            rod,
+            [contact_bodies.SLIDE, -contact_bodies.APPROACH],
+            contact_bodies.ROD_FRICTION,
+            0.0,
+            law,
         )
-        np.testing.assert_allclose(found.impulse, rod_impact.rigid_impacts().impulse, atol=1e-15)
+        np.testing.assert_allclose(
+            found.impulse, contact_bodies.rigid_impacts().impulse, atol=1e-15
+        )
     # a tip that does not rebound: what its impulses leave has no normal velocity
-    np.testing.assert_allclose(rod_impact.rigid_impacts().velocity[:, 1], 0.0, atol=1e-12)
-    assert (rod_impact.rigid_impacts().energy_change < 0).all()
+    np.testing.assert_allclose(contact_bodies.rigid_impacts().velocity[:, 1], 0.0, atol=1e-12)
+    assert (contact_bodies.rigid_impacts().energy_change < 0).all()
 
 
 def test_gaps_of_the_peg_are_negative_exactly_where_mujoco_finds_it_inside() -> None:
@@ -198,12 +206,12 @@ def test_path_of_the_peg_starts_at_home_and_rests_at_every_pose() -> None:
 
 
 def test_sliding_block_in_closed_form_is_what_a_solver_with_an_event_finds() -> None:
-    coupling, mass = sliding_block.COUPLING, sliding_block.MASS
-    limit = sliding_block.FRICTION * mass * sliding_block.GRAVITY
+    coupling, mass = contact_bodies.BLOCK_COUPLING, contact_bodies.BLOCK_MASS
+    limit = contact_bodies.BLOCK_FRICTION * mass * contact_bodies.GRAVITY
 
     def place_and_speed(time: float) -> tuple[float, float]:
-        place = float(sliding_block.handle_place(np.array([time]))[0])
-        return place, sliding_block.SPEED * min(time / sliding_block.EASE, 1.0)
+        place = float(contact_bodies.handle_place(np.array([time]))[0])
+        return place, contact_bodies.SPEED * min(time / contact_bodies.EASE, 1.0)
 
     # Coulomb's friction regularised far below what is compared, and solved stiffly
     def rate(time: float, state: np.ndarray) -> list[float]:
@@ -215,17 +223,17 @@ def test_sliding_block_in_closed_form_is_what_a_solver_with_an_event_finds() -> 
     found = solve_ivp(
         rate, (0.0, times[-1]), [0.0, 0.0], "Radau", t_eval=times, rtol=1e-8, atol=1e-12
     ).y
-    place, force = sliding_block.exact_sliding(coupling, times)
+    place, force = contact_bodies.exact_sliding(coupling, times)
     np.testing.assert_allclose(place, found[0], atol=2e-8)
     handle = np.array([place_and_speed(time) for time in times])
     law = coupling.stiffness * (handle[:, 0] - found[0])
     law += coupling.damping * (handle[:, 1] - found[1])
     np.testing.assert_allclose(force, law, atol=5e-5)
-    before = times < sliding_block.breakaway(coupling)
+    before = times < contact_bodies.breakaway(coupling)
     assert force[before].max() < limit < force[~before][:3].max()
 
 
 def test_block_that_would_break_away_too_early_or_never_is_refused() -> None:
     for stiffness in (1e5, 10.0):
         with pytest.raises(StudyError, match="the block breaks away at"):
-            sliding_block.SlidingBlock(Coupling(stiffness, 1.0, 0.0, 0.0), GRID, GRID)
+            contact_bodies.SlidingBlock(Coupling(stiffness, 1.0, 0.0, 0.0), GRID, GRID)

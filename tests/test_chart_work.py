@@ -15,17 +15,23 @@ from scipy.spatial import ConvexHull
 from hapticbridge.check.cost import TimingStats
 from hapticbridge.cli import main
 from hapticbridge.errors import StudyError
-from hapticbridge.study.chart.files import prepared_files
-from hapticbridge.study.chart.tick_times import USUAL, VARIANTS
-from hapticbridge.study.chart.work import Work, WorkChart, growth_of, measure_work
-from hapticbridge.study.chart.work_files import WORK_ENDINGS, paragraph, write_work
-from hapticbridge.study.chart.work_scenes import (
+from hapticbridge.lab.chart.output import prepared_files
+from hapticbridge.lab.chart.work import (
     FAMILIES,
+    USUAL,
+    VARIANTS,
+    WORK_ENDINGS,
+    Work,
+    WorkChart,
     floating,
+    growth_of,
+    measure_work,
     mesh_ball,
+    paragraph,
     plate,
     resting,
     sphere,
+    write_work,
 )
 
 

@@ -53,7 +53,7 @@ NOT_FOR_A_RUN = frozenset(
         "hapticbridge.theory",
         "hapticbridge.plotting",
         "hapticbridge.report",
-        "hapticbridge.study",
+        "hapticbridge.lab",
         "hapticbridge.view.server",
         "hapticbridge.whatif",
     }

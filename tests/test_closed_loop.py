@@ -18,11 +18,10 @@ from hapticbridge.device import Hand, Motion, SimulatedDevice, random_hand
 from hapticbridge.device.simulated.hand import HAND_RANGES
 from hapticbridge.errors import DeviceError, StudyError
 from hapticbridge.guard import Limits
+from hapticbridge.lab.closed_loop import PARTS, ClosedLoop, LoopOutcome, Timing
 from hapticbridge.record import CLOCK_FIELDS, TICK_DTYPE
 from hapticbridge.rendering import METHODS
 from hapticbridge.scene import load_scene
-from hapticbridge.study.closed_loop import ClosedLoop, LoopOutcome
-from hapticbridge.study.jitter import PARTS, Timing
 from hapticbridge.theory.bounds import minimum_damping
 from hapticbridge.theory.sampled_loop import SampledLoop, WorstHand
 

@@ -7,9 +7,9 @@ import pytest
 from engine_stand_in import StandIn
 from engine_tasks import AMPLITUDE, COUPLING, MASS, driven_error, driven_mass, driven_path, opened
 
+from hapticbridge.lab.engines import Body, Pose, Task, composed
+from hapticbridge.lab.engines.base import Engine
 from hapticbridge.pose import quaternion_exp
-from hapticbridge.study.engines import Body, Pose, Task, composed
-from hapticbridge.study.engines.base import Engine
 from hapticbridge.theory.rigid_body import drive_mass
 
 

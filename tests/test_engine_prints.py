@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from hapticbridge.study.engines.prints import caught_prints
+from hapticbridge.lab.engines.base import caught_prints
 
 BUFFER = ctypes.create_string_buffer(4096)
 """C's stdout keeps it as long as the process lives."""

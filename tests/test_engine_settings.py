@@ -17,10 +17,10 @@ import mujoco
 import pytest
 from engine_tasks import FLOOR, GRAVITY, RESTING
 
-from hapticbridge.study.engines import Body, Engine, Pose, Task, open_engine
-from hapticbridge.study.engines.library import _MODULES
+from hapticbridge.lab.engines import Body, Engine, Pose, Task, open_engine
+from hapticbridge.lab.engines.base import _MODULES
 
-PACKAGE = "hapticbridge.study.engines."
+PACKAGE = "hapticbridge.lab.engines."
 LIBRARIES = (
     "pybullet",
     "sapien",
@@ -70,9 +70,8 @@ def libraries(monkeypatch: pytest.MonkeyPatch) -> Iterator[dict[str, MagicMock]]
 
 def engines_of(module: ModuleType) -> tuple[Engine, ...]:
     """Returns the engines of a module; ODE's refuses to tell them without its library."""
-    for name in ("OdeSpringEngine", "OdeEngine"):
-        if hasattr(module, name):
-            return (getattr(module, name)(),)
+    if hasattr(module, "OdeEngine"):
+        return (module.OdeEngine(), module.OdeSpringEngine())
     found: tuple[Engine, ...] = module.engines()
     return found
 
@@ -98,7 +97,7 @@ def test_pybullet_is_given_what_it_tells_and_nothing_else(
 ) -> None:
     library = libraries["pybullet"]
     library.getBasePositionAndOrientation.return_value = ((0.0,) * 3, (0.0, 0.0, 0.0, 1.0))
-    for engine in import_module(PACKAGE + "pybullet_engine").engines():
+    for engine in import_module(PACKAGE + "bullet").engines():
         library.setPhysicsEngineParameter.reset_mock()
         engine.open(TASK, 1e-3).close()
         given = dict(library.setPhysicsEngineParameter.call_args.kwargs)
@@ -120,7 +119,7 @@ def test_physx_is_given_what_it_tells(libraries: dict[str, MagicMock]) -> None:
     pose = MagicMock()
     pose.p.tolist.return_value, pose.q.tolist.return_value = [0.0] * 3, [1.0, 0.0, 0.0, 0.0]
     physx.PhysxRigidDynamicComponent.return_value.entity_pose = pose
-    module = import_module(PACKAGE + "sapien_engine")
+    module = import_module(PACKAGE + "physx")
     engine = module.engines()[0]
     for _ in range(2):
         engine.open(TASK, 1e-3)

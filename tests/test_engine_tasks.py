@@ -13,22 +13,22 @@ from engine_tasks import COUPLING
 
 from hapticbridge.device.trajectory import Motion
 from hapticbridge.errors import StudyError
-from hapticbridge.pose import quaternion_exp
-from hapticbridge.scene import Scene, load_scene
-from hapticbridge.study.engines import (
+from hapticbridge.lab.engines import (
     Body,
     Pose,
     Shape,
     Task,
     Velocity,
     available_engines,
+    base,
     composed,
     engine_names,
-    library,
-    ode_native,
+    ode,
     open_engine,
     task_from_scene,
 )
+from hapticbridge.pose import quaternion_exp
+from hapticbridge.scene import Scene, load_scene
 
 SCENE = """
 <mujoco>
@@ -269,7 +269,7 @@ def test_an_engine_that_is_not_there_names_what_to_install(monkeypatch: pytest.M
     def missing(_name: str) -> None:
         raise ImportError("No module named 'pydrake'")
 
-    monkeypatch.setattr(library, "import_module", missing)
+    monkeypatch.setattr(base, "import_module", missing)
     with pytest.raises(StudyError, match=r"'drake_point' is not installed .*hapticbridge\[peers\]"):
         open_engine("drake_point")
     with pytest.raises(StudyError, match=r"no engine 'havok'; engines: 'drake_hydroelastic'"):
@@ -277,8 +277,8 @@ def test_an_engine_that_is_not_there_names_what_to_install(monkeypatch: pytest.M
 
 
 def test_ode_says_that_it_comes_with_the_system(monkeypatch: pytest.MonkeyPatch) -> None:
-    ode_native.library.cache_clear()
-    monkeypatch.setattr(ode_native, "_NAMES", ("libode_that_nobody_has.so",))
+    ode.library.cache_clear()
+    monkeypatch.setattr(ode, "_NAMES", ("libode_that_nobody_has.so",))
     with pytest.raises(StudyError, match=r"ODE is not installed: .*apt install libode8"):
         open_engine("ode")
-    ode_native.library.cache_clear()
+    ode.library.cache_clear()

@@ -25,8 +25,7 @@ from scipy.spatial.transform import Rotation
 from hapticbridge.coupling import Coupling
 from hapticbridge.device.trajectory import Motion
 from hapticbridge.errors import StudyError
-from hapticbridge.pose import quaternion_exp
-from hapticbridge.study.engines import (
+from hapticbridge.lab.engines import (
     Body,
     Contacts,
     Engine,
@@ -37,6 +36,7 @@ from hapticbridge.study.engines import (
     composed,
     engine_names,
 )
+from hapticbridge.pose import quaternion_exp
 from hapticbridge.theory.rigid_body import CoupledScheme, drive_mass, integrate_rotation
 
 NOTHING = (0.0, 0.0, 0.0)

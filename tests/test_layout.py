@@ -26,7 +26,7 @@ ORDER = (
         "on_demand",
         "whole_file",
     ),
-    ("coupling", "kernel", "mechanics", "passivity"),
+    ("coupling", "kernel", "mechanics", "passivity", "sweep"),
     ("scene",),
     ("rendering",),
     ("ledger", "inputs", "device"),
@@ -34,8 +34,9 @@ ORDER = (
     ("provenance", "summary", "workspace", "realtime"),
     ("commands",),
     ("arrangement", "opened", "commanded", "bridge", "audit", "identify", "compare", "export"),
-    ("report", "film", "film_process", "view", "study", "check", "doctor"),
+    ("report", "film", "view", "theory_plots", "check", "doctor"),
     ("whatif",),  # runs the bridge and asks the audit, which must not know of either
+    ("lab",),
     ("cli",),
 )
 RANK = {name: rank for rank, names in enumerate(ORDER) for name in names}

@@ -16,10 +16,10 @@ from hapticbridge.certificate import default_coupling
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import SimulatedDevice
 from hapticbridge.errors import HapticBridgeError
+from hapticbridge.lab.closed_loop import ClosedLoop
 from hapticbridge.record import TickFlag
 from hapticbridge.rendering import METHODS
 from hapticbridge.scene import load_scene
-from hapticbridge.study.closed_loop import ClosedLoop
 from hapticbridge.theory.sampled_loop import SampledLoop, WorstHand
 
 # --- accuracy -------------------------------------------------------------------------------------

@@ -17,16 +17,26 @@ from map_tables import Row, without_rows, written
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Hand, Motion, SimulatedDevice
 from hapticbridge.errors import StudyError
-from hapticbridge.rendering import METHODS
-from hapticbridge.scene import load_scene
-from hapticbridge.scene.contacts import SUGGESTED
-from hapticbridge.study.maps import contact, contact_methods, contact_search
-from hapticbridge.study.maps.contact import CONTACT, evaluate, points
-from hapticbridge.study.maps.contact_agreement import agreement, exceptions
-from hapticbridge.study.maps.contact_methods import COMPARED, RIGS, cases_of, method_runs
-from hapticbridge.study.maps.contact_picture import PANELS
-from hapticbridge.study.maps.contact_rigs import (
+from hapticbridge.lab.maps import contact
+from hapticbridge.lab.maps.base import MISSING, VERDICTS, Point, loop_in, run_map, set_tool_mass
+from hapticbridge.lab.maps.contact import (
+    COMPARED,
+    CONTACT,
+    PANELS,
+    RIGS,
+    agreement,
+    cases_of,
+    evaluate,
+    exceptions,
+    method_runs,
+    points,
+)
+from hapticbridge.lab.maps.contact_rigs import (
+    PERIOD,
+    SHIPPED,
+    TREATMENTS,
     ContactRun,
+    Treatment,
     peg_device,
     peg_runs,
     start_in_hole,
@@ -35,10 +45,9 @@ from hapticbridge.study.maps.contact_rigs import (
     until_active,
     wall_runs,
 )
-from hapticbridge.study.maps.contact_treatments import PERIOD, SHIPPED, TREATMENTS, Treatment
-from hapticbridge.study.maps.rigs import loop_in, set_tool_mass
-from hapticbridge.study.maps.stability_map import Point, run_map
-from hapticbridge.study.maps.verdicts import MISSING, VERDICTS
+from hapticbridge.rendering import METHODS
+from hapticbridge.scene import load_scene
+from hapticbridge.scene.contacts import SUGGESTED
 
 LIGHT = [(0.03, 0.0, 1)]
 """A peg of 30 g without friction in the first random hand: the hardest case of the search."""
@@ -357,9 +366,9 @@ def test_map_at_reduced_resolution_agrees_with_the_rule(
         return peg_runs(treatment, stiffness, LIGHT)
 
     monkeypatch.setattr(contact, "peg_runs", few)
-    monkeypatch.setattr(contact_search, "peg_runs", few)
+    monkeypatch.setattr(contact, "peg_runs", few)
     names = (SHIPPED, "damped: 0.0005 8")
-    monkeypatch.setattr(contact_methods, "HANDS", 1)
+    monkeypatch.setattr(contact, "HANDS", 1)
     chosen = [
         p
         for p in points(1)

@@ -16,11 +16,17 @@ from matplotlib.axes import Axes
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import SimulatedDevice
 from hapticbridge.errors import StudyError
-from hapticbridge.rendering import METHODS
-from hapticbridge.study.maps import MapFiles, run_map
-from hapticbridge.study.maps.bound_of_method import limit_by_6, needed_by_6, used_damping
-from hapticbridge.study.maps.coupling import COUPLING
-from hapticbridge.study.maps.coupling_runs import (
+from hapticbridge.lab.maps import MapFiles, run_map
+from hapticbridge.lab.maps.base import (
+    MISSING,
+    Point,
+    free_tool_and_wall,
+    limit_by_6,
+    needed_by_6,
+    used_damping,
+)
+from hapticbridge.lab.maps.coupling import (
+    COUPLING,
     DEVICE_DAMPING,
     PATH,
     PERIOD,
@@ -29,9 +35,7 @@ from hapticbridge.study.maps.coupling_runs import (
     evaluate,
     points,
 )
-from hapticbridge.study.maps.rigs import free_tool_and_wall
-from hapticbridge.study.maps.stability_map import Point
-from hapticbridge.study.maps.verdicts import MISSING
+from hapticbridge.rendering import METHODS
 from hapticbridge.theory.bounds import maximum_stiffness, minimum_damping
 from hapticbridge.theory.virtual_mass import environment_minimum_damping
 

@@ -15,12 +15,11 @@ from map_tables import Row, without_rows, written
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import SimulatedDevice
 from hapticbridge.errors import StudyError
-from hapticbridge.rendering import METHODS
-from hapticbridge.scene import load_scene
-from hapticbridge.study.closed_loop import LoopOutcome
-from hapticbridge.study.maps.device import DEVICE, evaluate, read
-from hapticbridge.study.maps.device_runs import DAMPERS as DAMPING
-from hapticbridge.study.maps.device_runs import (
+from hapticbridge.lab.closed_loop import LoopOutcome
+from hapticbridge.lab.maps.base import Point, run_map, set_tool_mass
+from hapticbridge.lab.maps.device import DAMPERS as DAMPING
+from hapticbridge.lab.maps.device import (
+    DEVICE,
     LARGE,
     METHODS_SHOWN,
     PERIOD,
@@ -28,15 +27,17 @@ from hapticbridge.study.maps.device_runs import (
     RESOLUTION,
     STIFFNESS,
     WALL_MASS,
+    evaluate,
     friction_needed,
     friction_to_rest,
     pressed_device,
+    read,
     region_of,
     settle,
     shaken,
 )
-from hapticbridge.study.maps.rigs import set_tool_mass
-from hapticbridge.study.maps.stability_map import Point, run_map
+from hapticbridge.rendering import METHODS
+from hapticbridge.scene import load_scene
 from hapticbridge.theory.device_limits import quantization_limit
 
 
@@ -197,7 +198,7 @@ def test_a_cell_tells_the_size_of_the_cycle_that_was_seen(
     def settled(beta: float, sigma: float, knock: float) -> tuple[str, float, LoopOutcome]:
         return (*(large if knock else small), run)
 
-    monkeypatch.setattr("hapticbridge.study.maps.device.settle", settled)
+    monkeypatch.setattr("hapticbridge.lab.maps.device.settle", settled)
     got = evaluate(
         {"what": "cell", "method": "implicit", "beta": 1.0, "sigma": 1.0, "damping": 0.0}
     )

@@ -15,32 +15,29 @@ from map_tables import Row, without_rows, written
 
 from hapticbridge.device import Hand, Motion, SimulatedDevice
 from hapticbridge.errors import StudyError
-from hapticbridge.rendering import METHODS
-from hapticbridge.scene import load_scene
-from hapticbridge.study.maps.fitting_peg import (
+from hapticbridge.lab.maps.base import MISSING, VERDICTS, Point, run_map
+from hapticbridge.lab.maps.geometry import (
+    BEHIND,
+    BOUNDS,
     DEVICE_DAMPING,
+    GEOMETRY,
+    LENGTH,
+    METHODS_SHOWN,
     PERIOD,
     ROTATIONAL_DAMPING,
     contact_stiffness_limit,
     device_and_coupling,
+    evaluate,
     first_growth,
     is_stable,
     length_limit,
+    points,
     run,
     set_length,
     torque,
 )
-from hapticbridge.study.maps.geometry import GEOMETRY
-from hapticbridge.study.maps.geometry_runs import (
-    BEHIND,
-    BOUNDS,
-    LENGTH,
-    METHODS_SHOWN,
-    evaluate,
-    points,
-)
-from hapticbridge.study.maps.stability_map import Point, run_map
-from hapticbridge.study.maps.verdicts import MISSING, VERDICTS
+from hapticbridge.rendering import METHODS
+from hapticbridge.scene import load_scene
 from hapticbridge.theory.bounds import minimum_damping
 
 
@@ -91,7 +88,7 @@ def test_in_its_hole_lossless_is_implicit_with_the_damper_that_it_uses(
     found = torque(run("lossless", 0.1, stiffness))
     damping = max(ROTATIONAL_DAMPING - stiffness * PERIOD / 2, 0.0)
     assert not np.allclose(found, torque(run("implicit", 0.1, stiffness)), rtol=1e-3)
-    monkeypatch.setattr("hapticbridge.study.maps.fitting_peg.ROTATIONAL_DAMPING", damping)
+    monkeypatch.setattr("hapticbridge.lab.maps.geometry.ROTATIONAL_DAMPING", damping)
     np.testing.assert_array_equal(found, torque(run("implicit", 0.1, stiffness)))
 
 

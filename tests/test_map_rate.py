@@ -15,16 +15,15 @@ from map_tables import Row, without_rows, written
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import SimulatedDevice
 from hapticbridge.errors import StudyError
-from hapticbridge.rendering import METHODS
-from hapticbridge.scene import Scene, load_scene
-from hapticbridge.study.jitter import PARTS, Timing
-from hapticbridge.study.maps.rate import RATE, read
-from hapticbridge.study.maps.rate_runs import (
+from hapticbridge.lab.closed_loop import PARTS, Timing
+from hapticbridge.lab.maps.base import Point, run_map, set_tool_mass
+from hapticbridge.lab.maps.rate import (
     DAMPING,
     DELAYS,
     DEVICE_DAMPING,
     KNOCK,
     METHODS_SHOWN,
+    RATE,
     SEARCHED,
     SEEDS,
     TICKS,
@@ -32,12 +31,13 @@ from hapticbridge.study.maps.rate_runs import (
     WALL_MASS,
     evaluate,
     finite_hand,
+    read,
     unevenness,
     wall_limit,
     worst_hand,
 )
-from hapticbridge.study.maps.rigs import set_tool_mass
-from hapticbridge.study.maps.stability_map import Point, run_map
+from hapticbridge.rendering import METHODS
+from hapticbridge.scene import Scene, load_scene
 from hapticbridge.theory.sampled_loop import SampledLoop, WorstHand
 
 

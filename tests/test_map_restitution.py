@@ -17,23 +17,24 @@ from map_tables import Row, without_rows, written
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Motion, TrajectoryDevice
 from hapticbridge.errors import StudyError
-from hapticbridge.scene import Scene
-from hapticbridge.study.maps.falling_rod import (
+from hapticbridge.lab.maps.base import MISSING, Point, run_map, scene_of
+from hapticbridge.lab.maps.restitution import (
     APPROACH,
     INERTIA,
     LENGTH,
     MASS,
+    RESTITUTION,
+    RESTITUTION_LAWS,
     ROD,
     SETTINGS,
     TIP,
     drop,
+    evaluate,
+    points,
     restitution_of,
 )
-from hapticbridge.study.maps.restitution import RESTITUTION, RESTITUTION_LAWS, evaluate, points
-from hapticbridge.study.maps.rigs import scene_of
-from hapticbridge.study.maps.stability_map import Point, run_map
-from hapticbridge.study.maps.verdicts import MISSING
-from hapticbridge.study.sweep import sweep
+from hapticbridge.scene import Scene
+from hapticbridge.sweep.sweep import sweep
 from hapticbridge.theory.impact import ImpactBody
 
 GAINING: Point = {

@@ -14,29 +14,28 @@ from map_tables import Row, without_rows, written
 
 from hapticbridge.device import Motion, TrajectoryDevice
 from hapticbridge.errors import StudyError
-from hapticbridge.study.maps.rotation import ROTATION
-from hapticbridge.study.maps.rotation_picture import HIGHEST
-from hapticbridge.study.maps.rotation_runs import METHODS_SHOWN, evaluate, points
-from hapticbridge.study.maps.spinning_tool import (
+from hapticbridge.lab.maps.base import MISSING, Point, run_map
+from hapticbridge.lab.maps.rotation import (
+    HIGHEST,
+    INERTIA,
+    METHODS_SHOWN,
+    MIDDLE,
+    OBLIQUE,
+    PERIOD,
+    ROTATION,
+    TICKS,
     coupling_of,
+    cut_speed,
+    evaluate,
+    free_creation,
+    gyroscopic_speed,
+    points,
     speed_of_cut,
     spin,
     spinning_scene,
     sudden,
     turning,
 )
-from hapticbridge.study.maps.stability_map import Point, run_map
-from hapticbridge.study.maps.tumbling import (
-    INERTIA,
-    MIDDLE,
-    OBLIQUE,
-    PERIOD,
-    TICKS,
-    cut_speed,
-    free_creation,
-    gyroscopic_speed,
-)
-from hapticbridge.study.maps.verdicts import MISSING
 
 SOFT = 2.0
 

@@ -15,25 +15,27 @@ from map_tables import Row, without_rows, written
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import SimulatedDevice
 from hapticbridge.errors import StudyError
-from hapticbridge.scene import Scene, load_scene
-from hapticbridge.study.maps.free_tool import felt, least_mass, worst_angle
-from hapticbridge.study.maps.rigs import set_tool_mass
-from hapticbridge.study.maps.stability_map import Point, run_map
-from hapticbridge.study.maps.tool_mass import TOOL_MASS, read
-from hapticbridge.study.maps.tool_mass_runs import (
+from hapticbridge.lab.maps.base import Point, run_map, set_tool_mass
+from hapticbridge.lab.maps.tool_mass import (
     DAMPING,
     DEVICE_DAMPING,
     KNOCK,
     PATH,
     PERIOD,
     THEORIES,
+    TOOL_MASS,
     coupling_of,
     evaluate,
+    felt,
     hand_worst_for,
     held_still,
+    least_mass,
     predicted_limit,
+    read,
+    worst_angle,
     worst_hand,
 )
+from hapticbridge.scene import Scene, load_scene
 from hapticbridge.theory.sampled_loop import SampledLoop
 from hapticbridge.theory.virtual_mass import Integrator, environment_minimum_damping, minimum_mass
 

@@ -8,9 +8,9 @@ from random_hands import T, random_motion, shaken
 
 import hapticbridge as hb
 from hapticbridge.device import Motion, SimulatedDevice
+from hapticbridge.lab.closed_loop import ClosedLoop, LoopOutcome
 from hapticbridge.record import TickFlag
 from hapticbridge.scene import Parameter, scene_parameters, scene_path
-from hapticbridge.study.closed_loop import ClosedLoop, LoopOutcome
 
 FORCE_LIMIT, TORQUE_LIMIT = 10.0, 0.5  # N and N m, of the default simulated device
 

@@ -15,7 +15,7 @@ from hapticbridge import theory as p
 from hapticbridge.arguments import LARGEST, SMALLEST
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import CouplingError, HapticBridgeError, MechanicsError
-from hapticbridge.study.theory import alternatives
+from hapticbridge.theory_plots import alternatives
 
 T = 1e-3
 COUPLING = Coupling(1000, 1, 1, 1e-3)

@@ -22,9 +22,9 @@ from random_hands import random_motion, shaken, smooth
 
 import hapticbridge as hb
 from hapticbridge.device import Motion
+from hapticbridge.lab.closed_loop import ClosedLoop
 from hapticbridge.scene import scene_parameters
 from hapticbridge.scene.parameters import apply_parameters
-from hapticbridge.study.closed_loop import ClosedLoop
 
 FORCE_LIMIT = 10.0  # N, of the default simulated device
 

@@ -30,10 +30,9 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.device import Motion, SimulatedDevice
 from hapticbridge.errors import SceneError
 from hapticbridge.guard import Limits
+from hapticbridge.lab.closed_loop import ClosedLoop, Timing
 from hapticbridge.rendering import METHODS, method_named, prepare
 from hapticbridge.scene import load_scene
-from hapticbridge.study.closed_loop import ClosedLoop
-from hapticbridge.study.jitter import Timing
 
 
 def test_a_tool_without_coupling_has_no_condition_on_the_device() -> None:

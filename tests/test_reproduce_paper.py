@@ -17,21 +17,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hapticbridge.errors import HapticBridgeError
-from hapticbridge.study.folder import prepared_folder
-from hapticbridge.study.paper import (
-    damper,
-    direct,
-    discrete_passivity,
-    explicit_euler,
-    impact,
-    implicit_euler,
-    transmission_line,
-    virtual_mass,
-    worst_hand,
-)
-from hapticbridge.study.paper.check import Check, Relation
-from hapticbridge.study.paper.page import PAGE, number
-from hapticbridge.study.paper.walk import STEPS
+from hapticbridge.lab.paper import coupling, impact, integrators, transmission_line
+from hapticbridge.lab.paper.section import PAGE, Check, Relation, number
+from hapticbridge.lab.paper.walk import STEPS
+from hapticbridge.sweep.results import prepared_folder
 from hapticbridge.theory.sampled_loop import stability_limit
 
 SCRIPT = Path(__file__).parents[1] / "scripts" / "reproduce_paper"
@@ -121,25 +110,66 @@ def with_scheme(function: Callable[..., Any], scheme: str) -> Callable[..., Any]
     )
 
 
+def heavier(function: Callable[..., Any], factor: float) -> Callable[..., Any]:
+    return lambda mass, *arguments, **options: function(factor * mass, *arguments, **options)
+
+
 @pytest.mark.parametrize(
-    ("module", "name", "broken", "equation"),
+    ("module", "section", "name", "broken", "equation"),
     [
-        (direct, "maximum_stiffness", lambda f: scaled(f, 1.001), "(1)"),
-        (damper, "damping_spectrum", lambda f: scaled(f, 1 + 1e-8), "(6)"),
-        (damper, "wall_limit", lambda f: scaled(f, 1.003), "(6)"),
-        (discrete_passivity, "integrate_particle", lambda f: with_scheme(f, "explicit"), "(13)"),
-        (implicit_euler, "MASS", lambda m: 1.01 * m, "(16)"),
-        (explicit_euler, "MASS", lambda m: 1.01 * m, "(18)"),
-        (virtual_mass, "_in_mujoco", lambda f: scaled(f, 1.003), "(19)"),
-        (virtual_mass, "environment_minimum_damping", lambda f: scaled(f, 1.0001), "(19)"),
-        (impact, "RESTITUTION", lambda e: e + 1e-6, "§4"),
-        (worst_hand, "minimum_damping", lambda f: scaled(f, 1.002), "worst hand"),
-        (transmission_line, "transmission_line_stiffness", lambda f: scaled(f, 1.001), "future"),
+        (coupling, "direct_section", "maximum_stiffness", lambda f: scaled(f, 1.001), "(1)"),
+        (coupling, "backward_difference", "damping_spectrum", lambda f: scaled(f, 1 + 1e-8), "(6)"),
+        (coupling, "backward_difference", "wall_limit", lambda f: scaled(f, 1.003), "(6)"),
+        (
+            integrators,
+            "discrete_passivity_section",
+            "integrate_particle",
+            lambda f: with_scheme(f, "explicit"),
+            "(13)",
+        ),
+        (
+            integrators,
+            "implicit_euler_section",
+            "integrate_particle",
+            lambda f: heavier(f, 1.01),
+            "(16)",
+        ),
+        (
+            integrators,
+            "explicit_euler_section",
+            "integrate_particle",
+            lambda f: heavier(f, 1.01),
+            "(18)",
+        ),
+        (integrators, "virtual_mass_section", "_in_mujoco", lambda f: scaled(f, 1.003), "(19)"),
+        (
+            integrators,
+            "virtual_mass_section",
+            "environment_minimum_damping",
+            lambda f: scaled(f, 1.0001),
+            "(19)",
+        ),
+        (impact, "section", "RESTITUTION", lambda e: e + 1e-6, "§4"),
+        (
+            coupling,
+            "worst_hand_section",
+            "minimum_damping",
+            lambda f: scaled(f, 1.002),
+            "worst hand",
+        ),
+        (
+            transmission_line,
+            "section",
+            "transmission_line_stiffness",
+            lambda f: scaled(f, 1.001),
+            "future",
+        ),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
 def test_a_wrong_number_is_reported(
     module: Any,
+    section: str,
     name: str,
     broken: Callable[[Any], Any],
     equation: str,
@@ -147,20 +177,16 @@ def test_a_wrong_number_is_reported(
 ) -> None:
     monkeypatch.setattr(module, name, broken(getattr(module, name)))
     # one mass of the table is enough
-    monkeypatch.setattr(virtual_mass, "KEPT", {0.05: virtual_mass.KEPT[0.05]})
-    failed = [check for check in module_section(module).checks if not check.has_passed]
+    monkeypatch.setattr(integrators, "KEPT", {0.05: integrators.KEPT[0.05]})
+    failed = [check for check in getattr(module, section)().checks if not check.has_passed]
     assert failed
     assert any(check.equation.startswith(equation) for check in failed)
-
-
-def module_section(module: Any) -> Any:
-    return module.backward_difference() if module is damper else module.section()
 
 
 def test_script_fails_and_names_what_failed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(direct, "stability_limit", scaled(stability_limit, 1.01))
+    monkeypatch.setattr(coupling, "stability_limit", scaled(stability_limit, 1.01))
     names = script()
     monkeypatch.setitem(names["computed"].__globals__, "STEPS", (STEPS[0],))
     assert names["main"]([str(tmp_path)]) == 1
@@ -191,7 +217,7 @@ def test_a_folder_without_permission_is_refused(
         raise PermissionError(13, "Permission denied")
 
     # permissions do not hold for root, who runs tests in containers
-    monkeypatch.setattr("hapticbridge.study.folder.tempfile.TemporaryFile", refuse)
+    monkeypatch.setattr("hapticbridge.sweep.results.tempfile.TemporaryFile", refuse)
     with pytest.raises(HapticBridgeError, match=r"cannot write into .*: Permission denied"):
         prepared_folder(tmp_path)
 
@@ -265,13 +291,16 @@ def test_every_check_is_shown_once_and_every_section_is_linked(walk: tuple[int, 
 
 
 def test_figures_name_every_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(virtual_mass, "KEPT", {})
+    monkeypatch.setattr(integrators, "KEPT", {})
     for section, names in (
-        (virtual_mass, ("B ≤ KT: no mass suffices", "j = 1: 1.25 g", "j = 2: 4 g")),
-        (transmission_line, ("B = 0.5 N s/m", "1 sample there and back")),
-        (explicit_euler, ("implicit midpoint",)),
+        (
+            integrators.virtual_mass_section,
+            ("B ≤ KT: no mass suffices", "j = 1: 1.25 g", "j = 2: 4 g"),
+        ),
+        (transmission_line.section, ("B = 0.5 N s/m", "1 sample there and back")),
+        (integrators.discrete_passivity_section, ("implicit midpoint",)),
     ):
-        (curve,) = section.section().curves
+        (curve,) = section().curves
         panels = [axes.get_legend_handles_labels()[1] for axes in curve.figure.axes]
         assert all(panels)
         labels = [label for panel in panels for label in panel]

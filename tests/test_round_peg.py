@@ -10,7 +10,7 @@ from random_hands import random_motion, shaken
 
 import hapticbridge as hb
 from hapticbridge.device import Hand
-from hapticbridge.study.closed_loop import ClosedLoop
+from hapticbridge.lab.closed_loop import ClosedLoop
 
 FORCE_LIMIT = 10.0  # N, of the default simulated device
 

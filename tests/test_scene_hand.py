@@ -18,8 +18,8 @@ from random_hands import random_motion, shaken
 import hapticbridge as hb
 from hapticbridge.device import DEFAULT_HAND, Hand, SimulatedDevice, device_for, scene_hand
 from hapticbridge.errors import DeviceError, SceneError
+from hapticbridge.lab.closed_loop import ClosedLoop
 from hapticbridge.scene import plain_model, read_scene, scene_names, scene_path
-from hapticbridge.study.closed_loop import ClosedLoop
 
 FORCE_LIMIT, TORQUE_LIMIT = 10.0, 0.5  # N and N m, of the default simulated device
 

@@ -17,9 +17,9 @@ from scipy.spatial.transform import Rotation
 
 import hapticbridge as hb
 from hapticbridge.device import Hand
+from hapticbridge.lab.closed_loop import ClosedLoop
 from hapticbridge.scene import scene_parameters
 from hapticbridge.scene.parameters import apply_parameters
-from hapticbridge.study.closed_loop import ClosedLoop
 
 SCENES = ("screwdriver", "hex_key")
 PITCH = {"screwdriver": 1.0e-3, "hex_key": 1.75e-3}  # ISO 261: M6, M12

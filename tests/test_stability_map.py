@@ -12,11 +12,18 @@ import pytest
 
 from hapticbridge.cli import main
 from hapticbridge.errors import StudyError
+from hapticbridge.lab.maps import MAPS
+from hapticbridge.lab.maps.base import (
+    VERDICTS,
+    Finding,
+    Point,
+    StabilityMap,
+    draw_verdicts,
+    run_map,
+    verdict_numbers,
+)
 from hapticbridge.plotting import new_figure
-from hapticbridge.study.maps import MAPS
-from hapticbridge.study.maps.stability_map import Finding, Point, StabilityMap, run_map
-from hapticbridge.study.maps.verdicts import VERDICTS, draw_verdicts, verdict_numbers
-from hapticbridge.study.table import Table
+from hapticbridge.sweep.results import Table
 
 calls: list[Point] = []
 

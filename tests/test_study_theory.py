@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import CouplingError, HapticBridgeError
 from hapticbridge.plotting import ENDINGS, check_ending, inline_svg, new_figure, write_picture
-from hapticbridge.study.theory import alternatives, draw_alternatives, draw_z_width
 from hapticbridge.theory.spectrum import damping_spectrum_of
 from hapticbridge.theory.z_width import z_width
+from hapticbridge.theory_plots import alternatives, draw_alternatives, draw_z_width
 
 T = 1e-3
 

@@ -21,11 +21,9 @@ from hypothesis import strategies as st
 from sweep_runs import POINTS, computed, serial
 
 from hapticbridge.errors import StudyError
-from hapticbridge.study.points import grid, plain, point_key
-from hapticbridge.study.results import ResultFolder
-from hapticbridge.study.sweep import sweep
-from hapticbridge.study.table import Outcome
-from hapticbridge.study.workers import InThisProcess, cores
+from hapticbridge.sweep.points import grid, plain, point_key
+from hapticbridge.sweep.results import Outcome, ResultFolder
+from hapticbridge.sweep.sweep import InThisProcess, cores, sweep
 
 
 def test_the_table_holds_what_a_plain_loop_gives() -> None:
@@ -230,7 +228,7 @@ def test_few_tasks_are_in_flight_at_once(monkeypatch: pytest.MonkeyPatch) -> Non
             future.set_result(work())
         return concurrent.futures.wait(*arguments, **named)
 
-    monkeypatch.setattr(sys.modules["hapticbridge.study.sweep"], "wait_for", wait)
+    monkeypatch.setattr(sys.modules["hapticbridge.sweep.sweep"], "wait_for", wait)
     half_more = functools.partial(functions.plus, more=0.5)
     table = sweep(half_more, grid(n=range(500)), executor=Idle(), chunk=1)
     assert table["sum"].tolist() == [n + 0.5 for n in range(500)]

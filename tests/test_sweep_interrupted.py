@@ -21,11 +21,9 @@ import sweep_functions as functions
 from sweep_runs import computed, parts, serial
 
 from hapticbridge.signals import holding_interrupts
-from hapticbridge.study.points import Point, grid, point_key
-from hapticbridge.study.sweep import Chunk, _Shift, sweep
-from hapticbridge.study.table import Interrupted, Outcome
-from hapticbridge.study.task import WORKER_DIED
-from hapticbridge.study.workers import InThisProcess, Workers
+from hapticbridge.sweep.points import Point, grid, point_key
+from hapticbridge.sweep.results import Interrupted, Outcome
+from hapticbridge.sweep.sweep import WORKER_DIED, Chunk, InThisProcess, Workers, _Shift, sweep
 
 
 class Dead(BaseException):

@@ -17,9 +17,8 @@ import sweep_functions as functions
 from sweep_runs import POINTS, serial
 
 from hapticbridge.errors import StudyError
-from hapticbridge.study.points import grid
-from hapticbridge.study.sweep import sweep
-from hapticbridge.study.workers import InThisProcess
+from hapticbridge.sweep.points import grid
+from hapticbridge.sweep.sweep import InThisProcess, sweep
 
 
 def test_an_executor_of_somebody_else_that_breaks_is_one_sentence() -> None:
@@ -125,7 +124,7 @@ def test_what_is_not_installed_is_named_with_the_command_that_installs_it(
 def test_a_scheduler_that_does_not_answer_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nobody listens, there is no such protocol, or somebody listens and says nothing."""
     distributed = pytest.importorskip("distributed")
-    monkeypatch.setattr("hapticbridge.study.cluster._PATIENCE", 0.2)
+    monkeypatch.setattr(sys.modules["hapticbridge.sweep.sweep"], "_PATIENCE", 0.2)
     # a client that was refused is given up after 10 s, with a traceback that nobody can catch
     monkeypatch.setattr(distributed, "Client", None)
     with socket.create_server(("127.0.0.1", 0)) as silent:

@@ -14,22 +14,22 @@ import tyro
 from rich.table import Table
 
 from hapticbridge.audit import AuditReport, audit, verdict_words
+from hapticbridge.audit.batch import (
+    UNREADABLE,
+    audit_all,
+    check_table_name,
+    find_recordings,
+    reports_of,
+    worst_exit_code,
+    write_audits,
+)
 from hapticbridge.cli.terminal import err, out, plain, progress
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.film import Shot, still
 from hapticbridge.plotting import check_ending
 from hapticbridge.recording import Recording, read_recording, repair
 from hapticbridge.report import check_page_name, plot_recording, telling_time, write_report
-from hapticbridge.study.audits import (
-    UNREADABLE,
-    audit_all,
-    check_table_name,
-    reports_of,
-    worst_exit_code,
-    write_audits,
-)
-from hapticbridge.study.findings import find_recordings
-from hapticbridge.study.table import Interrupted, Table
+from hapticbridge.sweep.results import Interrupted, Table
 from hapticbridge.units import format_si
 from hapticbridge.whatif import WhatIf, changes_from, draw_what_if, what_if, write_what_if
 from hapticbridge.whatif.page import changes, rows, sentences

@@ -16,13 +16,9 @@ from hapticbridge.clock import period_of
 from hapticbridge.coupling import Coupling
 from hapticbridge.plotting import check_ending
 from hapticbridge.rendering import default_method
-from hapticbridge.study.theory import (
-    Alternative,
-    alternatives,
-    draw_alternatives,
-)
 from hapticbridge.theory.compensation import largest_felt_damping, law_damping
 from hapticbridge.theory.transfer import scalar
+from hapticbridge.theory_plots import Alternative, alternatives, draw_alternatives
 
 
 @dataclass(frozen=True, slots=True)

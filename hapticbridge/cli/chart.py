@@ -10,7 +10,7 @@ import tyro
 
 from hapticbridge.cli.terminal import err, out, plain, print_json, progress
 from hapticbridge.errors import StudyError
-from hapticbridge.study.chart import (
+from hapticbridge.lab.chart import (
     ChartFiles,
     Extent,
     chosen_methods,
@@ -22,11 +22,9 @@ from hapticbridge.study.chart import (
     settings_for,
     write_chart,
 )
-from hapticbridge.study.chart.timing import LEAST_REPEATS, REPEATS
-from hapticbridge.study.chart.work import measure_work
-from hapticbridge.study.chart.work_files import WORK_ENDINGS, write_work
-from hapticbridge.study.engines.library import available_engines, open_engine
-from hapticbridge.study.engines.prints import caught_prints
+from hapticbridge.lab.chart.chart import LEAST_REPEATS, REPEATS
+from hapticbridge.lab.chart.work import WORK_ENDINGS, measure_work, write_work
+from hapticbridge.lab.engines.base import available_engines, caught_prints, open_engine
 
 ALL = "all"
 

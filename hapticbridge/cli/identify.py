@@ -24,9 +24,9 @@ from hapticbridge.identify.profile import draw_identification, measured_profile
 from hapticbridge.plotting import check_ending
 from hapticbridge.rendering import default_method
 from hapticbridge.signals import interrupting_on_signals
-from hapticbridge.study.theory import draw_z_width, recommended
 from hapticbridge.summary import coupling_sentences
 from hapticbridge.theory.z_width import ZWidth, z_width
+from hapticbridge.theory_plots import draw_z_width, recommended
 from hapticbridge.units import format_si
 
 # What ``hapticbridge identify`` says of a device, and the couplings that follow.

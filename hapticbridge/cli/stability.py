@@ -12,7 +12,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from hapticbridge.cli.terminal import err, out, plain
 from hapticbridge.errors import StudyError, choices
-from hapticbridge.study.maps import MAPS, MapFiles, StabilityMap, run_map
+from hapticbridge.lab.maps import MAPS, MapFiles, StabilityMap, run_map
 
 ALL = "all"
 

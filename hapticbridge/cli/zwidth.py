@@ -26,9 +26,9 @@ from hapticbridge.identify.z_width import MeasuredWidth, measure_width, measured
 from hapticbridge.plotting import check_ending
 from hapticbridge.rendering import default_method
 from hapticbridge.signals import interrupting_on_signals
-from hapticbridge.study.theory import draw_z_width, recommended
 from hapticbridge.summary import coupling_sentences
 from hapticbridge.theory.z_width import ZWidth, z_width
+from hapticbridge.theory_plots import draw_z_width, recommended
 
 DEFAULT_RATE = 1000.0
 """Hz; what 'hapticbridge run' takes by itself, so that it need not be told."""

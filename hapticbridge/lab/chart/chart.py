@@ -1,0 +1,455 @@
+"""Measures a chart: every point judged once, then all timed side by side."""
+
+from __future__ import annotations
+
+import math
+import os
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence, Set
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticbridge.check.observe import quiet
+from hapticbridge.coupling import Coupling
+from hapticbridge.errors import HapticBridgeError, StudyError
+from hapticbridge.lab.chart.engine_run import EngineRun, PeerWork
+from hapticbridge.lab.chart.setting import OWN, SHIPPED, Setting, who
+from hapticbridge.lab.chart.workload import PASSIVE, Panel, Run, Score, Workload
+from hapticbridge.lab.engines.base import Engine, open_engine
+from hapticbridge.run_description import processor
+
+
+def pareto_front(costs: Sequence[float], errors: Sequence[float]) -> list[int]:
+    """Returns the indices of the points that no other point beats, cheapest first.
+
+    A point is beaten by one that costs no more and errs no more, and less in one of the two. Of
+    equal points the first stays. Points with a cost or an error that is not finite are never on
+    the front.
+
+    Args:
+        costs: One per point.
+        errors: One per point.
+    """
+    points = np.stack([np.asarray(costs, float), np.asarray(errors, float)], axis=-1)
+    order = [i for i in np.lexsort(points.T[::-1]) if np.isfinite(points[i]).all()]
+    front: list[int] = []
+    least = np.inf
+    for index in order:
+        if points[index, 1] < least:
+            least = points[index, 1]
+            front.append(int(index))
+    return front
+
+
+REPEATS = 7
+"""Rounds at most; the median of seven is not moved by three that were disturbed."""
+
+LEAST_REPEATS = 3
+"""Rounds at least, whatever they take: a median needs them."""
+
+PATIENCE = 45.0
+"""Time in s after which no new round begins."""
+
+SEED = 7
+"""Of the order within a round, so that no point always follows the same other one."""
+
+
+@dataclass(frozen=True, slots=True)
+class Cost:
+    """Processor time in s per simulated second.
+
+    Attributes:
+        median: Over the rounds; nan where a run failed before it could be timed.
+        low: Least.
+        high: Largest.
+        ratio: Median of the ratio to the baseline, each taken within one round; no unit.
+        ratio_low: Least of these.
+        ratio_high: Largest.
+        repeats: Rounds.
+    """
+
+    median: float
+    low: float
+    high: float
+    ratio: float
+    ratio_low: float
+    ratio_high: float
+    repeats: int
+
+
+@contextmanager
+def one_core() -> Iterator[int | None]:
+    """Keeps this thread on one core; yields which, None where the system has no such call."""
+    if not hasattr(os, "sched_setaffinity"):
+        yield None
+        return
+    allowed = os.sched_getaffinity(0)
+    core = max(allowed)
+    os.sched_setaffinity(0, {core})
+    try:
+        yield core
+    finally:
+        os.sched_setaffinity(0, allowed)
+
+
+def machine(core: int | None) -> str:
+    """Names the machine and the core that was measured on."""
+    where = "not pinned" if core is None else f"pinned to core {core} of {os.cpu_count()}"
+    return f"{processor()}, one thread, {where}"
+
+
+def interleaved_costs(
+    runs: Sequence[Run],
+    baseline: int,
+    *,
+    repeats: int = REPEATS,
+    patience: float = PATIENCE,
+    clock: Callable[[], float] = time.perf_counter,
+    progress: Callable[[int], None] | None = None,
+) -> list[Cost]:
+    """Runs all in rounds, in another order each round, so that a disturbance meets everyone.
+
+    The runs have been run before, which warmed them up.
+
+    Args:
+        runs: What to time.
+        baseline: Index of the run that ratios are to.
+        repeats: Rounds at most, >= 1.
+        patience: Time in s after which no further round begins, from the third round on.
+        clock: Time in s.
+        progress: Called with the number of runs done.
+    """
+    generator = np.random.default_rng(SEED)
+    rounds: list[NDArray[np.float64]] = []
+    start, done = clock(), 0
+    while len(rounds) < repeats:
+        if len(rounds) >= min(LEAST_REPEATS, repeats) and clock() - start > patience:
+            break
+        costs = np.zeros(len(runs))
+        for index in generator.permutation(len(runs)):
+            costs[index] = runs[index].go() / runs[index].seconds
+            done += 1
+            if progress is not None:
+                progress(done)
+        rounds.append(costs)
+    table = np.array(rounds)
+    ratios = table / table[:, [baseline]]
+    return [
+        Cost(*_spread(table[:, i]), *_spread(ratios[:, i]), repeats=len(rounds))
+        for i in range(len(runs))
+    ]
+
+
+def _spread(values: NDArray[np.float64]) -> tuple[float, float, float]:
+    """Returns median, least and largest of the rounds that were timed; nan where none was."""
+    known = values[np.isfinite(values)]
+    if not known.size:
+        return (float("nan"),) * 3
+    return float(np.median(known)), float(known.min()), float(known.max())
+
+
+@dataclass(frozen=True, slots=True)
+class Measurement:
+    """One point in one panel.
+
+    Attributes:
+        panel: Key of the panel.
+        setting: How it was simulated.
+        cost: What it cost.
+        score: How wrong it was.
+        chosen: Contacts and solver as the engine got them, by name.
+        limit_apart: Where errors are counted from each method's own limit: how far that limit
+            lies from the one that most methods agree on, in JND. 0 where they are counted from
+            the truth.
+    """
+
+    panel: str
+    setting: Setting
+    cost: Cost
+    score: Score
+    chosen: Mapping[str, str | int] = field(default_factory=dict)
+    limit_apart: float = 0.0
+
+    @property
+    def is_comparable(self) -> bool:
+        """Whether its error can be compared with those of other methods.
+
+        Not where it is smaller than the distance of what the methods' errors are counted from.
+        """
+        return not self.score.felt < self.limit_apart
+
+    @property
+    def is_sound(self) -> bool:
+        """Whether the environment was passive and the run stayed in contact."""
+        return self.score.verdict in PASSIVE
+
+    @property
+    def is_usual(self) -> bool:
+        """Whether nothing but method and period was chosen."""
+        setting = self.setting
+        is_plain = setting.contact == SHIPPED and setting.iterations is None
+        return is_plain and setting.substeps == 1
+
+    def cells(self, workload: str, coupling: Coupling) -> dict[str, object]:
+        """Returns the row of a table: every choice, every number."""
+        setting, method = self.setting, self.setting.method
+        used = method.used(coupling, setting.timestep)
+        return {
+            "workload": workload,
+            "panel": self.panel,
+            "engine": setting.engine,
+            "method": method.name,
+            "integrator": method.integrator,
+            "period_s": setting.period,
+            "substeps": setting.substeps,
+            "timestep_s": setting.timestep,
+            "contact": setting.contact,
+            **self.chosen,
+            "stiffness": coupling.stiffness,
+            "damping": coupling.damping,
+            "rotational_stiffness": coupling.rotational_stiffness,
+            "rotational_damping": coupling.rotational_damping,
+            "damping_used": used.damping,
+            "rotational_damping_used": used.rotational_damping,
+            **{f"cost_{name}": value for name, value in asdict(self.cost).items()},
+            **{f"error_{name}": value for name, value in asdict(self.score).items()},
+            "limit_apart": self.limit_apart,
+        }
+
+
+RESOLVED = 1e-5
+"""Error in JND below which a reference's own error may count, no unit: no order is taken from it.
+Five times what the tumbling body's reference errs by."""
+
+SETTLED = 0.1
+"""Difference of the powers over the two smallest halvings up to which an order counts as settled,
+no unit. A method of order p whose next term is of order p + 1 is within it when that term is
+less than a tenth of the error; larger would call the slope of a knee an order."""
+
+LEVEL = 0.1
+"""Settled powers up to this, no unit, are none: the error does not shrink with the step."""
+
+
+@dataclass(frozen=True, slots=True)
+class Order:
+    """How the error of a method goes with its period, at its three smallest resolved steps.
+
+        p = log(felt_2/felt_1) / log(T_2/T_1),   T_1 < T_2 < T_3
+
+    Attributes:
+        power: p between the two smaller steps, no unit.
+        before: p between the two larger ones.
+        finest: T_1 in s.
+        coarsest: T_3 in s.
+    """
+
+    power: float
+    before: float
+    finest: float
+    coarsest: float
+
+    @property
+    def is_settled(self) -> bool:
+        """Whether both powers agree; if not, the steps are too large to tell an order."""
+        return abs(self.power - self.before) <= SETTLED
+
+    @property
+    def is_level(self) -> bool:
+        """Whether the error stays as it is: it is the model's, not the step's."""
+        return self.is_settled and abs(self.power) <= LEVEL
+
+    @property
+    def words(self) -> str:
+        """The order as a picture has room for it."""
+        if self.is_level:
+            return "level"
+        return f"order {self.power:.1f}" if self.is_settled else "order ?"
+
+
+def convergence_orders(points: Sequence[Measurement]) -> dict[str, Order]:
+    """Returns orders by method or engine, of the points where nothing but the period was chosen.
+
+    A method is left out where fewer than three of its steps have an error that is finite and at
+    least ``RESOLVED``.
+    """
+    series: dict[str, list[tuple[float, float]]] = {}
+    for each in points:
+        felt = each.score.felt
+        if each.is_usual and math.isfinite(felt) and felt >= RESOLVED:
+            series.setdefault(who(each.setting), []).append((each.setting.period, felt))
+    return {name: _order(sorted(values)[:3]) for name, values in series.items() if len(values) > 2}
+
+
+def _order(steps: Sequence[tuple[float, float]]) -> Order:
+    (finest, first), (middle, second), (coarsest, third) = steps
+    return Order(
+        power=math.log(second / first) / math.log(middle / finest),
+        before=math.log(third / second) / math.log(coarsest / middle),
+        finest=finest,
+        coarsest=coarsest,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Chart:
+    """What was measured.
+
+    Attributes:
+        workload: What was simulated.
+        measurements: One per point and panel; the points' order is that of the settings.
+        skipped: What could not be simulated, by method or engine, and why.
+        machine: Where it was measured, in words.
+        baseline: The setting that ratios are to.
+        notes: What else is to be known, a sentence each.
+        engines: The other engines on it, by name, with their settings.
+    """
+
+    workload: Workload
+    measurements: tuple[Measurement, ...]
+    skipped: dict[str, str]
+    machine: str
+    baseline: str
+    notes: tuple[str, ...] = ()
+    engines: Mapping[str, Engine] = field(default_factory=dict)
+
+    def of(self, panel: Panel) -> list[Measurement]:
+        """Returns the points of a panel."""
+        return [each for each in self.measurements if each.panel == panel.key]
+
+    def front(self, panel: Panel) -> list[Measurement]:
+        """Returns the Pareto front, cheapest first.
+
+        Of the points that are sound and comparable, and render the coupling that was asked for: a
+        weld, or a tool that is where the handle is, renders another one, however well it converges.
+        """
+        points = [
+            each
+            for each in self.of(panel)
+            if each.is_sound and each.is_comparable and each.setting.method.has_law
+        ]
+        chosen = pareto_front(
+            [each.cost.median for each in points], [each.score.felt for each in points]
+        )
+        return [points[index] for index in chosen]
+
+    def orders(self, panel: Panel) -> dict[str, Order]:
+        """Returns by method how its error goes with the period."""
+        return convergence_orders(self.of(panel))
+
+
+def measure_chart(
+    workload: Workload,
+    settings: Sequence[Setting],
+    *,
+    repeats: int = REPEATS,
+    progress: Callable[[int, int], None] | None = None,
+) -> Chart:
+    """Judges and times every setting.
+
+    A setting that the workload cannot be rendered by is left out and named in ``skipped``; one that
+    diverges, or whose engine fails on the way, stays in.
+
+    Args:
+        workload: What to simulate.
+        settings: How.
+        repeats: Rounds of timing at most.
+        progress: Called with steps done and all of them.
+
+    Raises:
+        StudyError: No setting could be simulated.
+    """
+    total = len(settings) * (1 + repeats)
+
+    def tell(done: int) -> None:
+        if progress is not None:
+            progress(min(done, total), total)
+
+    runs: list[tuple[Setting, Run, dict[str, Score]]] = []
+    skipped: dict[str, str] = {}
+    peer_work = cache(workload.peer_work)
+    # the chart tells of every run that diverges; MuJoCo need not
+    with quiet(), one_core() as core:
+        for index, setting in enumerate(settings):
+            tell(index)
+            try:
+                run = _opened(workload, setting, peer_work)
+                runs.append((setting, run, dict(run.scores())))
+            except HapticBridgeError as error:
+                skipped.setdefault(who(setting), str(error))
+        if not runs:
+            raise StudyError(
+                f"workload '{workload.name}': no point could be simulated; first: "
+                f"{next(iter(skipped.values()), 'no setting')}"
+            )
+        baseline = _baseline(
+            [setting for setting, _, _ in runs],
+            {i for i, (_, _, scores) in enumerate(runs) if _has_failed(scores)},
+        )
+        costs = interleaved_costs(
+            [run for _, run, _ in runs],
+            baseline,
+            repeats=repeats,
+            progress=lambda done: tell(len(settings) + done),
+        )
+        where = machine(core)
+    tell(total)
+    apart = {} if workload.references is None else workload.references.disagreement()
+    measurements = tuple(
+        Measurement(
+            panel.key,
+            setting,
+            cost,
+            scores[panel.key],
+            run.chosen,
+            limit_apart=0.0 if panel.is_truth else apart.get(setting.method.name, 0.0),
+        )
+        for panel in workload.panels
+        for (setting, run, scores), cost in zip(runs, costs, strict=True)
+        # what another engine converges to is no error of its own
+        if panel.is_truth or setting.engine == OWN
+    )
+    label = runs[baseline][0].label
+    engines = {each.engine.name: each.engine for _, each, _ in runs if isinstance(each, EngineRun)}
+    return Chart(workload, measurements, skipped, where, label, tuple(_notes(apart)), engines)
+
+
+def _opened(workload: Workload, setting: Setting, peer_work: Callable[[], PeerWork]) -> Run:
+    if setting.engine == OWN:
+        return workload.run(setting)
+    return EngineRun(open_engine(setting.engine), peer_work(), setting)
+
+
+def _has_failed(scores: Mapping[str, Score]) -> bool:
+    return any(score.verdict == "failed" for score in scores.values())
+
+
+def _baseline(settings: Sequence[Setting], failed: Set[int]) -> int:
+    """Returns the index of ``implicit`` at the period nearest to 1 ms, or what comes nearest."""
+
+    def distance(index: int) -> tuple[bool, bool, bool, float]:
+        setting = settings[index]
+        is_plain = setting.substeps == 1 and setting.contact == SHIPPED
+        return (
+            index in failed,  # it may not have been timed
+            setting.engine != OWN or setting.method.name != "implicit",
+            not (is_plain and setting.iterations is None),
+            abs(np.log(setting.period / 1e-3)),
+        )
+
+    return min(range(len(settings)), key=distance)
+
+
+def _notes(apart: Mapping[str, float]) -> Iterator[str]:
+    if len(apart) > 1:
+        central = min(apart, key=lambda name: apart[name])
+        listed = ", ".join(f"{name} {felt:.2g}" for name, felt in apart.items() if name != central)
+        yield (
+            "How far the methods' own limits lie from the one that most of them are near, that of "
+            f"{central}, in JND: {listed}. A point that is nearer to its own limit than that limit "
+            "is to the others cannot be compared with them: it is drawn pale, and is neither on "
+            "the front nor recommended."
+        )

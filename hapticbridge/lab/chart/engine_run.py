@@ -1,0 +1,201 @@
+"""The same work in another engine: the same motion, the same judge, its own contacts and solver."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticbridge.coupling import Coupling
+from hapticbridge.device import Motion
+from hapticbridge.errors import HapticBridgeError, StudyError
+from hapticbridge.lab.chart.scene_run import Judge, Path, PeerWork, Take
+from hapticbridge.lab.chart.setting import Setting
+from hapticbridge.lab.chart.workload import Score
+from hapticbridge.lab.engines.base import Engine, Pose, Simulation, Task, Velocity, composed
+from hapticbridge.lab.engines.from_scene import task_from_scene
+from hapticbridge.record import TICK_DTYPE
+from hapticbridge.rendering import METHODS
+from hapticbridge.scene import Scene
+
+HELD = METHODS["explicit"]
+"""How engines get the coupling: a force that is computed after a step and held in the next. Those
+whose name ends with ``SPRING`` solve it together with the contacts, as a spring of their own."""
+
+FARTHEST = 10.0
+"""Distance in m of the tool at which a run has diverged beyond doubt."""
+
+_LEFT = ("tool_position", "tool_quaternion", "wrench_on_tool")
+
+
+def work_of(
+    scene: Scene, path: Path, duration: float, finest: float, coupling: Coupling, judge: Judge
+) -> PeerWork:
+    """Describes a scene that is led along a path to other engines.
+
+    Args:
+        scene: One free tool among fixed shapes.
+        path: Of the handle.
+        duration: In s.
+        finest: Shortest period in s: the handle is exact at its multiples.
+        coupling: K and B.
+        judge: Of the workload.
+
+    Raises:
+        StudyError: The scene cannot be given to other engines.
+    """
+    motion = motion_along(path, duration, finest)
+    return PeerWork((task_from_scene(scene, motion, coupling),), duration, judge)
+
+
+def motion_along(path: Path, duration: float, finest: float) -> Motion:
+    """Returns a path as a motion that is exact at the multiples of ``finest`` s."""
+    times = finest * np.arange(0.0, round(duration / finest) + 1)
+    return Motion(times, *path(times))
+
+
+class EngineRun:
+    """A workload in an engine at one time step, as a chart times and judges it.
+
+    What is timed is every step of the run through the engine's Python interface, with the
+    coupling's law: a user pays that too. Compare engines with the engine ``mujoco``, which is
+    called the same way, and not with the compiled loop of the bridge.
+
+    Raises:
+        StudyError: The setting has substeps.
+    """
+
+    def __init__(self, engine: Engine, work: PeerWork, setting: Setting) -> None:
+        if setting.substeps != 1:
+            raise StudyError("other engines are not divided into substeps; give a smaller step")
+        self.engine, self._work, self._setting = engine, work, setting
+        ticks = round(work.duration / setting.period)
+        self._poses = [task.handle_poses(setting.period, ticks)[1:] for task in work.tasks]
+        self._ticks = [ticks] * len(work.tasks)
+
+    @property
+    def seconds(self) -> float:
+        """Simulated time in s of what is timed: a run that ended early counts as far as it came."""
+        return max(1, sum(self._ticks)) * self._setting.period
+
+    @property
+    def chosen(self) -> Mapping[str, str | int]:
+        """What the engine was set to, and which page of its documentation advises it.
+
+        Method and integrator of the bridge are none of another engine's.
+        """
+        told = "; ".join(
+            f"{name}: {setting.value} ({setting.source})"
+            for name, setting in self.engine.settings.items()
+        )
+        coupling = self.engine.settings.get("coupling")
+        return {
+            "method": "held force" if coupling is None else coupling.value,
+            "integrator": "",
+            "solref": "",
+            "solimp": "",
+            "cone": "",
+            "solver_iterations": "",
+            "engine_settings": f"{self.engine.name} {self.engine.version}; {told}",
+        }
+
+    def go(self) -> float:
+        """Runs it; returns the processor time in s of the steps, nan where none was completed."""
+        if not any(self._ticks):
+            return float("nan")
+        spent = 0.0
+        for task, poses, ticks in zip(self._work.tasks, self._poses, self._ticks, strict=True):
+            if not ticks:
+                break
+            try:
+                simulation = self.engine.open(task, self._setting.period)
+                try:
+                    begin = time.thread_time()
+                    for pose in poses[:ticks]:
+                        simulation.step(pose.position, pose.quaternion)
+                    spent += time.thread_time() - begin
+                finally:
+                    simulation.close()
+            except Exception:
+                return float("nan")  # a round that failed is none; the others are counted
+        return spent
+
+    def scores(self) -> Mapping[str, Score]:
+        """Runs it once more with every tick written down, and judges it.
+
+        An engine that raises on the way has ``failed`` there, and the score says what it raised.
+
+        Raises:
+            HapticBridgeError: The engine refuses the task.
+        """
+        takes: list[Take] = []
+        has_failed = False
+        self._ticks = [0] * len(self._ticks)
+        for index, (task, poses) in enumerate(zip(self._work.tasks, self._poses, strict=True)):
+            take, has_failed = self._take(task, poses)
+            takes.append(take)
+            self._ticks[index] = take.records.size
+            if take.ended:
+                break
+        found = self._work.judge(takes)
+        if not has_failed:
+            return found
+        return {key: replace(score, verdict="failed") for key, score in found.items()}
+
+    def _take(self, task: Task, poses: Sequence[Pose]) -> tuple[Take, bool]:
+        """Goes along a motion; returns the take, and whether the engine raised an error."""
+        rows = np.zeros(len(poses), TICK_DTYPE)
+        done, ended, has_failed, velocity = 0, "", False, Velocity()
+        try:
+            simulation = self.engine.open(task, self._setting.period)
+            try:
+                for pose in poses:
+                    simulation.step(pose.position, pose.quaternion)
+                    ended = _written(rows[done : done + 1], simulation, task.grip)
+                    if ended:
+                        break
+                    done += 1
+                velocity = simulation.velocity()
+            finally:
+                simulation.close()
+        except Exception as error:
+            # a foreign library raises what it likes; one engine's failure must not end the chart
+            if isinstance(error, HapticBridgeError) and not done:
+                raise
+            has_failed = True
+            ended = f"raised {type(error).__name__}: {' '.join(str(error).split())}"
+        if ended:
+            ended += f" after {self._setting.period * done:.4g} s"
+        take = Take(
+            setting=self._setting,
+            records=rows[:done],
+            ended=ended,
+            environment="not metered",
+            created=float("nan"),
+            velocity=np.array([*velocity.linear, *velocity.angular]),
+        )
+        return take, has_failed
+
+
+def _written(row: NDArray[np.void], simulation: Simulation, grip: Pose) -> str:
+    """Writes one record; returns what is not of this world in it, empty where all is."""
+    pose = composed(simulation.pose(), grip)
+    wrench = simulation.wrench()
+    row["tool_position"] = pose.position
+    row["tool_quaternion"] = pose.quaternion
+    row["wrench_on_tool"] = (*wrench.force, *wrench.torque)
+    # before the contacts: an engine asked for those of such a pose may raise
+    if not all(np.isfinite(row[name]).all() for name in _LEFT):
+        return "a number was not finite"
+    if np.abs(row["tool_position"]).max() >= FARTHEST:
+        return f"the tool was {FARTHEST:g} m away"
+    row["contacts"] = simulation.contacts().points
+    return ""
+
+
+def peer_settings(engines: Sequence[str], periods: Sequence[float]) -> list[Setting]:
+    """Returns the points of other engines: every one at every period."""
+    return [Setting(HELD, period, engine=name) for name in engines for period in periods]

@@ -1,0 +1,267 @@
+"""Workload ``peg_in_hole``: a peg without friction, pushed against its hole in several ways."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import minimize
+from scipy.spatial.transform import Rotation
+
+from hapticbridge.coupling import Coupling
+from hapticbridge.errors import StudyError
+from hapticbridge.lab.chart.engine_run import PeerWork, work_of
+from hapticbridge.lab.chart.scene_run import (
+    REFERENCE_REFINEMENT,
+    OwnReferences,
+    Stage,
+    Staged,
+    Stages,
+    Take,
+)
+from hapticbridge.lab.chart.workload import Panel, Score, diverged, score_of
+from hapticbridge.record import TICK_DTYPE
+from hapticbridge.scene import Scene, load_scene
+
+HOME = np.array([0.0, 0.0, 0.04])
+"""Where the peg's centre starts in m, 10 mm above the mouth."""
+
+POSES: tuple[tuple[tuple[float, float, float], tuple[float, float, float]], ...] = (
+    ((0.0, 0.0, 0.012), (0.0, 0.0, 0.0)),
+    ((2e-3, 0.5e-3, 0.012), (0.0, 0.0, 0.02)),
+    ((-1e-3, 1.5e-3, 0.010), (0.03, 0.06, 0.0)),
+    ((0.5e-3, 0.0, -0.012), (0.0, -0.05, 0.0)),
+)
+"""Where the handle goes, in m and as a rotation vector in rad: in, against a wall, tilted against
+two edges, onto the bottom. The last three are judged."""
+
+RAMP, HOLD = 0.2, 0.4
+"""Time in s to go to a pose and to stay there. The ramp is a minimum-jerk one, which leaves little
+to ring; after the hold, with the damping of the chart, e⁻⁶ of it is left."""
+
+DURATION = len(POSES) * (RAMP + HOLD)
+
+JUDGED = tuple(range(1, len(POSES)))
+
+
+def peg_path(times: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Returns positions and quaternions of the handle, counted from ``HOME``."""
+    stops = np.array([(*HOME, 0.0, 0.0, 0.0), *((*place, *turn) for place, turn in POSES)])
+    stage = np.minimum((times / (RAMP + HOLD)).astype(int), len(POSES) - 1)
+    share = np.clip((times - stage * (RAMP + HOLD)) / RAMP, 0.0, 1.0)
+    smooth = share**3 * (10 - 15 * share + 6 * share**2)
+    poses = stops[stage] + smooth[:, None] * (stops[stage + 1] - stops[stage])
+    turns = Rotation.from_rotvec(poses[:, 3:]).as_quat(canonical=True)[:, [3, 0, 1, 2]]
+    return poses[:, :3] - HOME, turns
+
+
+def end_of_hold(index: int) -> float:
+    """Returns the time in s at which the handle leaves a pose."""
+    return (index + 1) * (RAMP + HOLD)
+
+
+HALF_WIDTH, HALF_LENGTH = 0.01, 0.03
+"""Of the peg of ``models/peg_in_hole`` in m."""
+
+CLEARANCE, DEPTH = 0.2e-3, 0.04
+"""Gap a side with the peg in the middle, and depth of the hole, in m."""
+
+SCALE = 1e3
+"""Lengths are given to the optimiser in mm and angles in mrad, so that its steps suit both; it
+stops at 1e-16 of the energy, some 1e-10 m."""
+
+_SIGNS = np.array([(1.0, 1.0), (1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0)])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RestingPeg:
+    """A peg at rest.
+
+    Attributes:
+        position: Of its centre in m, the hole's mouth at z = 0, shape (3,).
+        rotation: Rotation vector in rad, shape (3,).
+        wrench: On the peg by the coupling, force in N and torque in N m, shape (6,).
+        gaps: Distances in m that the contacts leave, all >= 0 but for rounding.
+    """
+
+    position: NDArray[np.float64]
+    rotation: NDArray[np.float64]
+    wrench: NDArray[np.float64]
+    gaps: NDArray[np.float64]
+
+
+def gaps(
+    position: NDArray[np.float64], rotation: NDArray[np.float64], clearance: float = CLEARANCE
+) -> NDArray[np.float64]:
+    """Returns how far a peg is from each wall and the bottom, in m; < 0 where it would be inside.
+
+    What of the peg lies below the mouth is a convex body; its extreme points are the four lower
+    corners, and where the long edges pass the plane of the mouth. Valid while exactly those four
+    edges pass it: an inserted peg that is not turned by more than some 30 degrees.
+
+    Args:
+        position: Of the centre, shape (3,).
+        rotation: Rotation vector, shape (3,).
+        clearance: Gap a side in m.
+
+    Returns:
+        Shape (36,): eight points by four walls, then the corners above the bottom.
+    """
+    axes = Rotation.from_rotvec(rotation).as_matrix()
+    across = HALF_WIDTH * _SIGNS @ axes[:, :2].T
+    lower = position + across - HALF_LENGTH * axes[:, 2]
+    upper = position + across + HALF_LENGTH * axes[:, 2]
+    share = lower[:, 2:] / (lower[:, 2:] - upper[:, 2:])
+    points = np.vstack([lower, lower + share * (upper - lower)])[:, :2]
+    wall = HALF_WIDTH + clearance
+    return np.concatenate([(wall - points).ravel(), (wall + points).ravel(), lower[:, 2] + DEPTH])
+
+
+def resting_peg(
+    coupling: Coupling,
+    position: ArrayLike,
+    rotation: ArrayLike = (0.0, 0.0, 0.0),
+    clearance: float = CLEARANCE,
+) -> RestingPeg:
+    """Finds the pose that a coupling to a handle that stands still pulls a rigid peg into.
+
+        minimise  ½ K ‖h − p‖² + ½ K_r ‖log(R_h Rᵀ)‖²    subject to  gaps(p, R) >= 0
+
+    Without friction this is where any mechanics that loses energy ends.
+
+    Args:
+        coupling: K and K_r, both > 0; the dampings play no part.
+        position: h, of the handle in m.
+        rotation: Of the handle, a rotation vector in rad.
+        clearance: Gap a side in m.
+
+    Raises:
+        StudyError: The optimiser found no minimum, or a stiffness is not > 0.
+    """
+    if not (coupling.stiffness > 0 and coupling.rotational_stiffness > 0):
+        raise StudyError("the coupling must hold the peg's place and turning: K > 0 and K_r > 0")
+    handle, turn = np.asarray(position, float), np.asarray(rotation, float)
+    handle_rotation = Rotation.from_rotvec(turn)
+
+    def wrench(values: NDArray[np.float64]) -> NDArray[np.float64]:
+        place, rotated = values[:3] / SCALE, Rotation.from_rotvec(values[3:] / SCALE)
+        angle = (handle_rotation * rotated.inv()).as_rotvec()
+        return np.concatenate(
+            [coupling.stiffness * (handle - place), coupling.rotational_stiffness * angle]
+        )
+
+    weights = np.repeat([coupling.stiffness, coupling.rotational_stiffness], 3)
+
+    def energy(values: NDArray[np.float64]) -> float:
+        return float(np.sum(wrench(values) ** 2 / weights) / 2 * SCALE**2)
+
+    start = np.zeros(6)
+    start[2] = SCALE * max(handle[2], HALF_LENGTH - DEPTH + 1e-3)
+    found = minimize(
+        energy,
+        start,
+        method="SLSQP",
+        constraints={
+            "type": "ineq",
+            "fun": lambda v: SCALE * gaps(v[:3] / SCALE, v[3:] / SCALE, clearance),
+        },
+        options={"ftol": 1e-16, "maxiter": 500},
+    )
+    left = gaps(found.x[:3] / SCALE, found.x[3:] / SCALE, clearance)
+    # mode 8: no further descent to be found at this precision, which is the end as well
+    if found.status not in (0, 8) or left.min() < -1e-8:
+        raise StudyError(f"no resting pose of the peg was found: {found.message}")
+    return RestingPeg(
+        position=found.x[:3] / SCALE,
+        rotation=found.x[3:] / SCALE,
+        wrench=wrench(found.x),
+        gaps=left,
+    )
+
+
+SETTLED = Panel(
+    "settled",
+    "a peg at rest, pushed against its hole",
+    "pose of least energy of a rigid peg in a rigid hole, by SciPy's SLSQP, in three pushes",
+)
+MOVING = Panel(
+    "moving",
+    "the same peg while it goes in and meets the wall",
+    f"the same method at a step {REFERENCE_REFINEMENT} times smaller than the smallest: "
+    "convergence, not truth",
+    is_truth=False,
+)
+
+COUPLING = Coupling(1000.0, 3.0, 1.0, 2e-3)
+"""As the other workloads', with three times the damping, so that the peg is at rest at the end of
+each hold. Where it rests does not depend on it."""
+
+MOVING_TIME = 0.9
+"""In s: into the hole, and 0.1 s into the hold against the wall."""
+
+
+def _scene() -> Scene:
+    return load_scene("peg_in_hole", friction=0.0)
+
+
+class PegInHole(Staged):
+    """The workload.
+
+    Args:
+        coupling: K and B, K > 0 and K_r > 0.
+        grid: Longest period T in s.
+        finest: Shortest period T in s.
+        refinement: How many times smaller the step of the moving peg's reference is.
+
+    Raises:
+        StudyError: The coupling holds no peg.
+    """
+
+    name = "peg_in_hole"
+    about = "a frictionless peg goes into its hole and is pushed against walls, edges and bottom"
+    panels: Sequence[Panel] = (SETTLED, MOVING)
+    has_contact = True
+
+    def __init__(
+        self, coupling: Coupling, grid: float, finest: float, refinement: int = REFERENCE_REFINEMENT
+    ) -> None:
+        resting = [resting_peg(coupling, *POSES[index]) for index in JUDGED]
+        self._reference = np.zeros(len(JUDGED), TICK_DTYPE)
+        self._reference["tool_position"] = [each.position for each in resting]
+        turned = Rotation.from_rotvec([each.rotation for each in resting])
+        self._reference["tool_quaternion"] = turned.as_quat(canonical=True)[:, [3, 0, 1, 2]]
+        self._reference["wrench_on_tool"] = [each.wrench for each in resting]
+        self._finest = finest
+        self._duration = grid * round(DURATION / grid)
+        stages = Stages(lambda: Stage(_scene(), peg_path, self._duration, coupling))
+        self._limits = OwnReferences(stages, grid, finest, MOVING_TIME, refinement)
+        super().__init__(coupling, stages, self._limits)
+
+    def peer_work(self) -> PeerWork:
+        """Describes the peg to other engines."""
+        return work_of(_scene(), peg_path, self._duration, self._finest, self.coupling, self._judge)
+
+    def _judge(self, takes: Sequence[Take]) -> Mapping[str, Score]:
+        (take,) = takes
+        return {SETTLED.key: self.settled(take), MOVING.key: self._limits.score(take)}
+
+    def settled(self, take: Take) -> Score:
+        """Compares where the peg rests at the end of each hold with the rigid optimum."""
+        if take.has_diverged:
+            return diverged(take.created, take.ended)
+        ends = [round(end_of_hold(index) / take.setting.period) - 1 for index in JUDGED]
+        records = take.records[np.minimum(ends, take.records.size - 1)]
+        force, exact = (
+            np.linalg.norm(each["wrench_on_tool"][:, :3], axis=1)
+            for each in (records, self._reference)
+        )
+        is_touching = bool(np.all(records["contacts"] > 0))
+        return score_of(
+            self._reference,
+            records,
+            stiffness=float(np.max(np.abs(force / exact - 1))),
+            created=take.created,
+            verdict=take.environment if is_touching else "lost contact",
+        )

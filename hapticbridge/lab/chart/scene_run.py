@@ -1,0 +1,488 @@
+"""A scene led along a prescribed motion at one setting, compiled, as a bridge would run it."""
+
+from __future__ import annotations
+
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticbridge.check.case import motion_for
+from hapticbridge.check.perception import felt_error
+from hapticbridge.coupling import Coupling
+from hapticbridge.device import Motion
+from hapticbridge.device.trajectory import pose_at
+from hapticbridge.errors import HapticBridgeError, StudyError
+from hapticbridge.kernel.codes import DIRECT, WELD
+from hapticbridge.kernel.state import BoundKernel
+from hapticbridge.kernel.tick import simulate
+from hapticbridge.lab.chart.setting import OWN, Setting, ShippedOptions
+from hapticbridge.lab.chart.workload import (
+    NAN,
+    Judge,
+    Panel,
+    PeerWork,
+    References,
+    Run,
+    Score,
+    Take,
+    diverged,
+    score_of,
+)
+from hapticbridge.options import run_parameters
+from hapticbridge.record import SAMPLE_DTYPE, TICK_DTYPE
+from hapticbridge.rendering import IMPLICIT, METHODS, Method, prepare
+from hapticbridge.scene import Scene, load_scene
+from hapticbridge.summary import Ledger
+
+Path = Callable[[NDArray[np.float64]], tuple[NDArray[np.float64], NDArray[np.float64]]]
+"""The handle's motion: times in s, shape (n,), to positions in m, (n, 3), and quaternions (n, 4),
+both counted from the handle's start; at time 0 it is there, at rest."""
+
+Start = Callable[[Scene], None]
+"""Changes the scene's state before the first tick: a body that already spins."""
+
+_BAD = (
+    mujoco.mjtWarning.mjWARN_BADQPOS,
+    mujoco.mjtWarning.mjWARN_BADQVEL,
+    mujoco.mjtWarning.mjWARN_BADQACC,
+)
+"""After these MuJoCo has reset the scene, and what follows is another run."""
+
+
+class Stage:
+    """A scene with its motion, set up anew for every setting; one for all points of a chart.
+
+    Args:
+        scene: Loaded; its model is changed.
+        path: Of the handle.
+        duration: In s.
+        coupling: K and B asked for.
+        starts: How each take begins; one take by default.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        path: Path,
+        duration: float,
+        coupling: Coupling,
+        starts: Sequence[Start | None] = (None,),
+    ) -> None:
+        self._scene = scene
+        self._shipped = ShippedOptions.of(scene.model)
+        self._path = path
+        self.duration = duration
+        self.coupling = coupling
+        self._starts = starts
+        self._samples: dict[float, NDArray[np.void]] = {}
+        # a thousand runs share the memory of the longest
+        self._rows = np.zeros(0, TICK_DTYPE)
+
+    @property
+    def shipped(self) -> ShippedOptions:
+        """Contacts and solver as the scene's file says them."""
+        return self._shipped
+
+    @property
+    def seconds(self) -> float:
+        """Simulated time of all takes in s."""
+        return self.duration * len(self._starts)
+
+    def samples(self, period: float) -> NDArray[np.void]:
+        """Returns the handle's poses at T, 2T, … as ``SAMPLE_DTYPE``."""
+        if period not in self._samples:
+            ticks = round(self.duration / period)
+            self._samples[period] = self.samples_at(period * np.arange(1.0, ticks + 1))
+        return self._samples[period]
+
+    def samples_at(self, times: NDArray[np.float64]) -> NDArray[np.void]:
+        """Returns the handle's poses at times in s as ``SAMPLE_DTYPE``."""
+        samples = np.zeros(times.size, SAMPLE_DTYPE)
+        samples["position"], samples["quaternion"] = self._path(times)
+        return samples
+
+    def play(self, setting: Setting, judge: Callable[[Take], None] | None = None) -> float:
+        """Runs every take; returns the processor time of the ticks alone in s.
+
+        Args:
+            setting: How.
+            judge: Sees each take before the next one overwrites its records.
+
+        Raises:
+            HapticBridgeError: The method cannot render the scene.
+        """
+        samples, seconds = self.samples(setting.period), 0.0
+        if self._rows.size < samples.size:
+            self._rows = np.zeros(samples.size, TICK_DTYPE)
+        rows = self._rows[: samples.size]
+        for start in self._starts:
+            binding = self.bound(setting, start)
+            begin = time.thread_time()
+            done = simulate(binding.state, samples, binding.row, rows)
+            # what diverged counts as if it had gone on
+            seconds += (time.thread_time() - begin) * samples.size / max(done, 1)
+            if judge is not None:
+                judge(self._take(setting, binding, rows[:done], samples.size))
+        return seconds
+
+    def bound(self, setting: Setting, start: Start | None = None) -> BoundKernel:
+        """Puts the scene to its start, and binds it for the compiled loop.
+
+        Raises:
+            HapticBridgeError: The method cannot render the scene.
+        """
+        scene, period, method = self._scene, setting.period, setting.method
+        self._shipped.apply(scene, setting)
+        felt = prepare(scene, self.coupling, period, setting.substeps, method, warns=False)
+        # an error inside the C symbol would end the process, so the first step is Python's
+        mujoco.mj_step(scene.model, scene.data)
+        scene.reset()
+        if start is not None:
+            start(scene)
+        first = np.zeros(1, SAMPLE_DTYPE)
+        first["quaternion"][0, 0] = 1.0
+        parameters = run_parameters(
+            scene, self.coupling, method, first, period=period, felt=felt, substeps=setting.substeps
+        )
+        return BoundKernel(scene.model, scene.data, parameters)
+
+    def _take(
+        self, setting: Setting, binding: BoundKernel, rows: NDArray[np.void], ticks: int
+    ) -> Take:
+        warnings = self._scene.data.warning
+        ended = ""
+        if rows.size < ticks:
+            ended = f"a number was not finite after {setting.period * rows.size:.4g} s"
+        elif bad := [kind for kind in _BAD if warnings[int(kind)].number > 0]:
+            ended = f"MuJoCo gave its state up ({bad[0].name.removeprefix('mjWARN_')})"
+        return Take(
+            setting=setting,
+            records=rows,
+            ended=ended,
+            environment=Ledger.of(binding.state).environment,
+            created=float(rows["environment_energy"].max(initial=0.0)),
+            velocity=self._scene.data.qvel.copy(),
+        )
+
+
+class SceneRun:
+    """A stage at one setting, as a chart times and judges it."""
+
+    def __init__(self, stage: Stage, setting: Setting, judge: Judge) -> None:
+        self._stage, self._setting, self._judge = stage, setting, judge
+        self.seconds = stage.seconds
+
+    @property
+    def chosen(self) -> Mapping[str, str | int]:
+        """Contacts and solver of this point, for a table."""
+        return self._stage.shipped.chosen(self._setting)
+
+    def go(self) -> float:
+        """Runs it; returns the processor time in s."""
+        return self._stage.play(self._setting)
+
+    def scores(self) -> Mapping[str, Score]:
+        """Runs it once more, and judges it."""
+        takes: list[Take] = []
+
+        def keep(take: Take) -> None:
+            takes.append(replace(take, records=take.records.copy()))
+
+        self._stage.play(self._setting, keep)
+        return self._judge(takes)
+
+
+class Stages:
+    """The stages of a workload: a scene with a weld in it cannot serve the other methods."""
+
+    def __init__(self, make: Callable[[], Stage]) -> None:
+        self._make = make
+        self._stages: dict[bool, Stage] = {}
+
+    def for_method(self, setting: Setting) -> Stage:
+        """Returns the stage that a setting runs on."""
+        is_weld = setting.method.scheme == WELD
+        if is_weld not in self._stages:
+            self._stages[is_weld] = self._make()
+        return self._stages[is_weld]
+
+
+REFERENCE_REFINEMENT = 32
+"""How many times smaller the reference's step is than the smallest step of the chart."""
+
+TOUCHING = 0.5
+"""Share of the reference's instants in contact that a run must share, or it has lost contact."""
+
+
+@dataclass(frozen=True, slots=True)
+class OwnReference:
+    """A method's own limit at small steps.
+
+    Attributes:
+        records: ``TICK_DTYPE`` at whole multiples of the chart's longest period.
+        period: Of the reference in s.
+    """
+
+    records: NDArray[np.void]
+    period: float
+
+
+class OwnReferences:
+    """The reference of each method, computed when it is first asked for.
+
+    Args:
+        stages: Where it runs.
+        grid: Longest period of the chart in s.
+        finest: Shortest period of the chart in s.
+        duration: How much of the motion is compared, in s.
+        refinement: How many times smaller than ``finest`` the step is.
+    """
+
+    def __init__(
+        self,
+        stages: Stages,
+        grid: float,
+        finest: float,
+        duration: float,
+        refinement: int = REFERENCE_REFINEMENT,
+    ) -> None:
+        self._stages, self._grid = stages, grid
+        self._period, self._count = finest / refinement, round(duration / grid)
+        self._found: dict[str, OwnReference | None] = {}
+
+    def of(self, method: Method) -> OwnReference | None:
+        """Returns a method's reference; None where it diverges even at this step."""
+        if method.name not in self._found:
+            setting = Setting(method, self._period)
+            stage = self._stages.for_method(setting)
+            records = fine_records(stage, setting, self._grid, self._count)
+            self._found[method.name] = (
+                None if records is None else OwnReference(records, self._period)
+            )
+        return self._found[method.name]
+
+    def score(self, take: Take) -> Score:
+        """Compares the first part of a take with the same method at the small step."""
+        if take.setting.engine != OWN:
+            return Score(felt=NAN)  # not on the chart
+        reference = self.of(take.setting.method)
+        if take.has_diverged:
+            return diverged(take.created, take.ended)
+        if reference is None:
+            return Score(felt=NAN, created=take.created, verdict=take.environment)
+        records = take.at(self._grid)[: self._count]
+        touches = reference.records["contacts"] > 0
+        has_lost = touches.any() and np.mean(records["contacts"][touches] > 0) < TOUCHING
+        return score_of(
+            reference.records,
+            records,
+            created=take.created,
+            verdict="lost contact" if has_lost else take.environment,
+        )
+
+    def disagreement(self) -> dict[str, float]:
+        """Returns how far each method's limit is from the central one in JND, 0 for that one.
+
+        Central is the limit whose median distance to all is least: the one that most agree on. It
+        is that of a method that renders the coupling that was asked for, if there is one.
+        Where limits agree, they are likely the motion of the model; where not, at most one is.
+        """
+        found = {name: each.records for name, each in self._found.items() if each is not None}
+        centers = [name for name in found if METHODS[name].has_law] or list(found)
+        apart = [
+            {name: felt_error(found[center], each).felt for name, each in found.items()}
+            for center in centers
+        ]
+        return min(apart, key=lambda row: float(np.median(list(row.values()))), default={})
+
+
+def fine_records(
+    stage: Stage, setting: Setting, grid: float, count: int
+) -> NDArray[np.void] | None:
+    """Runs a stage and keeps one record per ``grid`` s; None where it diverges.
+
+    The memory of a million ticks is not needed: the run goes from one instant to the next.
+
+    Raises:
+        StudyError: The method cannot render the scene, or ``grid`` is no multiple of the period.
+    """
+    every = round(grid / setting.period)
+    if abs(every * setting.period / grid - 1) > 1e-9:
+        raise StudyError(f"{grid:g} s is no whole number of periods of {setting.period:g} s")
+    try:
+        binding = stage.bound(setting)
+    except HapticBridgeError as error:
+        raise StudyError(f"no reference for '{setting.method.name}': {error}") from None
+    kept, rows = np.zeros(count, TICK_DTYPE), np.zeros(every, TICK_DTYPE)
+    for k in range(count):
+        times = setting.period * np.arange(k * every + 1.0, (k + 1) * every + 1)
+        if simulate(binding.state, stage.samples_at(times), binding.row, rows) < every:
+            return None
+        kept[k] = rows[-1]
+    return kept
+
+
+class Staged(ABC):
+    """A workload whose every point is its stage at another setting.
+
+    Args:
+        coupling: K and B.
+        stages: Where it runs.
+        references: The methods' own limits, where it compares with them.
+
+    Attributes:
+        needs_tool: What a method that does without the tool's own dynamics fails to do, as in
+            "method 'weld' …"; empty where the workload suits it.
+    """
+
+    needs_tool: ClassVar[str] = ""
+
+    def __init__(
+        self, coupling: Coupling, stages: Stages, references: References | None = None
+    ) -> None:
+        self.coupling = coupling
+        self.references = references
+        self._stages = stages
+
+    def run(self, setting: Setting) -> Run:
+        """Prepares a point.
+
+        Raises:
+            StudyError: The method does without the tool's own dynamics, and that is what is judged.
+        """
+        method = setting.method
+        if self.needs_tool and method.scheme in (WELD, DIRECT):
+            raise StudyError(f"method '{method.name}' {self.needs_tool}")
+        return SceneRun(self._stages.for_method(setting), setting, self._judge)
+
+    @abstractmethod
+    def _judge(self, takes: Sequence[Take]) -> Mapping[str, Score]:
+        """Says what the takes of a point are worth, by ``Panel.key``."""
+
+
+COUPLING = Coupling(1000.0, 1.0, 1.0, 1e-3)
+"""K = 1000 N/m and B = 1 N s/m: what the default simulated device (b = 2 N s/m) certifies at 1 kHz,
+and B = K T there, so that a compensated coupling is compensated in full."""
+
+PROBED = 1e-3
+"""T in s of the run that finds the first contact."""
+
+AFTER_CONTACT = 0.3
+"""How much of the motion after the first contact is simulated, in s."""
+
+SHORTEST, LONGEST = 0.4, 1.2
+"""Range of the simulated time in s: enough ticks to compare, and a chart in three minutes. Where
+the path touches later, it is played as much faster as it takes."""
+
+REFINEMENT = 8
+"""How many times smaller the reference's step is than the smallest of the chart: 64 times smaller
+than 1 ms by default. Scenes cost many times what a peg does."""
+
+
+class SceneMotion(Staged):
+    """The workload.
+
+    Args:
+        scene: A shipped scene's name or an MJCF file, with ``NAME.csv`` beside it.
+        coupling: K and B.
+        grid: Longest period T in s.
+        finest: Shortest period T in s.
+        refinement: How many times smaller the reference's step is than ``finest``.
+
+    Raises:
+        HapticBridgeError: The scene cannot be read, or there is no hand path beside it.
+    """
+
+    def __init__(
+        self,
+        scene: str,
+        coupling: Coupling,
+        grid: float,
+        finest: float,
+        refinement: int = REFINEMENT,
+    ) -> None:
+        first = load_scene(scene)
+        motion = motion_for(first)
+        if motion is None:
+            raise StudyError(
+                f"scene '{first.name}' has no hand path; put {first.path.stem}.csv "
+                "(t,x,y,z[,qw,qx,qy,qz]) beside it"
+            )
+        self.name = first.name
+        touched = _first_contact(Stage(first, path_of(motion), motion.duration, coupling))
+        self.has_contact = touched is not None
+        needed = motion.duration if touched is None else touched + AFTER_CONTACT
+        duration = float(np.clip(needed, SHORTEST, LONGEST))
+        self.speed = max(1.0, needed / duration)
+        duration = grid * max(1, round(duration / grid))
+        stages = Stages(
+            lambda: Stage(load_scene(scene), path_of(motion, self.speed), duration, coupling)
+        )
+        self._limits = OwnReferences(stages, grid, finest, duration, refinement)
+        super().__init__(coupling, stages, self._limits)
+        told = "" if self.speed == 1 else f", {self.speed:.3g} times as fast"
+        self.about = f"the scene's own hand path, {duration:g} s of it{told}"
+        self.panels: Sequence[Panel] = (
+            Panel(
+                "moving",
+                f"{self.name} along its hand path{told}",
+                f"the same method at a step {refinement} times smaller than the smallest: "
+                "convergence, not truth",
+                is_truth=False,
+            ),
+        )
+
+    def peer_work(self) -> PeerWork:
+        """Refuses: convergence to a method's own limit means nothing across engines.
+
+        Raises:
+            StudyError: Always.
+        """
+        raise StudyError(
+            f"scene '{self.name}' has no reference that is true for every engine; charts with "
+            "other engines: 'point_mass', 'peg_in_hole', 'spinning_body'"
+        )
+
+    def _judge(self, takes: Sequence[Take]) -> Mapping[str, Score]:
+        (take,) = takes
+        return {self.panels[0].key: self._limits.score(take)}
+
+
+def path_of(motion: Motion, speed: float = 1.0) -> Path:
+    """Returns a motion as the path of a stage, played faster by a factor >= 1."""
+
+    def path(
+        times: NDArray[np.float64],
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        positions, quaternions = np.zeros((times.size, 3)), np.zeros((times.size, 4))
+        cursor = 0
+        for k, now in enumerate(times):
+            start = cursor if k and now >= times[k - 1] else 0
+            cursor, positions[k], quaternions[k] = pose_at(motion.table, speed * now, start)
+        return positions, quaternions
+
+    return path
+
+
+def _first_contact(stage: Stage) -> float | None:
+    """Returns when the tool first touches in s, None for never.
+
+    Contacts that are there from the start are no event: the first tick with more of them is.
+    """
+    samples = stage.samples(PROBED)
+    rows = np.zeros(samples.size, TICK_DTYPE)
+    binding = stage.bound(Setting(IMPLICIT, PROBED))
+    done = simulate(binding.state, samples, binding.row, rows)
+    if not done:
+        return None
+    contacts = rows["contacts"][:done]
+    more = np.flatnonzero(contacts > contacts[0])
+    if more.size:
+        return float(PROBED * more[0])
+    return 0.0 if contacts[0] else None

@@ -1,0 +1,606 @@
+"""Cost against work: how a tick's time grows with bodies, contacts and triangles."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from hapticbridge.check.cost import TICK_SHARE, WARM_UP, TimingStats
+from hapticbridge.check.observe import rehearsal_parameters
+from hapticbridge.errors import StudyError
+from hapticbridge.jit import direct
+from hapticbridge.kernel.state import BoundKernel
+from hapticbridge.kernel.tick import after_step, before_step
+from hapticbridge.lab.chart.chart import machine, one_core
+from hapticbridge.lab.chart.output import PICTURES, csv_text, write_files
+from hapticbridge.lab.chart.scene_run import COUPLING
+from hapticbridge.lab.maps.base import scene_of
+from hapticbridge.plotting import new_figure
+from hapticbridge.record import SAMPLE_DTYPE
+from hapticbridge.scene import Scene
+
+PERIOD = 1e-3
+"""T in s."""
+
+TICKS = 300
+"""Ticks of a run, with the first ``WARM_UP`` not counted."""
+
+LONGEST = 2.0
+"""Time in s after which a run ends early: scenes that cannot be simulated at 1 kHz by far."""
+
+SHAKE = 1e-3
+"""How far the handle goes down in m, at 5 Hz: a tool on the floor is pressed, and never sleeps."""
+
+
+@dataclass(frozen=True, slots=True)
+class Variant:
+    """How a scene is stepped.
+
+    Attributes:
+        name: In tables.
+        has_islands: Whether MuJoCo divides the scene into islands that it solves by themselves.
+        is_bare: Whether MuJoCo's step is run alone, without the bridge's arithmetic.
+        sleeps: Whether MuJoCo lets bodies at rest sleep. The bridge refuses that (a sleeping tool
+            would not feel its coupling), so it is measured with the bare step.
+    """
+
+    name: str
+    has_islands: bool = True
+    is_bare: bool = False
+    sleeps: bool = False
+
+
+USUAL = Variant("bridge")
+VARIANTS = (
+    USUAL,
+    Variant("bridge, islands off", has_islands=False),
+    Variant("MuJoCo's step alone", is_bare=True),
+    Variant("MuJoCo's step alone, with sleep", is_bare=True, sleeps=True),
+)
+
+
+def tick_times(scene: Scene, variant: Variant, clock: Callable[[], int]) -> NDArray[np.float64]:
+    """Returns the time of each tick in s, whole ticks as the live loop has them.
+
+    Args:
+        scene: Reset first.
+        variant: How it is stepped.
+        clock: Time in ns.
+
+    Raises:
+        SceneError: The scene cannot be rendered.
+    """
+    model, data = scene.model, scene.data
+    with _flags(model, variant):
+        parameters = rehearsal_parameters(scene, COUPLING, PERIOD)
+        binding = BoundKernel(model, data, parameters)
+        state, row = binding.state, binding.row
+        samples = np.zeros(TICKS, SAMPLE_DTYPE)
+        phase = 2 * np.pi * 5.0 * PERIOD * np.arange(1.0, TICKS + 1)
+        samples["position"][:, 2] = -SHAKE / 2 * (1 - np.cos(phase))
+        samples["quaternion"][:, 0] = 1.0
+        before = direct(before_step, state, samples[:1], row, 0, PERIOD)
+        after = direct(after_step, state, row, 0)
+        step, times = mujoco.mj_step, np.zeros(TICKS)
+        started, done = clock(), 0
+        for k in range(TICKS):
+            sample = samples[k : k + 1]
+            if variant.is_bare:
+                before(state, sample, row, 0, PERIOD)
+                begin = clock()
+                step(model, data)
+                times[k] = clock() - begin
+            else:
+                begin = clock()
+                before(state, sample, row, 0, PERIOD)
+                step(model, data)
+                after(state, row, 0)
+                times[k] = clock() - begin
+            done = k + 1
+            if clock() - started > 1e9 * LONGEST and done > 2 * WARM_UP:
+                break
+    return 1e-9 * times[WARM_UP:done]
+
+
+@contextmanager
+def _flags(model: mujoco.MjModel, variant: Variant) -> Iterator[None]:
+    before = int(model.opt.disableflags), int(model.opt.enableflags)
+    if not variant.has_islands:
+        model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_ISLAND)
+    if variant.sleeps:
+        model.opt.enableflags |= int(mujoco.mjtEnableBit.mjENBL_SLEEP)
+    try:
+        yield
+    finally:
+        model.opt.disableflags, model.opt.enableflags = before
+
+
+SPACING = 0.05
+"""Between the bodies of a scene in m: none touches its neighbour."""
+
+FOOT = 2e-3
+"""Radius in m of the balls that a plate stands on, one contact each."""
+
+BALL = 0.01
+"""Radius in m of a ball, and half the edge of a box."""
+
+MOST = 200_000
+"""Triangles at most: more take MuJoCo minutes to compile."""
+
+_FRAME = """
+<mujoco model="{name}">
+  <option gravity="0 0 {gravity}" cone="elliptic"><flag diagexact="enable"/></option>
+  <default>
+    <geom solref="0.002 1" solimp="0.9 0.95 0.001 0.5 2" friction="0.4 0 0" condim="3"/>
+  </default>
+  {assets}
+  <worldbody>
+    {bodies}
+  </worldbody>
+</mujoco>"""
+
+
+@dataclass(frozen=True, slots=True)
+class Family:
+    """Scenes that differ in one count.
+
+    Attributes:
+        name: In tables.
+        unit: What is counted.
+        about: What the scenes are, in a sentence.
+        sizes: The counts.
+        build: Returns the scene of a count.
+    """
+
+    name: str
+    unit: str
+    about: str
+    sizes: tuple[int, ...]
+    build: Callable[[int], Scene]
+
+
+def floating(count: int) -> Scene:
+    """Returns ``count`` free balls, the tool among them, that touch nothing."""
+    return _scene("bodies", _tool_ball() + _others(count - 1, _ball), gravity=0.0)
+
+
+def plate(count: int) -> Scene:
+    """Returns a tool that stands on ``count`` feet, as near to a square as they divide."""
+    _check(count, 100_000)
+    # a full rectangle: a body that stands on one side of itself would tilt
+    rows = max(n for n in range(1, int(count**0.5) + 1) if count % n == 0)
+    columns = count // rows
+    feet = "".join(
+        f'<geom type="sphere" size="{FOOT}" mass="0" pos="{x} {y} 0"/>'
+        for x in 3 * FOOT * (np.arange(columns) - (columns - 1) / 2)
+        for y in 3 * FOOT * (np.arange(rows) - (rows - 1) / 2)
+    )
+    tool = (
+        f'<body name="tool" pos="0 0 {FOOT}"><freejoint/>'
+        f'<inertial pos="0 0 0" mass="0.1" diaginertia="1e-4 1e-4 1e-4"/>{feet}'
+        '<site name="grip"/></body>'
+    )
+    return _scene("contacts", _FLOOR + tool)
+
+
+def mesh_ball(count: int) -> Scene:
+    """Returns a tool that is a convex mesh of about ``count`` triangles on a box."""
+    _check(count, MOST)
+    points = " ".join(f"{value:.6g}" for value in (BALL * sphere(count // 2 + 2)).ravel())
+    assets = f'<asset><mesh name="ball" vertex="{points}"/></asset>'
+    tool = (
+        f'<body name="tool" pos="0 0 {BALL}"><freejoint/>'
+        '<geom type="mesh" mesh="ball" mass="0.1"/><site name="grip"/></body>'
+    )
+    floor = '<geom type="box" size="1 1 0.1" pos="0 0 -0.1"/>'
+    return _scene("triangles", floor + tool, assets=assets)
+
+
+def resting(count: int) -> Scene:
+    """Returns a free tool beside ``count`` boxes that rest on the floor, four contacts each."""
+    return _scene("resting", _FLOOR + _tool_ball(0.3) + _others(count, _box))
+
+
+def sphere(count: int) -> NDArray[np.float64]:
+    """Returns points spread evenly on the unit sphere (Fibonacci's lattice), shape (count, 3).
+
+    Their convex hull has 2 count − 4 triangles.
+    """
+    index = np.arange(count) + 0.5
+    height, angle = 1 - 2 * index / count, np.pi * (1 + 5**0.5) * index
+    ring = np.sqrt(1 - height**2)
+    return np.stack([ring * np.cos(angle), ring * np.sin(angle), height], axis=-1)
+
+
+FAMILIES = (
+    Family(
+        "bodies",
+        "free bodies",
+        "free balls that touch nothing",
+        (1, 2, 5, 10, 20, 50, 100, 200),
+        floating,
+    ),
+    Family(
+        "contacts",
+        "contacts",
+        "one body that stands on many feet",
+        (1, 3, 10, 30, 100, 200, 500),
+        plate,
+    ),
+    Family(
+        "triangles",
+        "triangles",
+        "a ball that is a convex mesh, on a box",
+        (12, 100, 1000, 10_000, 100_000),
+        mesh_ball,
+    ),
+    Family(
+        "resting",
+        "boxes at rest",
+        "on the floor, four contacts each",
+        (1, 3, 10, 30, 100),
+        resting,
+    ),
+)
+
+_FLOOR = '<geom name="floor" type="plane" size="20 20 1"/>'
+
+
+def _scene(name: str, bodies: str, *, gravity: float = -9.81, assets: str = "") -> Scene:
+    return scene_of(_FRAME.format(name=name, gravity=gravity, assets=assets, bodies=bodies))
+
+
+def _tool_ball(height: float = 0.0) -> str:
+    return (
+        f'<body name="tool" pos="0 0 {height}" gravcomp="1"><freejoint/>'
+        f'<geom type="sphere" size="{BALL}" mass="0.1"/><site name="grip"/></body>'
+    )
+
+
+def _others(count: int, body: Callable[[float, float], str]) -> str:
+    _check(count + 1, 10_000)
+    side = int(np.ceil(np.sqrt(max(count, 1))))
+    return "".join(body(SPACING * (1 + i % side), SPACING * (1 + i // side)) for i in range(count))
+
+
+def _ball(x: float, y: float) -> str:
+    return (
+        f'<body pos="{x} {y} 0"><freejoint/><geom type="sphere" size="{BALL}" mass="0.1"/></body>'
+    )
+
+
+def _box(x: float, y: float) -> str:
+    return (
+        f'<body pos="{x} {y} {BALL}"><freejoint/>'
+        f'<geom type="box" size="{BALL} {BALL} {BALL}" mass="0.1"/></body>'
+    )
+
+
+def _check(count: int, most: int) -> None:
+    if not 1 <= count <= most:
+        raise StudyError(f"a scene of {count} is asked for; it must be 1 to {most}")
+
+
+ROUNDS = 3
+"""How often every scene is run, in turn with the others."""
+
+LARGE = 0.1
+"""Share of a family's largest size from which on its exponent is fitted, no unit: below, the cost
+that every tick has hides the growth."""
+
+
+@dataclass(frozen=True, slots=True)
+class Work:
+    """What a scene cost.
+
+    Attributes:
+        family: Its name.
+        variant: Its name.
+        size: The count that was asked for.
+        contacts: Contacts at the end.
+        rows: Constraint rows at the end.
+        freedoms: Degrees of freedom.
+        time: Of a tick in s, all rounds together.
+        low: Least median of a round in s.
+        high: Largest.
+        rate: Hz at which the 99th percentile of a tick fills half a period.
+    """
+
+    family: str
+    variant: str
+    size: int
+    contacts: int
+    rows: int
+    freedoms: int
+    time: TimingStats
+    low: float
+    high: float
+    rate: float
+
+
+@dataclass(frozen=True, slots=True)
+class Growth:
+    """How the time of a tick goes with the size: time ~ size^p.
+
+    Attributes:
+        exponent: p, fitted to the larger sizes; no unit.
+        low: Least p from one of these sizes to the next.
+        high: Largest. Far from ``low``, the growth is no power of the size.
+        start: Smallest size of the fit.
+    """
+
+    exponent: float
+    low: float
+    high: float
+    start: float
+
+
+@dataclass(frozen=True, slots=True)
+class WorkChart:
+    """Everything that was measured.
+
+    Attributes:
+        points: One per family, size and variant.
+        machine: In words.
+    """
+
+    points: tuple[Work, ...]
+    machine: str
+
+    def of(self, family: Family, variant: Variant) -> list[Work]:
+        """Returns the points of a family by size."""
+        return [p for p in self.points if (p.family, p.variant) == (family.name, variant.name)]
+
+    def variants(self, family: Family) -> list[Variant]:
+        """Returns the variants that a family was measured with."""
+        return [variant for variant in VARIANTS if self.of(family, variant)]
+
+    def growth(self, family: Family, variant: Variant) -> Growth | None:
+        """Returns how the time goes with the larger sizes; None for fewer than two."""
+        points = self.of(family, variant)
+        return growth_of(
+            np.array([each.size for each in points], dtype=np.float64),
+            np.array([each.time.median for each in points]),
+        )
+
+
+def growth_of(sizes: NDArray[np.float64], times: NDArray[np.float64]) -> Growth | None:
+    """Fits time ~ size^p to the sizes from ``LARGE`` of the largest on.
+
+    Args:
+        sizes: > 0, rising, shape (n,).
+        times: In s, > 0, shape (n,).
+
+    Returns:
+        None for fewer than two such sizes.
+    """
+    large = sizes >= LARGE * sizes.max(initial=0.0) * (1 - 1e-9)
+    if np.count_nonzero(large) < 2:
+        return None
+    size, time = np.log(sizes[large]), np.log(times[large])
+    local = np.diff(time) / np.diff(size)
+    return Growth(
+        exponent=float(np.polyfit(size, time, 1)[0]),
+        low=float(local.min()),
+        high=float(local.max()),
+        start=float(sizes[large][0]),
+    )
+
+
+def measure_work(
+    families: tuple[Family, ...] = FAMILIES,
+    *,
+    most: int | None = None,
+    rounds: int = ROUNDS,
+    clock: Callable[[], int] = time.thread_time_ns,
+    progress: Callable[[int, int], None] | None = None,
+) -> WorkChart:
+    """Times ticks of scenes that grow, all in turn, on one core.
+
+    Bodies at rest are measured with every variant, the others as the bridge runs them.
+
+    Args:
+        families: What grows.
+        most: Largest size; None for all.
+        rounds: How often every scene is run.
+        clock: Time in ns; by default the thread's own, in which nothing else of the machine counts.
+        progress: Called with the runs done and all of them.
+    """
+    jobs = [
+        (family, variant, size)
+        for family in families
+        for size in family.sizes
+        if most is None or size <= most
+        for variant in (VARIANTS if family.name == "resting" else (USUAL,))
+    ]
+    scenes: dict[tuple[str, int], Scene] = {}
+    times: dict[int, list[NDArray[np.float64]]] = {i: [] for i in range(len(jobs))}
+    counts: dict[int, tuple[int, int, int]] = {}
+    with one_core() as core:
+        for turn in range(rounds):
+            for index, (family, variant, size) in enumerate(jobs):
+                if progress is not None:
+                    progress(turn * len(jobs) + index, rounds * len(jobs))
+                key = (family.name, size)
+                if key not in scenes:
+                    scenes[key] = family.build(size)
+                times[index].append(tick_times(scenes[key], variant, clock))
+                data = scenes[key].data
+                counts[index] = int(data.ncon), int(data.nefc), int(scenes[key].model.nv)
+        where = machine(core)
+    if progress is not None:
+        progress(rounds * len(jobs), rounds * len(jobs))
+    points = []
+    for index, (family, variant, size) in enumerate(jobs):
+        spread = TimingStats.of(np.concatenate(times[index]))
+        medians = [float(np.median(each)) for each in times[index]]
+        contacts, rows, freedoms = counts[index]
+        points.append(
+            Work(
+                family=family.name,
+                variant=variant.name,
+                size=size,
+                contacts=contacts,
+                rows=rows,
+                freedoms=freedoms,
+                time=spread,
+                low=min(medians),
+                high=max(medians),
+                rate=TICK_SHARE / spread.p99,
+            )
+        )
+    return WorkChart(tuple(points), where)
+
+
+RATE = 1000.0
+"""Hz that a paragraph asks for."""
+
+WORK_ENDINGS = (*PICTURES, "csv", "json")
+"""Of the files; there is no page."""
+
+HOLDS = f"A rate is held where 99 of 100 ticks take at most {100 * TICK_SHARE:g} % of its period"
+"""What the paragraph means by that."""
+
+ROOM = 15.0
+"""How far the axis of time goes beyond half of a tick, a ratio without unit: the legend stands
+above the curves."""
+
+COLOURS = ("#1a5fb4", "#e08a00", "#2e8b57", "#b3261e")
+
+
+def draw_work(chart: WorkChart) -> Figure:
+    """Draws the tick's time over the count, a panel for each way to grow."""
+    figure = new_figure(8, 7)
+    panels = figure.subplots(2, 2, sharey=True)
+    for axes, family in zip(panels.ravel(), FAMILIES, strict=True):
+        _draw_family(axes, chart, family)
+    figure.suptitle(
+        "Processor time of a tick at 1 kHz; n^p (least and largest p between two sizes)\n"
+        f"{chart.machine}",
+        fontsize="medium",
+        parse_math=False,
+    )
+    return figure
+
+
+def _draw_family(axes: Axes, chart: WorkChart, family: Family) -> None:
+    axes.set_xlabel(f"{family.unit}: {family.about}", fontsize="x-small")
+    if not chart.variants(family):
+        axes.set_title("not measured", fontsize="small")
+        return
+    for variant, colour in zip(chart.variants(family), COLOURS, strict=False):
+        points = chart.of(family, variant)
+        sizes = [each.size for each in points]
+        growth = chart.growth(family, variant)
+        told = variant.name if growth is None else f"{variant.name}: {_power(growth)}"
+        axes.plot(
+            sizes, [1e6 * p.time.median for p in points], "o-", color=colour, ms=4, label=told
+        )
+        axes.plot(sizes, [1e6 * p.time.p99 for p in points], ":", color=colour, lw=1)
+    axes.plot([], [], ":", color="grey", label="99th percentile")
+    axes.axhline(1e6 * TICK_SHARE / RATE, color="black", ls="--", lw=0.9)
+    axes.annotate(
+        "half of a tick at 1 kHz", (0.02, 1e6 * TICK_SHARE / RATE), va="bottom",
+        xycoords=("axes fraction", "data"), fontsize="x-small",
+    )  # fmt: skip
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    axes.set_ylabel("processor time of a tick (µs)", fontsize="small")
+    axes.grid(visible=True, alpha=0.3)
+    low, high = axes.get_ylim()
+    axes.set_ylim(low, max(high, ROOM * 1e6 * TICK_SHARE / RATE))
+    axes.legend(fontsize="xx-small", loc="upper left")
+
+
+def paragraph(chart: WorkChart) -> str:
+    """Says how the cost grows, and how much fits into a tick at 1 kHz."""
+    said = []
+    for family in FAMILIES:
+        points = chart.of(family, USUAL)
+        if not points:
+            continue
+        fit = [each.size for each in points if each.rate >= RATE]
+        last = points[-1]
+        most = f"up to {max(fit)} hold 1 kHz" if fit else "none holds 1 kHz"
+        said.append(
+            f"{family.unit}: {1e6 * points[0].time.median:.3g} µs a tick for {points[0].size}, "
+            f"{1e6 * last.time.median:.3g} µs for {last.size}"
+            f"{_grows(chart.growth(family, USUAL))}; {most}"
+        )
+        said += [_against(chart, family, last)] if len(chart.variants(family)) > 1 else []
+    told = [each[0].upper() + each[1:] for each in said if each]
+    return ". ".join([*told, HOLDS]) + "."
+
+
+def _grows(growth: Growth | None) -> str:
+    return "" if growth is None else f" (growing as {_power(growth)} from {growth.start:g} on)"
+
+
+def _power(growth: Growth) -> str:
+    return f"n^{growth.exponent:.2f} ({growth.low:.2f} to {growth.high:.2f})"
+
+
+def _against(chart: WorkChart, family: Family, last: Work) -> str:
+    """Says what islands and sleep are worth at the largest size."""
+    found = [chart.of(family, variant)[-1] for variant in chart.variants(family)]
+    if len(found) < len(VARIANTS):
+        return ""
+    usual, undivided, bare, asleep = found
+    return (
+        f"without islands a tick with {last.size} {family.unit} takes {_ratio(undivided, usual)} "
+        "times as long, and sleep, which a bridge refuses, would make MuJoCo's step "
+        f"{_ratio(bare, asleep)} times as fast"
+    )
+
+
+def _ratio(slow: Work, fast: Work) -> str:
+    """Returns a ratio of medians with the least and the largest that the rounds leave possible."""
+    least, most = slow.low / fast.high, slow.high / fast.low
+    return f"{slow.time.median / fast.time.median:.3g} ({least:.3g} to {most:.3g})"
+
+
+def write_work(chart: WorkChart, paths: Mapping[str, Path]) -> dict[str, Any]:
+    """Writes picture, table and JSON; returns what is in the JSON file.
+
+    Args:
+        chart: What was measured.
+        paths: By ending, as ``prepared_files`` returned them.
+
+    Raises:
+        HapticBridgeError: A file cannot be written.
+    """
+    rows = [_row(each) | {"machine": chart.machine} for each in chart.points]
+    growths = {
+        family.name: {
+            variant.name: None if growth is None else asdict(growth)
+            for variant in chart.variants(family)
+            for growth in (chart.growth(family, variant),)
+        }
+        for family in FAMILIES
+    }
+    said = {
+        "machine": chart.machine,
+        "paragraph": paragraph(chart),
+        "growth": growths,
+        "points": rows,
+    }
+    texts = {"csv": csv_text(rows), "json": json.dumps(said, indent=2, allow_nan=False) + "\n"}
+    write_files(paths, texts, draw_work(chart))
+    return said
+
+
+def _row(each: Work) -> dict[str, object]:
+    row = asdict(each)
+    spread = row.pop("time")
+    return row | {f"time_{name}": value for name, value in spread.items()}

@@ -1,0 +1,281 @@
+"""Device, hand and scene in one compiled loop: what a bridge would do, as fast as it goes.
+
+The loop inlines the functions of the live tick around MuJoCo's C symbol and the simulated device's
+exact step, and lets the interpreter lock go, so that threads run side by side. Record for record it
+is what ``Bridge.run`` writes for the same device.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticbridge.arguments import Arguments
+from hapticbridge.coupling import Coupling
+from hapticbridge.device import SimulatedDevice
+from hapticbridge.device.simulated.dynamics import STATE_DTYPE as DEVICE_DTYPE
+from hapticbridge.device.simulated.dynamics import next_sample
+from hapticbridge.errors import StudyError
+from hapticbridge.jit import compiled_for_threads, direct
+from hapticbridge.kernel.codes import OK
+from hapticbridge.kernel.state import STATE_DTYPE, BoundKernel
+from hapticbridge.kernel.tick import advance, after_step, before_step
+from hapticbridge.options import run_parameters
+from hapticbridge.record import SAMPLE_DTYPE, TICK_DTYPE
+from hapticbridge.rendering import Method, prepare
+from hapticbridge.scene import Scene
+from hapticbridge.summary import Ledger
+from hapticbridge.theory.sampled_loop import decays
+
+PARTS = 16
+"""Parts of a period in which jitter is counted. The device is exact between any two of them; more
+parts resolve jitter finer and cost a device step each."""
+
+_TIMING_ARGUMENTS = Arguments(StudyError)
+
+
+@dataclass(frozen=True, slots=True)
+class Timing:
+    """When ticks happen, as a share of the period and without unit.
+
+    Attributes:
+        jitter: Every tick is late by a random share in [0, jitter] of the period, 0 <= jitter < 1,
+            in whole sixteenths, of which every one up to jitter is equally likely; below 1/16 no
+            tick is late.
+        drops: Share of ticks that are missed, 0 <= drops < 1: the wrench is held on.
+        seed: Of the random numbers.
+
+    Raises:
+        StudyError: A value is no number or out of range.
+    """
+
+    jitter: float = 0.0
+    drops: float = 0.0
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name in ("jitter", "drops"):
+            value = _TIMING_ARGUMENTS.number(name, getattr(self, name), least=0.0)
+            if not value < 1:
+                raise StudyError(f"{name} is {value!r}; it must be a share, 0 <= {name} < 1")
+            object.__setattr__(self, name, value)
+        _TIMING_ARGUMENTS.whole("seed", self.seed, least=0, most=2**63 - 1)
+
+    @property
+    def is_even(self) -> bool:
+        """Whether every tick comes on time."""
+        return self.jitter < 1 / PARTS and self.drops == 0
+
+    def intervals(self, ticks: int) -> NDArray[np.int64]:
+        """Returns the time before each tick in sixteenths of the period, shape (ticks,)."""
+        generator = np.random.default_rng(self.seed)
+        late = generator.integers(0, int(self.jitter * PARTS) + 1, ticks)
+        missed = generator.geometric(1 - self.drops, ticks) - 1 if self.drops else 0
+        return np.asarray(PARTS * (1 + missed) + np.diff(late, prepend=0), dtype=np.int64)
+
+
+LEVER = 0.05
+"""Length in m that turns a torque into a force, so that one signal shows both diverge: half the
+width of a hand. It weighs the two against each other and decides nothing."""
+
+HUGE = 1e5
+"""Signal in N at which a run has diverged beyond doubt and ends, before MuJoCo's own limit on
+accelerations (1e10 in SI units) warns and resets."""
+
+FLOOR = 1e-6
+"""Signal in N that counts as none: MuJoCo's solver leaves 3e-8 N on a free mass at its default
+tolerance, whatever the motion."""
+
+LEAST_TICKS = 50
+"""Ticks of a run: a fifth of it is the window in which a decay is looked for, and ten samples are
+the fewest that show one."""
+
+MOST_TICKS = 10**9
+"""Ticks of a run at most: beyond, its signal alone would not fit into memory."""
+
+_ARGUMENTS = Arguments(StudyError)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LoopOutcome:
+    """What a run in the closed loop came to.
+
+    Attributes:
+        ticks: How many were done; fewer than asked where it diverged.
+        is_stable: Whether what a knock left falls from the fourth to the last fifth of the run. A
+            tool that was thrown out of contact decays too: ``fault`` tells of the energy it got.
+        environment: ``strict``, ``within slack`` or ``active``.
+        created: The largest Σ E_k so far at any tick, in J: > 0 where (14) is violated.
+        slack_share: Largest share of the slack that was used, without unit.
+        first_active: Tick of the first violation of the slack, −1 for none.
+        fault: Tick and port of the first fault, ``environment`` or ``device``; None if passive. The
+            device is metered only where no coupling law gives the wrench; else see ``is_stable``.
+        peak_force: Largest force on the tool in N.
+        last_force: Largest signal in the last fifth, force and torque over ``LEVER``, in N.
+        device_energy: Given to the device in J.
+        records: ``TICK_DTYPE``, if they were asked for; else empty.
+    """
+
+    ticks: int
+    is_stable: bool
+    environment: str
+    created: float
+    slack_share: float
+    first_active: int
+    fault: tuple[int, str] | None
+    peak_force: float
+    last_force: float
+    device_energy: float
+    records: NDArray[np.void]
+
+
+class ClosedLoop:
+    """A scene of its own to run in; one per thread.
+
+    Args:
+        scene: A loaded scene; copied, so that runs do not disturb it or each other.
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        model = copy.copy(scene.model)
+        self.scene = replace(scene, model=model, data=copy.copy(scene.data))
+
+    def run(
+        self,
+        device: SimulatedDevice,
+        coupling: Coupling,
+        method: Method,
+        *,
+        period: float = 1e-3,
+        ticks: int = 2000,
+        substeps: int = 1,
+        knock: NDArray[np.float64] | None = None,
+        timing: Timing | None = None,
+        keep_records: bool = False,
+    ) -> LoopOutcome:
+        """Runs the loop from rest.
+
+        Args:
+            device: Device and hand; started anew.
+            coupling: K and B.
+            method: How the tool is rendered.
+            period: T in s.
+            ticks: How many, >= 50.
+            substeps: MuJoCo steps per tick.
+            knock: Displacement of the device before the first tick, shape (6,), in m and rad; no
+                number is beyond 1e30.
+            timing: Late and missed ticks; None: every one on time.
+            keep_records: Whether to return the records.
+
+        Raises:
+            HapticBridgeError: A value is out of range, or the method cannot render the scene.
+        """
+        _ARGUMENTS.whole("ticks", ticks, least=LEAST_TICKS, most=MOST_TICKS)
+        if knock is not None:
+            knock = _ARGUMENTS.numbers("knock", knock, "m or rad")
+            if knock.shape != (6,):
+                raise StudyError(f"knock has shape {knock.shape}; it must be 6 numbers")
+        scene = self.scene
+        felt = prepare(scene, coupling, period, substeps, method, warns=False)
+        is_even = timing is None or timing.is_even
+        sample = np.zeros(1, SAMPLE_DTYPE)
+        sample[:] = device.start(period, 1 if is_even else PARTS)
+        parameters = run_parameters(
+            scene,
+            coupling,
+            method,
+            sample,
+            period=period,
+            felt=felt,
+            substeps=substeps,
+            info=device.info,
+        )
+        binding = BoundKernel(scene.model, scene.data, parameters)
+        if knock is not None:
+            device.displace(knock)
+        intervals = (
+            np.ones(ticks, np.int64) if timing is None or is_even else timing.intervals(ticks)
+        )
+        records = np.zeros(ticks if keep_records else 0, TICK_DTYPE)
+        signal, most = np.zeros(ticks), np.zeros(1)
+        done = _machine_code()(
+            binding.state, *device.stepper, sample, binding.row, intervals, signal, most, records
+        )
+        state, ledger = binding.state, Ledger.of(binding.state)
+        last = signal[-(ticks // 5) :] if done == ticks else signal[:done]
+        return LoopOutcome(
+            ticks=done,
+            is_stable=decays(signal[:done], ticks, FLOOR),
+            environment=ledger.environment,
+            created=float(most[0]),
+            slack_share=ledger.slack_share,
+            first_active=int(state["first_active"][0]),
+            fault=ledger.fault,
+            peak_force=float(state["peak_force"][0]),
+            last_force=float(last.max(initial=0.0)),
+            device_energy=float(state["device_energy"][0]),
+            records=records[: min(done, records.size)],
+        )
+
+
+@compiled_for_threads
+def _run(
+    state: NDArray[np.void],
+    devices: NDArray[np.void],
+    motion: NDArray[np.float64],
+    sample: NDArray[np.void],
+    row: NDArray[np.void],
+    intervals: NDArray[np.int64],
+    signal: NDArray[np.float64],
+    most: NDArray[np.float64],
+    records: NDArray[np.void],
+) -> int:
+    """Runs one tick per interval; returns how many were completed."""
+    s, written = state[0], devices[0].written
+    for k in range(intervals.size):
+        # the first sample is the start: no time passes before it
+        for _ in range(intervals[k] if k > 0 else 1):
+            next_sample(devices, motion, sample)
+        elapsed = devices[0].period * intervals[k]
+        for substep in range(s.substeps):
+            if before_step(state, sample, row, substep, elapsed) != OK:
+                return k
+            advance(state)
+            if after_step(state, row, substep) != OK:
+                return k
+        wrench = row[0].wrench_on_device
+        for i in range(6):
+            written[i] = wrench[i]
+        w = row[0].wrench_on_tool
+        force = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
+        torque = w[3] * w[3] + w[4] * w[4] + w[5] * w[5]
+        signal[k] = np.sqrt(force + torque / LEVER**2)
+        most[0] = max(most[0], s.environment_energy)
+        if records.size > 0:
+            records[k] = row[0]
+        if not signal[k] < HUGE:
+            return k + 1 if k + 1 < intervals.size else k
+    return int(intervals.size)
+
+
+@cache
+def _machine_code() -> Callable[..., int]:
+    """Returns the compiled loop; found once, because looking up the types takes a millisecond."""
+    none = np.zeros(0)
+    return direct(
+        _run,
+        np.zeros(1, STATE_DTYPE),
+        np.zeros(1, DEVICE_DTYPE),
+        np.empty((0, 8)),
+        np.zeros(1, SAMPLE_DTYPE),
+        np.zeros(1, TICK_DTYPE),
+        np.zeros(0, np.int64),
+        none,
+        none,
+        np.zeros(0, TICK_DTYPE),
+    )

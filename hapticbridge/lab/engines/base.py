@@ -1,0 +1,438 @@
+"""What a physics engine is to the study: it opens a task, and the simulation can be stepped."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import sys
+import tempfile
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib import import_module
+from typing import BinaryIO, Literal, NamedTuple, Protocol, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticbridge.arguments import Arguments
+from hapticbridge.coupling import Coupling
+from hapticbridge.device.trajectory import Motion, pose_at
+from hapticbridge.errors import StudyError, choices
+from hapticbridge.pose import (
+    Quaternion,
+    Vector,
+    add,
+    canonical,
+    conjugate,
+    product,
+    rotated,
+    scaled,
+)
+
+_STDOUT = 1
+"""File descriptor that C code prints to, whatever Python's ``sys.stdout`` is."""
+
+
+@contextmanager
+def caught_prints(told: Callable[[str], None]) -> Iterator[None]:
+    """Catches everything that is printed on stdout inside, from C too, and tells it afterwards.
+
+    PyBullet prints two lines whenever a world is opened; between braces of JSON they would be the
+    end of it. Each line is told once, however often it was printed.
+
+    Args:
+        told: Called with each different line, in the order of their first appearance.
+    """
+    try:
+        kept = os.dup(_STDOUT)
+    except OSError:  # a process without stdout has none to keep clean
+        yield
+        return
+    with tempfile.TemporaryFile() as file:
+        try:
+            _flush()
+            os.dup2(file.fileno(), _STDOUT)
+            try:
+                yield
+            finally:
+                # C keeps lines in memory where stdout is no terminal; they belong to this file
+                _flush()
+                os.dup2(kept, _STDOUT)
+        finally:
+            os.close(kept)
+            for line in _lines(file):
+                told(line)
+
+
+def _flush() -> None:
+    if sys.stdout is not None:
+        sys.stdout.flush()
+    ctypes.CDLL(None).fflush(None)
+
+
+def _lines(file: BinaryIO) -> list[str]:
+    file.seek(0)
+    lines = file.read().decode("utf-8", "replace").splitlines()
+    return list(dict.fromkeys(line.strip() for line in lines if line.strip()))
+
+
+Kind = Literal["box", "sphere", "capsule", "mesh"]
+SIZES = {"box": 3, "sphere": 1, "capsule": 2, "mesh": 0}
+"""How many numbers the size of a shape has."""
+
+NORM_TOLERANCE = 1e-9
+"""How far a quaternion's norm may be from 1, without unit: rounding, and no scaling by mistake."""
+
+MOST_STEPS = 10**8
+"""Longest run in steps: a day at 1 kHz."""
+
+_ARGUMENTS = Arguments(StudyError)
+
+
+class Pose(NamedTuple):
+    """A position in m and an orientation, a unit quaternion (w, x, y, z)."""
+
+    position: Vector = (0.0, 0.0, 0.0)
+    quaternion: Quaternion = (1.0, 0.0, 0.0, 0.0)
+
+
+class Velocity(NamedTuple):
+    """Velocity of the tool's centre of mass in m/s and angular velocity in rad/s, world frame."""
+
+    linear: Vector = (0.0, 0.0, 0.0)
+    angular: Vector = (0.0, 0.0, 0.0)
+
+
+ORIGIN = Pose()
+AT_REST = Velocity()
+
+
+def check_pose(name: str, pose: Pose) -> None:
+    """Refuses a pose that is not finite or whose quaternion is not of norm 1 within 1e-9.
+
+    Raises:
+        StudyError: It is so.
+    """
+    _vector(f"{name} position", pose.position, "m")
+    quaternion = _ARGUMENTS.numbers(f"{name} quaternion", pose.quaternion)
+    norm = float(np.linalg.norm(quaternion))
+    if quaternion.shape != (4,) or not abs(norm - 1.0) <= NORM_TOLERANCE:
+        raise StudyError(
+            f"{name} quaternion is {pose.quaternion}; it must be four numbers of norm 1 "
+            f"within {NORM_TOLERANCE:g}"
+        )
+
+
+def composed(outer: Pose, inner: Pose) -> Pose:
+    """Returns in the world frame the pose ``inner``, which is given in the frame ``outer``."""
+    position = add(outer.position, rotated(outer.quaternion, inner.position))
+    return Pose(position, canonical(product(outer.quaternion, inner.quaternion)))
+
+
+def inverted(pose: Pose) -> Pose:
+    """Returns the pose of the world in the frame ``pose``."""
+    back = conjugate(pose.quaternion)
+    return Pose(rotated(back, scaled(-1.0, pose.position)), canonical(back))
+
+
+def _vector(name: str, value: Vector, unit: str) -> None:
+    if _ARGUMENTS.numbers(name, value, unit).shape != (3,):
+        raise StudyError(f"{name} is {value}; it must be three numbers in {unit}")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Shape:
+    """A convex shape, in the frame of its body (of the world, where it is fixed).
+
+    Attributes:
+        kind: ``box``, ``sphere``, ``capsule`` or ``mesh``.
+        size: In m: half edges of a box; radius of a sphere; radius and half length of a capsule's
+            cylinder, which lies along its z axis; nothing for a mesh.
+        position: Of its centre, in m.
+        quaternion: Of its axes.
+        vertices: Of a mesh, in its own frame, in m, shape (n, 3), n >= 4: the shape is their convex
+            hull.
+
+    Raises:
+        StudyError: A value is not finite, out of range or mis-shaped.
+    """
+
+    kind: Kind
+    size: tuple[float, ...]
+    position: Vector = (0.0, 0.0, 0.0)
+    quaternion: Quaternion = (1.0, 0.0, 0.0, 0.0)
+    vertices: NDArray[np.float64] | None = None
+
+    def __post_init__(self) -> None:
+        if self.kind not in get_args(Kind):
+            raise StudyError(f"shape kind is {self.kind!r}; kinds: {choices(get_args(Kind))}")
+        if len(self.size) != SIZES[self.kind]:
+            raise StudyError(
+                f"size of a {self.kind} has {len(self.size)} numbers; it has {SIZES[self.kind]}"
+            )
+        if self.size:
+            _ARGUMENTS.numbers(f"{self.kind} size", self.size, "m", least=0, is_open=True)
+        check_pose("shape", self.pose)
+        if (self.vertices is None) == (self.kind == "mesh"):
+            raise StudyError("a mesh has vertices, and no other shape has")
+        if self.vertices is not None:
+            points = _ARGUMENTS.numbers("mesh vertices", self.vertices, "m")
+            if points.ndim != 2 or points.shape[1] != 3 or len(points) < 4:
+                raise StudyError(
+                    f"mesh vertices have shape {points.shape}; they must be (n, 3) with n >= 4"
+                )
+
+    @property
+    def pose(self) -> Pose:
+        """Position and axes as one."""
+        return Pose(self.position, self.quaternion)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Body:
+    """The tool: one rigid body, free in space.
+
+    Attributes:
+        mass: In kg, > 0.
+        inertia: Principal moments in kg m², > 0, none larger than the sum of the other two.
+        inertia_frame: Centre of mass and principal axes in the body's frame.
+        shapes: In the body's frame; may be empty.
+        friction: Coulomb's coefficient of every contact, without unit, >= 0.
+
+    Raises:
+        StudyError: A value is not finite or out of range.
+    """
+
+    mass: float
+    inertia: Vector
+    inertia_frame: Pose = ORIGIN
+    shapes: tuple[Shape, ...] = ()
+    friction: float = 0.0
+
+    def __post_init__(self) -> None:
+        _ARGUMENTS.number("mass", self.mass, "kg", least=0, is_open=True)
+        moments = _ARGUMENTS.numbers("inertia", self.inertia, "kg m²", least=0, is_open=True)
+        # 1e-9 for moments of a flat body, whose largest equals the sum by rounding
+        if moments.shape != (3,) or 2 * moments.max() > moments.sum() * (1 + 1e-9):
+            raise StudyError(
+                f"inertia is {self.inertia}; it must be three moments in kg m², "
+                "none larger than the sum of the other two"
+            )
+        check_pose("inertia frame", self.inertia_frame)
+        _ARGUMENTS.number("friction", self.friction, least=0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Task:
+    """What an engine has to simulate: a free tool among fixed shapes, moved by the coupling.
+
+    Attributes:
+        name: For tables and messages.
+        body: The tool.
+        fixed: The fixed shapes, in the world frame.
+        gravity: In m/s².
+        coupling: Between handle and grip; None leaves the tool alone.
+        grip: Pose of the grip in the body's frame.
+        start: Pose of the body's frame at the start.
+        start_velocity: Of its centre of mass, and about it.
+        handle: Poses of the handle in the world frame over time; None: it stays at the grip's pose
+            at the start.
+
+    Raises:
+        StudyError: A value is not finite or mis-shaped.
+    """
+
+    name: str
+    body: Body
+    fixed: tuple[Shape, ...] = ()
+    gravity: Vector = (0.0, 0.0, 0.0)
+    coupling: Coupling | None = None
+    grip: Pose = ORIGIN
+    start: Pose = ORIGIN
+    start_velocity: Velocity = AT_REST
+    handle: Motion | None = None
+
+    def __post_init__(self) -> None:
+        _vector("gravity", self.gravity, "m/s²")
+        check_pose("grip", self.grip)
+        check_pose("start", self.start)
+        _vector("start velocity", self.start_velocity.linear, "m/s")
+        _vector("start angular velocity", self.start_velocity.angular, "rad/s")
+
+    def handle_poses(self, timestep: float, steps: int) -> list[Pose]:
+        """Returns the handle's poses h_0 … h_N at the times 0, T, … N T.
+
+        Args:
+            timestep: T in s.
+            steps: N.
+
+        Raises:
+            StudyError: The timestep is not finite and positive, or N < 1.
+        """
+        check_timestep(timestep)
+        _ARGUMENTS.whole("steps", steps, least=1, most=MOST_STEPS)
+        if self.handle is None:
+            return [composed(self.start, self.grip)] * (steps + 1)
+        found, cursor = [], 0
+        for k in range(steps + 1):
+            cursor, position, quaternion = pose_at(self.handle.table, k * timestep, cursor)
+            found.append(Pose(position, quaternion))
+        return found
+
+
+def check_timestep(timestep: float) -> float:
+    """Returns a timestep in s, one finite number > 0.
+
+    Raises:
+        StudyError: It is not.
+    """
+    return _ARGUMENTS.number("timestep", timestep, "s", least=0, is_open=True)
+
+
+class Wrench(NamedTuple):
+    """Force in N and torque in N m about the grip, in the world frame."""
+
+    force: Vector
+    torque: Vector
+
+
+class Contacts(NamedTuple):
+    """The contacts of one step as the engine tells of them.
+
+    Attributes:
+        points: Points (or, where an engine has contact patches, patches) that touch.
+        depth: Deepest penetration in m, >= 0; 0 without contact.
+    """
+
+    points: int
+    depth: float
+
+    @classmethod
+    def of(cls, depths: Iterable[float]) -> Contacts:
+        """Returns what points of these depths in m, negative where they are apart, come to."""
+        touching = [depth for depth in depths if depth >= 0]
+        return cls(len(touching), max(touching, default=0.0))
+
+
+class Setting(NamedTuple):
+    """One setting of an engine: what it is set to, and the page of its documentation for it."""
+
+    value: str
+    source: str
+
+
+class Simulation(Protocol):
+    """A task in an engine, at some step. Step 0 is the start."""
+
+    def step(self, handle_position: Vector, handle_quaternion: Quaternion) -> None:
+        """Goes from step k − 1 to step k, at whose end the handle is at h_k.
+
+        A held coupling acts on the tool during the step with f_{k−1}; f_k is computed at its end.
+        """
+
+    def advance(self, force: Vector, torque: Vector) -> None:
+        """Sets a force in N and a torque in N m at the centre of mass and steps: what is timed."""
+
+    def pose(self) -> Pose:
+        """Returns the pose of the body's frame."""
+
+    def velocity(self) -> Velocity:
+        """Returns the velocity of the centre of mass and the angular velocity."""
+
+    def wrench(self) -> Wrench:
+        """Returns the coupling's wrench f_k on the tool, about the grip."""
+
+    def contacts(self) -> Contacts:
+        """Returns the contacts of the last step."""
+
+    def close(self) -> None:
+        """Gives back what the engine holds. Closing twice is allowed."""
+
+
+class Engine(Protocol):
+    """A physics engine, tuned as its own documentation advises."""
+
+    @property
+    def name(self) -> str:
+        """What ``--engines`` calls it."""
+
+    @property
+    def version(self) -> str:
+        """Version of the installed library."""
+
+    @property
+    def settings(self) -> Mapping[str, Setting]:
+        """Every setting that was made, and where its documentation advises it."""
+
+    def open(self, task: Task, timestep: float) -> Simulation:
+        """Sets a task up, with steps of ``timestep`` in s.
+
+        Raises:
+            StudyError: The engine cannot describe the task, or the timestep is out of range.
+        """
+
+
+_PACKAGE = "hapticbridge.lab.engines"
+
+_MODULES = {
+    "mujoco": "mujoco",
+    "ode": "ode",
+    "ode_spring": "ode",
+    "physx": "physx",
+    "physx_spring": "physx",
+    "pybullet": "bullet",
+    "pybullet_dantzig": "bullet",
+    "drake_point": "drake",
+    "drake_hydroelastic": "drake",
+}
+"""In which module an engine is: each has ``engines()``, and cannot be imported, or raises
+StudyError there, where its library is not installed."""
+
+
+class Engines(NamedTuple):
+    """The engines of this installation.
+
+    Attributes:
+        available: By name.
+        missing: By name, a sentence that says what is not installed and how to get it.
+    """
+
+    available: Mapping[str, Engine]
+    missing: Mapping[str, str]
+
+
+def engine_names() -> tuple[str, ...]:
+    """Returns the names of all engines, installed or not."""
+    return tuple(_MODULES)
+
+
+def available_engines() -> Engines:
+    """Imports every engine and says which are there."""
+    available: dict[str, Engine] = {}
+    missing: dict[str, str] = {}
+    for name in _MODULES:
+        try:
+            available[name] = open_engine(name)
+        except StudyError as error:
+            missing[name] = str(error)
+    return Engines(available, missing)
+
+
+def open_engine(name: str) -> Engine:
+    """Imports one engine.
+
+    Raises:
+        StudyError: There is none of that name, or its library is not installed; says how to get it.
+    """
+    if name not in _MODULES:
+        raise StudyError(f"no engine '{name}'; engines: {choices(_MODULES)}")
+    try:
+        module = import_module(f"{_PACKAGE}.{_MODULES[name]}")
+    except ImportError as error:
+        # what a library needs of the system (as libGL) may be missing where it is installed
+        raise StudyError(
+            f"engine '{name}' is not installed ({error}): pip install hapticbridge[peers]"
+        ) from None
+    found: tuple[Engine, ...] = module.engines()
+    return next(engine for engine in found if engine.name == name)

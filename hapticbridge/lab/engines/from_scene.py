@@ -1,0 +1,369 @@
+"""Describes a MuJoCo scene of one free tool among fixed shapes to other engines."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+
+import mujoco
+import numpy as np
+
+from hapticbridge.arguments import Array
+from hapticbridge.coupling import Coupling
+from hapticbridge.device.trajectory import Motion
+from hapticbridge.errors import StudyError
+from hapticbridge.jit import compiled
+from hapticbridge.kernel.codes import COUPLING_ACTUATORS
+from hapticbridge.lab.engines.base import (
+    SIZES,
+    Body,
+    Contacts,
+    Kind,
+    Pose,
+    Shape,
+    Task,
+    Velocity,
+    Wrench,
+    check_timestep,
+    composed,
+    inverted,
+)
+from hapticbridge.pose import (
+    ZERO_VECTOR,
+    Quaternion,
+    Vector,
+    add,
+    canonical,
+    cross,
+    product,
+    rotated,
+    rotation_between,
+    scaled,
+    subtract,
+)
+from hapticbridge.scene import Scene
+
+_KINDS: dict[int, Kind] = {
+    mujoco.mjtGeom.mjGEOM_BOX: "box",
+    mujoco.mjtGeom.mjGEOM_SPHERE: "sphere",
+    mujoco.mjtGeom.mjGEOM_CAPSULE: "capsule",
+    mujoco.mjtGeom.mjGEOM_MESH: "mesh",
+}
+
+_WITHOUT = (
+    mujoco.mjtDisableBit.mjDSBL_CONTACT,
+    mujoco.mjtDisableBit.mjDSBL_CONSTRAINT,
+    mujoco.mjtDisableBit.mjDSBL_GRAVITY,
+)
+
+
+def task_from_scene(
+    scene: Scene, motion: Motion | None = None, coupling: Coupling | None = None
+) -> Task:
+    """Returns the task that a scene of one free tool among fixed shapes sets.
+
+    MuJoCo's contact settings are left out: each engine has its own. Friction is that of the pairs
+    of geoms, as MuJoCo takes it the larger of the two.
+
+    Args:
+        scene: Its start is described; it is put there.
+        motion: Of the handle, counted from its first pose as ``check.motion_for`` returns it; it
+            begins where the grip is at the start. None: the handle rests there.
+        coupling: Between handle and grip; None leaves the tool alone.
+
+    Raises:
+        StudyError: It is none that other engines share. One body moves, on a free joint without
+            damping, armature or friction, and no other body is fixed to it; the geoms that touch
+            are boxes, spheres, capsules or convex meshes, each of the tool's against each of the
+            fixed, without margin and with one friction for sliding alone; there are no
+            constraints, tendons, fluid, or actuators of the scene's own.
+    """
+    scene.reset()
+    model, data = scene.model, scene.data
+    if fault := _fault(model):
+        raise StudyError(f"scene '{scene.name}' cannot be given to other engines: {fault}")
+    body_id = int(model.jnt_bodyid[0])
+    tool_ids, fixed_ids = _touching(scene, body_id)
+    start = _pose(data.xpos[body_id], data.xquat[body_id])
+    grip_in_world = _pose(scene.grip_pose()[:3], scene.grip_pose()[3:])
+    world_to_body = inverted(start)
+    inertia_frame = _pose(model.body_ipos[body_id], model.body_iquat[body_id])
+    body = Body(
+        mass=float(model.body_mass[body_id]),
+        inertia=_vector(model.body_inertia[body_id]),
+        inertia_frame=inertia_frame,
+        shapes=tuple(
+            _shape(model, i, _pose(model.geom_pos[i], model.geom_quat[i])) for i in tool_ids
+        ),
+        friction=_friction(scene, tool_ids, fixed_ids),
+    )
+    spin = rotated(start.quaternion, _vector(data.qvel[3:6]))
+    lever = subtract(composed(start, inertia_frame).position, start.position)
+    return Task(
+        name=scene.name,
+        body=body,
+        fixed=tuple(
+            _shape(model, i, _pose(data.geom_xpos[i], _quaternion(data.geom_xmat[i])))
+            for i in fixed_ids
+        ),
+        gravity=_vector(model.opt.gravity),
+        coupling=coupling,
+        grip=composed(world_to_body, grip_in_world),
+        start=start,
+        start_velocity=Velocity(add(_vector(data.qvel[:3]), cross(spin, lever)), spin),
+        handle=None if motion is None else _from(grip_in_world, motion),
+    )
+
+
+def _fault(model: mujoco.MjModel) -> str:
+    """Returns why other engines cannot be given a model; empty where they can."""
+    free = int(mujoco.mjtJoint.mjJNT_FREE)
+    if model.njnt != 1 or model.jnt_type[0] != free:
+        return f"it has {model.njnt} joint(s), and it must have a free joint and no other"
+    body_id = int(model.jnt_bodyid[0])
+    is_drag_free = model.opt.density == 0 and model.opt.viscosity == 0
+    faults = (
+        (int(np.sum(model.body_weldid == body_id)) > 1, "its tool is made of several bodies"),
+        (model.nmocap > 1, "it has moving mocap bodies"),
+        (model.neq > 0 or model.ntendon > 0, "it has constraints or tendons"),
+        (model.nu != len(COUPLING_ACTUATORS), "it has actuators of its own"),
+        (model.npair > 0 or model.nexclude > 0, "it has contact pairs of its own"),
+        (np.any(model.body_gravcomp), "it has gravity compensation"),
+        (
+            np.any(model.dof_damping)
+            or np.any(model.dof_armature)
+            or np.any(model.dof_frictionloss)
+            or np.any(model.jnt_stiffness),
+            "its free joint has damping, armature, friction or stiffness",
+        ),
+        (not is_drag_free or np.any(model.opt.wind), "it has a fluid"),
+        (any(model.opt.disableflags & bit for bit in _WITHOUT), "it has contact or gravity off"),
+    )
+    return next((clause for is_so, clause in faults if is_so), "")
+
+
+def _touching(scene: Scene, body_id: int) -> tuple[list[int], list[int]]:
+    """Returns the geoms of the tool and the fixed ones that can touch each other."""
+    model = scene.model
+    tool = [i for i in range(model.ngeom) if model.geom_bodyid[i] == body_id]
+    fixed = [i for i in range(model.ngeom) if model.geom_bodyid[i] != body_id]
+    own, affinity = model.geom_contype, model.geom_conaffinity
+    pairs = {(a, b) for a in tool for b in fixed if own[a] & affinity[b] or own[b] & affinity[a]}
+    tool_ids, fixed_ids = sorted({a for a, _ in pairs}), sorted({b for _, b in pairs})
+    fault = ""
+    if len(pairs) != len(tool_ids) * len(fixed_ids):
+        fault = "not every geom of the tool touches every fixed one"
+    for i in (*tool_ids, *fixed_ids):
+        kind = int(model.geom_type[i])
+        if kind not in _KINDS:
+            name = mujoco.mjtGeom(kind).name.removeprefix("mjGEOM_").lower()
+            fault = f"geom '{model.geom(i).name}' is a {name}; they share {', '.join(SIZES)}"
+        elif model.geom_margin[i] != 0 or model.geom_gap[i] != 0:
+            fault = f"geom '{model.geom(i).name}' has a margin or gap"
+    if fault:
+        raise StudyError(f"scene '{scene.name}' cannot be given to other engines: {fault}")
+    return tool_ids, fixed_ids
+
+
+def _friction(scene: Scene, tool_ids: list[int], fixed_ids: list[int]) -> float:
+    """Returns the friction that all pairs share."""
+    model, found = scene.model, set()
+    for a in tool_ids:
+        for b in fixed_ids:
+            rank = model.geom_priority[a] - model.geom_priority[b]
+            taken = (a, b) if rank == 0 else (a,) if rank > 0 else (b,)
+            dimensions = max(int(model.geom_condim[i]) for i in taken)
+            if dimensions > 3:
+                raise StudyError(
+                    f"scene '{scene.name}' cannot be given to other engines: it has torsional or "
+                    f"rolling friction (condim {dimensions}), which they do not share"
+                )
+            slides = dimensions == 3
+            found.add(max(float(model.geom_friction[i, 0]) for i in taken) if slides else 0.0)
+    if len(found) > 1:
+        raise StudyError(
+            f"scene '{scene.name}' cannot be given to other engines: its contacts differ in "
+            f"friction ({', '.join(f'{value:g}' for value in sorted(found))}), and a task has one"
+        )
+    return found.pop() if found else 0.0
+
+
+def _shape(model: mujoco.MjModel, geom_id: int, pose: Pose) -> Shape:
+    kind = _KINDS[int(model.geom_type[geom_id])]
+    vertices = None
+    if kind == "mesh":
+        mesh = int(model.geom_dataid[geom_id])
+        first, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
+        vertices = np.array(model.mesh_vert[first : first + count], dtype=np.float64)
+    size = tuple(float(value) for value in model.geom_size[geom_id][: SIZES[kind]])
+    return Shape(kind, size, pose.position, pose.quaternion, vertices)
+
+
+def _from(grip: Pose, motion: Motion) -> Motion:
+    """Returns a motion that is counted from its first pose, begun at the grip."""
+    table = motion.table
+    turned = [product(_four(row[4:]), grip.quaternion) for row in table]
+    return Motion(table[:, 0], table[:, 1:4] + np.asarray(grip.position), turned)
+
+
+def _pose(position: object, quaternion: object) -> Pose:
+    return Pose(_vector(position), canonical(_four(quaternion)))
+
+
+def _vector(values: object) -> tuple[float, float, float]:
+    x, y, z = (float(value) for value in np.asarray(values))
+    return x, y, z
+
+
+def _four(values: object) -> tuple[float, float, float, float]:
+    w, x, y, z = (float(value) for value in np.asarray(values))
+    return w, x, y, z
+
+
+def _quaternion(matrix: Array) -> Array:
+    quaternion = np.empty(4)
+    mujoco.mju_mat2Quat(quaternion, matrix)
+    return quaternion
+
+
+Frame = tuple[Vector, Quaternion]
+"""Position in m and orientation, as the compiler takes them."""
+
+_AT_ORIGIN = (ZERO_VECTOR, (1.0, 0.0, 0.0, 0.0))
+
+
+class HeldSimulation(ABC):
+    """A simulation whose coupling is a force and a torque that the engine is given every step.
+
+        f_k = K e_k + (B/T)(e_k − e_{k−1}),    e = h − x
+        τ_k = K_r φ_k + (B_r/T)(δφ_h − δφ_x),  φ = log(R_h R_xᵀ)
+
+    with the handle h and the grip x at the end of step k; step k + 1 is done under (f_k, τ_k),
+    moved to the centre of mass. This is ``mechanics.drive_mass``'s scheme ``held``. The handle has
+    not moved before step 0.
+
+    Engines know a body by its centre of mass: here a child's body is the frame of the principal
+    axes of inertia, for which ``_principal`` and ``_shape_pose`` translate. A child sets its engine
+    up in ``__init__`` after that of this class, and calls ``_begin`` last.
+    """
+
+    def __init__(self, task: Task, timestep: float) -> None:
+        """Takes the task.
+
+        Raises:
+            StudyError: The timestep is not finite and positive.
+        """
+        self._timestep = check_timestep(timestep)
+        coupling = task.coupling
+        self._gains = (
+            None
+            if coupling is None
+            else (
+                coupling.stiffness,
+                coupling.damping / timestep,
+                coupling.rotational_stiffness,
+                coupling.rotational_damping / timestep,
+            )
+        )
+        self._grip = (task.grip.position, task.grip.quaternion)
+        self._principal_in_body = task.body.inertia_frame
+        self._body_in_principal = inverted(task.body.inertia_frame)
+        self._centre = task.body.inertia_frame.position
+        self._handle: Frame = _AT_ORIGIN
+        self._tool: Frame = _AT_ORIGIN
+        self._wrench = self._at_centre = (ZERO_VECTOR, ZERO_VECTOR)
+
+    def _begin(self, task: Task) -> None:
+        """Computes the wrench of step 0."""
+        handle = task.handle_poses(self._timestep, 1)[0]
+        self._handle = (handle.position, handle.quaternion)
+        grip = composed(self.pose(), task.grip)
+        self._tool = (grip.position, grip.quaternion)
+        self._measure(self._handle)
+
+    def _principal(self, body: Pose) -> Pose:
+        """Returns the pose of the principal frame for a pose of the body's frame."""
+        return composed(body, self._principal_in_body)
+
+    def _shape_pose(self, shape: Shape) -> Pose:
+        """Returns the pose of one of the tool's shapes in the principal frame."""
+        return composed(self._body_in_principal, shape.pose)
+
+    def step(self, handle_position: Vector, handle_quaternion: Quaternion) -> None:
+        """Goes one step under the wrench of the last, and computes the next."""
+        self._couple((handle_position, handle_quaternion))
+        self._measure((handle_position, handle_quaternion))
+
+    def _couple(self, _handle: Frame) -> None:
+        """Does the step; a child whose engine has a spring of its own aims it at the handle."""
+        self.advance(*self._at_centre)
+
+    def wrench(self) -> Wrench:
+        """Returns the wrench on the tool about the grip."""
+        return Wrench(*self._wrench)
+
+    def _measure(self, handle: Frame) -> None:
+        if self._gains is None:
+            return
+        pose = self.pose()
+        self._tool, self._wrench, self._at_centre = _law(
+            self._gains,
+            (pose.position, pose.quaternion),
+            self._grip,
+            self._centre,
+            self._handle,
+            handle,
+            self._tool,
+        )
+        self._handle = handle
+
+    @abstractmethod
+    def advance(self, force: Vector, torque: Vector) -> None:
+        """Sets a force in N and a torque in N m at the centre of mass, and steps."""
+
+    @abstractmethod
+    def principal_pose(self) -> Pose:
+        """Returns the pose of the principal axes of inertia at the centre of mass."""
+
+    def pose(self) -> Pose:
+        """Returns the pose of the body's frame."""
+        return composed(self.principal_pose(), self._body_in_principal)
+
+    @abstractmethod
+    def velocity(self) -> Velocity:
+        """Returns the velocity of the centre of mass and the angular velocity."""
+
+    @abstractmethod
+    def contacts(self) -> Contacts:
+        """Returns the contacts of the last step."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Gives back what the engine holds."""
+
+
+@compiled
+def _law(
+    gains: tuple[float, float, float, float],
+    body: Frame,
+    grip: Frame,
+    centre: Vector,
+    handle_before: Frame,
+    handle: Frame,
+    tool_before: Frame,
+) -> tuple[Frame, tuple[Vector, Vector], tuple[Vector, Vector]]:
+    """Returns the grip's pose, the wrench about it, and the same wrench at the centre of mass."""
+    stiffness, damping, rotational_stiffness, rotational_damping = gains
+    position = add(body[0], rotated(body[1], grip[0]))
+    orientation = product(body[1], grip[1])
+    stretched = subtract(subtract(handle[0], handle_before[0]), subtract(position, tool_before[0]))
+    twisted = subtract(
+        rotation_between(handle_before[1], handle[1]),
+        rotation_between(tool_before[1], orientation),
+    )
+    force = add(scaled(stiffness, subtract(handle[0], position)), scaled(damping, stretched))
+    torque = add(
+        scaled(rotational_stiffness, rotation_between(orientation, handle[1])),
+        scaled(rotational_damping, twisted),
+    )
+    lever = subtract(position, add(body[0], rotated(body[1], centre)))
+    return (position, orientation), (force, torque), (force, add(torque, cross(lever, force)))

@@ -1,0 +1,468 @@
+"""ODE, the Open Dynamics Engine, through its C library.
+
+References:
+    ODE Manual, http://ode.org/wiki/index.php/Manual
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Mapping
+from ctypes import POINTER, Structure, c_char_p, c_double, c_int, c_uint, c_void_p
+from functools import cache
+from typing import Any, ClassVar
+
+import llvmlite.binding
+import numpy as np
+from numba import types
+from numpy.typing import NDArray
+
+from hapticbridge.arguments import Array
+from hapticbridge.errors import StudyError
+from hapticbridge.jit import compiled, direct
+from hapticbridge.kernel.mujoco_c import floats
+from hapticbridge.lab.engines.base import Contacts, Engine, Pose, Setting, Shape, Task, Velocity
+from hapticbridge.lab.engines.from_scene import Frame, HeldSimulation
+from hapticbridge.pose import (
+    ZERO_VECTOR,
+    Quaternion,
+    Vector,
+    add,
+    rotation_between,
+    scaled,
+    subtract,
+)
+
+_NAMES = ("libode.so.8", "libode.so.6", "libode.so", "libode.dylib")
+
+MISSING = (
+    "ODE is not installed: it comes as a system library, not from PyPI "
+    "(Debian and Ubuntu: apt install libode8)"
+)
+
+MOST_CONTACTS = 8
+"""Contacts of one pair of geoms: as many as two boxes can have in ODE."""
+
+APPROXIMATE_FRICTION = 0x7000
+"""``dContactApprox1``: friction in proportion to the normal force, not a constant box."""
+
+
+class Mass(Structure):
+    """``dMass`` in double precision."""
+
+    _fields_: ClassVar = [("mass", c_double), ("c", c_double * 4), ("inertia", c_double * 12)]
+
+
+class Surface(Structure):
+    """``dSurfaceParameters``."""
+
+    _fields_: ClassVar = [
+        ("mode", c_int),
+        *((name, c_double) for name in ("mu", "mu2", "rho", "rho2", "rhoN", "bounce")),
+        *((name, c_double) for name in ("bounce_vel", "soft_erp", "soft_cfm", "motion1")),
+        *((name, c_double) for name in ("motion2", "motionN", "slip1", "slip2")),
+    ]
+
+
+class ContactGeom(Structure):
+    """``dContactGeom``."""
+
+    _fields_: ClassVar = [
+        ("position", c_double * 4),
+        ("normal", c_double * 4),
+        ("depth", c_double),
+        ("geom_1", c_void_p),
+        ("geom_2", c_void_p),
+        ("side_1", c_int),
+        ("side_2", c_int),
+    ]
+
+
+class Contact(Structure):
+    """``dContact``."""
+
+    _fields_: ClassVar = [
+        ("surface", Surface),
+        ("geom", ContactGeom),
+        ("direction", c_double * 4),
+    ]
+
+
+_REAL, _ID, _INT = c_double, c_void_p, c_int
+_THREE = (_ID, _REAL, _REAL, _REAL)
+_QUATERNION = (_ID, POINTER(_REAL))
+_SIGNATURES: dict[str, tuple[Any, ...]] = {
+    "dInitODE2": (_INT, c_uint),
+    "dGetConfiguration": (c_char_p,),
+    "dSetMessageHandler": (None, _ID),
+    "dWorldCreate": (_ID,),
+    "dWorldDestroy": (None, _ID),
+    "dWorldSetGravity": (None, *_THREE),
+    "dWorldSetERP": (None, _ID, _REAL),
+    "dWorldSetCFM": (None, _ID, _REAL),
+    "dWorldSetContactSurfaceLayer": (None, _ID, _REAL),
+    "dBodyCreate": (_ID, _ID),
+    "dBodySetMass": (None, _ID, POINTER(Mass)),
+    "dMassSetParameters": (None, POINTER(Mass), *(_REAL,) * 10),
+    "dBodySetPosition": (None, *_THREE),
+    "dBodySetQuaternion": (None, *_QUATERNION),
+    "dBodySetLinearVel": (None, *_THREE),
+    "dBodySetAngularVel": (None, *_THREE),
+    "dBodyGetPosition": (POINTER(_REAL), _ID),
+    "dBodyGetQuaternion": (POINTER(_REAL), _ID),
+    "dBodyGetLinearVel": (POINTER(_REAL), _ID),
+    "dBodyGetAngularVel": (POINTER(_REAL), _ID),
+    "dBodySetFiniteRotationMode": (None, _ID, _INT),
+    "dBodySetGyroscopicMode": (None, _ID, _INT),
+    "dBodySetAutoDisableFlag": (None, _ID, _INT),
+    "dCreateBox": (_ID, *_THREE),
+    "dCreateSphere": (_ID, _ID, _REAL),
+    "dCreateCapsule": (_ID, _ID, _REAL, _REAL),
+    "dGeomDestroy": (None, _ID),
+    "dGeomSetBody": (None, _ID, _ID),
+    "dGeomSetPosition": (None, *_THREE),
+    "dGeomSetQuaternion": (None, *_QUATERNION),
+    "dGeomSetOffsetPosition": (None, *_THREE),
+    "dGeomSetOffsetQuaternion": (None, *_QUATERNION),
+    "dJointGroupCreate": (_ID, _INT),
+    "dJointGroupDestroy": (None, _ID),
+    "dJointAttach": (None, _ID, _ID, _ID),
+    "dJointCreateBall": (_ID, _ID, _ID),
+    "dJointSetBallAnchor": (None, *_THREE),
+    "dJointSetBallAnchor2": (None, *_THREE),
+    "dJointSetBallParam": (None, _ID, _INT, _REAL),
+    "dJointCreateAMotor": (_ID, _ID, _ID),
+    "dJointSetAMotorNumAxes": (None, _ID, _INT),
+    "dJointSetAMotorAxis": (None, _ID, _INT, _INT, _REAL, _REAL, _REAL),
+    "dJointSetAMotorAngle": (None, _ID, _INT, _REAL),
+    "dJointSetAMotorParam": (None, _ID, _INT, _REAL),
+}
+"""Type of the result, and of the arguments."""
+
+
+@cache
+def library() -> Any:
+    """Returns ODE's library, initialised, its functions' types declared.
+
+    Raises:
+        StudyError: It is not installed, or was built in single precision.
+    """
+    for name in _NAMES:
+        try:
+            found = ctypes.CDLL(name)
+        except OSError:
+            continue
+        llvmlite.binding.load_library_permanently(name)
+        break
+    else:
+        raise StudyError(MISSING)
+    for name, (result, *arguments) in _SIGNATURES.items():
+        function = getattr(found, name)
+        function.restype, function.argtypes = result, arguments
+    if b"ODE_double_precision" not in found.dGetConfiguration().split():
+        raise StudyError("the installed ODE was built in single precision; double is needed")
+    found.dInitODE2(0)
+    # it reports on a degenerate step, which is then done anyway
+    found.dSetMessageHandler(ctypes.cast(_SILENT, c_void_p))
+    return found
+
+
+def _silence(_number: int, _text: bytes, _arguments: int) -> None:
+    """Takes what ODE would print."""
+
+
+_SILENT = ctypes.CFUNCTYPE(None, c_int, c_char_p, c_void_p)(_silence)
+"""Kept here for as long as ODE may call it."""
+
+_POINTER, _WHOLE, _DOUBLE, _NOTHING = types.intp, types.int32, types.float64, types.void
+_collide: Any = types.ExternalFunction(
+    "dCollide", _WHOLE(_POINTER, _POINTER, _WHOLE, _POINTER, _WHOLE)
+)
+_create: Any = types.ExternalFunction("dJointCreateContact", _POINTER(*(_POINTER,) * 3))
+_attach: Any = types.ExternalFunction("dJointAttach", _NOTHING(*(_POINTER,) * 3))
+_empty: Any = types.ExternalFunction("dJointGroupEmpty", _NOTHING(_POINTER))
+_step: Any = types.ExternalFunction("dWorldStep", _WHOLE(_POINTER, _DOUBLE))
+_force: Any = types.ExternalFunction("dBodySetForce", _NOTHING(_POINTER, *(_DOUBLE,) * 3))
+_torque: Any = types.ExternalFunction("dBodySetTorque", _NOTHING(_POINTER, *(_DOUBLE,) * 3))
+
+
+@compiled
+def step(
+    ids: tuple[int, int, int],
+    pairs: NDArray[Any],
+    contacts: tuple[int, int, int, int],
+    timestep: float,
+    force: Vector,
+    torque: Vector,
+    depths: Array,
+) -> int:
+    """Sets force and torque, makes the contacts, steps, and removes them.
+
+    Args:
+        ids: World, body and group of joints.
+        pairs: Geoms that may touch, the tool's first, shape (n, 2).
+        contacts: Address of an array of ``MOST_CONTACTS`` contacts with their surfaces filled in,
+            size of one, where in it the geometry is, and where in that the depth is, in bytes.
+        timestep: In s.
+        force: At the centre of mass in N.
+        torque: In N m.
+        depths: Is filled with the contacts' depths in m.
+
+    Returns:
+        How many contacts there were.
+    """
+    world, body, group = ids
+    address, size, geometry, depth = contacts
+    _force(body, force[0], force[1], force[2])
+    _torque(body, torque[0], torque[1], torque[2])
+    total = 0
+    for i in range(pairs.shape[0]):
+        count = _collide(pairs[i, 0], pairs[i, 1], MOST_CONTACTS, address + geometry, size)
+        for j in range(count):
+            contact = address + j * size
+            depths[total] = floats(contact + geometry + depth, 1)[0]
+            total += 1
+            _attach(_create(world, group, contact), body, 0)
+    _step(world, timestep)
+    _empty(group)
+    return total
+
+
+LAYER = 1e-7
+"""Depth in m that a contact keeps. At 0 a settled tool's contacts come and go, and in two of six
+poses of the peg in its hole it chattered by 9 to 50 µm; the pose is wrong by about this depth."""
+
+CFM = 1e-7
+"""Constraint force mixing of the contacts in 1/kg times s: 1e-10, the default, leaves the equations
+of redundant contacts so near to singular that the solver stops early; at 1e-5 the peg sinks by
+0.1 µm."""
+
+_MANUAL = "ODE Manual"
+
+
+class OdeEngine:
+    """ODE with its direct solver."""
+
+    name = "ode"
+    settings: Mapping[str, Setting] = {
+        "coupling": Setting("held force", f"{_MANUAL}: Rigid Body Functions, Mass and force"),
+        "step": Setting("dWorldStep (direct solver)", f"{_MANUAL}: World, Stepping Functions"),
+        "ERP": Setting("0.2 (default)", f"{_MANUAL}: Concepts, How To Use ERP and CFM"),
+        "CFM": Setting(f"{CFM:g}", f"{_MANUAL}: Concepts, How To Use ERP and CFM"),
+        "contact surface layer": Setting(f"{LAYER:g} m", f"{_MANUAL}: World, Contact Parameters"),
+        "friction": Setting("dContactApprox1", f"{_MANUAL}: Joint Types, Contact"),
+        "rotation": Setting("finite", f"{_MANUAL}: Rigid Body Functions, Miscellaneous"),
+        "gyroscopic mode": Setting("on (default)", f"{_MANUAL}: Rigid Body Functions"),
+    }
+
+    @property
+    def version(self) -> str:
+        """ODE does not tell its own version, only how it was built."""
+        return str(library().dGetConfiguration().decode())
+
+    def open(self, task: Task, timestep: float) -> OdeSimulation:
+        """Sets a task up; see ``Engine.open``. It knows no convex meshes."""
+        return OdeSimulation(task, timestep)
+
+
+class OdeSimulation(HeldSimulation):
+    """A task in ODE."""
+
+    def __init__(self, task: Task, timestep: float) -> None:
+        super().__init__(task, timestep)
+        self._ode = ode = library()
+        for shape in (*task.body.shapes, *task.fixed):
+            if shape.kind == "mesh":
+                raise StudyError(f"task '{task.name}' has a mesh, which is not given to ODE")
+        self._world = world = ode.dWorldCreate()
+        ode.dWorldSetGravity(world, *task.gravity)
+        ode.dWorldSetERP(world, 0.2)
+        ode.dWorldSetCFM(world, CFM)
+        ode.dWorldSetContactSurfaceLayer(world, LAYER)
+        self._body = self._tool_in(world, task)
+        tools = [self._geom(shape, self._shape_pose(shape)) for shape in task.body.shapes]
+        fixed = [self._geom(shape, shape.pose, is_fixed=True) for shape in task.fixed]
+        self._geoms = [*tools, *fixed]
+        self._group = ode.dJointGroupCreate(0)
+        pairs = np.array([(a, b) for a in tools for b in fixed], dtype=np.intp).reshape(-1, 2)
+        self._buffer = (Contact * MOST_CONTACTS)()
+        for contact in self._buffer:
+            contact.surface.mode = APPROXIMATE_FRICTION
+            contact.surface.mu = task.body.friction
+        self._depths = np.empty(MOST_CONTACTS * len(pairs))
+        self._touching = 0
+        self._fixed_arguments = (
+            (world, self._body, self._group),
+            pairs,
+            (
+                ctypes.addressof(self._buffer),
+                ctypes.sizeof(Contact),
+                Contact.geom.offset,
+                ContactGeom.depth.offset,
+            ),
+            self._timestep,
+        )
+        nothing = (0.0, 0.0, 0.0)
+        self._step = direct(step, *self._fixed_arguments, nothing, nothing, self._depths)
+        self._begin(task)
+
+    def _tool_in(self, world: int, task: Task) -> int:
+        """Adds the tool's body and returns its address."""
+        ode, mass = self._ode, Mass()
+        body: int = ode.dBodyCreate(world)
+        ode.dMassSetParameters(mass, task.body.mass, 0, 0, 0, *task.body.inertia, 0, 0, 0)
+        ode.dBodySetMass(body, mass)
+        start = self._principal(task.start)
+        ode.dBodySetPosition(body, *start.position)
+        ode.dBodySetQuaternion(body, _array(start.quaternion))
+        ode.dBodySetLinearVel(body, *task.start_velocity.linear)
+        ode.dBodySetAngularVel(body, *task.start_velocity.angular)
+        ode.dBodySetFiniteRotationMode(body, 1)
+        ode.dBodySetGyroscopicMode(body, 1)
+        ode.dBodySetAutoDisableFlag(body, 0)
+        return body
+
+    def _geom(self, shape: Shape, pose: Pose, *, is_fixed: bool = False) -> int:
+        ode = self._ode
+        geom: int
+        if shape.kind == "box":
+            geom = ode.dCreateBox(None, *(2 * half for half in shape.size))
+        elif shape.kind == "sphere":
+            geom = ode.dCreateSphere(None, *shape.size)
+        else:
+            geom = ode.dCreateCapsule(None, shape.size[0], 2 * shape.size[1])
+        if is_fixed:
+            ode.dGeomSetPosition(geom, *pose.position)
+            ode.dGeomSetQuaternion(geom, _array(pose.quaternion))
+        else:
+            ode.dGeomSetBody(geom, self._body)
+            ode.dGeomSetOffsetPosition(geom, *pose.position)
+            ode.dGeomSetOffsetQuaternion(geom, _array(pose.quaternion))
+        return geom
+
+    def advance(self, force: Vector, torque: Vector) -> None:
+        """Sets a force in N and a torque in N m at the centre of mass, and steps."""
+        self._touching = self._step(*self._fixed_arguments, force, torque, self._depths)
+
+    def principal_pose(self) -> Pose:
+        """Returns the pose of the principal axes of inertia at the centre of mass."""
+        p, q = self._ode.dBodyGetPosition(self._body), self._ode.dBodyGetQuaternion(self._body)
+        return Pose((p[0], p[1], p[2]), (q[0], q[1], q[2], q[3]))
+
+    def velocity(self) -> Velocity:
+        """Returns the velocity of the centre of mass and the angular velocity."""
+        v, w = self._ode.dBodyGetLinearVel(self._body), self._ode.dBodyGetAngularVel(self._body)
+        return Velocity((v[0], v[1], v[2]), (w[0], w[1], w[2]))
+
+    def contacts(self) -> Contacts:
+        """Returns the contacts of the last step, as they were at its start."""
+        return Contacts.of(self._depths[: self._touching].tolist())
+
+    def close(self) -> None:
+        """Gives back what ODE holds."""
+        if self._world:
+            for geom in self._geoms:
+                self._ode.dGeomDestroy(geom)
+            self._ode.dJointGroupDestroy(self._group)
+            self._ode.dWorldDestroy(self._world)
+            self._world = 0
+
+
+def _array(quaternion: Quaternion) -> ctypes.Array[ctypes.c_double]:
+    return (ctypes.c_double * 4)(*quaternion)
+
+
+# dParamLoStop, dParamHiStop, dParamCFM, dParamStopERP, dParamStopCFM and dParamERP
+_LOW, _HIGH, _CFM, _STOP_ERP, _STOP_CFM, _ERP = 0, 1, 8, 9, 10, 13
+_GROUP = 0x100
+"""Between the parameters of an angular motor's axes."""
+
+
+class OdeSpringEngine(OdeEngine):
+    """ODE with an implicit coupling: a soft ball joint and a soft angular motor."""
+
+    name = "ode_spring"
+    settings: Mapping[str, Setting] = {
+        **OdeEngine.settings,
+        "coupling": Setting(
+            "implicit spring: ball joint and angular motor, CFM 1/(T K + B)",
+            "ODE Manual: Concepts, How To Use ERP and CFM",
+        ),
+    }
+
+    def open(self, task: Task, timestep: float) -> OdeSimulation:
+        """Sets a task up; see ``Engine.open``. It knows no convex meshes."""
+        return OdeSpringSimulation(task, timestep)
+
+
+class OdeSpringSimulation(OdeSimulation):
+    """A task in ODE whose coupling is implicit in position and velocity.
+
+    A joint with CFM 1/(T K + B) and ERP 1 whose target is y off pulls with
+
+        λ = (T K + B)(y/T − v),    y = T (K (h_k − x_{k−1}) + B δh/T) / (T K + B)
+
+    which is the coupling's f_k with x_k = x_{k−1} + T v: ODE's own spring, ERP = T K/(T K + B),
+    whose damper acts against the moving handle.
+    """
+
+    def __init__(self, task: Task, timestep: float) -> None:
+        super().__init__(task, timestep)
+        self._ball = self._motor = 0
+        coupling = task.coupling
+        if coupling is None:
+            return
+        ode, body = self._ode, self._body
+        self._ball = ode.dJointCreateBall(self._world, None)
+        ode.dJointAttach(self._ball, body, None)
+        ode.dJointSetBallAnchor(self._ball, *self._tool[0])
+        softness = 1.0 / (timestep * coupling.stiffness + coupling.damping)
+        ode.dJointSetBallParam(self._ball, _ERP, 1.0)
+        ode.dJointSetBallParam(self._ball, _CFM, softness)
+        hardness = timestep * coupling.rotational_stiffness + coupling.rotational_damping
+        if hardness == 0:
+            return
+        self._motor = ode.dJointCreateAMotor(self._world, None)
+        ode.dJointAttach(self._motor, body, None)
+        ode.dJointSetAMotorNumAxes(self._motor, 3)
+        for axis in range(3):
+            ode.dJointSetAMotorAxis(self._motor, axis, 0, *(float(i == axis) for i in range(3)))
+            for parameter, value in (
+                (_HIGH, 0.0),
+                (_LOW, 0.0),
+                (_STOP_ERP, 1.0),
+                (_STOP_CFM, 1.0 / hardness),
+            ):
+                ode.dJointSetAMotorParam(self._motor, axis * _GROUP + parameter, value)
+
+    def _couple(self, handle: Frame) -> None:
+        """Aims the joints at the handle, and steps."""
+        if self._gains is not None:
+            stiffness, damping, rotational_stiffness, rotational_damping = self._gains
+            stretch = subtract(handle[0], self._tool[0])
+            moved = subtract(handle[0], self._handle[0])
+            offset = _offset(stiffness, damping, stretch, moved)
+            self._ode.dJointSetBallAnchor2(self._ball, *add(self._tool[0], offset))
+            if self._motor:
+                twist = rotation_between(self._tool[1], handle[1])
+                turned = rotation_between(self._handle[1], handle[1])
+                angles = _offset(rotational_stiffness, rotational_damping, twist, turned)
+                for axis, angle in enumerate(angles):
+                    self._ode.dJointSetAMotorAngle(self._motor, axis, -angle)
+        self.advance(ZERO_VECTOR, ZERO_VECTOR)
+
+
+def _offset(stiffness: float, damping: float, stretch: Vector, moved: Vector) -> Vector:
+    """Returns y for K, B/T, h_k − x_{k−1} and δh."""
+    pull = add(scaled(stiffness, stretch), scaled(damping, moved))
+    return scaled(1.0 / (stiffness + damping), pull)
+
+
+def engines() -> tuple[Engine, ...]:
+    """Returns the engines of this module.
+
+    Raises:
+        StudyError: ODE is not installed.
+    """
+    library()
+    return (OdeEngine(), OdeSpringEngine())

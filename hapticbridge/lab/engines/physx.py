@@ -1,0 +1,255 @@
+"""PhysX 5 on the processor, through SAPIEN, in single precision: held force, or its own spring.
+
+References:
+    PhysX 5 User's Guide and API, https://nvidia-omniverse.github.io/PhysX/physx/5.4.1
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Mapping
+from functools import cache
+from importlib.metadata import version
+from typing import Any
+
+import numpy as np
+
+from hapticbridge.lab.engines.base import (
+    Contacts,
+    Engine,
+    Pose,
+    Setting,
+    Shape,
+    Task,
+    Velocity,
+    composed,
+)
+from hapticbridge.lab.engines.from_scene import Frame, HeldSimulation
+from hapticbridge.pose import (
+    ZERO_VECTOR,
+    Quaternion,
+    Vector,
+    product,
+    rotation_between,
+    scaled,
+    subtract,
+)
+
+with warnings.catch_warnings():
+    # that no graphics card was found, which nothing here draws on
+    warnings.simplefilter("ignore")
+    import sapien
+    from sapien import physx
+
+
+POSITION_ITERATIONS = 20
+"""Of the solver: at PhysX's own 4 a settled tool is wrong by 0.1 µm more; 50 change nothing."""
+
+CONTACT_OFFSET = 1e-3
+"""Distance in m at which contacts are made: some steps' motion, small against the parts."""
+
+LENGTH, SPEED = 1e-4, 1.0
+"""``PxTolerancesScale``: a length in m and a speed in m/s, of the whole process. The manifold of
+two shapes keeps its normal until they have moved by a share of their size or of this length. At the
+default of 1 m a peg that leans on its hole's edge by 19 mrad still has the normal from when it
+stood upright, and rests 31 µm away; at 1 mm 0.7 µm; at 0.1 mm, half the peg's clearance, 0.5 µm, as
+where its manifolds are made in place. The steps take as long. The manual advises the size of the
+objects; 10 mm changes nothing here. The speed enters only bouncing and sleep, which are off."""
+
+_GUIDE = "PhysX 5 User's Guide"
+_DYNAMICS = f"{_GUIDE}: Rigid Body Dynamics"
+_COLLISION = f"{_GUIDE}: Advanced Collision Detection"
+SLERP = 4.0
+"""A slerp drive is a quarter as stiff as it is told, without unit: it acts on half the angle
+(measured under a torque: 4.00)."""
+
+_X_TO_Z: Quaternion = (math.sqrt(0.5), 0.0, -math.sqrt(0.5), 0.0)
+"""A capsule lies along x in PhysX."""
+
+
+class SapienEngine:
+    """PhysX 5 with its temporal Gauss-Seidel solver."""
+
+    name = "physx"
+    version = f"PhysX 5 in SAPIEN {version('sapien')}"
+    settings: Mapping[str, Setting] = {
+        "coupling": Setting("held force", f"{_DYNAMICS}, Applying Forces"),
+        "solver": Setting("TGS", f"{_DYNAMICS}, Temporal Gauss-Seidel"),
+        "position iterations": Setting(f"{POSITION_ITERATIONS}", f"{_DYNAMICS}, Solver Iterations"),
+        "velocity iterations": Setting("1", f"{_DYNAMICS}, Solver Iterations"),
+        "contact offset": Setting(
+            f"{CONTACT_OFFSET:g} m",
+            f"{_COLLISION}, Tuning Shape Collision",
+        ),
+        "rest offset": Setting("0", f"{_COLLISION}, Tuning Shape Collision"),
+        "contact generation": Setting("PCM", f"{_COLLISION}, PCM"),
+        "tolerances": Setting(
+            f"length {LENGTH:g} m (default 1), speed {SPEED:g} m/s",
+            "PhysX 5 API: PxTolerancesScale, which advises the size of the objects; "
+            "chosen shorter, or PCM keeps normals of a pose that was left",
+        ),
+        "friction": Setting("every iteration", f"{_DYNAMICS}, Friction"),
+        "sleep threshold": Setting("0", f"{_DYNAMICS}, Sleeping"),
+        "damping": Setting("0", f"{_DYNAMICS}, Damping"),
+    }
+
+    def open(self, task: Task, timestep: float) -> SapienSimulation:
+        """Sets a task up; see ``Engine.open``."""
+        return SapienSimulation(task, timestep)
+
+
+class SapienSimulation(HeldSimulation):
+    """A task in a PhysX scene of its own."""
+
+    def __init__(self, task: Task, timestep: float) -> None:
+        super().__init__(task, timestep)
+        _physx()
+        # SAPIEN has these for the whole process, and reads them when something is made
+        scene_config = physx.PhysxSceneConfig()
+        scene_config.gravity = np.array(task.gravity)
+        scene_config.enable_tgs = scene_config.enable_pcm = True
+        scene_config.enable_friction_every_iteration = True
+        physx.set_scene_config(scene_config)
+        physx.set_shape_config(contact_offset=CONTACT_OFFSET, rest_offset=0.0)
+        physx.set_body_config(
+            solver_position_iterations=POSITION_ITERATIONS,
+            solver_velocity_iterations=1,
+            sleep_threshold=0.0,
+        )
+        self._system = physx.PhysxCpuSystem()
+        self._system.timestep = self._timestep
+        self._scene = sapien.Scene([self._system])
+        material = physx.PhysxMaterial(task.body.friction, task.body.friction, 0.0)
+        if task.fixed:
+            fixed = physx.PhysxRigidStaticComponent()
+            for shape in task.fixed:
+                fixed.attach(_collision(shape, shape.pose, material))
+            self._add(fixed, Pose())
+        self._body = body = physx.PhysxRigidDynamicComponent()
+        for shape in task.body.shapes:
+            body.attach(_collision(shape, self._shape_pose(shape), material))
+        body.mass, body.inertia = task.body.mass, np.array(task.body.inertia)
+        body.cmass_local_pose = sapien.Pose()
+        body.linear_damping = body.angular_damping = 0.0
+        self._add(body, self._principal(task.start))
+        body.linear_velocity = np.array(task.start_velocity.linear)
+        body.angular_velocity = np.array(task.start_velocity.angular)
+        self._begin(task)
+
+    def _add(self, component: Any, pose: Pose) -> None:
+        entity = sapien.Entity()
+        entity.add_component(component)
+        entity.set_pose(sapien.Pose(pose.position, pose.quaternion))
+        self._scene.add_entity(entity)
+
+    def advance(self, force: Vector, torque: Vector) -> None:
+        """Sets a force in N and a torque in N m at the centre of mass, and steps."""
+        self._body.add_force_torque(force, torque)
+        self._system.step()
+
+    def principal_pose(self) -> Pose:
+        """Returns the pose of the principal axes of inertia at the centre of mass."""
+        pose = self._body.entity_pose
+        (x, y, z), (w, i, j, k) = pose.p.tolist(), pose.q.tolist()
+        return Pose((x, y, z), (w, i, j, k))
+
+    def velocity(self) -> Velocity:
+        """Returns the velocity of the centre of mass and the angular velocity."""
+        linear, angular = self._body.linear_velocity, self._body.angular_velocity
+        return Velocity(tuple(linear.tolist()), tuple(angular.tolist()))
+
+    def contacts(self) -> Contacts:
+        """Returns the contacts of the last step, as they were at its start.
+
+        PhysX stops what would touch within the step, and leaves gaps of less than a nanometre: what
+        pushes touches, too.
+        """
+        points = [point for contact in self._system.get_contacts() for point in contact.points]
+        return Contacts.of(
+            max(-point.separation, 0.0) if np.any(point.impulse) else -point.separation
+            for point in points
+        )
+
+    def close(self) -> None:
+        """Lets go of the scene; PhysX takes it back with its last reference."""
+        self._body = self._system = self._scene = None
+
+
+class SapienSpringEngine(SapienEngine):
+    """PhysX 5 with an implicit coupling: the drives of a D6 joint."""
+
+    name = "physx_spring"
+    settings: Mapping[str, Setting] = {
+        **SapienEngine.settings,
+        "coupling": Setting(
+            "implicit spring: D6 joint, linear and slerp drives", f"{_GUIDE}: Joints, D6 Joint"
+        ),
+    }
+
+    def open(self, task: Task, timestep: float) -> SapienSimulation:
+        """Sets a task up; see ``Engine.open``."""
+        return SapienSpringSimulation(task, timestep)
+
+
+class SapienSpringSimulation(SapienSimulation):
+    """A task in PhysX whose coupling is a drive from the world to the grip.
+
+    Its target is h_k, its target velocity the handle's over the step. The solver's iterations are
+    parts of the step here, so that it is less damped than the implicit scheme of one step.
+    """
+
+    def __init__(self, task: Task, timestep: float) -> None:
+        super().__init__(task, timestep)
+        coupling = task.coupling
+        if coupling is None:
+            return
+        self._drive = drive = physx.PhysxDriveComponent(self._body)
+        grip = composed(self._body_in_principal, task.grip)
+        drive.set_pose_in_child(sapien.Pose(*grip))
+        for set_gains in (
+            drive.set_drive_property_x,
+            drive.set_drive_property_y,
+            drive.set_drive_property_z,
+        ):
+            set_gains(coupling.stiffness, coupling.damping)
+        drive.set_drive_property_slerp(
+            SLERP * coupling.rotational_stiffness, SLERP * coupling.rotational_damping
+        )
+        self._body.entity.add_component(drive)
+
+    def _couple(self, handle: Frame) -> None:
+        """Aims the drive at the handle, and steps."""
+        if self._gains is not None:
+            rate = 1.0 / self._timestep
+            moved = scaled(rate, subtract(handle[0], self._handle[0]))
+            turned = scaled(rate, rotation_between(self._handle[1], handle[1]))
+            self._drive.set_drive_target(sapien.Pose(*handle))
+            self._drive.set_drive_velocity_target(moved, turned)
+        self.advance(ZERO_VECTOR, ZERO_VECTOR)
+
+
+@cache
+def _physx() -> Any:
+    """Starts PhysX with its tolerances; SAPIEN takes what is there, and else starts its own."""
+    return physx.PhysxEngine(LENGTH, SPEED)
+
+
+def _collision(shape: Shape, pose: Pose, material: Any) -> Any:
+    quaternion = pose.quaternion
+    if shape.kind == "box":
+        made = physx.PhysxCollisionShapeBox(np.array(shape.size), material)
+    elif shape.kind == "sphere":
+        made = physx.PhysxCollisionShapeSphere(shape.size[0], material)
+    elif shape.kind == "capsule":
+        made = physx.PhysxCollisionShapeCapsule(*shape.size, material)
+        quaternion = product(quaternion, _X_TO_Z)
+    else:
+        made = physx.PhysxCollisionShapeConvexMesh(shape.vertices, np.ones(3), material)
+    made.local_pose = sapien.Pose(pose.position, quaternion)
+    return made
+
+
+def engines() -> tuple[Engine, ...]:
+    """Returns the engines of this module."""
+    return (SapienEngine(), SapienSpringEngine())

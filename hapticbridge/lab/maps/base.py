@@ -1,0 +1,556 @@
+"""What a stability map is: points, what happens at each, and what it all says."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import tempfile
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import ListedColormap
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+from numpy.typing import ArrayLike, NDArray
+
+from hapticbridge.device import Motion
+from hapticbridge.errors import StudyError
+from hapticbridge.files import finite_or_null
+from hapticbridge.lab.closed_loop import ClosedLoop
+from hapticbridge.plotting import write_picture
+from hapticbridge.rendering import METHODS
+from hapticbridge.scene import Scene, load_scene
+from hapticbridge.scene.load import scene_path
+from hapticbridge.sweep.results import Table
+from hapticbridge.sweep.sweep import sweep
+from hapticbridge.theory.bounds import maximum_stiffness
+
+Point = dict[str, float | int | str | bool]
+
+LEAST_POINTS, MOST_POINTS = 4, 1_000_000
+"""Fewest and most points of a map: with fewer there is no grid, and a million take hours to days
+and a gigabyte."""
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """What a map shows.
+
+    Attributes:
+        figure: The picture, legible at 800 pixels.
+        paragraph: What it says, in a few sentences with its numbers.
+        boundary: Where methods fail, measured beside predicted; for JSON.
+    """
+
+    figure: Figure
+    paragraph: str
+    boundary: Mapping[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class StabilityMap:
+    """A map: which points, what is run at each, how it is read.
+
+    Attributes:
+        name: What the command line calls it.
+        about: One sentence.
+        default_points: How many points there are about if nobody chooses.
+        points: Returns about that many points, in a fixed order.
+        evaluate: What happens at a point; at the top level of a module, so that other processes
+            find it.
+        read: What the table says.
+    """
+
+    name: str
+    about: str
+    default_points: int
+    points: Callable[[int], Sequence[Point]]
+    evaluate: Callable[[Point], Mapping[str, float | int | str | bool]]
+    read: Callable[[Table], Finding]
+
+
+@dataclass(frozen=True, slots=True)
+class MapFiles:
+    """What a map left in its folder.
+
+    Attributes:
+        picture: PNG.
+        table: CSV or Parquet, a row a point.
+        boundary: JSON: ``about``, ``paragraph``, ``points``, ``failed`` and ``boundary``.
+        finding: What it shows.
+        failed: Points that could not be computed; their reasons are in the table.
+    """
+
+    picture: Path
+    table: Path
+    boundary: Path
+    finding: Finding
+    failed: int
+
+
+def computed(table: Table, name: str) -> Table:
+    """Returns the rows of a map's table at which something was computed.
+
+    Args:
+        table: All rows; where a point failed, ``error`` says why.
+        name: The map's.
+
+    Raises:
+        StudyError: There is no such row.
+    """
+    if not len(table):
+        raise StudyError(f"map '{name}': the table has no rows, so there is nothing to read")
+    if table.failed.all():
+        raise StudyError(f"map '{name}': no point could be computed; first: {table['error'][0]}")
+    return table.select(~table.failed)
+
+
+def run_map(
+    stability_map: StabilityMap,
+    folder: Path,
+    *,
+    points: int | None = None,
+    form: str = "csv",
+    executor: Executor | None = None,
+    scheduler: str | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> MapFiles:
+    """Computes a map and writes its picture, table and boundary.
+
+    What is done is kept in ``folder/NAME.parts``; the same map, begun again after a kill, goes on
+    from there.
+
+    Args:
+        stability_map: Which.
+        folder: Made if missing.
+        points: About how many, 4 to 1 000 000; None for the map's own number.
+        form: Of table and parts: ``csv`` or ``parquet`` (needs the extra ``tables``).
+        executor: Where points are computed; by default a pool of processes.
+        scheduler: Address of a dask.distributed cluster instead.
+        progress: Called with the points done and all points.
+
+    Raises:
+        StudyError: The folder, the workers or the number cannot be used, or every point failed.
+    """
+    if points is not None and not LEAST_POINTS <= points <= MOST_POINTS:
+        raise StudyError(
+            f"points is {points}; a map needs {LEAST_POINTS} or more, and {MOST_POINTS} at most"
+        )
+    name = stability_map.name
+    files = {end: folder / f"{name}.{end}" for end in ("png", form, "json")}
+    for path in files.values():
+        _check_writable(path)
+    table = sweep(
+        stability_map.evaluate,
+        stability_map.points(points or stability_map.default_points),
+        folder=folder / f"{name}.parts",
+        format=form,
+        executor=executor,
+        scheduler=scheduler,
+        progress=progress,
+    )
+    table.write(files[form])  # first: it is what cost the time
+    failed = int(table.failed.sum())
+    finding = stability_map.read(computed(table, name))
+    write_picture(finding.figure, files["png"])
+    said = {
+        "map": name,
+        "about": stability_map.about,
+        "points": len(table),
+        "failed": failed,
+        "paragraph": finding.paragraph,
+        "boundary": finding.boundary,
+    }
+    text = json.dumps(finite_or_null(said), indent=2, allow_nan=False)
+    try:
+        files["json"].write_text(text + "\n", encoding="utf-8")
+    except OSError as error:
+        raise StudyError(f"cannot write '{files['json']}': {error.strerror}") from None
+    return MapFiles(files["png"], files[form], files["json"], finding, failed)
+
+
+def _check_writable(path: Path) -> None:
+    """Refuses a file that could not be written, before the sweep; leaves the disk as it was.
+
+    A folder that is missing or none is the sweep's to make or refuse.
+    """
+    if not path.parent.is_dir():
+        return
+    is_new = not path.exists()
+    try:
+        with path.open("ab"):
+            pass
+        if is_new:
+            path.unlink()
+    except OSError as error:
+        raise StudyError(f"cannot write '{path}': {error.strerror}") from None
+
+
+WIDTH = 1e-3
+"""Relative width of a bracket, without unit, at which maps end a search: a tenth of a per cent. An
+agreement is never quoted below half of it. Halving it costs one run more."""
+
+
+@dataclass(frozen=True, slots=True)
+class Bracket:
+    """Between what a search ended.
+
+    Attributes:
+        lower: Largest value that was seen stable; 0 if the lower end of the search was not.
+        upper: Smallest value above it that was not; inf if the upper end of the search was stable.
+    """
+
+    lower: float
+    upper: float
+
+    @property
+    def middle(self) -> float:
+        """The geometric middle: at most half the relative width away from the limit."""
+        if self.lower == 0 or math.isinf(self.upper):
+            return self.lower if self.lower == 0 else self.upper
+        return math.sqrt(self.lower * self.upper)
+
+
+def largest_stable(
+    is_stable: Callable[[float], bool], lower: float, upper: float, width: float = WIDTH
+) -> Bracket:
+    """Searches by bisection, even in the logarithm, for where stability ends.
+
+    Args:
+        is_stable: Whether a value is stable; stable below one limit and not above it. Where it
+            changes more than once, one of the changes is found.
+        lower: Where the search begins, > 0.
+        upper: Where it ends, > lower. Ends that have nothing to do with a prediction make the
+            search independent of it.
+        width: Relative width at which it ends, > 0.
+
+    Returns:
+        The bracket; ``Bracket(0, lower)`` if nothing was stable and ``Bracket(upper, inf)`` if all
+        was.
+
+    Raises:
+        StudyError: An end or the width is out of range.
+    """
+    if not (0 < lower < upper < math.inf and 0 < width < math.inf):
+        raise StudyError(
+            f"a search from {lower!r} to {upper!r} with the width {width!r} is none; it needs "
+            "0 < lower < upper and a width > 0"
+        )
+    if not is_stable(lower):
+        return Bracket(0.0, lower)
+    if is_stable(upper):
+        return Bracket(upper, math.inf)
+    while upper > lower * (1 + width):
+        middle = math.sqrt(lower * upper)
+        lower, upper = (middle, upper) if is_stable(middle) else (lower, middle)
+    return Bracket(lower, upper)
+
+
+def agreement(measured: ArrayLike, predicted: ArrayLike, width: float = WIDTH) -> float | None:
+    """Returns the largest relative deviation that a search of that width can tell.
+
+    That is max(deviation, width/2), without unit; None where nothing can be compared.
+
+    Args:
+        measured: Middles of brackets, any shape.
+        predicted: Broadcasts with them.
+        width: Relative width of the brackets.
+    """
+    ratio = np.asarray(measured, dtype=np.float64) / np.asarray(predicted, dtype=np.float64)
+    known = np.abs(ratio[np.isfinite(ratio)] - 1)
+    return max(float(known.max()), width / 2) if known.size else None
+
+
+def per_cent(share: float | None) -> str:
+    """Returns an agreement in words, to three digits at most."""
+    return "nowhere comparable" if share is None else f"within {100 * share:.2g} %"
+
+
+def used_damping(
+    name: str, stiffness: ArrayLike, damping: ArrayLike, period: float
+) -> NDArray[np.float64]:
+    """Returns B' in N s/m, the damping of a method's law: max(B − a K T, 0).
+
+    It is ``Method.used`` over arrays; the method's integration adds a K T again.
+
+    Args:
+        name: The method; a is its ``lag``.
+        stiffness: K in N/m.
+        damping: B in N s/m as asked for; broadcasts with K.
+        period: T in s.
+    """
+    taken = METHODS[name].lag * period * np.asarray(stiffness, dtype=np.float64)
+    return np.asarray(np.maximum(np.asarray(damping, dtype=np.float64) - taken, 0.0))
+
+
+def law_in_words(name: str, subscript: str = "") -> str:
+    """Returns which damping a method's law uses, as titles and legends say it.
+
+    Args:
+        name: The method.
+        subscript: Of K and B: empty, or ``_r`` in rotation.
+    """
+    lag = METHODS[name].lag
+    taken = {0.0: "", 0.5: f" − K{subscript} T/2"}.get(lag, f" − K{subscript} T")
+    return f"B{subscript}′ = B{subscript}{taken}"
+
+
+def needed_by_6(
+    name: str, stiffness: ArrayLike, damping: ArrayLike, period: float
+) -> NDArray[np.float64]:
+    """Returns the device damping in N s/m that (6) asks for, K T/2 + B'."""
+    spring = np.asarray(stiffness, dtype=np.float64) * period / 2
+    return np.asarray(spring + used_damping(name, stiffness, damping, period))
+
+
+def limit_by_6(
+    name: str, device_damping: float, period: float, damping: ArrayLike
+) -> NDArray[np.float64]:
+    """Returns the K in N/m at which K T/2 + B' = b, for B < b.
+
+    That is 2 (b − B)/T without a lag. With a lag of ½ or 1 it is 2b/T: there B' is 0, and below it
+    K T/2 + B' stays below b.
+    """
+    spent = np.asarray(damping, dtype=np.float64) * (METHODS[name].lag == 0.0)
+    return np.asarray(maximum_stiffness(device_damping, period, spent))
+
+
+METHOD_COLOURS: Mapping[str, str] = {
+    "implicit": "#000000",
+    "compensated": "#9aa3d6",
+    "lossless": "#3a1fd1",
+    "implicitfast": "#7b3294",
+    "implicitfast:compensated": "#d684bd",
+    "explicit": "#00868b",
+    "explicit:implicitfast": "#5cc8d8",
+    "explicit:rk4": "#7f7f7f",
+    "weld": "#6b3f14",
+    "direct": "#d6219c",
+}
+"""Colour of each rendering method's lines. None is near a verdict's (``verdicts.COLOURS``: green,
+yellow, orange, red): red would say that a method is unstable."""
+
+THEORY_COLOUR = "#1a5fb4"
+"""Colour of what was computed and not measured, unless it is black."""
+
+
+STILL = Motion([0.0, 1.0], np.zeros((2, 3)))
+"""The path of a hand that wants to stay where it is."""
+
+
+def swinging(amplitude: float, frequency: float, duration: float, count: int) -> Motion:
+    """Returns the path of a hand that swings along x and turns nothing: A (1 − cos 2πft).
+
+    Args:
+        amplitude: A in m; it goes 2A far and back.
+        frequency: f in Hz.
+        duration: In s.
+        count: Rows, evenly over the duration; between them the path is straight.
+    """
+    time = np.linspace(0.0, duration, count)
+    path = np.zeros((count, 3))
+    path[:, 0] = amplitude * (1 - np.cos(2 * np.pi * frequency * time))
+    return Motion(time, path)
+
+
+_of_this_thread = threading.local()
+
+
+def scene_of(mjcf: str) -> Scene:
+    """Loads a scene from the text of an MJCF file that refers to no other."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "rig.xml"
+        path.write_text(mjcf, encoding="utf-8")
+        return load_scene(path)
+
+
+def free_body(mass: float, inertia: ArrayLike) -> str:
+    """Returns the MJCF of a free tool in nothing: no gravity, no contact, held by its centre.
+
+    Args:
+        mass: In kg.
+        inertia: Principal moments about its centre in kg m², shape (3,).
+    """
+    moments = " ".join(map(repr, np.asarray(inertia, float).tolist()))
+    return f"""
+<mujoco>
+  <option gravity="0 0 0"/>
+  <worldbody>
+    <body name="tool">
+      <freejoint/>
+      <inertial pos="0 0 0" mass="{mass!r}" diaginertia="{moments}"/>
+      <geom type="sphere" size="0.01" mass="0" contype="0" conaffinity="0"/>
+      <site name="grip"/>
+    </body>
+  </worldbody>
+</mujoco>"""
+
+
+def free_tool_and_wall() -> Scene:
+    """Loads ``virtual_wall`` with its rail taken away: a tool of six degrees of freedom."""
+    text = scene_path("virtual_wall").read_text(encoding="utf-8")
+    freed, count = re.subn(r"<joint [^>]*type=\"slide\"[^>]*/>", "<freejoint/>", text)
+    assert count == 1, "virtual_wall has one slide joint"
+    return scene_of(freed.replace('<key name="home" qpos="0"/>', '<key name="home"/>'))
+
+
+def loop_in(
+    scene: str | Callable[[], Scene],
+    key: object = None,
+    change: Callable[[mujoco.MjModel], None] | None = None,
+) -> ClosedLoop:
+    """Returns a closed loop on a scene, made once per thread.
+
+    Args:
+        scene: The name of a shipped one, or what loads it.
+        key: What tells this change from others; loops are kept by scene and key.
+        change: Applied to the model before the first run; derived constants are set again.
+    """
+    loops: dict[object, ClosedLoop] = _of_this_thread.__dict__.setdefault("loops", {})
+    if (scene, key) not in loops:
+        loop = ClosedLoop(load_scene(scene) if isinstance(scene, str) else scene())
+        if change is not None:
+            change(loop.scene.model)
+            mujoco.mj_setConst(loop.scene.model, loop.scene.data)
+        loops[scene, key] = loop
+    return loops[scene, key]
+
+
+def wall_loop(mass: float, scene: str | Callable[[], Scene] = "virtual_wall") -> ClosedLoop:
+    """Returns a closed loop whose tool is a wall: so heavy that no hand moves it.
+
+    Args:
+        mass: Of the tool in kg.
+        scene: As for ``loop_in``, its tool called ``tool``.
+    """
+    return loop_in(scene, ("wall", mass), lambda model: set_tool_mass(model, "tool", mass))
+
+
+def set_tool_mass(model: mujoco.MjModel, body: str, mass: float) -> None:
+    """Gives a body another mass and scales its inertia alike.
+
+    The inertia per kg is rounded to single precision, so that a mass set before leaves no trace:
+    what a point gives must not depend, even in its last bit, on the points before it.
+
+    Args:
+        model: Changed in place; ``mj_setConst`` must follow.
+        body: The tool's name.
+        mass: In kg.
+    """
+    body_id = model.body(body).id
+    per_kg = model.body_inertia[body_id] / model.body_mass[body_id]
+    model.body_inertia[body_id] = mass * per_kg.astype(np.float32).astype(np.float64)
+    model.body_mass[body_id] = mass
+
+
+VERDICTS = ("strict", "within slack", "active", "unstable")
+"""From safe to unsafe. The first three are the environment's; ``unstable`` is the loop's."""
+
+MISSING = "no point could be computed"
+"""What a picture or a paragraph says where every point of a group failed."""
+
+COLOURS = ("#a8d5ba", "#f4e3a1", "#f0a868", "#c0504d")
+"""Of the verdicts; told apart by lightness as well as by hue."""
+
+
+def verdict_numbers(is_stable: ArrayLike, environment: NDArray[np.object_]) -> NDArray[np.int64]:
+    """Returns the place of each run's verdict in ``VERDICTS``."""
+    numbers = np.array([VERDICTS.index(name) for name in environment], dtype=np.int64)
+    return np.where(np.asarray(is_stable, dtype=bool), numbers, VERDICTS.index("unstable"))
+
+
+def draw_verdicts(
+    axes: Axes,
+    x: NDArray[np.float64],
+    y: NDArray[np.float64],
+    verdict: NDArray[np.int64],
+    *,
+    log_x: bool = False,
+    log_y: bool = False,
+) -> None:
+    """Colours a grid of runs by verdict.
+
+    Args:
+        axes: Where.
+        x: Of each run, shape (n,); the runs fill a grid.
+        y: Likewise.
+        verdict: From ``verdict_numbers``.
+        log_x: Whether x is even in its logarithm.
+        log_y: Whether y is.
+
+    Without a run the axes say that no point could be computed.
+    """
+    if log_x:
+        axes.set_xscale("log")
+    if log_y:
+        axes.set_yscale("log")
+    if not len(x):
+        say_missing(axes)
+        return
+    columns, rows = np.unique(x), np.unique(y)
+    cells = np.full((rows.size, columns.size), np.nan)
+    cells[np.searchsorted(rows, y), np.searchsorted(columns, x)] = verdict
+    axes.pcolormesh(
+        _edges(columns, is_log=log_x),
+        _edges(rows, is_log=log_y),
+        cells,
+        cmap=ListedColormap(COLOURS),
+        vmin=-0.5,
+        vmax=len(VERDICTS) - 0.5,
+        rasterized=True,
+    )
+
+
+def say_missing(axes: Axes) -> None:
+    """Writes into axes that there is nothing to show, because every point of a group failed."""
+    axes.text(0.5, 0.5, MISSING, ha="center", va="center", transform=axes.transAxes)
+
+
+def _edges(centres: NDArray[np.float64], *, is_log: bool) -> NDArray[np.float64]:
+    """Returns the borders between cells, and as far outside the first and the last."""
+    at = np.log(centres) if is_log else centres
+    if at.size == 1:
+        middle = np.array([at[0] - 0.5, at[0] + 0.5])
+    else:
+        inner = (at[1:] + at[:-1]) / 2
+        middle = np.concatenate([[2 * at[0] - inner[0]], inner, [2 * at[-1] - inner[-1]]])
+    return np.asarray(np.exp(middle) if is_log else middle)
+
+
+def verdict_legend(
+    figure: Figure, lines: Sequence[tuple[str, str, str]] = (), columns: int = 4
+) -> None:
+    """Names the colours, and the lines of theory, below a figure.
+
+    Args:
+        figure: Drawn already.
+        lines: Label, colour and line style each; the styles ``o`` and ``s`` are white circles and
+            squares.
+        columns: Of the legend.
+    """
+    handles: list[object] = [
+        Patch(facecolor=colour, label=name) for name, colour in zip(VERDICTS, COLOURS, strict=True)
+    ]
+    axes = figure.axes[0]
+    for label, colour, style in lines:
+        is_marker = style in ("o", "s")
+        handles += axes.plot(
+            [],
+            [],
+            color=colour,
+            label=label,
+            ls="" if is_marker else style,
+            marker=style if is_marker else "",
+            mfc="white",
+        )
+    figure.legend(
+        handles=handles, loc="outside lower center", ncols=columns, fontsize="small", frameon=False
+    )

@@ -1,0 +1,588 @@
+"""Map ``contact``: which settings of MuJoCo's contact, and which methods, create energy."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from functools import cache
+from typing import Any, TypeAlias
+
+import mujoco
+import numpy as np
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from numpy.typing import NDArray
+
+from hapticbridge.coupling import Coupling
+from hapticbridge.lab.maps.base import (
+    COLOURS,
+    MISSING,
+    VERDICTS,
+    Finding,
+    Point,
+    StabilityMap,
+    computed,
+    draw_verdicts,
+    loop_in,
+    say_missing,
+)
+from hapticbridge.lab.maps.contact_rigs import (
+    PEG_ROTATION,
+    PERIOD,
+    SHIPPED,
+    SHIPPED_SOLIMP,
+    TREATMENTS,
+    ContactRun,
+    Treatment,
+    deepest,
+    firm_device,
+    peg_runs,
+    random_push,
+    random_taps,
+    recorded,
+    run_once,
+    set_mass,
+    summary,
+    ticks_of,
+    until_active,
+    wall_runs,
+)
+from hapticbridge.plotting import new_figure
+from hapticbridge.rendering import METHODS
+from hapticbridge.scene.contacts import (
+    HEAVY_SLACK_STEPS,
+    SLACK_STEPS,
+    STRICT_STEPS,
+    ContactNumbers,
+    contact_numbers,
+)
+from hapticbridge.sweep.results import Table
+
+HEAVY = 0.1
+"""Tool mass in kg from which the rule's line for heavier tools counts."""
+
+LINES = (
+    ("strict", "-", f"rule: strict above (τ = {STRICT_STEPS:g} T or more)"),
+    ("relaxed", "--", f"within slack above (τ = {SLACK_STEPS:g} T)"),
+    ("heavy", ":", f"the same from 0.1 kg (τ = {HEAVY_SLACK_STEPS:g} T)"),
+)
+"""Regions of the rule: name, line style and words."""
+
+
+def is_in(region: str, numbers: ContactNumbers) -> bool:
+    """Tells whether the rule has a setting in a region; ``abrupt`` is where it promises nothing."""
+    if region == "strict":
+        return numbers.grade == "strict"
+    if region == "relaxed":
+        return numbers.light_grade != "active"
+    return (numbers.grade == "active") == (region == "abrupt")
+
+
+def verdicts(table: Table) -> NDArray[np.int64]:
+    """Returns the worst verdict of each row, by its place in ``VERDICTS``."""
+    return np.where(table["active"] > 0, 2, np.where(table["within_slack"] > 0, 1, 0))
+
+
+def agreement(table: Table) -> dict[str, Any]:
+    """Counts, on the peg's grid, what the rule says against what was measured."""
+    mine = table.select(table["rig"] == "peg")
+    numbers = [
+        contact_numbers((s * PERIOD, d), SHIPPED_SOLIMP, PERIOD)
+        for s, d in zip(mine["steps"], mine["dampratio"], strict=True)
+    ]
+    measured = verdicts(mine)
+    regions = {
+        name: np.array([is_in(name, n) for n in numbers], dtype=bool)
+        for name in ("strict", "relaxed", "abrupt")
+    }
+    return {
+        name: {
+            "cells": int(cells.sum()),
+            **{
+                verdict.replace(" ", "_"): int((measured[cells] == place).sum())
+                for place, verdict in enumerate(VERDICTS[:3])
+            },
+        }
+        for name, cells in regions.items()
+    }
+
+
+def exceptions(table: Table) -> list[dict[str, Any]]:
+    """Returns where the search was worse than the rule says, by treatment and tool mass in kg."""
+    found = []
+    for name, treatment in TREATMENTS.items():
+        mine = table.select(table["treatment"] == name)
+        for mass, verdict in zip(mine["mass"].tolist(), verdicts(mine).tolist(), strict=True):
+            numbers = treatment.numbers
+            grade = numbers.grade if mass >= HEAVY else numbers.light_grade
+            if treatment.is_ruled and verdict > VERDICTS.index(grade):
+                worse = {"treatment": name, "mass": mass, "rule": grade}
+                found.append({**worse, "measured": VERDICTS[verdict]})
+    return found
+
+
+Columns: TypeAlias = Sequence[tuple[str, float, str, float, str]]
+"""Of figures beside the bars: heading, right edge as a share of the bars' width, what stands there,
+its factor and format."""
+
+
+def draw_bars(
+    axes: Axes, found: Sequence[Mapping[str, Any]], names: Sequence[str], columns: Columns
+) -> None:
+    """Draws a bar an entry, runs by verdict, with what they came to in columns beside it.
+
+    Args:
+        axes: Where; the columns stand to their right.
+        found: An entry a bar; without one the axes say that no point could be computed.
+        names: Of the bars.
+        columns: What to write beside them.
+    """
+    if not found:
+        say_missing(axes)
+        return
+    places = np.arange(len(found))[::-1]
+    left = np.zeros(len(found))
+    for verdict, colour in zip(VERDICTS[:3], COLOURS[:3], strict=True):
+        width = np.array([one[verdict.replace(" ", "_")] for one in found])
+        axes.barh(places, width, left=left, color=colour, height=0.8)
+        left = left + width
+    beside = axes.get_yaxis_transform()
+    for heading, share, name, factor, form in columns:
+        edge = 1 + share
+        axes.text(edge, len(found) - 0.3, heading, transform=beside, size=7, ha="right")
+        for place, one in zip(places, found, strict=True):
+            text = format(factor * one[name], form)
+            axes.text(edge, place, text, transform=beside, size=8, ha="right", va="center")
+    axes.set_yticks(places, names, size=8)
+    axes.set_xlim(0, max(left.max(), 1.0))
+    axes.set_ylim(-0.6, len(found) - 0.4)
+    axes.set_xlabel("runs by verdict")
+
+
+SEARCH_MASSES = (0.03, 0.1, 0.3)
+"""In kg."""
+
+SEARCH_STIFFNESS = (1000.0, 6000.0)
+"""K in N/m."""
+
+SEARCH_HANDS = (0, 1, 2)
+"""The recorded one and two seeds."""
+
+FRICTION = (0.0, 0.42)
+
+
+def search(name: str, mass: float) -> dict[str, float | int]:
+    """Runs a peg of a mass in kg in one treatment, by K, friction and hand."""
+    cases = list(itertools.product([mass], FRICTION, SEARCH_HANDS))
+    treatment = TREATMENTS[name]
+    return summary([run for k in SEARCH_STIFFNESS for run in peg_runs(treatment, k, cases)])
+
+
+def searched(table: Table, name: str) -> dict[str, Any]:
+    """Returns what one treatment came to in a table of the map, over all tools."""
+    mine = table.select(table["treatment"] == name)
+    treatment = TREATMENTS[name]
+    return {
+        "treatment": name,
+        "relaxation": treatment.relaxation,
+        "static_depth": treatment.static_depth,
+        "runs": int(mine["runs"].sum()),
+        "strict": int(mine["strict"].sum()),
+        "within_slack": int(mine["within_slack"].sum()),
+        "active": int(mine["active"].sum()),
+        "created": float(mine["created"].max()),
+        "slack_share": float(mine["slack_share"].max()),
+        "median_depth": float(np.median(mine["median_depth"])),
+        "largest_depth": float(mine["largest_depth"].max()),
+    }
+
+
+SEARCH_COLUMNS: Columns = (
+    ("most energy\nmade, J", 0.34, "created", 1.0, ".1e"),
+    ("depth, mm:\nmedian", 0.66, "median_depth", 1e3, ".2f"),
+    ("\nlargest", 0.9, "largest_depth", 1e3, ".2f"),
+    ("steady depth,\n× shipped", 1.28, "static_depth", 1.0, ".3g"),
+    ("\nτ, ms", 1.5, "relaxation", 1e3, ".3g"),
+)
+"""Beside the bars. The steady depth is computed, the others are measured."""
+
+
+def draw_search(axes: Axes, found: Sequence[Mapping[str, Any]]) -> None:
+    """Draws a bar a treatment, runs by verdict, with what they came to in columns beside it."""
+    draw_bars(axes, found, [one["treatment"] for one in found], SEARCH_COLUMNS)
+
+
+COMPARED = ("implicit", "compensated", "lossless")
+"""The methods that are passive behind the coupling. They differ away from contact, and in the
+damping of their law: so the hands here come and go."""
+
+HANDS = 20
+"""A rig. At the mouth the first is the recorded one, the others are seeds."""
+
+FELT_DAMPING = 1.25
+"""B over K T, no unit: more than 1, so that every method has some of its law left (B > K T)."""
+
+MOUTH = 0.0275
+"""Height of the peg's centre at the start in m, 2.5 mm of it in the hole: where the recorded hand
+is when its part begins, and where a random one goes in and out."""
+
+RIGS = ("taps", "mouth")
+
+Case = tuple[float, float, float, int]
+"""K in N/m, tool mass in kg, friction and hand."""
+
+
+def method_points() -> list[tuple[str, str, float]]:
+    """Returns rig, method and tool mass in kg of every comparison."""
+    return list(itertools.product(RIGS, COMPARED, SEARCH_MASSES))
+
+
+def cases_of(rig: str, mass: float) -> list[Case]:
+    """Returns what each method is run through on a rig with a tool mass in kg."""
+    friction = FRICTION if rig == "mouth" else (0.0,)
+    return list(itertools.product(SEARCH_STIFFNESS, [mass], friction, range(HANDS)))
+
+
+def compared(rig: str, method: str, mass: float) -> dict[str, float | int]:
+    """Runs a tool of a mass in kg on a rig by a method, by K, friction and hand."""
+    return summary(list(method_runs(rig, method, cases_of(rig, mass))))
+
+
+def method_runs(
+    rig: str, method: str, cases: Iterable[Case], *, same_law: bool = False
+) -> Iterator[ContactRun]:
+    """Runs a method through cases; ``taps`` are on a wall, ``mouth`` is in and out of a hole.
+
+    Args:
+        rig: One of ``RIGS``.
+        method: Its name.
+        cases: What to run it through.
+        same_law: Whether it is asked for what gives it the K and B' that ``lossless`` uses, which
+            need the same device. By default all methods are asked for the same K and B.
+    """
+    treatment = Treatment(method=method)
+    for stiffness, mass, friction, hand in cases:
+        damping, turning = FELT_DAMPING * stiffness * PERIOD, PEG_ROTATION[0] * stiffness
+        felt = Coupling(stiffness, damping, turning, FELT_DAMPING * turning * PERIOD)
+        coupling = felt
+        if same_law:
+            law = METHODS["lossless"].used(felt, PERIOD)
+            coupling = METHODS[method].rendered(law, PERIOD)
+        if rig == "taps":
+            loop = loop_in("virtual_wall", "contact")
+            path, holder = random_taps(hand)
+        else:
+            loop = loop_in("peg_in_hole", "mouth", _start_at_mouth)
+            path, holder = recorded() if hand == 0 else random_push(hand)
+        treatment.apply(loop.scene.model, friction)
+        set_mass(loop, "tool" if rig == "taps" else "peg", mass)
+        device = firm_device(felt, path, holder)
+        records, run = run_once(loop, device, coupling, treatment, ticks_of(device))
+        yield replace(run, depth=deepest(loop, records) if rig == "mouth" else _behind(records))
+
+
+def _start_at_mouth(model: mujoco.MjModel) -> None:
+    model.key_qpos[0, 2] = MOUTH
+
+
+def _behind(records: NDArray[np.void]) -> float:
+    # the face is 10 mm from where the tool's surface starts
+    return max(0.0, float(records["tool_position"][:, 0].max()) - 0.01)
+
+
+def methods_found(table: Table) -> list[dict[str, Any]]:
+    """Returns what each method came to on each rig in a table of the map, over all tools."""
+    found = []
+    for rig, method in itertools.product(RIGS, COMPARED):
+        mine = table.select((table["rig"] == rig) & (table["method"] == method))
+        if len(mine):
+            counts = ("runs", "strict", "within_slack", "active")
+            worst = ("created", "slack_share", "peak_force", "largest_depth")
+            found.append(
+                {
+                    "rig": rig,
+                    "method": method,
+                    **{name: int(mine[name].sum()) for name in counts},
+                    **{name: float(mine[name].max()) for name in worst},
+                    "median_depth": float(np.median(mine["median_depth"])),
+                }
+            )
+    return found
+
+
+def of_methods(found: Sequence[Mapping[str, Any]]) -> str:
+    """Says what the methods came to, in a sentence a rig; nothing where none was computed."""
+    said = []
+    words = {"taps": "tapping on a wall", "mouth": "in and out of the hole"}
+    for rig, doing in words.items():
+        mine = [one for one in found if one["rig"] == rig]
+        if mine:
+            parts = [
+                f"'{one['method']}' is strict in {one['strict']} of {one['runs']} runs, active in "
+                f"{one['active']}, makes {1e3 * one['created']:.2g} mJ at most"
+                for one in mine
+            ]
+            said.append(f"{HANDS} hands {doing}, as shipped: {'; '.join(parts)}.")
+    return " ".join(said)
+
+
+METHOD_COLUMNS: Columns = (
+    ("most energy\nmade, J", 0.34, "created", 1.0, ".1e"),
+    ("slack\nused", 0.56, "slack_share", 1.0, ".2f"),
+    ("peak\nforce, N", 0.84, "peak_force", 1.0, ".1f"),
+    ("depth, mm:\nmedian", 1.2, "median_depth", 1e3, ".2f"),
+    ("\nlargest", 1.5, "largest_depth", 1e3, ".2f"),
+)
+"""Beside the bars: the largest of all runs, but for the median."""
+
+
+def draw_methods(axes: Axes, found: Sequence[Mapping[str, Any]]) -> None:
+    """Draws a bar a rig and method, runs by verdict, with what they came to beside it."""
+    names = [f"{one['method']}, {one['rig']}" for one in found]
+    draw_bars(axes, found, names, METHOD_COLUMNS)
+
+
+STEPS = (0.25, 20.0)
+"""Range of timeconst/T, even in its logarithm."""
+
+DAMPING_RATIO = (0.05, 12.8)
+"""Range of dampratio, even in its logarithm; six times beyond the usual ones, for there it ends."""
+
+PANELS = (
+    ("wall", "implicit", (2000.0, 20_000.0), "one mass on a wall, discrete"),
+    ("wall", "implicitfast", (2000.0, 20_000.0), "one mass on a wall, implicitfast"),
+    ("peg", "implicit", (1000.0, 6000.0), "peg in the hole, discrete"),
+)
+"""Rig, method, K in N/m and title."""
+
+BESIDE = (1.0, 1.22)
+"""Width of bars and of the columns beside them, as a ratio."""
+
+CONTOUR = 160
+"""Points along each axis from which the rule's lines are drawn; more make them smoother."""
+
+Array = NDArray[np.float64]
+
+
+def draw(
+    table: Table, found: Sequence[Mapping[str, Any]], methods: Sequence[Mapping[str, Any]]
+) -> Figure:
+    """Draws verdicts over timeconst and dampratio with the rule on top, methods and search below.
+
+    Args:
+        table: Of the map.
+        found: What each treatment of the search came to.
+        methods: What each method came to on each rig.
+    """
+    figure = new_figure(8, 16)
+    parts = figure.subfigures(3, 1, squeeze=False, height_ratios=(1, 0.4, 1.05))
+    above, between, below = parts[:, 0]
+    rows = above.add_gridspec(2, 3)
+    for column, (rig, method, stiffness, title) in enumerate(PANELS):
+        for row, k in enumerate(stiffness):
+            axes = above.add_subplot(rows[row, column])
+            _draw_panel(axes, table, rig, method, k)
+            axes.set_title(f"{title}\nK = {k:g} N/m", fontsize="small")
+            if row == 1:
+                axes.set_xlabel("timeconst / T")
+            if column == 0:
+                axes.set_ylabel("dampratio")
+    draw_methods(between.add_subplot(between.add_gridspec(1, 2, width_ratios=BESIDE)[0]), methods)
+    between.suptitle(
+        f"The methods on the contact as shipped, {HANDS} hands each: taps on a wall, and in and "
+        "out of the hole's mouth;\ntools and K as below, B = 1.25 K T felt",
+        fontsize="small",
+    )
+    draw_search(below.add_subplot(below.add_gridspec(1, 2, width_ratios=BESIDE)[0]), found)
+    below.suptitle(
+        "The search on the peg: 30, 100 and 300 g, K = 1000 and 6000 N/m, friction 0 and 0.42,\n"
+        "one recorded and two random hands",
+        fontsize="small",
+    )
+    figure.suptitle(
+        f"Contact settings (solref) at T = {1e3 * PERIOD:g} ms, impedance 0.9 to 0.95,\n"
+        "elliptic cone: the worst run of each cell\nwall: 10, 50 and 200 g; "
+        "peg: 30 and 100 g, friction 0 and 0.42, random hands",
+        fontsize="medium",
+    )
+    _legend(figure, sorted(set(verdicts(table).tolist())))
+    return figure
+
+
+def _legend(figure: Figure, verdicts: Sequence[int]) -> None:
+    handles: list[Artist] = [Patch(facecolor=COLOURS[v], label=VERDICTS[v]) for v in verdicts]
+    handles += [Line2D([], [], color="black", ls=style, label=words) for _, style, words in LINES]
+    figure.legend(
+        handles=handles, loc="outside lower center", ncols=3, fontsize="small", frameon=False
+    )
+
+
+def _draw_panel(axes: Axes, table: Table, rig: str, method: str, stiffness: float) -> None:
+    is_mine = (table["rig"] == rig) & (table["method"] == method)
+    mine = table.select(is_mine & (table["stiffness"] == stiffness))
+    draw_verdicts(axes, mine["steps"], mine["dampratio"], verdicts(mine), log_x=True, log_y=True)
+    steps, ratio, regions = _rule()
+    for (_, style, _), is_above in zip(LINES, regions, strict=True):
+        axes.contour(
+            steps, ratio, is_above, levels=[0.5], linestyles=style, linewidths=1.5, colors="black"
+        )
+    axes.plot(2.0, 1.0, "o", color="black", mfc="white", ms=5)
+    axes.annotate(
+        "as shipped",
+        (2.0, 1.0),
+        xytext=(-6, -30),
+        textcoords="offset points",
+        size=7,
+        ha="center",
+        arrowprops={"arrowstyle": "-", "lw": 0.6},
+    )
+    axes.set_xlim(*STEPS)
+    axes.set_ylim(*DAMPING_RATIO)
+
+
+@cache
+def _rule() -> tuple[Array, Array, list[Array]]:
+    """Returns timeconst/T, dampratio, and where each line's region of the rule is.
+
+    The regions have a row a dampratio. Kept, because every panel shows the same.
+    """
+    steps, ratio = (np.geomspace(*ends, CONTOUR) for ends in (STEPS, DAMPING_RATIO))
+    numbers = [
+        [contact_numbers((s * PERIOD, d), SHIPPED_SOLIMP, PERIOD) for s in steps] for d in ratio
+    ]
+    regions = [
+        np.array([[is_in(name, one) for one in row] for row in numbers], dtype=np.float64)
+        for name, _, _ in LINES
+    ]
+    return steps, ratio, regions
+
+
+def points(count: int) -> Sequence[Point]:
+    """Returns timeconst by dampratio a panel and K, search and methods, ``count`` in all."""
+    searches: list[Point] = [
+        _point("search", name, "implicit", mass=mass)
+        for name in TREATMENTS
+        for mass in SEARCH_MASSES
+    ]
+    searches += [_point(rig, "", method, mass=mass) for rig, method, mass in method_points()]
+    side = max(2, round((max(0, count - len(searches)) / 6) ** 0.5))
+    grid = [
+        _point(rig, "", method, stiffness=k, steps=float(s), dampratio=float(ratio))
+        for rig, method, stiffness, _ in PANELS
+        for k in stiffness
+        for ratio in np.geomspace(*DAMPING_RATIO, side)
+        for s in np.geomspace(*STEPS, side)
+    ]
+    return grid + searches
+
+
+def _point(rig: str, name: str, method: str, **numbers: float) -> Point:
+    zeros = {"stiffness": 0.0, "steps": 0.0, "dampratio": 0.0, "mass": 0.0}
+    return {"rig": rig, "treatment": name, "method": method, **zeros, **numbers}
+
+
+def evaluate(point: Point) -> Mapping[str, float | int]:
+    """Runs a setting with light and heavy tools, with and without friction, and several hands.
+
+    The worst run is the verdict of a cell, so its runs end with the first that is active.
+    """
+    if point["rig"] == "search":
+        return search(str(point["treatment"]), float(point["mass"]))
+    if point["rig"] in RIGS:
+        return compared(str(point["rig"]), str(point["method"]), float(point["mass"]))
+    solref = float(point["steps"]) * PERIOD, float(point["dampratio"])
+    treatment = Treatment(solref, method=str(point["method"]))
+    runs = wall_runs if point["rig"] == "wall" else peg_runs
+    return summary(until_active(runs(treatment, float(point["stiffness"]))))
+
+
+def read(table: Table) -> Finding:
+    """Draws verdicts over timeconst and dampratio with the rule on top, methods and search below.
+
+    Raises:
+        StudyError: No point was computed at all.
+    """
+    table = computed(table, "contact")
+    found = [searched(table, name) for name in TREATMENTS if np.any(table["treatment"] == name)]
+    methods = methods_found(table)
+    rule, worse = agreement(table), exceptions(table)
+    said = [_of_rule(rule, len(worse)), _of_fast(table), _of_search(found), _of_shipped(found)]
+    said.append(of_methods(methods) or f"Of the methods {MISSING}.")
+    return Finding(
+        draw(table, found, methods),
+        " ".join(filter(None, said)),
+        {"period": PERIOD, "rule": rule, "search": found, "methods": methods, "exceptions": worse},
+    )
+
+
+def _of_rule(rule: Mapping[str, Mapping[str, int]], worse: int) -> str:
+    inside, sure, below = (rule[name] for name in ("relaxed", "strict", "abrupt"))
+    if not inside["cells"] + below["cells"]:
+        return f"On the peg's grid {MISSING}."
+    holds = sure["strict"] == sure["cells"] and not inside["active"] and not worse
+    return (
+        f"The rule {'held' if holds else 'did not hold everywhere'}: on the peg's grid "
+        f"{sure['strict']} of {sure['cells']} settings that it calls strict were "
+        f"so in every run, {inside['cells'] - inside['active']} of {inside['cells']} that it has "
+        f"within the slack for 30 g stayed there, and {below['active']} of {below['cells']} for "
+        f"which it promises nothing did not; in the search {worse} rows were worse than it says."
+    )
+
+
+def _of_fast(table: Table) -> str:
+    fast = table.select((table["rig"] == "wall") & (table["method"] == "implicitfast"))
+    if not len(fast):
+        return f"On a wall under 'implicitfast' {MISSING}."
+    share = 100 * float(np.mean(verdicts(fast) > 0))
+    return f"Under 'implicitfast' a mass on a wall creates energy at {share:.0f} % of the settings."
+
+
+def _of_search(found: Sequence[Mapping[str, Any]]) -> str:
+    if not found:
+        return f"In the search {MISSING}."
+    strict = [one for one in found if one["strict"] == one["runs"]]
+    at_rate = [one for one in strict if TREATMENTS[one["treatment"]].substeps == 1]
+    if at_rate:
+        best = min(at_rate, key=lambda one: one["median_depth"])
+        text = (
+            f"{len(at_rate)} of {len(found)} treatments are strict on the peg in every run with "
+            f"one step a tick; least deep is '{best['treatment']}', median "
+            f"{1e3 * best['median_depth']:.2f} mm and at most {1e3 * best['largest_depth']:.2f} "
+            f"mm, {best['static_depth']:.2g} times as deep as shipped under a steady force; it "
+            f"takes {1e3 * best['relaxation']:.3g} ms to come back after a push"
+        )
+    else:
+        text = f"none of {len(found)} treatments is strict on the peg in every run"
+    finer = [one for one in strict if TREATMENTS[one["treatment"]].substeps > 1]
+    if finer:
+        best = min(finer, key=lambda one: one["median_depth"])
+        text += (
+            f"; with substeps '{best['treatment']}' is too, at {1e3 * best['median_depth']:.2f} mm"
+        )
+    return f"The search: {text}."
+
+
+def _of_shipped(found: Sequence[Mapping[str, Any]]) -> str:
+    for one in found:
+        if one["treatment"] == SHIPPED:
+            return (
+                f"The setting as shipped is strict in {one['strict']} of {one['runs']} runs and "
+                f"uses up to {one['slack_share']:.2f} of the slack, at "
+                f"{1e3 * one['median_depth']:.2f} and at most {1e3 * one['largest_depth']:.2f} mm."
+            )
+    return ""
+
+
+CONTACT = StabilityMap(
+    name="contact",
+    about="settings of MuJoCo's contact: energy that they create on a wall and in a hole, and the "
+    "search for one that creates none",
+    default_points=333,
+    points=points,
+    evaluate=evaluate,
+    read=read,
+)

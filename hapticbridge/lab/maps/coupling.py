@@ -1,0 +1,411 @@
+"""Map ``coupling``: stiffness against damping at one device, for every method."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import cache
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from hapticbridge.coupling import Coupling
+from hapticbridge.device import SimulatedDevice
+from hapticbridge.lab.closed_loop import ClosedLoop, LoopOutcome
+from hapticbridge.lab.maps.base import (
+    MISSING,
+    THEORY_COLOUR,
+    VERDICTS,
+    Finding,
+    Point,
+    StabilityMap,
+    agreement,
+    computed,
+    draw_verdicts,
+    free_tool_and_wall,
+    largest_stable,
+    law_in_words,
+    limit_by_6,
+    loop_in,
+    needed_by_6,
+    per_cent,
+    swinging,
+    used_damping,
+    verdict_legend,
+    verdict_numbers,
+    wall_loop,
+)
+from hapticbridge.lab.maps.tool_mass import felt, worst_angle
+from hapticbridge.plotting import new_figure
+from hapticbridge.rendering import METHODS
+from hapticbridge.sweep.results import Table
+from hapticbridge.theory.sampled_loop import WorstHand
+
+PERIOD = 1e-3
+"""T in s."""
+
+DEVICE_DAMPING = 2.0
+"""b in N s/m, that of the default simulated device."""
+
+TOOL_MASS = 0.05
+"""In kg, that of the scene ``virtual_wall``, whose tool and wall these are, without the rail."""
+
+WALL_MASS = 1e6
+"""In kg: a tool that moves for no hand, and so a wall of known place without MuJoCo's contact. Its
+limit is (6) to within T (KT/2 + B)/(2 m) = 1e-9; a lighter one drifts, which is no decay."""
+
+STABLE = ("stable_on_wall", "stable_free", "stable_tapping")
+"""Columns that must all be true where a loop is stable; one that was not measured is left out."""
+
+TICKS = 2000
+KNOCK = np.array([1e-4, 0.0, 0.0, 0.0, 0.0, 0.0])
+"""Displacement that starts a run of the worst hand, in m: 0.1 mm, so that a loop that decays never
+reaches the wall 10 mm away."""
+
+THEORIES: Mapping[str, str] = {
+    "implicit": "implicit",
+    "compensated": "implicit",
+    "lossless": "lossless",
+    "implicitfast": "implicitfast",
+    "implicitfast:compensated": "implicit",
+    "explicit": "explicit",
+    "explicit:rk4": "explicit:rk4",
+    "weld": "implicit",
+}
+"""Which theory of a free tool a method's worst hand is tuned with. The weld's law is not the
+coupling's: its hand is that of the nominal K and B. On a heavy tool it is stiffer by the mass, so
+for it there is no wall without contact."""
+
+STIFFNESS = (100.0, 20_000.0)
+"""Range of K in N/m, even in its logarithm: from soft to five times the bound at B = 0."""
+
+DAMPING = (0.0, 3.0)
+"""Range of B in N s/m, up to one and a half times b, beyond which nothing is passive."""
+
+SEARCHED = (1.0, 200_000.0)
+"""Range of K in N/m in which a limit on a wall is searched: far beyond the picture's on both sides,
+and the same for every B."""
+
+
+PATH = swinging(0.0075, 1.5, duration=2.0, count=201)
+"""Of a hand that goes 5 mm deep into the wall three times in 2 s."""
+
+
+def points(count: int) -> Sequence[Point]:
+    """Returns a grid of K and B for every method, ``count`` runs in all, and a limit per column.
+
+    A cell takes three runs.
+    """
+    side = max(2, round((count / 3 / len(THEORIES)) ** 0.5))
+    stiffness = np.geomspace(*STIFFNESS, side)
+    damping = np.linspace(*DAMPING, side)
+    cells: list[Point] = [
+        {"what": "cell", "method": method, "stiffness": float(k), "damping": float(b)}
+        for method in THEORIES
+        for b in damping
+        for k in stiffness
+    ]
+    limits: list[Point] = [
+        {"what": "limit", "method": method, "stiffness": 0.0, "damping": float(b)}
+        for method in THEORIES
+        if METHODS[method].has_law
+        for b in damping[damping < DEVICE_DAMPING]
+    ]
+    return cells + limits
+
+
+def evaluate(point: Point) -> Mapping[str, float | str | bool]:
+    """Runs one coupling three times for 2 s, or finds the largest K that is stable on a wall.
+
+    A wall and a free tool, each with its worst hand, say whether the loop is stable. A wall without
+    contact exists only where there is a coupling law: for the weld it is not run, and the value is
+    missing. An ordinary hand that taps a wall says what the environment creates, and whether the
+    device is given what nobody pays for: its run fails where it diverges, or where the first fault
+    is the device's port. ``fault_tick`` and ``fault_port`` name the first fault, −1 and nothing if
+    there is none.
+    """
+    name, damping = str(point["method"]), float(point["damping"])
+    if point["what"] == "limit":
+        return {"limit": _limit_on_wall(name, damping)}
+    coupling = _coupling(float(point["stiffness"]), damping)
+    on_wall: dict[str, bool] = {}
+    if METHODS[name].has_law:
+        on_wall = {"stable_on_wall": _worst_hand(name, coupling, None).is_stable}
+    is_stable_free = _worst_hand(name, coupling, TOOL_MASS).is_stable
+    touch = _tool().run(
+        SimulatedDevice(damping=DEVICE_DAMPING, path=PATH),
+        coupling,
+        METHODS[name],
+        period=PERIOD,
+        ticks=TICKS,
+    )
+    tick, port = touch.fault or (-1, "")
+    return on_wall | {
+        "stable_free": is_stable_free,
+        "stable_tapping": touch.ticks == TICKS and port != "device",
+        "fault_tick": tick,
+        "fault_port": port,
+        "environment": touch.environment,
+        "created": touch.created,
+        "slack_share": touch.slack_share,
+        "peak_force": touch.peak_force,
+    }
+
+
+def _coupling(stiffness: float, damping: float) -> Coupling:
+    return Coupling(stiffness, damping, 1.0, 1e-3)  # the rail lets nothing turn
+
+
+def _worst_hand(name: str, coupling: Coupling, mass: float | None) -> LoopOutcome:
+    """Runs the hand that is worst for a method on a wall (no mass) or with a free tool."""
+    used = METHODS[name].used(coupling, PERIOD)
+    k, b = used.stiffness, used.damping
+    if mass is None:  # at Nyquist, where the damper alone is the worst hand
+        hand, loop = WorstHand(DEVICE_DAMPING, np.pi / PERIOD, PERIOD), _wall()
+    else:
+        angle, _ = worst_angle(THEORIES[name], k, b, mass, PERIOD)
+        response = complex(felt(THEORIES[name], k, b, mass, PERIOD, angle))
+        hand, loop = WorstHand(DEVICE_DAMPING, angle / PERIOD, PERIOD, response), _tool()
+    return loop.run(
+        SimulatedDevice(hand=hand),
+        coupling,
+        METHODS[name],
+        period=PERIOD,
+        ticks=TICKS,
+        knock=KNOCK,
+    )
+
+
+def _tool() -> ClosedLoop:
+    return loop_in(free_tool_and_wall)
+
+
+def _wall() -> ClosedLoop:
+    return wall_loop(WALL_MASS, free_tool_and_wall)
+
+
+def _limit_on_wall(name: str, damping: float) -> float:
+    """Returns the largest K in N/m at which the wall's worst hand is stable; 0 for none."""
+
+    def is_stable(stiffness: float) -> bool:
+        return _worst_hand(name, _coupling(stiffness, damping), None).is_stable
+
+    return largest_stable(is_stable, *SEARCHED).middle
+
+
+def of_method(table: Table, what: str, name: str) -> Table:
+    """Returns the rows of one method that are ``cell`` or ``limit``."""
+    return table.select((table["what"] == what) & (table["method"] == name))
+
+
+def verdicts_of(cells: Table) -> NDArray[np.int64]:
+    """Returns the verdict of each cell: its place in ``VERDICTS``, shape (n,).
+
+    Unstable is where a run that was measured failed; a missing value is no measurement.
+    """
+    is_stable = np.ones(len(cells), dtype=bool)
+    for column in STABLE:
+        value = cells.numbers(column)
+        is_stable &= np.isnan(value) | (value == 1)
+    return verdict_numbers(is_stable, cells.texts("environment"))
+
+
+CONTOUR = 41
+"""Points along each axis from which the free tool's bound is drawn; more make it smoother."""
+
+FINE = 201
+"""Points along each axis from which (6) is drawn; more make its corner sharper."""
+
+
+def draw(table: Table) -> Figure:
+    """Draws K against B by method, with the bounds and the measured limits on top."""
+    figure = new_figure(8, 8.4)
+    *panels, last = figure.subplots(3, 3, sharex=True, sharey=True).ravel()
+    last.remove()
+    for axes, name in zip(panels, THEORIES, strict=True):
+        has_wall = METHODS[name].has_law
+        _draw_cells(axes, of_method(table, "cell", name))
+        _draw_theory(axes, name, has_wall=has_wall)
+        limits = of_method(table, "limit", name)
+        axes.plot(limits["damping"], limits.numbers("limit"), "o", color="black", ms=4, mfc="white")
+        axes.set_title(f"{name}{_note(name)}", fontsize="medium")
+        axes.set_xlim(*DAMPING)
+        axes.set_ylim(*STIFFNESS)
+    for axes in panels[5:]:
+        axes.set_xlabel("coupling damping B (N s/m)")
+        axes.tick_params(labelbottom=True)
+    for axes in panels[::3]:
+        axes.set_ylabel("coupling stiffness K (N/m)")
+    figure.suptitle(
+        f"K against B, device damping b = {DEVICE_DAMPING:g} N s/m at {1 / PERIOD:g} Hz;\n"
+        f"worst hands on a wall and with a tool of {1e3 * TOOL_MASS:g} g, and a hand that taps.\n"
+        "B is asked for; the law uses B′ = B, or less where a title says so (0 at least)",
+        fontsize="medium",
+    )
+    verdict_legend(
+        figure,
+        [
+            ("(6): b = K T/2 + B′", "black", "-"),
+            ("(7), Tustin's rule, at low frequency", "black", ":"),
+            (f"free tool of {1e3 * TOOL_MASS:g} g by this method", THEORY_COLOUR, "--"),
+            ("measured limit on a wall", "black", "o"),
+        ],
+    )
+    return figure
+
+
+def _draw_cells(axes: Axes, cells: Table) -> None:
+    draw_verdicts(axes, cells["damping"], cells["stiffness"], verdicts_of(cells), log_y=True)
+
+
+def _note(name: str) -> str:
+    """Returns what a panel's title says beside the method's name."""
+    method = METHODS[name]
+    if not method.has_law:
+        return ": free, and tapping"
+    return f", {law_in_words(name)}" if method.lag else ""
+
+
+def _draw_theory(axes: Axes, name: str, *, has_wall: bool) -> None:
+    """Draws what was measured against: (6) and (7) only where a wall was."""
+    b = DEVICE_DAMPING
+    if has_wall:
+        fine = np.linspace(*DAMPING, FINE), np.geomspace(*STIFFNESS, FINE)
+        by_6 = needed_by_6(name, fine[1][:, None], fine[0], PERIOD)
+        axes.contour(*fine, by_6, levels=[b], colors="black", linewidths=1.8)
+    if has_wall and METHODS[name].lag == 0.0:
+        # (7) as θ → 0: (K T)² = 2 b (K T + 2 B)
+        damping = np.linspace(*DAMPING, FINE)
+        low = (b + np.sqrt(b**2 + 4 * b * damping)) / PERIOD
+        axes.plot(damping, low, color="black", ls=":", lw=1.5)
+    axes.contour(
+        np.linspace(*DAMPING, CONTOUR),
+        np.geomspace(*STIFFNESS, CONTOUR),
+        np.minimum(_needed(_first_alike(name)), 10 * b),
+        levels=[b],
+        colors=THEORY_COLOUR,
+        linestyles="--",
+        linewidths=1.5,
+    )
+
+
+def _first_alike(name: str) -> str:
+    """Returns the first method with the same free tool's bound, which is so computed once."""
+    mine = THEORIES[name], METHODS[name].lag
+    return next(each for each in THEORIES if (THEORIES[each], METHODS[each].lag) == mine)
+
+
+@cache
+def _needed(name: str) -> NDArray[np.float64]:
+    """Returns the device damping in N s/m that a free tool needs, rows of K by columns of B."""
+    stiffness, damping = np.geomspace(*STIFFNESS, CONTOUR), np.linspace(*DAMPING, CONTOUR)
+    used = used_damping(name, stiffness[:, None], damping, PERIOD)
+    return np.array(
+        [
+            [worst_angle(THEORIES[name], k, float(b), TOOL_MASS, PERIOD)[1] for b in row]
+            for k, row in zip(stiffness, used, strict=True)
+        ]
+    )
+
+
+def read(table: Table) -> Finding:
+    """Draws K against B by method, with the bounds on top, and compares the limits with (6).
+
+    Raises:
+        StudyError: No point was computed at all.
+    """
+    table = computed(table, "coupling")
+    boundary = {
+        name: _cells_below(name, of_method(table, "cell", name))
+        | _limits(name, of_method(table, "limit", name))
+        for name in THEORIES
+    }
+    return Finding(
+        draw(table),
+        _paragraph(boundary),
+        {"period": PERIOD, "device_damping": DEVICE_DAMPING, "methods": boundary},
+    )
+
+
+def _cells_below(name: str, cells: Table) -> dict[str, Any]:
+    """Counts what happened at a method's points below (6), where a device bears the coupling."""
+    needed = needed_by_6(name, cells["stiffness"], cells["damping"], PERIOD)
+    below = needed < DEVICE_DAMPING
+    mine = cells.select(below)
+    is_passive = verdicts_of(mine) <= VERDICTS.index("within slack")
+    ports = mine.texts("fault_port")
+    return {
+        "passive_share_below_6": float(np.mean(is_passive)) if len(mine) else None,
+        "runs_below_6": len(mine),
+        "environment_faults_below_6": int((ports == "environment").sum()),
+        "device_faults_below_6": int((ports == "device").sum()),
+        "most_slack_used_below_6": float(mine.numbers("slack_share").max(initial=0.0)),
+        "largest_tapping_force_below_6": float(mine.numbers("peak_force").max(initial=0.0)),
+    }
+
+
+def _limits(name: str, limits: Table) -> dict[str, Any]:
+    """Compares the limits that were found on a wall with (6); empty where none was searched."""
+    if not len(limits):
+        return {}
+    predicted = limit_by_6(name, DEVICE_DAMPING, PERIOD, limits["damping"])
+    measured = limits.numbers("limit")
+    return {
+        "damping": limits["damping"].tolist(),
+        "measured_on_wall": measured.tolist(),
+        "predicted_6": predicted.tolist(),
+        "largest_deviation": agreement(measured, predicted),
+    }
+
+
+def _paragraph(boundary: Mapping[str, Mapping[str, Any]]) -> str:
+    if "largest_deviation" in boundary["implicit"]:
+        worst = boundary["implicit"]["largest_deviation"]
+        on_wall = (
+            f"On a wall the worst hand turns 'implicit' unstable {per_cent(worst)} of "
+            "K = 2 (b − B)/T, eq. (6)"
+        )
+    else:
+        on_wall = f"On a wall, behind 'implicit', {MISSING}"
+    said = [on_wall, *(_of_method(name, mine) for name, mine in boundary.items())]
+    said.append(
+        "B is the damping asked for; 'compensated' and 'lossless' use B − K T and B − K T/2, 0 "
+        "at least, and (6) holds for what is used"
+    )
+    return ". ".join(said) + ". The table holds tick and port of every first fault."
+
+
+def _of_method(name: str, mine: Mapping[str, Any]) -> str:
+    if not mine["runs_below_6"]:
+        return f"'{name}': {MISSING} below (6)"
+    text = (
+        f"'{name}' is stable and passive at {100 * mine['passive_share_below_6']:.0f} % of the "
+        "points below (6)"
+    )
+    faults = [
+        f"the {port} port at {mine[f'{port}_faults_below_6']}"
+        for port in ("environment", "device")
+        if mine[f"{port}_faults_below_6"]
+    ]
+    if faults:
+        return (
+            f"{text}; the hand that taps finds at fault {' and '.join(faults)} of "
+            f"{mine['runs_below_6']}"
+        )
+    text += "; the hand that taps finds no port at fault"
+    if mine["most_slack_used_below_6"] > 0:
+        text += f" and {100 * mine['most_slack_used_below_6']:.0f} % of the slack used"
+    return text
+
+
+COUPLING = StabilityMap(
+    name="coupling",
+    about="stiffness against damping of the coupling at one device, for every method: stable and "
+    "passive, or not",
+    default_points=6000,
+    points=points,
+    evaluate=evaluate,
+    read=read,
+)

@@ -1,0 +1,558 @@
+"""Map ``device``: what encoder steps and dry friction of a device make of a wall.
+
+Diolaiti's regions are those of a spring alone, B = 0, of which no method takes anything off: the
+law is one for ``implicit``, ``compensated`` and ``lossless``, and one of them is run. With a damper
+they differ by their B', and each is measured.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import ListedColormap
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from numpy.typing import NDArray
+
+from hapticbridge.coupling import Coupling
+from hapticbridge.device import Hand, Motion, SimulatedDevice
+from hapticbridge.lab.closed_loop import LoopOutcome
+from hapticbridge.lab.maps.base import COLOURS as VERDICT_COLOURS
+from hapticbridge.lab.maps.base import (
+    METHOD_COLOURS,
+    MISSING,
+    Finding,
+    Point,
+    StabilityMap,
+    computed,
+    largest_stable,
+    law_in_words,
+    say_missing,
+    used_damping,
+    wall_loop,
+)
+from hapticbridge.plotting import new_figure
+from hapticbridge.rendering import METHODS
+from hapticbridge.sweep.results import Table
+from hapticbridge.theory.device_limits import quantization_limit
+
+RANGE = (0.1, 2.0)
+"""Of β and of σ, even in their logarithms."""
+
+METHODS_SHOWN = ("implicit", "compensated", "lossless")
+"""Methods whose need for friction is measured, which the bounds allow on a real device."""
+
+DAMPERS = (0.0, 3.0)
+"""Range of B in N s/m asked for, for the friction that a coupling's damper needs: K T/2 and K T,
+below which ``lossless`` and ``compensated`` use none, are 1 and 2."""
+
+REGIONS = ("passive", "locally stable", "bounded limit cycle", "unstable")
+
+PERIOD = 1e-3
+"""T in s."""
+
+STIFFNESS = 2000.0
+"""K in N/m. Only β = b/(K T) and σ = f_c/(K Δ) count, and the mass a little."""
+
+RESOLUTION = 1e-5
+"""Δ in m: an encoder of 10 µm at the handle."""
+
+QUANTUM = STIFFNESS * RESOLUTION
+"""K Δ in N, the step of the force."""
+
+DEVICE_MASS = 0.1
+"""m_d in kg, that of the default simulated device."""
+
+PULL = 1.0
+"""Stiffness of the hand in N/m: a five hundredth of K's step in force is what it varies by, so that
+it presses with a steady force."""
+
+PRESSED = 5.5
+"""Force of the hand in steps of K Δ. The half matters: the wall can answer with five or six steps,
+each wrong by half of one, and half a step is the friction that then holds the device."""
+
+LARGE = 3000.0
+"""Knock of the second run in steps of the encoder: 3 cm. Friction alone can stop a smaller one even
+where damping does not suffice: it takes 4 σ steps a swing from any motion."""
+
+WALL_MASS = 1e9
+"""In kg: a tool that the hand's press moves by 2e-9 m in a run, a five thousandth of a step."""
+
+TICKS = 6000
+"""Of a knocked run; one that is only pressed has settled in half of them."""
+
+CHANGED = 0.02
+"""Share by which the range of motion must rise or fall between the last two sixths of a run to
+count as doing so, without unit; less would take the beat of a cycle with the samples for it."""
+
+NOTHING = 2.0
+"""Range in steps of the encoder up to which motion is the cycle across one border, and neither
+rises nor falls."""
+
+DIVERGED = 3.0
+"""Multiple of the knock beyond which motion has diverged, without unit; a free device overshoots at
+most to its start."""
+
+FRICTION = (0.01, 10.0)
+"""Range of σ in which that at which a pressed device rests is searched."""
+
+DAMPED = 5.0
+"""b in N s/m while B is varied, above K T/2 + B throughout."""
+
+SHAKEN = 0.05
+"""Stroke of the shaken hand, in steps of the encoder: small, so that the device's own damping takes
+nothing, which would otherwise help friction."""
+
+
+def region_of(small: str, large: str) -> str:
+    """Returns the region that two runs show, from what they did alone.
+
+    Args:
+        small: What became of a device that was only pressed, as ``settle`` names it.
+        large: The same of one that was knocked as well; where it ``falls`` until the end, the
+            small one says what it falls to.
+    """
+    if "diverges" in {small, large}:
+        return "locally stable" if small == "rest" else "unstable"
+    is_passive = small == "rest" and large in {"rest", "falls"}
+    return "passive" if is_passive else "bounded limit cycle"
+
+
+def settle(
+    beta: float, sigma: float, knock: float, damping: float = 0.0, name: str = "implicit"
+) -> tuple[str, float, LoopOutcome]:
+    """Runs a device that a hand presses on a wall, after a knock.
+
+    Args:
+        beta: b/(K T), without unit, >= 0.
+        sigma: f_c/(K Δ), without unit, >= 0.
+        knock: Displacement at the start in steps of the encoder.
+        damping: B in N s/m asked for, >= 0. At 0 all of ``METHODS_SHOWN`` have one law.
+        name: The method.
+
+    Returns:
+        ``rest``, ``cycle`` (motion that neither ends nor grows), ``falls`` (it is still on its way
+        down) or ``diverges``; the range of the
+        reported position in the last sixth in steps of the encoder; and the run.
+    """
+    device = pressed_device(beta, sigma)
+    start = np.array([knock * RESOLUTION, 0.0, 0.0, 0.0, 0.0, 0.0])
+    ticks = TICKS if knock else TICKS // 2
+    run = _wall(name, device, damping, ticks, start)
+    steps = run.records["device_position"][:, 0] / RESOLUTION
+    width = ticks // 6
+    if run.ticks < ticks or np.abs(steps).max() > DIVERGED * max(knock, 2 * PRESSED):
+        return "diverges", float(np.ptp(steps[-width:])), run
+    before, last = float(np.ptp(steps[-2 * width : -width])), float(np.ptp(steps[-width:]))
+    if last == 0:
+        return "rest", last, run
+    if last > NOTHING and last > before * (1 + CHANGED):
+        return "diverges", last, run
+    if last > NOTHING and last < before * (1 - CHANGED):
+        return "falls", last, run
+    return "cycle", last, run
+
+
+def pressed_device(beta: float, sigma: float, limit: float = 10.0) -> SimulatedDevice:
+    """Returns a device with friction and encoder steps whose hand presses it on the wall.
+
+    Args:
+        beta: b/(K T), without unit, >= 0.
+        sigma: f_c/(K Δ), without unit, >= 0.
+        limit: Of its data sheet, in N and N m.
+    """
+    time = [0.0, 0.02, 100.0]
+    target = np.zeros((3, 3))
+    target[1:, 0] = PRESSED * QUANTUM / PULL
+    hand = Hand(
+        mass=0.0,
+        damping=0.0,
+        stiffness=PULL,
+        rotational_inertia=0.0,
+        rotational_damping=0.0,
+        rotational_stiffness=0.0,
+    )
+    return SimulatedDevice(
+        mass=DEVICE_MASS,
+        damping=beta * STIFFNESS * PERIOD,
+        friction=sigma * QUANTUM,
+        resolution=RESOLUTION,
+        hand=hand,
+        path=Motion(time, target),
+        force_limit=limit,
+        torque_limit=limit,
+    )
+
+
+def _wall(
+    name: str, device: SimulatedDevice, damping: float, ticks: int, knock: NDArray[np.float64]
+) -> LoopOutcome:
+    return wall_loop(WALL_MASS).run(
+        device,
+        Coupling(STIFFNESS, damping, 0.0, 0.0),
+        METHODS[name],
+        period=PERIOD,
+        ticks=ticks,
+        knock=knock,
+        keep_records=True,
+    )
+
+
+def friction_needed(name: str, damping: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Returns the σ that theory asks for, ½ + B'/(K T): f_c = K Δ/2 + B' Δ/T.
+
+    Args:
+        name: The method, whose law uses B'.
+        damping: B in N s/m asked for, >= 0.
+
+    References:
+        Abbott & Okamura 2005.
+    """
+    return 0.5 + used_damping(name, STIFFNESS, damping, PERIOD) / (PERIOD * STIFFNESS)
+
+
+def friction_to_rest(name: str, damping: float) -> float:
+    """Returns a σ at which a pressed device begins to come to rest.
+
+    0 where it rests at the least that is tried, inf where it never does. With a damper rest and
+    cycle take turns between K Δ/2 and a little above; one of the changes is found.
+
+    Args:
+        name: The method.
+        damping: B in N s/m asked for, >= 0.
+    """
+    beta = DAMPED / (STIFFNESS * PERIOD)
+    return largest_stable(
+        lambda sigma: settle(beta, sigma, 0.0, damping, name)[0] != "rest", *FRICTION
+    ).middle
+
+
+def shaken(name: str, damping: float) -> float:
+    """Returns the σ that pays for what the motor gives a hand that shakes it across one step.
+
+    The hand is stiff and moves the device to and fro across a border between two encoder steps,
+    once a tick; the motor's work on it, over the way, is the friction that would take it.
+
+    Args:
+        name: The method.
+        damping: B in N s/m asked for, >= 0.
+    """
+    ticks = 400
+    side = np.where(np.arange(ticks + 2) % 2 == 0, -0.5, 0.5) * SHAKEN
+    side[0] = 0.0
+    # a border lies half a step from where the device starts, and it goes there first
+    way = np.concatenate([[0.0, 0.0], np.full(50, 0.5), 0.5 + side]) * RESOLUTION
+    path = np.zeros((way.size, 3))
+    path[:, 0] = way
+    device = SimulatedDevice(
+        mass=1e-3,
+        damping=DAMPED,
+        resolution=RESOLUTION,
+        hand=Hand(mass=0.0, damping=1e6, stiffness=1e9),
+        path=Motion(PERIOD * np.arange(way.size), path),
+    )
+    run = _wall(name, device, damping, way.size - 1, np.zeros(6))
+    first = way.size - 300
+    force = run.records["wrench_on_device"][first:-1, 0]
+    moved = np.diff(way)[first : first + force.size]
+    return float((force * moved).sum() / np.abs(moved).sum() / QUANTUM)
+
+
+COLOURS = (VERDICT_COLOURS[0], "#8fb8de", VERDICT_COLOURS[1], VERDICT_COLOURS[3])
+"""Of the regions: those of the verdicts from strict to unstable, and one that no verdict has for
+what depends on the knock."""
+
+MARKERS = {"shaken": "o", "pressed": "s"}
+
+WORDS = {"shaken": "shaken across a step", "pressed": "pressed, comes to rest"}
+"""What a marker stands for."""
+
+SIZES = (7.0, 5.5, 3.5)
+"""Of the methods' markers in points, and three times their lines' widths: where ``compensated`` and
+``lossless`` use no damper they lie on each other, and all must be seen."""
+
+
+def draw(cells: Table, friction: Mapping[str, Any]) -> Figure:
+    """Draws the regions, and beside them the friction that was found at each damper."""
+    figure = new_figure(8, 5.4)
+    left, right = figure.subplots(1, 2, width_ratios=(1.1, 1))
+    _draw_regions(left, cells)
+    _draw_friction(right, friction)
+    figure.suptitle(
+        f"Encoder steps of Δ = {1e6 * RESOLUTION:g} µm against dry friction f_c: a device of\n"
+        f"{1e3 * DEVICE_MASS:g} g pressed on a wall, K = {STIFFNESS:g} N/m, {1 / PERIOD:g} Hz",
+        fontsize="medium",
+    )
+    figure.legend(
+        handles=[
+            *(Patch(facecolor=c, label=r) for r, c in zip(REGIONS, COLOURS, strict=True)),
+            Line2D([], [], color="black", label="β = ½, σ = ½ (Diolaiti)"),
+        ],
+        title="measured (colours) and predicted (lines)",
+        title_fontsize="small",
+        fontsize="small",
+        loc="outside lower center",
+        ncols=5,
+        columnspacing=1.2,
+        frameon=False,
+    )
+    return figure
+
+
+def _draw_regions(axes: Axes, cells: Table) -> None:
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    if len(cells):
+        number = np.array([REGIONS.index(name) for name in cells["region"]])
+        beta, sigma = np.unique(cells["beta"]), np.unique(cells["sigma"])
+        grid = np.full((sigma.size, beta.size), np.nan)
+        grid[np.searchsorted(sigma, cells["sigma"]), np.searchsorted(beta, cells["beta"])] = number
+        axes.pcolormesh(
+            beta, sigma, grid, cmap=ListedColormap(COLOURS), vmin=-0.5, vmax=3.5, shading="nearest"
+        )
+        for place, name in {
+            (1.0, 1.0): REGIONS[0],
+            (0.22, 1.0): REGIONS[1],
+            (1.0, 0.22): REGIONS[2],
+            (0.22, 0.22): REGIONS[3],
+        }.items():
+            axes.text(*place, f"theory:\n{name}", ha="center", va="center", fontsize="small")
+    else:
+        say_missing(axes)
+    axes.axvline(0.5, color="black", lw=1.8)
+    axes.axhline(0.5, color="black", lw=1.8)
+    axes.set_xlim(*RANGE)
+    axes.set_ylim(*RANGE)
+    ticks = (0.1, 0.2, 0.5, 1.0, 2.0)
+    axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
+    axes.set_yticks(ticks, [f"{tick:g}" for tick in ticks])
+    axes.minorticks_off()
+    axes.set_xlabel("damping of the device, β = b/(K T)")
+    axes.set_ylabel("friction of the device, σ = f_c/(K Δ)")
+    axes.set_title("B = 0: pressed, and knocked; one law", fontsize="medium")
+
+
+def _draw_friction(axes: Axes, found: Mapping[str, Any]) -> None:
+    axes.set_xlabel("coupling damping B asked for (N s/m)")
+    axes.set_ylabel("friction needed, f_c/(K Δ)")
+    axes.set_title(f"with a damper, b = {DAMPED:g} N s/m", fontsize="medium")
+    if not found:
+        say_missing(axes)
+        return
+    for name, size in zip(METHODS_SHOWN, SIZES, strict=True):
+        if name in found:
+            mine, colour = found[name], METHOD_COLOURS[name]
+            style: dict[str, Any] = {"color": colour, "mfc": "white", "ls": "", "ms": size}
+            axes.plot(
+                mine["damping"],
+                mine["predicted"],
+                color=colour,
+                lw=size / 3,
+                label=f"{name}: {law_in_words(name)}",
+            )
+            for what, marker in MARKERS.items():
+                axes.plot(mine["damping"], mine[what], marker, **style)
+    for what, marker in MARKERS.items():
+        axes.plot([], [], marker, color="black", mfc="white", label=f"measured: {WORDS[what]}")
+    # room above for the names
+    axes.set_ylim(0, 1.75 * max(max(mine["predicted"]) for mine in found.values()))
+    lines = Line2D([], [], ls="", label="lines: f_c = K Δ/2 + B′ Δ/T")
+    axes.legend(
+        handles=[lines, *axes.get_legend_handles_labels()[0]], fontsize="small", loc="upper left"
+    )
+
+
+SMALLEST = 1e-4
+"""Deviation in per cent below which rounding alone is left, and nothing smaller is quoted."""
+
+
+def points(count: int) -> Sequence[Point]:
+    """Returns a grid of β and σ, and dampers by method at which the friction needed is measured."""
+    side = max(3, round(count**0.5))
+    values = np.geomspace(*RANGE, side)
+    cells: list[Point] = [
+        _point("cell", METHODS_SHOWN[0], float(beta), float(sigma), 0.0)
+        for beta in values
+        for sigma in values
+    ]
+    dampers: list[Point] = [
+        _point("friction", name, 0.0, 0.0, float(damping))
+        for name in METHODS_SHOWN
+        for damping in np.linspace(*DAMPERS, max(3, side // 3))
+    ]
+    return cells + dampers
+
+
+def _point(what: str, method: str, beta: float, sigma: float, damping: float) -> Point:
+    return {"what": what, "method": method, "beta": beta, "sigma": sigma, "damping": damping}
+
+
+def evaluate(point: Point) -> Mapping[str, float | str | bool]:
+    """Lets a pressed device settle from where it is and from a large knock, and says what it did.
+
+    Or measures the friction that pays for a coupling's damper.
+    """
+    if point["what"] == "friction":
+        law = str(point["method"]), float(point["damping"])
+        return {"needed_at_rest": friction_to_rest(*law), "needed_shaken": shaken(*law)}
+    beta, sigma = float(point["beta"]), float(point["sigma"])
+    small, small_range, _ = settle(beta, sigma, 0.0)
+    large, large_range, run = settle(beta, sigma, LARGE)
+    return {
+        "small": small,
+        "large": large,
+        "region": region_of(small, large),
+        "cycle": small_range if small == "cycle" else large_range if large == "cycle" else 0.0,
+        "last_range": large_range,
+        "ticks": run.ticks,
+        "device_energy": run.device_energy,
+    }
+
+
+def read(table: Table) -> Finding:
+    """Compares regions over β and σ, and the friction that a damper needs, with theory.
+
+    Where no point of one of the two, or of a method, was computed it is left out, and the
+    paragraph says so.
+
+    Raises:
+        StudyError: No point was computed at all.
+    """
+    table = computed(table, "device")
+    cells = table.select(table["what"] == "cell")
+    dampers = table.select(table["what"] == "friction")
+    boundary: dict[str, Any] = {
+        "period": PERIOD,
+        "stiffness": STIFFNESS,
+        "resolution": RESOLUTION,
+        "regions": _regions(cells) if len(cells) else {},
+        "friction": {
+            name: _friction(name, mine)
+            for name in METHODS_SHOWN
+            if len(mine := dampers.select(dampers["method"] == name))
+        },
+    }
+    said = [_of_regions(boundary["regions"]), _of_friction(boundary["friction"])]
+    return Finding(draw(cells, boundary["friction"]), " ".join(said), boundary)
+
+
+def _regions(cells: Table) -> dict[str, Any]:
+    cycle = cells.numbers("cycle")[cells["region"] == "bounded limit cycle"]
+    return {
+        "points": {name: int((cells["region"] == name).sum()) for name in REGIONS},
+        "agreement": float(np.mean(cells["region"] == predicted_regions(cells))),
+        "measured_edges": _edges(cells),
+        "predicted_edges": {"beta": 0.5, "sigma": 0.5},
+        "largest_cycle_steps": float(cycle.max()) if cycle.size else None,
+        "median_cycle_steps": float(np.median(cycle)) if cycle.size else None,
+    }
+
+
+def _friction(name: str, dampers: Table) -> dict[str, Any]:
+    """Returns σ that a method needs at each B, measured twice and by theory."""
+    predicted = friction_needed(name, dampers["damping"])
+    shaken_needs = dampers.numbers("needed_shaken")
+    return {
+        "damping": dampers["damping"].tolist(),
+        "predicted": predicted.tolist(),
+        "shaken": shaken_needs.tolist(),
+        "pressed": dampers.numbers("needed_at_rest").tolist(),
+        "worst_ratio_error": float(np.abs(shaken_needs / predicted - 1).max()),
+    }
+
+
+def _of_regions(found: Mapping[str, Any]) -> str:
+    if not found:
+        return f"Regions over β and σ: {MISSING}."
+    counts = ", ".join(f"{name} {count}" for name, count in found["points"].items())
+    edges, largest = found["measured_edges"], found["largest_cycle_steps"]
+    size = (
+        "no bounded limit cycle was seen"
+        if largest is None
+        else f"in encoder steps, peak to peak, the largest bounded limit cycle is {largest:.0f}, "
+        f"the median one {found['median_cycle_steps']:.0f}"
+    )
+    return (
+        f"What the runs did agrees with Diolaiti's regions at {100 * found['agreement']:.0f} % of "
+        f"the points: {counts}. Divergence ends at β = {_said(edges['beta'])}, and the pressed "
+        f"device comes to rest from σ = {_said(edges['sigma'])} on (theory: both ½); {size}."
+    )
+
+
+def _of_friction(found: Mapping[str, Any]) -> str:
+    if not found:
+        return f"Friction against the damper: {MISSING}."
+    error = max(SMALLEST, *(100 * mine["worst_ratio_error"] for mine in found.values()))
+    needs = "; ".join(_needs_of(name, found.get(name)) for name in METHODS_SHOWN)
+    return (
+        "With a damper, a hand that shakes the device across one encoder step needs f_c = K Δ/2 + "
+        f"B′ Δ/T within {error:.2g} %. That, and where one that only presses begins to let it "
+        f"rest, at the values of B that were tried: {needs}."
+    )
+
+
+def _needs_of(name: str, mine: Mapping[str, Any] | None) -> str:
+    if mine is None:
+        return f"'{name}': {MISSING}"
+    shaken_needs, pressed = mine["shaken"], mine["pressed"]
+    return (
+        f"'{name}' shaken {min(shaken_needs):.3g} to {max(shaken_needs):.3g} K Δ, pressed "
+        f"{min(pressed):.3g} to {max(pressed):.3g} K Δ"
+    )
+
+
+def _said(edge: Mapping[str, float] | None) -> str:
+    return "no value here" if edge is None else f"{edge['last']:.2f} to {edge['first']:.2f}"
+
+
+def _edges(cells: Table) -> dict[str, Any]:
+    """Returns between which β divergence ends, and between which σ motion from a press ends.
+
+    None where no run was bad, or the largest value had a bad one.
+    """
+    return {
+        "beta": _edge(cells["beta"], cells["large"] == "diverges"),
+        "sigma": _edge(cells["sigma"], cells["small"] != "rest"),
+    }
+
+
+def _edge(values: NDArray[np.float64], is_bad: NDArray[np.bool_]) -> dict[str, float] | None:
+    """Returns the ``last`` value with a bad run, and the ``first`` one from which none is bad."""
+    if not is_bad.any() or not (values > values[is_bad].max()).any():
+        return None
+    last = float(values[is_bad].max())
+    return {"last": last, "first": float(values[values > last].min())}
+
+
+def predicted_regions(cells: Table) -> NDArray[np.object_]:
+    """Returns Diolaiti's region at each row, from its β and σ."""
+    coupling = Coupling(STIFFNESS, 0.0, 0.0, 0.0)
+    return np.array(
+        [
+            quantization_limit(
+                SimulatedDevice(
+                    damping=float(b) * STIFFNESS * PERIOD,
+                    friction=float(s) * QUANTUM,
+                    resolution=RESOLUTION,
+                ).info,
+                coupling,
+                PERIOD,
+            ).region
+            for b, s in zip(cells["beta"], cells["sigma"], strict=True)
+        ],
+        dtype=object,
+    )
+
+
+DEVICE = StabilityMap(
+    name="device",
+    about="encoder steps against Coulomb friction of the device: Diolaiti's four regions, measured",
+    default_points=400,
+    points=points,
+    evaluate=evaluate,
+    read=read,
+)

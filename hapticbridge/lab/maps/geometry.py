@@ -1,0 +1,403 @@
+"""Map ``geometry``: how long a peg may be, rendered directly and through the coupling.
+
+The peg touches both walls of its hole throughout, where ``lossless`` is in its implicit form: what
+tells the methods behind the coupling apart is the B' that their law uses, with (6) in B'.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import mujoco
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from hapticbridge.coupling import Coupling
+from hapticbridge.device import SimulatedDevice
+from hapticbridge.guard import UNLIMITED
+from hapticbridge.lab.closed_loop import LoopOutcome
+from hapticbridge.lab.maps.base import (
+    MISSING,
+    THEORY_COLOUR,
+    Finding,
+    Point,
+    StabilityMap,
+    agreement,
+    computed,
+    draw_verdicts,
+    largest_stable,
+    law_in_words,
+    limit_by_6,
+    loop_in,
+    per_cent,
+    verdict_legend,
+    verdict_numbers,
+)
+from hapticbridge.plotting import new_figure
+from hapticbridge.rendering import METHODS
+from hapticbridge.sweep.results import Table
+from hapticbridge.theory.sampled_loop import WorstHand
+
+PERIOD = 1e-3
+"""T in s."""
+
+DEVICE_DAMPING = 2e-3
+"""b_θ in N m s/rad, that of the default simulated device."""
+
+ROTATIONAL_DAMPING = 5e-4
+"""B_r of the coupling in N m s/rad: b_θ/4, what the bridge itself would choose."""
+
+COUPLING_STIFFNESS = 2000.0
+"""K of the coupling in N/m, well below its own limit 2b/T: translation must not be what fails."""
+
+GROWTH = 1.001
+"""Share of the knock's torque beyond which it has grown, without unit: above the rounding of depths
+of less than a micrometre."""
+
+TICKS = 500
+"""A run. One per cent beyond the limit the knock has grown a thousandfold by then, and more."""
+
+KNOCK = np.array([0.0, 0.0, 0.0, 0.0, 1e-4, 0.0])
+"""Turn that starts a run, in rad: at every length less deep than the walls are thick."""
+
+
+def length_limit(contact_stiffness: NDArray[np.float64] | float) -> NDArray[np.float64]:
+    """Returns the longest L in m that ``direct`` bears: 2 √(b_θ/(T K_c)), K_c in N/m."""
+    return np.asarray(2 * np.sqrt(DEVICE_DAMPING / (PERIOD * np.asarray(contact_stiffness))))
+
+
+def contact_stiffness_limit(length: NDArray[np.float64] | float) -> NDArray[np.float64]:
+    """Returns the largest K_c in N/m that ``direct`` bears: 4 b_θ/(T L²), L in m."""
+    return np.asarray(4 * DEVICE_DAMPING / (PERIOD * np.asarray(length) ** 2))
+
+
+def device_and_coupling(name: str, stiffness: float) -> tuple[SimulatedDevice, Coupling]:
+    """Returns the rotational damper behind which a peg is run, and its coupling.
+
+    At Nyquist, where a spring is worst, that damper is device and worst hand in one. The damper of
+    the translation is four times what two contacts could need: translation is not what fails.
+
+    Args:
+        name: ``direct``, or a method with a coupling.
+        stiffness: K_c in N/m per wall, or K_r in N m/rad.
+    """
+    if name == "direct":
+        # box against box makes two contacts on a wall, one at each end of the 20 mm of its width
+        coupling = Coupling(stiffness / 2, 0.0, 0.0, 0.0)
+        damping = 4 * stiffness * PERIOD
+    else:
+        coupling = Coupling(COUPLING_STIFFNESS, 0.0, stiffness, ROTATIONAL_DAMPING)
+        damping = 4 * COUPLING_STIFFNESS * PERIOD
+    nyquist = np.pi / PERIOD
+    device = SimulatedDevice(
+        damping=damping,
+        rotational_damping=DEVICE_DAMPING,
+        hand=WorstHand(damping, nyquist, PERIOD),
+        rotational_hand=WorstHand(DEVICE_DAMPING, nyquist, PERIOD),
+        force_limit=UNLIMITED.force,
+        torque_limit=UNLIMITED.torque,
+    )
+    return device, coupling
+
+
+def run(name: str, length: float, stiffness: float) -> LoopOutcome:
+    """Runs a peg that fills its hole, handle midway, behind the rotational damper alone.
+
+    Args:
+        name: ``direct``, or a method with a coupling.
+        length: L in m: of the peg, and so between contacts on opposite walls.
+        stiffness: K_c in N/m per wall, or K_r in N m/rad.
+
+    Returns:
+        The outcome, with its records.
+    """
+    loop = loop_in("planar_peg", "geometry")
+    set_length(loop.scene.model, length)
+    mujoco.mj_setConst(loop.scene.model, loop.scene.data)
+    device, coupling = device_and_coupling(name, stiffness)
+    return loop.run(
+        device,
+        coupling,
+        METHODS[name],
+        period=PERIOD,
+        ticks=TICKS,
+        knock=KNOCK,
+        keep_records=True,
+    )
+
+
+def set_length(model: mujoco.MjModel, length: float) -> None:
+    """Makes the peg of ``planar_peg`` as long as asked, midway in a hole that it just fills.
+
+    Mass and inertia stay, so that nothing but the geometry changes with L.
+
+    Args:
+        model: Changed in place; ``mj_setConst`` must follow.
+        length: L in m.
+    """
+    peg = model.geom("peg").id
+    model.geom_size[peg, 2] = length / 2
+    model.body_pos[model.body("peg").id] = 0.0
+    walls = [model.geom("hole_east").id, model.geom("hole_west").id]
+    for side, wall in zip((1.0, -1.0), walls, strict=True):
+        model.geom_size[wall, 2] = length  # twice the peg's, so that its ends meet no edge
+        model.geom_pos[wall] = [side * (model.geom_size[peg, 0] + model.geom_size[wall, 0]), 0, 0]
+    bottom = model.geom("hole_bottom").id
+    model.geom_pos[bottom, 2] = -2 * length - model.geom_size[bottom, 2]
+    for geom in (peg, *walls, bottom):
+        model.geom_rbound[geom] = np.linalg.norm(model.geom_size[geom])
+        model.geom_aabb[geom, 3:] = model.geom_size[geom]
+
+
+def is_stable(name: str, length: float, stiffness: float) -> bool:
+    """Returns whether what a knock in rotation leaves falls, and was never its double."""
+    return has_calmed(run(name, length, stiffness), name, length, stiffness)
+
+
+def has_calmed(outcome: LoopOutcome, name: str, length: float, stiffness: float) -> bool:
+    """Returns whether a run's torque falls, and was never the double of what the knock left.
+
+    What is thrown out of the hole is calm too, but had grown before.
+    """
+    largest = torque(outcome).max(initial=0.0)
+    return outcome.is_stable and bool(largest < 2 * knocked(name, length, stiffness))
+
+
+def first_growth(outcome: LoopOutcome, name: str, length: float, stiffness: float) -> int:
+    """Returns the first tick at which the device feels more than the knock left, −1 for none."""
+    grown = np.flatnonzero(torque(outcome) > GROWTH * knocked(name, length, stiffness))
+    return int(grown[0]) if grown.size else -1
+
+
+def torque(outcome: LoopOutcome) -> NDArray[np.float64]:
+    """Returns the size of the torque about the hinge at each tick in N m."""
+    return np.asarray(np.abs(outcome.records["wrench_on_tool"][:, 4]))
+
+
+def knocked(name: str, length: float, stiffness: float) -> float:
+    """Returns the torque in N m that the knock leaves before the loop answers."""
+    twist = float(KNOCK[4])
+    if name == "direct":
+        return 0.5 * stiffness * length**2 * twist
+    return (stiffness + ROTATIONAL_DAMPING / PERIOD) * twist
+
+
+LENGTH = (5e-3, 0.5)
+"""Range of L in m, even in its logarithm."""
+
+CONTACT_STIFFNESS = (10.0, 1e6)
+"""Range of K_c in N/m, even in its logarithm: its limit at both ends of ``LENGTH`` lies within."""
+
+ROTATIONAL_STIFFNESS = (0.1, 10.0)
+"""Range of K_r in N m/rad, even in its logarithm, about the bounds of 3 and 4 N m/rad."""
+
+LIMITS_AMONG = 60
+"""One limit is searched for every so many cells; a search takes about a dozen runs."""
+
+BEHIND = ("implicit", "compensated", "lossless")
+"""Methods with a coupling, which all get the same B_r asked for."""
+
+METHODS_SHOWN = ("direct", *BEHIND)
+
+BOUNDS = {
+    name: float(limit_by_6(name, DEVICE_DAMPING, PERIOD, ROTATIONAL_DAMPING)) for name in BEHIND
+}
+"""The largest K_r in N m/rad by (6): 2 (b_θ − B_r)/T for ``implicit``; 2 b_θ/T for the others, of
+whose B' nothing is left there."""
+
+
+def points(count: int) -> Sequence[Point]:
+    """Returns a grid of length and stiffness for each method, about ``count`` in all, and limits.
+
+    ``stiffness`` is K_c in N/m for ``direct`` and K_r in N m/rad behind the coupling. The limits
+    are searched over L at given K_c for ``direct``, and over K_r at given L behind the coupling.
+    """
+    side = max(2, round((count / len(METHODS_SHOWN)) ** 0.5))
+    lengths = np.geomspace(*LENGTH, side)
+    ranges = {"direct": CONTACT_STIFFNESS} | dict.fromkeys(BEHIND, ROTATIONAL_STIFFNESS)
+    cells: list[Point] = [
+        {"what": "cell", "method": name, "length": float(length), "stiffness": float(stiffness)}
+        for name in METHODS_SHOWN
+        for length in lengths
+        for stiffness in np.geomspace(*ranges[name], side)
+    ]
+    many = max(3, count // (len(METHODS_SHOWN) * LIMITS_AMONG))
+    searched = np.geomspace(*LENGTH, many)
+    direct: list[Point] = [
+        {"what": "limit", "method": "direct", "length": 0.0, "stiffness": float(stiffness)}
+        for stiffness in contact_stiffness_limit(searched[::-1])
+    ]
+    behind: list[Point] = [
+        {"what": "limit", "method": name, "length": float(length), "stiffness": 0.0}
+        for name in BEHIND
+        for length in searched
+    ]
+    return cells + direct + behind
+
+
+def evaluate(point: Point) -> Mapping[str, float | int | str | bool]:
+    """Runs one peg behind its worst hand, or searches for the limit that the point leaves open."""
+    name, length, stiffness = (
+        str(point["method"]),
+        float(point["length"]),
+        float(point["stiffness"]),
+    )
+    if point["what"] == "limit":
+        if name == "direct":
+            found = largest_stable(
+                lambda value: is_stable(name, value, stiffness), LENGTH[0] / 4, 4 * LENGTH[1]
+            )
+        else:
+            lower, upper = ROTATIONAL_STIFFNESS
+            found = largest_stable(
+                lambda value: is_stable(name, length, value), lower / 4, 4 * upper
+            )
+        return {"limit": found.middle}
+    outcome = run(name, length, stiffness)
+    return {
+        "stable": has_calmed(outcome, name, length, stiffness),
+        "environment": outcome.environment,
+        "created": outcome.created,
+        "first_active": outcome.first_active,
+        "first_growth": first_growth(outcome, name, length, stiffness),
+    }
+
+
+def draw(table: Table, limits: Mapping[str, Table]) -> Figure:
+    """Draws contact stiffness over length, and that of the coupling, with the limits on top.
+
+    Args:
+        table: All rows that were computed.
+        limits: The searches of each method.
+    """
+    figure = new_figure(8, 7.6)
+    panels = figure.subplots(2, 2, sharex=True).ravel()
+    for axes, name in zip(panels, METHODS_SHOWN, strict=True):
+        _draw_cells(axes, table, name)
+        mine = limits[name]
+        if name == "direct":
+            lengths = np.geomspace(*LENGTH, 100)
+            axes.plot(1e3 * lengths, contact_stiffness_limit(lengths), color="black", lw=1.8)
+            x, y = mine.numbers("limit"), mine["stiffness"]
+            axes.set_title("direct: no coupling", fontsize="medium")
+            axes.set_ylabel("contact stiffness K_c (N/m)")
+            axes.set_ylim(*CONTACT_STIFFNESS)
+        else:
+            axes.axhline(BOUNDS[name], color=THEORY_COLOUR, lw=1.8, ls="--")
+            x, y = mine["length"], mine.numbers("limit")
+            axes.set_title(f"{name}, {law_in_words(name, '_r')}", fontsize="medium")
+            axes.set_ylabel("coupling stiffness K_r (N m/rad)")
+            axes.set_ylim(*ROTATIONAL_STIFFNESS)
+        axes.plot(1e3 * x, y, "o", color="black", ms=4, mfc="white")
+        axes.set_xlim(1e3 * LENGTH[0], 1e3 * LENGTH[1])
+    for axes in panels[2:]:
+        axes.set_xlabel("length of the peg L (mm)")
+    figure.suptitle(
+        f"A peg that fills its hole, handle midway, b_θ = {1e3 * DEVICE_DAMPING:g} mN m s/rad "
+        f"at {1 / PERIOD:g} Hz, worst hand in rotation;\nbehind the coupling B_r = "
+        f"{1e3 * ROTATIONAL_DAMPING:g} mN m s/rad is asked for, and the law uses B_r′ (0 at least)",
+        fontsize="medium",
+    )
+    verdict_legend(
+        figure,
+        [
+            ("L = 2 √(b_θ/(T K_c))", "black", "-"),
+            ("(6): b_θ = K_r T/2 + B_r′", THEORY_COLOUR, "--"),
+            ("measured limit", "black", "o"),
+        ],
+    )
+    return figure
+
+
+def _draw_cells(axes: Axes, table: Table, name: str) -> None:
+    cells = table.select((table["what"] == "cell") & (table["method"] == name))
+    verdict = verdict_numbers(cells.numbers("stable") == 1, cells.texts("environment"))
+    length = 1e3 * cells["length"]
+    draw_verdicts(axes, length, cells["stiffness"], verdict, log_x=True, log_y=True)
+
+
+def read(table: Table) -> Finding:
+    """Draws contact or coupling stiffness over the length, with the limits on top.
+
+    Raises:
+        StudyError: No point was computed at all.
+    """
+    table = computed(table, "geometry")
+    limits = table.select(table["what"] == "limit")
+    of_method = {name: limits.select(limits["method"] == name) for name in METHODS_SHOWN}
+    boundary = {
+        "period": PERIOD,
+        "device_rotational_damping": DEVICE_DAMPING,
+        "direct": _of_direct(of_method["direct"]),
+        **{name: _behind(name, of_method[name]) for name in BEHIND},
+    }
+    return Finding(draw(table, of_method), _paragraph(boundary), boundary)
+
+
+def _of_direct(limits: Table) -> dict[str, Any]:
+    """Compares the longest pegs that were found, each at its K_c, with the printed limit."""
+    predicted, measured = length_limit(limits["stiffness"]), limits.numbers("limit")
+    return {
+        "contact_stiffness": limits["stiffness"].tolist(),
+        "measured_length": measured.tolist(),
+        "predicted_length": predicted.tolist(),
+        "largest_deviation": agreement(measured, predicted),
+    }
+
+
+def _behind(name: str, limits: Table) -> dict[str, Any]:
+    """Compares the largest K_r that were found, each at its length, with (6) and each other."""
+    measured = limits.numbers("limit")
+    # 0 and infinity: nothing or everything that was searched is stable, which is no limit
+    known = measured[np.isfinite(measured) & (measured > 0)]
+    return {
+        "coupling_rotational_damping": ROTATIONAL_DAMPING,
+        "length": limits["length"].tolist(),
+        "measured_rotational_stiffness": measured.tolist(),
+        "predicted_6": BOUNDS[name],
+        "largest_deviation": agreement(measured, BOUNDS[name]),
+        "smallest": float(known.min()) if known.size else None,
+        "largest": float(known.max()) if known.size else None,
+        "largest_over_smallest": float(known.max() / known.min()) if known.size else None,
+    }
+
+
+def _paragraph(boundary: Mapping[str, Any]) -> str:
+    direct = boundary["direct"]
+    contact, length = direct["contact_stiffness"], direct["measured_length"]
+    if contact:
+        soft, stiff = int(np.argmin(contact)), int(np.argmax(contact))
+        said = (
+            f"Rendered directly, a peg is stable up to {1e3 * length[soft]:.3g} mm with contacts "
+            f"of {contact[soft]:.3g} N/m and up to {1e3 * length[stiff]:.3g} mm with "
+            f"{contact[stiff]:.3g} N/m: {per_cent(direct['largest_deviation'])} of "
+            "L = 2 √(b_θ/(T K_c)). "
+        )
+    else:
+        said = f"Rendered directly, {MISSING}. "
+    behind = "; ".join(_said_of(name, boundary[name]) for name in BEHIND)
+    return f"{said}Behind the coupling the largest K_r: {behind}. Eq. (6) does not know L."
+
+
+def _said_of(name: str, mine: Mapping[str, Any]) -> str:
+    if mine["largest"] is None:
+        return f"'{name}', {'no limit was found' if mine['length'] else MISSING}"
+    return (
+        f"'{name}', between {mine['smallest']:.4g} and {mine['largest']:.4g} N m/rad over all "
+        f"lengths, {per_cent(mine['largest_deviation'])} of the {mine['predicted_6']:.3g} N m/rad "
+        "of eq. (6)"
+    )
+
+
+GEOMETRY = StabilityMap(
+    name="geometry",
+    about="length of a peg against the stiffness of its contacts, rendered directly, and against "
+    "that of the coupling in front of it, by method",
+    default_points=3600,
+    points=points,
+    evaluate=evaluate,
+    read=read,
+)

@@ -1,0 +1,509 @@
+"""Map ``rate``: how stiff a wall may be at each period, delay, jitter and share of lost ticks.
+
+At even ticks for ``implicit``, ``compensated`` and ``lossless`` at the same B asked for, each
+against the bound for the B' that its law uses.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
+from numpy.typing import ArrayLike, NDArray
+
+from hapticbridge.coupling import Coupling
+from hapticbridge.device import Hand, SimulatedDevice
+from hapticbridge.lab.closed_loop import PARTS, LoopOutcome, Timing
+from hapticbridge.lab.maps.base import (
+    MISSING,
+    STILL,
+    THEORY_COLOUR,
+    WIDTH,
+    Finding,
+    Point,
+    StabilityMap,
+    agreement,
+    computed,
+    largest_stable,
+    law_in_words,
+    per_cent,
+    say_missing,
+    wall_loop,
+)
+from hapticbridge.plotting import new_figure
+from hapticbridge.rendering import METHODS
+from hapticbridge.sweep.results import Table
+from hapticbridge.theory.bounds import maximum_stiffness, minimum_damping
+from hapticbridge.theory.sampled_loop import SampledLoop, WorstHand
+
+THEORY_WIDTH = WIDTH / 100
+"""Relative width of the search for what theory says: far below that of a measurement."""
+
+DEVICE_DAMPING = 2.0
+"""b in N s/m, that of the default simulated device."""
+
+DAMPING = 1.0
+"""B in N s/m asked for where even ticks are measured: half of b, for then the worst hand behind
+``implicit`` is at a frequency above zero at every delay. With less, as where a method takes some
+off, it is a mass without bound, which takes longer to show (``SWINGS``)."""
+
+METHODS_SHOWN = ("implicit", "compensated", "lossless")
+"""Methods whose limit is searched at even ticks, which the bounds allow on a real device."""
+
+PERIODS = (1e-4, 5e-3)
+"""Range of T in s, even in its logarithm."""
+
+DELAYS = 6
+"""Delays of 0 to 5 samples."""
+
+UNEVEN_PERIOD = 1e-3
+"""T in s for jitter and lost ticks, where the coupling is a spring alone (B = 0): with a damper the
+bound at the longest interval, K = 2 (b/T_max − B/T), is gone after the first lost ticks. Of B = 0
+no method takes anything off: on a wall all of ``METHODS_SHOWN`` have one law, and one is run."""
+
+JITTER, DROPS = 0.9, 0.5
+"""Largest share of a period by which ticks are late, and of ticks that are lost."""
+
+UNEVEN = ("jitter", "drops")
+"""Ways in which ticks are uneven."""
+
+HANDS: Mapping[str, Hand | None] = {"no hand": None, "ordinary hand": Hand()}
+
+SEEDS = 3
+"""Runs with other random numbers that must all be stable; more find a lower limit, slowly."""
+
+WALL_MASS = 1e6
+"""In kg: a tool that moves for no hand (see the map ``coupling``)."""
+
+EVEN_SHARE = 0.65
+"""Share of all searches that is at even ticks: 4 periods a line and 10 shares, of 110."""
+
+TICKS = 2000
+SWINGS = 16.0
+"""Swings of the worst hand that a run must hold at least, a fifth of which is judged. Where B' is
+small, or K far above the limit, the hand that needs most damping swings once in 600 ticks and grows
+slowly: a window shorter than a swing takes that for decay. With 8 a limit is found up to 3 % too
+low, with 16 and with 64 within 0.04 % of theory."""
+
+KNOCK = np.array([1e-4, 0.0, 0.0, 0.0, 0.0, 0.0])
+"""Displacement that starts a run, in m."""
+
+SEARCHED = (10.0, 1e6)
+"""Ends of every search for K in N/m, at every period alike: what is expected lies between 105 and
+20 000, and nothing expected goes into it. A softer wall decays too slowly for a run; a much stiffer
+one asks for another kind of hand, and longer runs to show it."""
+
+
+def points(count: int) -> Sequence[Point]:
+    """Returns searches for the largest K: by method, period and delay, and by jitter and drops.
+
+    Even ticks get the smaller part of ``count`` for each line: over T a limit is as good as
+    straight.
+    """
+    steps = max(2, round(EVEN_SHARE * count / (len(METHODS_SHOWN) * DELAYS)))
+    shares = max(2, round((1 - EVEN_SHARE) * count / (len(UNEVEN) * len(HANDS))))
+    even: list[Point] = [
+        _point("delay", name, "worst hand", float(t), d, 0.0)
+        for name in METHODS_SHOWN
+        for d in range(DELAYS)
+        for t in np.geomspace(*PERIODS, steps)
+    ]
+    uneven: list[Point] = [
+        _point(what, METHODS_SHOWN[0], hand, UNEVEN_PERIOD, 0, float(share))
+        for what, most in (("jitter", JITTER), ("drops", DROPS))
+        for hand in HANDS
+        for share in np.linspace(0.0, most, shares)
+    ]
+    return even + uneven
+
+
+def _point(what: str, method: str, hand: str, period: float, delay: int, share: float) -> Point:
+    return {
+        "what": what,
+        "method": method,
+        "hand": hand,
+        "period": period,
+        "delay": delay,
+        "share": share,
+    }
+
+
+def evaluate(point: Point) -> Mapping[str, float | str | bool]:
+    """Searches for the largest K that is stable, and measures how uneven the ticks were."""
+    period, delay, share = float(point["period"]), int(point["delay"]), float(point["share"])
+    name = str(point["method"])
+    if point["what"] == "delay":
+
+        def is_stable(stiffness: float) -> bool:
+            return worst_hand(name, stiffness, period, delay).is_stable
+
+        limit = largest_stable(is_stable, *SEARCHED).middle
+        return {"limit": limit} | unevenness([period])
+
+    timings = [_timing(str(point["what"]), share, seed) for seed in range(SEEDS)]
+    hand = str(point["hand"])
+
+    def is_stable_in_all(stiffness: float) -> bool:
+        return all(finite_hand(name, hand, stiffness, timing).is_stable for timing in timings)
+
+    limit = largest_stable(is_stable_in_all, *SEARCHED).middle
+    intervals = np.concatenate([timing.intervals(TICKS) for timing in timings]) / PARTS
+    return {"limit": limit} | unevenness(period * intervals)
+
+
+def unevenness(intervals: ArrayLike) -> dict[str, float]:
+    """Returns what intervals T_k between ticks come to: three periods to put into 2 b/T.
+
+    Args:
+        intervals: In s, > 0, shape (n,).
+
+    Returns:
+        In s: ``mean``; ``longest``, with which K = 2 b/T suffices for any hand, because a hold of
+        T_k leaks at most ½ K δh_k² and the damping takes b δh_k²/T_k at least; and ``balanced``,
+        ΣT_k²/ΣT_k, with which a device that moves evenly over many ticks loses its balance.
+    """
+    each = np.asarray(intervals, dtype=np.float64)
+    return {
+        "mean": float(each.mean()),
+        "longest": float(each.max()),
+        "balanced": float(np.square(each).sum() / each.sum()),
+    }
+
+
+def _timing(what: str, share: float, seed: int) -> Timing:
+    return Timing(**{what: share}, seed=seed)
+
+
+def worst_hand(name: str, stiffness: float, period: float, delay: int) -> LoopOutcome:
+    """Runs the hand that is worst for a method's law on a wall that is felt whole samples late."""
+    coupling = Coupling(stiffness, DAMPING, 0.0, 0.0)
+    theory = SampledLoop(METHODS[name].used(coupling, period), period, delay=delay)
+    frequency = theory.worst_frequency()
+    felt = complex(theory.response(frequency))
+    hand = WorstHand(DEVICE_DAMPING, frequency, period, felt)
+    device = SimulatedDevice(damping=DEVICE_DAMPING, hand=hand, delay=delay)
+    swing = 2 * np.pi / (frequency * period)
+    return _run(name, device, coupling, period, ticks=max(TICKS, round(SWINGS * swing)))
+
+
+def finite_hand(name: str, hand: str, stiffness: float, timing: Timing) -> LoopOutcome:
+    """Runs a spring as wall for a device that is free or in an ordinary hand, at uneven ticks."""
+    device = SimulatedDevice(
+        damping=DEVICE_DAMPING, hand=HANDS[hand], path=STILL if HANDS[hand] else None
+    )
+    spring = Coupling(stiffness, 0.0, 0.0, 0.0)
+    return _run(name, device, spring, UNEVEN_PERIOD, timing=timing)
+
+
+def _run(
+    name: str,
+    device: SimulatedDevice,
+    coupling: Coupling,
+    period: float,
+    *,
+    ticks: int = TICKS,
+    timing: Timing | None = None,
+) -> LoopOutcome:
+    return wall_loop(WALL_MASS).run(
+        device,
+        coupling,
+        METHODS[name],
+        period=period,
+        ticks=ticks,
+        knock=KNOCK,
+        timing=timing,
+    )
+
+
+def wall_limit(name: str, period: float, delay: int) -> float:
+    """Returns the largest K in N/m on a wall for any hand: ``minimum_damping`` solved for K.
+
+    Args:
+        name: The method, whose law uses B' where ``DAMPING`` is asked for.
+        period: T in s, finite and > 0.
+        delay: d in whole samples, >= 0.
+
+    Raises:
+        CouplingError: An argument is out of range.
+    """
+
+    def is_enough(stiffness: float) -> bool:
+        coupling = Coupling(stiffness, DAMPING, 0.0, 0.0)
+        used = METHODS[name].used(coupling, period)
+        return minimum_damping(used, period, delay=delay) < DEVICE_DAMPING
+
+    return largest_stable(is_enough, *SEARCHED, THEORY_WIDTH).middle
+
+
+def uneven_bound(period: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Returns K = 2 b/T in N/m of the spring alone, at any of the periods of ``unevenness``."""
+    return np.asarray(maximum_stiffness(DEVICE_DAMPING, period))
+
+
+STYLES = {
+    "at_mean": ("K = 2b/T, T the mean interval", ":"),
+    "at_balanced": ("K = 2b ΣT/ΣT²: balance of energy", "--"),
+    "at_longest": ("K = 2b/T, T the longest: enough for any hand", "-"),
+}
+"""Label and line of each bound at uneven ticks."""
+
+AXES = {
+    "jitter": "ticks late by up to (share of T)",
+    "drops": "ticks lost (share of all)",
+}
+
+MARKERS = dict(zip(HANDS, "os", strict=True))
+
+SHOWN = (15.0, 7e4)
+"""Range of K in N/m at even ticks: all bounds at b, and room for the names below them."""
+
+
+def draw(boundary: Mapping[str, Any]) -> Figure:
+    """Draws what ``rate.read`` found."""
+    figure = new_figure(8, 8.4)
+    grid = figure.add_gridspec(2, 6, height_ratios=(1.25, 1))
+    above: list[Axes] = []
+    for place, (name, by_delay) in enumerate(boundary["methods"].items()):
+        where = grid[0, 2 * place : 2 * place + 2]
+        axes = figure.add_subplot(where, sharey=above[0] if above else None)
+        _draw_delays(axes, name, by_delay)
+        axes.tick_params(labelleft=not above)
+        above.append(axes)
+    above[0].set_ylabel("largest stable K (N/m)")
+    first = figure.add_subplot(grid[1, :3])
+    panels = (first, figure.add_subplot(grid[1, 3:], sharey=first))
+    for axes, (what, words) in zip(panels, AXES.items(), strict=True):
+        _draw_uneven(axes, boundary["uneven"][what], words)
+    first.set_ylabel("largest stable K (N/m)")
+    handles = [
+        first.plot([], [], marker, color="black", mfc="white", label=f"measured: {name}")[0]
+        for name, marker in MARKERS.items()
+    ]
+    handles += [
+        first.plot([], [], style, color=THEORY_COLOUR, label=label)[0]
+        for label, style in STYLES.values()
+    ]
+    figure.suptitle(
+        f"Largest stable K on a wall: behind the coupling is a tool of {1e-3 * WALL_MASS:g} t, "
+        f"device damping b = {DEVICE_DAMPING:g} N s/m\n"
+        f"above: even ticks, B = {DAMPING:g} N s/m asked for, the law uses B′ (0 at least);\n"
+        "circles: measured with the worst hand",
+        fontsize="medium",
+    )
+    names = ", ".join(METHODS_SHOWN)
+    figure.legend(
+        handles=handles,
+        title=f"below: T = {1e3 * UNEVEN_PERIOD:g} ms, B = 0, for which {names} have one law",
+        title_fontsize="small",
+        loc="outside lower center",
+        ncols=2,
+        fontsize="small",
+        frameon=False,
+    )
+    return figure
+
+
+def _draw_delays(axes: Axes, name: str, by_delay: Mapping[str, Any]) -> None:
+    # one hue, lighter the later: a delay is a quantity, and verdicts own the other colours
+    shade = matplotlib.colormaps["Blues_r"]
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    for delay, mine in by_delay.items():
+        colour, period = shade(0.65 * int(delay) / (DELAYS - 1)), 1e3 * np.array(mine["period"])
+        axes.plot(period, mine["predicted"], color=colour, label=delay)
+        axes.plot(period, _drawable(mine["measured"]), "o", color=colour, mfc="white", ms=5)
+    if by_delay:
+        axes.legend(
+            title="bound, delay in samples",
+            title_fontsize="small",
+            fontsize="small",
+            ncols=3,
+            loc="lower left",
+            handlelength=1.2,
+            columnspacing=1.0,
+        )
+    else:
+        say_missing(axes)
+    axes.set_ylim(*SHOWN)
+    axes.set_title(f"{name}, {law_in_words(name)}", fontsize="medium")
+    axes.set_xlabel("period T (ms)")
+    ticks = (0.1, 0.3, 1, 3)
+    axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
+    axes.xaxis.set_minor_formatter(NullFormatter())
+    axes.grid(visible=True, which="both", alpha=0.25)
+
+
+def _draw_uneven(axes: Axes, found: Mapping[str, Any], words: str) -> None:
+    axes.set_yscale("log")
+    for name, mine in found.items():
+        axes.plot(
+            mine["share"],
+            _drawable(mine["measured"]),
+            MARKERS[name],
+            color="black",
+            mfc="white",
+            ms=5,
+        )
+    if found:
+        lines = next(iter(found.values()))  # the ticks were the same for every hand
+        for key, (_, style) in STYLES.items():
+            axes.plot(lines["share"], lines[key], style, color=THEORY_COLOUR)
+    else:
+        say_missing(axes)
+    axes.set_xlabel(words)
+    axes.grid(visible=True, which="both", alpha=0.25)
+
+
+def _drawable(values: list[float]) -> np.ndarray[Any, np.dtype[np.float64]]:
+    """Returns values for a logarithmic axis, which has no place for 0 and infinity."""
+    numbers = np.array(values, dtype=np.float64)
+    return np.where(np.isfinite(numbers) & (numbers > 0), numbers, np.nan)
+
+
+WORDS = {"jitter": "Ticks late by up to a share of T", "drops": "A share of all ticks lost"}
+"""How the paragraph begins on uneven ticks."""
+
+LINES = ("mean", "balanced", "longest")
+"""Periods of ``unevenness`` with which the measurement at uneven ticks is compared."""
+
+
+def read(table: Table) -> Finding:
+    """Compares the largest K with theory: by method, period and delay; by jitter; by lost ticks.
+
+    A method, a delay or a hand without a computed point is left out, and the paragraph says so.
+
+    Raises:
+        StudyError: No point was computed at all.
+    """
+    table = computed(table, "rate")
+    boundary = {
+        "device_damping": DEVICE_DAMPING,
+        "damping": DAMPING,
+        "methods": {name: _by_delay(name, table) for name in METHODS_SHOWN},
+        "uneven": {what: _uneven(table.select(table["what"] == what)) for what in UNEVEN},
+    }
+    return Finding(draw(boundary), _paragraph(boundary), boundary)
+
+
+def _by_delay(name: str, table: Table) -> dict[str, Any]:
+    rows = table.select((table["what"] == "delay") & (table["method"] == name))
+    found: dict[str, Any] = {}
+    for delay in np.unique(rows["delay"]):
+        mine = rows.select(rows["delay"] == delay)
+        period, limit = mine["period"], mine.numbers("limit")
+        predicted = np.array([wall_limit(name, float(t), int(delay)) for t in period])
+        found[str(int(delay))] = {
+            "period": period.tolist(),
+            "measured": limit.tolist(),
+            "predicted": predicted.tolist(),
+            "worst_ratio_error": agreement(limit, predicted),
+            "slope": _slope(period, limit),
+        }
+    return found
+
+
+def _slope(period: NDArray[np.float64], limit: NDArray[np.float64]) -> float | None:
+    """Returns the power of T with which K goes; None where fewer than two K are known."""
+    is_known = np.isfinite(limit) & (limit > 0)
+    if is_known.sum() < 2:
+        return None
+    return float(np.polyfit(np.log(period[is_known]), np.log(limit[is_known]), 1)[0])
+
+
+def _uneven(rows: Table) -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for name in HANDS:
+        mine = rows.select(rows["hand"] == name)
+        if len(mine):
+            found[name] = {
+                "share": mine["share"].tolist(),
+                "measured": mine.numbers("limit").tolist(),
+                **{f"at_{line}": uneven_bound(mine.numbers(line)).tolist() for line in LINES},
+            }
+    return found
+
+
+def _paragraph(boundary: Mapping[str, Any]) -> str:
+    said = [_of_even(boundary["methods"])]
+    said += [_of_method(name, mine) for name, mine in boundary["methods"].items()]
+    said += [_of_uneven(what, mine) for what, mine in boundary["uneven"].items()]
+    return ". ".join(said) + "."
+
+
+def _of_even(methods: Mapping[str, Mapping[str, Any]]) -> str:
+    delays = [mine for by_delay in methods.values() for mine in by_delay.values()]
+    if not delays:
+        return f"Even ticks: {MISSING}"
+    known = [mine["worst_ratio_error"] for mine in delays if mine["worst_ratio_error"] is not None]
+    periods = [1e3 * period for mine in delays for period in mine["period"]]
+    return (
+        f"At even ticks, T = {min(periods):.3g} to {max(periods):.3g} ms and {DAMPING:g} N s/m "
+        "asked for, the worst hand turns the wall unstable "
+        f"{per_cent(max(known, default=None))} of the bound for its method and delay. Wall, b, B "
+        "and worst hand have no time but T: with K T kept, the runs at all periods are one loop "
+        "to another scale. With a delay a damper helps on a wall, so that B′ taken off costs "
+        "stiffness there"
+    )
+
+
+def _of_method(name: str, by_delay: Mapping[str, Any]) -> str:
+    left_out = [str(delay) for delay in range(DELAYS) if str(delay) not in by_delay]
+    if len(left_out) == DELAYS:
+        return f"'{name}' at even ticks: {MISSING}"
+    at_each = [
+        f"{100 * share:.0f} %" + (f" at {delay}" if delay != "0" else " without a delay")
+        for delay, mine in by_delay.items()
+        if (share := _share(mine)) is not None
+    ]
+    text = f"'{name}' bears, of K = 2b/T, {', '.join(at_each) or 'nothing that was found'}"
+    slope = by_delay.get("0", {}).get("slope")
+    if slope is not None:
+        text += f"; without a delay K was found to go with T to the power {slope:.3f}"
+    if left_out:
+        text += f"; delay of {', '.join(left_out)} samples: {MISSING}"
+    return text
+
+
+def _share(mine: Mapping[str, Any]) -> float | None:
+    """Returns the mean over the periods of K T/(2b); None where no K was found."""
+    share = np.array(mine["measured"]) * np.array(mine["period"]) / (2 * DEVICE_DAMPING)
+    known = share[np.isfinite(share) & (share > 0)]
+    return float(known.mean()) if known.size else None
+
+
+def _of_uneven(what: str, mine: Mapping[str, Any]) -> str:
+    free, held = mine.get("no hand"), mine.get("ordinary hand")
+    said = []
+    if free is None:
+        said.append(f"no hand: {MISSING}")
+    else:
+        first, last = free["measured"][0], free["measured"][-1]
+        is_known = 0 < first < np.inf and last < np.inf
+        kept = f"keeps {100 * last / first:.0f} % of its stiffness" if is_known else "bears"
+        said.append(
+            f"at {free['share'][-1]:g} a free device {kept} ({last:.0f} N/m), against "
+            f"2b ΣT/ΣT² = {free['at_balanced'][-1]:.0f} by the balance of energy, "
+            f"{free['at_mean'][-1]:.0f} at the mean interval and {free['at_longest'][-1]:.0f} at "
+            "the longest, which is enough for any hand"
+        )
+    if held is None:
+        said.append(f"ordinary hand: {MISSING}")
+    else:
+        said.append(f"an ordinary hand is stable up to {held['measured'][-1]:.0f} N/m")
+    return f"{WORDS[what]}: {'; '.join(said)}"
+
+
+RATE = StabilityMap(
+    name="rate",
+    about="largest stiffness of a wall against period and delay by method, and against jitter and "
+    "lost ticks",
+    default_points=110,
+    points=points,
+    evaluate=evaluate,
+    read=read,
+)

@@ -1,0 +1,431 @@
+"""Map ``restitution``: a rod after one contact of MuJoCo's, against three laws of impact.
+
+No rendering method plays a part: the rod has no handle and no coupling, and what its contact does
+is MuJoCo's alone, by integrator and contact setting.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import mujoco
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from hapticbridge.errors import StudyError, choices
+from hapticbridge.lab.maps.base import (
+    MISSING,
+    THEORY_COLOUR,
+    Finding,
+    Point,
+    StabilityMap,
+    computed,
+    say_missing,
+)
+from hapticbridge.plotting import new_figure
+from hapticbridge.sweep.results import Table
+from hapticbridge.theory.impact import ImpactBody, Law, resolve_impact
+
+MASS, LENGTH = 1.0, 1.0
+"""Of the uniform rod, in kg and m."""
+INERTIA = MASS * LENGTH**2 / 12
+"""About its centre of mass, in kg m²."""
+
+TIP = 1e-3
+"""Radius in m of the sphere that is the rod's lower end: a point, next to 1 m."""
+
+APPROACH = 1.0
+"""Speed in m/s at which the rod falls, without turning. Gravity is off: only the contact acts."""
+
+LONGEST = 0.2
+"""Time in s after which a contact that has not ended is read as it is: four times the longest."""
+
+ROD = f"""
+<mujoco>
+  <compiler angle="radian"/>
+  <option gravity="0 0 0" cone="elliptic"><flag diagexact="enable"/></option>
+  <worldbody>
+    <geom name="floor" type="plane" size="5 5 1"/>
+    <body name="rod">
+      <joint type="slide" axis="1 0 0"/>
+      <joint type="slide" axis="0 0 1"/>
+      <joint type="hinge" axis="0 1 0"/>
+      <inertial pos="0 0 0" mass="{MASS!r}" diaginertia="{INERTIA!r} {INERTIA!r} 0.001"/>
+      <geom name="tip" type="sphere" size="{TIP!r}" pos="{-LENGTH / 2!r} 0 0"/>
+    </body>
+  </worldbody>
+</mujoco>"""
+"""A rod that moves in a plane and whose lower end alone can touch the floor."""
+
+
+@dataclass(frozen=True, slots=True)
+class ContactSetting:
+    """How MuJoCo is asked to make the contact.
+
+    Attributes:
+        solref: Time constant in s and damping ratio, or minus stiffness and damping.
+        impedance: ``dmin`` and ``dmax``, without unit.
+        integrator: By its name in MJCF.
+        timestep: In s.
+    """
+
+    solref: tuple[float, float]
+    impedance: tuple[float, float]
+    integrator: str
+    timestep: float = 1e-3
+
+
+SETTINGS: Mapping[str, ContactSetting] = {
+    "scenes": ContactSetting((0.002, 1.0), (0.9, 0.95), "discrete"),
+    "scenes, implicitfast": ContactSetting((0.002, 1.0), (0.9, 0.95), "implicitfast"),
+    "soft": ContactSetting((0.02, 1.0), (0.9, 0.95), "discrete"),
+    "bouncy": ContactSetting((0.02, 0.1), (0.9, 0.95), "discrete"),
+    "bouncy, implicitfast": ContactSetting((0.02, 0.1), (0.9, 0.95), "implicitfast"),
+    "bouncy, implicitfast, 0.1 ms": ContactSetting((0.02, 0.1), (0.9, 0.95), "implicitfast", 1e-4),
+    "hard spring": ContactSetting((-1e5, -5.0), (0.99, 0.99), "discrete"),
+}
+"""``scenes`` is that of the scenes that come with hapticbridge, ``soft`` has MuJoCo's default
+``solref``; the others show what rebounds."""
+
+_INTEGRATORS = {
+    "discrete": mujoco.mjtIntegrator.mjINT_DISCRETE,
+    "implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Rebound:
+    """What one contact did to the rod.
+
+    Attributes:
+        velocity: Of the tip along t and n afterwards in m/s.
+        energy_change: Kinetic energy after minus before in J.
+        first_gain: First step after which the rod had more than at the start, −1 for none.
+        steps: How many the contact took.
+    """
+
+    velocity: tuple[float, float]
+    energy_change: float
+    first_gain: int
+    steps: int
+
+
+@lru_cache
+def restitution_of(setting: str) -> float:
+    """Returns e of a contact setting, from a rod that falls upright without friction.
+
+    Held in [0, 1], as the laws want it.
+    """
+    return min(1.0, max(0.0, drop(setting, np.pi / 2, 0.0, 0.0).velocity[1] / APPROACH))
+
+
+def drop(setting: str, angle: float, friction: float, slide: float) -> Rebound:
+    """Lets MuJoCo's contact act on a rod until it ends.
+
+    The tip starts half a step's fall above the floor. The contact has ended when its force is 0
+    again.
+
+    Args:
+        setting: One of ``SETTINGS``.
+        angle: Of the rod above the floor in rad; π/2 stands upright.
+        friction: μ, >= 0, without unit.
+        slide: Speed along the floor in m/s, > 0 towards the rod's upper end.
+
+    Raises:
+        StudyError: There is no such setting.
+    """
+    if setting not in SETTINGS:
+        raise StudyError(f"no contact setting is called '{setting}'; it has {choices(SETTINGS)}")
+    chosen = SETTINGS[setting]
+    model, data = _rod()
+    model.opt.timestep = chosen.timestep
+    model.opt.integrator = _INTEGRATORS[chosen.integrator]
+    model.geom_solref[:] = chosen.solref
+    model.geom_solimp[:] = (*chosen.impedance, 0.001, 0.5, 2)
+    model.geom_friction[:, 0] = max(friction, 1e-9)  # MuJoCo refuses 0 with a cone
+    mujoco.mj_resetData(model, data)
+    height = LENGTH / 2 * np.sin(angle) + TIP + APPROACH * chosen.timestep / 2
+    data.qpos[:] = 0.0, height, -angle
+    data.qvel[:] = slide, -APPROACH, 0.0
+    start = 0.5 * MASS * (slide**2 + APPROACH**2)
+    touched, first_gain, kinetic, step = False, -1, start, 0
+    for step in range(1, round(LONGEST / chosen.timestep) + 1):
+        mujoco.mj_step(model, data)
+        v_x, v_z, spin = (float(value) for value in data.qvel)
+        kinetic = 0.5 * (MASS * (v_x**2 + v_z**2) + INERTIA * spin**2)
+        if kinetic > start + 1e-9 and first_gain < 0:
+            first_gain = step
+        pushes = data.nefc > 0 and data.efc_force[0] > 0
+        if touched and not pushes:
+            break
+        touched = touched or pushes
+    tilt = -float(data.qpos[2])
+    arm = -LENGTH / 2 * np.cos(tilt), -LENGTH / 2 * np.sin(tilt) - TIP
+    velocity = float(v_x + spin * arm[1]), float(v_z - spin * arm[0])
+    return Rebound(velocity, kinetic - start, first_gain, step)
+
+
+@lru_cache
+def _rod() -> tuple[mujoco.MjModel, mujoco.MjData]:
+    model = mujoco.MjModel.from_xml_string(ROD)
+    return model, mujoco.MjData(model)
+
+
+SLIDE = 0.8
+"""Speed in m/s along the floor, forwards, backwards or none."""
+
+SHOWN = 0.75
+"""The friction coefficient whose curves are drawn, that of the example in which Newton gains."""
+
+DRAWN = ("scenes", "bouncy, implicitfast")
+
+COLOURS = {
+    "inelastic": "#b0b0b0",
+    "newton": THEORY_COLOUR,
+    "poisson": "#7fb2ee",
+    "stronge": "#0d2c54",
+}
+"""Of the laws, tints of theory's; ``inelastic`` is any of them with e = 0. What was measured is
+black."""
+
+STYLES = {"inelastic": ":", "newton": "-", "poisson": "--", "stronge": "-."}
+MEASURED: Mapping[str, Any] = {
+    "color": "black",
+    "ls": "",
+    "marker": "o",
+    "ms": 3.5,
+    "mfc": "white",
+}
+
+Summary = dict[str, Any]
+"""What one contact setting came to."""
+
+
+def draw(table: Table, by_setting: Mapping[str, Summary]) -> Figure:
+    """Draws the energy over the angle, and how far each law is from MuJoCo.
+
+    Args:
+        table: Of the map.
+        by_setting: What each contact setting came to.
+    """
+    figure = new_figure(8, 7.2)
+    panels = figure.subplots(2, 2, gridspec_kw={"height_ratios": [1, 1.1]})
+    for axes, name in zip(panels[0], DRAWN, strict=True):
+        _draw_curves(axes, table, name)
+    panels[0, 0].set_ylabel("change of kinetic energy (J)")
+    _draw_bars(panels[1, 0], by_setting)
+    _draw_gains(panels[1, 1], by_setting)
+    figure.suptitle(
+        f"A rod of {MASS:g} kg and {LENGTH:g} m falls at {APPROACH:g} m/s on MuJoCo's floor;\n"
+        f"above: it slides at {SLIDE:g} m/s, friction {SHOWN:g}",
+        fontsize="medium",
+    )
+    _legend(figure)
+    return figure
+
+
+def _draw_curves(axes: Axes, table: Table, name: str) -> None:
+    rows = (table["setting"] == name) & (table["friction"] == SHOWN) & (table["slide"] == SLIDE)
+    mine = table.select(rows)
+    if not len(mine):
+        say_missing(axes)
+        return
+    angle = np.degrees(mine["angle"])
+    for law, colour in COLOURS.items():
+        axes.plot(angle, mine[law], color=colour, ls=STYLES[law], lw=1.6)
+    axes.plot(angle, mine["energy_change"], **MEASURED)
+    axes.axhline(0.0, color="black", lw=0.6)
+    axes.set_xlabel("angle of the rod above the floor (°)")
+    axes.set_title(f"{name}: e = {mine['restitution'][0]:.2g}", fontsize="medium")
+
+
+def _legend(figure: Figure) -> None:
+    """Names laws and measurement, whether or not a panel shows them."""
+    handles = [
+        Line2D([], [], color=colour, ls=STYLES[law], lw=1.6, label=_named(law))
+        for law, colour in COLOURS.items()
+    ]
+    handles.append(Line2D([], [], label="MuJoCo", **MEASURED))
+    figure.legend(
+        handles=handles, loc="outside lower center", ncols=5, fontsize="small", frameon=False
+    )
+
+
+def _named(law: str) -> str:
+    return "any law, e = 0" if law == "inelastic" else law.capitalize()
+
+
+def _draw_bars(axes: Axes, by_setting: Mapping[str, Summary]) -> None:
+    place = np.arange(len(by_setting))
+    for shift, (law, colour) in enumerate(COLOURS.items()):
+        distances = [row["rms_distance_to_law"][law] for row in by_setting.values()]
+        axes.barh(place + 0.2 * (shift - 1.5), distances, 0.2, color=colour)
+    axes.set_yticks(place, [name.replace(", ", ",\n", 1) for name in by_setting], fontsize="small")
+    axes.invert_yaxis()
+    axes.set_xlabel("distance from MuJoCo, RMS (J)")
+
+
+def _draw_gains(axes: Axes, by_setting: Mapping[str, Summary]) -> None:
+    place = np.arange(len(by_setting))
+    axes.barh(
+        place - 0.18,
+        [row["largest_energy_change"] for row in by_setting.values()],
+        0.36,
+        fc="black",
+    )
+    axes.barh(
+        place + 0.18,
+        [row["largest_by_newton"] for row in by_setting.values()],
+        0.36,
+        color=COLOURS["newton"],
+    )
+    axes.set_yticks(place, [name.replace(", ", ",\n", 1) for name in by_setting], fontsize="small")
+    axes.invert_yaxis()
+    axes.axvline(0.0, color="black", lw=0.6)
+    axes.set_xlabel("largest change of energy (J)\nblack: MuJoCo, blue: Newton")
+
+
+RESTITUTION_LAWS: tuple[Law, ...] = ("newton", "poisson", "stronge")
+
+FRICTIONS = (0.0, 0.25, 0.5, 0.75, 1.0)
+"""Coulomb's μ, without unit."""
+
+LEAD = 0.2
+"""Share by which a law must be nearer to MuJoCo than the second to be named the nearest, without
+unit; with less, laws that a soft contact cannot tell apart would be named by chance."""
+
+
+def points(count: int) -> Sequence[Point]:
+    """Returns every contact setting, friction and slide at angles that make about ``count``."""
+    angles = np.linspace(0.05, 1.52, max(2, round(count / (len(SETTINGS) * len(FRICTIONS) * 3))))
+    return [
+        {"setting": name, "friction": friction, "slide": slide, "angle": float(angle)}
+        for name in SETTINGS
+        for friction in FRICTIONS
+        for slide in (-SLIDE, 0.0, SLIDE)
+        for angle in angles
+    ]
+
+
+def evaluate(point: Point) -> Mapping[str, float | int]:
+    """Drops a rod on MuJoCo's floor, and resolves the same impact by each law.
+
+    The laws get the e of the contact setting: that of a rod that falls upright without friction,
+    where they agree.
+    """
+    name = str(point["setting"])
+    angle, friction, slide = (float(point[key]) for key in ("angle", "friction", "slide"))
+    found = drop(name, angle, friction, slide)
+    restitution = restitution_of(name)
+    results: dict[str, float | int] = {
+        "energy_change": found.energy_change,
+        "restitution": restitution,
+        "own_restitution": found.velocity[1] / APPROACH,
+        "first_gain": found.first_gain,
+        "steps": found.steps,
+        "inelastic": _by_law("poisson", angle, friction, slide, 0.0),
+    }
+    return results | {
+        law: _by_law(law, angle, friction, slide, restitution) for law in RESTITUTION_LAWS
+    }
+
+
+def _by_law(law: Law, angle: float, friction: float, slide: float, restitution: float) -> float:
+    arm = [-LENGTH / 2 * np.cos(angle), -LENGTH / 2 * np.sin(angle) - TIP]
+    rod = ImpactBody(MASS, INERTIA, arm)
+    velocity = [slide, -APPROACH]
+    return float(resolve_impact(rod, velocity, friction, restitution, law).energy_change)
+
+
+def read(table: Table) -> Finding:
+    """Draws the energy over the angle, and how far each law is from MuJoCo.
+
+    Raises:
+        StudyError: No point was computed at all.
+    """
+    table = computed(table, "restitution")
+    groups = {name: table.select(table["setting"] == name) for name in SETTINGS}
+    by_setting = {name: _summary(mine) for name, mine in groups.items() if len(mine)}
+    return Finding(draw(table, by_setting), _paragraph(by_setting), {"settings": by_setting})
+
+
+def _summary(mine: Table) -> Summary:
+    measured = mine["energy_change"]
+    distances = {law: float(np.sqrt(np.mean((measured - mine[law]) ** 2))) for law in COLOURS}
+    return {
+        "restitution": float(mine["restitution"][0]),
+        "rms_distance_to_law": distances,
+        "nearest_law": _nearest(distances),
+        "largest_energy_change": float(measured.max()),
+        "largest_by_newton": float(mine["newton"].max()),
+        "share_that_gained": float(np.mean(mine["first_gain"] >= 0)),
+        "at_the_largest": {
+            key: float(mine[key][measured.argmax()]) for key in ("angle", "friction", "slide")
+        },
+        "largest_own_restitution": float(mine["own_restitution"].max()),
+    }
+
+
+def _nearest(distances: Mapping[str, float]) -> str | None:
+    """Returns the law that leads the second by more than ``LEAD``; None where none does."""
+    first, second = sorted(distances, key=distances.__getitem__)[:2]
+    return first if distances[first] < (1 - LEAD) * distances[second] else None
+
+
+def _paragraph(by_setting: Mapping[str, Summary]) -> str:
+    missing = [f"'{name}'" for name in SETTINGS if name not in by_setting]
+    said = f"With {', '.join(missing)} {MISSING}. " if missing else ""
+    nearest = [row["nearest_law"] for row in by_setting.values()]
+    counts = {law: nearest.count(law) for law in dict.fromkeys(nearest)}
+    names = {None: "none", "inelastic": "the inelastic one"}
+    likeness = ", ".join(
+        f"{names.get(law) or str(law).capitalize()} in {count}"
+        for law, count in sorted(counts.items(), key=lambda pair: -pair[1])
+    )
+    gains = [
+        f"'{name}' up to {row['largest_energy_change']:+.2g} J"
+        for name, row in by_setting.items()
+        if row["largest_energy_change"] > 0
+    ]
+    if "scenes" in by_setting:
+        said += _of_the_scenes(by_setting["scenes"])
+    own = max(by_setting, key=lambda name: by_setting[name]["largest_own_restitution"])
+    by_newton = max(by_setting, key=lambda name: by_setting[name]["largest_by_newton"])
+    said += (
+        f"Of the {len(by_setting)} settings the law that is nearest by more than {100 * LEAD:.0f} "
+        f"% is {likeness}. The largest e of a slanted rod is "
+        f"{by_setting[own]['largest_own_restitution']:.2g}, with '{own}', whose upright rod has "
+        f"{by_setting[own]['restitution']:.2g}; Newton's law changes the energy by "
+        f"{by_setting[by_newton]['largest_by_newton']:+.2g} J at most, with '{by_newton}'. "
+    )
+    if gains:
+        return f"{said}Kinetic energy is created with {', '.join(gains)}."
+    return f"{said}No setting created kinetic energy."
+
+
+def _of_the_scenes(usual: Summary) -> str:
+    distances = usual["rms_distance_to_law"]
+    return (
+        f"With the contact of the scenes a rod that falls upright comes back with e = "
+        f"{usual['restitution']:.2g}, and at any angle and friction its energy changes by "
+        f"{usual['largest_energy_change']:+.2g} J at most. Laws of impact with that e are "
+        f"{1e3 * min(distances[law] for law in RESTITUTION_LAWS):.2g} to "
+        f"{1e3 * max(distances[law] for law in RESTITUTION_LAWS):.2g} mJ away (RMS), e = 0 "
+        f"{1e3 * distances['inelastic']:.2g} mJ. "
+    )
+
+
+RESTITUTION = StabilityMap(
+    name="restitution",
+    about="energy of a rod after one contact of MuJoCo's, against the laws of Newton, Poisson and "
+    "Stronge",
+    default_points=4200,
+    points=points,
+    evaluate=evaluate,
+    read=read,
+)

@@ -1,0 +1,633 @@
+"""Map ``rotation``: how fast a tool may spin, and what happens where the angle passes π."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import mujoco
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from hapticbridge.coupling import Coupling
+from hapticbridge.kernel.state import BoundKernel
+from hapticbridge.kernel.tick import simulate
+from hapticbridge.lab.maps.base import (
+    METHOD_COLOURS,
+    MISSING,
+    THEORY_COLOUR,
+    Finding,
+    Point,
+    StabilityMap,
+    computed,
+    draw_verdicts,
+    free_body,
+    largest_stable,
+    loop_in,
+    scene_of,
+    verdict_legend,
+    verdict_numbers,
+)
+from hapticbridge.options import run_parameters
+from hapticbridge.plotting import new_figure
+from hapticbridge.pose import IDENTITY_POSE
+from hapticbridge.record import SAMPLE_DTYPE, TICK_DTYPE
+from hapticbridge.rendering import METHODS, prepare
+from hapticbridge.scene import Scene
+from hapticbridge.summary import Ledger
+from hapticbridge.sweep.results import Table
+
+INERTIA = np.array([1.5e-3, 3.63e-3, 4.53e-3])
+"""Of the tool about its principal axes x, y, z in kg m²: all different, so that it tumbles,
+and near those of a hand tool with a long handle."""
+
+PERIOD = 1e-3
+"""T in s."""
+
+TICKS = 1000
+
+OBLIQUE = np.array([0.1, 1.0, 0.1])
+"""Axis of the spin: near the middle principal axis, about which a free body is unstable."""
+
+MIDDLE = np.array([0.0, 1.0, 0.0])
+
+
+def cut_speed(stiffness: float) -> float:
+    """Returns the speed ω = π √(K_r/I) in rad/s at which a sudden turn winds the spring to π.
+
+    The tool starts at rest and the handle turns about the middle axis: relative to the handle it
+    swings with the amplitude ω √(I/K_r). The damping, also the numerical one, is left out.
+    """
+    return float(np.pi * np.sqrt(stiffness / INERTIA[1]))
+
+
+def gyroscopic_speed(stiffness: float) -> float:
+    """Returns the speed in rad/s from which on the gyroscopic torque can exceed the spring's.
+
+    The gyroscopic torque |ω × Iω| reaches ½ (I_z − I_x) ω² in the worst attitude, the spring gives
+    π K_r at most. A tool passes that attitude quickly: its angle passes π at higher speeds only.
+    """
+    return float(np.sqrt(2 * np.pi * stiffness / (INERTIA.max() - INERTIA.min())))
+
+
+def free_creation(speed: float, ticks: int = TICKS) -> float:
+    """Returns what the explicit gyroscopic term creates in a free tool, in J.
+
+    With the term at the start of the step, v⁺ = v − T I⁻¹(ω × Iω), the kinetic energy grows by
+
+        ½ T² (ω × Iω)ᵀ I⁻¹ (ω × Iω)
+
+    a step, since ω·(ω × Iω) = 0. Summed over the exact motion (fourth order) from a spin about
+    ``OBLIQUE``; beyond a few per cent of the kinetic energy what was created spins faster, and
+    creates more than this.
+
+    Args:
+        speed: In rad/s.
+        ticks: How many.
+    """
+    omega = speed * OBLIQUE / np.linalg.norm(OBLIQUE)
+    total = 0.0
+    for _ in range(ticks):
+        torque = np.cross(omega, INERTIA * omega)
+        total += 0.5 * PERIOD**2 * float(np.sum(torque**2 / INERTIA))
+        first = _torque_free(omega)
+        second = _torque_free(omega + PERIOD / 2 * first)
+        third = _torque_free(omega + PERIOD / 2 * second)
+        fourth = _torque_free(omega + PERIOD * third)
+        omega = omega + PERIOD / 6 * (first + 2 * second + 2 * third + fourth)
+    return total
+
+
+def _torque_free(omega: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.asarray(-np.cross(omega, INERTIA * omega) / INERTIA)
+
+
+MASS = 0.3
+"""In kg."""
+
+STIFFNESS, DAMPING = 2000.0, 0.5
+"""K in N/m and B in N s/m of the coupling's translation: it only keeps the tool in its place."""
+
+ROTATIONAL_DAMPING = 5e-4
+"""B_r in N m s/rad; none where K_r = 0."""
+
+DIVERGED = 1e3
+"""Kinetic energy in J that ends a run: ten times what the tool has at 200 rad/s, so that it has
+diverged beyond doubt, and before MuJoCo warns of numbers that are not finite."""
+
+CHUNK = 2
+"""Ticks after which that is looked at; five beyond it, MuJoCo would warn."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Spin:
+    """What a run with a spinning handle came to.
+
+    Attributes:
+        ticks: How many were done; fewer than ``TICKS`` where it diverged.
+        environment: ``strict``, ``within slack`` or ``active``.
+        created: The largest Σ E_k so far at any tick, in J.
+        slack_share: Largest share of the slack that was used, without unit.
+        first_active: Tick of the first violation of the slack, −1 for none.
+        largest_angle: Between handle and tool in rad, at most π.
+        crossed: Tick at which the angle had passed π since the tick before, −1 for never.
+        torque_jump: Largest change of the torque on the tool within a tick in N m.
+    """
+
+    ticks: int
+    environment: str
+    created: float
+    slack_share: float
+    first_active: int
+    largest_angle: float
+    crossed: int
+    torque_jump: float
+
+
+def spin(
+    method: str,
+    coupling: Coupling,
+    speed: float,
+    *,
+    angle: float = 0.0,
+    axis: NDArray[np.float64] = OBLIQUE,
+    spins_at_start: bool = True,
+) -> Spin:
+    """Turns the handle at a constant speed for 1 s, with the tool behind it.
+
+    Args:
+        method: One of ``rendering.METHODS`` that has a coupling.
+        coupling: K and B.
+        speed: Of the handle in rad/s.
+        angle: By which the handle is ahead of the tool at the start, about x, in rad.
+        axis: Of the handle's turning, in the world frame, shape (3,), of any length > 0.
+        spins_at_start: Whether the tool turns with the handle from the start, or is at rest.
+
+    Raises:
+        HapticBridgeError: A value is out of range, or the method cannot render a free tool.
+    """
+    scene = loop_in(spinning_scene).scene
+    chosen = METHODS[method]
+    felt = prepare(scene, coupling, PERIOD, 1, chosen)
+    quaternions = turning(speed, angle=angle, axis=axis)
+    samples = np.zeros(TICKS, SAMPLE_DTYPE)
+    samples["quaternion"] = quaternions[1:]
+    if spins_at_start:
+        _set_spin(scene, speed * axis / np.linalg.norm(axis))
+    first = np.zeros(1, SAMPLE_DTYPE)
+    first["quaternion"] = quaternions[0]
+    parameters = run_parameters(scene, coupling, chosen, first, period=PERIOD, felt=felt)
+    # the grip is where the device would be without the angle, not where it starts
+    parameters = replace(parameters, device_origin=IDENTITY_POSE)
+    binding = BoundKernel(scene.model, scene.data, parameters)
+    records = np.zeros(TICKS, TICK_DTYPE)
+    done = _run(binding, samples, records)
+    return _read(binding, records[:done])
+
+
+def turning(
+    speed: float, *, angle: float = 0.0, axis: NDArray[np.float64] = OBLIQUE
+) -> NDArray[np.float64]:
+    """Returns the handle's unit quaternions (w, x, y, z) at the ticks, shape (``TICKS`` + 1, 4).
+
+    Args:
+        speed: In rad/s.
+        angle: By which it is turned about x at the start, in rad.
+        axis: Of the turning, in the world frame, shape (3,), of any length > 0.
+    """
+    time = PERIOD * np.arange(TICKS + 1)
+    about = axis / np.linalg.norm(axis)
+    turns = Rotation.from_rotvec(np.outer(speed * time, about)) * Rotation.from_rotvec(
+        [angle, 0.0, 0.0]
+    )
+    return np.asarray(turns.as_quat(canonical=True)[:, [3, 0, 1, 2]])
+
+
+def coupling_of(stiffness: float) -> Coupling:
+    """Returns the coupling with a K_r in N m/rad; with 0 it does not hold the tool's turning."""
+    return Coupling(STIFFNESS, DAMPING, stiffness, ROTATIONAL_DAMPING if stiffness else 0.0)
+
+
+def sudden(method: str, stiffness: float, speed: float) -> Spin:
+    """Turns the handle suddenly about the middle axis, with the tool at rest."""
+    return spin(method, coupling_of(stiffness), speed, axis=MIDDLE, spins_at_start=False)
+
+
+def speed_of_cut(method: str, stiffness: float) -> float:
+    """Returns the speed in rad/s, 1 to 1000, at which a sudden turn winds the angle past π."""
+    return largest_stable(
+        lambda speed: sudden(method, stiffness, speed).crossed < 0, 1.0, 1000.0
+    ).middle
+
+
+def spinning_scene() -> Scene:
+    """Loads the tool, floating free of gravity."""
+    return scene_of(free_body(MASS, INERTIA))
+
+
+def _set_spin(scene: Scene, omega: NDArray[np.float64]) -> None:
+    scene.data.qvel[3:6] = omega  # the body's axes are the world's at the start
+    mujoco.mj_forward(scene.model, scene.data)
+
+
+def _run(binding: BoundKernel, samples: NDArray[np.void], records: NDArray[np.void]) -> int:
+    for first in range(0, TICKS, CHUNK):
+        part = slice(first, first + CHUNK)
+        done = simulate(binding.state, samples[part], binding.row, records[part])
+        if done < CHUNK or not binding.state["kinetic"][0] < DIVERGED:
+            return first + done
+    return TICKS
+
+
+def _read(binding: BoundKernel, records: NDArray[np.void]) -> Spin:
+    ledger = Ledger.of(binding.state)
+    handle = Rotation.from_quat(records["handle_quaternion"][:, [1, 2, 3, 0]])
+    tool = Rotation.from_quat(records["tool_quaternion"][:, [1, 2, 3, 0]])
+    between = (handle * tool.inv()).as_rotvec()
+    angles = np.linalg.norm(between, axis=1)
+    # just before the cut and just behind it the rotation vectors point opposite ways
+    opposite = np.sum(between[1:] * between[:-1], axis=1) < 0
+    crossed = np.flatnonzero(opposite & (angles[1:] > np.pi / 2) & (angles[:-1] > np.pi / 2))
+    jumps = np.linalg.norm(np.diff(records["wrench_on_tool"][:, 3:], axis=0), axis=1)
+    return Spin(
+        ticks=records.size,
+        environment=ledger.environment,
+        created=float(records["environment_energy"].max(initial=0.0)),
+        slack_share=ledger.slack_share,
+        first_active=-1 if ledger.first_active is None else ledger.first_active,
+        largest_angle=float(angles.max(initial=0.0)),
+        crossed=int(crossed[0]) + 1 if crossed.size else -1,
+        torque_jump=float(jumps.max(initial=0.0)),
+    )
+
+
+SOFT, HARD = 2.0, 20.0
+"""K_r in N m/rad: that of the simulated device, and one ten times stiffer."""
+
+METHODS_SHOWN = ("implicit", "compensated", "lossless", "implicitfast", "explicit", "weld")
+
+SPEED = (0.0, 200.0)
+ANGLE = (0.0, 3.1)
+"""Ranges in rad/s and rad: the angle ends short of the cut."""
+
+SLOWEST = 2.0
+"""In rad/s, where the lines over the logarithm of the speed begin."""
+
+LINES = (
+    ("implicit", 0.0),
+    ("implicit", SOFT),
+    ("implicit", HARD),
+    ("compensated", SOFT),
+    ("lossless", SOFT),
+    ("implicitfast", SOFT),
+    ("explicit", SOFT),
+)
+"""Method and K_r in N m/rad of what is drawn over the speed; with 0 the coupling is one of
+translation alone."""
+
+
+def points(count: int) -> Sequence[Point]:
+    """Returns a grid of speed and angle for each method, and lines over the speed."""
+    side = max(2, round((0.85 * count / len(METHODS_SHOWN)) ** 0.5))
+    many = max(4, round(0.15 * count / (len(LINES) + len(METHODS_SHOWN))))
+    cells = [
+        _point("cell", method, SOFT, speed, angle)
+        for method in METHODS_SHOWN
+        for angle in np.linspace(*ANGLE, side)
+        for speed in np.linspace(*SPEED, side)
+    ]
+    lines = [
+        _point("line", method, stiffness, speed)
+        for method, stiffness in LINES
+        for speed in np.geomspace(SLOWEST, SPEED[1], many)
+    ]
+    cuts = [
+        _point("cut", method, SOFT, speed)
+        for method in METHODS_SHOWN
+        for speed in np.linspace(SLOWEST, SPEED[1], many)
+    ]
+    return [*cells, *lines, *cuts, _point("limit", "implicit", SOFT, 0.0)]
+
+
+def _point(what: str, method: str, stiffness: float, speed: float, angle: float = 0.0) -> Point:
+    return {
+        "what": what,
+        "method": method,
+        "rotational_stiffness": float(stiffness),
+        "speed": float(speed),
+        "angle": float(angle),
+    }
+
+
+def evaluate(point: Point) -> Mapping[str, float | int | str]:
+    """Spins a handle for 1 s, or searches for the speed at which the angle passes π.
+
+    In a ``cell`` or on a ``line`` the tool spins with the handle from the start, in a ``cut`` it is
+    at rest.
+    """
+    method, stiffness = str(point["method"]), float(point["rotational_stiffness"])
+    if point["what"] == "limit":
+        return {"limit": speed_of_cut(method, stiffness)}
+    speed, angle = float(point["speed"]), float(point["angle"])
+    coupling = coupling_of(stiffness)
+    if point["what"] == "cut":
+        found = sudden(method, stiffness, speed)
+    else:
+        found = spin(method, coupling, speed, angle=angle)
+    return {
+        "ticks": found.ticks,
+        "environment": found.environment,
+        "created": found.created,
+        "slack_share": found.slack_share,
+        "first_active": found.first_active,
+        "largest_angle": found.largest_angle,
+        "crossed": found.crossed,
+        "torque_jump": found.torque_jump,
+    }
+
+
+STYLES = {0.0: "s:", SOFT: "o-", HARD: "^--"}
+"""Marker and line by K_r in N m/rad."""
+
+LEAST = 1e-12
+"""Energy in J that stands for none on a logarithmic axis."""
+
+HIGHEST = 5 * np.pi * SOFT
+"""Upper end of the axis of torque in N m: the jump at the cut, and room for the names above it."""
+
+
+def draw(table: Table) -> Figure:
+    """Draws verdicts over speed and angle, creation over speed, and the jump at the cut."""
+    figure = new_figure(8, 8.4)
+    grid = figure.add_gridspec(3, 6, height_ratios=[1, 1, 1.4])
+    for place, method in enumerate(METHODS_SHOWN):
+        row, column = divmod(place, 3)
+        axes = figure.add_subplot(grid[row, 2 * column : 2 * column + 2])
+        _draw_cells(axes, table, method)
+        if row == 1:
+            axes.set_xlabel("speed (rad/s)")
+        if column == 0:
+            axes.set_ylabel("angle at the start (rad)")
+    _draw_creation(figure.add_subplot(grid[2, :3]), table)
+    _draw_cut(figure.add_subplot(grid[2, 3:]), table)
+    figure.suptitle(
+        f"A free tool of {1e3 * INERTIA[0]:.3g}, {1e3 * INERTIA[1]:.3g}, "
+        f"{1e3 * INERTIA[2]:.3g} g m² behind a handle that spins for 1 s at "
+        f"{1 / PERIOD:g} Hz;\nabove and right: K_r = {SOFT:g} N m/rad",
+        fontsize="medium",
+    )
+    verdict_legend(
+        figure,
+        [
+            ("angle passed π", "black", "o"),
+            ("gyroscopic torque = π K_r", THEORY_COLOUR, "--"),
+        ],
+    )
+    return figure
+
+
+def _draw_cells(axes: Axes, table: Table, method: str) -> None:
+    axes.set_title(method, fontsize="medium")
+    cells = table.select((table["what"] == "cell") & (table["method"] == method))
+    verdict = verdict_numbers(cells.numbers("ticks") == TICKS, cells.texts("environment"))
+    draw_verdicts(axes, cells["speed"], cells["angle"], verdict)
+    passed = cells.select(cells.numbers("crossed") >= 0)
+    axes.plot(passed["speed"], passed["angle"], "o", color="black", ms=2, mfc="white", mew=0.5)
+    axes.axvline(gyroscopic_speed(SOFT), color=THEORY_COLOUR, ls="--", lw=1.5)
+
+
+def _draw_creation(axes: Axes, table: Table) -> None:
+    lines = table.select(table["what"] == "line")
+    for method, stiffness in LINES:
+        mine = lines.select(
+            (lines["method"] == method) & (lines["rotational_stiffness"] == stiffness)
+        )
+        if stiffness == 0:
+            predicted = [max(free_creation(float(speed)), LEAST) for speed in mine["speed"]]
+            axes.plot(
+                mine["speed"],
+                predicted,
+                color=THEORY_COLOUR,
+                lw=4,
+                alpha=0.5,
+                label=r"½T²|ω×Iω|²/I",
+            )
+        axes.plot(
+            mine["speed"],
+            np.maximum(mine.numbers("created"), LEAST),
+            STYLES[stiffness],
+            color=METHOD_COLOURS[method],
+            ms=3,
+            lw=1,
+            label=f"{method}, K_r = {stiffness:g}" if stiffness else "translation only",
+        )
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    axes.set_ylim(1e-4 * LEAST, 1e4)  # room for the names below the curves
+    axes.set_xlabel("speed (rad/s)")
+    axes.set_ylabel("energy created (J)")
+    axes.legend(fontsize="x-small", loc="lower right", ncols=2, handlelength=1.5)
+
+
+def _draw_cut(axes: Axes, table: Table) -> None:
+    cuts = table.select(table["what"] == "cut")
+    widths = (7, 5.5, 4, 2.5, 1, 1)  # all but the last lie on each other
+    for method, width in zip(METHODS_SHOWN, widths, strict=True):
+        mine = cuts.select(cuts["method"] == method)
+        jump = mine.numbers("torque_jump")
+        is_beyond = jump > HIGHEST
+        colour = METHOD_COLOURS[method]
+        label = method
+        if is_beyond.any():
+            # a line to there would seem to end at the edge: marks say that it does not
+            axes.plot(
+                mine["speed"][is_beyond],
+                np.full(is_beyond.sum(), 0.97 * HIGHEST),
+                "^",
+                color=colour,
+                ms=5,
+            )
+            label = f"{method} (▲ beyond: to {jump[is_beyond].max():.1g})"
+        shown = np.where(is_beyond, np.nan, jump)
+        axes.plot(mine["speed"], shown, "o-", color=colour, ms=3, lw=width, label=label)
+    axes.axvline(cut_speed(SOFT), color=THEORY_COLOUR, ls="--", lw=1.2, label="ω = π √(K_r/I)")
+    axes.axhline(2 * np.pi * SOFT, color=THEORY_COLOUR, ls=":", lw=1.2, label="2π K_r")
+    axes.set_ylim(0, HIGHEST)
+    axes.set_xlabel("speed of a sudden turn (rad/s)")
+    axes.set_ylabel("largest jump of torque\nin a tick (N m)")
+    axes.legend(fontsize="x-small", loc="upper right", bbox_to_anchor=(1.0, 0.95))
+
+
+TOLD_AT = 50.0
+"""Speed in rad/s at which the paragraph says what is created: eight turns a second."""
+
+TELLING = (1e-4, 0.05)
+"""Share of the kinetic energy within which creation is compared with theory: above rounding, and
+below what changes the motion."""
+
+
+def read(table: Table) -> Finding:
+    """Draws verdicts over speed and angle, creation over speed, and the jump at the cut.
+
+    Raises:
+        StudyError: No point was computed at all.
+    """
+    table = computed(table, "rotation")
+    boundary = _boundary(table)
+    return Finding(draw(table), _paragraph(boundary), boundary)
+
+
+def _boundary(table: Table) -> dict[str, Any]:
+    cells = table.select(table["what"] == "cell")
+    free = table.select((table["what"] == "line") & (table["rotational_stiffness"] == 0))
+    predicted = np.array([free_creation(float(speed)) for speed in free["speed"]])
+    kinetic = 0.5 * INERTIA[1] * free["speed"] ** 2
+    share = predicted / kinetic
+    told = (share > TELLING[0]) & (share < TELLING[1])
+    created = free.numbers("created")
+    ratio = created[told] / predicted[told]
+    cuts = table.select(table["what"] == "cut")
+    mine = cuts.select(cuts["method"] == "implicit")
+    passed = mine.select(mine.numbers("crossed") >= 0)
+    limit = table.select(table["what"] == "limit").numbers("limit")
+    return {
+        "period": PERIOD,
+        "rotational_stiffness": SOFT,
+        "gyroscopic_speed": gyroscopic_speed(SOFT),
+        "fastest_passive": {name: _fastest(cells, name) for name in METHODS_SHOWN},
+        "share_strict_below": {name: _strict_share(cells, name) for name in METHODS_SHOWN},
+        "first_passed": {name: _first_passed(cells, name) for name in METHODS_SHOWN},
+        "translation_only": {
+            "speed": free["speed"].tolist(),
+            "created": created.tolist(),
+            "predicted": predicted.tolist(),
+            "grows_up_to": _grows_up_to(free),
+            "compared_up_to": float(free["speed"][told].max()) if told.any() else None,
+            "largest_deviation": float(np.abs(ratio - 1).max()) if ratio.size else None,
+        },
+        "cut": {
+            "speed_measured": float(limit[0]) if limit.size else None,
+            "speed_predicted": cut_speed(SOFT),
+            "torque_jump": float(passed["torque_jump"].max()) if len(passed) else None,
+            "torque_jump_predicted": 2 * np.pi * SOFT,
+            "largest_torque_jump": {name: _largest_jump(cuts, name) for name in METHODS_SHOWN},
+            "created": float(passed["created"].max()) if len(passed) else None,
+        },
+    }
+
+
+def _largest_jump(cuts: Table, method: str) -> float | None:
+    """Returns the largest jump of torque of a method in N m; None where nothing was run."""
+    jump = cuts.select(cuts["method"] == method).numbers("torque_jump")
+    return float(jump.max()) if jump.size else None
+
+
+def _grows_up_to(free: Table) -> float | None:
+    """Returns the speed in rad/s up to which more is created at every faster point."""
+    if not len(free):
+        return None
+    falls = np.flatnonzero(np.diff(free.numbers("created")) <= 0)
+    return float(free["speed"][falls[0] if falls.size else -1])
+
+
+def _first_passed(cells: Table, method: str) -> float | None:
+    """Returns the slowest speed in rad/s at which the angle passed π in a run; None for none."""
+    mine = cells.select((cells["method"] == method) & (cells.numbers("crossed") >= 0))
+    return float(mine["speed"].min()) if len(mine) else None
+
+
+def _fastest(cells: Table, method: str) -> float | None:
+    """Returns the speed in rad/s up to which a method is passive at every angle; None for none."""
+    mine = cells.select(cells["method"] == method)
+    is_good = (mine.texts("environment") != "active") & (mine.numbers("ticks") == TICKS)
+    bad = mine["speed"][~is_good].min(initial=np.inf)
+    # at rest nothing moves and nothing can be created: that is no speed
+    good = mine["speed"][(mine["speed"] < bad) & (mine["speed"] > 0)]
+    return float(good.max()) if good.size else None
+
+
+def _strict_share(cells: Table, method: str) -> float | None:
+    """Returns the share of strict runs below ``gyroscopic_speed``."""
+    rows = (cells["method"] == method) & (cells["speed"] < gyroscopic_speed(SOFT))
+    return float(np.mean(cells.texts("environment")[rows] == "strict")) if rows.any() else None
+
+
+def _paragraph(boundary: Mapping[str, Any]) -> str:
+    said = [_of_method(name, boundary) for name in METHODS_SHOWN]
+    said += [_of_translation(boundary["translation_only"]), *_of_cut(boundary["cut"])]
+    return f"With K_r = {SOFT:g} N m/rad: " + ". ".join(said) + "."
+
+
+def _of_translation(free: Mapping[str, Any]) -> str:
+    if not free["speed"]:
+        return f"In translation alone {MISSING}"
+    usual = int(np.argmin(np.abs(np.asarray(free["speed"]) - TOLD_AT)))
+    text = (
+        f"Coupled in translation alone, the tool creates {free['created'][usual]:.2g} J in 1 s "
+        f"at {free['speed'][usual]:.3g} rad/s, and more the faster up to "
+        f"{free['grows_up_to']:.3g} rad/s"
+    )
+    if free["largest_deviation"] is None:
+        return text
+    return (
+        f"{text}; up to {free['compared_up_to']:.3g} rad/s, where that is little next to its "
+        f"own energy, it is ½T²|ω × Iω|²/I a step within {100 * free['largest_deviation']:.2g} %"
+    )
+
+
+def _of_cut(cut: Mapping[str, Any]) -> list[str]:
+    said = []
+    if cut["speed_measured"] is not None:
+        said.append(
+            f"A sudden turn passes the cut at π at {cut['speed_measured']:.4g} rad/s, predicted "
+            f"{cut['speed_predicted']:.4g} rad/s"
+        )
+    if cut["torque_jump"] is not None:
+        said.append(
+            f"Behind the cut the torque of 'implicit' flips by {cut['torque_jump']:.3g} N m within "
+            f"a tick, and it creates {cut['created']:.2g} J at most"
+        )
+    jumps = cut["largest_torque_jump"]
+    if all(jump is None for jump in jumps.values()):
+        said.append(f"Of sudden turns {MISSING}")
+    if (jumps["weld"] or 0.0) > cut["torque_jump_predicted"]:
+        said.append(
+            "The gains of a 'weld' are those of the translation; where its angle passes π its "
+            f"torque jumps by up to {jumps['weld']:.1g} N m"
+        )
+    return said
+
+
+def _of_method(name: str, boundary: Mapping[str, Any]) -> str:
+    fastest, strict = boundary["fastest_passive"][name], boundary["share_strict_below"][name]
+    passed = boundary["first_passed"][name]
+    if strict is None:
+        return f"'{name}': {MISSING}"
+    if fastest is None:
+        text = f"'{name}' is passive at every angle at no speed shown"
+    else:
+        text = f"'{name}' is passive, strictly or within its slack, at every angle up to "
+        text += f"{fastest:.3g} rad/s"
+    text += (
+        f", strict in {100 * strict:.0f} % of its runs below {boundary['gyroscopic_speed']:.3g} "
+        "rad/s, where the gyroscopic torque reaches what the spring gives at π"
+        if name == METHODS_SHOWN[0]
+        else f", strict in {100 * strict:.0f} %"
+    )
+    if passed is None:
+        return f"{text}; its angle passes π in no run"
+    return f"{text}; its angle first passes π at {passed:.3g} rad/s"
+
+
+ROTATION = StabilityMap(
+    name="rotation",
+    about="angular speed of the tool and angle between handle and tool, to the cut at π",
+    default_points=1500,
+    points=points,
+    evaluate=evaluate,
+    read=read,
+)

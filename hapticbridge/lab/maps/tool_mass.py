@@ -1,0 +1,553 @@
+"""Map ``tool_mass``: how light a tool each method can render, and how heavy."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import cache
+from typing import Any
+
+import mujoco
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import ArrayLike, NDArray
+
+from hapticbridge.coupling import Coupling
+from hapticbridge.device import SimulatedDevice
+from hapticbridge.errors import StudyError, choices
+from hapticbridge.lab.closed_loop import LoopOutcome
+from hapticbridge.lab.maps.base import (
+    MISSING,
+    THEORY_COLOUR,
+    WIDTH,
+    Finding,
+    Point,
+    StabilityMap,
+    agreement,
+    computed,
+    draw_verdicts,
+    largest_stable,
+    limit_by_6,
+    loop_in,
+    needed_by_6,
+    per_cent,
+    set_tool_mass,
+    swinging,
+    used_damping,
+    verdict_legend,
+    verdict_numbers,
+)
+from hapticbridge.plotting import new_figure
+from hapticbridge.rendering import METHODS
+from hapticbridge.sweep.results import Table
+from hapticbridge.theory.sampled_loop import WorstHand
+from hapticbridge.theory.spectrum import needed_for_fixed_environment
+
+NAMES = ("implicit", "lossless", "implicitfast", "explicit", "explicit:rk4")
+"""Methods that have a theory here."""
+
+ANGLES = np.union1d(np.linspace(0.01, np.pi, 2000), np.geomspace(0.01, np.pi, 1000))
+"""θ in rad at which theory is evaluated, even in θ and in log θ; to be finer than resonances of a
+heavy tool, which are B/m wide."""
+
+
+def least_mass(method: str, stiffness: float, damping: float, period: float) -> float:
+    """Returns the mass that a free tool must exceed to be stable behind a handle held still.
+
+        implicit        0
+        lossless        0
+        implicitfast    (T/2)(K T/2 − B), at least 0
+        explicit        (T/2)(K T/2 + B)
+        explicit:rk4    (B T/2)(2B + K T)/(2B − K T);  inf for B <= K T/2
+
+    From Jury's test of the loop z-transformed: the actuators of implicitfast have the spring at the
+    old place and the damper at the new velocity; RK4 holds the force exactly.
+
+    Args:
+        method: One of ``NAMES``.
+        stiffness: K in N/m, > 0.
+        damping: B in N s/m, >= 0.
+        period: T in s, > 0.
+
+    Returns:
+        m in kg.
+
+    Raises:
+        StudyError: The method is none of these, or a value is out of range.
+
+    References:
+        Brown & Colgate 1997, conditions that belong to eq. (19), for the semi-implicit step; the
+        other two are derived here alike.
+    """
+    _check(method, stiffness, damping, period)
+    kt, b = stiffness * period, damping
+    if method in ("implicit", "lossless"):
+        return 0.0
+    if method == "implicitfast":
+        return max(0.0, period / 2 * (kt / 2 - b))
+    if method == "explicit":
+        return period / 2 * (kt / 2 + b)
+    return b * period / 2 * (2 * b + kt) / (2 * b - kt) if 2 * b > kt else float("inf")
+
+
+def felt(
+    method: str, stiffness: float, damping: float, mass: float, period: float, angle: ArrayLike
+) -> NDArray[np.complex128]:
+    """Returns what the device feels of a free tool, force per displacement of the handle.
+
+        H = C / (1 + C P),    C = K + B D/T,    D = 1 − z⁻¹,    P = (T²/m) n / D²
+        n = 1 (implicit),  (1 + z⁻¹)/2 (lossless),  z⁻¹ (explicit),
+        z⁻¹(1 + z⁻¹)/2 (explicit:rk4, the exact hold)
+        H = C (m D²/T² − K D) / (m D²/T² + K z⁻¹ + B D/T)          (implicitfast)
+
+    Args:
+        method: One of ``NAMES``.
+        stiffness: K in N/m, > 0.
+        damping: B in N s/m, >= 0.
+        mass: m in kg, > 0.
+        period: T in s, > 0.
+        angle: θ = ωT in rad, 0 < θ <= π, any shape.
+
+    Returns:
+        H in N/m, shaped like the angle.
+
+    Raises:
+        StudyError: The method is none of these, or a value is out of range.
+    """
+    _check(method, stiffness, damping, period, mass)
+    back = np.exp(-1j * np.asarray(angle, dtype=np.float64))
+    change = 1 - back
+    coupling = stiffness + damping / period * change
+    inertia = mass * change**2 / period**2
+    if method == "implicitfast":
+        rest = inertia + stiffness * back + damping / period * change
+        return np.asarray(coupling * (inertia - stiffness * change) / rest)
+    late = {
+        "implicit": 1 + 0 * back,
+        "lossless": (1 + back) / 2,
+        "explicit": back,
+        "explicit:rk4": back * (1 + back) / 2,
+    }
+    return np.asarray(coupling / (1 + coupling * late[method] / inertia))
+
+
+def worst_angle(
+    method: str, stiffness: float, damping: float, mass: float, period: float
+) -> tuple[float, float]:
+    """Returns θ in rad at which a free tool needs most device damping, and that b in N s/m.
+
+    The damping is what any passive hand may ask for, provided that the tool is stable behind a
+    handle held still (``least_mass``); else inf.
+
+    Raises:
+        StudyError: The method is none of ``NAMES``, or a value is out of range.
+
+    References:
+        Colgate & Schenkel 1997.
+    """
+    response = felt(method, stiffness, damping, mass, period, ANGLES)
+    needed = needed_for_fixed_environment(response, period, ANGLES)
+    place = int(np.flatnonzero(needed >= needed.max() - 1e-12 * abs(needed.max()))[-1])
+    is_stable = mass > least_mass(method, stiffness, damping, period)
+    return float(ANGLES[place]), float(needed[place]) if is_stable else float("inf")
+
+
+def _check(method: str, stiffness: float, damping: float, period: float, mass: float = 1.0) -> None:
+    if method not in NAMES:
+        raise StudyError(f"no theory for method '{method}' here; choose {choices(NAMES)}")
+    for name, value, unit in (
+        ("stiffness", stiffness, "N/m"),
+        ("period", period, "s"),
+        ("mass", mass, "kg"),
+    ):
+        if not (np.isfinite(value) and value > 0):
+            raise StudyError(f"{name} is {value!r} {unit}; it must be finite and > 0")
+    if not (np.isfinite(damping) and damping >= 0):
+        raise StudyError(f"damping is {damping!r} N s/m; it must be finite and >= 0")
+
+
+PERIOD = 1e-3
+"""T in s."""
+
+DEVICE_DAMPING = 20.0
+"""b in N s/m: a well damped device, so that stiff couplings are in play. The loop is linear: with a
+tenth of b, B and K everything here happens at a tenth of the tool's mass."""
+
+DAMPING = 5.0
+"""B in N s/m, a quarter of b, as a default coupling has it."""
+
+MASS = (1e-3, 10.0)
+"""Range of the tool's mass in kg, even in its logarithm."""
+
+STIFFNESS = (1000.0, 60_000.0)
+"""Range of K in N/m, even in its logarithm: up to twice the bound (6) of 30 kN/m."""
+
+TICKS = 2000
+SWINGS = 8.0
+"""Swings of the tool on the coupling that a run must hold at least: a fifth of it is judged, and a
+fraction of a swing would be taken for growth or decay. More takes longer."""
+
+KNOCK = np.array([1e-4, 0.0, 0.0, 0.0, 0.0, 0.0])
+"""Displacement that starts a run, in m."""
+
+HELD_STILL = 1e9
+"""Mass in kg of a device that nobody moves: the handle is held still to 1e-12 m."""
+
+PATH = swinging(0.0025, 3.0, duration=2.0, count=401)
+"""Of a hand that swings the tool by 5 mm at 3 Hz, and turns nothing."""
+
+THEORIES: Mapping[str, str] = {
+    "implicit": "implicit",
+    "compensated": "implicit",
+    "lossless": "lossless",
+    "implicitfast": "implicitfast",
+    "explicit": "explicit",
+    "explicit:rk4": "explicit:rk4",
+}
+"""Methods shown, and the theory of a free tool of each."""
+
+LIMITS = 9
+"""Values of K per method at which the limits in mass are searched."""
+
+SEARCHES = ("held still", "worst hand")
+"""How the handle is held where a limit in mass is searched."""
+
+
+def points(count: int) -> Sequence[Point]:
+    """Returns a grid of mass and stiffness per method, and searches for the limit in mass."""
+    side = max(2, round((count / len(THEORIES)) ** 0.5))
+    stiffness = np.geomspace(*STIFFNESS, side)
+    cells: list[Point] = [
+        {"what": "cell", "method": name, "stiffness": float(k), "mass": float(m)}
+        for name in THEORIES
+        for k in stiffness
+        for m in np.geomspace(*MASS, side)
+    ]
+    # two to a column of the picture, and away from the grid's own values
+    limits: list[Point] = [
+        {"what": what, "method": name, "stiffness": float(k), "mass": 0.0}
+        for name in THEORIES
+        for k in np.geomspace(1.1 * STIFFNESS[0], STIFFNESS[1] / 1.1, min(LIMITS, side))
+        for what in SEARCHES
+    ]
+    return cells + limits
+
+
+def evaluate(point: Point) -> Mapping[str, float | str | bool]:
+    """Runs one tool behind a handle held still, in the worst hand and in an ordinary one.
+
+    Or searches for the mass from which on it is stable in one of the first two.
+    """
+    name, stiffness = str(point["method"]), float(point["stiffness"])
+    if point["what"] != "cell":
+        return _limit(name, stiffness, is_held=point["what"] == "held still")
+    mass = float(point["mass"])
+    held, in_hand = held_still(name, stiffness, mass), worst_hand(name, stiffness, mass)
+    ordinary = SimulatedDevice(damping=DEVICE_DAMPING, path=PATH)
+    moved = _run(ordinary, name, stiffness, mass, is_knocked=False)
+    return {
+        "stable_held_still": held.is_stable,
+        "stable_worst_hand": in_hand.is_stable,
+        "environment": moved.environment,
+        "created": moved.created,
+        "slack_share": moved.slack_share,
+        "first_active": moved.first_active,
+    }
+
+
+def held_still(name: str, stiffness: float, mass: float) -> LoopOutcome:
+    """Runs a knocked tool behind a handle held still."""
+    return _run(SimulatedDevice(mass=HELD_STILL, hand=None), name, stiffness, mass)
+
+
+def worst_hand(name: str, stiffness: float, mass: float) -> LoopOutcome:
+    """Runs a free tool in the hand that is worst for this method, mass and stiffness."""
+    device = SimulatedDevice(hand=hand_worst_for(name, stiffness, mass))
+    return _run(device, name, stiffness, mass)
+
+
+def hand_worst_for(name: str, stiffness: float, mass: float) -> WorstHand:
+    """Returns the hand that needs most damping for this method, mass and stiffness."""
+    law = THEORIES[name], stiffness, law_damping(name, stiffness), mass, PERIOD
+    angle, _ = worst_angle(*law)
+    response = complex(felt(*law, angle))
+    return WorstHand(DEVICE_DAMPING, angle / PERIOD, PERIOD, response)
+
+
+def law_damping(name: str, stiffness: float) -> float:
+    """Returns B' in N s/m, which a method's law uses where ``DAMPING`` is asked for."""
+    return float(used_damping(name, stiffness, DAMPING, PERIOD))
+
+
+def coupling_of(stiffness: float) -> Coupling:
+    """Returns the coupling of every run at a stiffness; nothing turns."""
+    return Coupling(stiffness, DAMPING, 0.0, 0.0)
+
+
+def _run(
+    device: SimulatedDevice, name: str, stiffness: float, mass: float, *, is_knocked: bool = True
+) -> LoopOutcome:
+    loop = loop_in("point_mass", "tool_mass")
+    # the mass is set before every run: the loop is shared with other masses
+    set_tool_mass(loop.scene.model, "tool", mass)
+    mujoco.mj_setConst(loop.scene.model, loop.scene.data)
+    swing = 2 * np.pi * (mass / stiffness) ** 0.5
+    return loop.run(
+        device,
+        coupling_of(stiffness),
+        METHODS[name],
+        period=PERIOD,
+        ticks=max(TICKS, round(SWINGS * swing / PERIOD)) if is_knocked else TICKS,
+        knock=KNOCK if is_knocked else None,
+    )
+
+
+def _limit(name: str, stiffness: float, *, is_held: bool) -> Mapping[str, float | bool]:
+    """Searches for the mass at which stability changes; NaN where it does not."""
+
+    def is_stable(mass: float) -> bool:
+        # a tool that is unstable by itself has no worst hand: theory tunes it to a stable one
+        return held_still(name, stiffness, mass).is_stable and (
+            is_held or worst_hand(name, stiffness, mass).is_stable
+        )
+
+    return _change(is_stable, WIDTH)
+
+
+def predicted_limit(name: str, stiffness: float, *, is_held: bool) -> Mapping[str, float | bool]:
+    """Returns where theory has the mass at which stability changes, within ``MASS``.
+
+    Args:
+        name: One of ``THEORIES``.
+        stiffness: K in N/m, > 0.
+        is_held: Whether the handle is held still, or held by the worst hand of the device.
+
+    Returns:
+        ``limit`` in kg, NaN where there is none; ``stable_if_light`` and ``stable_if_heavy``: at
+        the ends of the range.
+
+    Raises:
+        StudyError: The stiffness is out of range.
+    """
+    theory, damping = THEORIES[name], law_damping(name, stiffness)
+
+    def is_stable(mass: float) -> bool:
+        needed = worst_angle(theory, stiffness, damping, mass, PERIOD)[1]
+        return np.isfinite(needed) if is_held else needed < DEVICE_DAMPING
+
+    return _change(is_stable, WIDTH / 10)
+
+
+def _change(is_stable: Callable[[float], bool], width: float) -> Mapping[str, float | bool]:
+    first, last = (is_stable(mass) for mass in MASS)
+    found = {"limit": float("nan"), "stable_if_light": first, "stable_if_heavy": last}
+    if first == last:
+        return found
+    bracket = largest_stable(lambda mass: is_stable(mass) == first, *MASS, width)
+    return found | {"limit": bracket.middle}
+
+
+def of_method(table: Table, what: str, name: str) -> Table:
+    """Returns the rows of one kind of point and one method."""
+    return table.select((table["what"] == what) & (table["method"] == name))
+
+
+def is_stable(cells: Table) -> NDArray[np.bool_]:
+    """Returns where a tool was stable, held still and in the worst hand."""
+    return np.asarray(
+        (cells.numbers("stable_held_still") == 1) & (cells.numbers("stable_worst_hand") == 1)
+    )
+
+
+Array = NDArray[np.float64]
+
+CONTOUR = 61
+"""Points along each axis from which the worst hand's bound is drawn; more make it smoother and take
+a tenth of a millisecond each."""
+
+_MARKERS = {"held still": "s", "worst hand": "o"}
+
+_LINES = (
+    ("(6): b = K T/2 + B′", "black", "-"),
+    ("implicitfast: slack used up, K = B/T", "black", "-."),
+    ("least mass by theory, held still", THEORY_COLOUR, ":"),
+    ("limit by theory, worst hand", THEORY_COLOUR, "--"),
+)
+
+
+def draw(table: Table) -> Figure:
+    """Draws stiffness against mass by method, theory on top."""
+    figure = new_figure(8, 7.6)
+    panels = figure.subplots(2, 3, sharex=True, sharey=True).ravel()
+    for axes, name in zip(panels, THEORIES, strict=True):
+        cells = of_method(table, "cell", name)
+        verdict = verdict_numbers(is_stable(cells), cells.texts("environment"))
+        draw_verdicts(axes, cells["mass"], cells["stiffness"], verdict, log_x=True, log_y=True)
+        _draw_theory(axes, name)
+        for what, marker in _MARKERS.items():
+            rows = of_method(table, what, name)
+            axes.plot(
+                rows.numbers("limit"), rows["stiffness"], marker, color="black", mfc="white", ms=4.5
+            )
+        axes.set_title(name, fontsize="medium")
+        axes.set_xlim(*MASS)
+        axes.set_ylim(*STIFFNESS)
+    for axes in panels[3:]:
+        axes.set_xlabel("tool mass m (kg)")
+        axes.set_xticks(np.geomspace(MASS[0], MASS[1] / 10, 4))  # the last would touch the next
+    for axes in panels[::3]:
+        axes.set_ylabel("coupling stiffness K (N/m)")
+    figure.suptitle(
+        f"Which tool at which stiffness: free tool, B = {DAMPING:g} N s/m, "
+        f"device damping b = {DEVICE_DAMPING:g} N s/m, {1 / PERIOD:g} Hz;\n"
+        "the law of 'compensated' uses B′ = B − K T, of 'lossless' B − K T/2 (0 at least)",
+        fontsize="medium",
+    )
+    measured = [(f"measured, {what}", "black", marker) for what, marker in _MARKERS.items()]
+    verdict_legend(figure, [*_LINES, *measured], columns=3)
+    return figure
+
+
+@cache
+def _needed(name: str) -> tuple[Array, Array, Array]:
+    """Returns mass, stiffness and the device damping that theory asks for, (n,), (n,), (n, n)."""
+    mass, stiffness = np.geomspace(*MASS, CONTOUR), np.geomspace(*STIFFNESS, CONTOUR)
+    needed = [
+        [worst_angle(THEORIES[name], k, law_damping(name, k), m, PERIOD)[1] for m in mass]
+        for k in stiffness
+    ]
+    return mass, stiffness, np.array(needed)
+
+
+def _draw_theory(axes: Axes, name: str) -> None:
+    mass, stiffness, needed = _needed(name)
+    least = np.array(
+        [least_mass(THEORIES[name], k, law_damping(name, k), PERIOD) for k in stiffness]
+    )
+    is_shown = np.isfinite(least) & (least > 0)
+    axes.plot(least[is_shown], stiffness[is_shown], color=THEORY_COLOUR, ls=":", lw=2.2)
+    axes.contour(
+        mass,
+        stiffness,
+        # where the tool is unstable by itself no damping is enough; the cap makes that a number
+        np.minimum(needed, 3 * DEVICE_DAMPING),
+        levels=[DEVICE_DAMPING],
+        colors=THEORY_COLOUR,
+        linestyles="--",
+        linewidths=1.6,
+    )
+    if name == "implicitfast":
+        # its spring lags by a step, so E_k = K δx² − ½ m (Δv)², against a slack of ½ (K + B/T) δx²
+        axes.axhline(DAMPING / PERIOD, color="black", ls="-.", lw=1.4)
+    axes.axhline(float(limit_by_6(name, DEVICE_DAMPING, PERIOD, DAMPING)), color="black", lw=1.8)
+
+
+def read(table: Table) -> Finding:
+    """Counts what failed by method, and compares the limits in mass with theory.
+
+    A method of which no point was computed is left out, and the paragraph says so.
+
+    Raises:
+        StudyError: No point was computed at all.
+    """
+    table = computed(table, "tool_mass")
+    methods: dict[str, dict[str, Any]] = {}
+    for name in THEORIES:
+        cells = of_method(table, "cell", name)
+        methods[name] = _counts(name, cells) if len(cells) else {}
+        for what in SEARCHES:
+            rows = of_method(table, what, name)
+            if len(rows):
+                methods[name][what] = _compare(name, rows, is_held=what == "held still")
+    boundary = {
+        "period": PERIOD,
+        "device_damping": DEVICE_DAMPING,
+        "damping": DAMPING,
+        "methods": methods,
+    }
+    return Finding(draw(table), _paragraph(methods), boundary)
+
+
+def _counts(name: str, cells: Table) -> dict[str, Any]:
+    """Returns how many tools of the grid were unstable, and what the stable ones created."""
+    stable = is_stable(cells)
+    is_below = needed_by_6(name, cells["stiffness"], DAMPING, PERIOD) < DEVICE_DAMPING
+    return {
+        "points": len(cells),
+        "unstable_held_still": int((cells.numbers("stable_held_still") != 1).sum()),
+        "points_below_6": int(is_below.sum()),
+        "unstable_below_6": int((is_below & ~stable).sum()),
+        "most_created": float(cells.numbers("created")[stable].max(initial=0.0)),
+    }
+
+
+def _compare(name: str, rows: Table, *, is_held: bool) -> dict[str, Any]:
+    """Returns the limits that were found beside theory's; None where there is none."""
+    predicted = [predicted_limit(name, float(k), is_held=is_held) for k in rows["stiffness"]]
+    theory = np.array([p["limit"] for p in predicted], dtype=np.float64)
+    limit = rows.numbers("limit")
+    ends = ("stable_if_light", "stable_if_heavy")
+    is_same = [
+        np.array([p[end] for p in predicted], dtype=bool) == (rows.numbers(end) == 1)
+        for end in ends
+    ]
+    return {
+        "stiffness": rows["stiffness"].tolist(),
+        "measured_mass": [float(m) if np.isfinite(m) else None for m in limit],
+        "predicted_mass": [float(m) if np.isfinite(m) else None for m in theory],
+        "worst_ratio_error": agreement(limit, theory),
+        "disagreements": int((~(is_same[0] & is_same[1])).sum()),
+    }
+
+
+def _paragraph(methods: Mapping[str, Mapping[str, Any]]) -> str:
+    said = [_of_method(name, mine) for name, mine in methods.items()]
+    compared = [mine[what] for mine in methods.values() for what in SEARCHES if what in mine]
+    if compared:
+        known = [each["worst_ratio_error"] for each in compared]
+        worst = max((error for error in known if error is not None), default=None)
+        searches = sum(len(each["stiffness"]) for each in compared)
+        astray = sum(each["disagreements"] for each in compared)
+        said.append(
+            f"Measured limits in mass agree with theory {per_cent(worst)}; whether there is a "
+            f"limit at all, theory and measurement disagree on in {astray} of {searches} searches"
+        )
+    return ". ".join(said) + "."
+
+
+def _of_method(name: str, mine: Mapping[str, Any]) -> str:
+    if not mine:
+        return f"'{name}': {MISSING}"
+    if "points" not in mine:
+        said = f"'{name}': {MISSING} on the grid"
+    else:
+        unstable = mine["unstable_held_still"]
+        held = f"unstable at {unstable} of" if unstable else "stable at all"
+        said = (
+            f"'{name}': held still, a tool is {held} {mine['points']} points of the grid; below "
+            f"(6), held still or in its worst hand, it is unstable at {mine['unstable_below_6']} "
+            f"of {mine['points_below_6']}; where stable, it creates at most "
+            f"{mine['most_created']:.2g} J"
+        )
+    for what in SEARCHES:
+        if what not in mine:
+            said += f"; {what}, limits: {MISSING}"
+    limits = mine.get("held still", {}).get("measured_mass", [])
+    found = [mass for mass in limits if mass is not None]
+    if found:
+        said += (
+            f". Held still, stability changes with the mass at {len(found)} of the {len(limits)} "
+            f"stiffnesses that were searched: at {1e3 * min(found):.3g} to "
+            f"{1e3 * max(found):.3g} g"
+        )
+    return said
+
+
+TOOL_MASS = StabilityMap(
+    name="tool_mass",
+    about="mass of the tool, 1 g to 10 kg, against stiffness of the coupling, by method",
+    default_points=1000,
+    points=points,
+    evaluate=evaluate,
+    read=read,
+)

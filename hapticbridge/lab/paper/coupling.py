@@ -1,0 +1,689 @@
+"""Equations (2) and (4) to (7): what a coupling asks of the device."""
+
+from __future__ import annotations
+
+from itertools import product
+
+import numpy as np
+from matplotlib.axes import Axes
+from numpy.typing import NDArray
+from scipy import signal
+
+from hapticbridge.coupling import Coupling
+from hapticbridge.lab.paper.in_mujoco import HEAVY, ImplicitMass, decays, hold, wall_limit
+from hapticbridge.lab.paper.section import Check, Curve, Section, Table, panels
+from hapticbridge.theory.bounds import maximum_stiffness, minimum_damping
+from hapticbridge.theory.sampled_loop import SampledLoop, WorstHand, stability_limit
+from hapticbridge.theory.spectrum import (
+    damping_spectrum,
+    damping_spectrum_of,
+    needed_for_fixed_environment,
+)
+from hapticbridge.theory.transfer import angles, coupling_transfer
+
+PERIOD = 1e-3
+"""T in s."""
+
+COUPLING = Coupling(stiffness=1000.0, damping=2.0, rotational_stiffness=0.0, rotational_damping=0.0)
+K, B = COUPLING.stiffness, COUPLING.damping
+TAU = 2e-3
+"""Time constant of the low-pass in s: two samples, as a velocity filter may have."""
+
+THETA = np.linspace(1e-3, np.pi, 4000)
+NYQUIST_HZ = 0.5 / PERIOD
+HERTZ = THETA / np.pi * NYQUIST_HZ
+
+_Complex = NDArray[np.complex128]
+
+
+def spring_with(damping: float) -> Coupling:
+    """Returns the walk's spring with another damper, B in N s/m."""
+    return Coupling(K, damping, 0.0, 0.0)
+
+
+def low_passed(z: _Complex) -> _Complex:
+    """C of a spring and a low-passed damper, written in z."""
+    return np.asarray(K + B * (1 - 1 / z) / (PERIOD + TAU * (1 - 1 / z)))
+
+
+def delayed(z: _Complex) -> _Complex:
+    """C of the spring and damper, one sample late."""
+    return np.asarray((K + B / PERIOD * (1 - 1 / z)) / z)
+
+
+def any_coupling() -> Section:
+    """Walks through (2)."""
+    omega = THETA / PERIOD
+    digital = signal.dlti([K + B / PERIOD, -B / PERIOD], [1, 0], dt=PERIOD)
+    curves = {
+        "spring": damping_spectrum_of(lambda z: np.full_like(z, K), PERIOD, omega),
+        "spring and damper (4)": damping_spectrum_of(digital, PERIOD, omega),
+        f"the same, damper low-passed with τ = {TAU * 1e3:g} ms": damping_spectrum_of(
+            low_passed, PERIOD, omega
+        ),
+    }
+    late = np.asarray(damping_spectrum_of(delayed, PERIOD, omega))
+    figure, (axes,) = panels(1, height=4.2)
+    for name, curve in curves.items():
+        axes.plot(HERTZ, curve, label=name)
+    axes.plot(HERTZ, np.where(np.isfinite(late), late, np.nan), label="(4) delayed by one sample")
+    first = HERTZ[np.isinf(late)].min()
+    axes.axvspan(first, NYQUIST_HZ, color="C3", alpha=0.12, label="delayed: none suffices")
+    axes.set_ylim(0, 8)
+    axes.set_xlabel("frequency (Hz)")
+    axes.set_ylabel("device damping needed (N s/m)")
+    axes.legend(fontsize="small", loc="upper left")
+
+    filtered = minimum_damping(COUPLING, PERIOD, filter_time=TAU)
+    return Section(
+        equation="(2)",
+        title="The condition, for any coupling",
+        formulas=(
+            "b > (T/2)(1 − cos ωT) / Re{ (1 − e<sup>−jωT</sup>) / C(e<sup>jωT</sup>) }"
+            "&emsp;for 0 &lt; ω ≤ π/T",
+        ),
+        paragraphs=(
+            "C is the transfer function from the distance of handle and tool to the force. The "
+            "real part must be positive. The condition holds for every passive hand and every "
+            "discrete-time passive environment, so nothing of the scene enters.",
+            "It takes any C. A low-pass behind the damper lowers the need at high frequency. One "
+            "sample of delay makes the real part negative above some frequency: no device damping "
+            "is then enough for <em>every</em> environment.",
+        ),
+        curves=(
+            Curve(
+                "any_coupling",
+                f"Condition (2) for four couplings, K = {K:g} N/m, B = {B:g} N s/m, T = 1 ms.",
+                figure,
+            ),
+        ),
+        checks=(
+            Check(
+                equation="(2)",
+                quantity="spring alone, b = KT/2",
+                route="frequency sweep",
+                expected=K * PERIOD / 2,
+                got=float(np.max(curves["spring"])),
+                unit="N s/m",
+                tolerance=1e-9,
+            ),
+            Check(
+                equation="(2)",
+                quantity="low-passed damper, b = KT/2 + B T/(T + 2τ)",
+                route="frequency sweep of C as a callable of z",
+                expected=K * PERIOD / 2 + B * PERIOD / (PERIOD + 2 * TAU),
+                got=float(np.max(damping_spectrum_of(low_passed, PERIOD, omega))),
+                unit="N s/m",
+                tolerance=1e-9,
+            ),
+            Check(
+                equation="(2)",
+                quantity="low-passed damper against a wall, b at the limit of stability",
+                route="time-domain loop, bisection",
+                expected=float(filtered),
+                got=stability_limit(SampledLoop(COUPLING, PERIOD, filter_time=TAU)),
+                unit="N s/m",
+                tolerance=1e-3,
+            ),
+            Check(
+                equation="(2)",
+                quantity="one sample late, b for every environment",
+                route="frequency sweep",
+                expected=np.inf,
+                got=float(late.max()),
+                unit="N s/m",
+                tolerance=0.0,
+            ),
+        ),
+    )
+
+
+def discretizations() -> Section:
+    """Walks through (4) and (5)."""
+    k, b = np.asarray(K), np.asarray(B)
+    backward = coupling_transfer(k, b, PERIOD, THETA, "backward", 0.0)
+    tustin = coupling_transfer(k, b, PERIOD, THETA, "tustin", 0.0)
+    continuous = K + 1j * THETA / PERIOD * B
+    figure, (size, phase) = panels(1, height=3.8, columns=2)
+    named = (
+        ("K + jωB, not sampled", continuous, "grey"),
+        ("(4) backward difference", backward, "C0"),
+        ("(5) Tustin", tustin, "C3"),
+    )
+    for name, transfer, colour in named:
+        inner = slice(None, -1)  # (5) has no value at Nyquist
+        size.semilogy(HERTZ[inner], np.abs(transfer[inner]), color=colour, label=name)
+        phase.plot(HERTZ[inner], np.degrees(np.angle(transfer[inner])), color=colour)
+    size.set_ylim(500, 1e5)
+    size.set_ylabel("|C| (N/m)")
+    size.legend(fontsize="small", loc="upper left")
+    phase.set_ylabel("phase of C (degrees)")
+    for axes in (size, phase):
+        axes.set_xlabel("frequency (Hz)")
+
+    middle = len(THETA) // 3
+    turn = float(THETA[middle])
+    samples = np.arange(400)
+    handle = np.cos(turn * samples)
+    # the last force of a long run of the difference equations, projected on the motion
+    difference = B / PERIOD * np.diff(handle, prepend=0)
+    by_tustin = np.zeros(len(handle))
+    for i in range(1, len(handle)):
+        by_tustin[i] = 2 * B / PERIOD * (handle[i] - handle[i - 1]) - by_tustin[i - 1]
+    # the alternating answer to the start never decays: (5) has a pole at −1; averaging removes it
+    smooth = (by_tustin[1:-1] + 0.5 * (by_tustin[:-2] + by_tustin[2:])) / (1 + np.cos(turn))
+    base = np.stack([np.cos(turn * samples), -np.sin(turn * samples)], axis=1)
+    fit, *_ = np.linalg.lstsq(base[1:], (K * handle + difference)[1:], rcond=None)
+    fit_tustin, *_ = np.linalg.lstsq(base[2:-1], (K * handle[1:-1] + smooth)[1:], rcond=None)
+    system = signal.dlti([K + B / PERIOD, -B / PERIOD], [1, 0], dt=PERIOD)
+    return Section(
+        equation="(4), (5)",
+        title="Two ways to discretise the damper",
+        formulas=(
+            "C(z) = K + (B/T)(1 − z<sup>−1</sup>)&emsp;(4)",
+            "C(z) = K + (2B/T)(1 − z<sup>−1</sup>)/(1 + z<sup>−1</sup>)&emsp;(5)",
+        ),
+        paragraphs=(
+            "The backward difference (4) stays finite, K + 2B/T at Nyquist. Tustin's rule (5) "
+            "keeps the phase of a spring and damper up to Nyquist, where it has a pole.",
+        ),
+        curves=(Curve("discretisations", "Size and phase of the two couplings.", figure),),
+        checks=(
+            Check(
+                equation="(4)",
+                quantity=f"|C| at {HERTZ[middle]:.0f} Hz",
+                route="difference equation in time, fitted",
+                expected=float(abs(backward[middle])),
+                got=float(np.hypot(*fit)),
+                unit="N/m",
+                tolerance=1e-9,
+            ),
+            Check(
+                equation="(4)",
+                quantity="|C| at Nyquist, K + 2B/T",
+                route="scipy.signal.dfreqresp",
+                expected=K + 2 * B / PERIOD,
+                got=float(abs(signal.dfreqresp(system, w=[np.pi])[1][0])),
+                unit="N/m",
+                tolerance=1e-9,
+            ),
+            Check(
+                equation="(5)",
+                quantity=f"|C| at {HERTZ[middle]:.0f} Hz",
+                route="difference equation in time, fitted",
+                expected=float(abs(tustin[middle])),
+                got=float(np.hypot(*fit_tustin)),
+                unit="N/m",
+                tolerance=1e-6,
+            ),
+        ),
+    )
+
+
+DIRECT_PERIOD = 1e-3
+"""T in s."""
+
+CONTACT = 1e4
+"""K_c in N/m: a stiff contact, so that a peg of a few centimetres is at the limit."""
+DEVICE = 2e-3
+"""b_θ in N m s/rad, the simulated device's."""
+BEHIND = Coupling(stiffness=2.4, damping=5e-4, rotational_stiffness=0, rotational_damping=0)
+"""The coupling that the comparison puts in between, as one axis: 2.4 N m/rad, 5e-4 N m s/rad."""
+
+
+def _contact_hessian(length: float) -> NDArray[np.float64]:
+    """Second differences of the energy of two contact springs, over (x, y, angle)."""
+
+    def energy(pose: NDArray[np.float64]) -> float:
+        x, _, angle = pose
+        arm = length / 2 * np.sin(angle)
+        return float(0.5 * CONTACT * ((x + arm) ** 2 + (x - arm) ** 2))
+
+    step = 1e-4
+    unit = step * np.eye(3)
+    return np.array(
+        [
+            [
+                (energy(i + j) - energy(i - j) - energy(j - i) + energy(-i - j)) / (4 * step**2)
+                for j in unit
+            ]
+            for i in unit
+        ]
+    )
+
+
+def _needed_behind(stiffness: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Worst damping over frequency for a massless tool between the coupling and a spring."""
+    theta = angles(np.linspace(1e-3, np.pi, 2000) / DIRECT_PERIOD, DIRECT_PERIOD)
+    k, b = np.asarray(BEHIND.stiffness), np.asarray(BEHIND.damping)
+    coupling = coupling_transfer(k, b, DIRECT_PERIOD, theta, "backward", 0.0)
+    spring = stiffness[:, None]
+    felt = coupling * spring / (coupling + spring)
+    return np.asarray(needed_for_fixed_environment(felt, DIRECT_PERIOD, theta).max(axis=1))
+
+
+def direct_section() -> Section:
+    """Walks through (1), with the erratum."""
+    limit = float(2 * np.sqrt(DEVICE / (DIRECT_PERIOD * CONTACT)))
+    lengths = np.geomspace(2e-3, 0.3, 200)
+    stiffness = 0.5 * CONTACT * lengths**2
+    behind = _needed_behind(stiffness)
+    bound = BEHIND.stiffness * DIRECT_PERIOD / 2 + BEHIND.damping
+
+    figure, (axes,) = panels(1, height=4.2)
+    axes.loglog(1e3 * lengths, stiffness * DIRECT_PERIOD / 2, label="rendered directly, ¼ K_c L² T")
+    axes.loglog(1e3 * lengths, behind, label="behind a coupling")
+    axes.axhline(bound, color="C1", ls=":", label="K_r T/2 + B_r, the coupling's own bound (6)")
+    axes.axhline(DEVICE, color="grey", ls="--", label="this device's b_θ")
+    axes.axvline(1e3 * limit, color="C3", lw=1, label="L = 2 √(b_θ/(T K_c))")
+    axes.set_xlabel("distance L between the contacts (mm)")
+    axes.set_ylabel("rotational damping needed (N m s/rad)")
+    axes.legend(fontsize="small")
+
+    hessian = _contact_hessian(limit)
+    spring = Coupling(0.5 * CONTACT * limit**2, 0.0, 0.0, 0.0)
+    return Section(
+        equation="(1)",
+        title="Direct rendering: the geometry of the tool decides",
+        formulas=(
+            "K<sub>peg</sub> = diag( 2K<sub>c</sub>, 0, ½ K<sub>c</sub> L² )",
+            "L ≤ 2 √( b<sub>θ</sub> / (T K<sub>c</sub>) )",
+        ),
+        paragraphs=(
+            "A massless rigid peg tracks the handle in a grounded hole. Each of two contacts on "
+            "opposite walls has the stiffness K<sub>c</sub>; they lie a distance L apart, with "
+            "the handle midway. The rotational entry ½ K<sub>c</sub> L² is that of the paper's "
+            "erratum. The first lateral contact alone gives K<sub>c</sub>.",
+            "A device with rotational damping b<sub>θ</sub> bears the stiffness 2 "
+            f"b<sub>θ</sub>/T, so a contact of {CONTACT:g} N/m at {DIRECT_PERIOD * 1e3:g} ms and "
+            f"{DEVICE:g} N m s/rad allows {1e3 * limit:.2f} mm. A longer tool is unstable. Behind "
+            "a coupling the need levels off at the coupling's own bound, whatever L is.",
+        ),
+        curves=(
+            Curve(
+                "direct_rendering",
+                "Damping that a device needs over the distance of the contacts.",
+                figure,
+            ),
+        ),
+        checks=(
+            Check(
+                equation="(1)",
+                quantity="lateral stiffness 2K_c",
+                route="second difference of the contacts' energy",
+                expected=2 * CONTACT,
+                got=float(hessian[0, 0]),
+                unit="N/m",
+                tolerance=1e-6,
+            ),
+            Check(
+                equation="(1)",
+                quantity="rotational stiffness ½K_c L² (erratum) at the limit, 2b_θ/T",
+                route="second difference of the contacts' energy",
+                expected=float(maximum_stiffness(DEVICE, DIRECT_PERIOD)),
+                got=float(hessian[2, 2]),
+                unit="N m/rad",
+                # the second difference of sin² over 1e-4 rad is short by 1e-8 of itself
+                tolerance=1e-6,
+            ),
+            Check(
+                equation="(1)",
+                quantity=f"b_θ at which L = {1e3 * limit:.2f} mm is stable",
+                route="time-domain loop, bisection",
+                expected=DEVICE,
+                got=stability_limit(SampledLoop(spring, DIRECT_PERIOD)),
+                unit="N m s/rad",
+                tolerance=1e-3,
+            ),
+            Check(
+                equation="(1)",
+                quantity="b_θ needed behind the coupling, largest over L = 2 … 300 mm",
+                route="frequency sweep, against the bound (6) of the coupling",
+                expected=bound,
+                got=float(behind.max()),
+                unit="N m s/rad",
+                tolerance=1e-9,
+                relation="at most",
+            ),
+        ),
+    )
+
+
+def identity_residual(period: float) -> float:
+    """Returns the device side minus the right-hand side, relative, for random motion.
+
+    Args:
+        period: T in s, > 0.
+    """
+    rng = np.random.default_rng(6)
+    count, size = 200, 3
+    h, x = rng.normal(size=(2, count + 2, size))
+    x[0] = x[1] - rng.normal(size=size)
+
+    def symmetric() -> NDArray[np.float64]:
+        root = rng.normal(size=(size, size))
+        return np.asarray(root @ root.T, dtype=np.float64)
+
+    k, b, device = symmetric() * 1e3, symmetric(), symmetric() * 2
+
+    def square(v: NDArray[np.float64], matrix: NDArray[np.float64]) -> float:
+        return float(np.sum((v @ matrix) * v))
+
+    d, moved = np.diff(h, axis=0, prepend=0.0), np.diff(x, axis=0, prepend=0.0)
+    e, change = h - x, d - moved
+    force = e @ k + change @ b / period
+    n = count
+    inner = slice(1, n + 1)
+    left = float(np.sum(force[1 : n + 1] * d[2 : n + 2])) + square(d[1 : n + 2], device / period)
+    right = (
+        float(np.sum(force[inner] * moved[inner]))
+        + 0.5 * square(moved[inner], k + b / period)
+        + 0.5 * square(change[0:n] + d[inner], b / period)
+        + square(d[inner], (device - b) / period - k / 2)
+        + 0.5 * square(e[n] + d[n + 1], k)
+        + 0.5 * square(change[n] + d[n + 1], b / period)
+        + square(d[n + 1], device / period - k / 2 - b / (2 * period))
+        - 0.5 * square(e[0], k)
+        - float(force[0] @ d[1])
+        - 0.5 * square(change[0], b / period)
+    )
+    return abs(left - right) / abs(left)
+
+
+SHORT = 1e-3
+"""How far before Nyquist (7) is looked at, in rad."""
+
+STIFF, LIGHT = Coupling(4000.0, 0.5, 0.0, 0.0), 0.05
+"""A coupling and a mass in kg with which Tustin's damper needs far more than (6)."""
+
+
+def backward_difference() -> Section:
+    """Walks through (6)."""
+    omega = THETA / PERIOD
+    figure, (spectrum, largest) = panels(1, height=4.0, columns=2)
+    for damping in (0.0, 0.5, 1.0, 2.0):
+        curve = damping_spectrum(spring_with(damping), PERIOD, omega)
+        spectrum.plot(HERTZ, curve, label=f"B = {damping:g} N s/m")
+        spectrum.plot(NYQUIST_HZ, K * PERIOD / 2 + damping, "ko", ms=4)
+    spectrum.plot([], [], "ko", ms=4, label="KT/2 + B")
+    spectrum.set_xlabel("frequency (Hz)")
+    spectrum.set_ylabel("device damping needed (N s/m)")
+    spectrum.legend(fontsize="small", loc="upper left")
+    device = np.geomspace(0.5, 20, 50)
+    for rate in (500, 1000, 2000, 4000):
+        largest.loglog(device, maximum_stiffness(device, 1 / rate), label=f"{rate} Hz")
+    largest.set_xlabel("device damping b (N s/m)")
+    largest.set_ylabel("largest K for B = 0 (N/m)")
+    largest.legend(fontsize="small")
+
+    bound = K * PERIOD / 2 + B
+    loops = [
+        Check(
+            equation="(6)",
+            quantity=f"wall, T = {period * 1e3:g} ms: b at the limit of stability",
+            route="time-domain loop with the worst hand, bisection",
+            expected=K * period / 2 + B,
+            got=stability_limit(SampledLoop(COUPLING, period)),
+            unit="N s/m",
+            tolerance=1e-3,
+        )
+        for period in (5e-4, 1e-3, 2e-3)
+    ]
+    dampings = (0.5, 1.0, 2.0, 5.0, 10.0, 20.0)
+    return Section(
+        equation="(6)",
+        title="Backward difference: b > KT/2 + B",
+        formulas=(
+            "b > (T/2) [K² + 2(1 − cos ωT)(B/T)(K + B/T)] / (K + 2B/T)"
+            " &emsp;⟹&emsp; b > KT/2 + B&emsp;(6)",
+        ),
+        paragraphs=(
+            "Put (4) into (2): the need rises with frequency and is largest at Nyquist. The worst "
+            "hand there holds nothing: the device's own damper alone must keep the loop stable.",
+            "(6) is not only necessary. An exact identity of the sampled energies shows that it "
+            "is sufficient for any passive hand, also a nonlinear one, and in several dimensions "
+            "as the matrix inequality b ⪰ KT/2 + B. The identity is evaluated here on random "
+            "motion in three dimensions.",
+            "With MuJoCo in the loop the same hand holds a heavy free body through the coupling "
+            "actuators under the <code>discrete</code> integrator: the limit is the paper's.",
+        ),
+        curves=(
+            Curve(
+                "backward_difference",
+                f"Left: the need over frequency, K = {K:g} N/m, T = 1 ms. Right: what a device "
+                "allows; doubling the rate doubles K.",
+                figure,
+            ),
+        ),
+        checks=(
+            Check(
+                equation="(6)",
+                quantity="b = KT/2 + B",
+                route="frequency sweep of (2)",
+                expected=bound,
+                got=float(np.max(damping_spectrum(COUPLING, PERIOD, omega))),
+                unit="N s/m",
+                tolerance=1e-9,
+            ),
+            *loops,
+            Check(
+                equation="(6)",
+                quantity="sufficiency: residual of the energy identity",
+                route="random motion, K, B and b in three dimensions",
+                expected=0.0,
+                got=identity_residual(PERIOD),
+                tolerance=1e-12,
+            ),
+            Check(
+                equation="(6)",
+                quantity="heavy tool, b at the limit of stability",
+                route="MuJoCo in the loop, bisection",
+                expected=bound,
+                got=wall_limit(COUPLING, PERIOD),
+                unit="N s/m",
+                tolerance=2e-3,
+            ),
+        ),
+        table=Table(
+            ("device damping b (N s/m)", *(f"{value:g}" for value in dampings)),
+            (
+                (
+                    "largest K at 1 kHz, B = 0 (N/m)",
+                    *(f"{float(maximum_stiffness(value, PERIOD)):g}" for value in dampings),
+                ),
+            ),
+        ),
+    )
+
+
+def tustin() -> Section:
+    """Walks through (7)."""
+    omega = THETA / PERIOD
+    figure, (axes,) = panels(1, height=4.0)
+    for damping in (0.0, 0.5, 1.0, 2.0):
+        curve = damping_spectrum(spring_with(damping), PERIOD, omega, discretization="tustin")
+        axes.semilogy(HERTZ, np.where(np.isfinite(curve), curve, np.nan), label=f"B = {damping:g}")
+    axes.axhline(K * PERIOD / 2 + B, color="grey", ls=":", label="(6) for B = 2 N s/m")
+    axes.set_ylim(0.05, 100)
+    axes.set_xlabel("frequency (Hz)")
+    axes.set_ylabel("device damping needed (N s/m)")
+    axes.legend(fontsize="small", loc="upper left")
+
+    own = K * PERIOD / 2 + B
+    gamma = (K * PERIOD - 2 * B) / (K * PERIOD + 2 * B)
+    theta = THETA[:-1]
+    closed = own * (1 + 2 * gamma * np.cos(theta) + gamma**2) / (2 * (1 + np.cos(theta)))
+    swept = damping_spectrum(COUPLING, PERIOD, theta / PERIOD, discretization="tustin")
+    return Section(
+        equation="(7)",
+        title="Tustin: no device damping is enough",
+        formulas=("b > [ (KT)² + 4B² tan²(ωT/2) ] / [ 2(KT + 2B) ]&emsp;(7)",),
+        paragraphs=(
+            "Put (5) into (2). At low frequency the need is small, (KT)²/(2(KT + 2B)); towards "
+            "Nyquist it grows without limit as soon as B is not 0. So Tustin's damper is not used, "
+            "although it looks like the better approximation.",
+        ),
+        curves=(
+            Curve(
+                "tustin", f"The need over frequency, K = {K:g} N/m, T = 1 ms; B in N s/m.", figure
+            ),
+        ),
+        checks=(
+            Check(
+                equation="(7)",
+                quantity="largest difference from the closed form in γ, relative",
+                route="frequency sweep of (2) with (5)",
+                expected=0.0,
+                got=float(np.max(np.abs(swept / closed - 1))),
+                tolerance=1e-6,
+            ),
+            Check(
+                equation="(7)",
+                quantity="b at ω → 0, (KT)²/(2(KT + 2B))",
+                route="frequency sweep at 0.016 Hz",
+                expected=(K * PERIOD) ** 2 / (2 * (K * PERIOD + 2 * B)),
+                got=float(damping_spectrum(COUPLING, PERIOD, 0.1, discretization="tustin")),
+                unit="N s/m",
+                tolerance=1e-6,
+            ),
+            Check(
+                equation="(7)",
+                quantity=f"b at {SHORT:g} rad before Nyquist, 8B²/((KT + 2B)(π − ωT)²)",
+                route="frequency sweep, against the growth of (7) without limit",
+                expected=8 * B**2 / ((K * PERIOD + 2 * B) * SHORT**2),
+                got=float(
+                    damping_spectrum(
+                        COUPLING, PERIOD, (np.pi - SHORT) / PERIOD, discretization="tustin"
+                    )
+                ),
+                unit="N s/m",
+                # the next term of tan² is 1/6 of SHORT², the spring's share 1/64
+                tolerance=1e-6,
+            ),
+            Check(
+                equation="(7)",
+                quantity=f"mass of {LIGHT:g} kg behind it: b at the limit, ten times (6) and more",
+                route="time-domain loop with the worst hand, bisection",
+                expected=10 * (STIFF.stiffness * PERIOD / 2 + STIFF.damping),
+                got=stability_limit(
+                    SampledLoop(STIFF, PERIOD, mass=LIGHT, discretization="tustin")
+                ),
+                unit="N s/m",
+                tolerance=0.0,
+                relation="at least",
+            ),
+            Check(
+                equation="(7)",
+                quantity="B = 0: b = KT/2, as for (6)",
+                route="time-domain loop, bisection",
+                expected=K * PERIOD / 2,
+                got=stability_limit(SampledLoop(spring_with(0.0), PERIOD, discretization="tustin")),
+                unit="N s/m",
+                tolerance=1e-3,
+            ),
+        ),
+    )
+
+
+HAND_PERIOD = 1e-3
+"""T in s."""
+
+HAND_COUPLING = Coupling(1000.0, 2.0, 0.0, 0.0)
+PERIODS = (5e-4, 1e-3, 2e-3)
+DELAYS = (0, 1)
+FILTER_TIMES = (0.0, 2e-3)
+"""Grid of the checks: T in s, samples of delay, time constant of the low-pass in s."""
+
+TICKS = 3000
+"""Of a run with MuJoCo in the loop: 3 s, in which a force that decays is gone."""
+
+
+def _in_mujoco(share: float) -> NDArray[np.float64]:
+    bound = HAND_COUPLING.stiffness * HAND_PERIOD / 2 + HAND_COUPLING.damping
+    hand = WorstHand(share * bound, np.pi / HAND_PERIOD, HAND_PERIOD)
+    return hold(ImplicitMass(HAND_COUPLING, HAND_PERIOD, HEAVY).force, hand, TICKS)
+
+
+def worst_hand_section() -> Section:
+    """Shows that the bounds are reached."""
+    figure, (delayed, simulated) = panels(1, height=4.0, columns=2)
+    loop = SampledLoop(HAND_COUPLING, HAND_PERIOD, delay=1)
+    frequency = loop.worst_frequency()
+    response = complex(loop.response(frequency))
+    bound = float(loop.damping_spectrum(frequency))
+    for share, colour in ((0.98, "C3"), (1.02, "C0")):
+        hand = WorstHand(share * bound, frequency, HAND_PERIOD, response)
+        _draw_envelope(delayed, np.abs(loop.simulate(hand, 1500).force), share, colour)
+        _draw_envelope(simulated, np.abs(_in_mujoco(share))[:300], share, colour)
+    delayed.set_title(
+        f"one sample of delay, wall; worst at {frequency / 2 / np.pi:.0f} Hz", fontsize="small"
+    )
+    simulated.set_title("MuJoCo in the loop, worst at Nyquist", fontsize="small")
+
+    checks = []
+    for period, delay, filter_time in product(PERIODS, DELAYS, FILTER_TIMES):
+        case = SampledLoop(HAND_COUPLING, period, delay=delay, filter_time=filter_time)
+        expected = float(
+            minimum_damping(HAND_COUPLING, period, delay=delay, filter_time=filter_time)
+        )
+        checks.append(
+            Check(
+                equation="worst hand",
+                quantity=f"T = {1e3 * period:g} ms, delay {delay}, τ = {1e3 * filter_time:g} ms: "
+                "b at the limit",
+                route="time-domain loop, bisection, against the bound over frequency",
+                expected=expected,
+                got=stability_limit(case),
+                unit="N s/m",
+                tolerance=1e-3,
+            )
+        )
+    checks.extend(
+        Check(
+            equation="worst hand",
+            quantity=f"heavy tool, b = {share:g} of (6): 1 if the force decays",
+            route="MuJoCo in the loop",
+            expected=expected,
+            got=float(decays(_in_mujoco(share), TICKS)),
+            tolerance=0.0,
+        )
+        for share, expected in ((0.98, 0.0), (1.02, 1.0))
+    )
+    return Section(
+        equation="worst hand",
+        title="The hand that reaches the bound",
+        formulas=(
+            "(b + Z<sub>0</sub>) v<sub>k</sub> + (b − Z<sub>0</sub>) v<sub>k−1</sub> = "
+            "F<sub>k</sub> + F<sub>k−1</sub>, &ensp; h<sub>k+1</sub> = h<sub>k</sub> + T "
+            "v<sub>k</sub>",
+            "Z<sub>0</sub> tuned so that the loop closes on itself at θ<sub>0</sub>; "
+            "Z<sub>0</sub> = b cot²(θ<sub>0</sub>/2) for a spring",
+        ),
+        paragraphs=(
+            "The paper's conditions hold for every passive hand. They are tight: device mass and "
+            "hand together may be a lossless line, Z<sub>0</sub> tanh(sT/2), which takes no power "
+            "and turns the phase until the loop is marginal. Its recursion under a held force is "
+            "exact. With it a time-domain loop loses stability where the bound over frequency "
+            "says.",
+            "With the delay of one sample the bound is that against a wall. At Nyquist "
+            "Z<sub>0</sub> = 0 and the device's damper alone is the worst hand.",
+        ),
+        curves=(
+            Curve(
+                "worst_hand",
+                "Force at 0.98 and 1.02 of the damping needed, in the plain loop and with MuJoCo.",
+                figure,
+            ),
+        ),
+        checks=tuple(checks),
+    )
+
+
+def _draw_envelope(axes: Axes, force: NDArray[np.float64], share: float, colour: str) -> None:
+    """Draws the largest force of every 20 ticks, relative to the first."""
+    blocks = force[: len(force) // 20 * 20].reshape(-1, 20).max(axis=1)
+    time = 20e3 * HAND_PERIOD * np.arange(len(blocks))
+    axes.semilogy(time, blocks / blocks[0], color=colour, label=f"b = {share:g} of the bound")
+    axes.set_xlabel("time (ms)")
+    axes.set_ylabel("largest force, over the first")
+    axes.legend(fontsize="small", loc="upper left")

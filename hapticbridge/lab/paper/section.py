@@ -1,0 +1,197 @@
+"""A part of the walk through the paper: equation, explanation, curves, checks."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from jinja2 import Environment, PackageLoader, select_autoescape
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from hapticbridge.errors import HapticBridgeError
+from hapticbridge.plotting import inline_svg, new_figure, write_picture
+
+Relation = Literal["equals", "at most", "at least"]
+"""How the number that was got must stand to the expected one."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Check:
+    """A number of the paper, got by two routes.
+
+    The routes share as little as can be, and ``route`` says what was done. A closed form and its
+    sweep over frequency have only the coupling in common. A time-domain loop takes its worst hand
+    from the theory, and finds the limit itself. Where only a kept value stands against the code,
+    ``route`` says that too.
+
+    Attributes:
+        equation: Which equation it belongs to, as the paper numbers it: ``(6)``.
+        quantity: What the number is.
+        route: How ``got`` was found, against how ``expected`` was.
+        expected: What the equation says.
+        got: What the other route says.
+        tolerance: Largest deviation that passes, relative to ``expected``, or in the number's own
+            unit where ``expected`` is 0.
+        unit: Of both numbers.
+        relation: ``equals``, or which bound ``expected`` is for ``got``.
+    """
+
+    equation: str
+    quantity: str
+    route: str
+    expected: float
+    got: float
+    tolerance: float
+    unit: str = ""
+    relation: Relation = "equals"
+
+    @property
+    def deviation(self) -> float:
+        """How far ``got`` is on the wrong side, relative unless ``expected`` is 0; nan is kept."""
+        if self.got == self.expected:  # two infinities have no difference
+            return 0.0
+        difference = self.got - self.expected
+        if self.relation == "equals":
+            difference = abs(difference)
+        elif self.relation == "at least":
+            difference = -difference
+        if math.isfinite(self.expected) and self.expected != 0:
+            difference /= abs(self.expected)
+        return difference if not difference < 0 else 0.0
+
+    @property
+    def has_passed(self) -> bool:
+        """Whether the deviation is within the tolerance; never for nan."""
+        return self.deviation <= self.tolerance
+
+
+@dataclass(frozen=True, slots=True)
+class Curve:
+    """A figure with its place and its caption.
+
+    Attributes:
+        name: Name of its file, without ending.
+        caption: What it shows, one or two sentences.
+        figure: The drawing.
+    """
+
+    name: str
+    caption: str
+    figure: Figure
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """Numbers side by side.
+
+    Attributes:
+        head: One heading per column, with unit.
+        rows: Cells as they are shown.
+    """
+
+    head: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Section:
+    """What the page says about one equation, or a few that belong together.
+
+    Formulas and paragraphs are HTML of the package's own; nothing of a user's may enter them.
+
+    Attributes:
+        equation: Their numbers in the paper, ``(15), (16)``; empty for what the paper only names.
+        title: What they are about.
+        formulas: The equations, one line each.
+        paragraphs: What they mean and how they are checked here.
+        curves: Figures.
+        checks: Numbers by two routes.
+        table: Numbers side by side, if any.
+    """
+
+    equation: str
+    title: str
+    formulas: tuple[str, ...]
+    paragraphs: tuple[str, ...]
+    curves: tuple[Curve, ...]
+    checks: tuple[Check, ...]
+    table: Table | None = None
+
+
+def panels(rows: int, *, height: float, columns: int = 1) -> tuple[Figure, tuple[Axes, ...]]:
+    """Returns a figure 8 inches wide and its axes, row by row.
+
+    Args:
+        rows: Panels above each other.
+        height: Of the figure in inches.
+        columns: Panels beside each other.
+    """
+    figure = new_figure(8, height)
+    grid = figure.subplots(rows, columns, squeeze=False)
+    for axes in grid.flat:
+        axes.grid(alpha=0.3)
+    return figure, tuple(grid.flat)
+
+
+PAGE = "brown_colgate_1997.html"
+"""Name of the page; the figures lie beside it as PNG."""
+
+
+def number(value: float) -> str:
+    """Formats a number of a check: six digits, ``∞`` for infinity, a real minus sign."""
+    if math.isinf(value):
+        return "∞" if value > 0 else "−∞"
+    return f"{value:.6g}".replace("-", "−")
+
+
+def deviation(check: Check) -> str:
+    """Formats a check's deviation with the tolerance that it is held against."""
+    got = f"{check.deviation:.1e}" if check.deviation else "0"
+    allowed = f"{check.tolerance:.0e}" if check.tolerance else "0"
+    return f"{got} (≤ {allowed})".replace("-", "−")
+
+
+def passed(sections: Sequence[Section]) -> bool:
+    """Returns whether every check passed."""
+    return all(check.has_passed for section in sections for check in section.checks)
+
+
+def write_walk(sections: Sequence[Section], folder: Path) -> Path:
+    """Writes the page and the figures.
+
+    Args:
+        sections: What to write, in the order of the page.
+        folder: Where; it exists.
+
+    Returns:
+        The page's path.
+
+    Raises:
+        HapticBridgeError: A file cannot be written.
+    """
+    for section in sections:
+        for curve in section.curves:
+            write_picture(curve.figure, folder / f"{curve.name}.png")
+            # the places just found serve the page too; finding them takes half of the drawing
+            curve.figure.set_layout_engine("none")
+    environment = Environment(
+        loader=PackageLoader("hapticbridge", "templates"), autoescape=select_autoescape()
+    )
+    environment.filters["number"] = number
+    environment.filters["deviation"] = deviation
+    environment.filters["svg"] = inline_svg
+    page = environment.get_template("paper.html").render(
+        sections=sections,
+        checks=[check for section in sections for check in section.checks],
+        has_passed=passed(sections),
+    )
+    path = folder / PAGE
+    try:
+        path.write_text(page, encoding="utf-8")
+    except OSError as error:
+        raise HapticBridgeError(f"cannot write '{path}': {error.strerror}") from None
+    return path
