@@ -4,10 +4,9 @@ with hapticbridge.Bridge("peg_in_hole", "simulated", recording="run.mcap") as br
     summary = bridge.run(duration=10.0)
 report = hapticbridge.audit("run.mcap")
 
-Read ``bridge`` first, the loop, then ``kernel.step``, its arithmetic; ``scene`` and ``device`` are
-what it joins, ``coupling`` and ``passivity`` the law between them and its bounds, ``recording``
-what stays of a run and ``audit`` the second opinion on it. Imports go one way, from ``errors`` to
-``cli``.
+Read ``bridge`` first, the loop, then ``kernel.tick``, its arithmetic. ``scene`` and ``device`` are
+joined by the ``coupling``; ``theory`` has its bounds. ``recording`` keeps a run and ``audit``
+judges it a second time. Imports go one way, from ``errors`` to ``cli``.
 """
 
 from typing import TYPE_CHECKING
@@ -16,8 +15,8 @@ from hapticbridge.audit import audit as audit  # beside it stands the package of
 from hapticbridge.lazy import lazy_exports
 
 if TYPE_CHECKING:
-    from hapticbridge import theory as mechanics
-    from hapticbridge import theory as passivity
+    from hapticbridge import theory as passivity  # noqa: F401 - the public name
+    from hapticbridge import theory as theory
     from hapticbridge.audit import AuditReport as AuditReport
     from hapticbridge.bridge import Bridge as Bridge
     from hapticbridge.clock import RealClock as RealClock
@@ -41,8 +40,8 @@ else:
     __getattr__, __dir__, __all__ = lazy_exports(
         __name__,
         {
-            "mechanics": "hapticbridge.theory",
-            "passivity": "hapticbridge.theory",
+            "theory": "hapticbridge.theory",
+            "passivity": "hapticbridge.theory:",
             "AuditReport": "hapticbridge.audit",
             "Bridge": "hapticbridge.bridge",
             "RealClock": "hapticbridge.clock",

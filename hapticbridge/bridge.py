@@ -93,7 +93,9 @@ class Bridge(Commanded):
         self._stopped_by = self._stopped_by or "duration"
         return self.summary()
 
-    def _loop(self, on_tick: Callable[[int], None] | None) -> str:
+    def _loop(  # noqa: PLR0912, PLR0915 - one loop
+        self, on_tick: Callable[[int], None] | None
+    ) -> str:
         """Runs the ticks until the end; returns why the kernel refused one, or nothing."""
         state, row = self._binding.state, self._binding.row
         model, data, substeps = self.scene.model, self.scene.data, range(self._substeps)

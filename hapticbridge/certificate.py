@@ -10,7 +10,6 @@ from typing import Literal
 import numpy as np
 
 from hapticbridge.coupling import Coupling
-from hapticbridge.device import DeviceInfo
 from hapticbridge.device.base import DeviceInfo
 from hapticbridge.errors import CouplingError
 from hapticbridge.kernel.parameters import SLACK_SHARE, RunParameters, checked_substeps
@@ -205,8 +204,8 @@ def default_coupling(
 
     The result is the requested coupling: K and B = B' + the method's own damping, so that the law
     uses B' without clipping. It needs 85 % of b. If several laws per tick or a delay need more, K
-    and B' are lowered together to meet it, separately for each kind of axis; ``required_damping`` is
-    linear in both.
+    and B' are lowered together to meet it, separately for each kind of axis; ``required_damping``
+    is linear in both.
 
     Args:
         info: The device; unknown damping is replaced as in ``assumed_damping``.

@@ -257,8 +257,8 @@ def export(
         form: One of ``FORMATS``.
         target: File with an extension of the format; None takes the recording's name with the
             usual one.
-        span: First time and end in s of the run's clock, the end excluded. Only ticks due and events
-            in between are written; metadata ``cut`` then holds the two times.
+        span: First time and end in s of the run's clock, the end excluded. Only ticks due and
+            events in between are written; metadata ``cut`` then holds the two times.
         overwrite: True replaces existing files.
 
     Raises:

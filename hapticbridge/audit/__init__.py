@@ -1,12 +1,10 @@
 """The verdict on a recording, from the recording alone. Never imports the bridge.
 
-``ask`` is what is called; read ``verdict`` first. It asks three things: is the file whole
-(``structure``), do its numbers agree with their second computation in plain NumPy (``balance``,
-held against them in ``physics`` and judged in ``judgement``), and does the scene do the same again
-(``replay``, ``rerun``, ``attached_scene``). The second computation goes block by block
-(``reached``): ``law`` is the coupling's, ``watched``, ``controlled``, ``limited`` and ``guarded``
-are the guard's, ``device_port`` what the device was given. ``interventions`` and ``ending`` read
-the events; ``report`` is what comes out.
+Read ``verdict`` first. It checks that the file is whole (``structure``), computes the energies
+again in plain NumPy (``energy``), checks the recorded motion against the coupling law (``motion``)
+and the guard (``guard``), and simulates the scene again (``replay``). ``events`` reads what
+happened during the run, ``report`` holds the result, ``batch`` audits folders. ``ask`` is the
+public entry point.
 """
 
 from typing import TYPE_CHECKING

@@ -1,8 +1,9 @@
 """Checks and simplification of a scene.
 
-``case`` leads a scene through its ``motion`` as a bridge would and keeps an ``observation``.
-``inventory`` counts the model's parts. ``rules`` lists the faults; each is a ``faults.Fault`` with
-its place in the files. ``cost`` measures the time of a tick. ``lean`` tries the edits of
-``simplifications`` on a ``draft``; ``trial`` judges each by its cost and by the force difference of
-``felt``.
+``case`` runs a scene through its motion as a bridge would; ``observe`` records it. ``inventory``
+counts the parts of the model. ``model_faults``, ``contact_faults`` and ``run_faults`` list what is
+wrong, each a ``fault`` with its place in the files (``source_map``). ``cost`` measures the time of
+a tick. ``lean`` tries the edits of ``simplify`` on a ``version`` of the scene and compares its
+motion (``witness``) and forces (``perception``) with the original; ``lean_output`` writes the
+result. ``physics`` holds shared formulas.
 """

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
-from rich.table import Table
+from rich.table import Table as TextTable
 
 from hapticbridge.audit import AuditReport, audit, verdict_words
 from hapticbridge.audit.batch import (
@@ -88,7 +88,7 @@ def print_what_if(found: WhatIf) -> None:
     """Prints what was changed, the runs side by side, and what to know of them."""
     for name, before, after in changes(found):
         out.print(plain(f"{name}: {before} -> {after}"))
-    table = Table(box=None, pad_edge=False)
+    table = TextTable(box=None, pad_edge=False)
     table.add_column(plain(found.path.name))
     for run in found.runs:
         table.add_column(run.name)

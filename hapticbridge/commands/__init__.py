@@ -1,8 +1,7 @@
-"""What may be asked of a run while it goes on, and how it is done so that it can be repeated.
+"""Commands to a run in progress, recorded so that the audit can repeat them.
 
-Read ``command`` first, then its way: ``queue`` checks it, ``allowance`` and ``span`` against what
-the device bears, ``operator`` does it between two ticks, and ``change`` is what it was, as an event
-that the audit repeats.
+``command`` holds the commands. ``allowed`` refuses a coupling that the device cannot bear.
+``execution`` queues a command, applies it between two ticks and records it as an event.
 """
 
 from hapticbridge.commands.allowed import CouplingLimits as CouplingLimits

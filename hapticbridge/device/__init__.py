@@ -1,11 +1,10 @@
 """Haptic devices: real, simulated and replayed, behind one protocol.
 
-Read ``base`` (four calls) and ``data_sheet`` (what is known of a device) first, then ``simulated``
-and ``trajectory``, which need no hardware, then a real driver; ``rawhid`` is the plainest. Real
-ones stand on ``transport``, which carries their bytes and finds them. ``families`` is the table of
-their drivers, ``discovery`` lists those that are plugged in; ``library`` opens one by its
-``specification`` and fills in its sheet from a ``profile`` (``profile_search``). What all share is
-in ``lateness_above_baseline``, ``silence`` and ``last_word``.
+Read ``base`` first: four calls and a data sheet. ``simulated`` and ``trajectory`` need no
+hardware; ``rawhid`` is the plainest real driver. Real drivers use ``transport`` for their bytes.
+``registry`` opens a device by its name and options, with the numbers of a ``profile``. ``family``
+describes a driver, ``discovery`` lists the devices that are plugged in. ``watchdog`` ends the
+force if device or program stops answering.
 """
 
 from hapticbridge.device.base import AXES as AXES

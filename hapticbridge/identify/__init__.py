@@ -1,10 +1,8 @@
 """Identification of a device's mechanics from small motions.
 
-Read ``identification`` first. ``experiment`` moves one axis by the force of ``excitation``.
-``weak_form`` turns the run into linear equations and ``fit`` solves them with intervals
-(``estimate``, ``axis_fit``). ``resolution`` finds the encoder's step, and ``measured_profile``
-stores the result for later runs. ``wall`` and ``swing`` try virtual walls on the device,
-``measured_width`` compares them with theory.
+Read ``identify`` first. It moves one axis by the force of ``excitation``, and ``fit`` solves for
+mass, damping, friction and delay with intervals. ``profile`` stores the result for later runs.
+``z_width`` tries virtual walls on the device and compares them with theory.
 """
 
 from hapticbridge.identify.fit import AxisFit as AxisFit

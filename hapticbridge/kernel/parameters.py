@@ -275,8 +275,8 @@ class RunParameters:
         g = K + B/T with one law a tick, half of K/n + B/T with n > 1; zero where no coupling law
         gives the wrench (a weld, a tool without mass): the proof that affords a slack needs one.
         With several laws a tick, ½‖δx_i‖²_{K + nB/T} per law would be affordable at no device
-        damping where B = 0; half of it is (``certificate.required_damping``), and of the motions δx_i
-        the records only tell their sum, over which uniform motion is least.
+        damping where B = 0; half of it is (``certificate.required_damping``), and of the motions
+        δx_i the records only tell their sum, over which uniform motion is least.
         """
         if not self.has_law:
             return 0.0, 0.0

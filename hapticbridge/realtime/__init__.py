@@ -1,7 +1,7 @@
 """Real-time requests to the operating system, and lateness of the loop.
 
-``grants`` makes the requests and undoes them, ``remedies`` names the commands that grant a refused
-one, ``pace`` checks that a scene's step fits into the period, ``lateness_above_baseline`` and ``host`` measure.
+``realtime`` makes the requests, names the command that grants a refused one and checks that a step
+of the scene fits into the period; ``doctor`` measures this machine against a baseline.
 """
 
 from hapticbridge.realtime.realtime import Grant as Grant

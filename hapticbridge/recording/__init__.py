@@ -1,11 +1,9 @@
 """Recordings: the file, the process that writes it, and the ring before it.
 
-Read ``format`` first: it says what a recording is. Records leave the loop through ``ring``
-(``ring_memory``), events through a pipe; ``stream`` is the loop's end of both, ``recorder`` and
-``recorder_process`` are the other. An ``onlooker`` may look on, and ``snapshot`` has the scene's
-positions for it. ``writer`` writes a file on top of ``output`` and ``chunk_index``; ``reader``
-reads one, whole or damaged, through ``file_bytes``, ``container``, ``fields`` and ``contents``;
-``recovery`` and ``salvage`` mend what was cut; ``run_time`` says when ticks were due.
+Read ``format`` first, the definition of a recording. Records leave the loop through ``ring``,
+events through a pipe. ``recorder`` is the loop's end of both, ``recorder_process`` the other;
+``snapshot`` holds the scene's positions for a viewer. ``writer`` writes a file. ``reader`` reads
+one, whole or damaged, through ``container``; ``repair`` rewrites a file that was cut.
 """
 
 from hapticbridge.recording.format import Attachment as Attachment

@@ -1,9 +1,7 @@
 """Plots and HTML pages of a recorded run.
 
-Read ``page`` first; it draws an ``evidence``. ``lead`` and ``facts`` write its words. ``energies``,
-``motion``, ``timing`` and ``moment`` draw its plots with the help of ``panels``; ``curves`` draws a
-plot of its own. ``likely`` finds the ``cause`` of an active run: ``at_device`` with a ``remedy`` in
-numbers, or ``in_environment`` with the geoms that ``touched``.
+Read ``page`` first. It shows an ``evidence``, described by ``facts``, drawn by ``plots``. ``cause``
+names the likely cause of an active run and its remedy.
 """
 
 from hapticbridge.report.evidence import DRAWABLE as DRAWABLE

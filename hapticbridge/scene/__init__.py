@@ -1,12 +1,9 @@
 """MJCF scenes behind a haptic device: loading, handle, coupling and checks.
 
-Read ``load`` first. It reads a scene, adds the handle and its coupling (``attach``, ``start``),
-compiles it (``compiler``) and refuses unsuitable scenes (``checks``). The result is a
-``scene.Scene``, which a bridge steps. ``source`` keeps the files' bytes for the recording.
-``parameter_file`` and ``parameters`` hold the scene's settable numbers, ``custom`` its custom data,
-``library`` the shipped scenes. ``contact_rule``, ``contact_check`` and ``contact_concerns`` hold a
-measured rule for contacts that generate energy. ``methods`` and ``weld`` serve the methods for
-comparison.
+Read ``load`` first. It reads a scene, adds the handle and its coupling (``handle``), compiles it
+(``compile``) and refuses unsuitable scenes (``checks``). The result is a ``scene.Scene``, which a
+bridge steps. ``source`` keeps the files' bytes for the recording, ``parameters`` the scene's
+settable numbers, ``contacts`` a measured rule for contacts that generate energy.
 """
 
 from hapticbridge.scene.compile import custom_numbers as custom_numbers

@@ -1,10 +1,9 @@
 """Repetition of a recorded run through a changed bridge.
 
 The package runs the bridge and the audit. The audit judges all runs alike, so it never imports the
-bridge. Read ``what_if`` first. It takes a run apart (``recorded``, ``unpacked``, ``exact``),
-applies ``changes``, and lets ``repeat`` run it: with the recorded motion (``again``), and with a
-model hand (``hands``) that follows the recorded hand's ``intent``. ``side_by_side``, ``picture``
-and ``page`` present the ``outcome``.
+bridge. Read ``what_if`` first. It takes a run apart (``recorded``), applies changed ``settings``
+and runs it again with the recorded motion or with a model of the recorded hand
+(``replayed_hand``). ``page`` presents the outcome.
 """
 
 from hapticbridge.whatif.page import draw_what_if as draw_what_if

@@ -1,5 +1,4 @@
-"""Haply's Inverse3 and its kin, through the maker's service.
+"""Haply's Inverse3 through the maker's service.
 
-``driver`` is the device, ``messages`` what is said to the service; ``finding`` and ``timing`` come
-before the loop.
+``device`` is the driver, ``messages`` the JSON messages of the service.
 """

@@ -1,5 +1,4 @@
-"""USB force-feedback sticks of the class PID.
+"""USB force-feedback sticks of the class PID (physical interface device).
 
-``driver`` is the device; ``reports`` finds its reports in its own descriptor, ``effects`` pushes
-it, ``stick`` reads it, ``sheet`` says what is known, stated and assumed of it.
+``device`` is the driver, ``reports`` the layout of its HID reports, read from its descriptor.
 """

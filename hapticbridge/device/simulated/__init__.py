@@ -1,5 +1,4 @@
 """A simulated device in a simulated hand.
 
-``driver`` is the device, ``handheld`` its compiled step, ``sampled_axis`` the exact solution of one
-axis; ``hand`` and ``scene_hand`` say who holds it.
+``device`` is the driver, ``dynamics`` its exact compiled step, ``hand`` the parameters of the hand.
 """

@@ -1,6 +1,5 @@
-"""What carries bytes to devices, and what finds them: HID, USB, WebSocket.
+"""Transport of bytes to devices: HID, USB, WebSocket.
 
-``hid``, ``usb`` and ``websocket`` carry; ``hid_search`` and ``usb_search`` (``usb_bus``) find.
-``hid_requests``, ``hid_descriptor`` and ``hid_layout`` are a HID device's account of itself,
-``hex_log`` keeps what went over the wire, ``usb_context`` ends libusb in the right order.
+``hid``, ``usb`` and ``websocket`` find and open devices and carry their bytes. ``hid_descriptor``
+reads the report layout of a HID device. ``trace`` logs the bytes of a session.
 """

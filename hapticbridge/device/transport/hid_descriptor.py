@@ -11,7 +11,8 @@ References:
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from dataclasses import field as dataclass_field
 
 from hapticbridge.errors import DeviceError
 
@@ -79,12 +80,12 @@ class Field:
 class _State:
     """What items have set so far."""
 
-    globals: dict[int, Number] = field(default_factory=dict)
-    pushed: list[dict[int, Number]] = field(default_factory=list)
-    usages: list[Number] = field(default_factory=list)
+    globals: dict[int, Number] = dataclass_field(default_factory=dict)
+    pushed: list[dict[int, Number]] = dataclass_field(default_factory=list)
+    usages: list[Number] = dataclass_field(default_factory=list)
     least: Number | None = None
-    collections: list[int] = field(default_factory=list)
-    lengths: dict[tuple[int, int], int] = field(default_factory=dict)
+    collections: list[int] = dataclass_field(default_factory=list)
+    lengths: dict[tuple[int, int], int] = dataclass_field(default_factory=dict)
 
     def value(self, item: int, *, is_signed: bool = False) -> int:
         number = self.globals.get(item, (0, 0))
