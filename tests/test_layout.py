@@ -124,7 +124,7 @@ def test_a_small_module_has_several_importers() -> None:
 
 
 SMALL = 80
-"""Lines of a small module, with its docstrings. Below it, looking it up costs more than it holds."""
+"""Lines of a small module, docstrings included. A smaller one is not worth looking up."""
 
 INTERFACES = {
     "hapticbridge.lazy",  # imported by package files, which are not counted
