@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 import hapticbridge as hb
 from hapticbridge.cli import main
-from hapticbridge.commands import Command, Couple, Reset, Switch
+from hapticbridge.commands import Command, Couple, Record, Reset, Switch
 from hapticbridge.errors import CommandError
 from hapticbridge.recording import Recording
 
@@ -498,6 +498,7 @@ RECORDED = (
     "stiff coupling, controller damper",
     "active environment, controller tank",
     "trip: energy",
+    "recorder stopped and started",
 )
 """Runs whose recordings are judged."""
 
@@ -531,14 +532,25 @@ TEXTS = {"method": "implicit", "grip": "elsewhere", "scene_sha256": "0", "dampin
 """Other metadata, and to what they are changed."""
 
 
+def restart_recorder(bridge: hb.Bridge, _: int) -> None:
+    """Stops the recorder in tick 100 and starts it in tick 200, from where a file begins anew."""
+    total = bridge.summary().ticks
+    if total in (100, 200):
+        command(bridge, Record(on=total == 200))
+
+
 def recordings(folder: Path) -> dict[str, Recording]:
-    """Records the runs that are judged."""
+    """Records the runs that are judged; one that starts a recorder in mid-run gives two files."""
     table, found = runs(), {}
+    options = {"coupling": COUPLING, "controller": "damper"}
+    table["recorder stopped and started"] = Run(PEG, Scripted, options, 0.5, act=restart_recorder)
     for number, name in enumerate(RECORDED):
         path = folder / f"{number}.mcap"
         with table[name].open(folder, recording=path) as bridge:
             table[name].go(bridge)
         found[name] = hb.read_recording(path)
+        if (later := path.with_stem(f"{path.stem}-2")).is_file():
+            found[f"{name}, second file"] = hb.read_recording(later)
     return found
 
 
