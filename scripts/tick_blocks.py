@@ -40,7 +40,7 @@ class UnpacedClock:
         return time.perf_counter_ns()
 
 
-def opened(asked: dict[str, str], stack: ExitStack) -> hb.Bridge:
+def open_bridge(asked: dict[str, str], stack: ExitStack) -> hb.Bridge:
     """Closes the last bridge and opens the one that is asked for."""
     stack.close()
     bridge = hb.Bridge(
@@ -55,7 +55,7 @@ def opened(asked: dict[str, str], stack: ExitStack) -> hb.Bridge:
     return stack.enter_context(bridge)
 
 
-def block(bridge: hb.Bridge, *, in_contact: bool) -> dict[str, float | None]:
+def run_block(bridge: hb.Bridge, *, in_contact: bool) -> dict[str, float | None]:
     """Runs a block of ticks; returns their median times in ns."""
     bridge.run(BLOCK * bridge.period)
     rows = bridge.latest_records(BLOCK)
@@ -75,9 +75,9 @@ def main() -> None:
             asked = json.loads(line)
             answer: dict[str, float | None] = {}
             if asked:
-                bridge, in_contact = opened(asked, stack), asked["in_contact"]
+                bridge, in_contact = open_bridge(asked, stack), asked["in_contact"]
             elif bridge is not None:
-                answer = block(bridge, in_contact=in_contact)
+                answer = run_block(bridge, in_contact=in_contact)
             print(json.dumps(answer), flush=True)
 
 

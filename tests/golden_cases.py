@@ -112,14 +112,14 @@ def json_text(content: Json) -> str:
     return json.dumps(content, indent=1, ensure_ascii=False) + "\n"
 
 
-def differing(one: Any, other: Any, where: str = "") -> list[str]:
+def difference_lines(one: Any, other: Any, where: str = "") -> list[str]:
     """Returns the places in which two JSON values differ, with both values."""
     if isinstance(one, dict) and isinstance(other, dict):
         names = [*one, *(name for name in other if name not in one)]
         return [
             line
             for name in names
-            for line in differing(
+            for line in difference_lines(
                 one.get(name, "missing"),
                 other.get(name, "missing"),
                 f"{where} / {name}".lstrip(" /"),
@@ -243,7 +243,7 @@ class StallingClock(hb.SimulatedClock):
 
 
 def command(bridge: hb.Bridge, asked: Command) -> None:
-    """Gives a command; waits out the real time that must lie between two."""
+    """Gives a command. Two need 50 ms of real time between them, which a fast run waits out."""
     while True:
         try:
             return bridge.command(asked, by="script")
@@ -349,7 +349,7 @@ def _hurried(scene: str, folder: Path) -> Path:
 
 
 METHODS = ("lossless", "implicit", "compensated")
-"""The methods for users. The scene of each has one degree of freedom to ten."""
+"""Methods for users: every scene is run with each of them."""
 
 COMPARED = (
     "implicitfast",
@@ -360,7 +360,7 @@ COMPARED = (
     "weld",
     "direct",
 )
-"""The methods that exist only to be compared."""
+"""Methods that exist only to be compared."""
 
 COUPLING = hb.Coupling(2400.0, 0.5, 2.4, 5e-4)
 
@@ -557,25 +557,25 @@ def recordings(folder: Path) -> dict[str, Recording]:
     return found
 
 
-def judged(path: Path) -> Json:
+def audit_report(path: Path) -> Json:
     """Returns the audit's report on a file, without its path."""
     report = json.loads(hb.audit(path).to_json())
     del report["path"]
     return dict(report)
 
 
-def described(recording: Recording) -> Json:
+def description(recording: Recording) -> Json:
     """Returns what a recording says of its run beside its ticks, and how it is judged."""
     meta = {name: text for name, text in sorted(recording.meta.items()) if name not in VOLATILE}
     files = {
         name: hashlib.sha256(data).hexdigest()[:DIGITS]
         for name, data in sorted(recording.attachments.items())
     }
-    report = judged(recording.path)
+    report = audit_report(recording.path)
     return {"meta": meta, "attachments": files, "events": recording.events, "report": report}
 
 
-def tampered(recording: Recording, folder: Path) -> Iterator[tuple[str, Path]]:
+def tampered_files(recording: Recording, folder: Path) -> Iterator[tuple[str, Path]]:
     """Yields files with something changed and signed anew, each with what was changed."""
     path = folder / "tampered.mcap"
     meta, events = recording.meta, recording.events
@@ -636,7 +636,7 @@ def tampered(recording: Recording, folder: Path) -> Iterator[tuple[str, Path]]:
     yield "one bit of the file", path
 
 
-def differences(one: Json, other: Json) -> Json:
+def changed_entries(one: Json, other: Json) -> Json:
     """Returns the entries of ``other`` that ``one`` has not, or has otherwise."""
     return {name: value for name, value in other.items() if one.get(name) != value}
 
@@ -648,11 +648,12 @@ def audits(folder: Path) -> Json:
     """
     kept = recordings(folder)
     whole = kept[TAMPERED]
-    base = judged(whole.path)
+    base = audit_report(whole.path)
     return {
-        "recordings": {name: described(recording) for name, recording in kept.items()},
+        "recordings": {name: description(recording) for name, recording in kept.items()},
         "tampered": {
-            name: differences(base, judged(path)) for name, path in tampered(whole, folder)
+            name: changed_entries(base, audit_report(path))
+            for name, path in tampered_files(whole, folder)
         },
     }
 
