@@ -299,7 +299,7 @@ def heap_reader() -> Callable[[], int]:
     return held
 
 
-@pytest.mark.parametrize(("pipelined", "controller"), [(False, "tank"), (True, "damper")])
+@pytest.mark.parametrize(("pipelined", "controller"), [(False, "off"), (True, "damper")])
 @pytest.mark.parametrize("watched", ["by nobody", "by the recorder", "by recorder and viewer"])
 def test_ten_thousand_ticks_allocate_nothing_that_stays(
     tmp_path: Path, pipelined: bool, controller: str, watched: str

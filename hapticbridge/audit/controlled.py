@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from hapticbridge.audit.differences import steps, turns
 from hapticbridge.audit.watched import Seen
 from hapticbridge.kernel.account import BOUND, SWINGS, TANK_START, THRESHOLD, WINDOW
-from hapticbridge.kernel.guarding import DAMPER, ENVIRONMENT, TANK
+from hapticbridge.kernel.guarding import DAMPER, ENVIRONMENT
 from hapticbridge.kernel.parameters import RunParameters
 
 Array = NDArray[np.float64]
@@ -86,7 +86,7 @@ class Account:
         then = copy.copy(self)
         parameters, guarding = self.parameters, self.parameters.guarding
         nothing, free = np.zeros((len(ticks), 2)), np.full((len(ticks), 6), np.inf)
-        acts = guarding.controller in (DAMPER, TANK)
+        acts = guarding.controller == DAMPER
         acts |= guarding.controller == ENVIRONMENT and parameters.has_law
         if not acts:
             return Controlled(wrench, free, nothing), then
@@ -108,9 +108,6 @@ class Account:
         then.sent, then.gained = ticks["wrench_on_device"][-1].copy(), float(gained[-1])
         then.account, then.axes = float(account[-1]), axes[-1]
         then.velocity, then.reversed = velocity[-1], history[-WINDOW:]
-        if guarding.controller == TANK:
-            share = _tank_share(parameters, wrench, velocity, account)
-            return Controlled(wrench * share[:, None], free, nothing), then
         debt = account - THRESHOLD
         if guarding.controller == ENVIRONMENT:
             created = np.diff(excess, prepend=self.over)

@@ -129,7 +129,7 @@ class Run:
     token that is printed."""
     port: int | None = None
     """Port to serve the view on, by default 8080; 0: any that is free."""
-    controller: Literal["damper", "environment", "tank", "off"] | None = None
+    controller: Literal["damper", "environment", "off"] | None = None
     """Passivity controller: what is done when the device was given more than its damping burns and
     the scene gives up, or, 'environment', when the scene created more than the coupling's slack; by
     default 'damper' where the device condition does not hold, else 'environment'."""

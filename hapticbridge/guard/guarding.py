@@ -9,9 +9,9 @@ from hapticbridge.certificate import assumed_damping
 from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import DeviceError, choices
 from hapticbridge.guard.limits import Limits
-from hapticbridge.kernel.guarding import DAMPER, ENVIRONMENT, MOST_BUTTONS, OFF, TANK, Guarding
+from hapticbridge.kernel.guarding import DAMPER, ENVIRONMENT, MOST_BUTTONS, OFF, Guarding
 
-CONTROLLERS = {"damper": DAMPER, "environment": ENVIRONMENT, "tank": TANK, "off": OFF}
+CONTROLLERS = {"damper": DAMPER, "environment": ENVIRONMENT, "off": OFF}
 """Passivity controllers by name."""
 
 SURPLUS = 0.05
