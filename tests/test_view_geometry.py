@@ -229,7 +229,8 @@ def test_a_geom_has_its_own_colour_or_its_materials_and_of_a_texture_the_mean() 
       <asset>
         <texture name="t" type="2d" builtin="checker" width="8" height="8"
           rgb1="1 0 0" rgb2="0 0 1"/>
-        <texture name="c" type="cube" builtin="flat" width="8" height="48" rgb1="0 0.4 0" rgb2="0 0.4 0"/>
+        <texture name="c" type="cube" builtin="flat" width="8" height="48"
+          rgb1="0 0.4 0" rgb2="0 0.4 0"/>
         <material name="plain" rgba="0.2 0.4 0.6 1"/>
         <material name="checker" texture="t" rgba="1 1 0.5 1"/>
         <material name="cube" texture="c" rgba="1 1 1 0.25"/>
