@@ -16,14 +16,7 @@ from hapticbridge.device.registry import DRIVERS
 from hapticbridge.errors import DeviceError, choices
 from hapticbridge.kernel.codes import BACKWARDS, BAD_SAMPLE, GAVE_ENERGY, JUMPED, STRETCHED, TWISTED
 from hapticbridge.kernel.handle import handle_pose
-from hapticbridge.kernel.parameters import (
-    DAMPER,
-    ENVIRONMENT,
-    MOST_BUTTONS,
-    OFF,
-    TANK,
-    GuardParameters,
-)
+from hapticbridge.kernel.parameters import DAMPER, ENVIRONMENT, MOST_BUTTONS, OFF, GuardParameters
 from hapticbridge.pose import canonical
 from hapticbridge.record import SAMPLE_DTYPE
 
@@ -308,7 +301,7 @@ def with_remedy(reason: str) -> str:
     return reason
 
 
-CONTROLLERS = {"damper": DAMPER, "environment": ENVIRONMENT, "tank": TANK, "off": OFF}
+CONTROLLERS = {"damper": DAMPER, "environment": ENVIRONMENT, "off": OFF}
 """Passivity controllers by name."""
 
 SURPLUS = 0.05

@@ -229,7 +229,7 @@ class Arrangement:
             limits: Limits on the wrench, within the device's own; None takes these.
             controller: Passivity controller: ``damper`` acts where the device was given more than
                 its damping burns and the scene gives up, ``environment`` where the scene created
-                more than the coupling's slack; ``tank``, ``off``. None: ``damper`` where the device
+                more than the coupling's slack; ``off``. None: ``damper`` where the device
                 condition does not hold, else ``environment``.
             clutch: Number of the device's button, from 0, that lets it move without the handle.
             dead_man: Number of the button that must be held for any force.

@@ -93,10 +93,10 @@ def holding_interrupts() -> Iterator[None]:
 
 @contextmanager
 def leaving_on_interrupt(code: int) -> Iterator[None]:
-    """Lets Ctrl-C end the process at once and without a word, where there is nothing to lose.
+    """Ends the process at once on Ctrl-C, without a message, where there is nothing to lose.
 
-    For imports: a ``KeyboardInterrupt`` in them is lost where it falls into one of the importer's
-    callbacks, which only print it. Whoever has set SIGINT to something else keeps it.
+    For imports: there a ``KeyboardInterrupt`` is lost in callbacks of the importer, which print it,
+    or becomes another error in a library's C code. A handler other than Python's own is kept.
 
     Args:
         code: The exit code.

@@ -49,7 +49,7 @@ def save(tab: Tab, target: Path) -> None:
 def draw_view(tab: Tab, file: Path, target: Path) -> None:
     """Draws the view of a recording at its largest force."""
     replay = Replay(file)
-    theatre = Theatre(replay, Address("127.0.0.1", 0))
+    theatre = Theatre(replay, Address(0))
     moment = telling_time(read_recording(file), audit(file))
     tab.open(theatre.url, 1200, 900)
     tab.wait_for("document.querySelectorAll('canvas').length >= 5")

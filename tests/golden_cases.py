@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 import hapticbridge as hb
 from hapticbridge.cli import main
-from hapticbridge.commands import Command, Couple, Reset, Switch
+from hapticbridge.commands import Command, Couple, Record, Reset, Switch
 from hapticbridge.errors import CommandError
 from hapticbridge.recording import Recording
 
@@ -112,14 +112,14 @@ def json_text(content: Json) -> str:
     return json.dumps(content, indent=1, ensure_ascii=False) + "\n"
 
 
-def differing(one: Any, other: Any, where: str = "") -> list[str]:
+def difference_lines(one: Any, other: Any, where: str = "") -> list[str]:
     """Returns the places in which two JSON values differ, with both values."""
     if isinstance(one, dict) and isinstance(other, dict):
         names = [*one, *(name for name in other if name not in one)]
         return [
             line
             for name in names
-            for line in differing(
+            for line in difference_lines(
                 one.get(name, "missing"),
                 other.get(name, "missing"),
                 f"{where} / {name}".lstrip(" /"),
@@ -243,7 +243,7 @@ class StallingClock(hb.SimulatedClock):
 
 
 def command(bridge: hb.Bridge, asked: Command) -> None:
-    """Gives a command; waits out the real time that must lie between two."""
+    """Gives a command. Two need 50 ms of real time between them, which a fast run waits out."""
     while True:
         try:
             return bridge.command(asked, by="script")
@@ -349,7 +349,7 @@ def _hurried(scene: str, folder: Path) -> Path:
 
 
 METHODS = ("lossless", "implicit", "compensated")
-"""The methods for users. The scene of each has one degree of freedom to ten."""
+"""Methods for users: every scene is run with each of them."""
 
 COMPARED = (
     "implicitfast",
@@ -360,9 +360,12 @@ COMPARED = (
     "weld",
     "direct",
 )
-"""The methods that exist only to be compared."""
+"""Methods that exist only to be compared."""
 
 COUPLING = hb.Coupling(2400.0, 0.5, 2.4, 5e-4)
+
+TURNED = ((0.6, -0.224, 0.768), (0.8, 0.168, -0.576), (0.0, 0.96, 0.28))
+"""Device axes in the scene of which none lies along one of the scene's: every product counts."""
 
 STIFF = hb.Coupling(8000.0, 0.5, 8.0, 5e-4)
 """Twice what the simulated device bears."""
@@ -448,7 +451,7 @@ def _guard_runs() -> Iterator[tuple[str, Run]]:
             yield name, Run(WORKSHOP, Scripted, options, act=inputs)
     yield "scaled up", Run(PEG, Scripted, {"scale": 2.0})
     yield "force scaled down", Run(PEG, Scripted, {"scale": 1.5, "force_scale": 0.5})
-    yield "turned axes", Run(PEG, Scripted, {"axes": [[0, 1, 0], [-1, 0, 0], [0, 0, 1]]})
+    yield "turned axes", Run(PEG, Scripted, {"axes": TURNED})
     yield "absolute poses", Run(MASS, Scripted, {"absolute": True})
     yield "500 Hz", Run(MASS, Scripted, {"rate": 500.0})
     yield "4 kHz", Run(PEG, Scripted, {"rate": 4000.0})
@@ -498,6 +501,7 @@ RECORDED = (
     "stiff coupling, controller damper",
     "active environment, controller tank",
     "trip: energy",
+    "recorder stopped and started",
 )
 """Runs whose recordings are judged."""
 
@@ -531,36 +535,47 @@ TEXTS = {"method": "implicit", "grip": "elsewhere", "scene_sha256": "0", "dampin
 """Other metadata, and to what they are changed."""
 
 
+def restart_recorder(bridge: hb.Bridge, _: int) -> None:
+    """Stops the recorder in tick 100 and starts it in tick 200, from where a file begins anew."""
+    total = bridge.summary().ticks
+    if total in (100, 200):
+        command(bridge, Record(on=total == 200))
+
+
 def recordings(folder: Path) -> dict[str, Recording]:
-    """Records the runs that are judged."""
+    """Records the runs that are judged; one that starts a recorder in mid-run gives two files."""
     table, found = runs(), {}
+    options = {"coupling": COUPLING, "controller": "damper"}
+    table["recorder stopped and started"] = Run(PEG, Scripted, options, 0.5, act=restart_recorder)
     for number, name in enumerate(RECORDED):
         path = folder / f"{number}.mcap"
         with table[name].open(folder, recording=path) as bridge:
             table[name].go(bridge)
         found[name] = hb.read_recording(path)
+        if (later := path.with_stem(f"{path.stem}-2")).is_file():
+            found[f"{name}, second file"] = hb.read_recording(later)
     return found
 
 
-def judged(path: Path) -> Json:
+def audit_report(path: Path) -> Json:
     """Returns the audit's report on a file, without its path."""
     report = json.loads(hb.audit(path).to_json())
     del report["path"]
     return dict(report)
 
 
-def described(recording: Recording) -> Json:
+def description(recording: Recording) -> Json:
     """Returns what a recording says of its run beside its ticks, and how it is judged."""
     meta = {name: text for name, text in sorted(recording.meta.items()) if name not in VOLATILE}
     files = {
         name: hashlib.sha256(data).hexdigest()[:DIGITS]
         for name, data in sorted(recording.attachments.items())
     }
-    report = judged(recording.path)
+    report = audit_report(recording.path)
     return {"meta": meta, "attachments": files, "events": recording.events, "report": report}
 
 
-def tampered(recording: Recording, folder: Path) -> Iterator[tuple[str, Path]]:
+def tampered_files(recording: Recording, folder: Path) -> Iterator[tuple[str, Path]]:
     """Yields files with something changed and signed anew, each with what was changed."""
     path = folder / "tampered.mcap"
     meta, events = recording.meta, recording.events
@@ -621,7 +636,7 @@ def tampered(recording: Recording, folder: Path) -> Iterator[tuple[str, Path]]:
     yield "one bit of the file", path
 
 
-def differences(one: Json, other: Json) -> Json:
+def changed_entries(one: Json, other: Json) -> Json:
     """Returns the entries of ``other`` that ``one`` has not, or has otherwise."""
     return {name: value for name, value in other.items() if one.get(name) != value}
 
@@ -633,11 +648,12 @@ def audits(folder: Path) -> Json:
     """
     kept = recordings(folder)
     whole = kept[TAMPERED]
-    base = judged(whole.path)
+    base = audit_report(whole.path)
     return {
-        "recordings": {name: described(recording) for name, recording in kept.items()},
+        "recordings": {name: description(recording) for name, recording in kept.items()},
         "tampered": {
-            name: differences(base, judged(path)) for name, path in tampered(whole, folder)
+            name: changed_entries(base, audit_report(path))
+            for name, path in tampered_files(whole, folder)
         },
     }
 

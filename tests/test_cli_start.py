@@ -6,6 +6,7 @@ import importlib
 import inspect
 import os
 import re
+import signal
 import subprocess
 import sys
 from dataclasses import fields
@@ -15,6 +16,7 @@ import pytest
 from cli_cases import Called
 
 from hapticbridge.cli.main import COMMANDS
+from hapticbridge.signals import leaving_on_interrupt
 
 HEAVY = frozenset(
     {"numpy", "mujoco", "numba", "llvmlite", "scipy", "matplotlib", "tyro", "rich", "mcap"}
@@ -183,7 +185,22 @@ def test_a_renderer_that_mujoco_does_not_know_is_one_sentence(value: str) -> Non
     assert "'disable'" in line
 
 
-def test_ctrl_c_while_it_imports_is_exit_code_130_without_a_traceback() -> None:
+def test_ctrl_c_while_it_imports_is_silence_and_exit_code_130() -> None:
     command = [sys.executable, "-c", INTERRUPTED]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stdout, done.stderr) == (130, "", "interrupted\n")
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "")
+
+
+def test_a_handler_of_sigint_that_is_not_pythons_own_is_kept() -> None:
+    def kept(_number: int, _frame: object) -> None: ...
+
+    before = signal.signal(signal.SIGINT, kept)
+    try:
+        with leaving_on_interrupt(130):
+            assert signal.getsignal(signal.SIGINT) is kept
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        with leaving_on_interrupt(130):
+            assert signal.getsignal(signal.SIGINT) is not signal.default_int_handler
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    finally:
+        signal.signal(signal.SIGINT, before)

@@ -12,13 +12,13 @@ import pytest
 RUNS = golden.runs()
 
 PRINTING = ("tyro", "rich", "python")
-"""What the layout of a help text depends on; all but the first two also decide about numbers."""
+"""Versions that decide the layout of a help text. Tyro and rich decide nothing else."""
 
 
 def hold(frozen: Any, found: Any, *, is_text: bool = False) -> None:
     """Fails where the two differ; skips where another machine or version may be the reason."""
     found = json.loads(json.dumps(found))
-    differing = golden.differing(frozen, found)
+    differing = golden.difference_lines(frozen, found)
     if not differing:
         return
     then, now = json.loads(golden.MACHINE.read_text(encoding="utf-8")), golden.machine()

@@ -20,7 +20,7 @@ from report_runs import Made
 
 from hapticbridge.audit import audit
 from hapticbridge.errors import HapticBridgeError, RecordingError
-from hapticbridge.kernel.parameters import TANK, GuardParameters
+from hapticbridge.kernel.parameters import DAMPER, GuardParameters
 from hapticbridge.record import TickFlag
 from hapticbridge.recording import Recording, read_recording
 from hapticbridge.report import plot_recording, write_report
@@ -137,7 +137,7 @@ def test_what_was_at_work_is_drawn_when_it_was(run_file: Path) -> None:
 def test_what_the_guard_did_is_drawn_and_told(run_file: Path, tmp_path: Path) -> None:
     """Samples that stay away, a controller, a re-seating and a trip, made up in a quiet run."""
     recording = read_recording(run_file)
-    guard = replace(evidence_of(recording).parameters.guarding, controller=TANK, stale_ticks=10)
+    guard = replace(evidence_of(recording).parameters.guarding, controller=DAMPER, stale_ticks=10)
     ticks = recording.ticks.copy()
     ticks["flags"] = 0
     ticks["flags"][20:50] = int(TickFlag.STALE_SAMPLE)
@@ -160,11 +160,11 @@ def test_what_the_guard_did_is_drawn_and_told(run_file: Path, tmp_path: Path) ->
     assert np.flatnonzero(shown["tripped"]).tolist() == [len(ticks) - 1]
     damped = draw_timing(evidence).axes[-1].get_lines()[0]
     assert np.asarray(damped.get_ydata()).max() == 1.5
-    assert ("controller", "tank") in guard_facts(evidence)
+    assert ("controller", "damper") in guard_facts(evidence)
     page = tmp_path / "page.html"
     write_report(changed, audit(run_file), page)
     text = page.read_text(encoding="utf-8")
-    assert "tank, at work in" in text
+    assert "damper, at work in" in text
     assert "up to 1.5 N s/m injected" in text
     assert "reason it jumped" in text
 

@@ -26,7 +26,6 @@ from chromium import browser
 from cli_cases import Called
 from PIL import Image
 from report_runs import LOOSE
-from test_view_address import OUTSIDE, outside
 
 from hapticbridge.audit import audit
 from hapticbridge.bridge import Bridge
@@ -36,9 +35,8 @@ from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.film_process import Stage
 from hapticbridge.recording import Attachment, Ring, read_recording
 from hapticbridge.recording.snapshot import Snapshot
-from hapticbridge.view.address import COOKIE, Address
 from hapticbridge.view.trace import LINES, Trace
-from hapticbridge.view.window import Window
+from hapticbridge.view.window import Address, Window
 
 pytest.importorskip("viser", reason="needs the extra 'view'")
 
@@ -277,40 +275,105 @@ def is_let_in(host: str, port: int, path: str = "/", **options: Any) -> bool:
         return False
 
 
+@pytest.mark.parametrize(
+    ("host", "origin", "reason"),
+    [
+        ("127.0.0.1:8080", None, ""),
+        ("localhost:8080", "http://localhost:8080", ""),
+        ("[::1]:8080", "http://[::1]:8080", ""),
+        ("evil.example:8080", None, "not the host"),
+        ("127.0.0.1.evil.example", None, "not the host"),
+        ("", None, "not the host"),
+        ("[::1", None, "not the host"),
+        ("127.0.0.1:8080", "http://evil.example", "another page"),
+        ("127.0.0.1:8080", "http://127.0.0.1:9999", "another page"),
+        ("127.0.0.1:8080", "https://127.0.0.1:8080", "another page"),
+        ("127.0.0.1:8080", "null", "another page"),
+    ],
+)
+def test_only_requests_of_its_own_page_are_answered(
+    host: str, origin: str | None, reason: str
+) -> None:
+    headers = {"Host": host} | ({} if origin is None else {"Origin": origin})
+    address = Address(8080)
+    said = address.refusal(f"/?token={address.token}", headers)
+    assert (reason in said) if reason else said == ""
+
+
+def test_the_token_is_random_and_not_shown() -> None:
+    first, second = Address(), Address()
+    assert first.token != second.token
+    assert len(first.token) >= 32
+    assert first.token not in repr(first)
+
+
+@pytest.mark.parametrize("way", ["query", "cookie"])
+def test_token_opens_and_nothing_else_does(way: str) -> None:
+    address = Address()
+
+    def refusal(token: str) -> str:
+        headers = {"host": "127.0.0.1:80"}
+        if way == "cookie":
+            return address.refusal("/", headers | {"cookie": f"a=b; hapticbridge_80={token}"})
+        return address.refusal(f"/x?a=b&token={token}", headers)
+
+    assert refusal(address.token) == ""
+    for wrong in ("", address.token[:-1], address.token + "x", "ü", address.token.swapcase()):
+        assert "token" in refusal(wrong)
+    assert "token" in address.refusal("/", {"host": "localhost"})
+    assert "token" in address.refusal("//[", {"host": "localhost"})  # not a path
+
+
+@pytest.mark.parametrize("port", [65536, -1])
+def test_a_port_out_of_range_is_refused(port: int) -> None:
+    with pytest.raises(HapticBridgeError, match=f"port is {port}"):
+        Address(port)
+
+
 def test_the_server_answers_its_own_page_alone(replay: Replay) -> None:
-    with served(replay, Address("127.0.0.1", 0)) as (theatre, port):
-        assert theatre.url == f"http://127.0.0.1:{port}/"
-        assert answer("127.0.0.1", port)[0] == 200
-        assert answer("127.0.0.1", port, Host="evil.example")[0] == 403
-        assert answer("127.0.0.1", port, Origin="http://evil.example")[0] == 403
-        assert is_let_in("127.0.0.1", port)
-        assert is_let_in("127.0.0.1", port, origin=f"http://127.0.0.1:{port}")
-        assert not is_let_in("127.0.0.1", port, origin="http://evil.example")
+    address = Address(0)
+    with served(replay, address) as (theatre, port):
+        secret = f"/?token={address.token}"
+        assert theatre.url == f"http://127.0.0.1:{port}{secret}"
+        assert answer("127.0.0.1", port, secret)[0] == 200
+        assert answer("127.0.0.1", port, secret, Host="evil.example")[0] == 403
+        assert answer("127.0.0.1", port, secret, Origin="http://evil.example")[0] == 403
+        assert is_let_in("127.0.0.1", port, secret)
+        assert is_let_in("127.0.0.1", port, secret, origin=f"http://127.0.0.1:{port}")
+        assert not is_let_in("127.0.0.1", port, secret, origin="http://evil.example")
         # a second Host beside the right one, as a careless proxy might read it
-        assert not is_let_in("127.0.0.1", port, additional_headers={"Host": "evil.example"})
+        evil = {"Host": "evil.example"}
+        assert not is_let_in("127.0.0.1", port, secret, additional_headers=evil)
         # viser's own way out to the internet is gone
         handlers = theatre._server._websock_server._incoming_handlers
-        gone = ("ShareUrl", "FileTransferStart")  # nor does it keep files for anybody
+        gone = ("ShareUrl", "FileTransferStart")  # nor does it keep files that a browser sends
         assert not any(handlers[kind] for kind in handlers if kind.__name__.startswith(gone))
         with socket.socket() as probe, pytest.raises(OSError, match="refused"):
-            probe.connect((OUTSIDE, port))  # served on loopback's first address alone
+            probe.connect(("127.0.0.2", port))  # served on loopback's first address alone
 
 
-def test_another_address_needs_the_token(replay: Replay) -> None:
-    address = outside()
+def test_the_page_needs_the_token_and_a_browser_keeps_it(replay: Replay) -> None:
+    address, host = Address(0), "127.0.0.1"
     with served(replay, address) as (_, port):
-        status, cookie, _ = answer(OUTSIDE, port)
+        status, cookie, _ = answer(host, port)
         assert (status, cookie) == (403, "")
-        assert answer(OUTSIDE, port, "/?token=wrong")[0] == 403
-        assert not is_let_in(OUTSIDE, port)
-        assert not is_let_in(OUTSIDE, port, additional_headers={"Cookie": f"{COOKIE}=wrong"})
-        status, cookie, _ = answer(OUTSIDE, port, f"/?token={address.token}")
+        assert answer(host, port, "/?token=wrong")[0] == 403
+        assert not is_let_in(host, port)
+        assert not is_let_in(
+            host, port, additional_headers={"Cookie": f"hapticbridge_{port}=wrong"}
+        )
+        status, cookie, _ = answer(host, port, f"/?token={address.token}")
         assert status == 200
-        assert cookie == f"{COOKIE}={address.token}; Path=/; HttpOnly; SameSite=Strict"
-        kept = {"Cookie": cookie.split(";")[0]}
-        assert answer(OUTSIDE, port, **kept)[0] == 200
-        assert is_let_in(OUTSIDE, port, additional_headers=kept)
-        assert not is_let_in(OUTSIDE, port, additional_headers=kept, origin="http://evil.example")
+        kept = f"hapticbridge_{port}={address.token}"
+        assert cookie == f"{kept}; Path=/; HttpOnly; SameSite=Strict"
+        assert answer(host, port, Cookie=kept)[0] == 200
+        assert is_let_in(host, port, additional_headers={"Cookie": kept})
+        # through a tunnel from another port, which gets a cookie of its own
+        tunnel = f"/?token={address.token}"
+        assert (
+            f"hapticbridge_9000={address.token}"
+            in answer(host, port, tunnel, Host="localhost:9000")[1]
+        )
 
 
 def test_a_port_in_use_is_said_and_not_exchanged(replay: Replay) -> None:
@@ -319,11 +382,11 @@ def test_a_port_in_use_is_said_and_not_exchanged(replay: Replay) -> None:
         taken.listen()
         port = taken.getsockname()[1]
         with pytest.raises(HapticBridgeError, match=f"port {port} is in use"):
-            Theatre(replay, Address("127.0.0.1", port))
+            Theatre(replay, Address(port))
 
 
 def test_a_browser_sees_the_tool_move_with_the_slider(replay: Replay, tmp_path: Path) -> None:
-    with served(replay, Address("127.0.0.1", 0)) as (theatre, _), browser(tmp_path) as tab:
+    with served(replay, Address(0)) as (theatre, _), browser(tmp_path) as tab:
         page = tab()
         page.open(theatre.url)
         page.wait_for("document.body.innerText.includes('Passivity margin')")
@@ -342,7 +405,7 @@ def test_a_browser_sees_the_tool_move_with_the_slider(replay: Replay, tmp_path: 
                     middle = np.argwhere(is_red[:, :600]).mean(axis=0)
                     is_there = np.abs(middle - last).max() < 1.0
                     is_there = is_there and not np.abs(middle - before).max() <= way
-        own = ("data:", "blob:", theatre.url)
+        own = ("data:", "blob:", theatre.url.partition("?")[0])
         assert [request[:99] for request in page.requests if not request.startswith(own)] == []
         assert page.complaints == []
 
@@ -350,7 +413,7 @@ def test_a_browser_sees_the_tool_move_with_the_slider(replay: Replay, tmp_path: 
 def test_whatever_a_browser_sends_for_the_time_the_replay_goes_on(
     replay: Replay, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    with served(replay, Address("127.0.0.1", 0)) as (theatre, _), hand(theatre.url) as page:
+    with served(replay, Address(0)) as (theatre, _), hand(theatre.url) as page:
         for value in (float("nan"), float("inf"), -1e308, "x", None, [1.0], {"a": 1}):
             page.send("time (s)", value=value)
         page.send("play", value="x")
@@ -362,7 +425,7 @@ def test_whatever_a_browser_sends_for_the_time_the_replay_goes_on(
 def test_of_two_times_that_are_asked_for_at_once_the_newer_stays(
     replay: Replay, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with served(replay, Address("127.0.0.1", 0)) as (theatre, _), hand(theatre.url) as page:
+    with served(replay, Address(0)) as (theatre, _), hand(theatre.url) as page:
         draw, is_drawing = theatre._page.show, threading.Event()
 
         def slow_at_first(sight: Sight) -> None:
@@ -382,7 +445,7 @@ def test_of_two_times_that_are_asked_for_at_once_the_newer_stays(
 
 def test_a_replay_that_plays_moves_on_and_begins_again_at_its_end(replay: Replay) -> None:
     is_over = threading.Event()
-    with served(replay, Address("127.0.0.1", 0)) as (theatre, _), hand(theatre.url) as page:
+    with served(replay, Address(0)) as (theatre, _), hand(theatre.url) as page:
         player = threading.Thread(target=theatre.play, args=(is_over,))
         player.start()
         try:
@@ -399,7 +462,7 @@ def test_a_replay_that_plays_moves_on_and_begins_again_at_its_end(replay: Replay
 def test_a_killed_view_and_ten_deaf_browsers_do_not_touch_the_run(
     floor: Path, tmp_path: Path
 ) -> None:
-    path, window = tmp_path / "run.mcap", Window(Address("127.0.0.1", 0))
+    path, window = tmp_path / "run.mcap", Window(Address(0))
     deaf: list[Any] = []
 
     def disturb(_: Bridge, tick: int) -> None:
@@ -424,7 +487,7 @@ def test_a_killed_view_and_ten_deaf_browsers_do_not_touch_the_run(
 def test_the_button_of_the_page_stops_the_run_and_the_recording_says_who_did(
     floor: Path, tmp_path: Path
 ) -> None:
-    path, window = tmp_path / "run.mcap", Window(Address("127.0.0.1", 0))
+    path, window = tmp_path / "run.mcap", Window(Address(0))
     scene = str(floor.with_name("floor.xml"))
     with (
         Bridge(scene, ScriptedDevice(pressed), LOOSE, recording=path, onlooker=window) as bridge,
@@ -468,7 +531,7 @@ def test_a_run_hears_commands_and_nothing_else(
     said: bytes, heard: list[Command], refused: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("hapticbridge.view.window.INTERVAL", 0.0)
-    window = Window(Address("127.0.0.1", 0))
+    window = Window(Address(0))
     commands: list[Command] = []
     window.on_command = commands.append
     process = types.SimpleNamespace(stdout=io.BytesIO(said))

@@ -27,8 +27,7 @@ from hapticbridge.commands.command import Stop
 from hapticbridge.errors import HapticBridgeError, SafetyTrip
 from hapticbridge.guard import Limits
 from hapticbridge.recording import read_recording
-from hapticbridge.view.address import Address
-from hapticbridge.view.window import Window
+from hapticbridge.view.window import Address, Window
 
 pytest.importorskip("viser", reason="needs the extra 'view'")
 
@@ -57,7 +56,7 @@ def until(condition: Callable[[], Any]) -> None:
 @contextlib.contextmanager
 def running(folder: Path) -> Iterator[tuple[Bridge, Window]]:
     """A run in real time with its page, until the block is over."""
-    scene, window = folder / "floor.xml", Window(Address("127.0.0.1", 0))
+    scene, window = folder / "floor.xml", Window(Address(0))
     scene.write_text(FLOOR)
     failed: list[BaseException] = []
 
@@ -159,7 +158,7 @@ def test_nothing_that_is_sent_by_hand_exceeds_a_limit(tmp_path: Path) -> None:
 @contextlib.contextmanager
 def controls() -> Iterator[tuple[Controls, Hand, list[Any]]]:
     """Controls without a run, a hand on them, and what they asked for."""
-    address, asked = Address("127.0.0.1", 0), list[Any]()
+    address, asked = Address(0), list[Any]()
     server = serve(address)
     try:
         shown = Controls(server, allowance(), asked.append)
@@ -265,7 +264,7 @@ def test_commands_reach_the_bridge_slowly_and_the_newest_wins() -> None:
 def test_the_page_keeps_its_last_picture_and_says_why_the_run_ended(
     tmp_path: Path, stretch: float, why: str
 ) -> None:
-    scene, window = tmp_path / "floor.xml", Window(Address("127.0.0.1", 0))
+    scene, window = tmp_path / "floor.xml", Window(Address(0))
     scene.write_text(FLOOR)
     bridge = Bridge(
         str(scene),

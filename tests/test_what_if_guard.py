@@ -126,7 +126,7 @@ def vars_of(limits: Limits) -> dict[str, float]:
 
 
 @pytest.mark.parametrize(
-    ("recorded_with", "chosen"), [("off", "off"), ("tank", "tank"), ("damper", None), (None, None)]
+    ("recorded_with", "chosen"), [("off", "off"), ("damper", None), (None, None)]
 )
 def test_the_controller_is_the_recorded_one_unless_it_was_left_open(
     recorded_with: str | None, chosen: str | None, tmp_path: Path
@@ -148,7 +148,7 @@ def test_a_model_hand_feels_the_controller_that_is_asked_for(tmp_path: Path) -> 
     assert at_work["damper"].any()
     with pytest.raises(
         RecordingError,
-        match="controller is 'dampr'; choose one of 'damper', 'environment', 'off', 'tank'",
+        match="controller is 'dampr'; choose one of 'damper', 'environment', 'off'",
     ):
         what_if(path, {"controller": "dampr"})
 

@@ -17,7 +17,7 @@ from hapticbridge.audit.events import RunEvents
 from hapticbridge.audit.motion import poses_before, quaternion_product, steps, turn_between, turns
 from hapticbridge.kernel.codes import CLUTCHED, FORCE_OFF
 from hapticbridge.kernel.guard import STILL, STILL_TURN
-from hapticbridge.kernel.parameters import DAMPER, ENVIRONMENT, TANK, RunParameters
+from hapticbridge.kernel.parameters import DAMPER, ENVIRONMENT, RunParameters
 from hapticbridge.kernel.passivity_controller import BOUND, SWINGS, TANK_START, THRESHOLD, WINDOW
 from hapticbridge.record import TickFlag
 
@@ -342,7 +342,7 @@ class Account:
         then = copy.copy(self)
         parameters, guarding = self.parameters, self.parameters.guarding
         nothing, free = np.zeros((len(ticks), 2)), np.full((len(ticks), 6), np.inf)
-        acts = guarding.controller in (DAMPER, TANK)
+        acts = guarding.controller == DAMPER
         acts |= guarding.controller == ENVIRONMENT and parameters.has_law
         if not acts:
             return Controlled(wrench, free, nothing), then
@@ -364,9 +364,6 @@ class Account:
         then.sent, then.gained = ticks["wrench_on_device"][-1].copy(), float(gained[-1])
         then.account, then.axes = float(account[-1]), axes[-1]
         then.velocity, then.reversed = velocity[-1], history[-WINDOW:]
-        if guarding.controller == TANK:
-            share = _tank_share(parameters, wrench, velocity, account)
-            return Controlled(wrench * share[:, None], free, nothing), then
         debt = account - THRESHOLD
         if guarding.controller == ENVIRONMENT:
             created = np.diff(excess, prepend=self.over)

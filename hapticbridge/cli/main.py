@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from hapticbridge.errors import HapticBridgeError, SafetyTrip
+from hapticbridge.signals import leaving_on_interrupt
 
 DONE, READER_GONE, USAGE_ERROR, SAFETY_TRIP, INTERRUPTED = 0, 1, 2, 3, 130
 
@@ -120,7 +121,8 @@ def _execute(name: str, words: list[str]) -> int:
 def _command_class(name: str) -> type[Any]:
     """Imports the command's module and returns its class."""
     try:
-        module = importlib.import_module(f"hapticbridge.cli.{COMMANDS[name].module}")
+        with leaving_on_interrupt(INTERRUPTED):
+            module = importlib.import_module(f"hapticbridge.cli.{COMMANDS[name].module}")
     except RuntimeError as error:
         if "MUJOCO_GL" not in str(error):
             raise

@@ -10,7 +10,7 @@ from contextlib import ExitStack
 from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 import tyro
 from rich.markup import escape
@@ -262,12 +262,11 @@ class Run:
     because a force that rises behind a hand would be given to it."""
     view: bool = False
     """Show the run in a browser, from a process of its own; needs the extra 'view'."""
-    host: str | None = None
-    """Address to serve the view on, by default 127.0.0.1; another than this machine's own needs the
-    token that is printed."""
     port: int | None = None
-    """Port to serve the view on, by default 8080; 0: any that is free."""
-    controller: Literal["damper", "environment", "tank", "off"] | None = None
+    """Port on this machine to serve the view on, by default 8080; 0: any that is free. Only the
+    printed address gets in. From another machine: ssh -L 8080:localhost:8080 MACHINE, then open
+    the printed address there."""
+    controller: Literal["damper", "environment", "off"] | None = None
     """Passivity controller: what is done when the device was given more than its damping burns and
     the scene gives up, or, 'environment', when the scene created more than the coupling's slack; by
     default 'damper' where the device condition does not hold, else 'environment'."""
@@ -302,11 +301,10 @@ class Run:
             raise RecordingError(f"'{self.record}' exists; choose another file or add --overwrite")
         clock = SimulatedClock() if self.fast else RealClock()
         refuse_simulated_time(self.device, clock)  # before anybody is asked to home it
-        asked = {"host": self.host, "port": self.port}
-        place: dict[str, Any] = {name: at for name, at in asked.items() if at is not None}
-        if place and not self.view:
-            raise HapticBridgeError(f"--{' and --'.join(place)} without --view has no effect")
-        window = Window(Address(**place)) if self.view else None
+        if self.port is not None and not self.view:
+            raise HapticBridgeError("--port without --view has no effect")
+        address = Address() if self.port is None else Address(self.port)
+        window = Window(address) if self.view else None
         scene = load_scene(self.scene, self.grip, **settings_from(self.settings))
         with ExitStack() as stack:
             told = stack.enter_context(interrupting_on_signals())
@@ -366,7 +364,7 @@ class Run:
             stack.enter_context(bridge)
         told.append(bridge.stop_on_signal)  # also while it closes, which must not be cut short
         if window is not None:
-            tell_address(window.address, window.url, "watch the run, stop it and move the device")
+            tell_address(window.url)
         if not self.as_json:
             announce_measured(bridge)
         summary = bridge.run(self.duration)

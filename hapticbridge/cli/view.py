@@ -28,30 +28,26 @@ class View:
 
     file: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FILE")]
     """The recording (.mcap)."""
-    host: str = "127.0.0.1"
-    """Address to serve the page on; another than this machine's own needs the token that is
-    printed."""
     port: int = 8080
-    """Port to serve it on; 0: any that is free."""
+    """Port on this machine, where only the printed address gets in; 0: any that is free. From
+    another machine: ssh -L 8080:localhost:8080 MACHINE, then open the printed address there."""
 
     def execute(self) -> int:
         """Serves the page; returns the exit code."""
         check_view()
-        address = Address(self.host, self.port)
+        address = Address(self.port)
         from hapticbridge.view.replay import Replay, Theatre  # noqa: PLC0415 - of an extra
 
         with progress("simulating again") as show:
             replay = Replay(self.file, show)
         theatre = Theatre(replay, address)
-        tell_address(address, theatre.url, "watch the recording")
+        tell_address(theatre.url)
         with contextlib.suppress(KeyboardInterrupt):
             theatre.play(threading.Event())
         theatre.close()
         return 0
 
 
-def tell_address(address: Address, url: str, power: str) -> None:
-    """Prints what to open in a browser, and what whoever has the address can do."""
-    err.print(f"view: {plain(url)}")
-    if not address.is_loopback:
-        err.print(f"[yellow]warning:[/yellow] anyone with this address can {power}")
+def tell_address(url: str) -> None:
+    """Prints the address to open in a browser."""
+    err.print(f"view: {plain(url)}", soft_wrap=True)

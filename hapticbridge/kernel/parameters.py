@@ -17,9 +17,12 @@ from hapticbridge.kernel.codes import COUPLED, DIRECT, HELD, LOSSLESS, WELD, has
 
 # What the guard does within a tick, as numbers: part of what decides what a run computes.
 
-OFF, DAMPER, TANK, ENVIRONMENT = 0, 1, 2, 3
-"""Passivity controllers: none; damping against the motion, for what both ports owe; a tank that
-scales the wrench; damping for what the environment's port owes alone."""
+OFF, DAMPER, ENVIRONMENT = 0, 1, 3
+"""Passivity controllers as recordings number them: none; damping against the motion, and a tank
+behind it, for what both ports owe; damping for what the environment's port owes alone. Recordings
+of earlier versions have a 2 where a tank acted by itself."""
+
+_TANK_ALONE = 2
 
 MOST_BUTTONS = 32
 """Buttons that a mask may name; no handle has more."""
@@ -43,7 +46,7 @@ class GuardParameters:
     """What the guard does within a tick; everything is off by default.
 
     Attributes:
-        controller: ``OFF``, ``DAMPER``, ``TANK`` or ``ENVIRONMENT``.
+        controller: ``OFF``, ``DAMPER`` or ``ENVIRONMENT``.
         credit: Damping in N s/m that the energy account takes the device to burn.
         rotational_credit: Likewise in N m s/rad.
         most_damping: Largest damping in N s/m that the controller adds on an axis.
@@ -94,8 +97,13 @@ class GuardParameters:
     ramp_energy: float = math.inf
 
     def __post_init__(self) -> None:
-        if self.controller not in (OFF, DAMPER, TANK, ENVIRONMENT):
-            raise HapticBridgeError(f"controller is {self.controller!r}; it must be 0 to 3")
+        if self.controller == _TANK_ALONE:
+            raise HapticBridgeError(
+                "the controller is a tank by itself, which only earlier versions of hapticbridge "
+                "ran and judge; 'hapticbridge export' still reads a recording of it"
+            )
+        if self.controller not in (OFF, DAMPER, ENVIRONMENT):
+            raise HapticBridgeError(f"controller is {self.controller!r}; it must be 0, 1 or 3")
         for name in _NOT_NEGATIVE:
             value = getattr(self, name)
             if not _is_number(value) or not 0 <= value < math.inf:

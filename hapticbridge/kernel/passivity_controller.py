@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from hapticbridge.jit import compiled
 from hapticbridge.kernel.codes import CONTROLLER_ACTIVE, FORCE_OFF
-from hapticbridge.kernel.parameters import DAMPER, ENVIRONMENT, TANK
+from hapticbridge.kernel.parameters import DAMPER, ENVIRONMENT
 from hapticbridge.pose import Vector, scaled
 
 THRESHOLD = 1e-5
@@ -168,10 +168,10 @@ def control(state: NDArray[np.void], force: Vector, torque: Vector) -> tuple[Vec
     has burnt or given back what it was given. A damper on the tool would sit nearer to the cause,
     and makes contacts create more (as scaling the tool's velocity does).
 
-    The tank scales the wrench so that the work it does over the next tick, at the speed of the last
-    one, is no more than what the tank holds. By itself it acts whether there is a debt or not;
-    behind the damper only then, for what α cannot pay because it is clipped, and not in such a
-    swing, where the speed of the last tick says nothing of the next.
+    Behind the damper a tank scales the wrench so that the work it does over the next tick, at the
+    speed of the last one, is no more than what the tank holds. It pays what α cannot because it is
+    clipped, and does not act in such a swing, where the speed of the last tick says nothing of the
+    next.
 
     References:
         Hannaford & Ryu 2002 (damper); Kim & Ryu 2010 (bound); Franken et al. 2011 (tank).
@@ -201,6 +201,4 @@ def control(state: NDArray[np.void], force: Vector, torque: Vector) -> tuple[Vec
                 is_swinging = is_swinging or _swings(state, i)
             if not is_swinging:
                 force, torque = _from_tank(state, force, torque)
-    elif s.controller == TANK:
-        force, torque = _from_tank(state, force, torque)
     return force, torque

@@ -30,8 +30,6 @@ from hapticbridge.rendering import method_named
 from hapticbridge.run_description import parameters_of
 from hapticbridge.view.sliders import SYMBOLS, Sliders, by_hand
 
-SHARED = "**Anyone with this address can watch this run, stop it, and move the device.**"
-
 PACE = 2.0 * INTERVAL
 """In s, least time between two lines to the bridge. At its own limit a line that was held up and
 the next one would come too close, and be refused."""

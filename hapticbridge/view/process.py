@@ -25,13 +25,13 @@ from hapticbridge.film_process import LEAST_REFERENCE
 from hapticbridge.recording import RecordingFile, Ring
 from hapticbridge.recording.snapshot import Snapshot
 from hapticbridge.run_description import parameters_of
-from hapticbridge.view.address import Address
-from hapticbridge.view.controls import SHARED, Controls, Outlet, allowance_of
+from hapticbridge.view.controls import Controls, Outlet, allowance_of
 from hapticbridge.view.geometry import Tendons
 from hapticbridge.view.page import Page
 from hapticbridge.view.server import serve
 from hapticbridge.view.sight import Sight
 from hapticbridge.view.trace import Trace
+from hapticbridge.view.window import Address
 
 FRAME = 1 / 30
 """Time in s between two pictures, as often as the bridge publishes them."""
@@ -181,11 +181,9 @@ def run() -> None:
     job, told = _told(stream)
     try:
         live = LiveRun(Ring.attach(job["ring"]), job["snapshot"], told)
-        address = Address(job["host"], job["port"], job["token"])
+        address = Address(job["port"], job["token"])
         server = serve(address)
         outlet = Outlet(answers.fileno())
-        if not address.is_loopback:
-            server.gui.add_markdown(SHARED)
         page = Page(server, live.model, live.parameters, dict(told.meta), live.reference)
         controls = Controls(server, allowance_of(told.meta), outlet.ask)
         page.add_curves()

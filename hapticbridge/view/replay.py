@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 
 from hapticbridge.film_process import Stage
 from hapticbridge.recording.snapshot import MOST_CONTACTS
-from hapticbridge.view.address import Address
 from hapticbridge.view.geometry import Tendons
 from hapticbridge.view.page import Page
 from hapticbridge.view.server import serve, stop
 from hapticbridge.view.sight import Sight
 from hapticbridge.view.trace import Trace
+from hapticbridge.view.window import Address
 
 FRAME = 1 / 30
 """Seconds between two instants that can be chosen, unless there would be more than ``MOST``."""

@@ -1,4 +1,4 @@
-"""viser's server behind our own door."""
+"""viser's server, where each request must pass a check of its host, its origin and its token."""
 
 from __future__ import annotations
 
@@ -18,31 +18,30 @@ from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
 from hapticbridge.errors import HapticBridgeError
-from hapticbridge.view.address import COOKIE, LOOPBACK, Address
+from hapticbridge.view.window import HOST, Address
 
 Process = Callable[[Any, Request], Response | Awaitable[Response | None] | None]
 
 MOST_MESSAGE = 1 << 16
-"""Bytes of a message from a browser; what it sends here are button presses and camera poses, some
-hundred bytes."""
+"""Largest message from a browser in bytes. Button presses and camera poses have some hundred."""
 
 _SERVING = threading.Lock()
 
 
 def serve(address: Address) -> viser.ViserServer:
-    """Starts viser's server where every request, of pages and of sockets, is asked for first.
+    """Starts viser's server with a check before every request, of pages and of sockets.
 
     Raises:
-        HapticBridgeError: It did not come to listen at this address alone.
+        HapticBridgeError: The port is in use, or this version of viser skips the check.
     """
     with _SERVING, _behind(address), contextlib.redirect_stdout(io.StringIO()):
-        server = viser.ViserServer(host=address.host, port=address.port, verbose=False)
+        server = viser.ViserServer(host=HOST, port=address.port, verbose=False)
     if address.port and server.get_port() != address.port:  # viser takes the next one instead
         stop(server)
         raise HapticBridgeError(f"port {address.port} is in use; choose another with --port")
-    if not _is_guarded(server.get_port(), address):
+    if not _is_guarded(server.get_port()):
         stop(server)
-        raise HapticBridgeError("this version of viser lets everybody in; nothing is served")
+        raise HapticBridgeError("this version of viser skips the check of the token")
     # viser would carry the page to a server of its own on the internet if a browser asked for it,
     # and keep files that a browser sends
     for name in ("ShareUrlRequest", "ShareUrlDisconnect", "FileTransferStartUpload"):
@@ -66,8 +65,8 @@ def stop(server: viser.ViserServer) -> None:
 def _take_values_alone(server: viser.ViserServer) -> None:
     """Lets a browser change the value of an element, and nothing else of it.
 
-    viser sets whatever attribute of its own handle a message names: ``removed`` would take the
-    button that stops a run away from everybody, ``props`` would end this process.
+    viser sets any attribute of its handle that a message names: ``removed`` would take the button
+    that stops a run off all pages, ``props`` would end this process.
     """
     kind, take = viser._messages.GuiUpdateMessage, server.gui._handle_gui_updates
 
@@ -79,10 +78,9 @@ def _take_values_alone(server: viser.ViserServer) -> None:
     server._websock_server.register_handler(kind, take_value)
 
 
-def _is_guarded(port: int, address: Address) -> bool:
-    """Knocks as a stranger would: another version of viser may have another door."""
-    host = LOOPBACK[0] if address.host in ("", "0.0.0.0") else address.host
-    knock = http.client.HTTPConnection(host, port, timeout=10.0)
+def _is_guarded(port: int) -> bool:
+    """Checks that a request with a foreign Host is refused; viser has no hook for the check."""
+    knock = http.client.HTTPConnection(HOST, port, timeout=10.0)
     try:
         knock.request("GET", "/", headers={"Host": "stranger.invalid"})
         return knock.getresponse().status == http.HTTPStatus.FORBIDDEN
@@ -94,7 +92,7 @@ def _is_guarded(port: int, address: Address) -> bool:
 
 @contextlib.contextmanager
 def _behind(address: Address) -> Iterator[None]:
-    """Puts the door before whatever is served meanwhile; viser has no place for it of its own."""
+    """Puts the check before all that is served meanwhile; viser has no hook for it."""
     module: Any = websockets.asyncio.server
     plain = module.serve
 
@@ -105,7 +103,7 @@ def _behind(address: Address) -> Iterator[None]:
 
     # viser looks the name up in its server's thread, which runs once ViserServer() returns
     module.serve = guarded
-    # refusals are no news, nor is what viser cannot read of what a browser sends
+    # neither refusals nor messages that viser cannot read are news
     for name in ("websockets.server", "asyncio"):
         logging.getLogger(name).setLevel(logging.CRITICAL)
     try:
@@ -127,8 +125,7 @@ def _door(address: Address, inner: Process | None) -> Process:
         if asyncio.iscoroutine(answer):
             answer = await answer
         if isinstance(answer, Response) and address.is_in_query(request.path):
-            cookie = f"{COOKIE}={address.token}; Path=/; HttpOnly; SameSite=Strict"
-            answer.headers["Set-Cookie"] = cookie
+            answer.headers["Set-Cookie"] = address.cookie(first["host"])
         return answer if isinstance(answer, Response) else None
 
     return ask

@@ -1,31 +1,41 @@
-"""The view as the bridge sees it: a process that is told what happens, and may ask for little."""
+"""The view as the bridge sees it: its address, and the process that shows the run."""
 
 from __future__ import annotations
 
 import contextlib
+import hmac
 import importlib.util
 import json
+import secrets
 import subprocess
 import sys
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from http.cookies import CookieError, SimpleCookie
 from pathlib import Path
 from queue import SimpleQueue
 from typing import IO, cast
+from urllib.parse import parse_qs, urlsplit
 
+from hapticbridge.arguments import Arguments
 from hapticbridge.commands import Command, command_of
 from hapticbridge.commands.command import LONGEST_LINE
 from hapticbridge.commands.execution import INTERVAL
 from hapticbridge.errors import CommandError, HapticBridgeError
 from hapticbridge.recording import Attachment
-from hapticbridge.view.address import Address
 
 BY = "view"
-"""Who gave a command of the page, as the recording says."""
+"""Source of the page's commands in the recording."""
+
+HOST = "127.0.0.1"
+"""Address on which pages are served. Other machines reach it through an SSH tunnel alone."""
 
 PATIENCE = 2.0
-"""In s: how long the process may take to end; the run is over by then, and no force is left."""
+"""Longest time in s for the process to end. The run is over by then, and no force is left."""
+
+_LOOPBACK = ("127.0.0.1", "localhost", "::1")
 
 _BOOTSTRAP = """
 import sys
@@ -35,8 +45,87 @@ run()
 """
 
 
+@dataclass(frozen=True, slots=True)
+class Address:
+    """The port of a page on this machine, and the token that admits a visitor.
+
+    Other users of the machine reach the port, too; without the token they are refused. A browser
+    also sends requests that a foreign page made it send. Those carry that page's Origin or, where
+    a name was bound anew to this machine, a foreign Host; both are refused. From another machine,
+    ``ssh -L 8080:localhost:8080 MACHINE`` leads to the page.
+
+    Attributes:
+        port: 1 to 65535, or 0 for any that is free.
+        token: Secret of the page; random unless it is given.
+
+    Raises:
+        HapticBridgeError: The port is out of range.
+    """
+
+    port: int = 8080
+    token: str = field(default_factory=lambda: secrets.token_urlsafe(24), repr=False)
+
+    def __post_init__(self) -> None:
+        Arguments(HapticBridgeError).whole("port", self.port, least=0, most=65535)
+
+    def url(self, port: int) -> str:
+        """Returns the address to open in a browser, for the port that was found free."""
+        return f"http://{HOST}:{port}/?token={self.token}"
+
+    def refusal(self, path: str, headers: Mapping[str, str]) -> str:
+        """Returns the reason why a request is refused, or an empty text.
+
+        Args:
+            path: Path of the request with its query.
+            headers: Headers of the request; names in any case.
+        """
+        lower = {name.lower(): value for name, value in headers.items()}
+        host = lower.get("host", "")
+        try:
+            name = urlsplit(f"http://{host}").hostname
+        except ValueError:
+            name = None
+        if name not in _LOOPBACK:
+            return "this is not the host of this page"
+        origin = lower.get("origin")
+        if origin is not None and origin != f"http://{host}":
+            return "a request made by another page is refused"
+        if not (self.is_in_query(path) or self._is_in_cookie(host, lower.get("cookie", ""))):
+            return "the token is missing or wrong; open the address that hapticbridge printed"
+        return ""
+
+    def is_in_query(self, path: str) -> bool:
+        """Returns whether a request's path carries the token."""
+        try:
+            shown = parse_qs(urlsplit(path).query).get("token", [""])[0]
+        except ValueError:  # not a path
+            return False
+        return _are_equal(shown, self.token)
+
+    def cookie(self, host: str) -> str:
+        """Returns the cookie that keeps the token for a page at a host and port."""
+        return f"{_cookie_name(host)}={self.token}; Path=/; HttpOnly; SameSite=Strict"
+
+    def _is_in_cookie(self, host: str, cookie: str) -> bool:
+        try:
+            jar = SimpleCookie(cookie)
+        except CookieError:
+            return False
+        name = _cookie_name(host)
+        return name in jar and _are_equal(jar[name].value, self.token)
+
+
+def _cookie_name(host: str) -> str:
+    # browsers share cookies between ports; two pages must not take each other's away
+    return f"hapticbridge_{host.rpartition(':')[2]}"
+
+
+def _are_equal(shown: str, token: str) -> bool:
+    return hmac.compare_digest(shown.encode(), token.encode())
+
+
 def check_view() -> None:
-    """Checks that a page can be served, before anything is started for it.
+    """Checks that the extra 'view' is installed.
 
     Raises:
         HapticBridgeError: The extra 'view' is not installed.
@@ -46,20 +135,19 @@ def check_view() -> None:
 
 
 class Window:
-    """Starts the process of the live view; an ``RingObserver`` of a bridge.
+    """The process of the live view; an ``RingObserver`` of a bridge.
 
-    Whatever becomes of it, the loop goes on: records are read from the ring without a word to the
-    bridge, and events leave through a thread of their own.
+    The loop never waits for it: positions and records are read from shared memory, and events leave
+    through a thread of their own.
 
     Args:
-        address: Where the page is served.
+        address: Port and token of the page.
 
     Attributes:
-        address: Likewise.
-        on_command: Called from a thread with what somebody asks for on the page; raises a
-            ``CommandError`` where it is refused, and the page then says why. Whatever else its
-            process may say is no command.
-        url: What to open in a browser, once it is shown.
+        address: Port and token of the page.
+        on_command: Called from a thread with each command of the page. It raises a
+            ``CommandError`` to refuse one, and the page then shows the reason.
+        url: Address to open in a browser, once the page is served.
 
     Raises:
         HapticBridgeError: The extra 'view' is not installed.
@@ -91,13 +179,12 @@ class Window:
             "snapshot": snapshot,
             "metadata": dict(metadata),
             "attachments": [[name, len(data)] for name, data in files.items()],
-            "host": self.address.host,
             "port": self.address.port,
             "token": self.address.token,
         }
         package = str(Path(__file__).resolve().parents[2])
         self._process = subprocess.Popen(
-            # -P: a file in the user's working folder must not stand in for a module
+            # -P: a file in the user's working folder must not replace a module
             [sys.executable, "-P", "-c", _BOOTSTRAP, package],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
@@ -116,17 +203,16 @@ class Window:
         threading.Thread(target=self._listen, daemon=True).start()
 
     def event(self, event: Mapping[str, object]) -> None:
-        """Tells the process what happened; never waits and never raises."""
+        """Sends an event to the process; never waits and never raises."""
         self._outbox.put(json.dumps(event).encode() + b"\n")
 
     def close(self) -> None:
         """Ends the process."""
         self._outbox.put(None)
         if self._process is not None:
-            # its input ends, and it tells its page so
             try:
                 self._process.wait(PATIENCE)
-            except subprocess.TimeoutExpired:  # it hangs, or was stopped: that it cannot refuse
+            except subprocess.TimeoutExpired:  # it hangs, or was stopped
                 self._process.kill()
                 self._process.wait()
             for stream in (self._process.stdin, self._process.stdout):
@@ -135,7 +221,7 @@ class Window:
 
     @property
     def process_id(self) -> int | None:
-        """Of the process; None before it is started."""
+        """Number of the process; None before it is started."""
         return None if self._process is None else self._process.pid
 
     def _listen(self) -> None:
@@ -144,7 +230,7 @@ class Window:
         with contextlib.suppress(OSError, ValueError):
             while line := stream.readline(LONGEST_LINE + 1):
                 if not line.endswith(b"\n"):
-                    return  # longer than any command: this is not our page's process any more
+                    return  # longer than any command: not the process that was started
                 try:
                     command = command_of(line)
                     if self.on_command is not None:

@@ -28,8 +28,7 @@ from hapticbridge.errors import DeviceError, DeviceLost
 from hapticbridge.guard import Limits
 from hapticbridge.recording.ring import HEAD, TAIL
 from hapticbridge.theory.sampled_loop import WorstHand
-from hapticbridge.view.address import Address
-from hapticbridge.view.window import Window
+from hapticbridge.view.window import Address, Window
 
 PUSHER = """<mujoco><compiler angle="radian"/>
 <option timestep="0.001" integrator="discrete" gravity="0 0 0" cone="elliptic"/>
@@ -398,7 +397,7 @@ def _watched(how: int) -> Callable[[Rig], None]:
         def around(stack: ExitStack) -> None:
             stack.enter_context(patch("hapticbridge.view.window.check_view"))
             stack.enter_context(patch("hapticbridge.view.window._BOOTSTRAP", _SPECTATOR))
-            rig.options["onlooker"] = window = Window(Address("127.0.0.1", 0))
+            rig.options["onlooker"] = window = Window(Address(0))
 
             def act(bridge: Bridge, tick: int) -> None:
                 if tick == CAUSE:

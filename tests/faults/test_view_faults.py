@@ -22,8 +22,7 @@ from hapticbridge.bridge import Bridge
 from hapticbridge.clock import SimulatedClock
 from hapticbridge.record import TICK_DTYPE
 from hapticbridge.recording import read_recording
-from hapticbridge.view.address import Address
-from hapticbridge.view.window import Window
+from hapticbridge.view.window import Address, Window
 
 pytest.importorskip("viser", reason="needs the extra 'view'")
 
@@ -74,7 +73,7 @@ def shouted_at(window: Window, stack: contextlib.ExitStack) -> None:
 def run(folder: Path, name: str, deed: Deed | None) -> tuple[Path, Any, float]:
     scene, path = folder / "floor.xml", folder / f"{name}.mcap"
     scene.write_text(FLOOR)
-    window = None if deed is None else Window(Address("127.0.0.1", 0))
+    window = None if deed is None else Window(Address(0))
     with contextlib.ExitStack() as stack:
 
         def disturb(tick: int) -> None:
@@ -118,7 +117,7 @@ def test_a_page_that_stands_still_holds_nobody_up_at_the_end(tmp_path: Path) -> 
 def test_a_page_that_slept_goes_on_with_the_run(tmp_path: Path) -> None:
     scene, path = tmp_path / "floor.xml", tmp_path / "run.mcap"
     scene.write_text(FLOOR)
-    window = Window(Address("127.0.0.1", 0))
+    window = Window(Address(0))
     told: list[str] = []
 
     def disturb(_: Bridge, tick: int) -> None:
