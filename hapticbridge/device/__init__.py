@@ -1,11 +1,11 @@
 """Haptic devices: real, simulated and replayed, behind one protocol.
 
-Read ``base`` (four calls) and ``data_sheet`` (what is known of a device) first, then ``simulated``
-and ``trajectory``, which need no hardware, then a real driver; ``rawhid`` is the plainest. Real
-ones stand on ``transport``, which carries their bytes and finds them. ``families`` lists them,
-``plugged`` says what of them is there; ``library`` opens one by its ``specification`` and fills in
-its sheet from a ``profile`` (``profile_search``). What all share is in ``lateness``, ``silence``
-and ``last_word``.
+Read ``base`` (four calls) and ``data_sheet`` (a device's properties) first, then ``simulated`` and
+``trajectory``, which need no hardware. ``rawhid`` is the simplest real driver. Real drivers use
+``transport``, which finds devices and carries their bytes. ``families`` lists the drivers and
+``plugged`` the connected devices. ``library`` opens a device by its ``specification`` and completes
+its sheet from a ``profile`` (``profile_search``). ``lateness``, ``silence`` and ``last_word`` are
+shared by all.
 """
 
 from hapticbridge.device.base import Device as Device

@@ -1,4 +1,4 @@
-"""All hardware that there is a codec for: what is supported, what is plugged in, and its rules."""
+"""Supported hardware, connected devices and udev rules."""
 
 from __future__ import annotations
 
@@ -14,25 +14,25 @@ from hapticbridge.device.spacemouse.driver import FAMILY as SPACEMOUSE
 from hapticbridge.device.transport import hid_search, usb_search
 
 FAMILIES: tuple[Family, ...] = (FALCON, SPACEMOUSE, RAWHID, PID, HAPLY, FORCE_DIMENSION)
-"""In the order in which they are listed."""
+"""All drivers of real hardware, in the order in which they are listed."""
 
 RULES_FILE = "/etc/udev/rules.d/70-hapticbridge.rules"
-"""Where the rules go. The number must be below 73: ``73-seat-late.rules`` is what turns the tag
+"""Path of the udev rules. The number must be below 73: ``73-seat-late.rules`` turns the tag
 ``uaccess`` into a permission, and rules are read in the order of their names."""
 
 
 def family_named(name: str) -> Family | None:
-    """Returns the family that ``open_device`` knows by a name, or None."""
+    """Returns the family with a name of ``open_device``, or None."""
     return next((family for family in FAMILIES if family.name == name), None)
 
 
 def plugged_devices() -> list[Plugged]:
-    """Lists every device of every family that is plugged in; empty where there is no USB."""
+    """Lists every connected device of every family; empty without USB."""
     return [device for family in FAMILIES for device in plugged_of(family)]
 
 
 def plugged_of(family: Family) -> list[Plugged]:
-    """Lists a family's devices that are plugged in, with what keeps each from being opened."""
+    """Lists a family's connected devices, with the reason if one cannot be opened."""
     if family.find is not None:
         return family.find()
     if family.transport == "hid":
@@ -41,7 +41,7 @@ def plugged_of(family: Family) -> list[Plugged]:
 
 
 def blind_spots() -> list[str]:
-    """Says what keeps devices from being seen at all, one sentence each; empty where nothing."""
+    """Returns the reasons why devices cannot be detected at all, one sentence each."""
     spots = []
     if hid_search.hid_api() is None:
         spots.append("hidapi cannot be loaded, so HID devices are not seen: 'pip install hidapi'")
@@ -53,14 +53,14 @@ def blind_spots() -> list[str]:
 
 
 def udev_rules(families: Sequence[Family] = FAMILIES) -> str:
-    """Returns the udev rules that let whoever sits at the machine open these devices.
+    """Returns the udev rules that let a local user open these devices.
 
-    A HID device is matched by its kernel name, ``BUS:VENDOR:PRODUCT.NUMBER``, which it has over
-    Bluetooth too, where there is no USB parent to look at. A rule cannot ask a device what it can
-    do, so a family that is a class gets a rule for each of its devices that is plugged in.
+    A HID device is matched by its kernel name, ``BUS:VENDOR:PRODUCT.NUMBER``. It exists over
+    Bluetooth too, where there is no USB parent. A rule cannot read a device's capabilities, so a
+    family that is a device class gets one rule per connected device.
     """
     lines = [
-        "# Lets whoever sits at the machine open haptic devices. Written by",
+        "# Lets a local user of the machine open haptic devices. Written by",
         "# 'hapticbridge devices --udev-rules'. Its number must stay below 73: 73-seat-late.rules",
         "# turns the tag into a permission. To install it:",
         f"#   hapticbridge devices --udev-rules | sudo tee {RULES_FILE}",
@@ -68,11 +68,11 @@ def udev_rules(families: Sequence[Family] = FAMILIES) -> str:
     ]
     for family in families:
         if not family.ids and family.recognises is None:
-            continue  # no node to open: a program of the maker's has it
+            continue  # the maker's program opens the device, so there is no node to open
         lines += ["", f"# {family.name}: {family.about}"]
         ids = family.ids if family.recognises is None else _ids_plugged_in(family)
         if not ids:
-            lines.append("# none is plugged in: plug it in, and write these rules again")
+            lines.append("# none is connected: plug it in, and write these rules again")
         for usb_id in ids:
             vendor, product = f"{usb_id.vendor:04x}", f"{usb_id.product:04x}"
             if family.transport == "hid":
@@ -88,6 +88,6 @@ def udev_rules(families: Sequence[Family] = FAMILIES) -> str:
 
 
 def _ids_plugged_in(family: Family) -> tuple[UsbId, ...]:
-    """Returns the products of a family that are plugged in, each once."""
+    """Returns the connected products of a family, each once."""
     found = {(one.vendor, one.product): one.name for one in plugged_of(family)}
     return tuple(UsbId(*numbers, name) for numbers, name in sorted(found.items()))
