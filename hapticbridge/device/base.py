@@ -1,4 +1,4 @@
-"""What a haptic device is to the bridge: a protocol of four calls."""
+"""Protocol of a haptic device: four calls."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from hapticbridge.device.data_sheet import DeviceInfo
 
 
 class Device(Protocol):
-    """Where the handle's motion comes from and where the wrench goes.
+    """Source of the handle's motion and sink of the wrench.
 
-    The loop calls ``start`` once, then in each tick ``read`` and later ``write``; ``close`` ends.
-    The sample of tick k is the state at the time k · period. A wrench written in tick k acts from
-    then on until the next write.
+    The loop calls ``start`` once, then ``read`` and later ``write`` in each tick, and finally
+    ``close``. The sample of tick k is the state at time k · period. A wrench written in tick k acts
+    until the next write.
 
     Attributes:
         info: The device's data sheet, complete before ``start``.
@@ -24,7 +24,7 @@ class Device(Protocol):
     info: DeviceInfo
 
     def start(self, period: float) -> NDArray[np.void]:
-        """Brings the device to its initial state, from which two runs are identical.
+        """Brings the device to its initial state, from which runs are reproducible.
 
         Args:
             period: The loop's period in s, finite and > 0.
@@ -37,17 +37,16 @@ class Device(Protocol):
         """
 
     def read(self, sample: NDArray[np.void]) -> int:
-        """Fills in the newest sample.
+        """Writes the newest sample.
 
         Args:
-            sample: Shape (1,), ``SAMPLE_DTYPE``, filled in place.
+            sample: Output, shape (1,), ``SAMPLE_DTYPE``.
 
         Returns:
-            0 where the sample is new, ``TickFlag.STALE_SAMPLE`` where the device had nothing new
-            since the last read and the sample repeats it.
+            0 for a new sample; ``TickFlag.STALE_SAMPLE`` if the sample repeats the last one.
 
         Raises:
-            DeviceLost: It is gone, or has been silent too long.
+            DeviceLost: The device is gone, or silent for too long.
         """
 
     def write(self, wrench: NDArray[np.float64]) -> None:
@@ -55,10 +54,10 @@ class Device(Protocol):
 
         Args:
             wrench: Shape (6,): force in N, torque in N m, on the device, in the device's frame.
-                What it has no axis for it leaves out.
+                Components without an axis are ignored.
 
         Raises:
-            DeviceLost: It is gone.
+            DeviceLost: The device is gone.
         """
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""Table of the hardware drivers. A driver is imported when one of its devices is asked for."""
+"""Table of the hardware drivers. A driver is imported when one of its devices is opened."""
 
 from __future__ import annotations
 

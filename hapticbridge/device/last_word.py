@@ -1,11 +1,4 @@
-"""A process of its own that says zero to a device when the bridge can no longer.
-
-A bridge that is killed (SIGKILL), or whose interpreter crashes, runs no line of its own any more. A
-child that holds a second handle to the same device node sees its end of a pipe close, or that it
-has another parent, and then writes the reports it was given. It is possible where two processes may
-hold one device: hidraw. USB interfaces belong to the one that claimed them; there the device's own
-watchdog is all there is.
-"""
+"""Guardian process that writes a zero-force report if the bridge process dies."""
 
 from __future__ import annotations
 
@@ -33,26 +26,31 @@ if not is_told or not os.read(0, 1):
                 pass
         time.sleep(0.002)
 """
-# three times, because a report of the dead bridge may still be on its way behind the first
+# three times, because a report of the dead bridge may still follow the first one
 
 POLL = 0.01
-"""In s: how often the child looks whether the bridge is still its parent. The end of the pipe comes
-at once, but not where a process that the bridge forked holds the pipe open after it; then the force
-stays for so long. Each look takes some microseconds, on another core."""
+"""Time in s between checks that the bridge is still the child's parent. A closed pipe is detected
+at once, unless a process forked by the bridge holds it open; the force then lasts for this time.
+Each check takes some microseconds on another core."""
 
 PATIENCE = 5.0
-"""In s: how long the child may take to end; it needs a millisecond."""
+"""Longest time in s for the child to end; it needs about a millisecond."""
 
 
 class LastWord:
-    """Holds reports that are written to a device node if this process ends without ``close``.
+    """Child process that writes reports to a device node if this process ends without ``close``.
+
+    A bridge that is killed (SIGKILL) or crashes runs no code of its own any more. The child holds a
+    second handle to the device node. It detects the closed pipe or a new parent, and then writes
+    the reports. This requires a node that two processes can hold, such as hidraw. A USB interface
+    belongs to one process; there the device's own watchdog is the only protection.
 
     Args:
         path: The device node; opened once more, for writing.
-        reports: What is written, each with its number first.
+        reports: Reports to write, each starting with its number.
 
     Raises:
-        OSError: The node cannot be opened again, or no process started.
+        OSError: The node cannot be opened again, or no process can be started.
     """
 
     def __init__(self, path: str, *reports: bytes) -> None:
@@ -64,15 +62,15 @@ class LastWord:
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 pass_fds=(node,),
-                start_new_session=True,  # Ctrl-C ends the bridge, which then says close
+                start_new_session=True,  # Ctrl-C ends the bridge, which then calls close
                 bufsize=0,
             )
         finally:
             os.close(node)
-        cast(IO[bytes], self._process.stdout).read(1)  # from here on it heeds the pipe
+        cast(IO[bytes], self._process.stdout).read(1)  # the child now watches the pipe
 
     def close(self) -> None:
-        """Tells the child that nothing needs to be said; may be called more than once."""
+        """Ends the child without writing the reports; may be called more than once."""
         process = self._process
         if process.stdin is None or process.stdin.closed:
             return
@@ -86,13 +84,13 @@ class LastWord:
 
 
 def last_word_at(path: str, *reports: bytes) -> LastWord | None:
-    """Returns a ``LastWord`` where two processes may hold the node; None elsewhere.
+    """Returns a ``LastWord`` if two processes can hold the node; otherwise None.
 
-    The device's own watchdog is there in any case, or its effects end by themselves.
+    Without it, the device's own watchdog or the limited duration of its effects ends the force.
 
     Args:
         path: The device node.
-        reports: What takes the force away, each with its number first.
+        reports: Reports that end the force, each starting with its number.
     """
     if not path.startswith("/dev/hidraw"):
         return None

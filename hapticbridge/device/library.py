@@ -1,4 +1,4 @@
-"""Devices by name, as the command line and scripts ask for them."""
+"""Devices by name, for the command line and scripts."""
 
 from __future__ import annotations
 
@@ -29,37 +29,37 @@ _LIMITS = ("force_limit", "torque_limit", "speed_limit")
 
 
 def open_device(spec: str, *, tell: Tell = tell_nobody, **options: object) -> Device:
-    """Opens a device by what a user would type.
+    """Opens a device by its specification.
 
-    Specifications are a name, or a name, a colon and what the device needs to know:
+    A specification is a name, or a name, a colon and details of the device:
 
     - ``simulated``, ``simulated:damping=5,friction=0.1``: a ``SimulatedDevice`` with these
       parameters, numbers in SI units. ``hand_mass``, ``hand_damping``, ``hand_stiffness``,
       ``hand_rotational_inertia``, ``hand_rotational_damping`` and ``hand_rotational_stiffness``
-      change its hand, ``hand=none`` lets it go. ``path=FILE`` comes last: all after it is the
-      file's name.
+      change its hand, ``hand=none`` removes it. ``path=FILE`` must be last: all text after it is
+      the file's name.
     - ``trajectory:FILE``: follows a CSV file (``read_motion``) or repeats the device motion of a
-      recording. All after the colon is the file's name, commas and colons too.
-    - a device that is plugged in, by its family's name (``hapticbridge devices`` lists them), with
-      options that the family has: ``spacemouse:speed=0.1,turn=1,dead_band=0.05``,
+      recording. All text after the colon is the file's name, with commas and colons.
+    - a connected device, by the name of its family (``hapticbridge devices`` lists them), with
+      options of that family: ``spacemouse:speed=0.1,turn=1,dead_band=0.05``,
       ``rawhid:serial=12345,damping=2``, ``falcon:firmware=FILE``, ``pid:newtons=4,travel=0.08``,
-      ``haply:serial=049D``, ``forcedimension:library=FILE``. ``serial`` picks one of several,
-      ``log=FILE`` keeps what went over the wire. What its driver does not know comes from the
-      profile of the unit or its kind, or from that of ``profile=NAME`` (or a file, or ``none``).
+      ``haply:serial=049D``, ``forcedimension:library=FILE``. ``serial`` selects one of several,
+      ``log=FILE`` records the transferred bytes. Numbers unknown to the driver come from the
+      profile of the unit or its model, or from ``profile=NAME`` (or a file, or ``none``).
 
     Args:
         spec: The specification.
-        tell: Takes sentences for the user while the device is opened: what to do, how far it is.
-        **options: The same parameters from code. What the specification says goes first; a
+        tell: Receives messages for the user while the device is opened: instructions and progress.
+        **options: The parameters as keyword arguments; the specification takes precedence. A
             trajectory takes ``force_limit`` (N), ``torque_limit`` (N m) and ``speed_limit`` (m/s).
 
     Returns:
-        The device, not yet started. A real one is claimed, so that a missing one is refused at
+        The device, not yet started. A real device is claimed, so that a missing one is refused at
         once.
 
     Raises:
         DeviceError: The name, an option or a value is not valid, the file is not a motion, or the
-            device is not plugged in or may not be opened.
+            device is not connected or cannot be opened.
         RecordingError: The file is a recording that cannot be read.
     """
     name, _, rest = spec.partition(":")
@@ -77,7 +77,7 @@ def open_device(spec: str, *, tell: Tell = tell_nobody, **options: object) -> De
                 model = device.info.name
                 chosen = profile_of(name, device.info.serial, model)
                 if chosen is None and (models := modelled(name)):
-                    tell(f"there is no profile of '{model}'; there are {choices(models)}")
+                    tell(f"no profile of '{model}' exists; profiles: {choices(models)}")
             if chosen is not None:
                 device.info = chosen.fill(device.info)
         except BaseException:
@@ -86,24 +86,24 @@ def open_device(spec: str, *, tell: Tell = tell_nobody, **options: object) -> De
         return device
     if name not in _OPENERS:
         names = choices([*_OPENERS, *DRIVERS])
-        raise DeviceError(f"unknown device '{name}'; there are {names}")
+        raise DeviceError(f"unknown device '{name}'; choose one of {names}")
     return _OPENERS[name](rest, options)
 
 
 def device_for(scene: Scene, spec: str, tell: Tell = tell_nobody) -> Device:
-    """Opens a device for a scene; the simulated one does what the scene is there for.
+    """Opens a device for a scene; a simulated device takes its hand and its path from the scene.
 
-    Its hand is the one that the scene asks for (``scene_hand``) and follows ``NAME.csv`` beside the
-    scene, if there is one. Every option in the specification goes before what the scene says.
+    The hand is the scene's (``scene_hand``) and follows ``NAME.csv`` beside the scene, if present.
+    Every option in the specification takes precedence over the scene.
 
     Args:
         scene: The scene that the device will move in.
-        spec: What ``open_device`` understands.
-        tell: Takes sentences for the user, likewise.
+        spec: A specification for ``open_device``.
+        tell: Receives messages for the user.
 
     Raises:
-        DeviceError: See ``open_device``.
-        SceneError: The scene asks for a hand that cannot be.
+        DeviceError: As for ``open_device``.
+        SceneError: The scene specifies an impossible hand.
     """
     name, _, rest = spec.partition(":")
     if name != "simulated":
@@ -146,15 +146,17 @@ def _open_trajectory(rest: str, options: Mapping[str, object]) -> Device:
     path = Path(rest)
     if not _is_recording(path):
         return TrajectoryDevice(read_motion(path), **limits)
-    # devices stand left of recordings and know nothing of files' formats; only whoever asks for a
-    # recording by name needs the reader
+    # imported here, because the package device must not depend on recordings; only the replay of a
+    # recording needs the reader
     from hapticbridge.recording import read_recording  # noqa: PLC0415
 
     recording = read_recording(path)
     try:
         period = float(recording.meta["period_s"])
     except (KeyError, ValueError):
-        raise DeviceError(f"{path}: the recording does not say its period (period_s)") from None
+        raise DeviceError(
+            f"{path}: the recording lacks its period (period_s), so it cannot be replayed"
+        ) from None
     return ReplayDevice(recording.ticks, period, name=str(path), **limits)
 
 
@@ -165,7 +167,7 @@ _OPENERS: dict[str, Callable[[str, Mapping[str, object]], Device]] = {
 
 
 def _is_recording(path: Path) -> bool:
-    """Tells a recording by its first bytes; by its name if it is too short for them."""
+    """Recognises a recording by its first bytes, or by its suffix."""
     if path.suffix == ".mcap":
         return True
     try:
@@ -174,4 +176,4 @@ def _is_recording(path: Path) -> bool:
         with path.open("rb") as file:
             return file.read(len(_MCAP_MAGIC)) == _MCAP_MAGIC
     except (OSError, ValueError):
-        return False  # whoever reads it as a motion says why it cannot be
+        return False  # reading it as a motion then reports the reason

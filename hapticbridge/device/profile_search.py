@@ -1,8 +1,4 @@
-"""Which profile is whose: shipped ones, and the user's own before them.
-
-Shipped profiles lie beside this module in ``profiles/``; a user's own, which ``identify`` writes,
-in the platform's configuration folder.
-"""
+"""Search of profiles: the user's own take precedence over shipped ones."""
 
 from __future__ import annotations
 
@@ -17,12 +13,15 @@ SHIPPED = Path(__file__).parent / "profiles"
 
 
 def own_folder() -> Path:
-    """Returns the folder of the user's own profiles; it need not exist."""
+    """Returns the folder of the user's own profiles, which may not exist.
+
+    It is in the platform's configuration folder; ``identify`` writes profiles there.
+    """
     return Path(platformdirs.user_config_dir("hapticbridge", appauthor=False)) / "devices"
 
 
 def profiles() -> dict[str, Path]:
-    """Returns all profiles by name, the user's own in the place of shipped ones."""
+    """Returns all profiles by name; the user's own replace shipped ones of equal name."""
     found = {path.stem: path for path in sorted(SHIPPED.glob("*.toml"))}
     found |= {path.stem: path for path in sorted(own_folder().glob("*.toml"))}
     return found
@@ -32,26 +31,28 @@ def profile_named(name: str) -> Profile:
     """Returns a profile by name, or from a file.
 
     Raises:
-        DeviceError: There is none of that name, or it is not valid.
+        DeviceError: No profile has that name, or it is not valid.
     """
     known = profiles()
     if name in known:
         return read_profile(known[name])
     if name.endswith(".toml"):
         return read_profile(Path(name))
-    raise DeviceError(f"unknown profile '{name}'; there are {choices(known)}, or a .toml file")
+    raise DeviceError(
+        f"unknown profile '{name}'; choose one of {choices(known)}, or name a .toml file"
+    )
 
 
 def profile_of(device: str, serial: str = "", model: str = "") -> Profile | None:
-    """Returns the profile of a unit, else that of its model, else that of its driver, else None.
+    """Returns the profile of a unit, else of its driver or model, else None.
 
-    A user's ``DEVICE-SERIAL.toml`` goes before ``DEVICE.toml``, which goes before the shipped one
-    that names the model; a file of the user's with its name goes in its place.
+    The order is the user's ``DEVICE-SERIAL.toml``, then ``DEVICE.toml``, then the shipped profile
+    that names the model. A user's file with the name of a shipped profile replaces it.
 
     Args:
         device: Name of the driver.
-        serial: Of the unit; may be empty.
-        model: What the driver calls it; empty: only a profile for all models of the driver.
+        serial: Serial number of the unit; may be empty.
+        model: Model as named by the driver; empty: only a profile for all models of the driver.
 
     Raises:
         DeviceError: The file is not valid.
@@ -65,7 +66,7 @@ def profile_of(device: str, serial: str = "", model: str = "") -> Profile | None
 
 
 def modelled(device: str) -> tuple[str, ...]:
-    """Returns the models of a driver that there are profiles for.
+    """Returns the models of a driver that have profiles.
 
     Raises:
         DeviceError: A file is not valid.
@@ -74,7 +75,7 @@ def modelled(device: str) -> tuple[str, ...]:
 
 
 def _by_model(device: str) -> list[Profile]:
-    # only names that are shipped: a broken file of the user's for another device is not read here
+    # only shipped names, so that a user's broken file for another device is not read here
     known = profiles()
     found = [read_profile(known[path.stem]) for path in sorted(SHIPPED.glob("*.toml"))]
     return [profile for profile in found if profile.device == device and profile.models]

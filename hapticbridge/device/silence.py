@@ -1,30 +1,31 @@
-"""How long device and program may hear nothing of each other before either takes it for the end."""
+"""Watchdog timeouts between host and device."""
 
 from __future__ import annotations
 
 SILENCE = 0.05
-"""In s: fifty samples at 1 kHz. Shorter would take an ordinary kernel's stalls for a lost device,
-longer would leave the last force on the motors for longer."""
+"""Time without a new sample after which a device counts as lost, in s: fifty samples at 1 kHz. At a
+shorter time, stalls of an ordinary kernel would look like a lost device. At a longer one, the last
+force would stay on the motors for longer."""
 
 
 SHORTEST_WATCHDOG, WATCHDOG_PERIODS = 0.02, 10
-"""The watchdog asked for is ten periods of the loop, but not less than 20 ms: an ordinary kernel
-stalls a loop for some ms now and then, and a force that drops out each time would rattle."""
+"""Shortest watchdog of a device in s, and watchdog in periods of the loop; the longer time is
+requested. An ordinary kernel stalls a loop for some ms now and then. A force that drops out each
+time would rattle."""
 
 
 class SilenceWatch:
-    """Tells a device that has fallen silent from a loop that was away.
+    """Detector of a silent device that ignores pauses of the loop.
 
-    A device is silent once it has given nothing new for ``SILENCE``, asked all the while. Where the
-    loop itself has not read for so much longer than its period, nobody asked: the count begins
-    anew.
+    A device is silent if it sends nothing new for ``SILENCE`` although it is read. If the loop
+    itself pauses for longer than its period plus ``SILENCE``, the count restarts.
 
     Args:
         now: Time in s on the link's clock, at the device's first sample.
-        period: The loop's in s; 0 where it is far below ``SILENCE``.
+        period: The loop's period in s; 0 if it is far below ``SILENCE``.
 
     Attributes:
-        silence: Time in s since the device gave something new.
+        silence: Time in s since the last new sample.
     """
 
     def __init__(self, now: float, period: float = 0.0) -> None:
@@ -33,11 +34,11 @@ class SilenceWatch:
         self.silence = 0.0
 
     def is_silent(self, now: float, *, is_new: bool) -> bool:
-        """Notes a reading; returns whether the device has been silent for too long.
+        """Records a reading; returns whether the device has been silent for too long.
 
         Args:
-            now: Time in s on the same clock.
-            is_new: Whether this reading brought something new.
+            now: Time in s on the link's clock.
+            is_new: True if this reading brought a new sample.
         """
         was_away = self.was_away(now)
         self._read = now
@@ -47,21 +48,21 @@ class SilenceWatch:
         return self.silence > SILENCE
 
     def was_away(self, now: float) -> bool:
-        """Returns whether the loop has not read for so long that nobody asked the device.
+        """Returns whether the loop has paused without reading the device.
 
-        What a device that answers questions has said since is then as old as the last question: a
-        loop that goes by it finds the hand where it was, and two ticks later somewhere else.
+        A device that replies to requests then holds an answer as old as its last request. Used by
+        the loop, it would place the hand at its old position, and elsewhere two ticks later.
 
         Args:
-            now: Time in s on the same clock, before the reading is noted.
+            now: Time in s on the link's clock, before ``is_silent`` records the reading.
         """
         return now - self._read > SILENCE + self._period
 
 
 def watchdog_time(period: float) -> float:
-    """Returns for how long in s a device should go on with a force that is not renewed.
+    """Returns the time in s for which a device should hold a force that is not renewed.
 
     Args:
-        period: The loop's in s.
+        period: The loop's period in s.
     """
     return max(SHORTEST_WATCHDOG, WATCHDOG_PERIODS * period)

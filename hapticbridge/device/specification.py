@@ -1,4 +1,4 @@
-"""``name=value,name=value``: what a user types after a device's name and a colon."""
+"""Options of a device specification: ``name=value,name=value``."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from hapticbridge.errors import DeviceError, choices
 
 FILES = ("path",)
-"""Options that take all that comes after them: the file's name, commas too."""
+"""Options that take all remaining text as a file's name, commas included."""
 
 TEXTS = ("hand", "serial", "firmware", "log", "profile", "reverse", "service", "library")
 """Options that are text up to the next comma; a serial number may have leading zeros."""
@@ -17,7 +17,7 @@ WHOLE = ("delay",)
 
 
 def parsed(device: str, text: str, valid: Iterable[str]) -> dict[str, object]:
-    """Reads what stands after a device's name.
+    """Parses the options after a device's name.
 
     Args:
         device: The name.
@@ -25,8 +25,8 @@ def parsed(device: str, text: str, valid: Iterable[str]) -> dict[str, object]:
         valid: Options that the device has.
 
     Raises:
-        DeviceError: A part is no ``name=value``, a name is there twice or unknown, or a value is no
-            number.
+        DeviceError: A part is not ``name=value``, a name occurs twice or is unknown, or a value is
+            not a number.
     """
     names = tuple(valid)
     values: dict[str, object] = {}
@@ -34,9 +34,9 @@ def parsed(device: str, text: str, valid: Iterable[str]) -> dict[str, object]:
         name, equals, text = text.partition("=")
         name = name.strip()
         if not equals:
-            raise DeviceError(f"'{name}' is no option; options are written name=value")
+            raise DeviceError(f"'{name}' is not an option; write options as name=value")
         if name in values:
-            raise DeviceError(f"{name} is there twice")
+            raise DeviceError(f"option '{name}' is set twice; set it once")
         refuse_unknown(device, [name], names)
         if name in FILES:
             value, text = text, ""
@@ -57,14 +57,14 @@ def _value(name: str, text: str) -> object:
 
 
 def refuse_unknown(device: str, options: Iterable[str], valid: Iterable[str]) -> None:
-    """Refuses an option that a device does not have, by its name.
+    """Refuses an option that a device does not have.
 
     Raises:
-        DeviceError: Names the first one, and those that there are.
+        DeviceError: Names the first unknown option, and the valid ones.
     """
     names = tuple(valid)
     unknown = [name for name in options if name not in names]
     if unknown:
         raise DeviceError(
-            f"unknown option '{unknown[0]}' of the {device} device; there are {choices(names)}"
+            f"unknown option '{unknown[0]}' of the {device} device; choose one of {choices(names)}"
         )

@@ -1,17 +1,4 @@
-"""How a Falcon is brought to speak: its serial bridge, its loader, and one question at a time.
-
-The Falcon is a signal processor behind an FTDI serial bridge. Without power it forgets its program,
-so the host sends it: at 9600 baud the loader is greeted, at 140000 baud it takes the program in
-pieces and sends each back, which is all the check there is; then both go to 1.5 Mbaud and packets
-(``packets``). The program is the maker's and is not shipped here.
-
-Requests of the bridge, all without data (FTDI's names and numbers): 0 reset (value 1 empties what
-came from the device, 2 what goes to it), 1 modem lines, 2 flow control, 3 baud rate, 4 data format,
-6 event character, 9 latency timer in ms.
-
-References:
-    libnifalcon's source (2019) for the sequence. No device has been asked.
-"""
+"""Boot protocol of a Falcon: serial bridge and loader."""
 
 from __future__ import annotations
 
@@ -29,24 +16,26 @@ READ_FROM, WRITE_TO = 0x81, 0x02
 """Addresses of its bulk endpoints."""
 
 LARGEST_FIRMWARE = 65536
-"""In bytes. The four images known have 7324 to 8492; a larger file is another file."""
+"""Largest firmware file in bytes. The four known images have 7324 to 8492 bytes; a larger file is
+not firmware."""
 
 CHUNK = 62
-"""Bytes of the program per piece: what fits beside the status bytes into one packet back."""
+"""Bytes of firmware per piece. The returned piece fits into one packet together with the status
+bytes."""
 
 GREETINGS = 100
-"""How often the loader is greeted, as libnifalcon does, before it is given up: 10 s in all."""
+"""Number of greetings to the loader, as in libnifalcon, before the boot fails: 10 s in all."""
 
 ANSWER_TIME = 0.1
-"""In s: how long one answer is waited for. The slowest, a piece of the program at 140000 baud, is
-on the line for 9 ms, there and back, and in the bridge for up to 16."""
+"""Longest wait for one answer of the loader in s. The slowest answer, a piece of firmware at 140000
+baud, takes 9 ms on the line in both directions and up to 16 ms in the bridge."""
 
 PROBES = 20
-"""Packets that a Falcon is asked with before it counts as not speaking: the first ones after a
-change of baud rate may be lost."""
+"""Number of packets without a reply after which a Falcon counts as not running. The first packets
+after a change of baud rate may be lost."""
 
 PROBE_TIME = 0.02
-"""In s: how long each of them is waited for; a reply is there within 1.3 ms."""
+"""Longest wait for the reply to a probe in s; a reply takes up to 1.3 ms."""
 
 _RESET, _MODEM, _FLOW, _BAUD, _FORMAT, _EVENT, _LATENCY = 0, 1, 2, 3, 4, 6, 9
 _EMPTY_INPUT, _EMPTY_OUTPUT = 1, 2
@@ -54,37 +43,42 @@ _DTR_LOW, _DTR_HIGH, _RTS_LOW = 0x0100, 0x0101, 0x0200
 _BAUD_GREETING, _BAUD_LOADING, _BAUD_RUNNING = 0x4138, 0x0015, 0x0002
 _HELLO, _HELLO_ANSWER, _LOAD = b"\x0aC\x0d", b"\x0aD,\x0d", b"A"
 _EVENT_AT_END = 0x0100 | ord(">")
-_WRITE_MS = 100  # outside the loop a write may take its time
+_WRITE_MS = 100  # writes outside the loop are not urgent
 _NO_MOTORS = np.zeros(3, np.int64)
 
 
 class Link(Protocol):
-    """What the codec needs of a USB link; ``UsbLink`` is the real one."""
+    """USB link of a Falcon; ``UsbLink`` is the real one."""
 
     def now(self) -> float:
-        """Returns the time in s of a clock that only grows."""
+        """Returns the time of a monotonic clock in s."""
 
     def control(self, request: int, value: int) -> None:
-        """Sends a vendor's request without data."""
+        """Sends a vendor request without data.
+
+        The serial bridge is an FTDI chip. Its requests have FTDI's names and numbers: 0 reset
+        (value 1 clears the data from the device, 2 the data to it), 1 modem lines, 2 flow control,
+        3 baud rate, 4 data format, 6 event character, 9 latency timer in ms.
+        """
 
     def write(self, packet: array.array[int], timeout_ms: int = ...) -> bool:
-        """Sends a packet; returns False where the device did not take it in time."""
+        """Sends a packet; returns False if the device did not accept it in time."""
 
     def take(self) -> list[bytes]:
-        """Returns the packets that came since the last call, without waiting."""
+        """Returns the packets received since the last call, without waiting."""
 
     def wait(self, timeout: float) -> None:
-        """Returns as soon as a packet is there, at the latest after ``timeout`` s."""
+        """Returns as soon as a packet is available, at the latest after ``timeout`` s."""
 
     def close(self) -> None:
-        """Lets the device go."""
+        """Releases the device."""
 
 
 def read_firmware(path: str) -> bytes:
-    """Reads a program for the Falcon.
+    """Reads a firmware file for the Falcon. The firmware belongs to the maker and is not shipped.
 
     Raises:
-        DeviceError: There is no such file, it cannot be read, or it cannot be one.
+        DeviceError: The file does not exist, cannot be read, or has an impossible size.
     """
     try:
         image = Path(path).read_bytes()
@@ -100,10 +94,10 @@ def read_firmware(path: str) -> bytes:
 
 
 def enter_run_mode(link: Link) -> None:
-    """Sets the bridge to packets: 1.5 Mbaud, and the shortest wait before it passes a reply on.
+    """Sets the bridge to packets at 1.5 Mbaud with the shortest latency.
 
-    That wait, the latency timer, is 1 ms. The event character asks the bridge to pass on at once
-    what ends with '>'; whether a Falcon's bridge heeds it is measured, not assumed.
+    The latency timer is set to 1 ms. The event character requests immediate delivery of data that
+    ends with '>'. Whether a Falcon's bridge obeys it is measured (``measured_timing``).
     """
     link.control(_LATENCY, 1)
     link.control(_BAUD, _BAUD_RUNNING)
@@ -113,7 +107,7 @@ def enter_run_mode(link: Link) -> None:
 
 
 def send_question(link: Link, flags: int = 0) -> None:
-    """Sends a packet without force, and waits for nothing; ``flags`` are ``Request`` bits."""
+    """Sends a packet without force and returns at once; ``flags`` are ``Request`` bits."""
     packet = array.array("B", bytes(SIZE))
     encode(_NO_MOTORS, flags, np.frombuffer(packet, np.uint8))
     link.write(packet, _WRITE_MS)
@@ -123,24 +117,24 @@ def ask(link: Link, stream: ReplyStream, flags: int, timeout: float) -> bool:
     """Sends a packet without force and waits for the reply.
 
     Args:
-        link: To the Falcon, in run mode.
-        stream: Takes the reply.
+        link: Link to the Falcon, in run mode.
+        stream: Receives the reply.
         flags: ``Request`` bits.
         timeout: Longest wait in s.
 
     Returns:
-        Whether there was a reply in time.
+        True if a reply came in time.
     """
     send_question(link, flags)
     return answers(link, stream, timeout) > 0
 
 
 def answers(link: Link, stream: ReplyStream, timeout: float) -> int:
-    """Waits until at least one reply is there; returns how many there are, 0 if none comes.
+    """Waits for at least one reply and returns the number of replies, 0 after a timeout.
 
     Args:
-        link: To the Falcon, in run mode.
-        stream: Takes them.
+        link: Link to the Falcon, in run mode.
+        stream: Receives the replies.
         timeout: Longest wait in s.
     """
     end = link.now() + timeout
@@ -153,28 +147,34 @@ def answers(link: Link, stream: ReplyStream, timeout: float) -> int:
 
 
 def speaks(link: Link, stream: ReplyStream) -> bool:
-    """Returns whether a Falcon in run mode answers packets: whether it has its program."""
+    """Returns whether a Falcon in run mode answers packets, that is whether it has its firmware."""
     return any(ask(link, stream, 0, PROBE_TIME) for _ in range(PROBES))
 
 
 def upload(link: Link, image: bytes, name: str, tell: Tell) -> None:
-    """Gives a Falcon its program.
+    """Loads the firmware into a Falcon, which loses it without power.
+
+    At 9600 baud the loader is greeted. At 140000 baud it receives the firmware in pieces and
+    returns each, which is the only check.
 
     Args:
-        link: To the Falcon.
-        image: The program.
-        name: What errors call the device.
-        tell: Told how far it is, at every quarter.
+        link: Link to the Falcon.
+        image: The firmware.
+        name: Name of the device in messages.
+        tell: Receives the progress, at every quarter.
 
     Raises:
-        DeviceError: The loader does not answer, or sent back something else than was sent.
-        DeviceLost: It is gone.
+        DeviceError: The loader does not answer, or returned other bytes than it received.
+        DeviceLost: The device is gone.
+
+    References:
+        libnifalcon's source (2019) for the sequence; not verified on hardware.
     """
     _greet(link, name)
     link.control(_MODEM, _DTR_LOW)
     link.control(_BAUD, _BAUD_LOADING)
     if _echo(link, _LOAD) != _LOAD:
-        raise DeviceError(f"{name}: its loader does not begin to load; switch its power off and on")
+        raise DeviceError(f"{name}: its loader does not start to load; switch its power off and on")
     quarter = 0
     for start in range(0, len(image), CHUNK):
         piece = image[start : start + CHUNK]
@@ -204,14 +204,14 @@ def _greet(link: Link, name: str) -> None:
         link.control(request, value)
     link.take()
     for _ in range(GREETINGS):
-        # a zero byte may come before the answer, from the line's being switched
+        # switching the line may insert a zero byte before the answer
         if _echo(link, _HELLO, len(_HELLO_ANSWER)).lstrip(b"\0") == _HELLO_ANSWER:
             return
     raise DeviceError(f"{name}: its loader does not answer; switch its power off and on")
 
 
 def _echo(link: Link, data: bytes, length: int | None = None) -> bytes:
-    """Sends bytes; returns what comes back within ``ANSWER_TIME``, as many by default."""
+    """Sends bytes and returns the answer within ``ANSWER_TIME``, by default of equal length."""
     wanted = len(data) if length is None else length
     link.write(array.array("B", data), _WRITE_MS)
     end = link.now() + ANSWER_TIME

@@ -1,14 +1,14 @@
-"""The Novint Falcon: three translations with force, over USB.
+"""Novint Falcon: three translations with force, over USB.
 
-Its replies answer the packet before: force and question go out together, and while one reply waits
-in the serial bridge the next question is under way. So one packet goes out in each tick, at the
-loop's rate, and what has come by then is read. A packet is answered, and its force acts, when it
-arrives; so from a sample to the force that answers it as many whole ticks pass as a reply needs to
-come back: two at 1 kHz, because the bridge holds a reply for up to 1 ms.
+A packet carries the force and requests the encoders; its reply comes one packet later. While one
+reply waits in the serial bridge, the next request is on its way. So each tick sends one packet and
+reads the replies that have arrived. A packet is answered, and its force acts, on arrival. From a
+sample to the resulting force therefore as many whole ticks pass as a reply takes: two at 1 kHz,
+because the bridge holds a reply for up to 1 ms.
 
 The device's frame: x to the right, y away from the user, z up, in m from the middle of the
-workspace, 0.125 m before the base. Axes, signs and bits are as libnifalcon's source has them: no
-real Falcon has moved under this code yet.
+workspace, 0.125 m before the base. Axes, signs and bits follow libnifalcon's source. The driver has
+not been verified on hardware.
 """
 
 from __future__ import annotations
@@ -48,23 +48,23 @@ from hapticbridge.tick import SAMPLE_DTYPE, TickFlag
 
 
 class FalconDevice:
-    """A Falcon that is open: it speaks, has found its zeros, and its timing has been measured.
+    """An open Falcon: booted, homed, and with measured timing.
 
-    The sheet's ``rate`` is how often replies were delivered with two questions always under way,
-    its ``delay`` the time within which 95 % of 0.1 s of replies came back, asked at all phases of
-    the bridge's timer (``timing``). Mass, damping and friction are not known of any unit;
-    who measured them gives them. The resolution follows from the geometry in the middle of the
-    workspace.
+    The sheet's ``rate`` is the rate of deliveries with two requests always on their way. Its
+    ``delay`` is the time within which 95 % of the replies in 0.1 s came back, over all phases of
+    the bridge's timer (``timing``). Mass, damping and friction are unknown unless the user states
+    measured values. The resolution follows from the geometry in the middle of the workspace.
 
     Args:
-        link: To the Falcon.
-        name: What errors call it.
-        firmware: File with its program, for one that has none; None: it must have it.
-        mass, damping, friction: At the grip in kg, N s/m and N, or None.
-        tell: Told what the user should know or do.
+        link: Link to the Falcon.
+        name: Name of the device in messages.
+        firmware: Firmware file for a device without firmware; None if it has its firmware.
+        mass, damping, friction: Values at the grip in kg, N s/m and N, or None.
+        tell: Receives messages for the user.
 
     Raises:
-        DeviceError: It has no program and none was named, does not take it, or was not homed.
+        DeviceError: The device has no firmware and no file was named, it refuses the firmware, or
+            it was not homed.
     """
 
     def __init__(
@@ -114,17 +114,18 @@ class FalconDevice:
         self._asked = self._asked_before = self._sampled_after = 0.0
 
     def start(self, period: float) -> NDArray[np.void]:
-        """Asks for the pose, without force, and compiles what the loop will call.
+        """Reads the pose, without force, and compiles the functions of the loop.
 
         Args:
             period: The loop's period in s, at most 0.02.
 
         Raises:
-            DeviceError: The period is out of range, no grip has its encoders, or it is gone.
+            DeviceError: The period is out of range, the encoders match no position of the grip, or
+                the device is gone.
         """
         if checked_period(period) > LONGEST_PERIOD:
             raise DeviceError(
-                f"{self._name}: is asked once a tick, so the rate must be at least "
+                f"{self._name}: is polled once per tick, so the rate must be at least "
                 f"{1 / LONGEST_PERIOD:g} Hz, not {1 / period:g} Hz"
             )
         motion, reply, sample = self._motion, self._stream.reply, self._last
@@ -136,8 +137,8 @@ class FalconDevice:
             raise silent(self._name)
         if self._believe(motion, reply, sample, np.inf) != BELIEVED:
             raise DeviceError(
-                f"{self._name}: encoders at {reply['encoders'][0].tolist()} are no position of the "
-                "grip; switch its power off and on, so that it is homed again"
+                f"{self._name}: encoder counts {reply['encoders'][0].tolist()} match no position "
+                "of the grip; switch its power off and on to home it again"
             )
         now = self._link.now()
         self._watch = SilenceWatch(now)
@@ -146,22 +147,22 @@ class FalconDevice:
         return sample.copy()
 
     def read(self, sample: NDArray[np.void]) -> int:
-        """Reports the newest reply's pose and buttons (1 right, 2 forward, 4 centre, 8 left).
+        """Returns the pose and buttons of the newest reply (1 right, 2 forward, 4 centre, 8 left).
 
-        What cannot be is not believed and counts as nothing new: encoders that no grip position
-        has, or a jump faster than 3 m/s. Waits only after the loop stood still (``ask_anew``).
+        Impossible replies count as no reply: encoders that match no position of the grip, or a jump
+        faster than 3 m/s. The call waits only after a pause of the loop (``ask_anew``).
 
         Args:
-            sample: Shape (1,), ``SAMPLE_DTYPE``, filled in place.
+            sample: Output, shape (1,), ``SAMPLE_DTYPE``.
 
         Returns:
-            0, or ``TickFlag.STALE_SAMPLE`` where the sample repeats the last one.
+            0, or ``TickFlag.STALE_SAMPLE`` if the sample repeats the last one.
 
         Raises:
-            DeviceError: It was not started, is gone, or gave nothing to believe for 50 ms.
+            DeviceError: The device was not started, is gone, or sent no valid reply for 50 ms.
         """
         if not self._is_started:
-            raise DeviceError(f"{self._name} is read before it was started")
+            raise DeviceError(f"{self._name} is read before it was started; call start() first")
         found = 0
         for packet in self._link.take():
             found += self._stream.feed(packet)
@@ -171,7 +172,7 @@ class FalconDevice:
         now = self._link.now()
         is_believed = False
         if found:
-            # a reply may be to the last question or the one before: no older than that is its pose
+            # the reply answers the last request or the one before, so its pose is at most that old
             elapsed, self._sampled_after = now - self._sampled_after, self._asked_before
             verdict = self._believe(self._motion, self._stream.reply, self._last, elapsed)
             is_believed = verdict == BELIEVED
@@ -181,15 +182,15 @@ class FalconDevice:
         return 0 if is_believed else int(TickFlag.STALE_SAMPLE)
 
     def write(self, wrench: NDArray[np.float64]) -> None:
-        """Sends a force, and with it the next question; the torque is left out.
+        """Sends a force together with the next request; the torque is ignored.
 
-        What is not taken in time is left out; but no force at all is sent until it is taken.
+        A packet that is not accepted in time is dropped, except for zero force, which is repeated.
 
         Args:
             wrench: Shape (6,), in the device's frame.
 
         Raises:
-            DeviceLost: It is gone, or does not take that it is to give no force.
+            DeviceLost: The device is gone, or does not accept zero force.
         """
         self._command(self._motion, wrench, self._bytes)
         self._asked_before, self._asked = self._asked, self._link.now()
@@ -197,14 +198,14 @@ class FalconDevice:
             insist(self._link, self._packet, self._name)
 
     def close(self) -> None:
-        """Commands zero force, puts the lights out and lets the device go."""
+        """Commands zero force, switches the lights off and releases the device."""
         if not self._is_open:
             return
         self._is_open = self._is_started = False
         try:
-            for _ in range(2):  # the first reply may be to a question of the loop's
+            for _ in range(2):  # the first reply may answer a request of the loop
                 ask(self._link, self._stream, 0, SILENCE)
         except DeviceLost:
-            pass  # whoever pulled the plug also took the force away
+            pass  # an unplugged device has no force
         finally:
             self._link.close()

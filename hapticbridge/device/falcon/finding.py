@@ -1,4 +1,4 @@
-"""Novint's Falcon: finding one among what is plugged in."""
+"""Discovery of a Falcon."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ def open_falcon(options: Mapping[str, object], tell: Tell, backend: Any = None) 
     """Finds a Falcon and opens it.
 
     Args:
-        options: Those of ``FAMILY``: names of files and numbers in SI units.
-        tell: Told what the user should know or do.
-        backend: A pyusb backend; None takes libusb.
+        options: Options of ``FAMILY``: names of files and numbers in SI units.
+        tell: Receives messages for the user.
+        backend: A pyusb backend; None selects libusb.
 
     Raises:
-        DeviceError: There is none, it cannot be opened, is lost, or an option is not valid.
+        DeviceError: No Falcon is found, it cannot be opened or is lost, or an option is not valid.
     """
     numbers = stated_numbers(options, _NUMBERS)
     firmware = str(options["firmware"]) if options.get("firmware") else None
     if firmware is not None:
-        read_firmware(firmware)  # a wrong name is said before anything moves
+        read_firmware(firmware)  # report a wrong file name before anything moves
     plugged = chosen(FAMILY, find(FAMILY, backend), options.get("serial"))
     log = HexLog.asked(options)
     link = UsbLink.open(

@@ -1,22 +1,22 @@
 """Geometry of the Falcon's three legs: thigh angles and grip position.
 
-The maker's frame, in metres: z out of the base towards the user along the machine's axis, x to the
-right, y up; all three thighs at the encoders' zero put the grip at (0, 0, 0.1346). Leg i is turned
-by φ_i about z; in its own frame (u outwards, v sideways, w = z), measured from the hip's axis,
+The maker's frame, in m: z from the base towards the user along the machine's axis, x to the right,
+y up. With all three thighs at the encoders' zero the grip is at (0, 0, 0.1346). Leg i is rotated by
+φ_i about z. In its own frame (u outwards, v sideways, w = z), measured from the hip's axis,
 
     u = x cos φ + y sin φ − r,    v = −x sin φ + y cos φ − s,    w = z
 
 The thigh of length a swings by θ in the plane (u, w). The shin is a parallelogram of side b that
-leans sideways by v + f, between two short links d and e along the leg's plane, and ends at the grip
-plate, c inwards of the grip's own point. The leg closes where
+leans sideways by v + f, between two short links d and e along the leg's plane. It ends at the grip
+plate, c inwards of the grip's own point. The leg closes if
 
     h(p, θ) = √((u + c − a cos θ)² + (w − a sin θ)²) − L(v) = 0,    L(v) = √(b² − (v + f)²) + d + e
 
-h is a length: its gradient along p is nearly of length one, so Newton's steps are well scaled.
-Because of d + e this is no sphere, and the grip's position has no closed form; θ has.
+h is a length. Its gradient along p has nearly unit length, so Newton's steps are well scaled.
+Because of d + e the surface is not a sphere: the grip's position has no closed form, but θ has.
 
-Every function says by its result whether there is an answer; none returns a number that is not
-finite.
+Every function reports by its result whether a solution exists, and none returns a non-finite
+number.
 
 References:
     Stamper 1997 (the mechanism); the lengths are those of libnifalcon's source (2019).
@@ -32,51 +32,54 @@ from numpy.typing import NDArray
 from hapticbridge.jit import compiled
 
 THIGH, SHIN = 0.060, 0.1025
-"""a and b in m: thigh, and the parallelogram's long side."""
+"""Lengths a and b in m: thigh, and long side of the parallelogram."""
 
 PLATE, LINKS = 0.01443, 2 * 0.01125
-"""c and d + e in m: from the grip's point to the plate's joint, and the two links of the shin."""
+"""Lengths c and d + e in m: from the grip's point to the plate's joint, and the two links of the
+shin."""
 
 SIDEWAYS, HIP_OUT, HIP_SIDEWAYS = -0.025, 0.0400, -0.02309
-"""f, r and s in m: the plate's joint beside the leg's plane, the hip's axis outwards and beside."""
+"""Offsets f, r and s in m: the plate's joint sideways of the leg's plane, and the hip's axis
+outwards and sideways."""
 
 LEG_ANGLES = np.radians([105.0, -15.0, -135.0])
-"""φ in rad: a third of a turn apart, 15° off the maker's frame."""
+"""Angles φ in rad: a third of a turn apart, 15° off the maker's frame."""
 
 RADIANS_PER_COUNT = 2 * math.pi / (4 * 320) * 0.01425 / 0.110
-"""Thigh angle per encoder count: 320 slots read four times a turn, on a shaft of 14.25 mm that
-drives a sector of 110 mm. 6.36e-4 rad."""
+"""Thigh angle in rad per encoder count, 6.36e-4: 320 slots with four counts each per turn, on a
+shaft of 14.25 mm that drives a sector of 110 mm."""
 
 ZERO_ANGLE = math.radians(35.0)
 """Thigh angle in rad at which a homed encoder reads 0."""
 
 LARGEST_RADIUS, NEAREST, FARTHEST = 0.075, 0.060, 0.190
-"""In m: distance from the axis and along it beyond which no grip is believed to be. The workspace
-is 0.1 m wide and 0.075 to 0.175 m from the base; more is a wrong encoder, less would refuse a grip
-that leans at its stop."""
+"""Limits of a plausible grip position in m: distance from the axis, and smallest and largest
+distance along it. The workspace is 0.1 m wide and reaches from 0.075 to 0.175 m. Positions beyond
+the limits mean a wrong encoder; tighter limits would refuse a grip that leans at its stop."""
 
 STEPS = 12
-"""Newton steps at most; from the middle of the workspace 6 reach its corners, 2 are usual."""
+"""Largest number of Newton steps. From the middle of the workspace 6 reach its corners, 2 are
+usual."""
 
 LONGEST_STEP = 0.02
-"""In m: Newton's steps are cut to it, a fifth of the workspace, so that the first one from far away
-does not leave the place where the legs can lean."""
+"""Longest Newton step in m: a fifth of the workspace. A longer first step could leave the region in
+which the legs can lean."""
 
 CLOSED = 1e-14
-"""In m: how well the legs must close. Rounding leaves 3e-17; a fifth of an atom is far below any
+"""Largest closure error of the legs in m. Rounding leaves 3e-17, and the limit is far below an
 encoder's step."""
 
 FLATTEST = 0.03
-"""Smallest |det| of the legs' directions, and smallest lever as a share of the thigh, no unit. In
-the middle of the workspace they are 0.8 and 0.98, at its rim 0.07 and 0.05; at 0 a leg is stretched
-or folded, and two positions answer to the same angles."""
+"""Smallest |det| of the legs' directions, and smallest lever relative to the thigh, without unit.
+In the middle of the workspace they are 0.8 and 0.98, at its rim 0.07 and 0.05. At 0 a leg is
+stretched or folded, and two positions have equal angles."""
 
 _COS, _SIN = np.cos(LEG_ANGLES), np.sin(LEG_ANGLES)
 
 
 @compiled
 def is_within_reach(position: NDArray[np.float64]) -> bool:
-    """Returns whether a grip can be there: near enough to the axis, and neither too near nor far.
+    """Returns whether a grip position is plausible.
 
     Args:
         position: Shape (3,), in m.
@@ -87,15 +90,15 @@ def is_within_reach(position: NDArray[np.float64]) -> bool:
 
 @compiled
 def inverse(position: NDArray[np.float64], angles: NDArray[np.float64]) -> bool:
-    """Writes the thigh angles of a grip position; returns whether every leg reaches it.
+    """Computes the thigh angles of a grip position; returns whether every leg reaches it.
 
         θ = atan2(w, u + c) − arccos((ρ² + a² − L²) / (2 a ρ)),    ρ² = (u + c)² + w²
 
-    the smaller of the two angles: the knee outside.
+    This is the smaller of the two angles, with the knee outside.
 
     Args:
         position: Shape (3,), in m, in the maker's frame.
-        angles: Shape (3,), in rad, filled in place; unchanged where there is no answer.
+        angles: Output, shape (3,), in rad; unchanged without a solution.
     """
     found = np.empty(3)
     for i in range(3):
@@ -123,14 +126,14 @@ def closure(
     gradients: NDArray[np.float64],
     levers: NDArray[np.float64],
 ) -> bool:
-    """Writes how far each leg is from closing, and how that changes; returns whether it can be.
+    """Computes the closure error of each leg and its derivatives; returns whether they exist.
 
     Args:
         position: Shape (3,), in m.
         angles: Shape (3,), in rad.
-        gaps: h of each leg in m, shape (3,), filled in place.
-        gradients: ∂h/∂p, a row per leg, no unit, shape (3, 3), filled in place.
-        levers: ∂h/∂θ in m, shape (3,), filled in place; negative with the knee outside.
+        gaps: Output: h of each leg in m, shape (3,).
+        gradients: Output: ∂h/∂p, a row per leg, without unit, shape (3, 3).
+        levers: Output: ∂h/∂θ in m, shape (3,); negative with the knee outside.
     """
     for i in range(3):
         out = position[0] * _COS[i] + position[1] * _SIN[i] - HIP_OUT + PLATE
@@ -160,7 +163,7 @@ def solve(
     Args:
         rows: Shape (3, 3).
         right: Shape (3,).
-        answer: Shape (3,), filled in place; unchanged where the determinant is 0.
+        answer: Output, shape (3,); unchanged for a determinant of 0.
     """
     a, b, c = rows[0], rows[1], rows[2]
     x0, x1, x2 = (
@@ -189,15 +192,14 @@ def solve(
 
 @compiled
 def forward(angles: NDArray[np.float64], position: NDArray[np.float64]) -> bool:
-    """Moves a grip position to where the thigh angles put it; returns whether that is anywhere.
+    """Computes the grip position of the thigh angles; returns whether it exists.
 
-    Newton's method on the three closures, from the position that is there: in a loop the last one.
-    The answer must lie within the reach, have every knee outside, and be no place where a leg is
-    stretched or folded.
+    Newton's method on the three closures starts from the current position, in a loop the last one.
+    The solution must be plausible, have every knee outside, and have no leg stretched or folded.
 
     Args:
         angles: Shape (3,), in rad.
-        position: Shape (3,), in m: where to begin; moved in place, unchanged without an answer.
+        position: Start and output, shape (3,), in m; unchanged without a solution.
     """
     point, step = position.copy(), np.empty(3)
     gaps, gradients, levers = np.empty(3), np.empty((3, 3)), np.empty(3)

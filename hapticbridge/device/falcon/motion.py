@@ -1,4 +1,4 @@
-"""What a tick does with a Falcon's packets: encoders to a pose to believe, force to motors."""
+"""Poses and forces of a Falcon from its packets."""
 
 from __future__ import annotations
 
@@ -18,37 +18,37 @@ from hapticbridge.device.falcon.statics import jacobian, thigh_torques
 from hapticbridge.jit import compiled
 
 MOTION_DTYPE = np.dtype([("position", "<f8", 3), ("angles", "<f8", 3), ("motors", "<i8", 3)])
-"""What is carried from tick to tick: the grip in the maker's frame in m, its thigh angles in rad,
-and the motor units of the last command."""
+"""State carried from tick to tick: position of the grip in the maker's frame in m, its thigh angles
+in rad, and the motor units of the last command."""
 
 PLACE = (0.0, 0.0, 0.125)
 """Middle of the workspace in the maker's frame, in m: half way between 0.075 and 0.175 from the
-base. The device's frame begins there."""
+base. It is the origin of the device's frame."""
 
 UNITS_PER_TORQUE = -1e4
-"""Motor units per N m at the thigh, of libnifalcon: its sign, and its scale, which nobody published
-a calibration of."""
+"""Motor units per N m at the thigh, with sign, from libnifalcon. No calibration of the scale is
+published."""
 
 MOTOR_LIMIT = 4096.0
-"""Motor units that a motor is sent at most. 9 N along the axis take 2259 on each, 9 N across it
-5200 on one; libnifalcon's users clamp at about as much."""
+"""Largest command to a motor in motor units. 9 N along the axis take 2259 on each motor, 9 N across
+it 5200 on one. Programs based on libnifalcon clamp at a similar value."""
 
 FORCE_LIMIT = 8.0
-"""In N: what CHAI3D lets applications ask of a Falcon; the maker's figure is above 8.9 N."""
+"""Largest force in N: the value that CHAI3D allows for a Falcon. The maker states above 8.9 N."""
 
 SPEED_LIMIT = 3.0
-"""In m/s: faster motion is not believed. No figure was found; a hand that crosses the 0.1 m of the
-workspace in 33 ms is at its end."""
+"""Largest plausible speed in m/s. No figure is published; a hand at this speed crosses the
+workspace of 0.1 m in 33 ms."""
 
 MOST_COUNTS = 3000
-"""Counts either side of zero that a thigh can turn to: -74° to 144°. The workspace takes -66° to
-114°; a whole turn further the same place would follow."""
+"""Largest encoder count of a thigh on either side of zero: -74° to 144°. The workspace takes -66°
+to 114°. One more turn would lead to the same position again."""
 
 FLAGS = int(Request.GREEN)
-"""The light while the loop runs."""
+"""Light during the loop, as ``Request`` bits."""
 
 BELIEVED, OUT_OF_REACH, JUMP = 0, 1, 2
-"""What ``believe`` makes of a reply."""
+"""Results of ``believe``."""
 
 
 @compiled
@@ -58,14 +58,14 @@ def believe(
     samples: NDArray[np.void],
     elapsed: float,
 ) -> int:
-    """Turns a reply into a sample in the device's frame, if the grip can be there.
+    """Converts a reply into a sample in the device's frame, if it is plausible.
 
     Args:
-        motions: Shape (1,), ``MOTION_DTYPE``; moved on only where the reply is believed.
+        motions: Shape (1,), ``MOTION_DTYPE``; updated only by a plausible reply.
         replies: Shape (1,), ``REPLY_DTYPE``.
-        samples: Shape (1,), ``SAMPLE_DTYPE``, filled in place likewise.
-        elapsed: Longest time in s that can lie between this pose and the one of the reply before;
-            inf believes any place within reach.
+        samples: Output, shape (1,), ``SAMPLE_DTYPE``; updated only by a plausible reply.
+        elapsed: Longest possible time in s since the pose of the previous reply; inf accepts any
+            position within reach.
 
     Returns:
         ``BELIEVED``, ``OUT_OF_REACH`` or ``JUMP``.
@@ -98,15 +98,16 @@ def believe(
 def command(
     motions: NDArray[np.void], wrench: NDArray[np.float64], packet: NDArray[np.uint8]
 ) -> None:
-    """Writes the packet that pushes the grip with a force, where it was last believed to be.
+    """Encodes the packet that applies a force at the last plausible grip position.
 
-    Where a motor would be asked for more than its limit, all three are scaled down together: the
-    force becomes smaller and keeps its direction.
+    If a motor would exceed its limit, all three are scaled down together, which keeps the direction
+    of the force.
 
     Args:
         motions: Shape (1,), ``MOTION_DTYPE``; its motor units are set.
-        wrench: Shape (6,) in the device's frame; the force counts, in N. Not finite is no force.
-        packet: Shape (16,), filled in place.
+        wrench: Shape (6,) in the device's frame, in N and N m. Only the force is used; a non-finite
+            force becomes zero.
+        packet: Output, shape (16,).
     """
     motion = motions[0]
     force, torques = np.empty(3), np.empty(3)
@@ -124,7 +125,7 @@ def command(
 
 
 def resolution() -> float:
-    """Returns the longest way in m that one encoder step can be, in the middle of the workspace."""
+    """Returns the largest displacement in m of one encoder step, in the middle of the workspace."""
     position, angles, matrix = np.array(PLACE), np.empty(3), np.empty((3, 3))
     inverse(position, angles)
     jacobian(position, angles, matrix)

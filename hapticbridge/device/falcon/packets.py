@@ -1,21 +1,21 @@
-"""The Falcon's run packets: 16 printable bytes each way, found again after anything.
+"""Packet format of the Falcon: 16 printable bytes in each direction.
 
     <  MMMM MMMM MMMM  F  A  >      to the device: three motors, flags
     <  EEEE EEEE EEEE  F  ?  >      from it: three encoders, flags, one byte of unknown use
 
-A number is 16 bits in two's complement, as four nibbles, the lowest first, each 0x41 + nibble; the
-flags are one byte, 0x41 + flags. The device speaks only when asked: one reply per request. There
-is no checksum. A reply is believed if it begins and ends as it must, 16 bytes apart, with nothing
-but nibbles between; what lies before it is dropped. '<' and '>' are no nibbles, so a reply with a
-byte lost or put in cannot pass for one.
+A number has 16 bits in two's complement, sent as four nibbles, the lowest first, each as 0x41 +
+nibble. The flags are one byte, 0x41 + flags. The device sends one reply per request, without a
+checksum. A reply is valid if '<' and '>' are 16 bytes apart with only nibbles between; bytes before
+it are dropped. Because '<' and '>' are not nibbles, a reply with a lost or inserted byte is never
+valid.
 
-It reaches the host through an FTDI bridge in USB packets of 64 bytes at most, each of which begins
-with two bytes of modem status; one of only these says that there is nothing to say.
+Replies arrive through an FTDI bridge in USB packets of at most 64 bytes. Each begins with two bytes
+of modem status; a packet of only these carries no data.
 
 References:
-    libnifalcon's source (2019). Two of its statements contradict each other: the flag for homing is
-    0x01 in the code and 0x10 in a comment, the lights are green 2, blue 4, red 8 in the code and
-    red 2, green 4, blue 8 in a comment. The code's values are used here; no device has been asked.
+    libnifalcon's source (2019). It contradicts itself twice: the flag for homing is 0x01 in the
+    code and 0x10 in a comment; the lights are green 2, blue 4, red 8 in the code and red 2, green
+    4, blue 8 in a comment. The code's values are used here; not verified on hardware.
 """
 
 from __future__ import annotations
@@ -28,27 +28,27 @@ from numpy.typing import NDArray
 from hapticbridge.jit import compiled
 
 SIZE = 16
-"""Bytes of a packet, either way."""
+"""Bytes per packet, in each direction."""
 
 STATUS = 2
 """Bytes of modem status before the data of each USB packet from an FTDI bridge."""
 
 LARGEST = 32767
-"""Largest number, either sign, that a packet carries."""
+"""Largest magnitude of a number in a packet."""
 
 REPLY_DTYPE = np.dtype([("encoders", "<i8", 3), ("buttons", "<i8"), ("homed", "<i8")])
-"""A reply: encoder counts; grip buttons as bits (1 right, 2 forward, 4 centre, 8 left); and a bit
-per encoder that has found its zero, true only while homing is on."""
+"""Reply: encoder counts; grip buttons as bits (1 right, 2 forward, 4 centre, 8 left); and a bit per
+encoder that has found its zero, valid only while homing is on."""
 
 _FIRST, _LAST, _ZERO = ord("<"), ord(">"), 0x41
-_ROOM = 4096  # bytes of tail and news together: far more than a USB packet, so nothing is cut
+_ROOM = 4096  # bytes of buffer: far more than a USB packet, so nothing is cut
 
 
 class Request(IntFlag):
     """Flags of a packet to the device.
 
     Attributes:
-        HOMING: Each encoder is set to 0 where it passes its index mark.
+        HOMING: Each encoder is set to 0 at its index mark.
         GREEN: The green light.
         BLUE: The blue light.
         RED: The red light.
@@ -62,12 +62,12 @@ class Request(IntFlag):
 
 @compiled
 def encode(motors: NDArray[np.int64], flags: int, packet: NDArray[np.uint8]) -> None:
-    """Writes a packet to the device.
+    """Encodes a packet to the device.
 
     Args:
-        motors: Shape (3,), motor units; what a packet cannot carry becomes its nearest.
+        motors: Shape (3,), motor units, clamped to the range of a packet.
         flags: ``Request`` bits, 0 to 15.
-        packet: Shape (16,), filled in place.
+        packet: Output, shape (16,).
     """
     packet[0], packet[14], packet[15] = _FIRST, _ZERO, _LAST
     packet[13] = _ZERO + (flags & 15)
@@ -91,16 +91,16 @@ def _is_reply(data: NDArray[np.uint8], at: int) -> bool:
 def newest_reply(
     data: NDArray[np.uint8], count: int, replies: NDArray[np.void]
 ) -> tuple[int, int, int]:
-    """Decodes the last reply in a stream of bytes, whatever stands around it.
+    """Decodes the last reply in a stream of bytes.
 
     Args:
-        data: The stream, of which the first ``count`` bytes count.
-        count: How many.
-        replies: Shape (1,), ``REPLY_DTYPE``, filled in place; unchanged where there is no reply.
+        data: The stream.
+        count: Number of valid bytes in ``data``.
+        replies: Output, shape (1,), ``REPLY_DTYPE``; unchanged without a reply.
 
     Returns:
-        How many bytes are done with, how many replies there were, and how many bytes belonged to
-        none. The rest may be the beginning of a reply: fewer than 16 bytes.
+        Number of consumed bytes, of replies, and of bytes that belonged to no reply. The remaining
+        bytes may be the beginning of a reply: fewer than 16.
     """
     at, found, dropped, last = 0, 0, 0, -1
     while at + SIZE <= count:
@@ -127,11 +127,11 @@ def newest_reply(
 
 
 class ReplyStream:
-    """Puts USB packets together to replies and keeps the newest.
+    """Assembles replies from USB packets and keeps the newest.
 
     Attributes:
-        reply: The newest, shape (1,), ``REPLY_DTYPE``.
-        dropped: Bytes so far that belonged to no reply.
+        reply: Newest reply, shape (1,), ``REPLY_DTYPE``.
+        dropped: Number of bytes so far that belonged to no reply.
     """
 
     def __init__(self) -> None:
@@ -141,10 +141,10 @@ class ReplyStream:
         self._count = 0
 
     def feed(self, packet: bytes) -> int:
-        """Takes a USB packet; returns how many replies it completed.
+        """Consumes a USB packet; returns the number of replies that it completed.
 
         Args:
-            packet: With its status bytes; of any content, and of 4081 bytes at most.
+            packet: Packet with its status bytes, of any content, at most 4081 bytes.
         """
         news = len(packet) - STATUS
         if news <= 0:
@@ -159,5 +159,5 @@ class ReplyStream:
         return found
 
     def clear(self) -> None:
-        """Forgets the beginning of a reply that was under way."""
+        """Discards the beginning of an incomplete reply."""
         self._count = 0

@@ -1,7 +1,4 @@
-"""A Falcon from plugged in to ready: its program, and the zeros of its encoders.
-
-And what is said to it outside the ticks: no force.
-"""
+"""Start of a Falcon: firmware and homing."""
 
 from __future__ import annotations
 
@@ -21,76 +18,81 @@ from hapticbridge.device.silence import SILENCE
 from hapticbridge.errors import DeviceError, DeviceLost
 
 LONGEST_PERIOD = 0.02
-"""In s. It is asked once a tick; slower, two lost replies would already count as silence."""
+"""Longest period of the loop in s. The device is polled once per tick; at a longer period two lost
+replies would already count as silence."""
 
 ZERO_TRIES = 20
-"""How often a packet without force is sent again that was not taken, for 1 ms each: no watchdog of
-a Falcon is known, so the force before it would stay."""
+"""Number of attempts, of 1 ms each, to send a zero force that was not accepted. No watchdog of a
+Falcon is known, so the previous force would remain."""
 
 HOMING_TIME = 60.0
-"""In s: how long the user has to move the grip through its range."""
+"""Time in s in which the user must move the grip through its range."""
 
 _ALL = 7  # a bit per encoder
 
 
 def silent(name: str) -> DeviceLost:
-    """Returns the error that a Falcon has fallen silent."""
-    return DeviceLost(f"{name}: gave no usable reply for {1e3 * SILENCE:g} ms")
+    """Returns the error of a Falcon that stopped replying."""
+    return DeviceLost(
+        f"{name}: gave no usable reply for {1e3 * SILENCE:g} ms; check its cable and its power"
+    )
 
 
 def insist(link: Link, packet: array.array[int], name: str) -> None:
-    """Sends a packet without force that was not taken until it is.
+    """Repeats a zero-force packet until it is accepted.
 
     Args:
-        link: To the Falcon.
-        packet: Of no force.
-        name: What errors call it.
+        link: Link to the Falcon.
+        packet: Packet without force.
+        name: Name of the device in messages.
 
     Raises:
-        DeviceLost: It is gone, or takes none in ``ZERO_TRIES``.
+        DeviceLost: The device is gone, or refused ``ZERO_TRIES`` attempts.
     """
     if not any(link.write(packet) for _ in range(ZERO_TRIES)):
-        raise DeviceLost(f"{name}: does not take that it is to give no force")
+        raise DeviceLost(
+            f"{name}: did not accept zero force in {ZERO_TRIES} attempts; switch its power off"
+        )
 
 
 def ask_anew(link: Link, stream: ReplyStream, name: str) -> float:
-    """Takes the force away and asks where the grip is now, after the loop stood still.
+    """Commands zero force and reads the pose again, after a pause of the loop.
 
-    Nothing takes the force of a Falcon away while its host stands still. The reply that waits is to
-    a question from before that; a coupling that is re-seated by it is stretched, as soon as the
-    next reply comes, by all that the hand has moved since.
+    A Falcon keeps its last force while the host pauses, and the waiting reply holds an outdated
+    pose. If the handle were re-anchored there, the next reply would stretch the coupling by the
+    hand's motion in the meantime.
 
     Args:
-        link: To a Falcon that speaks.
-        stream: Takes its replies; the newest is then to a question asked here.
-        name: What errors call it.
+        link: Link to a running Falcon.
+        stream: Receives the replies; the newest then answers a request of this call.
+        name: Name of the device in messages.
 
     Returns:
-        When it was first asked, in s: the pose is no older.
+        Time of the first request in s; the pose is not older.
 
     Raises:
-        DeviceLost: It is gone, or silent.
+        DeviceLost: The device is gone or silent.
     """
     asked = link.now()
-    for _ in range(2):  # the first reply may be to a question of the loop's
+    for _ in range(2):  # the first reply may answer a request of the loop
         if not ask(link, stream, Request.GREEN, SILENCE):
             raise silent(name)
     return asked
 
 
 def bring_up(link: Link, stream: ReplyStream, name: str, firmware: str | None, tell: Tell) -> None:
-    """Makes a Falcon speak: asks it first, and sends its program only where it does not answer.
+    """Brings a Falcon into run mode, and loads its firmware if it does not answer.
 
     Args:
-        link: To the Falcon.
-        stream: Takes its replies.
-        name: What errors call it.
-        firmware: File with its program, or None.
-        tell: Told how far the program is.
+        link: Link to the Falcon.
+        stream: Receives the replies.
+        name: Name of the device in messages.
+        firmware: Firmware file, or None.
+        tell: Receives the progress.
 
     Raises:
-        DeviceError: It has no program, and none was named or it does not run.
-        DeviceLost: It is gone.
+        DeviceError: The device has no firmware, and no file was named or the file does not run.
+        DeviceLost: The device is gone.
     """
     image = None if firmware is None else read_firmware(firmware)
     enter_run_mode(link)
@@ -98,30 +100,30 @@ def bring_up(link: Link, stream: ReplyStream, name: str, firmware: str | None, t
         return
     if image is None:
         raise DeviceError(
-            f"{name}: has no firmware (it forgets it without power); name the file with "
-            "the maker's program: falcon:firmware=FILE"
+            f"{name}: has no firmware (it loses it without power); name the maker's firmware "
+            "file: falcon:firmware=FILE"
         )
     upload(link, image, name, tell)
     enter_run_mode(link)
     stream.clear()
     if not speaks(link, stream):
         raise DeviceError(
-            f"{name}: took '{firmware}', and does not answer; it is no firmware for it"
+            f"{name}: accepted '{firmware}' but does not answer; name a file with its firmware"
         )
 
 
 def home(link: Link, stream: ReplyStream, name: str, tell: Tell) -> None:
-    """Waits until every encoder has passed its zero; asks the user to see to it.
+    """Waits until the user has moved every encoder through its zero.
 
     Args:
-        link: To a Falcon that speaks.
-        stream: Takes its replies.
-        name: What errors call it.
-        tell: Told what the user has to do.
+        link: Link to a running Falcon.
+        stream: Receives the replies.
+        name: Name of the device in messages.
+        tell: Receives the instruction to the user.
 
     Raises:
-        DeviceError: Nobody did within ``HOMING_TIME``.
-        DeviceLost: It is gone, or fell silent.
+        DeviceError: The grip was not moved within ``HOMING_TIME``.
+        DeviceLost: The device is gone or silent.
     """
     end, is_told = link.now() + HOMING_TIME, False
     heard = link.now()

@@ -1,4 +1,4 @@
-"""Forces at the Falcon's grip and torques at its thighs, by virtual work."""
+"""Statics of the Falcon's legs."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from hapticbridge.jit import compiled
 def jacobian(
     position: NDArray[np.float64], angles: NDArray[np.float64], matrix: NDArray[np.float64]
 ) -> bool:
-    """Writes ∂θ/∂p = −(∂h/∂θ)⁻¹ ∂h/∂p at a pose where the legs close.
+    """Computes ∂θ/∂p = −(∂h/∂θ)⁻¹ ∂h/∂p at a pose where the legs close.
 
     Args:
         position: Shape (3,), in m.
         angles: Shape (3,), in rad, those of the position.
-        matrix: Shape (3, 3), in rad/m, filled in place.
+        matrix: Output, shape (3, 3), in rad/m.
 
     Returns:
-        Whether there is one: no leg is stretched or folded.
+        False if a leg is stretched or folded.
     """
     gaps, gradients, levers = np.empty(3), np.empty((3, 3)), np.empty(3)
     if not closure(position, angles, gaps, gradients, levers):
@@ -42,7 +42,7 @@ def thigh_torques(
     force: NDArray[np.float64],
     torques: NDArray[np.float64],
 ) -> bool:
-    """Writes the thigh torques that push the grip with a force: τ = J⁻ᵀ F, J = ∂θ/∂p.
+    """Computes the thigh torques of a force at the grip: τ = J⁻ᵀ F, J = ∂θ/∂p.
 
     By virtual work τ·δθ = F·δp for every motion.
 
@@ -50,10 +50,10 @@ def thigh_torques(
         position: Shape (3,), in m.
         angles: Shape (3,), in rad, those of the position.
         force: Shape (3,), in N, in the maker's frame.
-        torques: Shape (3,), in N m, filled in place; zero where there is no answer.
+        torques: Output, shape (3,), in N m; zero without a solution.
 
     Returns:
-        Whether there is an answer.
+        Whether a solution exists.
     """
     torques[:] = 0.0
     gaps, gradients, levers = np.empty(3), np.empty((3, 3)), np.empty(3)

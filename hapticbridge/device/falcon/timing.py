@@ -1,4 +1,4 @@
-"""How fast a Falcon answers, measured on the unit before the loop begins."""
+"""Measured timing of a Falcon."""
 
 from __future__ import annotations
 
@@ -9,57 +9,61 @@ from hapticbridge.device.falcon.packets import ReplyStream
 from hapticbridge.errors import DeviceLost
 
 TIME = 0.1
-"""In s: how long each of the two measurements takes."""
+"""Length of each of the two measurements in s."""
 
 UNDER_WAY = 2
-"""Questions kept under way while the rate is measured: one is there when a reply leaves."""
+"""Number of requests kept on their way while the rate is measured, so that one waits when a reply
+leaves."""
 
 PACE = 1.07e-3
-"""In s: from question to question while the delay is measured. A little more than the bridge's
-timer of 1 ms, so that the questions sweep over all its phases."""
+"""Time in s between requests while the delay is measured. It is slightly longer than the bridge's
+timer of 1 ms, so that the requests sweep over all its phases."""
 
 SHARE = 0.95
-"""Share of replies that came back within the delay, no unit. The longest are the host's own stalls,
+"""Share of replies within the delay, without unit. The slowest replies are stalls of the host,
 which the loop counts as missed deadlines."""
 
 TRIES = 3
-"""How often the timing is measured before a Falcon counts as silent: a reply can be lost on the
-serial line, and a busy host can stall for as long as one is waited for."""
+"""Number of measurements before a Falcon counts as silent. A reply can be lost on the serial line,
+and a busy host can stall for longer than the timeout."""
 
-_ANSWER_TIME = 0.05  # s, longer is silence
+_ANSWER_TIME = 0.05
+"""Longest wait for a reply in s; a longer pause counts as silence."""
 
 
 def measured_timing(link: Link, stream: ReplyStream, name: str) -> tuple[float, float]:
-    """Returns at what rate replies are delivered, and within what time they come.
+    """Measures the rate of deliveries and the delay of replies.
 
-    The rate is deliveries per second with ``UNDER_WAY`` questions always asked; several replies
-    that came together are one delivery. The delay is the time from a question to its reply that
-    ``SHARE`` of the replies kept, one question at a time.
+    The rate is the number of deliveries per second with ``UNDER_WAY`` requests always on their way;
+    replies that arrive together are one delivery. The delay is the time from a request to its
+    reply, with one request at a time, that the share ``SHARE`` of the replies meets.
 
-    A question asks for the encoders and carries the force, so both are as old as each other: where
-    the loop sends one per tick, the force that answers a sample acts the delay later, rounded up to
-    whole ticks, beyond the one tick for which it is held.
+    A packet both requests the encoders and carries the force, so both have this delay. With one
+    packet per tick, the force that responds to a sample acts after the delay, rounded up to whole
+    ticks, beyond the one tick for which it is held.
 
     Args:
-        link: To a Falcon that speaks.
-        stream: Takes its replies.
-        name: What errors call it.
+        link: Link to a running Falcon.
+        stream: Receives the replies.
+        name: Name of the device in messages.
 
     Returns:
         The rate in Hz and the delay in s.
 
     Raises:
-        DeviceLost: It fell silent.
+        DeviceLost: The device stopped replying.
     """
     for _ in range(TRIES):
         rate = _rate(link, stream)
         if rate is not None and (delay := _delay(link, stream)) is not None:
             return rate, delay
-    raise DeviceLost(f"{name}: fell silent while its timing was measured")
+    raise DeviceLost(
+        f"{name}: fell silent while its timing was measured; check its cable and its power"
+    )
 
 
 def _rate(link: Link, stream: ReplyStream) -> float | None:
-    """Measures the rate in Hz; None where a reply did not come."""
+    """Measures the rate in Hz; None if a reply is missing."""
     for _ in range(UNDER_WAY):
         send_question(link)
     begin = last = link.now()
@@ -75,12 +79,12 @@ def _rate(link: Link, stream: ReplyStream) -> float | None:
         for _ in range(found):
             send_question(link)
     for _ in range(UNDER_WAY):
-        answers(link, stream, 2 * PACE)  # the last ones, which nobody waited for
+        answers(link, stream, 2 * PACE)  # drain the last replies
     return (deliveries - 1) / (last - begin)
 
 
 def _delay(link: Link, stream: ReplyStream) -> float | None:
-    """Measures the delay in s; None likewise."""
+    """Measures the delay in s; None if a reply is missing."""
     times = []
     end = link.now() + TIME
     while (begin := link.now()) < end:

@@ -1,5 +1,5 @@
 """Force Dimension's devices, through the maker's library.
 
-``driver`` is the device, ``library`` the maker's functions, ``models`` what is known of each kind
-beforehand, ``finding`` how one is opened.
+``driver`` is the device and ``finding`` opens it. ``library`` binds the maker's functions, and
+``models`` lists the properties of each device type.
 """

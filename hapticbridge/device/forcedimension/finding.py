@@ -1,4 +1,4 @@
-"""Force Dimension's devices: finding the maker's library and its devices, and opening one."""
+"""Discovery of Force Dimension's devices."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ def open_forcedimension(options: Mapping[str, object], tell: Tell) -> ForceDimen
     """Loads the library and opens one of its devices.
 
     Args:
-        options: ``library`` (its file), ``serial`` (the device's place in the library's list, from
-            0, where there are several), ``gravity`` (1 or 0), and numbers of the data sheet.
-        tell: Told what the device is and what was set.
+        options: ``library`` (its file), ``serial`` (number of the device in the library's list,
+            from 0, if there are several), ``gravity`` (1 or 0), and numbers of the data sheet.
+        tell: Receives a description of the device and its settings.
 
     Raises:
-        DeviceError: There is no library or no device, or an option is not valid.
-        DeviceLost: It is gone.
+        DeviceError: No library or no device is found, or an option is not valid.
+        DeviceLost: The device is gone.
     """
     numbers = stated_numbers(options, _NUMBERS)
     gravity = options.get("gravity", 1.0)
@@ -40,7 +40,7 @@ def open_forcedimension(options: Mapping[str, object], tell: Tell) -> ForceDimen
 
 
 def find() -> list[Plugged]:
-    """Lists the devices that the library has; without it, those that the kernel knows."""
+    """Lists the library's devices, or the kernel's list without the library."""
     try:
         return _listed(Dhd(located()))
     except DeviceError as error:
@@ -48,9 +48,9 @@ def find() -> list[Plugged]:
 
 
 def medium() -> str:
-    """Says in a sentence whether the library is there."""
+    """Returns a sentence on whether the library was found."""
     try:
-        return f"Force Dimension's library is there: {Dhd(located()).path}"
+        return f"Force Dimension's library was found: {Dhd(located()).path}"
     except DeviceError as error:
         return str(error)
 
@@ -77,14 +77,15 @@ FAMILY = Family(
     ids=(UsbId(0x1451, 0x0402, "Force Dimension omega"),),
     transport="library",
     axes="x, y, z; with rx, ry, rz where the wrist has motors",
-    force="what the library says, else 12 N (omega, sigma, lambda) or 20 N (delta)",
-    rate="4 kHz, as the maker says",
-    on_stall=f"its watchdog takes the force away after {1e3 * SHORTEST_WATCHDOG:g} ms; one that "
-    "has none is named when it is started",
+    force="the library's limit, else 12 N (omega, sigma, lambda) or 20 N (delta)",
+    rate="4 kHz, as stated by the maker",
+    on_stall=f"its watchdog ends the force after {1e3 * SHORTEST_WATCHDOG:g} ms; a device without "
+    "one is reported at its start",
     options=("library", "serial", "gravity", *_NUMBERS),
     open=open_forcedimension,
     find=find,
     medium=medium,
     sought="a device of Force Dimension's library",
 )
-"""Its products' numbers on the USB bus are not all known; the library finds them by itself."""
+"""Driver of Force Dimension's devices. Not all of their USB ids are known, so the library finds
+them."""

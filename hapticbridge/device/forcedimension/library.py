@@ -1,9 +1,10 @@
-"""Force Dimension's own library (DHD), loaded at run time: none of it is part of this project.
+"""Bindings of Force Dimension's library (DHD), loaded at run time.
 
-Signatures, types and codes as the SDK's header ``dhdc.h`` and its public Python bindings have them.
-Every call ends with the device's number. Getters and setters return a negative number where they
-failed, 0, or a positive one as a warning. Each talks to the device before it returns: how long
-that may take is up to the library, and cannot be bounded from here.
+The library is not part of this project. Signatures, types and codes follow the SDK's header
+``dhdc.h`` and its public Python bindings. The last argument of every call is the device's number.
+Getters and setters return a negative number on failure, 0, or a positive number as a warning. Each
+communicates with the device before it returns. The duration is up to the library and cannot be
+bounded here.
 """
 
 from __future__ import annotations
@@ -20,19 +21,19 @@ from typing import Any
 from hapticbridge.errors import DeviceError
 
 VARIABLE = "HAPTICBRIDGE_DHD"
-"""Environment variable that names the library's file where the option ``library`` does not."""
+"""Environment variable with the library's file, used without the option ``library``."""
 
 FRESH, TIMEGUARD, SATURATED = 0, 1, 2
-"""Codes: done; a getter had no newer sample; a motor is at its end."""
+"""Return codes: success; no newer sample; a motor is saturated."""
 
 MOST_WATCHDOG = 255
-"""Largest watchdog, in steps of ``WATCHDOG_STEP``: its argument is a byte."""
+"""Largest watchdog in steps of ``WATCHDOG_STEP``: the argument is a byte."""
 
 WATCHDOG_STEP = 125e-6
-"""In s."""
+"""Step of the watchdog in s."""
 
 TIMING, SHARE = 0.1, 0.95
-"""Time in s for which exchanges are measured, and the share of them that keeps the delay."""
+"""Time in s for which exchanges are measured, and share of them, without unit, within the delay."""
 
 _NUMBERS = POINTER(c_double)
 
@@ -58,24 +59,24 @@ FUNCTIONS: dict[str, tuple[Any, tuple[Any, ...]]] = {
     "dhdGetTime": (c_double, ()),
     "dhdErrorGetLastStr": (c_char_p, ()),
 }
-"""What is called, with the type of the result and those of the arguments."""
+"""Functions that are called, with the types of result and arguments."""
 
 NAMES = {
     "linux": ("libdrd.so.3", "libdrd.so", "libdhd.so.3", "libdhd.so"),
     "darwin": ("libdrd.dylib", "libdhd.dylib"),
     "win32": ("drd64.dll", "dhd64.dll"),
 }
-"""Usual names of its files, by ``sys.platform``. DRD holds all of DHD."""
+"""Usual file names of the library, by ``sys.platform``. DRD contains all of DHD."""
 
 
 class Dhd:
-    """The library, loaded, with every function that is used bound to its signature.
+    """The loaded library, with every used function bound to its signature.
 
     Args:
         path: Its file.
 
     Raises:
-        DeviceError: It cannot be loaded, or lacks a function.
+        DeviceError: The library cannot be loaded, or lacks a function.
     """
 
     def __init__(self, path: str) -> None:
@@ -102,24 +103,24 @@ class Dhd:
         return self._functions[name]
 
     def now(self) -> float:
-        """Returns the time in s of the library's own clock."""
+        """Returns the time of the library's own clock in s."""
         return float(self["dhdGetTime"]())
 
     def last_error(self) -> str:
-        """Returns what the library says of its last error."""
+        """Returns the library's description of its last error."""
         text = self["dhdErrorGetLastStr"]()
-        return text.decode(errors="replace") if text else "it does not say why"
+        return text.decode(errors="replace") if text else "no reason reported"
 
     def require(self, name: str, *arguments: Any, what: str) -> int:
-        """Calls a function; returns its code, 0 or a warning.
+        """Calls a function and returns its code, 0 or a warning.
 
         Args:
-            name: Of ``FUNCTIONS``.
-            *arguments: The function's.
-            what: What could not be done if it fails, for the message.
+            name: Key of ``FUNCTIONS``.
+            *arguments: Arguments of the function.
+            what: Description of the failure, for the message.
 
         Raises:
-            DeviceError: It failed; says what the library says.
+            DeviceError: The function failed; the message contains the library's description.
         """
         code = int(self[name](*arguments))
         if code < 0:
@@ -127,11 +128,11 @@ class Dhd:
         return code
 
     def has_watchdog(self, device: int, steps: int) -> bool:
-        """Sets a device's watchdog; returns False where it has none.
+        """Sets a device's watchdog; returns False if it has none.
 
         Args:
-            device: Its number.
-            steps: Of ``WATCHDOG_STEP``, 1 to ``MOST_WATCHDOG``. A force that is this old ends.
+            device: Number of the device.
+            steps: Age in ``WATCHDOG_STEP`` at which a force ends, 1 to ``MOST_WATCHDOG``.
         """
         self["dhdEnableExpertMode"]()
         code = int(self["dhdSetWatchdog"](steps, device))
@@ -139,10 +140,10 @@ class Dhd:
         return code >= 0
 
     def timing(self, exchange: Callable[[], object]) -> tuple[float, float]:
-        """Returns how often an exchange can be made, in Hz, and the time in s that most kept.
+        """Measures the rate of exchanges in Hz and the time in s that the share ``SHARE`` meets.
 
         Args:
-            exchange: Reads a sample and writes a force; made for ``TIMING``.
+            exchange: Reads a sample and writes a force; repeated for ``TIMING``.
         """
         times = []
         begin = last = self.now()
@@ -159,10 +160,11 @@ def located(library: object = None) -> str:
     """Returns the library's file.
 
     Args:
-        library: What the user named; None: the environment variable, else the usual names.
+        library: File named by the user; None selects the environment variable, else the usual
+            names.
 
     Raises:
-        DeviceError: None is found; says where to get it and how to name it.
+        DeviceError: The library was not found; the message names its source and the option.
     """
     named = library or os.environ.get(VARIABLE)
     if named:

@@ -1,4 +1,4 @@
-"""What Force Dimension's library calls its devices, and what is known of each beforehand."""
+"""Device types of Force Dimension's library."""
 
 from __future__ import annotations
 
@@ -13,18 +13,19 @@ from hapticbridge.errors import DeviceError
 from hapticbridge.pose import Quaternion, canonical
 
 ROTATION_ERROR = 1e-3
-"""Of R Rᵀ, without unit: more is no rotation, whatever rounded it."""
+"""Largest deviation of R Rᵀ from the identity, without unit. A larger one is not due to
+rounding."""
 
 
 @dataclass(frozen=True, slots=True)
 class Model:
-    """A kind of device.
+    """Properties of a device type.
 
     Attributes:
-        name: The maker's.
-        turns: Whether its wrist has motors.
-        force: Largest force in N, where the library sets no limit; None where none was found.
-        torque: Largest torque in N m, likewise.
+        name: The maker's name.
+        turns: True if its wrist has motors.
+        force: Largest force in N if the library sets no limit; None if unknown.
+        torque: Largest torque in N m if the library sets no limit; None if unknown.
     """
 
     name: str
@@ -48,24 +49,24 @@ MODELS = {
     203: Model("lambda.3"),
     206: Model("sigma.3"),
 }
-"""By ``dhdGetSystemType``: numbers of the SDK's header. Forces and torques are what CHAI3D lets
-programs ask of each; the maker's own figures are as large or larger."""
+"""Device types by ``dhdGetSystemType``, numbered as in the SDK's header. Forces and torques are
+those that CHAI3D allows; the maker's own figures are equal or larger."""
 
 
 def limits_of(
     model: Model, told: Sequence[float], asked: Mapping[str, float]
 ) -> tuple[float, float]:
-    """Returns the largest force in N and torque in N m that a device may be sent.
+    """Returns the largest force in N and torque in N m that may be commanded.
 
-    The lower holds of what the library says and of what was asked, or is known of the model.
+    Each is the lower of the library's limit and the user's or the model's value.
 
     Args:
-        model: The device's.
-        told: What the library says of each; it is negative where it sets no limit.
-        asked: Numbers of the data sheet that the user named.
+        model: Type of the device.
+        told: The library's limits of force and torque; negative if it sets no limit.
+        asked: Numbers of the data sheet set by the user.
 
     Raises:
-        DeviceError: Nobody knows.
+        DeviceError: No source states a limit.
     """
     limits = {"force": 0.0, "torque": USUAL_TORQUE_LIMIT}
     usual = {"force": model.force, "torque": model.torque}
@@ -76,8 +77,7 @@ def limits_of(
         known = [end for end in ends if end is not None]
         if not known:
             raise DeviceError(
-                f"neither the library nor this project knows the largest {name} of {model.name}; "
-                f"name it with {name}_limit="
+                f"the largest {name} of {model.name} is unknown; set it with {name}_limit="
             )
         limits[name] = min(known)
     return limits["force"], limits["torque"]
@@ -88,10 +88,10 @@ def quaternion_of(frame: Sequence[float], name: str) -> Quaternion:
 
     Args:
         frame: Nine numbers, row by row.
-        name: What errors call the device.
+        name: Name of the device in messages.
 
     Raises:
-        DeviceError: The matrix is no rotation, or a number in it is not finite.
+        DeviceError: The matrix is not a rotation, or a number in it is not finite.
     """
     flat = np.array(frame)
     matrix = flat.reshape(3, 3)
@@ -99,7 +99,9 @@ def quaternion_of(frame: Sequence[float], name: str) -> Quaternion:
     if not is_finite or not (
         np.abs(matrix @ matrix.T - np.eye(3)).max() < ROTATION_ERROR and np.linalg.det(matrix) > 0
     ):
-        raise DeviceError(f"{name} reports an orientation that is no rotation")
+        raise DeviceError(
+            f"{name} reports an orientation that is not a rotation; check its cable and restart it"
+        )
     quaternion = np.empty(4)
     mujoco.mju_mat2Quat(quaternion, flat)
     w, x, y, z = (quaternion / np.linalg.norm(quaternion)).tolist()

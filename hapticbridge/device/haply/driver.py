@@ -1,17 +1,18 @@
-"""Haply Inverse3 and its kin: three translations with force, through the maker's own service.
+"""Haply Inverse3 and related devices: three translations with force, through the maker's service.
 
-The service answers each message with the state it had when the message came. So a force goes out in
-each tick, and its answer is read at the next: force and question go together, as with the Falcon,
-and the force that answers a sample acts as many whole ticks later as an answer needs to come back.
-At most ``MOST_UNDER_WAY`` messages wait for their answers; where the service is slower than the
-loop, the newest force waits for its turn and older ones are left out, so nothing queues up.
+The service answers each message with the device's state when the message arrived. So each tick
+sends a force, and its answer is read in the next tick. As with the Falcon, one message carries the
+force and requests the state. The force that responds to a sample acts as many whole ticks later as
+an answer takes. At most ``MOST_UNDER_WAY`` messages wait for answers. If the service is slower than
+the loop, only the newest force waits and older ones are dropped, so nothing queues up.
 
 The service filters forces. Its force gate and its damping are set when the device is opened, the
-first by the option ``force_gate`` (what gain switches the gate off is nowhere said; 0 is sent); its
-oscillation damper and its global force scale cannot be set from here, and are named to the user.
+force gate by the option ``force_gate``. The gain that disables the gate is not documented; 0 is
+sent. Its oscillation damper and its global force scale cannot be set from here and are reported to
+the user.
 
-Positions are in the service's own frame, right-handed; which way its axes point depends on the
-preset and basis chosen there. No real device has moved under this code yet.
+Positions are in the service's right-handed frame, whose axes depend on the preset and basis chosen
+there. The driver has not been verified on hardware.
 """
 
 from __future__ import annotations
@@ -38,39 +39,41 @@ from hapticbridge.errors import DeviceError, DeviceLost
 from hapticbridge.tick import SAMPLE_DTYPE, TickFlag
 
 FORCE_LIMIT = 2.0
-"""In N: what Isaac Lab's driver limits itself to. The maker publishes no continuous force; more is
-to be asked for with the option ``force_limit``."""
+"""Largest force in N, as in Isaac Lab's driver. The maker publishes no continuous force; the option
+``force_limit`` sets a larger one."""
 
 FIRST_ANSWER = 1.0
-"""In s: longest wait for the list of devices and for the first state."""
+"""Longest wait in s for the list of devices and for the first state."""
 
 LONGEST_PERIOD = 0.02
-"""In s. A force holds only for its message; slower, the device falls idle between two ticks."""
+"""Longest period of the loop in s. A force lasts only for its message; at a longer period the
+device would idle between two ticks."""
 
 MOST_UNDER_WAY = 2
-"""Messages without an answer yet. One would leave the service idle while its answer travels."""
+"""Largest number of messages without an answer. With one, the service would idle while its answer
+travels."""
 
 
 class HaplyDevice:
-    """A device of the service that is open: its filters are set, its timing has been measured.
+    """An open device of the service, with its filters set and its timing measured.
 
-    The sheet's ``rate`` is how often states came with two messages always under way, its ``delay``
-    the time within which 95 % of the answers to single messages came. Mass, damping, friction and
-    resolution are not published; who measured them gives them.
+    The sheet's ``rate`` is the rate of states with two messages always on their way. Its ``delay``
+    is the time within which 95 % of the answers to single messages came. Mass, damping, friction
+    and resolution are not published; they are unknown unless the user states measured values.
 
     Args:
-        link: To the service, connected; the list of devices has been read from it.
+        link: Connected link to the service, after the list of devices was read.
         listed: The device.
         force_gate: Gain of the service's force gate, without unit, >= 0.
-        numbers: Of the data sheet, by name.
-        tell: Told what the service does to forces.
+        numbers: Numbers of the data sheet, by name.
+        tell: Receives a description of the service's force filters.
 
     Attributes:
-        held_back: Forces that were left out because the service was slower than the loop.
+        held_back: Number of forces dropped because the service was slower than the loop.
 
     Raises:
-        DeviceError: The service scales positions, or does not answer as it should.
-        DeviceLost: It is gone.
+        DeviceError: The service scales positions, or its answer is invalid.
+        DeviceLost: The service is gone.
     """
 
     def __init__(
@@ -121,14 +124,14 @@ class HaplyDevice:
         self._watch = SilenceWatch(link.now())
 
     def start(self, period: float) -> NDArray[np.void]:
-        """Asks for the state, without force.
+        """Requests the state, without force.
 
         Args:
             period: The loop's period in s, at most ``LONGEST_PERIOD``.
 
         Raises:
             DeviceError: The period is out of range, or the service reports no position.
-            DeviceLost: It is gone or silent.
+            DeviceLost: The service is gone or silent.
         """
         if checked_period(period) > LONGEST_PERIOD:
             raise DeviceError(
@@ -143,41 +146,41 @@ class HaplyDevice:
         return self._sample.copy()
 
     def read(self, sample: NDArray[np.void]) -> int:
-        """Reports the newest state that has come.
-
-        Waits for none, but for the answer to a new question after the loop stood still.
+        """Returns the newest state; waits only after a pause of the loop, for a new answer.
 
         Args:
-            sample: Shape (1,), ``SAMPLE_DTYPE``, filled in place.
+            sample: Output, shape (1,), ``SAMPLE_DTYPE``.
 
         Returns:
-            0, or ``TickFlag.STALE_SAMPLE`` where the sample repeats the last one.
+            0, or ``TickFlag.STALE_SAMPLE`` if the sample repeats the last one.
 
         Raises:
-            DeviceError: ``start`` has not been called, or what came is no state.
-            DeviceLost: The connection has dropped, the device is not listed any more, or nothing
-                was answered for ``SILENCE``.
+            DeviceError: The device was not started, or an answer is not a state.
+            DeviceLost: The connection was lost, the device is no longer listed, or no answer came
+                for ``SILENCE``.
         """
         if not self._is_started:
-            raise DeviceError(f"{self._name} is read before it was started")
+            raise DeviceError(f"{self._name} is read before it was started; call start() first")
         is_late = self._watch.was_away(self._link.now())
         newest = self._asked_anew() if is_late else self._take()
         if newest is not None:
             self._fill(newest)
         if self._watch.is_silent(self._link.now(), is_new=newest is not None):
-            raise DeviceLost(f"{SERVICE} has not answered for {1e3 * SILENCE:g} ms")
+            raise DeviceLost(
+                f"{SERVICE} has not answered for {1e3 * SILENCE:g} ms; check that it runs"
+            )
         sample[0] = self._sample[0]
         return int(TickFlag.STALE_SAMPLE) if newest is None else 0
 
     def write(self, wrench: NDArray[np.float64]) -> None:
-        """Sends a force, and with it the next question; the torque is left out.
+        """Sends a force together with the next request; the torque is ignored.
 
         Args:
             wrench: Shape (6,), in the service's frame.
 
         Raises:
             DeviceError: The force is not finite.
-            DeviceLost: The connection has dropped.
+            DeviceLost: The connection was lost.
         """
         force = tuple(wrench[:3].tolist())
         if not all(map(math.isfinite, force)):
@@ -187,7 +190,7 @@ class HaplyDevice:
         self._send_pending()
 
     def close(self) -> None:
-        """Commands zero force, waits for its answer up to ``SILENCE``, and ends the connection."""
+        """Commands zero force, waits up to ``SILENCE`` for the answer, and disconnects."""
         if not self._is_open:
             return
         self._is_open = self._is_started = False
@@ -197,12 +200,12 @@ class HaplyDevice:
             for _ in range(self._under_way + 1):
                 self._link.wait(SILENCE)
         except DeviceLost:
-            pass  # who sends no forces any more leaves the device idle
+            pass  # without messages the device idles
         finally:
             self._link.close()
 
     def _take(self) -> str | None:
-        """Takes all answers, sends a force that waited for one; returns the newest answer."""
+        """Returns the newest of all waiting answers, after sending a pending force."""
         answers = self._link.take()
         self._under_way = max(self._under_way - len(answers), 0)
         if answers and self._pending is not None:
@@ -210,10 +213,9 @@ class HaplyDevice:
         return answers[-1] if answers else None
 
     def _asked_anew(self) -> str | None:
-        """Asks for the state without force, after the loop stood still; returns the answer.
+        """Requests the state without force after a pause of the loop; returns the answer.
 
-        What waits to be read answers a question from before that, and a force that still waits to
-        be sent is as old.
+        Waiting answers and a pending force are older than the pause and are discarded.
         """
         self._pending = None
         self._take()
@@ -234,14 +236,14 @@ class HaplyDevice:
         self._pending = None
 
     def _ask(self, message: str) -> str:
-        """Sends a message and waits for its answer."""
+        """Sends a message and returns its answer."""
         self._link.send(message)
         answer = None
         for _ in range(self._under_way + 1):
             answer = self._link.wait(FIRST_ANSWER)
         self._under_way = 0
         if answer is None:
-            raise DeviceLost(f"{SERVICE} does not answer")
+            raise DeviceLost(f"{SERVICE} does not answer within {FIRST_ANSWER:g} s; restart it")
         return answer
 
     def _fill(self, message: str) -> None:

@@ -1,4 +1,4 @@
-"""Haply's Inverse3 and its kin: finding them in the maker's service, and opening one."""
+"""Discovery of Haply's devices in the maker's service."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from hapticbridge.device.transport.websocket import EXTRA, Link, WebSocketLink, 
 from hapticbridge.errors import DeviceError
 
 PLACE = ("localhost", 10001)
-"""Where the service listens unless its configuration says otherwise."""
+"""Default host and port of the service."""
 
 _NUMBERS = ("mass", "damping", "friction", "resolution", "force_limit")
 
@@ -25,11 +25,11 @@ def open_haply(options: Mapping[str, object], tell: Tell) -> HaplyDevice:
     Args:
         options: ``service`` (HOST:PORT), ``serial`` (the service's device_id), ``force_gate``,
             ``log`` (a file for the messages), and numbers of the data sheet.
-        tell: Told what the service does to forces.
+        tell: Receives a description of the service's force filters.
 
     Raises:
         DeviceError: The service does not run, lists no such device, or an option is not valid.
-        DeviceLost: It is gone.
+        DeviceLost: The service is gone.
     """
     host, port = _place(options.get("service"))
     link = WebSocketLink.open(host, port, SERVICE, HexLog.asked(options))
@@ -37,7 +37,7 @@ def open_haply(options: Mapping[str, object], tell: Tell) -> HaplyDevice:
 
 
 def opened(link: Link, options: Mapping[str, object], tell: Tell) -> HaplyDevice:
-    """Opens a device of a service that is connected; see ``open_haply``."""
+    """Opens a device of a connected service; arguments as for ``open_haply``."""
     try:
         numbers = stated_numbers(options, _NUMBERS)
         force_gate = checked_number("force_gate", options.get("force_gate", 0.0), "")
@@ -51,7 +51,7 @@ def opened(link: Link, options: Mapping[str, object], tell: Tell) -> HaplyDevice
 
 
 def find(place: tuple[str, int] = PLACE) -> list[Plugged]:
-    """Lists the devices that the service has; empty where it does not run."""
+    """Lists the devices of the service; empty if it does not run."""
     try:
         link = WebSocketLink.open(*place, SERVICE, HexLog(""))
     except DeviceError:
@@ -65,7 +65,7 @@ def find(place: tuple[str, int] = PLACE) -> list[Plugged]:
 
 
 def medium(place: tuple[str, int] = PLACE) -> str:
-    """Says in a sentence whether the service runs."""
+    """Returns a sentence on whether the service runs."""
     if websocket_client() is None:
         return EXTRA
     try:
@@ -96,7 +96,7 @@ def _plugged(device: Listed) -> Plugged:
 
 
 def _place(service: object) -> tuple[str, int]:
-    """Returns host and port of HOST:PORT; either may be missing."""
+    """Returns host and port of HOST:PORT; both are optional."""
     if service is None:
         return PLACE
     host, _, port = str(service).rpartition(":") if ":" in str(service) else (service, "", PLACE[1])
@@ -115,9 +115,9 @@ FAMILY = Family(
     ids=(),
     transport="service",
     axes="x, y, z",
-    force=f"{FORCE_LIMIT:g} N unless force_limit says more",
+    force=f"{FORCE_LIMIT:g} N, or more with force_limit",
     rate="1 kHz",
-    on_stall="the maker's service lets it idle; after how long is not documented",
+    on_stall="the maker's service ends the force; the time until then is not documented",
     options=("service", "serial", "force_gate", *_NUMBERS, "log"),
     open=open_haply,
     find=find,

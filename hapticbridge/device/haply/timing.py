@@ -1,4 +1,4 @@
-"""How fast a service answers, measured before the loop begins."""
+"""Measured timing of the service."""
 
 from __future__ import annotations
 
@@ -8,38 +8,38 @@ from hapticbridge.device.transport.websocket import Link
 from hapticbridge.errors import DeviceLost
 
 TIME = 0.1
-"""In s: how long each of the two measurements takes."""
+"""Length of each of the two measurements in s."""
 
 UNDER_WAY = 2
-"""Messages kept under way while the rate is measured, as in the loop."""
+"""Number of messages kept on their way while the rate is measured, as in the loop."""
 
 SHARE = 0.95
-"""Share of answers that came within the delay, no unit. The longest are the host's own stalls,
+"""Share of answers within the delay, without unit. The slowest answers are stalls of the host,
 which the loop counts as missed deadlines."""
 
 PACE = 1e-3
-"""In s, from message to message while the delay is measured: a loop's period, so that threads sleep
-in between as they will in the loop."""
+"""Time in s between messages while the delay is measured: a period of the loop, so that threads
+sleep in between as in the loop."""
 
-_ANSWER_TIME = 0.05  # s, longer is silence
+_ANSWER_TIME = 0.05
+"""Longest wait for an answer in s; a longer pause counts as silence."""
 
 
 def measured_timing(link: Link, message: str, name: str) -> tuple[float, float]:
-    """Returns at what rate states are delivered, and within what time they come.
+    """Measures the rate of states and the delay of answers.
 
-    A message carries a force and asks for the state, so both are as old as each other; see
-    ``timing``, where the same holds.
+    A message both carries a force and requests the state, so both have this delay.
 
     Args:
-        link: To a service; no message is under way.
-        message: One without force.
-        name: What errors call the device.
+        link: Link to a service without messages on their way.
+        message: Message without force.
+        name: Name of the device in messages.
 
     Returns:
         The rate in Hz and the delay in s.
 
     Raises:
-        DeviceLost: It fell silent.
+        DeviceLost: The service stopped answering.
     """
     return _rate(link, message, name), _delay(link, message, name)
 
@@ -66,11 +66,13 @@ def _delay(link: Link, message: str, name: str) -> float:
         link.send(message)
         _answer(link, name)
         times.append(link.now() - begin)
-        link.wait(max(begin + PACE - link.now(), 0.0))  # nothing comes: it only sleeps
+        link.wait(max(begin + PACE - link.now(), 0.0))  # no answer is due, so this only sleeps
     times.sort()
     return times[math.ceil(SHARE * len(times)) - 1]
 
 
 def _answer(link: Link, name: str) -> None:
     if link.wait(_ANSWER_TIME) is None:
-        raise DeviceLost(f"{name}: fell silent while its timing was measured")
+        raise DeviceLost(
+            f"{name}: fell silent while its timing was measured; restart the Inverse Service"
+        )

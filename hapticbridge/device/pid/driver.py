@@ -1,4 +1,4 @@
-"""USB force-feedback sticks of the class PID: two axes, a constant force streamed to each."""
+"""USB force-feedback sticks (class PID): two axes, each with a streamed constant force."""
 
 from __future__ import annotations
 
@@ -23,51 +23,51 @@ from hapticbridge.errors import DeviceError, DeviceLost
 from hapticbridge.tick import SAMPLE_DTYPE, TickFlag
 
 LOOKS, LOOK_MS = 20, 10
-"""At the start reports are waited for 20 times, up to 10 ms each: 0.2 s for a stick at rest that
-says nothing, less for one that streams."""
+"""Number and length in ms of the waits for reports at the start: 0.2 s for a silent stick at rest,
+less for one that streams."""
 
 STREAMING = 15
-"""Of those, how many must bring a report from a stick that streams; one that speaks only when it is
-moved brings none in a hand that keeps still. Taking the one for the other costs a flag, no more."""
+"""Smallest number of these waits that bring a report from a streaming stick. A stick that reports
+only changes brings none in a still hand. A wrong classification costs only a flag."""
 
 SLOTS = 4
 """Kinds of report in the loop: force and restart, for each of two effects."""
 
 
 class PidDevice:
-    """A force-feedback stick, its two axes taken for x (to the right) and y (away from the user).
+    """Force-feedback stick; its axes are x (to the right) and y (away from the user).
 
         p = travel/2 (X, −Y),   counts = full · F/newtons
 
-    with X and Y the deflection, -1 to 1. Nothing in the standard says newtons or metres, so both
-    are stated (``Scale``). If they are off by a factor, every force or every length is, and with
-    them K, B and the b that ``identify`` measures: b >= KT/2 + B holds or fails all the same.
+    X and Y are the deflection, -1 to 1. The standard has no units of force or length, so both
+    scales are stated (``Scale``). If a scale is wrong by a factor, every force or length is, and
+    with it K, B and the b that ``identify`` measures. The condition b >= KT/2 + B is not affected.
 
-    Each axis has a constant-force effect of its own with a fixed direction, so a tick sends one
-    short report per axis whose count has changed, at most two. One effect with a direction would
-    need SetEffect (some 18 bytes) as soon as the angle changes, and SetConstantForce. Pushing a peg
-    into its hole that is 1.62 reports a tick, against 1.44 with two effects; and between the two of
-    a tick its force would point elsewhere, where that of two effects is on its way.
+    Each axis has a constant-force effect of its own with a fixed direction. A tick therefore sends
+    one short report per axis whose count has changed, at most two. A single effect with a direction
+    would need SetEffect (some 18 bytes) at each change of angle, and SetConstantForce. Pushing a
+    peg into its hole that takes 1.62 reports a tick, compared to 1.44 with two effects. Between its
+    two reports the force would also point in a wrong direction.
 
-    A silent stick is one at rest: many report only what changes. A pulled plug is an error of the
-    next call.
+    A silent stick is at rest, because many sticks report only changes. An unplugged stick raises an
+    error at the next call.
 
     Args:
-        link: Reports to and from it, open, with ``SLOTS``.
-        name: What errors call it.
+        link: Open link for its reports, with ``SLOTS``.
+        name: Name of the device in messages.
         scale: Newtons, metres, and signs.
-        known: ``mass``, ``damping``, ``friction`` of the data sheet, where the user knows them.
-        intervals: How often it is asked and told, in s; None where that is unknown.
+        known: ``mass``, ``damping``, ``friction`` of the data sheet, as stated by the user.
+        intervals: Polling intervals for reports from and to the device in s; None if unknown.
         serial: Its serial number.
 
     Attributes:
         info: Its data sheet.
-        last_word: Takes the force away should this process die; None where no other process can,
-            and the effects' own end (``Effects.life``) does it alone.
-        workspace: Its travel along x, y and (it has none) z in m, as stated or assumed.
+        last_word: Ends the force if this process dies. None if no second process can open the node;
+            then only the effects' duration (``Effects.life``) ends it.
+        workspace: Travel along x, y and z in m, as stated or assumed (it has no z).
 
     Raises:
-        DeviceError: It does not do what is needed; says what.
+        DeviceError: The stick lacks a required capability; the message names it.
     """
 
     def __init__(
@@ -99,7 +99,7 @@ class PidDevice:
         self.last_word: LastWord | None = None
 
     def start(self, period: float) -> NDArray[np.void]:
-        """Starts the effects with no force, and finds out where the stick stands.
+        """Starts the effects without force, and reads the stick's position.
 
         Args:
             period: The loop's period in s, finite and > 0.
@@ -108,8 +108,8 @@ class PidDevice:
             The pose before the first tick, shape (1,), ``SAMPLE_DTYPE``.
 
         Raises:
-            DeviceError: The period is not, or the stick does not say where it stands.
-            DeviceLost: It is gone.
+            DeviceError: The period is not valid, or the stick does not report its position.
+            DeviceLost: The device is gone.
         """
         checked_period(period)
         self._effects.start(period)
@@ -119,26 +119,26 @@ class PidDevice:
         if not came and not self._stick.takes(
             self._link.requests.input_report(*self._stick.report)
         ):
-            raise DeviceError(f"{self._name} does not say where it stands; move it and start again")
+            raise DeviceError(f"{self._name} does not report its position; move it and start again")
         self._has_started = True
         self._fill()
         return self._sample.copy()
 
     def read(self, sample: NDArray[np.void]) -> int:
-        """Reports where the stick stands; waits for nothing.
+        """Returns the stick's position without waiting.
 
         Args:
-            sample: Shape (1,), ``SAMPLE_DTYPE``, filled in place.
+            sample: Output, shape (1,), ``SAMPLE_DTYPE``.
 
         Returns:
-            0, or ``STALE_SAMPLE`` where a stick that streams has sent nothing since the last read.
+            0, or ``STALE_SAMPLE`` if a streaming stick has sent nothing since the last read.
 
         Raises:
             DeviceLost: The device is gone.
-            DeviceError: It has not been started.
+            DeviceError: The device was not started.
         """
         if not self._has_started:
-            raise DeviceError(f"{self._name} is read before it was started")
+            raise DeviceError(f"{self._name} is read before it was started; call start() first")
         is_new = False
         for report in self._link.take():
             is_new |= self._stick.takes(report)
@@ -148,7 +148,7 @@ class PidDevice:
         return 0 if is_new or not self._streams else int(TickFlag.STALE_SAMPLE)
 
     def write(self, wrench: NDArray[np.float64]) -> None:
-        """Commands a force along x and y, each up to full scale.
+        """Commands a force along x and y, each clipped to full scale.
 
         Args:
             wrench: Shape (6,): force in N, torque in N m, on the device, in the device's frame.
@@ -163,12 +163,12 @@ class PidDevice:
         self._effects.push(shares.tolist())
 
     def close(self) -> None:
-        """Stops the effects, switches the motors off and lets the device go."""
+        """Stops the effects, switches the motors off and releases the device."""
         if not self._is_open:
             return
         self._is_open = False
         try:
-            with contextlib.suppress(DeviceLost):  # then the effects' own end does it
+            with contextlib.suppress(DeviceLost):  # a lost device ends its effects by itself
                 self._effects.close()
         finally:
             self._link.close()
@@ -176,7 +176,7 @@ class PidDevice:
                 self.last_word.close()
 
     def leave_last_word(self, path: str) -> None:
-        """Has another process hold what takes the force away, where two may hold the node.
+        """Starts a guardian process that ends the force, if two processes can hold the node.
 
         Args:
             path: The device node.
@@ -195,11 +195,11 @@ def open_pid(options: Mapping[str, object], tell: Tell, api: HidApi | None = Non
     Args:
         options: ``serial``, ``log``, ``newtons``, ``travel``, ``reverse``, ``profile``, and numbers
             of the data sheet, ``CHANGES``.
-        tell: Told what had to be assumed.
-        api: hidapi or what stands for it; its reports are then not sent by a thread.
+        tell: Receives a message about assumed values.
+        api: hidapi or a substitute; reports are then sent without a thread.
 
     Raises:
-        DeviceError: There is none, it cannot be opened, or it cannot do what is needed.
+        DeviceError: No stick is found, it cannot be opened, or it lacks a required capability.
     """
     plugged = chosen(FAMILY, find(FAMILY, api), options.get("serial"))
     scale, known = scale_of(options, plugged.serial, str(plugged), tell)
@@ -229,11 +229,11 @@ FAMILY = Family(
     ids=(),
     transport="hid",
     axes="2",
-    force="a share of full scale; newtons= says what that is",
+    force="a share of full scale, which newtons= states",
     rate="125 Hz to 1 kHz, one axis at a time",
     on_stall="its effects end by themselves after 0.1 s, on a slow bus after up to 0.4 s",
     options=("serial", "log", "newtons", "travel", "reverse", "profile", *CHANGES),
     open=open_pid,
     recognises=has_force_feedback,
 )
-"""A class: recognised by its report descriptor, not by a list of products."""
+"""Driver of a device class: devices are recognised by their report descriptor, not by a list."""

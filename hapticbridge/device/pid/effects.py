@@ -1,4 +1,4 @@
-"""The two constant-force effects by which a stick is pushed, and how they end by themselves."""
+"""Constant-force effects of a stick."""
 
 from __future__ import annotations
 
@@ -19,37 +19,38 @@ from hapticbridge.device.transport.hid import HidLink
 from hapticbridge.errors import DeviceError
 
 ANGLES = (270.0, 180.0)
-"""Degrees from north, clockwise, that the force of the x and y effect comes from: a positive one
-pushes to the right, and away from the user. The standard's words; never tried on a real stick."""
+"""Origins of the forces of the x and y effect in degrees clockwise from north, as the standard
+defines it. A positive force pushes to the right and away from the user. Not verified on
+hardware."""
 
 LOADS, LOAD_MS = 60, 1
-"""How often a device is asked what became of an effect, as often as Linux does, and how long is
-waited in between, in ms."""
+"""Number of queries for the result of a created effect (as in Linux), and the pause between them in
+ms."""
 
 RESTART, LIFE = 0.02, 5
-"""An effect is started anew every 20 ms and would end by itself after five times that: a host that
-has died lets go within 0.1 s, and four restarts may be lost on the way."""
+"""Time in s between restarts of an effect, and its duration in restarts. If the host dies, the
+force ends within 0.1 s; four restarts may be lost without an effect."""
 
 RESTART_REPORTS = 5
-"""On a slow bus restarts come no oftener than every five reports per effect, so that they take at
+"""Smallest number of reports per effect between restarts on a slow bus, so that restarts take at
 most a fifth of it."""
 
 SLOWEST_INTERVAL = 8e-3
-"""In s, where the interval is unknown: old sticks take 125 reports a second."""
+"""Assumed time per report in s if it is unknown: old sticks accept 125 reports a second."""
 
 
 class Effects:
-    """Creates an effect per axis, streams their forces, and keeps them alive.
+    """One constant-force effect per axis, with streamed force and limited duration.
 
     Args:
-        link: Reports to the device, open.
-        name: What errors call it.
+        link: Open link to the device.
+        name: Name of the device in messages.
         reports: Its reports.
-        interval: Time in s that a report to it takes, None where unknown.
+        interval: Time in s per report to the device, None if unknown.
 
     Raises:
         DeviceError: The device has no room for two effects, or refuses them.
-        DeviceLost: It is gone.
+        DeviceLost: The device is gone.
     """
 
     def __init__(
@@ -72,14 +73,14 @@ class Effects:
         self._ticks = self._every = 0
 
     def start(self, period: float) -> None:
-        """Gives the effects their direction and their life, and starts them without force.
+        """Sets direction and duration of the effects and starts them without force.
 
         Args:
-            period: The loop's, in s.
+            period: The loop's period in s.
         """
         self._every, self._ticks = max(int(self._restart / period), 1), 0
         reports = self._reports
-        # never shorter than a restart comes: a slow loop would drop its force between two ticks
+        # at least LIFE periods: a slow loop would otherwise lose its force between two ticks
         life = max(self.life, min(LIFE * period, reports.longest()))
         for index, angle, magnitude, start in zip(
             self._indices, ANGLES, self._magnitudes, self._starts, strict=True
@@ -90,10 +91,10 @@ class Effects:
         self._sent = [0] * len(ANGLES)
 
     def push(self, shares: Sequence[float]) -> None:
-        """Sends the forces that have changed, and restarts the effects when it is time.
+        """Sends changed forces, and restarts the effects when due.
 
         Args:
-            shares: Of full scale per axis, finite; beyond -1 to 1 it is full scale.
+            shares: Share of full scale per axis, finite, clipped to [-1, 1].
         """
         self._ticks += 1
         is_due = self._ticks >= self._every
@@ -110,7 +111,7 @@ class Effects:
                 self._link.write(start, len(ANGLES) + axis)
 
     def farewell(self) -> tuple[bytes, ...]:
-        """Returns what takes the force away, the effects too, and switches the motors off."""
+        """Returns the reports that end the force, free the effects and disable the motors."""
         reports = self._reports
         said: list[bytes | None] = []
         for index, magnitude in zip(self._indices, self._magnitudes, strict=True):
@@ -121,7 +122,7 @@ class Effects:
         return tuple(report for report in said if report is not None)
 
     def close(self) -> None:
-        """Sends the ``farewell``."""
+        """Sends the reports of ``farewell``."""
         for report in self.farewell():
             self._send(report)
 
@@ -135,14 +136,16 @@ class Effects:
         most = self._reports.most_effects(answer) if answer else None
         if most is not None and most < count:
             raise DeviceError(
-                f"{self._name} plays {most} effect at a time; two are needed, one for each axis"
+                f"{self._name} plays {most} effect at a time; two are needed, one per axis"
             )
 
     def _created(self) -> int:
         """Creates an effect in the device; returns its index."""
         requests = self._link.requests
         if not requests.set_feature(self._reports.create()):
-            raise DeviceError(f"{self._name} refuses to create a constant force")
+            raise DeviceError(
+                f"{self._name} refuses to create a constant force; unplug it and plug it in again"
+            )
         for _ in range(LOADS):
             answer = requests.feature(*self._reports.load)
             status, index = self._reports.loaded(answer) if answer else (None, 0)

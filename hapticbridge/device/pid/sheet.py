@@ -1,4 +1,4 @@
-"""What is known, stated and assumed of a force-feedback stick: its scales and its data sheet."""
+"""Scale and data sheet of a force-feedback stick."""
 
 from __future__ import annotations
 
@@ -20,27 +20,27 @@ from hapticbridge.device.profile_search import profile_named, profile_of
 from hapticbridge.errors import DeviceError
 
 ASSUMED_NEWTONS = 10.0
-"""Full scale in N that is assumed where nobody says it: more than an ordinary stick has, so that
-what is asked for comes out weaker. A stronger one exists; only a force gauge tells."""
+"""Assumed force at full scale in N: more than that of an ordinary stick, so that forces come out
+weaker than commanded. Stronger sticks exist; only a force gauge shows the true value."""
 
 ASSUMED_TRAVEL = 0.1
-"""In m from stop to stop, likewise: a grip some 12 cm above its pivot that turns by 24° to each
-side."""
+"""Assumed travel from stop to stop in m: a grip some 12 cm above its pivot that turns by 24° to
+each side."""
 
 CHANGES = ("mass", "damping", "friction")
-"""Numbers of the data sheet that the user may know."""
+"""Numbers of the data sheet that the user may state."""
 
 _AXES = ("x", "y")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scale:
-    """What a stick's counts are in metres and newtons.
+    """Scale of a stick's counts in metres and newtons.
 
     Attributes:
         newtons: Force at full scale in N, > 0.
-        travel: From stop to stop of each axis in m, > 0.
-        signs: Of the force per axis, shape (2,), -1 where the firmware turns it round.
+        travel: Travel of each axis from stop to stop in m, > 0.
+        signs: Sign of the force per axis, shape (2,); -1 if the firmware reverses it.
     """
 
     newtons: float
@@ -51,22 +51,22 @@ class Scale:
 def scale_of(
     options: Mapping[str, object], serial: str, model: str, tell: Tell
 ) -> tuple[Scale, dict[str, object]]:
-    """Returns the scale, and what else of the options is for the data sheet.
+    """Returns the scale, and the options for the data sheet.
 
-    What the user says goes first, then the profile of the unit or its model (``force_limit``:
-    newtons at full scale; ``workspace``: travel), then an assumption, of which the user is told.
-    What a profile was measured with must not be changed: its b would be in other units than the
-    force.
+    The user's options take precedence over the profile of the unit or its model (``force_limit``:
+    newtons at full scale; ``workspace``: travel). Without either, a value is assumed and reported.
+    The scale of a measured profile cannot be changed, because its b would then have other units
+    than the force.
 
     Args:
-        options: As given to ``open_device``.
-        serial: The unit's.
-        model: What the stick calls itself; the profile of another model is not taken.
-        tell: Takes the sentence.
+        options: Options of ``open_device``.
+        serial: Serial number of the unit.
+        model: Name that the stick reports; the profile of another model is not used.
+        tell: Receives the message about an assumed scale.
 
     Raises:
-        DeviceError: A number is out of range, contradicts the profile, or states what nobody can
-            know without the scale.
+        DeviceError: A number is out of range, contradicts the profile, or is stated without the
+            scale on which it depends.
     """
     measured = _measured_with(options.get("profile"), serial, model)
     for name, value in measured.items():
@@ -81,14 +81,14 @@ def scale_of(
     missing = [f"{name}=" for name, value in stated.items() if value is None]
     if changes and missing:
         raise DeviceError(
-            f"{next(iter(changes))} is in newtons and metres, of which a stick knows nothing: say "
-            f"{' and '.join(missing)} too"
+            f"{next(iter(changes))} is in newtons and metres, and a stick has no scale for them: "
+            f"state {' and '.join(missing)} too"
         )
     if missing:
         tell(
-            f"nobody says how strong or how wide this stick is: full scale is taken for "
-            f"{ASSUMED_NEWTONS:g} N and its travel for {1e3 * ASSUMED_TRAVEL:g} mm where not "
-            f"stated; {' and '.join(missing)} state it"
+            f"the strength or the travel of this stick is unknown: {ASSUMED_NEWTONS:g} N at full "
+            f"scale and a travel of {1e3 * ASSUMED_TRAVEL:g} mm are assumed unless stated; "
+            f"{' and '.join(missing)} state it"
         )
     newtons, travel = (
         checked_number(name, assumed if value is None else value, unit, is_positive=True)
@@ -104,7 +104,7 @@ def scale_of(
 
 
 def _measured_with(named: object, serial: str, model: str) -> dict[str, float | None]:
-    """Returns the scale that a profile's numbers are in; None where it does not say."""
+    """Returns the scale of a profile's numbers; None for an unknown part."""
     profile = profile_of("pid", serial, model) if named is None else None
     if named not in (None, "none"):
         profile = profile_named(str(named))
@@ -124,18 +124,18 @@ def data_sheet(
     intervals: tuple[float | None, float | None],
     known: dict[str, Any],
 ) -> DeviceInfo:
-    """Makes a data sheet.
+    """Returns the data sheet of a stick.
 
-    Its rate is that of a force on both axes, two reports: the loop's period counts as no shorter in
-    b >= KT/2 + B. Its delay is unknown, because no firmware says its own.
+    Its rate is that of a force on both axes, two reports. In b >= KT/2 + B the loop's period counts
+    as no shorter than that. Its delay is unknown, because no firmware reports it.
 
     Args:
-        name: What the device is called.
+        name: Name of the device.
         serial: Its serial number.
         scale: Newtons and metres.
-        step: Least change of deflection per axis, of -1 to 1.
-        intervals: Time per report from and to the device, in s; None where unknown.
-        known: Of ``CHANGES``.
+        step: Smallest change of deflection per axis, of -1 to 1.
+        intervals: Time per report from and to the device, in s; None if unknown.
+        known: Numbers of ``CHANGES``.
 
     Raises:
         DeviceError: A number is out of range.

@@ -1,4 +1,4 @@
-"""Where a force-feedback stick stands: its X and Y axes and its buttons, found by usage."""
+"""Axes and buttons of a force-feedback stick, found by usage."""
 
 from __future__ import annotations
 
@@ -17,10 +17,11 @@ from hapticbridge.device.transport.hid_search import CONTROLLERS
 from hapticbridge.errors import DeviceError
 
 X, Y = 0x00010030, 0x00010031
-"""Usages of the axes on the page of generic desktop controls: to the right, and to the user."""
+"""Usages of the axes on the page of generic desktop controls: to the right, and towards the
+user."""
 
 MOST_BUTTONS = 63
-"""Buttons that are told apart, as many as a sample has bits for."""
+"""Largest number of buttons: the bits of a sample."""
 
 _CONTROLLERS = {page << 16 | usage for page, usage in CONTROLLERS}
 _BUTTON_PAGE = 9
@@ -28,23 +29,23 @@ _BUTTON_PAGE = 9
 
 
 class Stick:
-    """Takes input reports one by one.
+    """Decoder of a stick's input reports.
 
     Args:
-        layout: The device's reports.
+        layout: Layout of the device's reports.
 
     Attributes:
-        deflection: To the right and towards the user, each -1 to 1.
-        buttons: A bit each, the first one lowest.
-        step: Least change of deflection that each axis can report.
+        deflection: Deflection to the right and towards the user, each -1 to 1.
+        buttons: One bit per button, the first one lowest.
+        step: Smallest change of deflection per axis.
         report: Number and length in bytes of the report with the X axis.
 
     Raises:
-        DeviceError: It has no X or Y, or its force does not act on both.
+        DeviceError: The stick has no X or Y, or its force does not act on both.
     """
 
     def __init__(self, layout: Layout) -> None:
-        # some have a mouse or a keyboard beside the stick, with an X and Y of their own
+        # some devices contain a mouse or a keyboard with an X and Y of its own
         fields = [
             field
             for field in layout.fields
@@ -62,7 +63,7 @@ class Stick:
                 raise DeviceError("its axes have no range")
         if not {X, Y} <= forced_axes(layout):
             raise DeviceError(
-                "its force does not act on both X and Y; it is no stick but a wheel or the like"
+                "its force does not act on both X and Y; it is not a stick but a wheel or similar"
             )
         self._buttons = _buttons(fields)
         self._places = (*self._axes, *(place for _, place in self._buttons))
@@ -73,12 +74,12 @@ class Stick:
         self.buttons = 0
 
     def takes(self, report: bytes) -> bool:
-        """Takes a report; returns whether it was one that says where an axis stands."""
+        """Decodes a report; returns whether it held the position of an axis."""
         number = as_number(self._layout, report)
         came, bits = number & 0xFF, 8 * (len(report) + (not self._layout.is_numbered))
         mine = [place for place in self._places if place.field.report == came]
         if not mine or any(place.offset + place.field.size > bits for place in mine):
-            return False  # none of ours, or cut short
+            return False  # an unrelated or truncated report
         is_new = False
         for axis, place in enumerate(self._axes):
             if place.field.report == came:
@@ -94,7 +95,7 @@ class Stick:
 
 
 def _buttons(fields: list[Field]) -> list[tuple[int, Place]]:
-    """Returns the first buttons: which bit each one has in a sample, and where it lies."""
+    """Returns the first buttons: bit in a sample, and place in the report."""
     found = []
     for field in fields:
         for index, usage in enumerate(field.usages[: field.count]):

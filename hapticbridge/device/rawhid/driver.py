@@ -1,4 +1,4 @@
-"""Home-made devices that speak the open protocol of ``rawhid.md``: 1 to 6 axes, 64-byte frames."""
+"""Home-made devices with the open protocol of ``rawhid.md``: 1 to 6 axes, 64-byte frames."""
 
 from __future__ import annotations
 
@@ -34,28 +34,27 @@ NO_WRENCH = (0.0,) * 6
 
 
 class RawHidDevice:
-    """A device that streams its state and obeys the newest force frame.
+    """A device that streams its state and applies the newest force frame.
 
-    The device sends a state frame at its own rate, without being asked; ``read`` takes the newest
-    that has come. Of frames lost on the way the newest one still is right, so they are counted and
-    nothing else; a frame with a wrong CRC is dropped and counted; a number that is not finite, a
-    fault that the device reports, or a clock that runs backwards (it has restarted, and may count
-    its pose from another place) ends the run.
+    The device sends state frames at its own rate; ``read`` returns the newest. Lost frames are
+    counted only, because the newest remains valid. A frame with a wrong CRC is dropped and counted.
+    The run ends on a non-finite number, a reported fault, or a clock that runs backwards. The last
+    means a restart, after which the pose may have another origin.
 
     Args:
-        link: Reports to and from the device, open.
-        name: What errors call it.
-        changes: Numbers of the data sheet that go before what the device says of itself.
-        now: Returns the time in s of a clock that only grows.
+        link: Open link for its reports.
+        name: Name of the device in messages.
+        changes: Numbers of the data sheet that replace those of the device.
+        now: Returns the time of a monotonic clock in s.
 
     Attributes:
         info: Its data sheet.
-        last_word: Says zero to it should this process die; None where no other process can.
-        states: The newest state, and how many were lost or damaged on the way.
+        last_word: Commands zero force if this process dies; None if no second process can.
+        states: Newest state, and numbers of lost and damaged frames.
 
     Raises:
-        DeviceError: It does not speak the protocol, another version of it, or its data sheet is
-            incomplete or out of range.
+        DeviceError: The device has another protocol or version, or its data sheet is incomplete or
+            out of range.
     """
 
     def __init__(
@@ -77,7 +76,7 @@ class RawHidDevice:
         self.last_word: LastWord | None = None
 
     def start(self, period: float) -> NDArray[np.void]:
-        """Waits for a state frame that is newer than this call.
+        """Waits for a state frame newer than this call.
 
         Args:
             period: The loop's period in s, finite and > 0.
@@ -86,8 +85,8 @@ class RawHidDevice:
             The pose before the first tick, shape (1,), ``SAMPLE_DTYPE``.
 
         Raises:
-            DeviceError: The period is not, the device sends nothing, must be homed first, or
-                reports a fault.
+            DeviceError: The period is not valid, or the device sends nothing, must be homed first,
+                or reports a fault.
         """
         period = checked_period(period)
         self._watchdog_ms = min(math.ceil(1e3 * watchdog_time(period)), LONGEST_WATCHDOG_MS)
@@ -98,11 +97,13 @@ class RawHidDevice:
             if states.takes(report):
                 break
         if states.newest is None:
-            raise DeviceError(f"{self._name} sends no state frames")
+            raise DeviceError(
+                f"{self._name} sends no state frames within {FIRST_STATE_MS} ms; check its firmware"
+            )
         if states.newest.status & Status.NOT_READY:
             raise DeviceError(
-                f"{self._name} does not know its pose yet: home or calibrate it, as its builder "
-                "says, and start again"
+                f"{self._name} has no valid pose yet: home or calibrate it as its builder "
+                "describes, and start again"
             )
         self._refuse_fault(states.newest)
         self._fill(states.newest)
@@ -110,30 +111,30 @@ class RawHidDevice:
         return self._sample.copy()
 
     def read(self, sample: NDArray[np.void]) -> int:
-        """Reports the newest pose that has come; waits for none.
+        """Returns the newest pose without waiting.
 
         Args:
-            sample: Shape (1,), ``SAMPLE_DTYPE``, filled in place.
+            sample: Output, shape (1,), ``SAMPLE_DTYPE``.
 
         Returns:
-            0, or ``STALE_SAMPLE`` where no valid frame has come since the last read.
+            0, or ``STALE_SAMPLE`` if no valid frame has come since the last read.
 
         Raises:
             DeviceLost: The device is gone, or silent for longer than ``SILENCE``.
-            DeviceError: It has not been started, has restarted, reports a fault, or a number that
-                is not finite.
+            DeviceError: The device was not started, has restarted, reports a fault, or sent a
+                non-finite number.
         """
         states = self.states
         if states.newest is None:
-            raise DeviceError(f"{self._name} is read before it was started")
+            raise DeviceError(f"{self._name} is read before it was started; call start() first")
         is_new = False
         for report in self._link.take():
             is_new |= states.takes(report)
-        if not self._has_begun:  # between the start and the loop nobody took what was sent
+        if not self._has_begun:  # frames between the start and the loop do not count as lost
             self._has_begun, states.lost = True, 0
         if self._watch.is_silent(self._now(), is_new=is_new):
             silence = 1e3 * self._watch.silence
-            raise DeviceLost(f"{self._name} has sent nothing for {silence:.0f} ms")
+            raise DeviceLost(f"{self._name} has sent nothing for {silence:.0f} ms; check its cable")
         if not is_new:
             sample[0] = self._sample[0]
             return int(TickFlag.STALE_SAMPLE)
@@ -143,7 +144,7 @@ class RawHidDevice:
         return 0
 
     def write(self, wrench: NDArray[np.float64]) -> None:
-        """Commands a wrench, on the axes that the device has.
+        """Commands a wrench on the axes that the device has.
 
         Args:
             wrench: Shape (6,): force in N, torque in N m, on the device, in the device's frame.
@@ -158,14 +159,14 @@ class RawHidDevice:
         self._send(force_frame(self._next(), values, self._watchdog_ms))
 
     def close(self) -> None:
-        """Switches the motors off and lets the device go."""
+        """Switches the motors off and releases the device."""
         if not self._is_open:
             return
         self._is_open = False
         try:
             self._send(force_frame(self._next(), NO_WRENCH, 1, is_enabled=False))
         except DeviceLost:
-            pass  # its own watchdog does it
+            pass  # the device's own watchdog ends the force
         finally:
             self._link.close()
             if self.last_word is not None:
@@ -173,7 +174,7 @@ class RawHidDevice:
 
     @property
     def velocity(self) -> NDArray[np.float64]:
-        """Velocity in m/s and angular velocity in rad/s as last reported, shape (6,); 0 before."""
+        """Last reported velocity in m/s and angular velocity in rad/s, shape (6,); initially 0."""
         state = self.states.newest
         numbers = (0.0,) * 12 if state is None else state.numbers
         moving: NDArray[np.float64] = np.array(numbers[6:]) * self._mask
@@ -181,7 +182,7 @@ class RawHidDevice:
 
     @property
     def on_the_way(self) -> int:
-        """How many force frames the device had not obeyed yet when it sent its newest state."""
+        """Number of force frames that the device had not yet applied at its newest state."""
         state = self.states.newest
         return 0 if state is None else (self._sequence - state.echo) & 0xFFFF
 
@@ -189,11 +190,12 @@ class RawHidDevice:
         if state.status & (Status.FAULT | Status.NOT_READY):
             what = "a fault of its own" if state.status & Status.FAULT else "that its pose was lost"
             raise DeviceError(
-                f"{self._name} reports {what} (status 0x{state.status:02x}) and gives no force"
+                f"{self._name} reports {what} (status 0x{state.status:02x}) and gives no force; "
+                "restart and home it"
             )
 
     def _fill(self, state: State) -> None:
-        """Makes a sample of a state; axes that the device lacks stay where they are."""
+        """Converts a state into a sample; axes that the device lacks do not move."""
         pose = self._mask * state.numbers[:6]
         sample = self._sample[0]
         sample["position"] = pose[:3]
@@ -206,4 +208,4 @@ class RawHidDevice:
         return self._sequence
 
     def _send(self, frame: bytes) -> None:
-        self._link.write(b"\0" + frame)  # reports without a number: hidapi wants a 0 in front
+        self._link.write(b"\0" + frame)  # hidapi requires a leading 0 for reports without a number

@@ -1,4 +1,4 @@
-"""Home-made devices that speak the open protocol: finding one among what is plugged in."""
+"""Discovery of home-made devices."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ def open_rawhid(
     """Finds and opens a raw HID device.
 
     Args:
-        options: ``serial``, ``log``, and numbers of the data sheet that go before its own.
-        api: hidapi or what stands for it; its reports are then not sent by a thread.
-        now: Returns the time in s of a clock that only grows.
+        options: ``serial``, ``log``, and numbers of the data sheet that replace its own.
+        api: hidapi or a substitute; reports are then sent without a thread.
+        now: Returns the time of a monotonic clock in s.
 
     Raises:
-        DeviceError: There is none, or it cannot be opened or does not speak the protocol.
+        DeviceError: No device is found, it cannot be opened, or it has another protocol.
     """
     plugged = chosen(FAMILY, find(FAMILY, api), options.get("serial"))
     link = HidLink.open(plugged, api, is_overlapped=api is None, log=HexLog.asked(options))
@@ -50,7 +50,7 @@ def open_rawhid(
 
 FAMILY = Family(
     name="rawhid",
-    about="home-made devices that speak hapticbridge/device/rawhid.md (Teensy and the like)",
+    about="home-made devices with the protocol hapticbridge/device/rawhid.md (as on Teensy)",
     ids=(UsbId(0x16C0, 0x0486, "Teensy raw HID"),),
     transport="hid",
     axes="1 to 6, as built",
@@ -58,8 +58,9 @@ FAMILY = Family(
     rate="to 1 kHz, as built",
     options=("serial", "log", *CHANGES),
     open=open_rawhid,
-    on_stall=f"its watchdog takes the force away after {1e3 * SHORTEST_WATCHDOG:g} ms, if it was "
-    "built as the protocol says",
+    on_stall=f"its watchdog ends the force after {1e3 * SHORTEST_WATCHDOG:g} ms, if it was built "
+    "to the protocol",
     usage=(0xFFAB, 0x0200),
 )
-"""Teensy's raw HID interface; its second interface (usage page FFC9) is an emulated serial port."""
+"""Driver of home-made devices with Teensy's raw HID interface. Its second interface (usage page
+FFC9) is an emulated serial port."""

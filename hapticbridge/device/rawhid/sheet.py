@@ -1,4 +1,4 @@
-"""What a raw HID device says of itself when it is asked, and the data sheet made of it."""
+"""Data sheet of a raw HID device."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ from hapticbridge.device.transport.hid import Link
 from hapticbridge.errors import DeviceError
 
 ASKS, ASK_WAIT_MS = 10, 100
-"""How often a page of the sheet is asked for before giving up, and how long each answer is waited
-for, in ms: a device that still boots has a second for each."""
+"""Number of requests for a page of the sheet, and wait for each answer in ms. A booting device has
+a second per page."""
 
 POLLING = 1e-3
-"""In s: a full-speed device is asked once a millisecond, in each direction."""
+"""Polling interval of a full-speed device in s, in each direction."""
 
 _MUST_SAY = ("rate", "speed_limit")
 CHANGES = (
@@ -42,19 +42,19 @@ CHANGES = (
     "torque_limit",
     "speed_limit",
 )
-"""Numbers of the data sheet that the user may know better than the device."""
+"""Numbers of the data sheet that the user may replace."""
 
 
 def asked(link: Link, name: str) -> tuple[Numbers, str]:
-    """Asks a device for both pages of its sheet.
+    """Requests both pages of a device's sheet.
 
     Args:
-        link: Reports to and from the device, open.
-        name: What errors call it.
+        link: Open link for its reports.
+        name: Name of the device in messages.
 
     Raises:
-        DeviceError: It does not answer, or speaks another version of the protocol.
-        DeviceLost: It is gone.
+        DeviceError: The device does not answer, or has another version of the protocol.
+        DeviceLost: The device is gone.
     """
     numbers, title = _page(link, name, NUMBERS_PAGE), _page(link, name, NAME_PAGE)
     assert isinstance(numbers, Numbers)
@@ -71,15 +71,15 @@ def _page(link: Link, name: str, page: int) -> Numbers | str:
             if (version := version_of(report)) not in (None, VERSION):
                 raise DeviceError(
                     f"{name} speaks version {version} of the raw HID protocol; "
-                    f"this is version {VERSION}"
+                    f"version {VERSION} is required, so update its firmware"
                 )
     raise DeviceError(
-        f"{name} does not answer as hapticbridge/device/rawhid.md says; is its firmware on it?"
+        f"{name} does not answer by the protocol hapticbridge/device/rawhid.md; check its firmware"
     )
 
 
 def reports(link: Link, timeout_ms: int) -> Iterator[bytes]:
-    """Yields reports as they come, for about that time: one a millisecond, or waiting."""
+    """Yields reports as they come, for about ``timeout_ms``; a report counts as 1 ms."""
     left = timeout_ms
     while left > 0:
         report = link.wait(min(left, 10))
@@ -89,16 +89,16 @@ def reports(link: Link, timeout_ms: int) -> Iterator[bytes]:
 
 
 def data_sheet(name: str, numbers: Numbers, title: str, changes: dict[str, Any]) -> DeviceInfo:
-    """Makes a data sheet of what the device says of itself and what the user knows better.
+    """Returns the data sheet from the device's numbers and the user's changes.
 
     Args:
-        name: What errors call it.
+        name: Name of the device in messages.
         numbers: Page 0.
         title: Page 1.
-        changes: Of ``CHANGES``, by name.
+        changes: Numbers of ``CHANGES``, by name.
 
     Raises:
-        DeviceError: A number that nobody can guess is missing, or one is out of range.
+        DeviceError: A required number is missing, or one is out of range.
     """
     known: dict[str, Any] = numbers.known()
     axes = numbers.axis_names
@@ -110,8 +110,8 @@ def data_sheet(name: str, numbers: Numbers, title: str, changes: dict[str, Any])
     known |= changes
     must = [*_MUST_SAY, *["force_limit"] * moves, *["torque_limit"] * turns]
     if missing := [field for field in must if known[field] is None]:
-        raise DeviceError(f"{name} does not say its {missing[0]}, and nobody can guess it")
-    # what the device adds by itself, a state that is one of its periods old, and the bus both ways
+        raise DeviceError(f"{name} does not report its {missing[0]}, which is required")
+    # the device's own delay, plus a state up to one of its periods old, plus the bus both ways
     delay = known.pop("delay")
     try:
         return DeviceInfo(
@@ -124,4 +124,4 @@ def data_sheet(name: str, numbers: Numbers, title: str, changes: dict[str, Any])
             **known,
         )
     except (DeviceError, ZeroDivisionError) as error:
-        raise DeviceError(f"{name} claims what cannot be: {error}") from None
+        raise DeviceError(f"{name} reports an impossible data sheet: {error}") from None

@@ -1,4 +1,4 @@
-"""The state frames of a raw HID device as they come: the newest, and what was lost on the way."""
+"""State frames of a raw HID device."""
 
 from __future__ import annotations
 
@@ -6,20 +6,20 @@ from hapticbridge.device.rawhid.frame import LARGEST, State, decoded
 from hapticbridge.errors import DeviceError
 
 _HALF_A_TURN = 0x80000000
-"""Of the device's clock, in µs: a step forwards by more is taken for one backwards."""
+"""Half the range of the device's clock in µs; a larger step forwards counts as a step backwards."""
 
 
 class StateStream:
-    """Takes reports one by one and counts.
+    """Decoder and counter of state frames.
 
     Args:
-        name: What errors call the device.
+        name: Name of the device in messages.
 
     Attributes:
-        newest: The state that came last; None before the first.
-        lost: State frames that never came, by their sequence.
-        damaged: Reports that were no valid frame.
-        repeated: State frames that came twice.
+        newest: Newest state; None before the first.
+        lost: Number of missing state frames, by their sequence.
+        damaged: Number of reports that were not valid frames.
+        repeated: Number of state frames that came twice.
     """
 
     def __init__(self, name: str) -> None:
@@ -28,7 +28,7 @@ class StateStream:
         self.lost = self.damaged = self.repeated = 0
 
     def takes(self, report: bytes) -> bool:
-        """Takes a report; returns whether it was a state frame that is newer than the last one.
+        """Decodes a report; returns whether it was a new state frame.
 
         Raises:
             DeviceError: The device has restarted, or a number is not finite.
@@ -44,7 +44,7 @@ class StateStream:
                 return False
             if (state.time_us - last.time_us) & _HALF_A_TURN:
                 raise DeviceError(
-                    f"{self._name} has restarted in mid-run; its pose may count from elsewhere"
+                    f"{self._name} has restarted during the run; its pose may have a new origin"
                 )
             self.lost += (state.sequence - last.sequence - 1) & 0xFFFF
         if not state.is_finite or max(map(abs, state.numbers)) > LARGEST:

@@ -1,4 +1,4 @@
-"""The simulated device's state, and its step from one sample to the next, compiled."""
+"""State of a simulated device, and its compiled step from one sample to the next."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ MAX_DELAY = 100
 """Largest output delay in samples."""
 
 FREE, IN_A_HAND, ON_A_LINE = 0, 1, 2
-"""Who holds the device: nobody, a hand of inertia, damper and spring, or a lossless line tuned to
-be the worst passive hand."""
+"""Holder of the device: none, a hand of inertia, damper and spring, or the lossless line of the
+worst passive hand."""
 
 STATE_DTYPE = np.dtype(
     [
@@ -59,14 +59,14 @@ STATE_DTYPE = np.dtype(
         ("held_before", "<f8", 6),
     ]
 )
-"""What the step reads and writes. ``written`` is the newest wrench; ``on_the_way`` is a ring of
-``delay`` + 1 wrenches between the write and the motors; ``holder``: ``FREE``, ``IN_A_HAND`` or
-``ON_A_LINE``; the lines hold p, q, r of v_k = p v_{k−1} + q F_k + r F_{k−1}."""
+"""State of the step. ``written`` is the newest wrench; ``on_the_way`` is a ring of ``delay`` + 1
+wrenches between the write and the motors; ``holder`` is ``FREE``, ``IN_A_HAND`` or ``ON_A_LINE``.
+The lines hold p, q, r of v_k = p v_{k−1} + q F_k + r F_{k−1}."""
 
 
 @compiled
 def _translate(s: Record, wrench: NDArray[np.float64], target: Vector) -> None:
-    """Moves the position by one period, each axis on its own."""
+    """Advances the position by one period, each axis separately."""
     axis = s.translation
     for i in range(3):
         drift = (target[i] - s.target_position[i]) / s.period
@@ -84,7 +84,7 @@ def _translate(s: Record, wrench: NDArray[np.float64], target: Vector) -> None:
 
 @compiled
 def _turn_about(s: Record, i: int, torque: float, angle: float, drift: float) -> float:
-    """Returns the turn about one axis over one period, and updates its velocity."""
+    """Returns the rotation about one axis over one period, and updates its velocity."""
     velocity = s.angular_velocity[i]
     acceleration = acceleration_at(s.rotation, torque, angle, velocity, drift)
     turn, gain = moved(s.rotation, 0, velocity - drift, acceleration, drift)
@@ -94,7 +94,7 @@ def _turn_about(s: Record, i: int, torque: float, angle: float, drift: float) ->
 
 @compiled
 def _rotate(s: Record, wrench: NDArray[np.float64], target: Quaternion) -> None:
-    """Turns the orientation by one period, along the axes of the device's frame."""
+    """Advances the orientation by one period, along the axes of the device's frame."""
     old, q = quaternion_of(s.target_quaternion), quaternion_of(s.quaternion)
     drift = scaled(1.0 / s.period, rotation_between(old, target))
     angle = rotation_between(old, q)
@@ -109,7 +109,7 @@ def _rotate(s: Record, wrench: NDArray[np.float64], target: Quaternion) -> None:
 
 @compiled
 def _follow_lines(s: Record, wrench: NDArray[np.float64]) -> None:
-    """Moves every axis by one period as device and worst hand do together (``WorstHand``)."""
+    """Advances all axes by one period with device and worst hand together (``WorstHand``)."""
     line = s.translation_line
     for i in range(3):
         s.velocity[i] = line[0] * s.velocity[i] + line[1] * wrench[i] + line[2] * s.held_before[i]
@@ -130,10 +130,10 @@ def _follow_lines(s: Record, wrench: NDArray[np.float64]) -> None:
 def next_sample(
     states: NDArray[np.void], motion: NDArray[np.float64], samples: NDArray[np.void]
 ) -> None:
-    """Moves device and hand by one period (not before the first sample) and reports the pose."""
+    """Advances device and hand by one period (not before the first sample) and writes the pose."""
     s = states[0]
     if s.tick > 0:
-        # the wrench written in tick k - 1 leaves the line of delay + 1 places in tick k + delay
+        # the wrench written in tick k - 1 leaves the ring of delay + 1 places in tick k + delay
         line = s.delay + 1
         entry = s.on_the_way[(s.tick - 1) % line]
         for i in range(6):
@@ -167,5 +167,5 @@ def next_sample(
 
 @compiled
 def _rounded(value: float, step: float) -> float:
-    """Returns the nearest multiple of a step, the value itself where the step is zero."""
+    """Returns the nearest multiple of a step, or the value itself for a step of zero."""
     return step * np.round(value / step) if step > 0.0 else value

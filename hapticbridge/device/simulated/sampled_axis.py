@@ -1,17 +1,4 @@
-"""One axis of a device in a hand, moved exactly over a time in which its force is held.
-
-    M v' = F − s f_c − b v − b_h (v − ṗ) − k_h (x − p),        x' = v,    s = sign(v)
-
-with the inertia M of device and hand, the device's damping b, the hand's damping b_h and stiffness
-k_h towards a target p of constant velocity ṗ, and Coulomb friction f_c. The relative velocity
-r = v − ṗ obeys the homogeneous M r'' + (b + b_h) r' + k_h r = 0 with r'(0) = a, the acceleration at
-the start. So for any time h
-
-    x(h) = x + h ṗ + d_0 r + d_1 a,        v(h) = v − (k_h/M) d_1 r + c_1 a
-
-where d_0, d_1 and c_1 are elements of one matrix exponential, found once per run. Written as
-increments, nothing cancels where the axis is nearly at rest.
-"""
+"""Exact motion of one axis of a device in a hand."""
 
 from __future__ import annotations
 
@@ -25,16 +12,17 @@ from hapticbridge.errors import DeviceError
 from hapticbridge.jit import compiled
 
 Record: TypeAlias = Any
-"""A structured scalar inside compiled code, where fields are attributes; NumPy's type has none."""
+"""Structured scalar inside compiled code, where fields are attributes. NumPy's type has none."""
 
 LEVELS = 41
-"""Friction looks for events in dyadic parts of the period, from T to T/2^40: 1e-15 s at 1 kHz."""
+"""Number of dyadic parts of the period in which friction locates events, from T to T/2^40: 1e-15 s
+at 1 kHz."""
 _COARSEST_LEVEL = 6
-"""Finest first part with friction, T/2^6: an axis that swings faster would need more phases than
-are allowed."""
+"""Finest first part with friction, T/2^6. A faster axis would need more phases than
+``_MOST_PHASES``."""
 
 _MOST_PHASES = 64
-"""Of slipping and sticking within a period; the bound is there so that the loop ends."""
+"""Largest number of slipping and sticking phases within a period, which bounds the loop."""
 
 AXIS_DTYPE = np.dtype(
     [
@@ -47,10 +35,9 @@ AXIS_DTYPE = np.dtype(
         ("steps", "<f8", (LEVELS, 5)),
     ]
 )
-"""The law of motion of an axis: M, b, b_h, k_h and f_c in SI units, and per level i of time
-h = T/2^i the numbers h, d_0, d_1, −(k_h/M) d_1 and c_1 (beyond i = 0 only with friction).
-``first_level``: the longest time in which
-the acceleration changes its sign at most once."""
+"""Law of motion of an axis: M, b, b_h, k_h and f_c in SI units. Per level i of time h = T/2^i it
+holds the numbers h, d_0, d_1, −(k_h/M) d_1 and c_1 (beyond i = 0 only with friction).
+``first_level`` is the longest time in which the acceleration changes its sign at most once."""
 
 
 def sampled_axis(
@@ -64,11 +51,23 @@ def sampled_axis(
 ) -> NDArray[np.void]:
     """Returns the law of motion of an axis for a period, as one ``AXIS_DTYPE`` scalar array.
 
+        M v' = F − s f_c − b v − b_h (v − ṗ) − k_h (x − p),        x' = v,    s = sign(v)
+
+    M is the inertia of device and hand, b the device's damping, b_h and k_h the hand's damping and
+    stiffness. The target p has the constant velocity ṗ; f_c is Coulomb friction. The relative
+    velocity r = v − ṗ obeys the homogeneous M r'' + (b + b_h) r' + k_h r = 0 with r'(0) = a, the
+    initial acceleration. So for any time h
+
+        x(h) = x + h ṗ + d_0 r + d_1 a,        v(h) = v − (k_h/M) d_1 r + c_1 a
+
+    d_0, d_1 and c_1 are elements of one matrix exponential, computed once per run. The form as
+    increments avoids cancellation near rest.
+
     Args:
         period: T in s, > 0.
         inertia: M in kg (or kg m²), > 0.
         damping: b in N s/m (or N m s/rad), >= 0.
-        hand_damping: b_h, likewise.
+        hand_damping: b_h in N s/m (or N m s/rad), >= 0.
         stiffness: k_h in N/m (or N m/rad), >= 0.
         friction: f_c in N (or N m), >= 0.
 
@@ -81,10 +80,10 @@ def sampled_axis(
     axis["hand_damping"] = hand_damping
     axis["stiffness"] = stiffness
     axis["friction"] = friction
-    # without friction only whole periods are stepped
+    # without friction only whole periods are needed
     levels = LEVELS if friction > 0.0 else 1
     times = period / 2.0 ** np.arange(levels)
-    # (∫r/h, r, h r') over the time h as unit: elements of order one at every level
+    # state (∫r/h, r, h r') in units of h, so that all elements are of order one at every level
     generator = np.zeros((levels, 3, 3))
     generator[:, 0, 1] = generator[:, 1, 2] = 1.0
     generator[:, 2, 1] = -stiffness / inertia * times**2
@@ -100,7 +99,7 @@ def sampled_axis(
     steps[:, 4] = times * transition[:, 1, 2]
     decay = (damping + hand_damping) / (2.0 * inertia)
     swing = math.sqrt(max(stiffness / inertia - decay * decay, 0.0))
-    # r' vanishes at most once within half a swing, π/swing; half of that is on the safe side
+    # r' vanishes at most once within half a swing, π/swing; half of that leaves a margin
     quarters = swing * period / (0.5 * math.pi)
     first_level = max(0, math.ceil(math.log2(quarters))) if quarters > 0.0 else 0
     if friction > 0.0 and first_level > _COARSEST_LEVEL:
@@ -119,7 +118,7 @@ def moved(
     """Returns the increments of position and velocity over the time of a level, without friction.
 
     Args:
-        axis: The law of motion, ``AXIS_DTYPE``.
+        axis: Law of motion, ``AXIS_DTYPE``.
         level: 0 for the whole period, i for T/2^i.
         relative_velocity: v − ṗ at the start.
         acceleration: v' at the start.
@@ -152,14 +151,14 @@ def _slide(
     drift: float,
     direction: float,
 ) -> tuple[int, float, float, float]:
-    """Slides in one direction until the velocity vanishes or the time is over.
+    """Slides in one direction until the velocity vanishes or the time ends.
 
-    A step is taken if the velocity keeps its sign at its end, and cannot have left and come back
-    within (the acceleration turns from against the motion to along it); else a step of half the
-    time is tried, which brackets the event down to T/2^40.
+    A step is accepted if the velocity keeps its sign at its end and cannot have vanished in
+    between. It can have if the acceleration changes from against the motion to along it. Otherwise
+    half the time is tried, which brackets the event down to T/2^40.
 
     Returns:
-        The units of T/2^40 left, the distance travelled, the new stretch x − p, the new velocity.
+        Remaining time in units of T/2^40, distance travelled, new stretch x − p, new velocity.
     """
     travel = 0.0
     friction = direction * axis.friction
@@ -172,7 +171,7 @@ def _slide(
             continue
         start = acceleration_at(axis, force - friction, stretch, velocity, drift)
         if velocity == 0.0:
-            # at the very moment of breaking away rounding must not pull it back
+            # at the moment of breaking away, rounding must not reverse the acceleration
             start = direction * max(direction * start, 0.0)
         dx, dv = moved(axis, level, velocity - drift, start, drift)
         next_stretch = stretch + (dx - units * axis.steps[LEVELS - 1, 0] * drift)
@@ -195,8 +194,8 @@ def _slide(
             if level < LEVELS - 1:
                 level += 1
             else:
-                # The event was a dip that did not reach zero, and is behind. There is no other
-                # within half a swing; what rounding shows there must not be searched again.
+                # The event was a dip that did not reach zero, and has passed. Within half a swing
+                # there is no other; rounding errors must not start another search.
                 is_past_dip = True
                 is_bracketed = False
                 level = axis.first_level
@@ -209,11 +208,11 @@ def moved_with_friction(
 ) -> tuple[float, float]:
     """Returns the increment of position and the new velocity after one period, with friction.
 
-    At rest the axis sticks while |F + b_h ṗ − k_h (x − p)| <= f_c; the moment at which the target
-    pulls it loose is found in closed form, the moment at which it comes to rest by bisection.
+    At rest the axis sticks while |F + b_h ṗ − k_h (x − p)| <= f_c. The moment of breaking away is
+    found in closed form, the moment of coming to rest by bisection.
 
     Args:
-        axis: The law of motion, ``AXIS_DTYPE``.
+        axis: Law of motion, ``AXIS_DTYPE``.
         force: F in N, held.
         stretch: x − p in m at the start.
         velocity: v in m/s at the start.

@@ -1,4 +1,4 @@
-"""The hand that a scene asks for: who performs the path beside it."""
+"""Hand of a scene."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ _FIELDS = ("stiffness", "damping", "rotational_stiffness", "rotational_damping")
 
 
 def scene_hand(model: mujoco.MjModel, path: Path) -> Hand:
-    """Returns the hand that performs a scene's path; ``DEFAULT_HAND`` where it asks for none.
+    """Returns the hand that follows a scene's path; ``DEFAULT_HAND`` without custom numbers.
 
-    A relaxed arm (135 N/m) follows a path only where little holds it back; somebody who drives a
-    nail or turns a key grips harder. A scene says so in its own file,
+    A relaxed arm (135 N/m) follows a path only against little resistance; driving a nail or turning
+    a key requires a firmer grip. A scene specifies it in its file,
 
         <custom><numeric name="simulated_hand" data="1000 30"/></custom>
 
-    with stiffness in N/m and damping in N s/m, and after them, where wanted, stiffness in N m/rad
-    and damping in N m s/rad of the rotation. What it does not say, the hand's inertia too, is that
-    of the default hand.
+    as stiffness in N/m and damping in N s/m, optionally followed by rotational stiffness in N m/rad
+    and rotational damping in N m s/rad. All other values, including the inertia, are those of the
+    default hand.
 
     Args:
         model: The compiled scene.
-        path: Its file, for the error.
+        path: Its file, for the message.
 
     Raises:
         SceneError: The numbers are not two or four, or one is not finite or negative.
@@ -43,8 +43,8 @@ def scene_hand(model: mujoco.MjModel, path: Path) -> Hand:
     where = f"scene '{path}': its custom numbers '{SCENE_HAND}' are '{words}'"
     if len(numbers) not in (2, 4):
         raise SceneError(
-            f"{where}; they must be stiffness in N/m and damping in N s/m of the hand, or these "
-            "and the same of its rotation in N m/rad and N m s/rad"
+            f"{where}; they must be stiffness in N/m and damping in N s/m of the hand, optionally "
+            "followed by its rotational stiffness in N m/rad and damping in N m s/rad"
         )
     try:
         return replace(DEFAULT_HAND, **dict(zip(_FIELDS, numbers, strict=False)))

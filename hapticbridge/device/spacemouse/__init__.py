@@ -1,4 +1,4 @@
 """3Dconnexion SpaceMouse: input without force.
 
-``driver`` is the device, ``reports`` what it sends, ``ids`` which products are one.
+``driver`` is the device, ``reports`` decodes its reports, ``ids`` lists the products.
 """

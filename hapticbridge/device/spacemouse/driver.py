@@ -1,4 +1,4 @@
-"""3Dconnexion SpaceMouse: six axes of input, as a rate of motion; it has no motors."""
+"""3Dconnexion SpaceMouse: six axes of input as a rate of motion, without motors."""
 
 from __future__ import annotations
 
@@ -36,40 +36,41 @@ from hapticbridge.pose import Quaternion, canonical, product, quaternion_exp
 from hapticbridge.tick import SAMPLE_DTYPE
 
 SPEED, TURN = 0.05, 0.8
-"""m/s and rad/s at full deflection, unless the user says otherwise: 10 cm, the reach of a desktop
-device, in two seconds, and a quarter of a turn likewise."""
+"""Default speed in m/s and turn rate in rad/s at full deflection. They cover 10 cm, the reach of a
+desktop device, and a quarter of a turn in two seconds."""
 
 DEAD_BAND = 0.05
-"""Share of full deflection that counts as rest: 17 counts. A hand that pushes along one axis spills
-some per cent into the others, and a worn puck does not return to zero."""
+"""Share of full deflection that counts as rest, without unit: 17 counts. A push along one axis
+moves the others by some per cent, and a worn puck does not return to zero."""
 
 HELD = 0.5
-"""In s. A deflected puck repeats its report some hundred times a second; one that has said nothing
-for this long is out of reach, and must not go on moving the tool. Not verified on hardware."""
+"""Time without a report after which a deflection counts as zero, in s. A deflected puck repeats its
+report some hundred times a second; a silent one is out of radio range and must not move the tool.
+Not verified on hardware."""
 
-# the maker's y points to the user and z down, the bridge's away and up: half a turn about x, which
-# maps rotations as it maps translations
+# The maker's y points to the user and z down, the bridge's y away and z up. This is half a turn
+# about x, which maps rotations and translations alike.
 _TO_BRIDGE = np.array([1.0, -1.0, -1.0, 1.0, -1.0, -1.0])
 
 
 class SpaceMouseDevice:
-    """A handle that moves as long as the puck is pushed, at a speed proportional to it.
+    """A handle that moves while the puck is deflected, at a proportional speed.
 
         p ← p + v T,   R ← exp(ω T) R
 
-    with v and ω from the deflection beyond the dead band, both in the frame of the base: x to the
-    right, y away from the user, z up. R is composed exactly. The device feels nothing: its motion
-    is prescribed, and what the tool is pushed with is shown and recorded. At rest it sends nothing,
-    which is no sign of its being unplugged.
+    v and ω follow from the deflection beyond the dead band, both in the frame of the base: x to the
+    right, y away from the user, z up. R is composed exactly. The motion is prescribed and does not
+    react to force; the wrench on the tool is shown and recorded. A puck at rest sends nothing, so
+    silence does not mean that it is unplugged.
 
     Args:
-        link: Reports to and from it, open.
-        name: What it is called.
-        speed: In m/s at full deflection of one axis, > 0.
-        turn: In rad/s, likewise.
-        dead_band: Share of full deflection that counts as rest, 0 to below 1.
-        force_limit: In N, >= 0, for the data sheet: what the recorded wrench is limited to.
-        torque_limit: In N m, >= 0, likewise.
+        link: Open link for its reports.
+        name: Name of the device.
+        speed: Speed in m/s at full deflection of one axis, > 0.
+        turn: Turn rate in rad/s at full deflection of one axis, > 0.
+        dead_band: Share of full deflection that counts as rest, 0 <= dead_band < 1.
+        force_limit: Force limit of the data sheet in N, >= 0; it limits the recorded wrench.
+        torque_limit: Torque limit of the data sheet in N m, >= 0; it limits the recorded wrench.
 
     Raises:
         DeviceError: A number is out of range.
@@ -116,7 +117,7 @@ class SpaceMouseDevice:
         self._to_origin()
 
     def start(self, period: float) -> NDArray[np.void]:
-        """Puts the handle to the origin, and the light on.
+        """Places the handle at the origin and switches the light on.
 
         Args:
             period: The loop's period in s, finite and > 0.
@@ -125,8 +126,8 @@ class SpaceMouseDevice:
             The pose before the first tick, shape (1,), ``SAMPLE_DTYPE``.
 
         Raises:
-            DeviceError: The period is not.
-            DeviceLost: It is gone.
+            DeviceError: The period is not valid.
+            DeviceLost: The device is gone.
         """
         self._period = checked_period(period)
         self._link.take()
@@ -138,20 +139,20 @@ class SpaceMouseDevice:
         return sample
 
     def read(self, sample: NDArray[np.void]) -> int:
-        """Moves the handle by one period (the first call does not) and reports its pose.
+        """Moves the handle by one period (not at the first call) and returns its pose.
 
         Args:
-            sample: Shape (1,), ``SAMPLE_DTYPE``, filled in place.
+            sample: Output, shape (1,), ``SAMPLE_DTYPE``.
 
         Returns:
-            0: the pose is that of this tick, whether the puck has spoken or not.
+            0: the pose is always that of this tick, with or without a report.
 
         Raises:
-            DeviceError: ``start`` has not been called.
+            DeviceError: The device was not started.
             DeviceLost: The device is gone.
         """
         if self._period == 0.0:
-            raise DeviceError(f"{self._name} is read before it was started")
+            raise DeviceError(f"{self._name} is read before it was started; call start() first")
         if self._has_begun:
             self._silence += self._period
             if self._silence > HELD:
@@ -166,10 +167,10 @@ class SpaceMouseDevice:
         return 0
 
     def write(self, wrench: NDArray[np.float64]) -> None:
-        """Ignores the wrench: there is no motor."""
+        """Ignores the wrench, because there is no motor."""
 
     def close(self) -> None:
-        """Puts the light out and lets the device go."""
+        """Switches the light off and releases the device."""
         if self._is_open:
             self._is_open = False
             self._light(LED_OFF)
@@ -198,7 +199,7 @@ class SpaceMouseDevice:
         sample[0] = (self._position, self._quaternion, self._buttons)
 
     def _light(self, report: bytes) -> None:
-        """Switches the light; some models have none, and nothing depends on it."""
+        """Switches the light; models without one are ignored."""
         with contextlib.suppress(DeviceError):
             self._link.write(report)
 
@@ -209,14 +210,14 @@ def open_spacemouse(
     """Finds and opens a SpaceMouse.
 
     Args:
-        options: ``serial``, ``log``, and numbers that ``SpaceMouseDevice`` takes.
-        api: hidapi or what stands for it.
+        options: ``serial``, ``log``, and numbers of ``SpaceMouseDevice``.
+        api: hidapi or a substitute.
 
     Raises:
-        DeviceError: There is none, it cannot be opened, or a number is out of range.
+        DeviceError: No SpaceMouse is found, it cannot be opened, or a number is out of range.
     """
     plugged = chosen(FAMILY, find(FAMILY, api), options.get("serial"))
-    # not overlapped: it is written to only before the loop and after it
+    # not overlapped: reports are written only before and after the loop
     link = HidLink.open(plugged, api, is_overlapped=False, log=HexLog.asked(options))
     numbers: dict[str, float] = {
         key: value  # type: ignore[misc] # checked by the device
@@ -236,7 +237,7 @@ _NUMBERS = ("speed", "turn", "dead_band", "force_limit", "torque_limit")
 
 FAMILY = Family(
     name="spacemouse",
-    about="3Dconnexion SpaceMouse and its ancestors: input only, its rate moves the handle",
+    about="3Dconnexion SpaceMouse and earlier models: input only, its rate moves the handle",
     ids=IDS,
     transport="hid",
     axes="6, by rate",

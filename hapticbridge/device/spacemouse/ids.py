@@ -1,8 +1,4 @@
-"""Which products of two vendors are a SpaceMouse, or were called so before.
-
-The maker's CadMouse (256f: c650, c651, c654 to c658, c664, c665, c668) are two-dimensional mice and
-are left out. Source: spacenavd of December 2025 and pyspacemouse of June 2026.
-"""
+"""Products of the SpaceMouse family."""
 
 from __future__ import annotations
 
@@ -40,4 +36,6 @@ IDS = (
     *(UsbId(0x046D, product, model) for product, model in _LOGITECH.items()),
     *(UsbId(0x256F, product, model) for product, model in _3DCONNEXION.items()),
 )
-"""All of them: Logitech's own numbers first, then the maker's since it stands alone."""
+"""All products: Logitech's ids first, then 3Dconnexion's. The CadMouse models (256f: c650, c651,
+c654 to c658, c664, c665, c668) are two-dimensional mice and are left out. Source: spacenavd of
+December 2025 and pyspacemouse of June 2026."""

@@ -1,4 +1,4 @@
-"""What a SpaceMouse reports: three layouts that tell themselves apart by number and length."""
+"""Input reports of a SpaceMouse."""
 
 from __future__ import annotations
 
@@ -6,10 +6,12 @@ import struct
 from typing import NamedTuple
 
 FULL_SCALE = 350
-"""Counts at full deflection of the puck (spacenavd, 2025). A few more can come and are clamped."""
+"""Counts at full deflection of the puck (spacenavd, 2025). Slightly larger counts can come and are
+clamped."""
 
 MOST_BUTTON_BYTES = 6
-"""A SpaceMouse Enterprise has 31 buttons; 48 fit into a record's integer with room to spare."""
+"""Bytes of buttons that are read. A SpaceMouse Enterprise has 31 buttons; 48 bits fit into a
+record's integer."""
 
 LED_ON, LED_OFF = bytes([4, 1]), bytes([4, 0])
 """Output report 4: the light in the base."""
@@ -20,7 +22,7 @@ _THREE, _SIX = struct.Struct("<3h"), struct.Struct("<6h")
 
 
 class Deflection(NamedTuple):
-    """How far the puck is pushed along or turned about some of its axes.
+    """Deflection of the puck along or about some of its axes.
 
     The maker's axes: x to the right, y towards the user, z down; rotations about them.
 
@@ -34,27 +36,27 @@ class Deflection(NamedTuple):
 
 
 class Buttons(NamedTuple):
-    """Which buttons are down.
+    """Pressed buttons.
 
     Attributes:
-        bits: One bit each; which key is which bit differs from model to model.
+        bits: One bit per button; the assignment differs between models.
     """
 
     bits: int
 
 
 def decoded(report: bytes) -> Deflection | Buttons | None:
-    """Reads one report.
+    """Decodes one report.
 
-    Report 1 is the translation; where it has 13 bytes (wireless models, the receiver, newer
-    firmware) it is translation and rotation. Report 2 is the rotation of older wired models, which
-    send both in pairs. Length tells them apart, not the product: one product was sold with both.
+    Report 1 is the translation; with 13 bytes (wireless models, the receiver, newer firmware) it
+    holds translation and rotation. Report 2 is the rotation of older wired models, which send both
+    in pairs. The layouts are distinguished by length, because one product was sold with both.
 
     Args:
         report: Any bytes, the report's number first.
 
     Returns:
-        None for what is none of these.
+        None for any other report.
     """
     if len(report) < 2:
         return None
@@ -71,11 +73,12 @@ def decoded(report: bytes) -> Deflection | Buttons | None:
 def share(count: int, dead_band: float) -> float:
     """Returns a deflection as a share of full scale, −1 to 1, 0 within the dead band.
 
-    sign(c) · max(0, |c| − d)/(1 − d) with c = count/350 clamped to ±1: continuous at the band's
-    edge, so nothing jumps where the puck leaves it.
+        sign(c) · max(0, |c| − d)/(1 − d),    c = count/350 clamped to ±1
+
+    It is continuous at the edge of the dead band.
 
     Args:
-        count: As reported.
+        count: Reported count.
         dead_band: d, share of full scale that counts as rest, 0 <= d < 1.
     """
     size = min(abs(count) / FULL_SCALE, 1.0)

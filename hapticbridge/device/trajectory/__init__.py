@@ -1,4 +1,4 @@
-"""Devices whose motion is given beforehand.
+"""Devices with a prescribed motion.
 
-``motion`` is poses over time, ``motion_csv`` reads them from a file, ``driver`` follows them.
+``motion`` holds poses over time, ``motion_csv`` reads them from a file, ``driver`` follows them.
 """

@@ -1,4 +1,4 @@
-"""Devices whose motion is given beforehand: from a table of poses, or from a recording."""
+"""Devices with a prescribed motion, from a table of poses or a recording."""
 
 from __future__ import annotations
 
@@ -21,14 +21,15 @@ from hapticbridge.tick import SAMPLE_DTYPE
 
 _STATE_DTYPE = np.dtype([("tick", "<i8"), ("cursor", "<i8"), ("period", "<f8")])
 
-_PERIOD_TOLERANCE = 1e-9  # relative: a period in whole ns and its decimal text differ by rounding
+_PERIOD_TOLERANCE = 1e-9
+"""Relative difference of periods that counts as rounding, as between whole ns and decimal text."""
 
 
 @compiled
 def _next_sample(
     states: NDArray[np.void], motion: NDArray[np.float64], samples: NDArray[np.void]
 ) -> None:
-    """Reports the pose at the time of the tick, and moves on to the next."""
+    """Writes the pose at the time of the tick, and advances to the next tick."""
     s = states[0]
     sample = samples[0]
     s.cursor, position, quaternion = pose_at(motion, s.tick * s.period, s.cursor)
@@ -68,17 +69,17 @@ def _prescribed(
 
 
 class TrajectoryDevice:
-    """Follows a motion whatever the force: the sample of tick k is its pose at k · period.
+    """Device that follows a motion under any force; sample k is the pose at k · period.
 
-    Between the motion's rows the position is interpolated linearly and the orientation by slerp;
-    after the last row it stays there. The poses are reported as the motion holds them; whether
-    they count from the first one is the bridge's choice.
+    Between the motion's rows the position is interpolated linearly and the orientation by slerp.
+    After the last row the pose is constant. Poses are reported as stored; the bridge may take them
+    relative to the first one.
 
     Args:
         motion: Poses over time (``read_motion`` reads them from a CSV file).
-        force_limit: In N, >= 0, for the data sheet: what the recorded wrench is limited to.
-        torque_limit: In N m, >= 0, likewise.
-        speed_limit: In m/s, >= 0, for the data sheet.
+        force_limit: Force limit of the data sheet in N, >= 0; it limits the recorded wrench.
+        torque_limit: Torque limit of the data sheet in N m, >= 0; it limits the recorded wrench.
+        speed_limit: Speed limit of the data sheet in m/s, >= 0.
 
     Raises:
         DeviceError: A limit is out of range.
@@ -104,7 +105,7 @@ class TrajectoryDevice:
         self._is_started = False
 
     def start(self, period: float) -> NDArray[np.void]:
-        """Goes to the first row, and compiles what the loop will call.
+        """Goes to the first row, and compiles the functions of the loop.
 
         Args:
             period: The loop's period in s, finite and > 0.
@@ -113,7 +114,7 @@ class TrajectoryDevice:
             The pose before the first tick, shape (1,), ``SAMPLE_DTYPE``.
 
         Raises:
-            DeviceError: The period is not.
+            DeviceError: The period is not valid.
         """
         self._states[0] = (0, 0, checked_period(period))
         sample = np.zeros(1, SAMPLE_DTYPE)
@@ -123,43 +124,43 @@ class TrajectoryDevice:
         return sample
 
     def read(self, sample: NDArray[np.void]) -> int:
-        """Reports the pose of this tick, no buttons.
+        """Returns the pose of this tick, without buttons.
 
         Args:
-            sample: Shape (1,), ``SAMPLE_DTYPE``, filled in place.
+            sample: Output, shape (1,), ``SAMPLE_DTYPE``.
 
         Raises:
-            DeviceError: ``start`` has not been called.
+            DeviceError: The device was not started.
         """
         if not self._is_started:
-            raise DeviceError("the trajectory is read before it was started")
+            raise DeviceError("the trajectory is read before it was started; call start() first")
         self._advance(self._states, self._table, sample)
         return 0
 
     def write(self, wrench: NDArray[np.float64]) -> None:
-        """Ignores the wrench: the motion is prescribed."""
+        """Ignores the wrench, because the motion is prescribed."""
 
     def close(self) -> None:
-        """Does nothing: there is nothing to release."""
+        """Does nothing, because the device holds no resources."""
 
 
 class ReplayDevice:
-    """Repeats the device motion of a recording sample by sample, buttons included.
+    """Device that repeats a recording's device motion sample by sample, with buttons.
 
-    Sample k is that of the recording's row k, to the bit; after the last one it stays there. A
-    deadline that the recorded run missed does not come back as time.
+    Sample k equals row k of the recording, bit for bit; after the last row the sample is constant.
+    Missed deadlines of the recorded run are not reproduced as time.
 
     Args:
         ticks: The recording's rows, ``TICK_DTYPE``, at least two.
         period: The recorded loop's period in s; ``start`` accepts no other.
-        name: What the recording is called in messages.
-        force_limit: In N, >= 0, for the data sheet: what the recorded wrench is limited to.
-        torque_limit: In N m, >= 0, likewise.
-        speed_limit: In m/s, >= 0, for the data sheet.
+        name: Name of the recording in messages.
+        force_limit: Force limit of the data sheet in N, >= 0; it limits the recorded wrench.
+        torque_limit: Torque limit of the data sheet in N m, >= 0; it limits the recorded wrench.
+        speed_limit: Speed limit of the data sheet in m/s, >= 0.
 
     Raises:
-        DeviceError: There are fewer than two rows, rows are missing in between, a pose is not
-            finite or no rotation, or a limit or the period is out of range.
+        DeviceError: Fewer than two rows, missing rows, a pose that is not finite or not a rotation,
+            or a limit or period out of range.
     """
 
     def __init__(
@@ -208,13 +209,13 @@ class ReplayDevice:
         """Goes to the first row.
 
         Args:
-            period: The loop's period in s: that of the recording.
+            period: The loop's period in s, equal to the recording's.
 
         Returns:
             The pose before the first tick, shape (1,), ``SAMPLE_DTYPE``.
 
         Raises:
-            DeviceError: It is another.
+            DeviceError: The period differs.
         """
         if abs(checked_period(period) - self._period) > _PERIOD_TOLERANCE * self._period:
             raise DeviceError(
@@ -226,24 +227,24 @@ class ReplayDevice:
         return np.asarray(self._samples[:1].copy())
 
     def read(self, sample: NDArray[np.void]) -> int:
-        """Reports the recorded sample of this tick.
+        """Returns the recorded sample of this tick.
 
         Args:
-            sample: Shape (1,), ``SAMPLE_DTYPE``, filled in place.
+            sample: Output, shape (1,), ``SAMPLE_DTYPE``.
 
         Raises:
-            DeviceError: ``start`` has not been called.
+            DeviceError: The device was not started.
         """
         tick = self._tick
         if tick < 0:
-            raise DeviceError(f"{self._name} is read before it was started")
+            raise DeviceError(f"{self._name} is read before it was started; call start() first")
         sample[0] = self._samples[tick]
         if tick + 1 < len(self._samples):
             self._tick = tick + 1
         return 0
 
     def write(self, wrench: NDArray[np.float64]) -> None:
-        """Ignores the wrench: the motion is prescribed."""
+        """Ignores the wrench, because the motion is prescribed."""
 
     def close(self) -> None:
-        """Does nothing: there is nothing to release."""
+        """Does nothing, because the device holds no resources."""

@@ -1,4 +1,4 @@
-"""A prescribed motion: poses over time, interpolated within a tick."""
+"""Prescribed motion: poses over time, interpolated within a tick."""
 
 from __future__ import annotations
 
@@ -23,31 +23,32 @@ from hapticbridge.pose import (
 TIME_AND_POSITION = ("t", "x", "y", "z")
 ORIENTATION = ("qw", "qx", "qy", "qz")
 NORM_TOLERANCE = 1e-3
-"""How far a quaternion's norm may be from 1: room for four printed digits, not for a mistake."""
+"""Largest deviation of a quaternion's norm from 1, without unit. It admits four printed digits, but
+no mistake."""
 LARGEST_NUMBER = 1e12
-"""No time in s and no position in m is beyond this; sums and differences stay finite."""
+"""Largest magnitude of a time in s or a position in m; sums and differences remain finite."""
 
 
 class Motion:
-    """Poses at increasing times, linear and by slerp in between, at rest after the last.
+    """Poses at increasing times, interpolated linearly and by slerp, constant after the last.
 
     Attributes:
-        table: Shape (n, 8), n >= 2: time in s from the first row (so it starts at 0), position
-            in m, unit quaternion (w, x, y, z) with w >= 0.
+        table: Shape (n, 8), n >= 2: time in s from the first row (starting at 0), position in m,
+            unit quaternion (w, x, y, z) with w >= 0.
     """
 
     def __init__(
         self, times: ArrayLike, positions: ArrayLike, quaternions: ArrayLike | None = None
     ) -> None:
-        """Takes a motion from arrays.
+        """Creates a motion from arrays.
 
         Args:
             times: Shape (n,), in s, n >= 2, finite and strictly increasing.
-            positions: Shape (n, 3), in m, finite. Neither is beyond ±1e12.
+            positions: Shape (n, 3), in m, finite. Times and positions must be within ±1e12.
             quaternions: Shape (n, 4), (w, x, y, z), of norm 1 within 1e-3; None: no rotation.
 
         Raises:
-            DeviceError: A shape or value is not as above; the message names the row, from 0.
+            DeviceError: A shape or value is not valid; the message names the row, from 0.
         """
         columns = [np.asarray(times, dtype=np.float64), np.asarray(positions, dtype=np.float64)]
         count = columns[0].size
@@ -74,7 +75,7 @@ class Motion:
         return float(self.table[-1, 0])
 
     def relative(self) -> Motion:
-        """Returns the motion from its first pose: p − p_0, and q ⊗ q_0⁻¹ in the same axes."""
+        """Returns the motion relative to its first pose: p − p_0 and q ⊗ q_0⁻¹."""
         return Motion(
             self.table[:, 0],
             self.table[:, 1:4] - self.table[0, 1:4],
@@ -83,7 +84,7 @@ class Motion:
 
 
 def first_fault(table: NDArray[np.float64]) -> tuple[int, str] | None:
-    """Returns the first row that is no part of a motion, and why; None where all are."""
+    """Returns the first invalid row of a motion and the reason; None if all rows are valid."""
     faults: list[tuple[int, str]] = []
     is_good = np.abs(table) <= LARGEST_NUMBER
     if not is_good.all():
@@ -119,7 +120,6 @@ def first_fault(table: NDArray[np.float64]) -> tuple[int, str] | None:
 
 @compiled
 def _normalise(table: NDArray[np.float64]) -> None:
-    """Scales the quaternions of a table to norm 1 and w >= 0."""
     for row in table:
         row[4], row[5], row[6], row[7] = canonical((row[4], row[5], row[6], row[7]))
 
@@ -147,9 +147,9 @@ def pose_at(table: NDArray[np.float64], time: float, cursor: int) -> tuple[int, 
 
     Args:
         table: ``Motion.table``.
-        time: In s from the first row, >= 0; at and beyond the last row the last pose holds.
-        cursor: The row that an earlier call with no later time returned, or 0: rows before it
-            are not searched again.
+        time: Time in s from the first row, >= 0; from the last row on, the last pose is returned.
+        cursor: Row returned by an earlier call with an equal or earlier time, or 0; the search
+            starts there.
 
     Returns:
         The row at or before the time, the position in m, and the quaternion.
@@ -175,20 +175,23 @@ def pose_at(table: NDArray[np.float64], time: float, cursor: int) -> tuple[int, 
 
 
 LISSAJOUS_AMPLITUDE = 0.01
-"""Half the width of the default motion along each axis, in m."""
+"""Amplitude of the default motion along each axis in m."""
 LISSAJOUS_ROTATION = 0.1
-"""Largest angle of the default motion about each axis, in rad."""
+"""Amplitude of the default motion about each axis in rad."""
 LISSAJOUS_EASE = 2.0
-"""The default motion grows from rest to its full size in this time, in s."""
-_FREQUENCIES = (0.23, 0.31, 0.41, 0.17, 0.13, 0.19)  # Hz: slow, and no two in a simple ratio
+"""Time in s in which the default motion grows from rest to its full amplitude."""
+_FREQUENCIES = (0.23, 0.31, 0.41, 0.17, 0.13, 0.19)
+"""Frequencies of the default motion per axis in Hz: slow, without simple ratios."""
 
 
 @compiled
 def lissajous(time: float) -> tuple[Vector, Quaternion]:
     """Returns the default motion: a slow Lissajous figure that starts at rest.
 
-    Each axis, of translation and of the rotation vector, is A s²(3 − 2s) sin(2πft) with its own
-    f below 0.5 Hz and s = min(t/2 s, 1), A = 1 cm or 0.1 rad. The fastest motion is 4.1 cm/s.
+        A s²(3 − 2s) sin(2πft),    s = min(t/2 s, 1)
+
+    for each axis of translation and of the rotation vector, with its own f below 0.5 Hz and A = 1
+    cm or 0.1 rad. The largest speed is 4.1 cm/s.
     """
     growth = min(time / LISSAJOUS_EASE, 1.0)
     ease = growth * growth * (3.0 - 2.0 * growth)

@@ -1,4 +1,4 @@
-"""Reads a motion from a CSV file, and says in which line a bad one is wrong."""
+"""Motion from a CSV file."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def read_motion(path: str | os.PathLike[str]) -> Motion:
 
     The first line that is neither empty nor a comment (``#``) names the columns, in any order:
     ``t,x,y,z`` in s and m, and either all or none of ``qw,qx,qy,qz``. Every further line is a row
-    of numbers; times strictly increase; the rate is free.
+    of numbers. Times must strictly increase; the rate is free.
 
     Args:
         path: The file, UTF-8.
@@ -31,7 +31,7 @@ def read_motion(path: str | os.PathLike[str]) -> Motion:
         The motion, its times counted from the first row.
 
     Raises:
-        DeviceError: The file cannot be read, or a line is not as above; the message names it.
+        DeviceError: The file cannot be read, or a line is not valid; the message names it.
     """
     path = Path(path)
     lines = _read_lines(path)
@@ -42,7 +42,7 @@ def read_motion(path: str | os.PathLike[str]) -> Motion:
     )
     header = next(numbered, None)
     if header is None:
-        raise DeviceError(f"{path}: the file is empty; a header t,x,y,z and two rows are needed")
+        raise DeviceError(f"{path}: the file is empty; it needs a header t,x,y,z and two rows")
     names = _column_names(f"{path}, line {header[0]}", header[1])
     width = len(names)
     numbers: list[int] = []
@@ -81,7 +81,7 @@ def read_motion(path: str | os.PathLike[str]) -> Motion:
 
 
 def _read_lines(path: Path) -> list[str]:
-    """Reads a text file; lines end in any of the usual ways, a byte-order mark is dropped."""
+    """Reads a text file with any line ending; a byte-order mark is dropped."""
     try:
         mode = path.stat().st_mode
         if not stat.S_ISREG(mode):
@@ -99,8 +99,8 @@ def _read_lines(path: Path) -> list[str]:
 
 
 def _column_names(where: str, line: str) -> list[str]:
-    """Returns the columns that a header names, or says what is wrong with them."""
-    # some programs quote the names of columns, none quotes numbers
+    """Returns the valid column names of a header."""
+    # some programs quote column names, but not numbers
     names = [field.strip().strip("\"'").strip().lower() for field in line.split(",")]
     needed = "a header with the columns t,x,y,z and optionally qw,qx,qy,qz is needed"
     if all(_is_number(name) for name in names):
@@ -112,7 +112,7 @@ def _column_names(where: str, line: str) -> list[str]:
         raise DeviceError(f"{where}: unknown column {unknown[0]!r:.40}; {needed}")
     if len(set(names)) < len(names):
         twice = next(name for name in names if names.count(name) > 1)
-        raise DeviceError(f"{where}: column {twice} is there twice")
+        raise DeviceError(f"{where}: column {twice} occurs twice; remove one of them")
     missing = [name for name in ORIENTATION if name not in names]
     if 0 < len(missing) < len(ORIENTATION):
         raise DeviceError(

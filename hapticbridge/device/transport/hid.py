@@ -1,4 +1,4 @@
-"""Reports to and from a HID device through hidapi: bounded waits, and one seam for tests."""
+"""Reports to and from a HID device through hidapi, with bounded waits."""
 
 from __future__ import annotations
 
@@ -14,53 +14,54 @@ from hapticbridge.device.transport.hid_search import HidApi, HidHandle, hid_api
 from hapticbridge.errors import DeviceError, DeviceLost
 
 LONGEST_REPORT = 256
-"""In bytes. Full-speed reports have at most 64; a longer one would be cut, and its check fail."""
+"""Largest report in bytes. Full-speed reports have at most 64; a longer one would be truncated and
+fail its check."""
 
 QUEUE = 63
-"""Reports that Linux keeps per open device (HIDRAW_BUFFER_SIZE, a ring with one free place). Of
-those that come when it is full it drops the new ones, so a full queue is an old one. It is also the
-most that is taken at once: a device that sends faster than it is read must not hold the loop."""
+"""Number of reports that Linux keeps per open device (HIDRAW_BUFFER_SIZE, a ring with one free
+place). When it is full, Linux drops new reports, so a full queue holds old ones. It is also the
+most that is taken at once, so that a fast device cannot block the loop."""
 
 FRESH_MS = 2
-"""In ms: how long a report is waited for after a full queue. At 1 kHz one comes within 1 ms."""
+"""Longest wait in ms for a new report after a full queue. At 1 kHz one comes within 1 ms."""
 
 LONGEST_WRITE = 0.05
-"""In s. A full-speed device is asked every millisecond, so a report that is not taken in 50 of them
-never will be; Linux gives up only after 5 s."""
+"""Longest time in s for a device to accept a report. A full-speed device is polled every
+millisecond, so after 50 polls it never will; Linux gives up only after 5 s."""
 
 
 class Link(Protocol):
-    """What a device needs of a transport: ``HidLink``, or what stands for it."""
+    """Report transport of a device; ``HidLink`` is the real one."""
 
     def take(self) -> list[bytes]:
-        """Returns the reports that have come, without waiting."""
+        """Returns the received reports without waiting."""
 
     def wait(self, timeout_ms: int) -> bytes:
-        """Returns the next report, or nothing after that time."""
+        """Returns the next report, or an empty one after the timeout."""
 
     def write(self, report: bytes) -> None:
-        """Sends a report, its number first."""
+        """Sends a report, starting with its number."""
 
     def close(self) -> None:
-        """Lets the device go."""
+        """Releases the device."""
 
 
 class HidLink:
     """An open HID device: newest reports without waiting, and reports to it.
 
-    Nothing here waits longer than it says. hidapi's ``write`` returns when the device has taken the
-    report, up to a millisecond later on full speed, and 5 s later where the device has hung; so a
-    link that is overlapped hands each report to a thread, which sends the newest one it has.
+    All waits are bounded. hidapi's ``write`` returns when the device has accepted the report: up to
+    a millisecond later on full speed, and 5 s later from a hung device. An overlapped link
+    therefore passes each report to a thread, which sends the newest.
 
     Args:
-        handle: The device, open.
-        name: What errors call it.
-        is_overlapped: Whether reports are sent by a thread. Without it ``write`` is hidapi's own.
-        log: Keeps what goes over the wire.
-        slots: How many kinds of report there are of which each newest one is to be sent, >= 1.
+        handle: The open device.
+        name: Name of the device in messages.
+        is_overlapped: True to send reports from a thread; otherwise ``write`` is hidapi's own.
+        log: Log of the transferred bytes.
+        slots: Number of kinds of report, >= 1; of each kind only the newest is sent.
 
     Attributes:
-        requests: Asks the device and sets its features, waiting for the answer.
+        requests: Requests that wait for the device's answer.
     """
 
     def __init__(
@@ -78,7 +79,7 @@ class HidLink:
         self.requests = HidRequests(handle, self._log)
         self._is_open = True
         self._lost = ""
-        # in each the newest wins, and they take turns
+        # one slot per kind of report, each with the newest only; slots take turns
         self._outgoing: list[deque[bytes]] = [deque(maxlen=1) for _ in range(slots)]
         self._wake, self._is_idle = threading.Event(), threading.Event()
         self._is_idle.set()
@@ -102,7 +103,7 @@ class HidLink:
         """Opens a device that was found.
 
         Raises:
-            DeviceError: It cannot be opened; says why and what to do.
+            DeviceError: The device cannot be opened; the message names reason and remedy.
         """
         module = hid_api() if api is None else api
         if plugged.problem is not None or module is None:
@@ -112,15 +113,16 @@ class HidLink:
             handle.open_path(plugged.path.encode())
         except (OSError, ValueError):
             raise DeviceError(
-                f"{plugged} at {plugged.path} cannot be opened; it may be in use or just unplugged"
+                f"{plugged} at {plugged.path} cannot be opened; it may be in use by another "
+                "program or just unplugged"
             ) from None
         return cls(handle, str(plugged), is_overlapped=is_overlapped, log=log, slots=slots)
 
     def take(self) -> list[bytes]:
-        """Returns the reports that have come since the last call, oldest first, without waiting.
+        """Returns the reports since the last call, oldest first, without waiting.
 
-        Only after a pause so long that the kernel's queue is full, and all in it old, a new one is
-        waited for, up to ``FRESH_MS``.
+        After a long pause the kernel's queue is full of old reports. Only then does the call wait
+        for a new one, up to ``FRESH_MS``.
 
         Raises:
             DeviceLost: The device is gone.
@@ -133,10 +135,10 @@ class HidLink:
         return reports
 
     def wait(self, timeout_ms: int) -> bytes:
-        """Returns the next report; empty if none comes in time.
+        """Returns the next report; empty after the timeout.
 
         Args:
-            timeout_ms: Longest time to wait in ms, >= 1.
+            timeout_ms: Longest wait in ms, >= 1.
 
         Raises:
             DeviceLost: The device is gone.
@@ -144,40 +146,45 @@ class HidLink:
         return self._read(timeout_ms)
 
     def write(self, report: bytes, slot: int = 0) -> None:
-        """Sends a report; overlapped, it replaces one of its slot that has not been sent yet.
+        """Sends a report; if overlapped, it replaces an unsent one in its slot.
 
         Args:
-            report: Its number first, 0 where the device's reports have none.
-            slot: Which kind of report it is.
+            report: Report starting with its number, 0 if the device's reports have none.
+            slot: Kind of report.
 
         Raises:
-            DeviceLost: The device is gone, or took no report for ``LONGEST_WRITE``.
+            DeviceLost: The device is gone, or accepted no report for ``LONGEST_WRITE``.
         """
         if self._lost or not self._is_open:
             raise DeviceLost(self._lost or f"{self._name} is closed")
         if self._writer is None:
             if not self._is_sent(report):
-                raise DeviceLost(f"{self._name} did not take a report")
+                raise DeviceLost(
+                    f"{self._name} did not accept a report; unplug it and plug it in again"
+                )
             return
         if not self._is_idle.is_set() and time.monotonic() - self._busy_since > LONGEST_WRITE:
-            self._lost = f"{self._name} takes no reports any more"
+            self._lost = f"{self._name} accepts no reports any more; unplug it and plug it in again"
             raise DeviceLost(self._lost)
         self._outgoing[slot].append(report)
         self._wake.set()
 
     def send(self, report: bytes) -> None:
-        """Sends a report before it returns, and drops what still waits to be sent: for set-up.
+        """Sends a report before it returns, and discards unsent ones, for the set-up.
 
         Raises:
-            DeviceLost: The device is gone, or takes no reports.
+            DeviceLost: The device is gone, or accepts no reports.
         """
         for waiting in self._outgoing:
             waiting.clear()
         if self._lost or not self._is_idle.wait(LONGEST_WRITE) or not self._is_sent(report):
-            raise DeviceLost(self._lost or f"{self._name} did not take a report")
+            raise DeviceLost(
+                self._lost
+                or f"{self._name} did not accept a report; unplug it and plug it in again"
+            )
 
     def close(self) -> None:
-        """Sends what is still to be sent, for at most ``LONGEST_WRITE``, and lets the device go."""
+        """Sends the remaining reports, for at most ``LONGEST_WRITE``, and releases the device."""
         if not self._is_open:
             return
         self._is_open = False
@@ -185,7 +192,7 @@ class HidLink:
             self._wake.set()
             self._writer.join(LONGEST_WRITE)
         if self._writer is None or not self._writer.is_alive():
-            self._handle.close()  # else it is inside hidapi's write, which uses what this frees
+            self._handle.close()  # not while the writer is inside hidapi, which uses this memory
         self._log.close()
 
     def _read(self, timeout_ms: int) -> bytes:
@@ -204,25 +211,25 @@ class HidLink:
         return is_taken(self._handle.write, report, self._log)
 
     def _send_newest(self) -> None:
-        """Runs in the writer's thread until the link is closed or the device lost."""
+        """Sends reports in the writer's thread until the link is closed or the device lost."""
         while True:
             self._wake.wait()
             self._wake.clear()
             while any(self._outgoing):
                 for waiting in self._outgoing:
                     if not self._is_newest_sent(waiting):
-                        self._lost = f"{self._name} is gone: it took no report"
+                        self._lost = f"{self._name} is gone: it did not accept a report"
                         return
             if not self._is_open:
                 return
 
     def _is_newest_sent(self, waiting: deque[bytes]) -> bool:
-        """Sends what waits in a slot, if anything; returns whether that went well."""
+        """Sends the waiting report of a slot, if any; returns whether that succeeded."""
         self._busy_since = time.monotonic()
         self._is_idle.clear()
         try:
             return self._is_sent(waiting.popleft())
         except IndexError:
-            return True  # nothing waits here, or it was just dropped
+            return True  # no report waits, or it was just replaced
         finally:
             self._is_idle.set()

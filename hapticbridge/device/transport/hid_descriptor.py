@@ -1,8 +1,8 @@
-"""A HID device's own description of its reports: which bits of which report mean what.
+"""HID report descriptor: meaning of the bits in each report.
 
 A report descriptor is a program for a small machine: items set the state (size, count, range,
-usage) of the fields that the next main item makes. What is read here is what finding fields by
-usage needs; designators, strings and delimiters are skipped.
+usage) of the fields that the next main item creates. Only what is required to find fields by usage
+is read; designators, strings and delimiters are skipped.
 
 References:
     USB-IF, Device Class Definition for Human Interface Devices 1.11, sections 5 and 6.2.2.
@@ -16,16 +16,17 @@ from dataclasses import dataclass, field
 from hapticbridge.errors import DeviceError
 
 INPUT, OUTPUT, FEATURE = 8, 9, 11
-"""Kinds of report, as the main items that describe them are numbered."""
+"""Kinds of report, numbered as the main items that describe them."""
 
 LONGEST_DESCRIPTOR = 4096
-"""In bytes: what Linux reads of one (HID_MAX_DESCRIPTOR_SIZE)."""
+"""Largest descriptor in bytes, as in Linux (HID_MAX_DESCRIPTOR_SIZE)."""
 
 LONGEST_REPORT_BITS = 8 * 16384
-"""What Linux takes for a report (HID_MAX_BUFFER_SIZE)."""
+"""Largest report in bits, as in Linux (HID_MAX_BUFFER_SIZE)."""
 
 MOST_USAGES = 1024
-"""Usages kept per field. A keyboard has 256; a range of 65536 means 'any', and names nothing."""
+"""Largest number of usages kept per field. A keyboard has 256; a range of 65536 means 'any' and is
+of no use."""
 
 _MAIN, _GLOBAL, _LOCAL, _LONG = 0, 1, 2, 0xFE
 _COLLECTION, _END_COLLECTION = 10, 12
@@ -35,28 +36,28 @@ _VARIABLE, _CONSTANT = 2, 1
 _USAGE, _USAGE_LEAST, _USAGE_MOST = range(3)
 
 Number = tuple[int, int]
-"""An item's data: its value without sign, and how many bytes it took."""
+"""Data of an item: unsigned value, and number of bytes."""
 
 
 @dataclass(frozen=True, slots=True)
 class Field:
-    """What one main item describes: ``count`` elements of ``size`` bits, one after another.
+    """Field of a report: ``count`` consecutive elements of ``size`` bits.
 
     Attributes:
         kind: ``INPUT``, ``OUTPUT`` or ``FEATURE``.
-        report: Number of the report, 0 where the device does not number them.
-        offset: First bit within the report, its number not counted.
+        report: Number of the report, 0 if the device does not number them.
+        offset: First bit within the report, without its number.
         size: Bits per element.
-        count: How many elements.
-        is_variable: Whether each element has a usage and a value of its own. If not it is an array:
-            an element's value says which usage is meant, ``minimum`` the first, in their order.
-        usages: 32 bits each, the page above; the last one goes for all further elements. None
-            where it is padding.
-        collections: Usages of the collections around it, outermost first.
-        minimum: Least logical value.
-        maximum: Most.
-        physical: Least and most physical value; the logical ones where the device gives none.
-        unit: Of the physical values, coded as the standard has it; 0: none.
+        count: Number of elements.
+        is_variable: True if each element has a usage and a value of its own. Otherwise the field is
+            an array: an element's value selects a usage in their order, ``minimum`` the first.
+        usages: 32 bits each, with the page in the upper half; the last one applies to all further
+            elements. Empty for padding.
+        collections: Usages of the enclosing collections, outermost first.
+        minimum: Smallest logical value.
+        maximum: Largest logical value.
+        physical: Smallest and largest physical value; the logical ones if the device states none.
+        unit: Unit of the physical values in the standard's code; 0: none.
         exponent: Power of ten of that unit.
     """
 
@@ -77,7 +78,7 @@ class Field:
 
 @dataclass(slots=True)
 class _State:
-    """What items have set so far."""
+    """State set by the items so far."""
 
     globals: dict[int, Number] = field(default_factory=dict)
     pushed: list[dict[int, Number]] = field(default_factory=list)
@@ -91,28 +92,28 @@ class _State:
         return _signed(number) if is_signed else number[0]
 
     def full_usages(self) -> list[int]:
-        """Returns the usages since the last main item; short ones are of the page that holds."""
+        """Returns the usages since the last main item; short ones belong to the current page."""
         page = self.value(_PAGE) << 16
         return [value if size == 4 else page | value for value, size in self.usages]
 
     def limits(self, least: int, most: int) -> tuple[int, int]:
-        """Returns a range; the upper end has a sign only where the lower one is negative."""
+        """Returns a range; the upper end is signed only if the lower end is negative."""
         low = self.value(least, is_signed=True)
         return low, self.value(most, is_signed=low < 0)
 
 
 def fields_of(descriptor: bytes) -> tuple[Field, ...]:
-    """Returns the fields that a report descriptor describes; padding is one without usages.
+    """Returns the fields of a report descriptor; padding has no usages.
 
     Args:
-        descriptor: As the device sent it.
+        descriptor: Bytes of the descriptor.
 
     Raises:
-        DeviceError: It is no report descriptor, and why.
+        DeviceError: The descriptor is not valid; the message names the reason.
     """
     if not 0 < len(descriptor) <= LONGEST_DESCRIPTOR:
         raise DeviceError(
-            f"a report descriptor of {len(descriptor)} bytes: it must have 1 to "
+            f"a report descriptor has {len(descriptor)} bytes; it must have 1 to "
             f"{LONGEST_DESCRIPTOR}"
         )
     state, fields = _State(), []
@@ -128,14 +129,14 @@ def fields_of(descriptor: bytes) -> tuple[Field, ...]:
                 state.collections.append(next(iter(state.full_usages()), 0))
             elif tag == _END_COLLECTION:
                 if not state.collections:
-                    raise DeviceError("a report descriptor that ends a collection it never began")
+                    raise DeviceError("a report descriptor ends a collection that never began")
                 state.collections.pop()
             state.usages, state.least = [], None
     return tuple(fields)
 
 
 def _items(descriptor: bytes) -> Iterator[tuple[int, int, Number]]:
-    """Yields kind, tag and data of each short item; long ones mean nothing to anybody."""
+    """Yields kind, tag and data of each short item; long items are skipped."""
     place = 0
     while place < len(descriptor):
         prefix = descriptor[place]
@@ -145,7 +146,7 @@ def _items(descriptor: bytes) -> Iterator[tuple[int, int, Number]]:
             length = (0, 1, 2, 4)[prefix & 3]
         data = descriptor[place + 1 : place + 1 + length]
         if len(data) < length:
-            raise DeviceError(f"a report descriptor that ends within the item at byte {place}")
+            raise DeviceError(f"a report descriptor ends within the item at byte {place}")
         place += 1 + length
         if prefix != _LONG:
             yield prefix >> 2 & 3, prefix >> 4, (int.from_bytes(data, "little"), length)
@@ -161,7 +162,7 @@ def _set_global(state: _State, tag: int, number: Number) -> None:
         state.pushed.append(dict(state.globals))
     elif tag == _POP:
         if not state.pushed:
-            raise DeviceError("a report descriptor that restores a state it never kept")
+            raise DeviceError("a report descriptor restores a state that it never stored")
         state.globals = state.pushed.pop()
     else:
         state.globals[tag] = number
@@ -182,13 +183,16 @@ def _set_local(state: _State, tag: int, number: Number) -> None:
 
 
 def _fields(state: _State, kind: int, flags: int) -> list[Field]:
-    """Returns the field that a main item makes, none where it is empty, and moves on."""
+    """Returns the field created by a main item, empty for an empty one, and advances the state."""
     size, count, report = state.value(_SIZE), state.value(_COUNT), state.value(_REPORT)
     if report > 255:
-        raise DeviceError(f"a report descriptor with a report number of {report}")
+        raise DeviceError(f"a report descriptor has the report number {report}; at most 255")
     offset = state.lengths.get((kind, report), 0)
     if offset + size * count > LONGEST_REPORT_BITS:
-        raise DeviceError(f"a report descriptor with a report of {offset + size * count} bits")
+        raise DeviceError(
+            f"a report descriptor has a report of {offset + size * count} bits; at most "
+            f"{LONGEST_REPORT_BITS}"
+        )
     state.lengths[kind, report] = offset + size * count
     usages = () if flags & _CONSTANT else tuple(state.full_usages())
     if not size or not count:
@@ -197,7 +201,7 @@ def _fields(state: _State, kind: int, flags: int) -> list[Field]:
     physical = state.limits(_PHYSICAL_LEAST, _PHYSICAL_MOST)
     exponent = _signed((state.value(_EXPONENT), 1)) if state.value(_EXPONENT) < 256 else 0
     if 8 <= exponent <= 15:
-        exponent -= 16  # four bits with a sign, unless the device sent eight
+        exponent -= 16  # four signed bits, unless the device sent eight
     return [
         Field(
             kind=kind,

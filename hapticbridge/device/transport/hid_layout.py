@@ -1,4 +1,4 @@
-"""A HID device's reports by usage: where a value is, how it is read, and how it is written."""
+"""Layout of a HID device's reports by usage."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from hapticbridge.device.transport.hid_descriptor import Field, fields_of
 from hapticbridge.errors import DeviceError
 
 WIDEST = 32
-"""Bits of the widest value that is read or written; the standard's own limit."""
+"""Bits of the widest value that is read or written: the standard's own limit."""
 
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """One element of a field: where a single value lies.
+    """Place of a single value: one element of a field.
 
     Attributes:
-        field: What it belongs to.
-        offset: Its first bit, the byte of the report's number counted.
+        field: The field of the element.
+        offset: First bit, counting the byte of the report's number.
     """
 
     field: Field
@@ -26,41 +26,41 @@ class Place:
 
     @property
     def mask(self) -> int:
-        """As many ones as it has bits."""
+        """Mask with as many ones as the value has bits."""
         return (1 << self.field.size) - 1
 
     def read(self, report: int) -> int:
         """Returns the logical value in a report.
 
         Args:
-            report: Its bytes as one number, the lowest first, the report's number among them.
+            report: All bytes of the report with its number, as one little-endian number.
         """
         value = report >> self.offset & self.mask
         is_negative = self.field.minimum < 0 and value >> (self.field.size - 1)
         return value - (1 << self.field.size) if is_negative else value
 
     def bits(self, value: int) -> int:
-        """Returns a logical value, kept within its range, as a report with only that in it."""
+        """Returns a logical value, clamped to its range, as the bits of a report."""
         field = self.field
         return (min(max(value, field.minimum), field.maximum) & self.mask) << self.offset
 
     def share(self, share: float) -> int:
-        """Returns the logical value at a share of the range, 0: least, 1: most."""
+        """Returns the logical value at a share of the range, 0: smallest, 1: largest."""
         return self.field.minimum + round(share * (self.field.maximum - self.field.minimum))
 
 
 class Layout:
-    """All reports of a device, as its descriptor has them.
+    """All reports of a device, from its descriptor.
 
     Args:
         descriptor: The report descriptor.
 
     Attributes:
-        fields: All of them, padding too.
-        is_numbered: Whether reports begin with their number.
+        fields: All fields, including padding.
+        is_numbered: True if reports begin with their number.
 
     Raises:
-        DeviceError: The descriptor is none.
+        DeviceError: The descriptor is not valid.
     """
 
     def __init__(self, descriptor: bytes) -> None:
@@ -68,7 +68,7 @@ class Layout:
         self.is_numbered = any(field.report for field in self.fields)
 
     def within(self, kind: int, collection: int) -> list[Field]:
-        """Returns the fields of a kind inside a collection of that usage, of its first report."""
+        """Returns the fields of a kind inside a collection with that usage, of its first report."""
         inside = [
             field
             for field in self.fields
@@ -77,7 +77,7 @@ class Layout:
         return [field for field in inside if field.report == inside[0].report]
 
     def length(self, kind: int, report: int) -> int:
-        """Returns how many bytes a report has, its number counted."""
+        """Returns the length of a report in bytes, including its number."""
         ends = [
             field.offset + field.size * field.count
             for field in self.fields
@@ -87,7 +87,7 @@ class Layout:
 
 
 def place_of(fields: list[Field], usage: int) -> Place | None:
-    """Returns where the value of a usage lies: the first variable element that has it."""
+    """Returns the place of a usage: the first variable element with it, or None."""
     for field in fields:
         if field.is_variable and usage in field.usages[: field.count]:
             return element(field, field.usages.index(usage))
@@ -95,15 +95,15 @@ def place_of(fields: list[Field], usage: int) -> Place | None:
 
 
 def element(field: Field, index: int) -> Place:
-    """Returns a field's element by its index, from 0."""
+    """Returns the place of a field's element by its index, from 0."""
     return Place(field, 8 + field.offset + index * field.size)
 
 
 def chosen_bits(fields: list[Field], usage: int) -> int | None:
-    """Returns the bits that choose a usage among others; None where it is none of them.
+    """Returns the bits that select a usage among others; None if it is not available.
 
-    In an array the element's value says which, counted from its least value in the order of the
-    descriptor; elsewhere each choice is a flag of its own.
+    In an array the element's value selects it, counted from the smallest value in the order of the
+    descriptor. Otherwise each usage has a flag of its own.
     """
     for field in fields:
         if usage not in field.usages:
@@ -117,7 +117,7 @@ def chosen_bits(fields: list[Field], usage: int) -> int | None:
 
 
 def chosen_usage(fields: list[Field], report: int) -> int | None:
-    """Returns which usage a report chooses, the other way round; None where it chooses none."""
+    """Returns the usage that a report selects, the inverse of ``chosen_bits``; None without one."""
     for field in fields:
         if field.usages and not field.is_variable:
             index = element(field, 0).read(report) - field.minimum
@@ -129,12 +129,12 @@ def chosen_usage(fields: list[Field], report: int) -> int | None:
 
 
 def composed(number: int, length: int, bits: int) -> bytes:
-    """Returns a report of a number and a length with these bits in it."""
+    """Returns a report with a number, a length and these bits."""
     return (number | bits).to_bytes(length, "little")
 
 
 def as_number(layout: Layout, report: bytes) -> int:
-    """Returns a report that came as one number, with a zero in the place of a missing number."""
+    """Returns a received report as one number, with 0 for a missing report number."""
     return int.from_bytes(report if layout.is_numbered else b"\0" + report, "little")
 
 
@@ -147,10 +147,10 @@ def filled(places: Mapping[Place, int]) -> int:
 
 
 def required(found: Place | None, name: str) -> Place:
-    """Returns what was found.
+    """Returns the place.
 
     Raises:
-        DeviceError: Nothing was; names it.
+        DeviceError: The place is None; the message names it.
     """
     if found is None:
         raise DeviceError(f"its reports lack {name}")

@@ -1,4 +1,4 @@
-"""What a HID device is asked outside the loop: feature reports, and its own description."""
+"""Requests to a HID device outside the loop."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from hapticbridge.device.transport.hid_search import HidHandle, descriptor_of
 
 
 def is_taken(send: Callable[[bytes], int], report: bytes, log: HexLog) -> bool:
-    """Hands a report to one of hidapi's calls; returns whether the device took it.
+    """Sends a report by one of hidapi's calls; returns whether the device accepted it.
 
     Args:
         send: The call: ``write``, or ``send_feature_report``.
-        report: Its number first, 0 where the device's reports have none.
-        log: Keeps it.
+        report: Report starting with its number, 0 if the device's reports have none.
+        log: Log of the transferred bytes.
     """
     if log.is_on:
         log.add(">", report)
@@ -25,32 +25,32 @@ def is_taken(send: Callable[[bytes], int], report: bytes, log: HexLog) -> bool:
 
 
 class HidRequests:
-    """Requests that wait for their answer, some ms on USB; nothing for a loop.
+    """Requests that wait some ms for an answer on USB, so not for use in a loop.
 
-    A device that does not answer is no error here: the answer is empty.
+    A device that does not answer raises no error; the answer is empty.
 
     Args:
-        handle: The device, open.
-        log: Keeps what goes over the wire.
+        handle: The open device.
+        log: Log of the transferred bytes.
     """
 
     def __init__(self, handle: HidHandle, log: HexLog) -> None:
         self._handle, self._log = handle, log
 
     def set_feature(self, report: bytes) -> bool:
-        """Sends a feature report, its number first; returns whether the device took it."""
+        """Sends a feature report, its number first; returns whether the device accepted it."""
         return is_taken(self._handle.send_feature_report, report, self._log)
 
     def feature(self, number: int, length: int) -> bytes:
-        """Asks for a feature report; returns it, its number first, or nothing."""
+        """Requests a feature report; returns it with its number first, or an empty answer."""
         return self._answer(self._handle.get_feature_report, number, length)
 
     def input_report(self, number: int, length: int) -> bytes:
-        """Asks for an input report instead of waiting for it; returns it likewise, or nothing."""
+        """Requests an input report instead of waiting for one; returns it as ``feature`` does."""
         return self._answer(self._handle.get_input_report, number, length)
 
     def report_descriptor(self) -> bytes:
-        """Returns what the device says of its reports, or nothing."""
+        """Returns the device's report descriptor, or an empty answer."""
         return descriptor_of(self._handle)
 
     def _answer(self, ask: Callable[[int, int], Sequence[int]], number: int, length: int) -> bytes:

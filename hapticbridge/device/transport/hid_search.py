@@ -1,4 +1,4 @@
-"""hidapi, and the HID devices that it and the kernel say are plugged in."""
+"""Connected HID devices, from hidapi and the kernel."""
 
 from __future__ import annotations
 
@@ -16,41 +16,41 @@ NO_NODE = (
     "the kernel gives it no hidraw node; load its driver (for 046d: 'sudo modprobe hid_logitech') "
     "and plug it in again"
 )
-NO_HIDAPI = "hidapi cannot be loaded; 'pip install hidapi' brings it"
+NO_HIDAPI = "hidapi cannot be loaded; 'pip install hidapi' installs it"
 
 CLASS = Path("/sys/class/hidraw")
-"""Where Linux shows HID devices to everybody; absent on other systems."""
+"""Folder in which Linux shows HID devices to all users; absent on other systems."""
 
 CONTROLLERS = frozenset({(0x01, 0x04), (0x01, 0x05), (0x0F, 0x01)})
-"""Usage page and usage of joysticks, game pads and physical interface devices: what a family that
-has no list of products looks at more closely. Others (keyboards!) are not opened to be asked."""
+"""Usage page and usage of joysticks, game pads and physical interface devices. A family without a
+list of products inspects only these; others, such as keyboards, are not opened."""
 
 _INTERVAL, _UNITS = re.compile(r"(\d+)(ms|us)"), {"ms": 1e-3, "us": 1e-6}
 
 
 class HidHandle(Protocol):
-    """An open device, as cython-hidapi offers it: the seam at which tests put a model."""
+    """An open device, as in cython-hidapi; tests replace it by a model."""
 
     def open_path(self, path: bytes) -> None:
-        """Opens the device; OSError where it cannot."""
+        """Opens the device; raises OSError on failure."""
 
     def set_nonblocking(self, enable: int) -> int:
-        """Makes ``read`` without a time return at once."""
+        """Makes ``read`` without a timeout return at once."""
 
     def read(self, max_length: int, timeout_ms: int = 0) -> Sequence[int]:
-        """Returns one report, or nothing; waits at most ``timeout_ms``."""
+        """Returns one report, or an empty one after ``timeout_ms``."""
 
     def write(self, data: bytes) -> int:
-        """Sends one report; its first byte is its number, 0 where reports have none."""
+        """Sends one report; its first byte is its number, 0 if reports have none."""
 
     def send_feature_report(self, data: bytes) -> int:
-        """Sets a feature report; likewise."""
+        """Sends a feature report; its first byte is its number, 0 if reports have none."""
 
     def get_feature_report(self, report_num: int, max_length: int) -> Sequence[int]:
-        """Asks for a feature report."""
+        """Requests a feature report."""
 
     def get_input_report(self, report_num: int, max_length: int) -> Sequence[int]:
-        """Asks for an input report."""
+        """Requests an input report."""
 
     def get_report_descriptor(self) -> Sequence[int]:
         """Returns the device's report descriptor."""
@@ -60,21 +60,20 @@ class HidHandle(Protocol):
 
 
 class HidApi(Protocol):
-    """hidapi's module: what is plugged in, and a handle to open."""
+    """hidapi's module: list of connected devices, and handles to open them."""
 
     def enumerate(self, vendor_id: int = 0, product_id: int = 0) -> list[dict[str, Any]]:
-        """Lists the HID collections that are plugged in."""
+        """Lists the connected HID collections."""
 
     def device(self) -> HidHandle:
         """Returns a handle that is not open yet."""
 
 
 def hid_api() -> HidApi | None:
-    """Returns hidapi's module, or None where it is not installed or cannot be loaded.
+    """Returns hidapi's module, or None if it is not installed or cannot be loaded.
 
-    On Linux it is ``hidraw``. The wheel's ``hid`` goes through a bundled libusb of 2016, which
-    scans the bus once at import, takes the device from the kernel's driver, and is three times
-    slower.
+    On Linux it is ``hidraw``. The wheel's ``hid`` uses a bundled libusb of 2016. That scans the bus
+    once at import, detaches the kernel's driver, and is three times slower.
     """
     for name in ("hidraw", "hid") if sys.platform == "linux" else ("hid",):
         try:
@@ -85,12 +84,12 @@ def hid_api() -> HidApi | None:
 
 
 def find(family: Family, api: HidApi | None = None) -> list[Plugged]:
-    """Lists the family's devices that are plugged in, with what keeps each from being opened.
+    """Lists the family's connected devices, with the reason if one cannot be opened.
 
     Args:
-        family: What to look for.
-        api: hidapi or what stands for it; None takes the real one. Only then the USB bus is asked
-            too, for devices without a hidraw node, and for all of them where hidapi is missing.
+        family: The family to look for.
+        api: hidapi or a substitute; None selects the real one. Only then the USB bus is searched
+            too, for devices without a hidraw node, and for all of them without hidapi.
 
     Returns:
         One entry per device.
@@ -102,7 +101,7 @@ def find(family: Family, api: HidApi | None = None) -> list[Plugged]:
         usage = entry.get("usage_page"), entry.get("usage")
         raw = entry["path"]
         path = raw.decode(errors="replace") if isinstance(raw, bytes) else str(raw)
-        # hidapi names one node once per top-level collection
+        # hidapi lists a node once per top-level collection
         if path in found or family.usage not in (None, usage):
             continue
         if family.recognises is None:
@@ -132,9 +131,9 @@ def find(family: Family, api: HidApi | None = None) -> list[Plugged]:
 
 
 def report_descriptor(path: str, api: HidApi | None) -> bytes:
-    """Returns a device's report descriptor, empty where nobody tells.
+    """Returns a device's report descriptor, empty if it is not available.
 
-    Linux shows it to everybody in sysfs, so nothing is opened there.
+    Linux shows it to all users in sysfs, so nothing is opened there.
     """
     try:
         return (CLASS / Path(path).name / "device/report_descriptor").read_bytes()
@@ -154,7 +153,7 @@ def report_descriptor(path: str, api: HidApi | None) -> bytes:
 
 
 def descriptor_of(handle: HidHandle) -> bytes:
-    """Returns the report descriptor of an open device, empty where hidapi does not tell."""
+    """Returns the report descriptor of an open device, empty if hidapi does not provide it."""
     try:
         return bytes(handle.get_report_descriptor())
     except (OSError, ValueError, AttributeError):  # hidapi before 0.14 has no such call
@@ -162,13 +161,13 @@ def descriptor_of(handle: HidHandle) -> bytes:
 
 
 def polling(path: str) -> tuple[float | None, float | None]:
-    """Returns how often the host asks a device for a report and offers it one, in s each.
+    """Returns the polling intervals for reports from and to a device, in s each.
 
     Args:
         path: A hidraw node.
 
     Returns:
-        None where the kernel does not say, and for a device without that endpoint.
+        None if the kernel does not list it, and for a device without that endpoint.
     """
     found: dict[str, float] = {}
     try:
@@ -178,5 +177,5 @@ def polling(path: str) -> tuple[float | None, float | None]:
             if (told := _INTERVAL.fullmatch(interval)) is not None:
                 found[direction] = int(told[1]) * _UNITS[told[2]]
     except (OSError, ValueError):
-        pass  # it was just unplugged
+        pass  # the device was just unplugged
     return found.get("in"), found.get("out")

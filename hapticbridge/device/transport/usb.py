@@ -1,4 +1,4 @@
-"""Bytes to and from a USB device through libusb: always one read under way, no wait unbounded."""
+"""Packets to and from a USB device through libusb, with bounded waits."""
 
 from __future__ import annotations
 
@@ -20,42 +20,42 @@ from hapticbridge.device.transport.usb_search import devices_of, libusb, node_of
 from hapticbridge.errors import DeviceError, DeviceLost
 
 PACKET = 64
-"""Bytes per bulk packet on full speed. Reads ask for one packet each, so that they end with it."""
+"""Bytes per bulk packet on full speed. Each read requests one packet, so that it ends with it."""
 
 MOST_PACKETS = 1024
-"""Packets kept for ``take``, the newest. An FTDI bridge sends one a millisecond though nobody asks,
-and between two runs nobody takes them: without a bound they would be 0.4 GB after an hour."""
+"""Largest number of packets kept for ``take``. An FTDI bridge sends one per millisecond without a
+request, and between runs they are not taken. Without a bound they would fill 0.4 GB per hour."""
 
 READ_MS = 100
-"""Longest wait of the reader thread for one packet, in ms: how long ``close`` may have to wait."""
+"""Longest wait of the reader thread for one packet in ms, which bounds the wait of ``close``."""
 
 WRITE_MS = 1
-"""Longest wait in ms for a device to take a packet in the loop; the least that libusb knows. A full
-speed frame is as long, and a device that is well takes a packet within it."""
+"""Longest wait in ms for a device to accept a packet in the loop: the smallest of libusb, and the
+length of a full-speed frame, within which a working device accepts it."""
 
 CONTROL_MS = 1000
 """Longest wait in ms for a control request, before the loop begins."""
 
 TO_VENDOR = 0x40
-"""bmRequestType of a vendor's request to the device, without data."""
+"""bmRequestType of a vendor request to the device, without data."""
 
 SWITCH_INTERVAL = 50e-6
-"""In s: after how long the reader thread gets the interpreter from a thread that does not let go,
-as the loop while it spins to its deadline. Python's default of 5 ms would cost five samples."""
+"""Time in s after which the reader thread gets the interpreter from a busy thread, such as the loop
+while it spins to its deadline. Python's default of 5 ms would cost five samples."""
 
 
 class UsbLink:
-    """A claimed USB device with one bulk endpoint each way.
+    """A claimed USB device with one bulk endpoint in each direction.
 
-    A thread keeps one read under way and queues what comes, packet by packet and as it is; it
-    notices an unplugged device at once, and the next ``take``, ``wait`` or ``write`` says so.
+    A thread keeps one read pending and queues the packets unchanged. It detects an unplugged device
+    at once; the next ``take``, ``wait`` or ``write`` reports it.
 
     Args:
         device: pyusb's device, with its first interface claimed.
-        name: What errors call it.
-        read_from: Address of the endpoint towards the host.
-        write_to: Address of the other.
-        log: Keeps what goes over the wire.
+        name: Name of the device in messages.
+        read_from: Address of the endpoint to the host.
+        write_to: Address of the endpoint to the device.
+        log: Log of the transferred bytes.
     """
 
     def __init__(
@@ -87,7 +87,7 @@ class UsbLink:
         """Opens a device that was found, and claims its first interface.
 
         Raises:
-            DeviceError: It cannot be opened; says why and what to do.
+            DeviceError: The device cannot be opened; the message names reason and remedy.
         """
         source = libusb() if backend is None else backend
         if plugged.problem is not None or source is None:
@@ -96,34 +96,34 @@ class UsbLink:
             if node_of(device) == plugged.path:
                 break
         else:
-            raise DeviceError(f"{plugged} has just been unplugged")
+            raise DeviceError(f"{plugged} has just been unplugged; plug it in again")
         try:
             _claim(device)
-        # the second is how pyusb says LIBUSB_ERROR_NOT_SUPPORTED: no driver lets it be opened
+        # pyusb raises NotImplementedError for LIBUSB_ERROR_NOT_SUPPORTED: no suitable driver
         except (usb.core.USBError, NotImplementedError) as error:
             usb.util.dispose_resources(device)
             number = getattr(error, "errno", None)
             reason = {
                 errno.EACCES: permission_problem(plugged.path),
-                errno.EBUSY: "another program has it",
-                errno.ENODEV: "it has just been unplugged",
+                errno.EBUSY: "another program has it; close that program",
+                errno.ENODEV: "it has just been unplugged; plug it in again",
             }.get(number or 0, f"{error}; unplug it and plug it in again")
             raise DeviceError(f"{plugged} cannot be opened: {reason}") from None
         return cls(device, str(plugged), read_from=read_from, write_to=write_to, log=log)
 
     def now(self) -> float:
-        """Returns the time in s of a clock that only grows."""
+        """Returns the time of a monotonic clock in s."""
         return time.monotonic()
 
     def control(self, request: int, value: int) -> None:
-        """Sends a vendor's request without data.
+        """Sends a vendor request without data.
 
         Args:
             request: bRequest.
             value: wValue.
 
         Raises:
-            DeviceLost: The device is gone, or refuses it.
+            DeviceLost: The device is gone, or refuses the request.
         """
         self._require()
         if self._log.is_on:
@@ -134,14 +134,14 @@ class UsbLink:
             raise self._failed(error) from None
 
     def write(self, packet: array.array[int], timeout_ms: int = WRITE_MS) -> bool:
-        """Sends a packet; returns False where the device did not take it in time.
+        """Sends a packet; returns False if the device did not accept it in time.
 
         Args:
-            packet: Of bytes; an array is not copied.
+            packet: Array of bytes, which is not copied.
             timeout_ms: Longest wait in ms, >= 1.
 
         Raises:
-            DeviceLost: The device is gone, or refuses it.
+            DeviceLost: The device is gone, or refuses the packet.
         """
         if self._lost or not self._is_open:
             self._require()
@@ -156,10 +156,10 @@ class UsbLink:
         return True
 
     def take(self) -> list[bytes]:
-        """Returns the packets that came since the last call, oldest first, without waiting.
+        """Returns the packets since the last call, oldest first, without waiting.
 
         Raises:
-            DeviceLost: The device is gone; packets that came before are returned first.
+            DeviceLost: The device is gone; earlier packets are returned first.
         """
         packets = self._packets
         if not packets or not self._is_open:
@@ -168,18 +168,18 @@ class UsbLink:
         return [packets.popleft() for _ in range(len(packets))]
 
     def wait(self, timeout: float) -> None:
-        """Returns as soon as a packet is there, at the latest after ``timeout`` s."""
+        """Returns as soon as a packet is available, at the latest after ``timeout`` s."""
         if not self._packets:
             self._arrived.wait(timeout)
 
     def close(self) -> None:
-        """Ends the reader and lets the device go; may be called more than once."""
+        """Ends the reader and releases the device; may be called more than once."""
         if not self._is_open:
             return
         self._is_open = False
         atexit.unregister(self.close)
         self._reader.join(2e-3 * READ_MS)
-        if not self._reader.is_alive():  # else it is still inside libusb with what this would free
+        if not self._reader.is_alive():  # not while the reader is inside libusb, using this memory
             usb.util.dispose_resources(self._device)
         _prompt_threads(-1)
         self._log.close()
@@ -192,13 +192,13 @@ class UsbLink:
         if not self._lost:
             self._lost = {
                 errno.ENODEV: f"{self._name} is gone: unplugged, or switched off",
-                errno.EPIPE: f"{self._name} refuses to go on (endpoint halted): unplug it and plug "
-                "it in again",
+                errno.EPIPE: f"{self._name} has halted its endpoint: unplug it and plug it in "
+                "again",
             }.get(error.errno or 0, f"{self._name} fails: {error}")
         return DeviceLost(self._lost)
 
     def _read_always(self) -> None:
-        """Runs in the reader's thread until the link is closed or the device lost."""
+        """Reads in the reader's thread until the link is closed or the device lost."""
         while self._is_open:
             try:
                 packet = self._device.read(self._read_from, PACKET, READ_MS).tobytes()
@@ -219,7 +219,7 @@ _prompt = {"links": 0, "usual": 0.0}
 
 
 def _prompt_threads(change: int) -> None:
-    """Makes threads change promptly while any link is open, and as before after the last one."""
+    """Shortens the thread switch interval while any link is open; restores it after the last."""
     if _prompt["links"] == 0:
         _prompt["usual"] = sys.getswitchinterval()
     _prompt["links"] += change
@@ -228,12 +228,12 @@ def _prompt_threads(change: int) -> None:
 
 
 def _claim(device: Any) -> None:
-    """Takes the device's first interface, from the kernel's driver if one has it."""
+    """Claims the device's first interface, and detaches the kernel's driver from it."""
     try:
         if device.is_kernel_driver_active(0):
             device.detach_kernel_driver(0)
     except NotImplementedError:
-        pass  # as pyusb says that this system has no drivers to detach
+        pass  # pyusb's error on systems without drivers to detach
     try:
         device.get_active_configuration()
     except usb.core.USBError as error:

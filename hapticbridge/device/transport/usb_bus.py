@@ -1,4 +1,4 @@
-"""What the kernel says is on the USB bus, read from sysfs: needs no libusb and no permission."""
+"""Devices on the USB bus, from sysfs."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from pathlib import Path
 from hapticbridge.device.plugged import Family, Plugged
 
 BUS = Path("/sys/bus/usb/devices")
-"""Where Linux lists what is plugged in; absent on a machine without USB and on other systems."""
+"""Folder in which Linux lists USB devices; absent without USB and on other systems."""
 
 NODES = Path("/dev/bus/usb")
-"""Where libusb opens a device: a folder per bus, a node per device."""
+"""Folder of the nodes that libusb opens: a folder per bus, a node per device."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,12 +20,12 @@ class OnTheBus:
     """One device on the USB bus.
 
     Attributes:
-        vendor: 16 bits.
-        product: 16 bits.
-        name: Its product string, empty where it has none.
-        serial: Its serial number, likewise.
-        node: What libusb opens.
-        has_hidraw: Whether any of its interfaces has a hidraw node.
+        vendor: Vendor id, 16 bits.
+        product: Product id, 16 bits.
+        name: Product string, empty if it has none.
+        serial: Serial number, empty if it has none.
+        node: Node that libusb opens.
+        has_hidraw: True if any of its interfaces has a hidraw node.
     """
 
     vendor: int
@@ -37,13 +37,15 @@ class OnTheBus:
 
 
 def on_the_bus(bus: Path | None = None) -> list[OnTheBus]:
-    """Lists the devices on the USB bus, in the order of their places on it.
+    """Lists the devices on the USB bus, in the order of their bus positions.
+
+    This requires neither libusb nor a permission.
 
     Args:
-        bus: The folder of sysfs that lists them; None takes ``BUS``.
+        bus: Folder of sysfs that lists them; None selects ``BUS``.
 
     Returns:
-        Empty where there is no bus. A device that goes away meanwhile is left out.
+        Empty without a bus. A device that is unplugged meanwhile is left out.
     """
     folder = BUS if bus is None else bus
     found = []
@@ -59,7 +61,7 @@ def on_the_bus(bus: Path | None = None) -> list[OnTheBus]:
             ]
             device = int(_text(entry / "devnum"))
         except (OSError, ValueError):
-            continue  # an interface and not a device, or one that has just gone
+            continue  # an interface, or a device that was just unplugged
         vendor, product, number = numbers
         found.append(
             OnTheBus(
@@ -77,12 +79,12 @@ def on_the_bus(bus: Path | None = None) -> list[OnTheBus]:
 def members(
     family: Family, devices: Iterable[OnTheBus], problem: Callable[[OnTheBus], str | None]
 ) -> list[Plugged]:
-    """Returns those of a family, as they are listed.
+    """Returns the devices of a family, in the listed order.
 
     Args:
-        family: Which.
-        devices: What is on the bus.
-        problem: Says why a device cannot be opened; None where it can.
+        family: The family.
+        devices: Devices on the bus.
+        problem: Returns the reason why a device cannot be opened, or None.
     """
     return [
         Plugged(

@@ -1,9 +1,4 @@
-"""A libusb context that ends after what belongs to it, in whatever order Python lets go of them.
-
-pyusb lets each of its objects free what it holds. Where a context and its devices go together as
-part of a cycle (an exception with its frames is one), Python finalizes them in any order, and to
-unreference a device or to close it after ``libusb_exit`` is an access to freed memory.
-"""
+"""libusb context with a safe order of release."""
 
 from __future__ import annotations
 
@@ -14,7 +9,7 @@ import usb.backend.libusb1 as pyusb
 
 
 class _Users:
-    """Counts what needs a context; the last one ends it."""
+    """Counter of the users of a context; the last one ends it."""
 
     def __init__(self) -> None:
         self.count = 1  # the context itself
@@ -37,7 +32,7 @@ class _Device(pyusb._Device):  # type: ignore[misc] # pyusb has no types
         self._users.release()
 
 
-class _Devices(pyusb._DevIterator):  # type: ignore[misc] # likewise
+class _Devices(pyusb._DevIterator):  # type: ignore[misc] # pyusb has no types
     def __init__(self, context: Any, users: _Users) -> None:
         self._users = users
         users.count += 1
@@ -52,14 +47,18 @@ class _Devices(pyusb._DevIterator):  # type: ignore[misc] # likewise
         self._users.release()
 
 
-class UsbContext(pyusb._LibUSB):  # type: ignore[misc] # likewise
-    """pyusb's backend, with a context of its own.
+class UsbContext(pyusb._LibUSB):  # type: ignore[misc] # pyusb has no types
+    """pyusb's backend with a libusb context that ends after all of its devices.
+
+    pyusb lets each of its objects free its own resources. If a context and its devices belong to a
+    cycle (for example an exception with its frames), Python finalizes them in any order. Closing a
+    device after ``libusb_exit`` would access freed memory.
 
     Args:
-        library: libusb, as pyusb has loaded it.
+        library: libusb, as loaded by pyusb.
 
     Raises:
-        usb.core.USBError: libusb cannot begin.
+        usb.core.USBError: libusb cannot be initialised.
     """
 
     def __init__(self, library: Any) -> None:
@@ -69,15 +68,15 @@ class UsbContext(pyusb._LibUSB):  # type: ignore[misc] # likewise
         self._users.end = lambda: library.libusb_exit(context)
 
     def _finalize_object(self) -> None:
-        if hasattr(self, "_users"):  # else there is no context
+        if hasattr(self, "_users"):  # absent if the context could not be created
             self._users.release()
 
     def enumerate_devices(self) -> _Devices:
-        """Lists what is plugged in."""
+        """Lists the connected devices."""
         return _Devices(self.ctx, self._users)
 
     def open_device(self, device: Any) -> Any:
-        """Opens a device; the context lives until it is closed."""
+        """Opens a device; the context lives at least until it is closed."""
         handle = super().open_device(device)
         self._users.count += 1
         return handle

@@ -1,4 +1,4 @@
-"""Which USB devices are plugged in, as libusb and the kernel tell it."""
+"""Connected USB devices, from libusb and the kernel."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from hapticbridge.device.transport.usb_context import UsbContext
 
 
 def libusb() -> Any:
-    """Returns a fresh libusb context for pyusb, or None where there is no libusb or no USB.
+    """Returns a new libusb context for pyusb, or None without libusb or USB.
 
-    Fresh, because an old one does not hear of devices plugged in later where udev does not run.
-    The system's libusb is preferred to the one of ``libusb-package``.
+    The context is new, because an old one misses devices that are plugged in later if udev does not
+    run. The system's libusb is preferred to that of ``libusb-package``.
     """
     module = usb.backend.libusb1
     for find_library in (None, libusb_package.find_library):
         try:
             if module.get_backend(find_library=find_library) is not None:
-                # pyusb offers no way to a second context
+                # pyusb itself cannot create a second context
                 return UsbContext(module._lib)
         except (usb.core.USBError, OSError):
             continue
@@ -34,17 +34,17 @@ def libusb() -> Any:
 
 
 def find(family: Family, backend: Any = None) -> list[Plugged]:
-    """Lists the family's devices that are plugged in, with what keeps each from being opened.
+    """Lists the family's connected devices, with the reason if one cannot be opened.
 
-    On Linux the kernel tells, without a device's being opened, which a running loop would feel;
-    elsewhere libusb is asked.
+    On Linux the kernel's list is used, because opening a device would disturb a running loop. On
+    other systems libusb is used.
 
     Args:
-        family: What to look for.
-        backend: A pyusb backend to ask; None takes kernel or libusb.
+        family: The family to look for.
+        backend: A pyusb backend; None selects kernel or libusb.
 
     Returns:
-        One entry per device, in the order of their places on the bus.
+        One entry per device, in the order of their bus positions.
     """
     listed = [] if backend is not None else members(family, on_the_bus(), _problem)
     source = libusb() if backend is None and not listed else backend
@@ -58,24 +58,24 @@ def _problem(device: OnTheBus) -> str | None:
 
 
 def devices_of(family: Family, backend: Any) -> list[Any]:
-    """Returns pyusb's devices that are of a family, in the order of their places on the bus."""
+    """Returns pyusb's devices of a family, in the order of their bus positions."""
     try:
         devices: Iterable[Any] = usb.core.find(find_all=True, backend=backend)
         known = [d for d in devices if family.model(d.idVendor, d.idProduct) is not None]
-    except (usb.core.USBError, NotImplementedError):  # the second: libusb cannot list them here
+    except (usb.core.USBError, NotImplementedError):  # pyusb's errors if libusb cannot list them
         return []
     return sorted(known, key=node_of)
 
 
 def node_of(device: Any) -> str:
-    """Returns where Linux keeps the device of pyusb: what tells two of a model apart."""
+    """Returns the Linux node of pyusb's device, which distinguishes two of one model."""
     return str(NODES / f"{device.bus or 0:03d}" / f"{device.address or 0:03d}")
 
 
 def _described(family: Family, device: Any) -> Plugged:
     node, problem, texts = node_of(device), None, ["", ""]
     try:
-        device.get_active_configuration()  # opens it; reading texts would hide why it cannot
+        device.get_active_configuration()  # opens the device; get_string would hide the error
         texts = [
             usb.util.get_string(device, index) or "" if index else ""
             for index in (device.iProduct, device.iSerialNumber)
@@ -83,7 +83,7 @@ def _described(family: Family, device: Any) -> Plugged:
     except usb.core.USBError as error:
         problem = permission_problem(node) if error.errno == errno.EACCES else None
     except (ValueError, NotImplementedError):
-        pass  # it has no texts, or libusb cannot open it here (as pyusb says that)
+        pass  # the device has no texts, or libusb cannot open it here
     finally:
         usb.util.dispose_resources(device)
     return Plugged(
