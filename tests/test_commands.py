@@ -77,8 +77,8 @@ def test_an_unknown_damping_is_the_one_that_the_default_coupling_takes() -> None
     allowed = allowance(damping=None)
     span = allowed.translation
     assert span.most_stiffness(0.0) == pytest.approx(2 * span.damping / T, rel=1e-9)
-    assert "taken for it" in allowed.reason()
-    assert "taken for it" not in allowance().reason()
+    assert "(assumed; it is unknown)" in allowed.reason()
+    assert "assumed" not in allowance().reason()
 
 
 def test_the_softest_coupling_still_shows_the_whole_force() -> None:

@@ -25,9 +25,7 @@ from hapticbridge.identify.resolution import step_of
 
 Array = NDArray[np.float64]
 
-UNHELD = (
-    "the device is assumed to be free: a hand that only damps cannot be distinguished from it"
-)
+UNHELD = "the device is assumed to be free: a hand that only damps cannot be distinguished from it"
 """Caveat printed with every measured b."""
 
 DURATION = 12.0

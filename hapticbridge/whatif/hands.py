@@ -34,14 +34,17 @@ def missing_for_closed_loop(info: DeviceInfo) -> str:
 
 
 class IdentifiedDevice(SimulatedDevice):
-    """The recorded device as its data sheet knows it, in a model hand that wants what it wanted.
+    """The recorded device by its data sheet, in a model hand with the recorded hand's intent.
+
+    Unlike a prescribed motion (``again``), the hand yields to the force.
 
     Args:
-        info: The recorded device, with mass and damping (``missing_for_closed_loop``).
-        hand: Who holds it.
-        ticks: The recorded rows, ``TICK_DTYPE``, at least three.
-        period: The recorded loop's in s.
-        start: Device pose (7,) before the first tick, where it is held still until then.
+        info: Data sheet of the recorded device, with mass and damping
+            (``missing_for_closed_loop``).
+        hand: Model of the hand.
+        ticks: Recorded rows, ``TICK_DTYPE``, at least three.
+        period: Recorded period in s.
+        start: Device pose (7,) before the first tick; the device is held there until then.
     """
 
     def __init__(
