@@ -123,11 +123,7 @@ def work_of_commands(
 ) -> Array:
     """Returns W_k of ``kept_behind_a_law``, the work of commands on the springs, (n,) in J.
 
-    Args:
-        parameters: Run parameters.
-        gains: K, B', K_r and B'_r in the tick before each and in each, (n, 4) each.
-        pulled: h_k − x_{k−1} in m and as rotation vectors, (n, 3) each.
-        share_before: Share of the wrench transmitted in the tick before each, (n,).
+    Arguments are those of ``kept_behind_a_law``; ``share_before`` has one value per tick.
     """
     work = np.zeros(len(share_before))
     for column, limit, p in zip((0, 2), limits_on_tool(parameters), pulled, strict=True):

@@ -83,10 +83,7 @@ class Guarded:
     ) -> tuple[Expected, Guarded]:
         """Computes the expected content of the next records, ``TICK_DTYPE``, at least one.
 
-        Args:
-            ticks: The records.
-            outside: External actions during the run.
-            excess: Energy created by the environment beyond the slack, (n,) in J.
+        ``excess`` is the energy created by the environment beyond the slack, (n,) in J.
         """
         then = copy.copy(self)
         seen, then.watch = self.watch.after(ticks, outside)

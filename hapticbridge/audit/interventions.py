@@ -54,10 +54,7 @@ class Interventions:
     ) -> Interventions:
         """Reads the events of a recording.
 
-        Args:
-            events: Events in order.
-            parameters: Run parameters at the start.
-            home: Tool pose (7,) before the first tick.
+        ``home`` is the tool pose (7,) before the first tick.
 
         Raises:
             RecordingError: An event is damaged.
@@ -107,9 +104,8 @@ class Interventions:
     def sentences(self, given: float | None = None) -> tuple[str, ...]:
         """Describes changes of the coupling; empty without any.
 
-        Args:
-            given: Energy that the changes added to the effective coupling, in J; None if not yet
-                known.
+        ``given`` is the energy that they added to the effective coupling, in J; None if not yet
+        known.
         """
         count = len(self.couplings) - 1
         if count < 1:

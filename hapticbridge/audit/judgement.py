@@ -69,8 +69,7 @@ class Judgement:
     def findings(self, *, strict: bool) -> dict[str, Any]:
         """Returns the fields of ``AuditReport`` that follow from the energies.
 
-        Args:
-            strict: True accepts only (14) itself.
+        ``strict`` accepts only (14) itself.
         """
         unstrict, active, kicked = self._unstrict, self._active, self._kicked
         if kicked is not None and not (active is not None and active.tick <= kicked.tick):

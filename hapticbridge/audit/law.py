@@ -53,11 +53,8 @@ class Motion:
     ) -> Motion:
         """Computes the motion of consecutive records.
 
-        Args:
-            ticks: Records, ``TICK_DTYPE``.
-            handle: Handle pose (7,) before the first of them.
-            tool: Tool pose (7,) before the first of them.
-            outside: External actions during the run; the jump of a reset is no motion.
+        ``handle`` and ``tool`` are the poses (7,) before the first record. The jump of a reset is
+        no motion.
         """
         handle_before = poses_before(ticks, "handle", handle, outside)
         tool_before = poses_before(ticks, "tool", tool, outside)
@@ -84,11 +81,8 @@ class Motion:
 def wrench_by_law(ticks: NDArray[np.void], gains: Array, period: float, motion: Motion) -> Array:
     """Returns the coupling's wrench on the tool, (n, 6) in N and N m.
 
-    Args:
-        ticks: Records with one law each; their flags select the rule of the torque.
-        gains: K, B', K_r and B'_r in each of them, (n, 4).
-        period: T in s.
-        motion: Motion of the records.
+    Each record has one law; its flags select the rule of the torque. ``gains`` holds K, B', K_r and
+    B'_r, (n, 4).
     """
     step, turn = motion.stretched
     k, b, k_r, b_r = (gains[:, column, None] for column in range(4))
@@ -110,11 +104,7 @@ def poses_before(
 ) -> Array:
     """Returns the pose before each tick, (n, 7).
 
-    Args:
-        ticks: Records, ``TICK_DTYPE``.
-        body: ``handle`` or ``tool``.
-        before: Pose (7,) before the first of them.
-        outside: External actions during the run.
+    ``before`` is the pose (7,) of the body (``handle`` or ``tool``) before the first record.
     """
     poses = np.concatenate([ticks[f"{body}_position"], ticks[f"{body}_quaternion"]], axis=1)
     poses = np.concatenate([before[None], poses[:-1]])

@@ -16,12 +16,7 @@ small velocity, which costs five digits. The re-simulation checks the rest."""
 
 
 def physics_fault(ticks: NDArray[np.void], balance: Balance) -> Fault | None:
-    """Returns the earliest disagreement between records and their second computation, or None.
-
-    Args:
-        ticks: Records without gaps, ``TICK_DTYPE``.
-        balance: Their second computation.
-    """
+    """Returns the earliest disagreement between records and their second computation, or None."""
     start = int(ticks["tick"][0])
     vectors = (
         ("handle_position", balance.handle_position, "m", "device pose and scale"),

@@ -56,11 +56,7 @@ class Reached:
     ) -> Reached:
         """Returns the state before the first tick.
 
-        Args:
-            parameters: Run parameters.
-            handle: Handle pose (7,).
-            tool: Tool pose (7,).
-            start_energy: Kinetic plus potential energy, in J.
+        ``start_energy`` is kinetic plus potential energy, in J.
         """
         device = np.array(parameters.device_start)
         guarded = Guarded.at_start(parameters, handle, tool, start_energy)

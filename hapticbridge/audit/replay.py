@@ -54,10 +54,6 @@ class Resimulation:
 
     All fields except the clock's are compared; ``outcome`` returns the result.
 
-    Args:
-        recording: The recording.
-        parameters: Run parameters.
-
     Raises:
         RecordingError: The attachments contradict the metadata, so the file was changed.
     """

@@ -100,10 +100,7 @@ class AuditReport:
 def verdict_words(verdict: str, environment: str, port: str) -> str:
     """Returns a verdict with its environment or port, as ``passive (strict)``.
 
-    Args:
-        verdict: Verdict of ``AuditReport``.
-        environment: Environment of ``AuditReport``; empty if unknown.
-        port: Port of ``AuditReport``; empty if unknown.
+    An unknown environment or port is empty.
     """
     beside = {"passive": environment, "active": port}.get(verdict)
     return f"{verdict} ({beside})" if beside else verdict

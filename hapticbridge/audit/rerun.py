@@ -34,10 +34,7 @@ _CHANGES = ("input", "resume", *COMMANDED)
 class Rerun:
     """Simulation of a recorded device motion in the attached scene.
 
-    Args:
-        recording: Recording without an ``obstacle``. Its events are applied when due; ``note`` adds
-            more.
-        parameters: Run parameters.
+    The recording must have no ``obstacle``. Its events are applied when due; ``note`` adds more.
 
     Attributes:
         model: The attached scene.
@@ -84,8 +81,7 @@ class Rerun:
     def add(self, ticks: NDArray[np.void]) -> NDArray[np.void]:
         """Simulates the next ticks.
 
-        Args:
-            ticks: Their records, ``TICK_DTYPE``, at least one; only external inputs are used.
+        Only the external inputs of the records are used.
 
         Returns:
             Simulated records; fewer if it ``is_over``.

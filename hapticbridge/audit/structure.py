@@ -68,12 +68,8 @@ def structure_fault(
 ) -> Fault | None:
     """Returns the first fault that makes records implausible, or None.
 
-    Impossible numbers come before times, times before flags, each at its earliest tick.
-
-    Args:
-        blocks: Blocks of records in order, ``TICK_DTYPE``, none empty.
-        parameters: Run parameters.
-        outside: External actions during the run.
+    Impossible numbers come before times, times before flags, each at its earliest tick. No block
+    may be empty.
     """
     found: dict[int, Fault] = {}
     before: NDArray[np.void] = np.zeros(0, TICK_DTYPE)
@@ -96,11 +92,7 @@ def structure_fault(
 def _first(is_wrong: NDArray[np.bool_], start: int, text: str, port: str) -> Fault | None:
     """Returns the fault of the first wrong record, or None.
 
-    Args:
-        is_wrong: True for each wrong record.
-        start: Tick of the first record.
-        text: Sentence with ``{}`` for the tick.
-        port: Field at fault.
+    ``text`` has ``{}`` for the tick.
     """
     if not is_wrong.any():
         return None

@@ -187,9 +187,7 @@ class _Passed:
     def by(self, outside: Interventions, late: int) -> Fault | None:
         """Checks every tick; returns the earliest fault of the records themselves.
 
-        Args:
-            outside: External actions during the run.
-            late: Delay in ticks from a sample to the wrench that answers it.
+        ``late`` is the delay in ticks from a sample to the wrench that answers it.
 
         Raises:
             RecordingError: The metadata lack the start of the energy balance.

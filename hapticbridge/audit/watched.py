@@ -31,9 +31,7 @@ def has_flag(ticks: NDArray[np.void], flag: TickFlag) -> Flags:
 def run_lengths(is_on: Flags, before: int) -> NDArray[np.int64]:
     """Returns the length of the uninterrupted run of True values up to each row.
 
-    Args:
-        is_on: Values of these rows.
-        before: Length of the run before the first row.
+    ``before`` is the length of the run before the first row.
     """
     index = np.arange(1, len(is_on) + 1)
     return np.asarray(index - np.maximum.accumulate(np.where(is_on, -before, index)))
@@ -97,12 +95,7 @@ class Watch:
         return cls(parameters, np.array(parameters.device_start), is_released=is_released)
 
     def after(self, ticks: NDArray[np.void], outside: Interventions) -> tuple[Seen, Watch]:
-        """Evaluates the next records, ``TICK_DTYPE``, at least one.
-
-        Args:
-            ticks: The records.
-            outside: External actions during the run.
-        """
+        """Evaluates the next records, ``TICK_DTYPE``, at least one."""
         guarding, period = self.parameters.guarding, self.parameters.period
         index = np.arange(len(ticks))
         first = (ticks["tick"] == 0) | np.isin(ticks["tick"], outside.resumed)
@@ -164,10 +157,8 @@ class Watch:
     def _risen(self, pace: Array, last: NDArray[np.int64], full: Array) -> Array:
         """Returns the progress of the rise, in ticks of a ramp.
 
-        Args:
-            pace: Largest progress in each tick, (n,).
-            last: Row in which the rise began; -1 before these rows.
-            full: Length of the rise, (n,).
+        ``pace`` is the largest progress in each tick. The rise began in row ``last``, −1 before
+        these rows, and ends at ``full``.
         """
         gone = np.cumsum(pace)
         before = np.where(last >= 0, gone[last] - pace[last], -self.risen)

@@ -70,14 +70,7 @@ class Repeater:
     """Applies events of commands to a live or simulated run.
 
     The loop applies the event that it records, so live run and re-simulation share one path.
-
-    Args:
-        binding: Kernel binding of the run.
-        model: Model of the scene.
-        data: Data of the scene.
-        method: The rendering method.
-        parameters: Run parameters at the start.
-        start: State of the scene at the start (``provenance.start_state``), as bytes.
+    ``start`` is the scene's state at the start (``provenance.start_state``), as bytes.
     """
 
     def __init__(

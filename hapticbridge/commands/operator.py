@@ -18,9 +18,7 @@ Tell = Callable[..., None]
 class Operator:
     """Executes one command per tick; commands that need zero force wait until it has faded.
 
-    Args:
-        queue: Queue of waiting commands.
-        tell: Records an event of the present tick: its name, then its details.
+    ``tell`` records an event of the present tick: its name, then its details.
 
     Attributes:
         felt: Requested coupling at the end of its present change.
@@ -43,9 +41,7 @@ class Operator:
     def begin(self, repeater: Repeater, fade_ticks: int) -> None:
         """Starts a run at its first tick.
 
-        Args:
-            repeater: Repeater of the run.
-            fade_ticks: Duration of the force's fading in ticks.
+        The force fades within ``fade_ticks``.
         """
         self._repeater, self._fade_ticks = repeater, fade_ticks
         self.later.clear()

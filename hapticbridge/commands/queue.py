@@ -63,9 +63,7 @@ class CommandQueue:
     def offer(self, command: Command, by: str) -> None:
         """Adds a command, or refuses it.
 
-        Args:
-            command: The command.
-            by: Origin of the command, for the recording.
+        ``by`` is the command's origin, for the recording.
 
         Raises:
             CommandError: It exceeds the device's limits, follows the last one too soon, or the loop

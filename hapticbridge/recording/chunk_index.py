@@ -22,9 +22,6 @@ class ChunkIndexFile:
     entry takes about 100 bytes in an unnamed temporary file, beside the recording if possible. The
     file vanishes when it is closed or its process dies.
 
-    Args:
-        folder: Folder of the recording.
-
     Raises:
         OSError: No file can be created, there or in the temporary folder.
     """

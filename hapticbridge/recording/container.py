@@ -55,9 +55,6 @@ class Container:
     The MCAP library's reader yields single messages (10 µs each) and stops at the first fault. Here
     a chunk is one block of bytes, and a fault becomes a sentence.
 
-    Args:
-        data: The file, which starts with the MCAP magic.
-
     Attributes:
         is_cut: True if the end of the file is missing.
         problems: Damage, one sentence each; complete after ``records`` is exhausted.

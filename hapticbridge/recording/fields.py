@@ -10,13 +10,7 @@ class DamageError(Exception):
 
 
 class Fields:
-    """Sequential reader of one record's fields.
-
-    Args:
-        data: Bytes that hold the record's body.
-        start: Start of the body.
-        stop: End of the body.
-    """
+    """Sequential reader of one record's fields."""
 
     def __init__(self, data: bytes | FileBytes, start: int, stop: int) -> None:
         self._data, self._position, self._stop = data, start, stop

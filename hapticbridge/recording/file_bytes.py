@@ -20,9 +20,6 @@ class FileBytes:
     It is not memory-mapped: a bridge that overwrites the file would truncate it, and access to a
     mapped page beyond the end kills the process. Slices may be read from several threads.
 
-    Args:
-        path: A regular file.
-
     Raises:
         RecordingError: It cannot be read.
     """

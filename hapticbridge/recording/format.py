@@ -88,10 +88,7 @@ def event_payload(event: Mapping[str, object], time_ns: int) -> bytes:
 
     Values that JSON cannot hold become text (``"nan"``, ``"inf"``, the ``str`` of an unknown
     object) instead of an error. The event of a trip is about such a number and must arrive.
-
-    Args:
-        event: The event; ``time_ns`` is added.
-        time_ns: Time in ns since the start of the run.
+    ``time_ns`` counts from the start of the run.
     """
     plain = _plain({**event, "time_ns": int(time_ns)})
     return json.dumps(plain, separators=(",", ":"), allow_nan=False).encode()

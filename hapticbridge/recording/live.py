@@ -65,9 +65,6 @@ class LiveLine:
     """Status line of a run: redrawn on a terminal, printed as plain lines elsewhere.
 
     After an error the stream is no longer used, and the recording continues.
-
-    Args:
-        stream: Stream to write to.
     """
 
     def __init__(self, stream: TextIO) -> None:

@@ -23,11 +23,8 @@ class Onlooker(Protocol):
     ) -> None:
         """Starts reading.
 
-        Args:
-            ring: Name of the ring for ``Ring.attach``; a reader must free nothing.
-            snapshot: Name of the shared memory with the scene's positions.
-            metadata: Metadata of the run, as in a recording.
-            attachments: Attachments of the run, as in a recording.
+        A reader must free nothing of the ring. ``snapshot`` names the shared memory with the
+        scene's positions. Metadata and attachments are those of a recording.
         """
 
     def event(self, event: Mapping[str, object]) -> None:

@@ -27,11 +27,7 @@ class Output:
     The MCAP library writes a finished chunk in one call; a buffer would hold its end back, and a
     kill would lose it. A full disk has no space for the index that closes the file, so space is
     reserved in advance. When no more can be reserved, the reserve takes the remaining data until
-    the run has ended.
-
-    Args:
-        path: The file; its content is lost.
-        is_new: True refuses an existing file.
+    the run has ended. The content of an existing file is lost; ``is_new`` refuses it.
 
     Attributes:
         is_full: True if no more space could be reserved; at most ``RESERVE`` bytes are then left.

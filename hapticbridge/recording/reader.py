@@ -60,10 +60,8 @@ class RecordingFile:
     def blocks(self, size: int | None = None) -> Iterator[NDArray[np.void]]:
         """Yields the records in order, ``TICK_DTYPE``, in blocks of equal size (the last: shorter).
 
-        The caller may keep a block.
-
-        Args:
-            size: Records per block, >= 1; ``BLOCK`` by default.
+        The caller may keep a block. ``size`` is the number of records per block, ``BLOCK`` by
+        default.
 
         Raises:
             RecordingError: The file cannot be read, or has changed since it was opened.
@@ -133,10 +131,7 @@ def _described(
 ) -> tuple[dict[str, Any], list[Attachment]]:
     """Reads a file; returns the fields of ``RecordingFile``, and the attachments.
 
-    Args:
-        path: The file.
-        runs: Receives the records, run by run.
-        keeps: True fills ``runs``.
+    ``runs`` receives the records if ``keeps``.
     """
     digest = layout.Digest()
     count, last, flags = 0, -1, 0

@@ -101,8 +101,7 @@ class Recorder:
     def wait_until_ready(self, timeout: float = 30.0) -> None:
         """Waits until the file is open and has its metadata and attachments.
 
-        Args:
-            timeout: Longest wait in s.
+        ``timeout`` is the longest wait in s.
 
         Raises:
             RecordingError: The file cannot be written, the process died, or the time is over.
@@ -120,9 +119,7 @@ class Recorder:
     def event(self, event: Mapping[str, object], time_ns: int) -> None:
         """Sends an event to the recording; never blocks and never raises.
 
-        Args:
-            event: The event: ``event`` is its name, the rest its data.
-            time_ns: Time in ns since the start of the run.
+        ``event["event"]`` is its name; ``time_ns`` counts from the start of the run.
         """
         self._outbox += layout.event_payload(event, time_ns) + b"\n"
         self._send()

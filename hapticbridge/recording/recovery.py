@@ -20,10 +20,6 @@ def repair(path: str | Path, output: str | Path) -> Recording:
     Metadata, attachments, and all whole records and events are kept. An event ``repaired``
     describes the repair, and the digest is computed anew.
 
-    Args:
-        path: A cut recording.
-        output: The new file; it must not exist.
-
     Returns:
         The new recording, as read back.
 

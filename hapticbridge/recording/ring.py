@@ -61,9 +61,6 @@ class Ring:
     def local(cls, capacity: int) -> Ring:
         """Returns a ring in this process's own memory.
 
-        Args:
-            capacity: Number of records, >= 1.
-
         Raises:
             RecordingError: The capacity is below 1.
         """
@@ -74,10 +71,7 @@ class Ring:
     def shared(cls, capacity: int) -> Ring:
         """Creates a ring in shared memory; ``close`` removes its name.
 
-        Segments left by killed processes are removed.
-
-        Args:
-            capacity: Number of records, >= 1; one record takes 400 bytes.
+        Segments left by killed processes are removed. One record takes 400 bytes.
 
         Raises:
             RecordingError: The capacity is below 1, or memory is insufficient.
@@ -101,9 +95,6 @@ class Ring:
     @classmethod
     def attach(cls, name: str) -> Ring:
         """Opens a ring created by another process.
-
-        Args:
-            name: The other ring's ``name``.
 
         Raises:
             RecordingError: There is no such ring, or it is not one of this version.
@@ -136,9 +127,6 @@ class Ring:
     def append(self, rows: NDArray[np.void]) -> int:
         """Writes records as the producer, as the kernel's compiled producer does.
 
-        Args:
-            rows: Records, shape (n,), ``TICK_DTYPE``.
-
         Returns:
             Number of records written, from the first on; a full ring refuses the rest.
         """
@@ -151,9 +139,6 @@ class Ring:
 
     def take(self, limit: int) -> NDArray[np.void]:
         """Reads records as the consumer, and frees their places.
-
-        Args:
-            limit: Largest number of records, >= 1.
 
         Returns:
             A copy of the oldest unread records, oldest first; empty if there is none.
@@ -172,9 +157,6 @@ class Ring:
         While the producer runs, request fewer than the capacity: the oldest record's place is
         written next.
 
-        Args:
-            count: Largest number of records, >= 0.
-
         Returns:
             The records, oldest first.
         """
@@ -190,8 +172,7 @@ class Ring:
     def since(self, number: int) -> tuple[int, NDArray[np.void]]:
         """Copies the records from a number on that are still in the ring, without freeing them.
 
-        Args:
-            number: Number of the first record, counted from the ring's start, >= 0.
+        Numbers count from the ring's start.
 
         Returns:
             Number of the first available record, and the records, oldest first.

@@ -35,11 +35,7 @@ def memory_folder() -> Path:
 def created(folder: Path, size: int) -> tuple[mmap.mmap, Path]:
     """Creates zeroed shared memory under a unique name.
 
-    Segments left by killed processes are removed.
-
-    Args:
-        folder: Folder for the segment.
-        size: Size in bytes.
+    Segments left by killed processes are removed. ``size`` is in bytes.
 
     Raises:
         OSError: Memory is insufficient.

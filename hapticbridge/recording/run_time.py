@@ -17,11 +17,7 @@ def due_times(ticks: NDArray[np.void], period: float) -> Array:
 
     This is the clock of the events' ``time_ns``; without a missed deadline it is (tick + 1) T. If
     the deadlines of a damaged file run backwards, all are computed as if none had been missed, so
-    that plots over time remain possible.
-
-    Args:
-        ticks: Records in order, ``TICK_DTYPE``, (n,).
-        period: T in s.
+    that plots over time remain possible. ``period`` is T in s.
 
     Returns:
         Shape (n,), increasing if the ticks' numbers are.
@@ -34,10 +30,6 @@ def due_times(ticks: NDArray[np.void], period: float) -> Array:
 
 class Timeline:
     """Due times of any number of ticks; only missed deadlines are stored.
-
-    Args:
-        blocks: Blocks of the run's records, ``TICK_DTYPE``.
-        period: T in s.
 
     Attributes:
         duration: Due time of the last tick in s; 0 without ticks.
@@ -62,9 +54,5 @@ class Timeline:
         self.duration = times[-1] if times else 0.0
 
     def row_at(self, time: float) -> int:
-        """Returns the row of the tick due nearest to a time in s; the first one for earlier times.
-
-        Args:
-            time: Time from 0 to ``duration``.
-        """
+        """Returns the row of the tick due nearest to a time in s, from 0 to ``duration``."""
         return round(float(np.interp(time, self._times, self._rows)))

@@ -19,12 +19,8 @@ def salvage(path: Path, rows: NDArray[np.void], events: Sequence[Mapping[str, ob
     """Rewrites a cut recording with the records and events that it lacks.
 
     The ring keeps the last seconds of records, read or not, so records that the recorder had taken
-    but not written are still available.
-
-    Args:
-        path: The recording; replaced on success, otherwise unchanged.
-        rows: Newest records, oldest first, ``TICK_DTYPE``.
-        events: Newest events, oldest first, with ``time_ns``.
+    but not written are still available. ``rows`` and ``events`` are the newest ones, oldest first.
+    The file is replaced on success, otherwise unchanged.
 
     Returns:
         The outcome, as a clause.

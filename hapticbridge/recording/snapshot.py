@@ -67,13 +67,8 @@ class Snapshot:
 
     A record has the poses of handle and tool only. A view draws all bodies, so the loop also
     publishes the generalised positions, mocap poses and contacts of one tick, about 30 times per
-    second. The loop never waits; a reader that meets a write reads again.
-
-    Args:
-        memory: Zeroed memory of ``size_of(model)`` bytes.
-        model: The scene.
-        name: Path of the shared memory, or None.
-        is_owner: True if ``close`` removes the name.
+    second. The loop never waits; a reader that meets a write reads again. ``memory`` has
+    ``size_of(model)`` zeroed bytes; an owner removes the name on ``close``.
 
     Attributes:
         head: Shape (8,), int64; see ``SEQUENCE``.

@@ -114,8 +114,7 @@ class RecordStream:
     def makes_room(self, *, may_wait: bool) -> bool:
         """Handles a record refused by a full ring.
 
-        Args:
-            may_wait: False for a run that was told to stop, which must not wait.
+        A run that was told to stop must not wait (``may_wait``).
 
         Returns:
             True after a wait in simulated time, to try again. False if the record is counted as
@@ -136,11 +135,7 @@ class RecordStream:
     def event(self, event: str, tick: int, time_ns: int, **details: object) -> None:
         """Sends an event to all readers; never blocks and never raises.
 
-        Args:
-            event: Name of the event.
-            tick: Tick before which it happened.
-            time_ns: Time in ns since the start of the run.
-            **details: Further data.
+        It happened before ``tick``; ``time_ns`` counts from the start of the run.
         """
         told = {"event": event, "tick": tick, **details}
         if self.recorder is not None:

@@ -127,9 +127,7 @@ class RecordingWriter:
     def write_event(self, event: Mapping[str, object], time_ns: int) -> None:
         """Appends an event.
 
-        Args:
-            event: The event: ``event`` is its name, the rest its data.
-            time_ns: Time in ns since the start of the run.
+        ``event["event"]`` is its name; ``time_ns`` counts from the start of the run.
 
         Raises:
             RecordingError: The file cannot be written; it ends with its last whole chunk.

@@ -36,15 +36,9 @@ def missing_for_closed_loop(info: DeviceInfo) -> str:
 class IdentifiedDevice(SimulatedDevice):
     """The recorded device by its data sheet, in a model hand with the recorded hand's intent.
 
-    Unlike a prescribed motion (``again``), the hand yields to the force.
-
-    Args:
-        info: Data sheet of the recorded device, with mass and damping
-            (``missing_for_closed_loop``).
-        hand: Model of the hand.
-        ticks: Recorded rows, ``TICK_DTYPE``, at least three.
-        period: Recorded period in s.
-        start: Device pose (7,) before the first tick; the device is held there until then.
+    Unlike a prescribed motion (``again``), the hand yields to the force. It needs mass and damping
+    (``missing_for_closed_loop``) and at least three rows. The device is held at the pose ``start``
+    (7,) until the first tick.
     """
 
     def __init__(

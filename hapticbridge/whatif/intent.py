@@ -41,14 +41,8 @@ def intended(
     positions is noise.
 
     Rotation follows the same law with rotation vectors from the start's orientation. It is exact
-    about one axis, and a good approximation for angles well below π.
-
-    Args:
-        info: The device.
-        hand: Model of the hand.
-        ticks: Recorded rows.
-        period: Recorded period in s.
-        start: Device pose (7,) before the first tick.
+    about one axis, and a good approximation for angles well below π. ``start`` is the device pose
+    (7,) before the first tick.
     """
     origin = Rotation.from_quat(np.array(start[3:]), scalar_first=True)
     turned = Rotation.from_quat(ticks["device_quaternion"], scalar_first=True) * origin.inv()

@@ -33,10 +33,6 @@ Event = Mapping[str, Any]
 class Repetition:
     """One repetition of a run with given settings.
 
-    Args:
-        run: The recorded run.
-        settings: Settings of the bridge.
-
     Attributes:
         settings: Settings of the bridge.
         warned: Warnings about the scene, one sentence each.
