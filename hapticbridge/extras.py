@@ -13,12 +13,8 @@ def optional_module(
 ) -> Any:
     """Imports a module of an optional package.
 
-    Args:
-        module: Dotted name of the module.
-        purpose: Feature that needs it, for the message.
-        extra: The project's extra that installs it.
-        error: Exception to raise.
-        package: Name of the package for the user; the module's first part by default.
+    ``extra`` is the project's extra that installs it. ``purpose`` and ``package`` name the feature
+    and the package in the message; ``package`` defaults to the module's first part.
 
     Raises:
         HapticBridgeError: ``error``, with the command that installs the package.

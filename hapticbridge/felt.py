@@ -18,10 +18,6 @@ from hapticbridge.tick import TickFlag
 def is_always_held(model: mujoco.MjModel, grip: str) -> bool:
     """Returns True if a lossless coupling stays implicit because the tool is never free.
 
-    Args:
-        model: The compiled scene with its handle.
-        grip: Name of the site on the tool.
-
     References:
         ``kernel.tree.ToolTree.is_never_free`` lists the causes.
     """

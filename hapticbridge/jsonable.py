@@ -10,8 +10,7 @@ from typing import Any
 def jsonable(value: Any) -> Any:
     """Replaces every number that is not finite by None.
 
-    Args:
-        value: Numbers, text, and nested mappings, lists and tuples of them; tuples become lists.
+    Mappings, lists and tuples may be nested; tuples become lists.
     """
     if isinstance(value, Mapping):
         return {key: jsonable(inner) for key, inner in value.items()}

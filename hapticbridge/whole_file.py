@@ -12,11 +12,8 @@ def whole_file(path: Path) -> Iterator[Path]:
     """Yields a temporary path; after the block the file replaces the target.
 
     If writing fails or is interrupted, an existing file is left unchanged and no partial file
-    remains.
-
-    Args:
-        path: The target; a link is followed. An existing path that is not a regular file, such as a
-            pipe or /dev/stdout, is written directly.
+    remains. A link is followed. An existing path that is not a regular file, such as a pipe or
+    /dev/stdout, is written directly.
 
     Raises:
         OSError: The file cannot replace the target.

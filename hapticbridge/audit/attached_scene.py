@@ -1,4 +1,4 @@
-"""The scene that a recording carries, held against what its metadata say of it."""
+"""Checks of the attached scene against the metadata."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from hapticbridge.recording import RecordingFile
 from hapticbridge.rendering import check_prepared, method_named
 
 FOREIGN_TOLERANCE = 1e-9
-"""Allowed difference, relative to a field's largest value, where the processor differs: other
-vector instructions round differently. Larger would hide tampering, smaller would refuse honest
-recordings."""
+"""Allowed difference on another processor, relative to a field's largest value; other vector
+instructions round differently. A larger tolerance would hide tampering, a smaller one would refuse
+honest recordings."""
 
 
 def attached_model(recording: RecordingFile, parameters: RunParameters) -> mujoco.MjModel:
-    """Loads the attached model, which must be that of the metadata.
+    """Loads the attached model and checks it against the metadata.
 
     Raises:
-        RecordingError: It is not, or cannot be loaded.
+        RecordingError: It contradicts the metadata or cannot be loaded.
     """
     content = recording.attachments[MODEL_ATTACHMENT]
     if hashlib.sha256(content).hexdigest() != recording.meta.get("scene_sha256"):
@@ -67,10 +67,10 @@ def attached_model(recording: RecordingFile, parameters: RunParameters) -> mujoc
 
 
 def check_start(recording: RecordingFile, state: NDArray[np.void]) -> None:
-    """Refuses metadata that do not repeat the start of the attached scene.
+    """Refuses metadata that contradict the start of the attached scene.
 
     Raises:
-        RecordingError: They do not.
+        RecordingError: They do.
     """
     for name in STARTS:
         recorded = meta_start(recording.meta, name)
@@ -84,7 +84,7 @@ def check_start(recording: RecordingFile, state: NDArray[np.void]) -> None:
 
 
 def is_same_processor(recording: RecordingFile) -> bool:
-    """Returns whether a run was recorded on this model of processor, as far as it says."""
+    """Returns True if the recording's processor model is this one or not stated."""
     try:
         return bool(json.loads(recording.meta["host"])["processor"] == processor())
     except (KeyError, TypeError, ValueError, RecursionError):

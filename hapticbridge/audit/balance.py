@@ -1,8 +1,8 @@
-"""A second opinion on a recording's physics: plain NumPy over the recorded poses and wrenches.
+"""Second computation of a recording's energies, in plain NumPy over recorded poses and wrenches.
 
-Written apart from the kernel on purpose. It uses other formulas where there are any (rotation
-vectors by matrices of quaternion products over whole arrays), so that one mistake does not hide
-the other. A long recording is judged block by block: ``Reached`` is what one hands to the next.
+It is written apart from the kernel on purpose, with other formulas where possible (quaternion
+products over whole arrays), so that one mistake does not hide another. Long recordings are judged
+block by block; ``Reached`` carries the state.
 """
 
 from __future__ import annotations
@@ -32,36 +32,37 @@ from hapticbridge.kernel.parameters import RunParameters
 Array = NDArray[np.float64]
 
 SLACK_SHARE = 0.5
-"""Share of the slack that counts where several laws are computed in a tick, without unit: as
-``certificate.needed_damping`` assumes."""
+"""Share of the slack that counts with several laws per tick, without unit; equal to the assumption
+of ``certificate.needed_damping``."""
 
 
 @dataclass(frozen=True, slots=True)
 class Balance:
-    """What the recorded poses and wrenches say by themselves.
+    """Quantities computed from recorded poses and wrenches.
 
-    Cumulative is from the first tick of the recording on, however many ticks came before these.
+    Cumulative values count from the first tick of the recording.
 
     Attributes:
-        wrench_on_tool: The coupling law at the recorded poses, (n, 6) in N and N m; the recorded
-            wrench itself where the recorded poses alone do not tell it.
-        wrench_on_device: What the guard should have sent for the recorded wrench, (n, 6).
-        injected_damping: What the passivity controller should have added at most on an axis of
-            translation and of rotation, (n, 2) in N s/m and N m s/rad.
-        handle_position: Where the recorded device pose puts the handle, (n, 3) in m.
-        handle_turn: By how much the recorded handle is turned from where it should be, (n,) in rad.
-        coupling_work: Cumulative Σ f·δx + τ·δφ of the recorded wrench, (n,) in J; as recorded
-            where it is summed over several laws a tick.
+        wrench_on_tool: Wrench of the coupling law at the recorded poses, (n, 6) in N and N m; the
+            recorded wrench if poses alone do not determine it.
+        wrench_on_device: Wrench that the guard should have sent for the recorded one, (n, 6).
+        injected_damping: Largest damping that the passivity controller should have added on an axis
+            of translation and of rotation, (n, 2) in N s/m and N m s/rad.
+        handle_position: Handle position computed from the recorded device pose, (n, 3) in m.
+        handle_turn: Angle between recorded and computed handle orientation, (n,) in rad.
+        coupling_work: Cumulative Σ f·δx + τ·δφ of the recorded wrench, (n,) in J; as recorded if
+            several laws per tick are summed.
         throughput: Cumulative Σ |f·δx + τ·δφ|, (n,) in J.
         device_energy: Cumulative energy given to the device by the recorded wrenches, (n,) in J.
-        device_throughput: The same with absolute values.
-        environment_energy: S_k − S_start − works, with ``coupling_work`` from here, (n,) in J.
+        device_throughput: Cumulative sum of that energy's absolute values, (n,) in J.
+        environment_energy: S_k − S_start − works, with the ``coupling_work`` above, (n,) in J.
         slack: Σ ½‖δx‖²_{K+B/T} + ½‖δφ‖²_{K_r+B_r/T}, (n,) in J.
-        kicked: What the device was given beyond what its damping burns and scene and coupling
-            give up, (n,) in J; zero for an unknown damping, or several laws a tick. Behind a
-            coupling law what the environment created is not in it: that is the other port's.
-        commanded: What commands that changed the coupling gave to what is felt, (n,) in J.
-        reached: What the balance of the next ticks begins with.
+        kicked: Energy given to the device beyond its dissipation and the energy released by scene
+            and coupling, (n,) in J. Zero for an unknown damping or several laws per tick. With a
+            coupling law, energy created by the environment is not included; it belongs to the other
+            port.
+        commanded: Energy that commands added to the effective coupling, (n,) in J.
+        reached: State at the end of these ticks.
     """
 
     wrench_on_tool: Array
@@ -90,16 +91,16 @@ class Balance:
         late: int = 0,
         following: NDArray[np.void] | None = None,
     ) -> Balance:
-        """Computes everything from records.
+        """Computes the balance of consecutive records.
 
         Args:
             ticks: Records without gaps, ``TICK_DTYPE``, at least one.
-            parameters: The run's.
-            before: What the ticks before them left.
-            outside: What was done to the run while it went on.
-            late: After how many ticks a wrench answers a sample: what was sent in row k acted on
-                the motion between rows k + late and k + late + 1.
-            following: The records after these, as many as ``late``, or fewer where they end.
+            parameters: Run parameters.
+            before: State before these ticks.
+            outside: External actions during the run.
+            late: Delay in ticks: the wrench of row k acted on the motion between rows k + late and
+                k + late + 1.
+            following: The next ``late`` records, or fewer at the end.
         """
         sums = before.sums
         numbers = ticks["tick"]
@@ -114,7 +115,7 @@ class Balance:
             np.sum(recorded[:, 3:] * motion.tool_turn, axis=1),
         )
         work = works[0] + works[1]
-        # over several laws a tick the work is a sum that their mean does not tell
+        # with several laws per tick the mean wrench does not determine the summed work
         coupling_work = (
             ticks["coupling_work"] if parameters.laws > 1 else summed(work, sums["coupling_work"])
         )
@@ -137,7 +138,7 @@ class Balance:
         slack = summed(slack, sums["slack"])
         expected, guarded = before.guarded.after(ticks, outside, created - slack)
         seen = expected.seen
-        kept, lost = coupling_work, created  # without a law, all that the scene took up
+        kept, lost = coupling_work, created  # without a law, all energy stored in the scene
         kept_sum = np.zeros(len(ticks))
         turned = np.zeros(len(ticks))
         if parameters.has_law:
@@ -145,8 +146,8 @@ class Balance:
             pulled = motion.pulled, motion.turned
             share_before = np.concatenate([[before.share], seen.share[:-1]])
             turned = work_of_commands(parameters, around, pulled, share_before)
-            # the slack pays for what the environment creates, but a ramp or a limit lets through
-            # only a share of the slack: counted here, it would blame a device that bears its law
+            # The slack covers energy created by the environment, but a ramp or a limit passes only
+            # a share of the slack. Counted here, it would blame a device that bears its coupling.
             lost = np.minimum(created, 0.0)
             parts, held = kept_behind_a_law(
                 parameters,
@@ -209,9 +210,9 @@ class Balance:
 
 
 def _slack_gains(parameters: RunParameters, gains: Array) -> tuple[Array, Array]:
-    """Returns K + B/T and K_r + B_r/T of the coupling that the tool was held by, (n,) each.
+    """Returns K + B/T and K_r + B_r/T of the coupling, (n,) each.
 
-    With n laws a tick only half of K/n + B/T counts; without a coupling law nothing does.
+    With n laws per tick only half of K/n + B/T counts; without a coupling law both are 0.
     """
     if not parameters.has_law:
         return np.zeros(len(gains)), np.zeros(len(gains))
@@ -222,7 +223,7 @@ def _slack_gains(parameters: RunParameters, gains: Array) -> tuple[Array, Array]
 
 
 def _kicked(parameters: RunParameters, given: Array, burnt: Array, taken: Array) -> Array:
-    """Returns Σ w·δp − Σ b‖δp‖²/t + what scene and coupling took up, in the device's scale."""
+    """Returns Σ w·δp − Σ b‖δp‖²/t + energy stored in scene and coupling, in the device's scale."""
     if parameters.device_damping is None or (parameters.has_law and parameters.laws > 1):
         return np.zeros(len(given))
     return np.asarray(given - burnt + parameters.force_scale / parameters.scale * taken)
@@ -231,7 +232,7 @@ def _kicked(parameters: RunParameters, given: Array, burnt: Array, taken: Array)
 def _later(
     ticks: NDArray[np.void], following: NDArray[np.void] | None, late: int
 ) -> tuple[Array, Array]:
-    """Returns the device's steps and turns ``late`` rows on; none where the records end by then."""
+    """Returns the device's steps and turns ``late`` rows later; zeros after the last record."""
     rows = ticks if following is None else np.concatenate([ticks, following])
     moved = []
     for field, of in (("device_position", steps), ("device_quaternion", turns)):

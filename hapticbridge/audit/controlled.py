@@ -1,7 +1,4 @@
-"""What the passivity controller should have made of the wrench, from records alone.
-
-The second computation of ``kernel.account``, over whole arrays, block by block.
-"""
+"""Second computation of the passivity controller."""
 
 from __future__ import annotations
 
@@ -22,13 +19,13 @@ Array = NDArray[np.float64]
 
 
 class Controlled(NamedTuple):
-    """What the controller makes of the wrench.
+    """Wrench after the passivity controller.
 
     Attributes:
-        wrench: With damping or the tank's share, (n, 6).
-        change: By how much each component may change from tick to tick, (n, 6); inf: at will.
-        injected: The most damping added on an axis of translation and of rotation, (n, 2) in
-            N s/m and N m s/rad.
+        wrench: Wrench with damping or the tank's share, (n, 6).
+        change: Largest change of each component from tick to tick, (n, 6); inf without a bound.
+        injected: Largest damping added on an axis of translation and of rotation, (n, 2) in N s/m
+            and N m s/rad.
     """
 
     wrench: Array
@@ -38,19 +35,20 @@ class Controlled(NamedTuple):
 
 @dataclass(slots=True)
 class Account:
-    """Where the energy account has got to.
+    """State of the passivity observer.
 
     Attributes:
-        parameters: The run's.
-        own: What the scene stored in the tick before, but for what its motors and users put in, J.
-        sent: Wrench (6,) that was sent then.
-        gained: What the account gets for that tick, in J.
-        account: In J.
-        axes: Accounts (6,) of the axes, in J.
-        velocity: Of the device in the tick before, (6,).
-        over: What the environment had created beyond the slack then, in J.
-        excess: The same, of which no more than the surplus was ever saved, in J.
-        reversed: Where the motion of each axis was reversed in the last ticks, (n, 6).
+        parameters: Run parameters.
+        own: Energy stored in the scene after the previous tick without the work of motors and
+            users, in J.
+        sent: Wrench (6,) sent in the previous tick.
+        gained: Contribution of the scene to the account in the previous tick, in J.
+        account: Observed energy in J.
+        axes: Observed energies (6,) of the axes, in J.
+        velocity: Device velocity (6,) in the previous tick.
+        over: Energy created by the environment beyond the slack so far, in J.
+        excess: That energy with savings capped at the credit limit, in J.
+        reversed: Reversals of the motion of each axis in the last ticks, (n, 6).
     """
 
     parameters: RunParameters
@@ -73,15 +71,15 @@ class Account:
         resumed: Array,
         excess: Array,
     ) -> tuple[Controlled, Account]:
-        """Says what the controller makes of the wrenches of the next records, at least one.
+        """Computes the controller's effect on the wrenches of the next records, at least one.
 
         Args:
             ticks: The records, ``TICK_DTYPE``.
-            wrench: What the coupling asks to be sent, (n, 6).
-            seen: What the watch saw.
-            device: Device pose (7,) in the tick before.
-            resumed: Ticks at which the run went on after a pause without force.
-            excess: What the environment has created beyond the slack, (n,) in J.
+            wrench: Wrench requested by the coupling, (n, 6).
+            seen: Result of the watch.
+            device: Device pose (7,) in the previous tick.
+            resumed: Ticks at which the run resumed after a pause without force.
+            excess: Energy created by the environment beyond the slack, (n,) in J.
         """
         then = copy.copy(self)
         parameters, guarding = self.parameters, self.parameters.guarding
@@ -123,13 +121,13 @@ class Account:
         held = wrench - damping * velocity
         if guarding.controller == ENVIRONMENT:
             return Controlled(held, change, _largest(damping)), then
-        # the tank comes last, and only where no axis is bounded
+        # the tank comes last, and only if no axis is bounded
         pays = (debt > 0) & ~swings.any(axis=1)
         share = np.where(pays, _tank_share(parameters, held, velocity, account), 1.0)
         return Controlled(held * share[:, None], change, _largest(damping)), then
 
     def _gained(self, ticks: NDArray[np.void], wrench: Array, share: Array) -> Array:
-        """Returns what the account gets for each tick: what the scene took up of what was felt."""
+        """Returns the scene's contribution per tick: stored energy times transmitted share."""
         own = ticks["kinetic"] + ticks["potential"] - ticks["actuator_work"]
         own = own - ticks["external_work"]
         change = np.diff(own, prepend=self.own)
@@ -147,12 +145,12 @@ def capped_sum(values: Array, surplus: float, before: float | Array = 0.0) -> Ar
 
 
 def _largest(damping: Array) -> Array:
-    """Returns the largest of three axes of either kind, (n, 2)."""
+    """Returns the largest of three axes of each kind, (n, 2)."""
     return np.asarray(damping.reshape(-1, 2, 3).max(axis=2))
 
 
 def _tank_share(parameters: RunParameters, wrench: Array, velocity: Array, account: Array) -> Array:
-    """Returns the share of the wrench that the tank pays for, (n,)."""
+    """Returns the share of the wrench that the tank covers, (n,)."""
     work = parameters.period * np.sum(wrench * velocity, axis=1)
     level = np.maximum(TANK_START - account, 0.0)
     return np.where(work > level, level / np.where(work > level, work, 1.0), 1.0)

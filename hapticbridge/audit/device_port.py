@@ -1,9 +1,4 @@
-"""What a device was given that nothing paid for, from recorded poses and wrenches.
-
-Over a run the device may keep what its damping burns, what the scene gives up and what the
-coupling's spring gives up; a hand can take no more out. What exceeds that comes from the wrench
-being held between the samples, and is the fault of the port ``device``.
-"""
+"""Energy balance of the device port, from recorded poses and wrenches."""
 
 from __future__ import annotations
 
@@ -23,19 +18,19 @@ def burnt_by_damping(
     interval: Array,
     is_running: NDArray[np.bool_],
 ) -> Array:
-    """Returns b‖δp‖²/t of each tick, the least that the device's damping burns, (n,) in J.
+    """Returns b‖δp‖²/t of each tick, the least dissipation of the device's damping, (n,) in J.
 
-    t is the time between two samples, T at least: a damper that moves by δp within t burns no less
-    than at constant speed, and a missed deadline makes t longer. Dry friction is not counted: an
-    encoder's steps do not tell how far the device slid.
+    t is the time between two samples, at least T. A damper that moves by δp within t dissipates no
+    less than at constant speed; a missed deadline makes t longer. Dry friction is not counted,
+    because encoder steps do not show how far the device slid.
 
     Args:
-        parameters: The run's; the damping is known.
+        parameters: Run parameters with known damping.
         moved: δp of each tick, (n, 3) in m.
-        turned: Its rotation vectors, (n, 3) in rad.
+        turned: Rotation vectors of each tick, (n, 3) in rad.
         interval: t as recorded, (n,) in s.
-        is_running: Where the tick's duration is known: a jump before the first tick or in a pause
-            took an unknown time, and burns nothing here.
+        is_running: True for ticks of known duration. A jump before the first tick or in a pause
+            took an unknown time and dissipates nothing here.
     """
     burnt = (parameters.device_damping or 0.0) * np.sum(moved**2, axis=1)
     burnt += (parameters.device_rotational_damping or 0.0) * np.sum(turned**2, axis=1)
@@ -44,7 +39,7 @@ def burnt_by_damping(
 
 
 def passed_shares(ticks: NDArray[np.void], parameters: RunParameters) -> tuple[Array, Array]:
-    """Returns the share of force and of torque that the guard let through, (n,) each."""
+    """Returns the shares of force and torque that the guard transmitted, (n,) each."""
     scales = (parameters.force_scale, parameters.force_scale / parameters.scale)
     shares = []
     for part, scale in zip((slice(0, 3), slice(3, 6)), scales, strict=True):
@@ -69,35 +64,37 @@ def kept_behind_a_law(
     share_before: float = 0.0,
     has_end: bool = True,
 ) -> tuple[Array, Array]:
-    """Returns what coupling and tool took up of what the handle gave, in J of the scene.
+    """Returns the energy stored in coupling and tool from the handle, in J of the scene.
 
         Σ c_k w_k + r_k V(e_k) − Σ max(0, r_k − r_{k−1}) (V(e_k) + ½‖δe_k‖²_{B/T}) − Σ W_k
 
-    V is the energy of a spring whose force stops growing at the limit, ½ K e² below it. With b >=
-    K T/2 + B and no limit in play, what the device is given less what it burns and plus this is
-    never above zero, whatever hand and tool do: the identity behind (6), in which V(e) at the end
-    stands on the left. The last sum is what a force that is switched on finds stretched already,
-    in a ramp or after a jump of the device before its first tick. W_k = r_{k−1} (V_k(p_k) −
-    V_{k−1}(p_k)), p = h_k − x_{k−1}, is what a command did to the spring by changing K
-    (``kernel.tuning``): neither scene nor coupling gave that up.
+    V is the energy of a spring whose force stops growing at the limit, ½ K e² below it. Let E be
+    the energy given to the device minus its dissipation plus this result. With b >= K T/2 + B and
+    no active limit, E is never above zero, for any hand and tool. This is the identity behind (6),
+    with V(e) at the end on the left. What exceeds zero comes from the wrench held between samples
+    and is the fault of the port ``device``.
+
+    The second sum is the energy already stretched into the spring when the force is switched on, in
+    a ramp or after a jump of the device before its first tick. W_k = r_{k−1} (V_k(p_k) −
+    V_{k−1}(p_k)), p = h_k − x_{k−1}, is the work of a command that changes K (``kernel.tuning``);
+    neither scene nor coupling released it.
 
     Args:
-        parameters: The run's, of a method with a coupling law and one law a tick.
+        parameters: Run parameters of a method with a coupling law and one law per tick.
         gains: K, B', K_r and B'_r in the tick before each and in each, (n, 4) each.
         pulled: p in m and as rotation vectors, (n, 3) each.
         stretch: e in m and as rotation vectors, (n, 3) each.
-        stretched: Their changes in each tick.
-        work: Of force and of torque on the tool in each tick, (n,) each in J.
-        passed: c, the share of force and of torque that the guard let through, (n,) each.
+        stretched: Change of e in each tick.
+        work: Work w of force and of torque on the tool in each tick, (n,) each in J.
+        passed: c, the share of force and of torque that the guard transmitted, (n,) each.
         since_start: Ticks since the force began to rise, (n,).
-        share: r, the share of the wrench that is let through while it rises or fades, (n,).
+        share: r, the share of the wrench transmitted by ramp and fading, (n,).
         share_before: r of the tick before the first of these.
-        has_end: Whether r_k V(e_k) is counted. It stands for what a device at e_k could still be
-            given; where the device is no longer there, because the sample is old, only what it was
-            given by then counts.
+        has_end: True counts r_k V(e_k), which a device at e_k could still receive. With an old
+            sample the device is elsewhere, and only the energy given so far counts.
 
     Returns:
-        What is summed over the ticks, each tick's part of it, and r V(e); (n,) each.
+        The summand of each tick, and r V(e); (n,) each.
 
     References:
         Brown & Colgate 1997, eq. (6); here summed over time instead of frequency by frequency.
@@ -124,13 +121,9 @@ def work_of_commands(
     pulled: tuple[Array, Array],
     share_before: Array,
 ) -> Array:
-    """Returns W_k of ``kept_behind_a_law``, what commands did to the springs, (n,) in J.
+    """Returns W_k of ``kept_behind_a_law``, the work of commands on the springs, (n,) in J.
 
-    Args:
-        parameters: The run's.
-        gains: K, B', K_r and B'_r in the tick before each and in each, (n, 4) each.
-        pulled: h_k − x_{k−1} in m and as rotation vectors, (n, 3) each.
-        share_before: The share of the wrench that was let through in the tick before each, (n,).
+    Arguments are those of ``kept_behind_a_law``; ``share_before`` has one value per tick.
     """
     work = np.zeros(len(share_before))
     for column, limit, p in zip((0, 2), limits_on_tool(parameters), pulled, strict=True):

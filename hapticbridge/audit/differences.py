@@ -1,4 +1,4 @@
-"""From tick to tick, over whole arrays: steps, turns and sums."""
+"""Steps, turns and sums over whole arrays."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def conjugate(q: Array) -> Array:
 
 
 def turn_between(a: Array, b: Array) -> Array:
-    """Returns the rotation vectors (…, 3) in the world frame that take a to b, in rad."""
+    """Returns the rotation vectors (…, 3) in the world frame from a to b, in rad."""
     q = quaternion_product(b, conjugate(a))
     q = np.where(q[..., :1] < 0, -q, q)
     sine = np.linalg.norm(q[..., 1:], axis=-1, keepdims=True)
@@ -37,15 +37,14 @@ def steps(values: Array, before: Array) -> Array:
 
 
 def turns(values: Array, before: Array) -> Array:
-    """Returns the rotation vectors from each orientation's predecessor to it."""
+    """Returns the rotation vector from each orientation's predecessor to it."""
     return turn_between(np.concatenate([before[None], values[:-1]]), values)
 
 
 def summed(values: Array, before: float) -> Array:
-    """Returns the sums up to each of the values, of what was before too.
+    """Returns cumulative sums that start from an earlier sum.
 
-    They are added one after the other, so that sums over blocks are those over the whole, to the
-    bit.
+    Values are added one by one, so that sums over blocks equal those over the whole to the bit.
     """
     return np.cumsum(np.concatenate([[before], values]))[1:]
 

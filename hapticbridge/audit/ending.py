@@ -1,4 +1,4 @@
-"""How a recorded run ended, where it was not as it was asked to."""
+"""Unusual endings of a run."""
 
 from __future__ import annotations
 
@@ -7,11 +7,7 @@ from typing import Any
 
 
 def how_it_ended(events: Sequence[Mapping[str, Any]]) -> str:
-    """Returns a clause that names the event which ended the run; empty for an ordinary end.
-
-    Args:
-        events: The recording's.
-    """
+    """Returns a clause that names the event that ended the run; empty for an ordinary end."""
     clauses = []
     for event in events:
         name, reason = event.get("event"), event.get("reason")
@@ -20,7 +16,7 @@ def how_it_ended(events: Sequence[Mapping[str, Any]]) -> str:
         elif name == "bridge_died":
             clauses.append(f"the bridge died after tick {event.get('tick')}")
         elif name == "recorder_died":
-            clauses.append("the recorder died in mid-run")
+            clauses.append("the recorder died during the run")
         elif name == "suspended":
             clauses.append(f"the machine was asleep for {event.get('seconds', 0):.3g} s")
         elif name == "stop" and event.get("signal"):
@@ -28,13 +24,13 @@ def how_it_ended(events: Sequence[Mapping[str, Any]]) -> str:
         elif name == "stop" and reason not in ("duration", "signal", "caller", None, ""):
             clauses.append(f"stopped by {_short(reason)}")
     has_trip = any(event.get("event") == "trip" for event in events)
-    if has_trip:  # what is raised then is the same in other words
+    if has_trip:  # its exception is reported as a stop too
         clauses = [clause for clause in clauses if not clause.startswith("stopped by")]
     return "; ".join(clauses)
 
 
 def _short(reason: object) -> str:
-    """Returns the text of a reason without the tick that it begins with, as a file may hold it."""
+    """Returns a reason's text without its leading tick, limited in length."""
     text = str(reason)
     head, mark, rest = text.partition(": ")
     return rest[:200] if mark and head.startswith("tick ") else text[:200]

@@ -1,7 +1,7 @@
-"""What the guard should have sent, and where the handle should have been, from records alone.
+"""Second computation of the guard, from records alone.
 
-The second computation of what ``kernel.watch``, ``kernel.account`` and ``kernel.wrench`` do tick by
-tick, over whole arrays, block by block.
+It repeats over whole arrays, block by block, what ``kernel.watch``, ``kernel.account`` and
+``kernel.wrench`` do tick by tick.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Expected:
-    """What should stand in some records.
+    """Expected content of some records.
 
     Attributes:
-        position: Of the handle, (n, 3) in m.
-        orientation: Of the handle, (n, 4).
-        wrench: That was sent to the device, (n, 6).
-        injected: The most damping that the controller added on an axis of translation and of
+        position: Handle position, (n, 3) in m.
+        orientation: Handle orientation, (n, 4).
+        wrench: Wrench sent to the device, (n, 6).
+        injected: Largest damping that the controller added on an axis of translation and of
             rotation, (n, 2) in N s/m and N m s/rad.
-        seen: What the watch saw.
+        seen: Result of the watch.
     """
 
     position: Array
@@ -46,17 +46,17 @@ class Expected:
 
 @dataclass(slots=True)
 class Guarded:
-    """Where the guard has got to.
+    """State of the guard after the previous tick.
 
     Attributes:
-        parameters: The run's.
-        watch: Where the watch has got to.
-        handle: Handle pose (7,) in the tick before.
-        tool: Tool pose (7,) then.
-        origin: Device pose that belongs to ``target``.
-        target: Handle pose.
-        account: Where the energy account has got to.
-        slewed: The wrench (6,) before ramp and fading.
+        parameters: Run parameters.
+        watch: State of the watch.
+        handle: Handle pose (7,).
+        tool: Tool pose (7,).
+        origin: Device pose at the last anchoring.
+        target: Handle pose at the last anchoring.
+        account: State of the passivity observer.
+        slewed: Wrench (6,) before ramp and fading.
     """
 
     parameters: RunParameters
@@ -72,7 +72,7 @@ class Guarded:
     def at_start(
         cls, parameters: RunParameters, handle: Array, tool: Array, start_energy: float
     ) -> Guarded:
-        """Returns what the first tick begins with; see ``Reached.at_start``."""
+        """Returns the state before the first tick; see ``Reached.at_start``."""
         origin, target = np.array(parameters.device_origin), np.array(parameters.handle_origin)
         watch = Watch.at_start(parameters)
         account = Account(parameters, start_energy)
@@ -81,12 +81,9 @@ class Guarded:
     def after(
         self, ticks: NDArray[np.void], outside: Interventions, excess: Array
     ) -> tuple[Expected, Guarded]:
-        """Says what the next records, ``TICK_DTYPE``, at least one, should hold.
+        """Computes the expected content of the next records, ``TICK_DTYPE``, at least one.
 
-        Args:
-            ticks: The records.
-            outside: What was done to the run while it went on.
-            excess: What the environment has created beyond the slack, (n,) in J.
+        ``excess`` is the energy created by the environment beyond the slack, (n,) in J.
         """
         then = copy.copy(self)
         seen, then.watch = self.watch.after(ticks, outside)
@@ -128,8 +125,8 @@ class Guarded:
     def _follow(self, ticks: NDArray[np.void], outside: Interventions) -> tuple[Array, Array]:
         """Maps the recorded device poses into the scene: h = h_0 + scale · A (p − p_0).
 
-        p_0 and h_0 are the device's pose and the tool's where the coupling was last re-seated;
-        while a clutch holds it, the handle stays where it was.
+        p_0 and h_0 are the device's and the tool's pose at the last anchoring. During a clutch the
+        handle keeps its pose.
         """
         parameters, count = self.parameters, len(ticks)
         handle, tool, device = (_poses(ticks, name) for name in ("handle", "tool", "device"))

@@ -1,4 +1,4 @@
-"""Was the environment passive, and the device's port: the verdict on energies, block by block."""
+"""Verdict on energies, block by block."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _RECORDED = ("kinetic", "potential", "actuator_work", "external_work")
 
 @dataclass(frozen=True, slots=True)
 class _Excess:
-    """When a limit was first exceeded, and by how many joules."""
+    """First tick beyond a limit, and the excess in J."""
 
     tick: int
     joules: float
@@ -24,14 +24,14 @@ class _Excess:
 
 @dataclass(slots=True)
 class Judgement:
-    """Gathers what decides the verdict while a recording passes by.
+    """Verdict collected over the blocks of a recording.
 
     Attributes:
-        is_watched: Whether the device's port is judged by what happened. A device that meets its
-            condition needs no watch behind a coupling law: that is the proof.
+        is_watched: True if the device port is judged by its energy. A device that meets its
+            condition behind a coupling law is proven safe without it.
         energies: Energies after the newest tick, in J.
         slack_share: Largest share of the slack that was used.
-        commanded: What commands gave to the coupling by the newest tick, in J.
+        commanded: Energy that commands have added to the coupling, in J.
     """
 
     is_watched: bool
@@ -43,7 +43,7 @@ class Judgement:
     _kicked: _Excess | None = None
 
     def add(self, ticks: NDArray[np.void], balance: Balance) -> None:
-        """Adds records, at least one, and their balance."""
+        """Adds at least one record with its balance."""
         created = balance.environment_energy
         rounding = TOLERANCE * (1 + balance.throughput)
         unstrict = created > rounding
@@ -67,10 +67,9 @@ class Judgement:
         }
 
     def findings(self, *, strict: bool) -> dict[str, Any]:
-        """Returns the fields of ``AuditReport`` that say what the energies mean.
+        """Returns the fields of ``AuditReport`` that follow from the energies.
 
-        Args:
-            strict: Accept only (14) itself.
+        ``strict`` accepts only (14) itself.
         """
         unstrict, active, kicked = self._unstrict, self._active, self._kicked
         if kicked is not None and not (active is not None and active.tick <= kicked.tick):
@@ -85,7 +84,7 @@ class Judgement:
                 "slack_share": self.slack_share,
             }
         if unstrict is None:
-            # within rounding it may be above zero; + 0.0 for zero itself, which has a sign
+            # rounding may leave it above zero; + 0.0 removes the sign of zero
             lost = max(-self.energies["environment_energy"], 0.0) + 0.0
             return {
                 "verdict": "passive",
@@ -116,7 +115,7 @@ class Judgement:
 
 
 def _first(is_beyond: NDArray[np.bool_], joules: NDArray[np.float64], start: int) -> _Excess | None:
-    """Returns the first of these ticks that is beyond a limit; ``start`` is the first one."""
+    """Returns the first tick beyond a limit; ``start`` is the number of the first tick."""
     if not is_beyond.any():
         return None
     at = int(np.argmax(is_beyond))

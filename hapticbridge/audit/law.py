@@ -1,4 +1,4 @@
-"""The coupling law at recorded poses, and the motion that it speaks of."""
+"""Coupling law at recorded poses."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """How handle and tool moved, (n, 3) each in m and as rotation vectors in rad.
+    """Motion of handle and tool, (n, 3) each, in m and as rotation vectors in rad.
 
     Attributes:
         handle_step: h_k − h_{k−1}.
         tool_step: x_k − x_{k−1}.
-        handle_turn: The handle's turn in each tick.
-        tool_turn: The tool's.
+        handle_turn: Rotation of the handle in each tick.
+        tool_turn: Rotation of the tool in each tick.
         stretch: h − x.
-        twist: The turn that takes the tool to the handle.
-        twist_before: The same in the tick before each.
+        twist: Rotation from the tool to the handle.
+        twist_before: Rotation from the tool to the handle in the previous tick.
         pulled: h_k − x_{k−1}, the stretch after the handle's step and before the tool's.
-        turned: The turn that takes the tool of the tick before to the handle.
-        carried: The tool's turn in each tick as quaternions, (n, 4).
+        turned: Rotation from the previous tick's tool to the handle.
+        carried: Rotation of the tool in each tick as quaternions, (n, 4).
     """
 
     handle_step: Array
@@ -51,14 +51,10 @@ class Motion:
     def of(
         cls, ticks: NDArray[np.void], handle: Array, tool: Array, outside: Interventions
     ) -> Motion:
-        """Returns the motion of records.
+        """Computes the motion of consecutive records.
 
-        Args:
-            ticks: ``TICK_DTYPE``.
-            handle: Handle pose (7,) before the first of them.
-            tool: Tool pose (7,), likewise.
-            outside: What was done to the run; a reset puts both poses to another place before a
-                tick, and that is no motion.
+        ``handle`` and ``tool`` are the poses (7,) before the first record. The jump of a reset is
+        no motion.
         """
         handle_before = poses_before(ticks, "handle", handle, outside)
         tool_before = poses_before(ticks, "tool", tool, outside)
@@ -78,18 +74,15 @@ class Motion:
 
     @property
     def stretched(self) -> tuple[Array, Array]:
-        """How the coupling was stretched and twisted in each tick."""
+        """Change of stretch and twist in each tick."""
         return self.handle_step - self.tool_step, self.handle_turn - self.tool_turn
 
 
 def wrench_by_law(ticks: NDArray[np.void], gains: Array, period: float, motion: Motion) -> Array:
-    """Returns the wrench on the tool that the coupling gives, (n, 6) in N and N m.
+    """Returns the coupling's wrench on the tool, (n, 6) in N and N m.
 
-    Args:
-        ticks: Records with one law each; their flags say which rule the torque follows.
-        gains: K, B', K_r and B'_r in each of them, (n, 4).
-        period: T in s.
-        motion: Of the records.
+    Each record has one law; its flags select the rule of the torque. ``gains`` holds K, B', K_r and
+    B'_r, (n, 4).
     """
     step, turn = motion.stretched
     k, b, k_r, b_r = (gains[:, column, None] for column in range(4))
@@ -97,7 +90,7 @@ def wrench_by_law(ticks: NDArray[np.void], gains: Array, period: float, motion: 
     torque = k_r * motion.twist + b_r / period * turn
     is_midpoint = (ticks["flags"] & int(TickFlag.MIDPOINT)) != 0
     if np.any(is_midpoint):
-        # the turn that takes the tool from the tick before to this one carries what was then
+        # quantities of the previous tick are rotated with the tool's turn
         carried = motion.carried
         spring = 0.5 * (motion.twist + rotate(carried, motion.twist_before))
         midway = 0.5 * (motion.handle_turn + rotate(carried, motion.handle_turn)) - motion.tool_turn
@@ -109,13 +102,9 @@ def wrench_by_law(ticks: NDArray[np.void], gains: Array, period: float, motion: 
 def poses_before(
     ticks: NDArray[np.void], body: str, before: Array, outside: Interventions
 ) -> Array:
-    """Returns the poses from which the motion of records begins, (n, 7).
+    """Returns the pose before each tick, (n, 7).
 
-    Args:
-        ticks: ``TICK_DTYPE``.
-        body: ``handle`` or ``tool``.
-        before: Its pose (7,) before the first of them.
-        outside: What was done to the run.
+    ``before`` is the pose (7,) of the body (``handle`` or ``tool``) before the first record.
     """
     poses = np.concatenate([ticks[f"{body}_position"], ticks[f"{body}_quaternion"]], axis=1)
     poses = np.concatenate([before[None], poses[:-1]])

@@ -1,4 +1,4 @@
-"""Limits on norm and change, as ``kernel.wrench`` applies them, from records alone."""
+"""Second computation of the wrench limits."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ Array = NDArray[np.float64]
 
 
 def _limited(vector: Array, limit: float) -> Array:
-    """Shortens what is longer than the limit."""
     norm = np.linalg.norm(vector, axis=-1, keepdims=True)
     return np.asarray(vector * np.where(norm > limit, limit / np.maximum(norm, 1e-300), 1.0))
 
@@ -24,15 +23,15 @@ def chained(
     starts: NDArray[np.bool_],
     first: Array,
 ) -> Array:
-    """Limits a vector where its change since the row before, as that was sent, is bounded.
+    """Limits norm and change of a vector; the change counts from the row before as sent.
 
     Args:
-        vector: (n, 3).
-        change: Most change of each component, (n, 3); inf where there is no bound.
+        vector: Vectors, (n, 3).
+        change: Largest change of each component, (n, 3); inf without a bound.
         limit: Largest norm.
         rise: Largest norm of the change.
-        starts: Rows before which it was zero.
-        first: What was sent before the first row, (3,).
+        starts: Rows that start from zero.
+        first: Vector sent before the first row, (3,).
     """
     sent = _limited(vector, limit)
     before = np.concatenate([first[None], sent[:-1]])
@@ -55,7 +54,7 @@ def chained(
 
 
 def limits_on_tool(parameters: RunParameters) -> tuple[float, float]:
-    """Returns force and torque on the tool at which no more reaches the device, N and N m."""
+    """Returns force and torque on the tool at the device's limits, in N and N m."""
     return (
         parameters.force_limit / parameters.force_scale,
         parameters.torque_limit * parameters.scale / parameters.force_scale,
@@ -63,7 +62,7 @@ def limits_on_tool(parameters: RunParameters) -> tuple[float, float]:
 
 
 def spring_energy(stiffness: Array, length: Array, limit: float) -> Array:
-    """Returns ∫ min(K e, limit) de, in J; for each K and length, (n,) each."""
+    """Returns ∫ min(K e, limit) de in J, for each K and length, (n,) each."""
     at_limit = np.divide(limit, stiffness, out=np.full_like(length, np.inf), where=stiffness > 0)
     elastic = np.minimum(length, at_limit)
     return np.asarray(0.5 * stiffness * elastic**2 + limit * (length - elastic))

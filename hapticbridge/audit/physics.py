@@ -1,4 +1,4 @@
-"""Do the records agree with their second computation: wrench law, poses, energies."""
+"""Comparison of records with their second computation."""
 
 from __future__ import annotations
 
@@ -11,17 +11,12 @@ from hapticbridge.audit.watched import has_flag
 from hapticbridge.tick import UNITS, TickFlag
 
 CONTROLLED_TOLERANCE = 1e-5
-"""Relative difference while the passivity controller acts: it divides a small debt by a squared
-small velocity, which takes five digits of a sum's rounding. The re-simulation tells the rest."""
+"""Relative tolerance while the passivity controller acts. It divides a small debt by a squared
+small velocity, which costs five digits. The re-simulation checks the rest."""
 
 
 def physics_fault(ticks: NDArray[np.void], balance: Balance) -> Fault | None:
-    """Returns the earliest disagreement between records and their second computation.
-
-    Args:
-        ticks: Records without gaps, ``TICK_DTYPE``.
-        balance: What their poses and wrenches say by themselves.
-    """
+    """Returns the earliest disagreement between records and their second computation, or None."""
     start = int(ticks["tick"][0])
     vectors = (
         ("handle_position", balance.handle_position, "m", "device pose and scale"),
@@ -85,7 +80,7 @@ def _first(
     unit: str,
     by: str,
 ) -> Fault | None:
-    wrong = ~(difference <= allowed)  # also where a sum overflowed to NaN
+    wrong = ~(difference <= allowed)  # True also for NaN from an overflow
     if not wrong.any():
         return None
     at = int(np.argmax(wrong))

@@ -1,4 +1,4 @@
-"""What one block of records hands to the next."""
+"""Audit state carried from one block of records to the next."""
 
 from __future__ import annotations
 
@@ -23,22 +23,22 @@ SUMS = (
     "kept",
     "commanded",
 )
-"""What is summed over ticks."""
+"""Names of the cumulative energies."""
 
 
 @dataclass(frozen=True, slots=True)
 class Reached:
-    """Where a recording has got to: what the balance of its next ticks begins with.
+    """State of the balance after the previous tick.
 
     Attributes:
-        handle: Handle pose (7,) in the tick before.
+        handle: Handle pose (7,).
         tool: Tool pose (7,).
         device: Device pose (7,).
-        sent: Wrench that was sent to the device, (6,).
-        start_energy: Kinetic plus potential energy before the first tick, in J.
-        share: Of the wrench that the ramp let through.
-        guarded: Where the guard has got to.
-        sums: The cumulative energies so far, in J.
+        sent: Wrench sent to the device, (6,).
+        start_energy: Kinetic, potential and elastic energy before the first tick, in J.
+        share: Share of the wrench that ramp and fading transmitted.
+        guarded: State of the guard.
+        sums: Cumulative energies in J.
     """
 
     handle: Array
@@ -54,13 +54,9 @@ class Reached:
     def at_start(
         cls, parameters: RunParameters, handle: Array, tool: Array, start_energy: float
     ) -> Reached:
-        """Returns what the first tick begins with.
+        """Returns the state before the first tick.
 
-        Args:
-            parameters: The run's.
-            handle: Handle pose (7,) before the first tick.
-            tool: Tool pose (7,) before the first tick.
-            start_energy: Kinetic plus potential energy before the first tick, in J.
+        ``start_energy`` is kinetic plus potential energy, in J.
         """
         device = np.array(parameters.device_start)
         guarded = Guarded.at_start(parameters, handle, tool, start_energy)

@@ -1,4 +1,4 @@
-"""Simulates a recorded run again from what its recording holds, and compares every number."""
+"""Re-simulation of a recorded run, compared in every number."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from hapticbridge.tick import CLOCK_FIELDS, TICK_DTYPE, TickFlag
 NOT_RUN = "not re-simulated"
 
 _OUTSIDE = int(TickFlag.OVERRUN | TickFlag.DROPPED_BEFORE | TickFlag.STALE_SAMPLE)
-"""Flags that the clock, the recorder and the device set, not the simulation."""
+"""Flags set by clock, recorder and device instead of the simulation."""
 
 _COMPARED = tuple(name for name in TICK_DTYPE.names or () if name not in CLOCK_FIELDS)
 
@@ -28,9 +28,9 @@ class Replay:
     Attributes:
         agreement: ``bit for bit``, ``within 1e-9 (other processor)``, ``disagrees``, or ``not
             re-simulated: …`` with the reason.
-        tick: First tick at which it disagrees, or None.
-        field: The first field of that tick that disagrees.
-        difference: By how much.
+        tick: First tick that disagrees, or None.
+        field: First field of that tick that disagrees.
+        difference: Size of the disagreement.
     """
 
     agreement: str
@@ -40,23 +40,19 @@ class Replay:
 
     @property
     def has_run(self) -> bool:
-        """Whether there was a re-simulation."""
+        """True if there was a re-simulation."""
         return not self.agreement.startswith(NOT_RUN)
 
     @property
     def disagrees(self) -> bool:
-        """Whether the recording is not what the scene does under the recorded motion."""
+        """True if the scene does not repeat the recording under the recorded motion."""
         return self.tick is not None
 
 
 class Resimulation:
-    """Simulates the recorded device motion again, block by block.
+    """Re-simulation of the recorded device motion, block by block.
 
-    What differs is kept as it comes; ``outcome`` tells. All fields are compared but the clock's.
-
-    Args:
-        recording: What is simulated again.
-        parameters: Of the recorded run.
+    All fields except the clock's are compared; ``outcome`` returns the result.
 
     Raises:
         RecordingError: The attachments contradict the metadata, so the file was changed.
@@ -84,10 +80,10 @@ class Resimulation:
         self._compare(ticks[: len(again)], again, start)
 
     def outcome(self) -> Replay:
-        """Says how the records agree with what was simulated, when there are no more.
+        """Returns the agreement after the last record.
 
         Raises:
-            RecordingError: An event after the last of them is damaged.
+            RecordingError: An event after the last record is damaged.
         """
         if self._obstacle:
             return Replay(f"{NOT_RUN}: {self._obstacle}")

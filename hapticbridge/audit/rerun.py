@@ -1,4 +1,4 @@
-"""A recorded run, simulated again: the whole scene at every tick, not only what was recorded."""
+"""Re-simulation of a recorded run with its whole scene."""
 
 from __future__ import annotations
 
@@ -25,26 +25,23 @@ from hapticbridge.rendering import method_named
 from hapticbridge.tick import SAMPLE_DTYPE, TICK_DTYPE, TickFlag
 
 DECISIVE = ("hapticbridge", "mujoco", "numba")
-"""Packages whose versions must match for a run to be repeated to the bit."""
+"""Packages whose versions must match for a repetition to the bit."""
 
 _CHANGES = ("input", "resume", *COMMANDED)
-"""Events that change what the next ticks compute."""
+"""Events that change the computation of later ticks."""
 
 
 class Rerun:
-    """Simulates a recorded device motion again, through what the recording carries.
+    """Simulation of a recorded device motion in the attached scene.
 
-    Args:
-        recording: What is simulated again, without an ``obstacle``. Its events are taken as they
-            fall due; more may be told with ``note``.
-        parameters: Of the recorded run.
+    The recording must have no ``obstacle``. Its events are applied when due; ``note`` adds more.
 
     Attributes:
         model: The attached scene.
-        data: Its state after the last tick that was simulated.
+        data: Its state after the last simulated tick.
         binding: The kernel's state bound to both.
-        done: How many ticks that are.
-        is_over: Whether a sample or a result was not finite, so that nothing follows.
+        done: Number of simulated ticks.
+        is_over: True after a sample or result that is not finite; nothing follows.
 
     Raises:
         RecordingError: The attachments contradict the metadata, so the file was changed.
@@ -59,8 +56,7 @@ class Rerun:
         self.done, self.is_over = 0, False
         self.model = model = attached_model(recording, parameters)
         self.data = data = mujoco.MjData(model)
-        # an error inside the C symbol would end the process, so MuJoCo takes its first step in
-        # Python
+        # an error inside the C function would end the process; the first step in Python raises
         self._start = start = recording.attachments[STATE_ATTACHMENT]
         method = method_named(recording.meta.get("method", ""))
         restore_state(model, data, start)
@@ -72,11 +68,11 @@ class Rerun:
 
     @property
     def slack(self) -> float:
-        """What the environment may have created by now, in J."""
+        """Energy that the environment may have created so far, in J."""
         return float(self.binding.state["slack"][0])
 
     def note(self, event: Mapping[str, Any]) -> None:
-        """Takes an event of a run that still goes on; those that change nothing are passed over."""
+        """Adds an event of a running run; events without effect on the simulation are ignored."""
         if event.get("event") in _CHANGES:
             self._changes.append(event)
         if event.get("event") == "resume":
@@ -85,11 +81,10 @@ class Rerun:
     def add(self, ticks: NDArray[np.void]) -> NDArray[np.void]:
         """Simulates the next ticks.
 
-        Args:
-            ticks: Their records, ``TICK_DTYPE``, at least one; only what came from outside is used.
+        Only the external inputs of the records are used.
 
         Returns:
-            Records as simulated; fewer where it ``is_over``.
+            Simulated records; fewer if it ``is_over``.
 
         Raises:
             RecordingError: An event among them is damaged.
@@ -108,7 +103,7 @@ class Rerun:
             end = len(ticks)
             if self._changes:
                 end = min(self._due(self._changes[0]) - self.done, end)
-            if end < done:  # in a run that goes on, news may be slower than records
+            if end < done:  # in a running run, events may arrive after records
                 raise RecordingError(f"an event before tick {self.done + done} came after it")
             state, row, part = self.binding.state, self.binding.row, slice(done, end)
             count = simulate_recorded(
@@ -132,7 +127,7 @@ class Rerun:
             self._apply(self._changes.popleft())
 
     def _elapsed(self, ticks: NDArray[np.void]) -> NDArray[np.float64]:
-        """Returns the times between two readings in s, as the live loop counted them."""
+        """Returns the times in s between two readings, as counted by the live loop."""
         read = ticks["read_ns"]
         before = np.concatenate([[self._read_ns], read[:-1]])
         before[np.isin(ticks["tick"], self._resumed)] = 0
@@ -162,7 +157,7 @@ class Rerun:
 
 
 def obstacle(recording: RecordingFile) -> str:
-    """Returns why a run cannot be simulated again here, or nothing."""
+    """Returns the reason why a run cannot be simulated again here; empty if it can."""
     try:
         recorded = dict(json.loads(recording.meta.get("versions", "")))
     except (ValueError, TypeError, RecursionError):

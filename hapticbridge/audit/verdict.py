@@ -1,4 +1,4 @@
-"""Judges a recording: is it whole, is it what it says, and was the environment passive?"""
+"""Verdict on a recording."""
 
 from __future__ import annotations
 
@@ -38,12 +38,12 @@ from hapticbridge.recording import RecordingFile, open_recording
 from hapticbridge.rendering import Method, method_named
 
 
-@np.errstate(all="ignore")  # numbers of a damaged file overflow; what comes out is then a fault
+@np.errstate(all="ignore")  # numbers of a damaged file may overflow; the result is then a fault
 def verdict_on(path: str | Path, *, strict: bool) -> AuditReport:
-    """Judges a recording; see ``audit.audit``, which everybody calls.
+    """Judges a recording; implements ``audit.audit``.
 
     Raises:
-        RecordingError: The file is not a recording at all.
+        RecordingError: The file is not a recording.
     """
     recording = open_recording(path)
     facts: dict[str, Any] = {
@@ -86,8 +86,8 @@ def verdict_on(path: str | Path, *, strict: bool) -> AuditReport:
     if outcome.disagrees:
         reason = (
             f"simulated again, tick {outcome.tick} differs in {outcome.field} by "
-            f"{outcome.difference:.3g}: the recording was changed, or in mid-run the scene, other "
-            "than by set_input"
+            f"{outcome.difference:.3g}: the recording was changed, or the scene was changed during "
+            "the run other than by set_input"
         )
         return _invalid(facts, Fault(reason, outcome.tick, outcome.field))
     report = AuditReport(**facts, **passed.judgement.findings(strict=strict))
@@ -142,14 +142,14 @@ def _device_facts(
                 is_always_held=was_never_lossless(recording.count, recording.flags),
             ),
         }
-    except HapticBridgeError as error:  # numbers beyond what the theory computes with
+    except HapticBridgeError as error:  # numbers outside the theory's range
         raise RecordingError(f"the metadata are out of range: {error}") from None
 
 
 def _unchecked(parameters: RunParameters, method: Method) -> str:
-    """Says what only the re-simulation can confirm, because records alone do not tell it."""
+    """Returns the part that only the re-simulation confirms; empty if there is none."""
     if not method.has_coupling:
-        return "the wrench is the contacts': checked by re-simulation alone"
+        return "the wrench comes from contacts: checked by re-simulation alone"
     if not method.has_law:
         return "the wrench is MuJoCo's constraint force: checked by re-simulation alone"
     if parameters.laws > 1:
@@ -170,14 +170,14 @@ def _invalid(facts: dict[str, Any], fault: Fault) -> AuditReport:
 
 
 class _Passed:
-    """What a recording's ticks tell while they pass by."""
+    """Checks of a recording's ticks, block by block."""
 
     def __init__(
         self, recording: RecordingFile, parameters: RunParameters, *, is_watched: bool
     ) -> None:
         self._recording, self._parameters = recording, parameters
         self.judgement, self.duration = Judgement(is_watched), 0.0
-        # the complaint of the re-simulation waits until the records themselves have been judged
+        # an error of the re-simulation is raised after the records themselves have been judged
         self._error: RecordingError | None = None
         try:
             self._simulation = Resimulation(recording, parameters)
@@ -185,14 +185,12 @@ class _Passed:
             self._error = error
 
     def by(self, outside: Interventions, late: int) -> Fault | None:
-        """Looks at every tick; returns the earliest fault of the records themselves.
+        """Checks every tick; returns the earliest fault of the records themselves.
 
-        Args:
-            outside: What was done to the run while it went on.
-            late: After how many ticks a wrench answers a sample.
+        ``late`` is the delay in ticks from a sample to the wrench that answers it.
 
         Raises:
-            RecordingError: The metadata do not say what the ledger counts from.
+            RecordingError: The metadata lack the start of the energy balance.
         """
         starts = {name: np.array(meta_start(self._recording.meta, name)) for name in STARTS}
         energy = float(starts["start_kinetic"][0] + starts["start_potential"][0])
@@ -214,7 +212,7 @@ class _Passed:
         return fault
 
     def outcome(self) -> Replay:
-        """Says how the re-simulation agrees.
+        """Returns the agreement of the re-simulation.
 
         Raises:
             RecordingError: The file was changed.
@@ -227,7 +225,7 @@ class _Passed:
 def _with_following(
     blocks: Iterable[NDArray[np.void]], count: int
 ) -> Iterator[tuple[NDArray[np.void], NDArray[np.void]]]:
-    """Yields blocks, each with as many of the records after it, or fewer where they end."""
+    """Yields each block with up to ``count`` of the following records."""
     waiting: deque[NDArray[np.void]] = deque()
     for block in chain(blocks, [None]):
         if block is not None:

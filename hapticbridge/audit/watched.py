@@ -1,7 +1,4 @@
-"""When the handle must have followed the device, from records alone, block by block.
-
-The second computation of what ``kernel.watch`` does tick by tick, over whole arrays.
-"""
+"""Second computation of the watch on device samples."""
 
 from __future__ import annotations
 
@@ -23,20 +20,18 @@ Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 _ROUNDING = 1e-6
-"""In ticks of a ramp: by how much two sums of parts of them may differ."""
+"""Largest rounding difference of two sums, in ticks of a ramp."""
 
 
 def has_flag(ticks: NDArray[np.void], flag: TickFlag) -> Flags:
-    """Returns in which records a flag is set."""
+    """Returns True for each record with a flag."""
     return np.asarray((ticks["flags"] & int(flag)) != 0)
 
 
 def run_lengths(is_on: Flags, before: int) -> NDArray[np.int64]:
-    """Returns for each row how many rows up to it are on without a gap.
+    """Returns the length of the uninterrupted run of True values up to each row.
 
-    Args:
-        is_on: Of these rows.
-        before: How many before the first of them.
+    ``before`` is the length of the run before the first row.
     """
     index = np.arange(1, len(is_on) + 1)
     return np.asarray(index - np.maximum.accumulate(np.where(is_on, -before, index)))
@@ -44,16 +39,16 @@ def run_lengths(is_on: Flags, before: int) -> NDArray[np.int64]:
 
 @dataclass(frozen=True, slots=True)
 class Seen:
-    """What the watch saw in some ticks.
+    """Result of the watch for some ticks.
 
     Attributes:
-        first: Which are the first of a run, after a start or a pause without force.
-        interval: Time in s since the device's last new sample, T at least between two readings.
+        first: True for the first tick after a start or a pause without force.
+        interval: Time in s since the device's last new sample, at least T between two readings.
         since_start: Ticks since the wrench began to rise.
-        ramp: In how many ticks it rises: slowly after a start, soon after a re-seating.
-        silence: For how many ticks it has been fading.
-        flags: Where the flags must be set that records repeat.
-        share: Of the wrench that is let through while it rises or fades.
+        ramp: Length of the rise in ticks: long after a start, short after a re-anchoring.
+        silence: Number of ticks for which the wrench has been fading.
+        flags: Expected values of redundant flags.
+        share: Share of the wrench transmitted by ramp and fading.
     """
 
     first: Flags
@@ -67,19 +62,19 @@ class Seen:
 
 @dataclass(slots=True)
 class Watch:
-    """Where the watch has got to.
+    """State of the watch after the previous tick.
 
     Attributes:
-        parameters: The run's.
-        device: Device pose (7,) in the tick before.
-        read_ns: When the device was read then.
-        stale: How many ticks in a row had nothing new.
-        silent: For how many ticks the wrench has been fading.
-        since_news: Time in s of those without news.
-        is_released: Whether the handle did not follow.
-        start: The tick at which the wrench began to rise.
-        is_soon: Whether it then rose soon.
-        risen: How far it has risen by now, in ticks of a ramp.
+        parameters: Run parameters.
+        device: Device pose (7,).
+        read_ns: Time of the device reading.
+        stale: Number of consecutive ticks without a new sample.
+        silent: Number of ticks for which the wrench has been fading.
+        since_news: Time in s without a new sample.
+        is_released: True if the handle did not follow the device.
+        start: Tick at which the wrench began to rise.
+        is_soon: True if that rise was a short one.
+        risen: Progress of the rise, in ticks of a ramp.
     """
 
     parameters: RunParameters
@@ -95,17 +90,12 @@ class Watch:
 
     @classmethod
     def at_start(cls, parameters: RunParameters) -> Watch:
-        """Returns what the first tick begins with."""
+        """Returns the state before the first tick."""
         is_released = parameters.guarding.dead_man != 0
         return cls(parameters, np.array(parameters.device_start), is_released=is_released)
 
     def after(self, ticks: NDArray[np.void], outside: Interventions) -> tuple[Seen, Watch]:
-        """Looks at the next records, ``TICK_DTYPE``, at least one.
-
-        Args:
-            ticks: The records.
-            outside: What was done to the run while it went on.
-        """
+        """Evaluates the next records, ``TICK_DTYPE``, at least one."""
         guarding, period = self.parameters.guarding, self.parameters.period
         index = np.arange(len(ticks))
         first = (ticks["tick"] == 0) | np.isin(ticks["tick"], outside.resumed)
@@ -115,7 +105,7 @@ class Watch:
         stale = run_lengths(is_stale, self.stale)
         interval = elapsed.copy()
         interval[0] += self.since_news
-        # one after the other, so that the sums do not depend on where a block ends
+        # added one by one, so that the sums do not depend on the blocks
         for k in (1 + np.flatnonzero(is_stale[:-1])).tolist():
             interval[k] += interval[k - 1]
 
@@ -165,21 +155,19 @@ class Watch:
         return seen, then
 
     def _risen(self, pace: Array, last: NDArray[np.int64], full: Array) -> Array:
-        """Returns how far the wrench has risen, in ticks of a ramp.
+        """Returns the progress of the rise, in ticks of a ramp.
 
-        Args:
-            pace: How far it may rise in each tick, (n,).
-            last: Row in which it began, -1 for before these.
-            full: How far it can, (n,).
+        ``pace`` is the largest progress in each tick. The rise began in row ``last``, −1 before
+        these rows, and ends at ``full``.
         """
         gone = np.cumsum(pace)
         before = np.where(last >= 0, gone[last] - pace[last], -self.risen)
         return np.minimum(gone - before, full)
 
     def _pace(self, ticks: NDArray[np.void], outside: Interventions, begins: Flags) -> Array:
-        """Returns how far the wrench may rise in each tick, in ticks of a ramp, (n,).
+        """Returns the largest progress in each tick, in ticks of a ramp, (n,).
 
-        min(1, V_0/V) where the coupling holds V, as the records have handle and tool.
+        It is min(1, V_0/V) for the energy V stored in the coupling at the recorded poses.
         """
         parameters, pace = self.parameters, np.ones(len(ticks))
         most = parameters.guarding.ramp_energy
@@ -200,6 +188,6 @@ class Watch:
 
 
 def _ramps(ticks: NDArray[np.void], risen: Array, full: Array) -> Flags:
-    """Returns where the flag must be set; where rounding decides, what the record says."""
+    """Returns the expected flag; where rounding decides, the recorded one."""
     is_close = (np.abs(risen - full) < _ROUNDING) & (risen != np.rint(risen))
     return np.where(is_close, has_flag(ticks, TickFlag.RAMPING), risen < full)

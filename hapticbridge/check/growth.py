@@ -52,9 +52,7 @@ class Growth:
 def growth_of(counts: NDArray[np.int64], times: NDArray[np.float64]) -> Growth:
     """Returns the median time by count, and a line weighted by the number of ticks.
 
-    Args:
-        counts: Shape (n,).
-        times: Shape (n,), in s.
+    Both arrays have shape (n,); times are in s.
     """
     steps = []
     for count in np.unique(counts).tolist():

@@ -42,11 +42,6 @@ def write_lean(lean: Lean, path: Path, *, overwrite: bool = False) -> Trial:
     the changes. MuJoCo writes numbers with 6 digits, so the file differs from the judged version by
     rounding. It is therefore read back and judged again.
 
-    Args:
-        lean: Result of ``find_lean``.
-        path: The file.
-        overwrite: True replaces an existing file.
-
     Returns:
         The written scene against the original.
 

@@ -91,9 +91,7 @@ def lean_facts(lean: Lean, written: Trial | None = None) -> dict[str, object]:
 def check_table(path: Path, scenes: Iterable[Path]) -> None:
     """Checks that a table can be written, before the search starts.
 
-    Args:
-        path: The file.
-        scenes: MJCF files, existing or to be written.
+    ``scenes`` are MJCF files, existing or to be written.
 
     Raises:
         SceneError: Its name does not end in .csv, its folder does not exist, or it would be read as

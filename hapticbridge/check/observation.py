@@ -100,12 +100,8 @@ def observe(
 ) -> Observation:
     """Leads a scene through a motion, as ``rehearse`` does, and inspects every step.
 
-    Args:
-        scene: Changed in place: reset, with the coupling's gains and the time step set.
-        samples: Poses relative to the first, ``SAMPLE_DTYPE``.
-        coupling: K and B.
-        period: T in s.
-        progress: Called with the number of ticks done and the total.
+    Arguments are those of ``rehearse``; ``progress`` is called with the number of ticks done and
+    the total.
 
     Raises:
         SceneError: A value is out of range, or a result is not finite; the message names the tick.

@@ -9,11 +9,7 @@ def reached_trees(model: mujoco.MjModel, tool: int, met: set[tuple[int, int]]) -
     """Returns the kinematic trees that can influence the tool's tree, including it.
 
     Contacts, equality constraints and tendons join trees. In a scene with flexes all trees count.
-
-    Args:
-        model: The compiled scene.
-        tool: The tool's kinematic tree.
-        met: Ids of the geoms that met.
+    ``met`` holds pairs of geom ids.
     """
     if model.nflex:  # contacts of a flex are not listed by geom
         return set(range(model.ntree))

@@ -1,4 +1,4 @@
-"""Which couplings a device allows while it is felt."""
+"""Couplings that may be selected during a run on a given device."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from hapticbridge.rendering import Method
 
 @dataclass(frozen=True, kw_only=True)
 class Allowance:
-    """What of stiffness and damping the device allows, in translation and where it turns.
+    """Limits of stiffness and damping on a device, in translation and rotation.
 
     Attributes:
         info: The device.
-        method: How the tool is rendered.
-        start: The coupling that the run began with, as asked for.
+        method: The rendering method.
+        start: Requested coupling at the start of the run.
         period: T in s.
         scale: s_h, handle motion per device motion.
         force_scale: s_f, force on the device per force on the tool.
         substeps: MuJoCo steps per tick.
-        limits: Of the run.
+        limits: Limits of the run.
     """
 
     info: DeviceInfo
@@ -41,13 +41,13 @@ class Allowance:
 
     @cached_property
     def translation(self) -> Span:
-        """How stiff and damped it may be along the axes."""
+        """Limits in translation."""
         limits = self.limits
         return Span(axis="translation", effort=limits.force, reach=limits.stretch, **self._common)
 
     @cached_property
     def rotation(self) -> Span | None:
-        """Likewise about them; None where the device feels no torque."""
+        """Limits in rotation; None for a device without torque."""
         if not self.info.turns:
             return None
         limits = self.limits
@@ -60,11 +60,11 @@ class Allowance:
 
     @property
     def spans(self) -> tuple[Span, ...]:
-        """Those that there are."""
+        """Limits of the available kinds of axis."""
         return (self.translation, *(() if self.rotation is None else (self.rotation,)))
 
     def felt(self, command: Couple, now: Coupling) -> Coupling:
-        """Returns the coupling that is to be felt after a command; what it leaves out stays."""
+        """Returns the requested coupling after a command; omitted gains keep their values."""
         felt = self.translation.put(now, command.stiffness, command.damping)
         stiffness, damping = command.rotational_stiffness, command.rotational_damping
         if self.rotation is None or stiffness is None or damping is None:
@@ -72,28 +72,28 @@ class Allowance:
         return self.rotation.put(felt, stiffness, damping)
 
     def used(self, felt: Coupling) -> Coupling:
-        """Returns the coupling of the law for one that is to be felt."""
+        """Returns the law's coupling for a requested one."""
         return self.method.used(felt, self.period / self.substeps)
 
     def reason(self) -> str:
-        """Returns why the sliders end where they do, in a sentence."""
+        """Returns the reason of the slider limits, in a sentence."""
         is_known = self.info.damping and (self.info.rotational_damping or not self.info.turns)
-        known = "" if is_known else " (taken for it, it is not known)"
+        known = "" if is_known else " (assumed; it is unknown)"
         dampings = " and ".join(f"{span.damping:.3g} {UNITS[span.axis][1]}" for span in self.spans)
         return (
-            f"They end where the device's damping of {dampings}{known} just bears what is felt "
-            "between two samples; beyond, a hand could feel the coupling push by itself."
+            f"They end where the device's damping of {dampings}{known} just suffices. Beyond, the "
+            "coupling could push the hand by itself."
         )
 
     def check(self, command: Couple) -> None:
-        """Refuses what the device does not allow.
+        """Refuses gains that the device does not allow.
 
         Raises:
-            CommandError: Says what is too much, and the bound.
+            CommandError: The message names the excessive value and the bound.
         """
         if not self.method.has_law:
             raise CommandError(
-                f"method '{self.method.name}' has no coupling law that could be changed in mid-run"
+                f"method '{self.method.name}' has no coupling law to change during a run"
             )
         self.translation.check(command.stiffness, command.damping)
         stiffness, damping = command.rotational_stiffness, command.rotational_damping

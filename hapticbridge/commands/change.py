@@ -1,11 +1,4 @@
-"""What a command changes in a run, as the event that a recording keeps and a re-simulation repeats.
-
-    coupling   stiffness, damping, rotational_stiffness, rotational_damping of the law; ticks
-    switch     force, clutch; fading where the force comes back after a reset
-    reset      (nothing: the scene goes back to where the run began)
-
-The loop applies the very event that it then records, so both ways are one.
-"""
+"""Events of commands: recorded, and repeated by a re-simulation."""
 
 from __future__ import annotations
 
@@ -24,24 +17,24 @@ from hapticbridge.provenance import restore_state
 from hapticbridge.rendering import Method
 
 CHANGES = ("coupling", "switch", "reset")
-"""Events that commands leave behind."""
+"""Names of the events that commands cause."""
 
 TUNING_TIME = 0.5
-"""In s: how long a change of the coupling takes, however small. From 2000 to 2400 N/m at 10 N the
-spring gains 4 mJ, 8 mW; from 200 to 2400 N/m 0.23 J, which the energy limit of the guard stops.
-Shorter is felt as a blow, longer as a slider that drags behind."""
+"""Duration in s of any change of the coupling. From 2000 to 2400 N/m at 10 N the spring gains 4 mJ,
+8 mW; from 200 to 2400 N/m 0.23 J, which the guard's energy limit stops. A shorter change feels like
+a blow, a longer one like a lagging slider."""
 
 
 def tuning_ticks(period: float) -> int:
-    """Returns in how many ticks of ``period`` seconds a coupling changes."""
+    """Returns the duration of a change of the coupling in ticks of ``period`` seconds."""
     return max(round(TUNING_TIME / period), 1)
 
 
 def coupling_in(event: Mapping[str, Any], parameters: RunParameters) -> Coupling:
-    """Returns the coupling that an event ``coupling`` names.
+    """Returns the coupling of an event ``coupling``.
 
     Raises:
-        RecordingError: It names none, the run has no coupling law, or it changes too fast.
+        RecordingError: It has none, the run has no coupling law, or its duration is wrong.
     """
     tick = event.get("tick")
     try:
@@ -59,10 +52,10 @@ def coupling_in(event: Mapping[str, Any], parameters: RunParameters) -> Coupling
 
 
 def bits_in(event: Mapping[str, Any]) -> int:
-    """Returns the bits of a record's ``buttons`` that an event ``switch`` asks for.
+    """Returns the bits of a record's ``buttons`` for an event ``switch``.
 
     Raises:
-        RecordingError: It does not say.
+        RecordingError: The event is damaged.
     """
     force, clutch = event.get("force"), event.get("clutch")
     if not isinstance(force, bool) or not isinstance(clutch, bool):
@@ -74,15 +67,10 @@ def bits_in(event: Mapping[str, Any]) -> int:
 
 
 class Repeater:
-    """Applies the events of commands to a run, be it live or simulated again.
+    """Applies events of commands to a live or simulated run.
 
-    Args:
-        binding: The run's.
-        model: Of the scene.
-        data: Likewise.
-        method: How the tool is rendered.
-        parameters: Of the run, as it began.
-        start: The scene's state at the start (``provenance.start_state``), as bytes.
+    The loop applies the event that it records, so live run and re-simulation share one path.
+    ``start`` is the scene's state at the start (``provenance.start_state``), as bytes.
     """
 
     def __init__(
@@ -98,7 +86,7 @@ class Repeater:
         self._method, self._parameters, self._start = method, parameters, start
 
     def apply(self, event: Mapping[str, Any]) -> None:
-        """Does what an event of ``CHANGES`` says, before the tick that it names.
+        """Applies an event of ``CHANGES`` before the tick that it names.
 
         Raises:
             RecordingError: The event is damaged.

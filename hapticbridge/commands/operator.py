@@ -1,4 +1,4 @@
-"""What the loop does with the commands that wait: at which tick, in which order."""
+"""Execution of waiting commands, in order and at their ticks."""
 
 from __future__ import annotations
 
@@ -16,15 +16,13 @@ Tell = Callable[..., None]
 
 
 class Operator:
-    """Takes one command a tick and does it; what must not happen under force waits until it faded.
+    """Executes one command per tick; commands that need zero force wait until it has faded.
 
-    Args:
-        queue: Where the commands wait.
-        tell: Notes an event of the present tick: its name, then its details.
+    ``tell`` records an event of the present tick: its name, then its details.
 
     Attributes:
-        felt: The coupling that is to be felt, once its change is over.
-        later: Resets that wait until the force has faded: tick, and who gave it.
+        felt: Requested coupling at the end of its present change.
+        later: Postponed commands: tick, command, origin.
     """
 
     def __init__(self, queue: CommandQueue, tell: Tell) -> None:
@@ -37,15 +35,13 @@ class Operator:
 
     @property
     def used(self) -> Coupling:
-        """The coupling of the law, once its change is over."""
+        """Law's coupling at the end of its present change."""
         return self._queue.allowance.used(self.felt)
 
     def begin(self, repeater: Repeater, fade_ticks: int) -> None:
-        """Takes up a run at its first tick.
+        """Starts a run at its first tick.
 
-        Args:
-            repeater: Of the run.
-            fade_ticks: In how many ticks its force fades.
+        The force fades within ``fade_ticks``.
         """
         self._repeater, self._fade_ticks = repeater, fade_ticks
         self.later.clear()
@@ -53,11 +49,11 @@ class Operator:
             self._switch("run")
 
     def act(self, tick: int) -> None:
-        """Does what is due before a tick."""
+        """Executes the command that is due before a tick."""
         if self.later:
             due, by = self.later[0]
             if tick < due:
-                return  # in the order that they were given
+                return  # commands keep their order
             self.later.popleft()
             self._do({"event": "reset", "by": by})
             self._switch(by)
@@ -86,7 +82,7 @@ class Operator:
     def _switch(self, by: str, *, is_fading: bool = False) -> None:
         force = self._has_force and not is_fading
         event = {"event": "switch", "force": force, "clutch": self._is_clutched, "by": by}
-        # of a force that is only away for a moment; nobody asked for it to be off
+        # a force that fades for a moment only was not switched off by a command
         self._do(event | ({"fading": True} if is_fading else {}))
 
     def _do(self, event: dict[str, Any]) -> None:

@@ -1,4 +1,4 @@
-"""The way of a command into the loop: checked, slowed down, and kept where the loop looks."""
+"""Thread-safe queue of validated, rate-limited commands."""
 
 from __future__ import annotations
 
@@ -12,32 +12,33 @@ from hapticbridge.commands.command import Command, Couple, Mark, Repeat, Reset
 from hapticbridge.errors import CommandError
 
 MOST_WAITING = 8
-"""Commands that may wait for the loop, which takes one a tick; a loop that leaves more undone
-stands still."""
+"""Largest number of waiting commands. The loop takes one per tick; more waiting ones mean that it
+stalls."""
 
 INTERVAL = 0.05
-"""In s, least time between two commands. A slider that is dragged needs no more than 20 a second to
-look smooth, and each takes the loop some 20 µs; a flood must not become a load."""
+"""Shortest time in s between two commands. A dragged slider looks smooth at 20 per second; each
+command costs the loop about 20 µs, and a flood must not become a load."""
 
 RESET_INTERVAL = 1.0
-"""Least time in s between two resets. The force fades before each and rises after it, which takes
-half a second. A shorter interval lets resets follow each other without any force between them."""
+"""Shortest time in s between two resets. The force fades before each and rises after it, which
+takes half a second. With a shorter interval, resets could follow each other without any force
+between them."""
 
 
 class CommandQueue:
-    """Commands between whoever gives them and the loop; nothing unchecked ever gets in.
+    """Queue of commands between their senders and the loop; every command in it is validated.
 
-    Any thread may ``offer``. The loop alone takes: it looks whether ``waiting`` is empty, which
-    takes no lock and allocates nothing, and pops from its left end, which the interpreter does in
-    one piece. The queue never holds more than ``MOST_WAITING``.
+    Any thread may ``offer``; only the loop takes. The loop tests whether ``waiting`` is empty,
+    which needs no lock and no allocation, and pops from its left end, which the interpreter does
+    atomically. The queue holds at most ``MOST_WAITING`` commands.
 
     Args:
-        allowance: What the device allows.
-        is_recorded: Whether the run is recorded, so that it can be marked.
-        now: Time in s, that never runs backwards.
+        allowance: Limits of the coupling on the device.
+        is_recorded: True for a recorded run, which can be marked.
+        now: Returns the time in s; it never runs backwards.
 
     Attributes:
-        waiting: Commands in their order, each with who gave it.
+        waiting: Commands in order, each with its origin.
     """
 
     def __init__(
@@ -50,25 +51,23 @@ class CommandQueue:
         self.allowance = allowance
         self.waiting: deque[tuple[Command | Repeat, str]] = deque(maxlen=MOST_WAITING)
         self._is_recorded, self._now = is_recorded, now
-        self._offering = threading.Lock()  # never the loop's
+        self._offering = threading.Lock()  # never taken by the loop
         self._last = self._last_reset = -float("inf")
 
     def warm_up(self) -> None:
-        """Computes what takes long, so that no command is the first one."""
+        """Computes the tables of limits in advance, so that the first command is not slow."""
         if self.allowance.method.has_law:
             for span in self.allowance.spans:
                 span.needed(span.least_stiffness, 0.0)
 
     def offer(self, command: Command, by: str) -> None:
-        """Hands a command over, or refuses it.
+        """Adds a command, or refuses it.
 
-        Args:
-            command: What is asked for.
-            by: Who asks, for the recording.
+        ``by`` is the command's origin, for the recording.
 
         Raises:
-            CommandError: It exceeds what the device allows, comes too soon after the last one, or
-                the loop does not take any.
+            CommandError: It exceeds the device's limits, follows the last one too soon, or the loop
+                stalls.
         """
         self._check(command)
         is_reset = isinstance(command, Reset)
@@ -79,9 +78,9 @@ class CommandQueue:
                 self._last_reset + RESET_INTERVAL - now if is_reset else 0.0,
             )
             if early > 0:
-                raise CommandError(f"the last command is too recent; ask again in {early:.2f} s")
+                raise CommandError(f"the last command is too recent; try again in {early:.2f} s")
             if len(self.waiting) >= MOST_WAITING:
-                raise CommandError("the loop takes no commands; it stands still")
+                raise CommandError("the loop takes no commands because it stalls; try again later")
             self._last = now
             if is_reset:
                 self._last_reset = now
@@ -91,8 +90,6 @@ class CommandQueue:
         if isinstance(command, Couple):
             self.allowance.check(command)
         elif isinstance(command, Reset) and not self.allowance.method.has_coupling:
-            raise CommandError(
-                "a tool without mass is where the hand is; there is nothing to reset"
-            )
+            raise CommandError("a massless tool follows the hand, so there is nothing to reset")
         elif isinstance(command, Mark) and not self._is_recorded:
             raise CommandError("this run is not recorded; start it with a recording to mark it")

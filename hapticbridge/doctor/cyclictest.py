@@ -40,10 +40,7 @@ def refusal(priority: int, *, locks_memory: bool) -> str:
     """Returns the reason why the program cannot run here; empty if it can.
 
     It is part of the kernel developers' real-time tests (Debian: ``apt install rt-tests``).
-
-    Args:
-        priority: The loop's priority under SCHED_FIFO; 0 if that was refused.
-        locks_memory: True if the loop may lock its memory.
+    ``priority`` is 0 if SCHED_FIFO was refused.
     """
     if not is_there():
         return "it is not installed"
@@ -63,12 +60,7 @@ def run(
 ) -> NDArray[np.int64] | str:
     """Runs one thread at the loop's priority; returns the lateness of each tick in ns.
 
-    Args:
-        period_ns: Period in ns; the program takes whole µs.
-        ticks: Number of wake-ups; the program skips missed deadlines.
-        priority: Priority under SCHED_FIFO, 1 to 99.
-        locks_memory: True to lock its memory.
-        core: Core to run on; None leaves it free.
+    The program takes whole µs and skips missed deadlines. Without ``core`` the thread may move.
 
     Returns:
         The lateness, or the reason of a failure in words.

@@ -64,11 +64,8 @@ def diagnose(
 ) -> Diagnosis:
     """Measures this machine.
 
-    Args:
-        rate: Ticks per second.
-        duration: Duration of the whole measurement in s, 1 to 3600; the loops share it.
-        system: Roots of the kernel's file systems.
-        tell: Called with the time done and the whole time, in s.
+    The duration in s, 1 to 3600, is shared by the loops. ``tell`` is called with the time done and
+    the whole time, in s.
 
     Raises:
         HapticBridgeError: Rate or duration is out of range.
@@ -124,10 +121,7 @@ def judged(
 ) -> tuple[str, str]:
     """Returns the verdict and its sentence.
 
-    Args:
-        lateness: Lateness by loop, at least ``bridge`` and ``bare sleep``.
-        found: Findings about the system.
-        rate: Rate in Hz.
+    ``lateness`` holds at least ``bridge`` and ``bare sleep``.
     """
     mine, period = lateness["bridge"], 1.0 / rate
     allowed = LATE_SHARE * period

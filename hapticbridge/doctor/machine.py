@@ -58,11 +58,7 @@ def findings(
 ) -> tuple[Finding, ...]:
     """Inspects the machine; properties that the system does not show become findings too.
 
-    Args:
-        system: Roots of the kernel's file systems.
-        grants: Results of the loop's real-time requests.
-        stolen: Time in s that the host took from all cores during the measurement.
-        duration: Duration of the measurement in s, > 0.
+    ``stolen`` is the time in s that the host took from all cores during ``duration`` s.
     """
     return (
         *(Finding(g.name, g.is_granted, g.sentence, g.remedy) for g in grants),

@@ -46,9 +46,7 @@ class Wakeups:
 def clock_turn(period_ns: int, ticks: int) -> tuple[NDArray[np.int64], int]:
     """Waits with the bridge's own clock, which sleeps and then spins.
 
-    Args:
-        period_ns: Period in ns.
-        ticks: Number of deadlines, including skipped ones.
+    The number of ticks includes skipped deadlines.
 
     Returns:
         Lateness of each tick in ns, and number of skipped deadlines.

@@ -13,12 +13,7 @@ from hapticbridge.tick import Column
 
 
 class Sink(Protocol):
-    """A table being written.
-
-    Args:
-        path: The file to write.
-        recording: Source of metadata and events.
-    """
+    """A table being written."""
 
     def __init__(self, path: Path, recording: RecordingFile) -> None: ...
 

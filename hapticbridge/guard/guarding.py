@@ -54,9 +54,7 @@ tick of 1 kHz is 3000."""
 def button_mask(button: int | None, what: str) -> int:
     """Returns the bit of a button; 0 for None.
 
-    Args:
-        button: Number of the button, from 0.
-        what: Purpose of the button, for the message.
+    ``what`` names the button's purpose for the message.
 
     Raises:
         DeviceError: The number is out of range.

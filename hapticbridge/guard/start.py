@@ -76,12 +76,8 @@ def wait_until_still(
 def refuse_simulated_time(device: DeviceInfo | str, clock: Clock) -> None:
     """Refuses a simulated clock for a device bound to real time.
 
-    Such a device has motors, or follows a live hand without end and with a delay.
-
-    Args:
-        device: Data sheet, or device string before the device is opened and homed; all hardware is
-            bound to real time.
-        clock: Clock of the run.
+    Such a device has motors, or follows a live hand without end and with a delay. A device string
+    is checked before the device is opened and homed; all hardware is bound to real time.
 
     Raises:
         DeviceError: The device is bound to real time and the clock is simulated.
@@ -104,11 +100,6 @@ def refuse_stretched_start(
     state: NDArray[np.void], sample: NDArray[np.void], limits: Limits
 ) -> None:
     """Refuses a start at which the coupling would already exceed the force limit.
-
-    Args:
-        state: Kernel state (``STATE_DTYPE``, one element) before the first tick.
-        sample: Device sample, shape (1,), ``SAMPLE_DTYPE``.
-        limits: Limits of the run.
 
     Raises:
         DeviceError: The message names the handle's distance from the grip, and the grip's position.

@@ -29,9 +29,7 @@ _DIVERGED = (
 def trip_reason(code: int, tick: int) -> str:
     """Describes why the kernel refused a tick.
 
-    Args:
-        code: Result of ``before_step`` or ``after_step``, not ``OK``.
-        tick: Number of the tick.
+    ``code`` is a result of ``before_step`` or ``after_step``, not ``OK``.
     """
     return f"tick {tick}: {_REASONS.get(code, _DIVERGED)}"
 
@@ -39,10 +37,8 @@ def trip_reason(code: int, tick: int) -> str:
 def with_remedy(reason: str) -> str:
     """Appends the remedy to a reason, for the message to the user.
 
-    Exception and recording keep the bare reason, because it is compared when the run is repeated.
-
-    Args:
-        reason: Result of ``trip_reason``; any other text is returned unchanged.
+    Exception and recording keep the bare reason, because it is compared when the run is repeated. A
+    reason that is not from ``trip_reason`` is returned unchanged.
     """
     for code, remedy in _REMEDIES.items():
         if reason.endswith(_REASONS[code]):

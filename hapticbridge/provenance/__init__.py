@@ -1,7 +1,7 @@
-"""What a recording says of its run, so that it can be judged and simulated again.
+"""Description of a run in its recording, for audit and re-simulation.
 
-``start`` is where the run begins, ``versions`` what computes it; ``description`` writes both into
-the recording's metadata and attachments and reads the run's parameters back, through ``metadata``.
+``start`` captures the run's start, ``versions`` the software. ``description`` writes both into
+metadata and attachments, and reads the run parameters back through ``metadata``.
 """
 
 from hapticbridge.provenance.description import MODEL_ATTACHMENT as MODEL_ATTACHMENT

@@ -1,6 +1,6 @@
-"""What a recording says about its run, and the run's parameters read back from it.
+"""Run description in a recording, and run parameters read back from it.
 
-Metadata are strings; numbers in them are written so that they read back to the same double.
+Metadata are strings; their numbers read back to the same double.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ MODEL_ATTACHMENT = "model.mjb"
 SOURCE_PREFIX = "scene/"
 
 _MID_RUN = "mid-run"
-"""Metadata ``began`` of a recording of an earlier version that begins while its run goes on."""
+"""Value of metadata ``began`` in recordings of earlier versions that begin during a run."""
 
 _FLOATS = ("scale", "force_scale", "force_limit", "torque_limit", "contact_stiffness")
 _POSES = ("device_origin", "handle_origin", "device_start")
@@ -43,9 +43,10 @@ _GAINS = ("stiffness", "damping", "rotational_stiffness", "rotational_damping")
 
 
 def attachments(scene: Scene) -> list[Attachment]:
-    """Returns the scene's sources, its compiled model and its start, as the recording keeps them.
+    """Returns the scene's sources, compiled model and start state as attachments.
 
-    Call it after the scene was prepared and reset: gains and timestep are part of the model.
+    Call it after the scene was prepared and reset, because gains and timestep are part of the
+    model.
     """
     kept = [
         Attachment(SOURCE_PREFIX + source.name, "application/octet-stream", source.data)
@@ -67,7 +68,7 @@ def describe_run(
     device: DeviceInfo,
     clock: str,
 ) -> dict[str, str]:
-    """Returns the recording's metadata; see ``parameters_of`` for the way back."""
+    """Returns the recording's metadata; ``parameters_of`` is the inverse."""
     coupling = parameters.coupling
     felt = parameters.felt
     meta = {name: repr(float(getattr(parameters, name))) for name in _FLOATS}
@@ -100,7 +101,7 @@ def describe_run(
 
 
 def _felt(meta: Mapping[str, str], method: Method) -> Coupling | None:
-    """Returns the coupling that a weld truly was; None for methods that have the one asked for."""
+    """Returns a weld's measured coupling; None for other methods."""
     if method.scheme != WELD:
         return None
     return Coupling(*meta_numbers(meta, "felt", len(_GAINS)))
@@ -110,13 +111,12 @@ def parameters_of(meta: Mapping[str, str]) -> RunParameters:
     """Returns the parameters of a recorded run.
 
     Raises:
-        RecordingError: Something is missing or out of range, or the recording begins in mid-run, as
-            those of earlier versions could.
+        RecordingError: A value is missing or out of range.
     """
     if meta.get("began") == _MID_RUN:
         raise RecordingError(
             "the recording begins in mid-run, which only earlier versions of hapticbridge recorded "
-            "and judge; 'hapticbridge export' still reads its ticks"
+            "and judged; 'hapticbridge export' still reads its ticks"
         )
     try:
         method = method_named(meta.get("method", ""))

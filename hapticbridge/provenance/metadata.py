@@ -1,4 +1,4 @@
-"""Numbers of a recording's metadata, read back to the same double or refused in a sentence."""
+"""Numbers of a recording's metadata."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _MOST_TICKS = 2**31
 
 
 def meta_float(meta: Mapping[str, str], name: str) -> float:
-    """Returns a number of the metadata.
+    """Returns a number of the metadata, equal to the last bit.
 
     Raises:
         RecordingError: It is missing, not a number or not finite.
@@ -53,7 +53,7 @@ def meta_start(meta: Mapping[str, str], name: str) -> list[float]:
     """Returns one of ``STARTS`` from the metadata.
 
     Raises:
-        RecordingError: It is missing, or not as many finite numbers.
+        RecordingError: It is missing, or has a wrong number of values.
     """
     if STARTS[name] == 1:
         return [meta_float(meta, name)]

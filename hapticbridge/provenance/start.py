@@ -1,4 +1,4 @@
-"""Where a run starts: MuJoCo's whole state, the compiled model, and what the ledger counts from."""
+"""Start of a run: MuJoCo's state, compiled model, and energies."""
 
 from __future__ import annotations
 
@@ -11,28 +11,28 @@ from hapticbridge.errors import RecordingError
 STATE_ATTACHMENT = "start_state.f64"
 
 STARTS = {"handle_start": 7, "tool_start": 7, "start_kinetic": 1, "start_potential": 1}
-"""What the ledger counts from, with its count of numbers: poses in m, energies in J."""
+"""Start values of the energy balance, with their number of elements: poses in m, energies in J."""
 
 _STORED = {"start_kinetic": "kinetic", "start_potential": "potential"}
 _STATE = mujoco.mjtState.mjSTATE_INTEGRATION
 
 
 def compiled_model(model: mujoco.MjModel) -> bytes:
-    """Returns the bytes of ``mj_saveModel``, the same in every compilation of one scene."""
+    """Returns the bytes of ``mj_saveModel``, equal in every compilation of one scene."""
     buffer = np.zeros(mujoco.mj_sizeModel(model), dtype=np.uint8)
     mujoco.mj_saveModel(model, None, buffer)
     return buffer.tobytes()
 
 
 def start_state(model: mujoco.MjModel, data: mujoco.MjData) -> NDArray[np.float64]:
-    """Returns everything that MuJoCo's next step depends on."""
+    """Returns the full state on which MuJoCo's next step depends."""
     state = np.zeros(mujoco.mj_stateSize(model, _STATE))
     mujoco.mj_getState(model, data, state, _STATE)
     return state
 
 
 def restore_state(model: mujoco.MjModel, data: mujoco.MjData, state: bytes) -> None:
-    """Puts data to a start that ``start_state`` returned.
+    """Sets data to a state from ``start_state``.
 
     Raises:
         RecordingError: The bytes are not a state of this model.
@@ -46,12 +46,12 @@ def restore_state(model: mujoco.MjModel, data: mujoco.MjData, state: bytes) -> N
     mujoco.mj_resetData(model, data)
     mujoco.mj_setState(model, data, np.frombuffer(state, dtype="<f8").astype(np.float64), _STATE)
     mujoco.mj_forward(model, data)
-    # mj_forward solves once more and would leave another warm start than the run began with
+    # mj_forward runs the solver and changes the warm start, so the state is set again
     mujoco.mj_setState(model, data, np.frombuffer(state, dtype="<f8").astype(np.float64), _STATE)
 
 
 def start_of(state: NDArray[np.void], name: str) -> list[float]:
-    """Returns one of ``STARTS`` from the kernel's state, as long as no tick has run."""
+    """Returns one of ``STARTS`` from the kernel's state before the first tick."""
     if name in _STORED:
         return [float(state[_STORED[name]][0])]
     body = name.removesuffix("_start")

@@ -1,4 +1,4 @@
-"""What a run was computed with: versions of programs, and the processor."""
+"""Software versions and processor of a run."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from importlib.metadata import version
 
 
 def versions() -> dict[str, str]:
-    """Returns the versions that decide whether a run can be repeated to the bit."""
+    """Returns the versions on which a bit-exact repetition depends."""
     packages = ("hapticbridge", "mujoco", "numba", "numpy", "scipy", "mcap")
     found = {name: _version_of(name) for name in packages}
     return found | {"python": platform.python_version()}
@@ -18,7 +18,7 @@ _version_of = cache(version)  # parses the package's metadata: 2 ms each
 
 
 def processor() -> str:
-    """Returns the processor's model, where the system tells it."""
+    """Returns the processor's model, or its architecture if the system does not report it."""
     try:
         with open("/proc/cpuinfo", encoding="utf-8") as lines:  # noqa: PTH123 - not a file to keep
             for line in lines:

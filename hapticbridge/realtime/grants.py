@@ -53,10 +53,7 @@ class Grant:
 def wants_real_time(asked: bool | None, clock: Clock, *, is_real: bool) -> bool:
     """Decides if a run requests real time.
 
-    Args:
-        asked: The user's choice; None requests it for a real device on a real clock.
-        clock: Clock of the loop.
-        is_real: True if the device drives a motor in a person's hand.
+    ``asked`` is the user's choice; None requests it for a device with motors on a real clock.
 
     Raises:
         HapticBridgeError: Real time was requested with a clock that is not real.
@@ -85,11 +82,8 @@ def memory_at_rest() -> Iterator[tuple[Grant, ...]]:
 def real_time(core: int | None = None) -> Iterator[tuple[Grant, ...]]:
     """Requests real time for the calling thread; undone at the end.
 
-    Threads and processes started meanwhile do not inherit the priority.
-
-    Args:
-        core: Core to run on; None takes an isolated core, or else the last allowed one, because the
-            first serves most interrupts.
+    Threads and processes started meanwhile do not inherit the priority. Without ``core`` it takes
+    an isolated core, or else the last allowed one, because the first serves most interrupts.
 
     Yields:
         One result per request.

@@ -41,9 +41,7 @@ class Lateness:
 def lateness_of(late_ns: ArrayLike, missed: int) -> Lateness:
     """Returns the percentiles of times from deadline to wake-up.
 
-    Args:
-        late_ns: Times in ns, at least one; 0 or less counts as on time.
-        missed: Number of skipped deadlines.
+    Times are in ns; 0 or less counts as on time.
 
     Raises:
         HapticBridgeError: There are no times.

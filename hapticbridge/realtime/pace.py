@@ -31,13 +31,7 @@ def check_pace(
     """Refuses a scene that cannot hold the rate on a real device; warns on others.
 
     A missed deadline prolongs the hold, and the condition b > KT/2 + B' then needs more damping.
-
-    Args:
-        scene: Prepared scene; its state is not changed.
-        method: Rendering method.
-        period: T in s.
-        substeps: MuJoCo steps per tick.
-        is_real: True if the device drives a motor in a person's hand.
+    The scene must be prepared; it is not changed.
 
     Raises:
         SceneError: The steps of a tick take longer than the period; the message names a possible

@@ -45,9 +45,7 @@ FILTER = (
 def way_to_pin(core: int, reason: int | None) -> str:
     """Returns the remedy for a refused core.
 
-    Args:
-        core: Number of the core.
-        reason: ``errno`` of the refusal; None if the number is out of range.
+    ``reason`` is the ``errno`` of the refusal; None if the number is out of range.
     """
     if not 0 <= core < (os.cpu_count() or 1):
         return f"choose a core from 0 to {(os.cpu_count() or 1) - 1}"

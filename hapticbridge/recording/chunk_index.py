@@ -1,9 +1,4 @@
-"""The index of a recording's chunks while it is being written: on disk, not in memory.
-
-An MCAP file ends with the place of each of its chunks, so that a reader finds a time without
-reading all that comes before. The MCAP library keeps these entries as objects until the file is
-finished: 0.9 kB a chunk, 10 MB an hour at 1 kHz, for as long as the run lasts.
-"""
+"""Chunk index on disk."""
 
 from __future__ import annotations
 
@@ -20,27 +15,26 @@ from mcap.writer import Writer
 
 
 class ChunkIndexFile:
-    """Stands in for the list in which the MCAP library keeps the index.
+    """Replacement of the MCAP library's chunk index that uses disk instead of memory.
 
-    Entries wait in a file without a name, beside the recording where that is possible, and go when
-    it is closed or its process dies. One entry is about 100 bytes.
-
-    Args:
-        folder: Where the recording is.
+    An MCAP file ends with the position of each chunk, for access by time. The library keeps these
+    entries as objects until the file is closed: 0.9 kB per chunk, 10 MB per hour at 1 kHz. Here an
+    entry takes about 100 bytes in an unnamed temporary file, beside the recording if possible. The
+    file vanishes when it is closed or its process dies.
 
     Raises:
-        OSError: No file can be made, there or where temporary files belong.
+        OSError: No file can be created, there or in the temporary folder.
     """
 
     def __init__(self, folder: Path) -> None:
         self._file = _nameless_file(folder)
 
     def take_over(self, writer: Writer) -> None:
-        """Replaces the library's list, which is private, in the only place that names it."""
+        """Replaces the library's private list; this is the only place that names it."""
         writer._Writer__chunk_indices = self  # type: ignore[attr-defined]
 
     def append(self, entry: ChunkIndex) -> None:
-        """Takes the entry of a finished chunk.
+        """Adds the entry of a finished chunk.
 
         Raises:
             OSError: The disk is full.
@@ -52,24 +46,24 @@ class ChunkIndexFile:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     def __iter__(self) -> Iterator[_Entries]:
-        """Yields all entries as one, which the library writes into the summary."""
+        """Yields all entries as one object, which the library writes into the summary."""
         self._file.seek(0)
         yield _Entries(self._file.read())
 
     def close(self) -> None:
-        """Frees the file."""
+        """Deletes the file."""
         self._file.close()
 
 
 def _nameless_file(folder: Path) -> IO[bytes]:
     try:
         return tempfile.TemporaryFile(dir=folder, buffering=0)
-    except OSError:  # one may write to a file or device in a folder that takes no others
+    except OSError:  # the recording's folder may not allow new files
         return tempfile.TemporaryFile(buffering=0)
 
 
 class _Entries:
-    """Entries that need no packing any more."""
+    """Packed entries."""
 
     def __init__(self, data: bytes) -> None:
         self._data = data

@@ -1,8 +1,4 @@
-"""The MCAP container, read defensively: chunks, checksums, and what is damaged.
-
-The MCAP library's reader yields one message at a time (10 µs each) and stops at the first fault;
-here a chunk comes out as one block of bytes, and a fault becomes a sentence.
-"""
+"""Tolerant reader of the MCAP container."""
 
 from __future__ import annotations
 
@@ -22,27 +18,27 @@ from hapticbridge.recording.fields import DamageError, Fields
 from hapticbridge.recording.file_bytes import FileBytes
 
 MAGIC = MCAP0_MAGIC
-"""How an MCAP file starts and ends."""
+"""First and last bytes of an MCAP file."""
 
 MAX_CHUNK_SIZE = 1 << 28
-"""The largest chunk that is decompressed, in bytes; a damaged size must not exhaust memory."""
+"""Largest chunk in bytes that is decompressed; a damaged size must not exhaust memory."""
 
 _RECORD = struct.Struct("<BQ")
 _CHUNK = struct.Struct("<QQQI")
 _FOOTER = struct.Struct("<QQI")
 _FOOTER_SIZE = _RECORD.size + _FOOTER.size
 _AHEAD = 64
-"""Chunks that are unpacked before they are asked for: some 8 MB of records at 128 kB each."""
+"""Number of chunks decompressed in advance: about 8 MB of records at 128 kB each."""
 
 
 @dataclass(frozen=True)
 class Block:
-    """Schema, channel and message records that belong together: a chunk, or loose ones.
+    """Schema, channel and message records of a chunk, or loose ones.
 
     Attributes:
-        label: How to name it in a sentence.
-        data: The records' bytes.
-        fault: What is wrong with it, or empty.
+        label: Name for messages.
+        data: Bytes of the records.
+        fault: Description of damage, or empty.
     """
 
     label: str
@@ -54,14 +50,14 @@ _Item: TypeAlias = Block | tuple[int, Fields]
 
 
 class Container:
-    """An MCAP file.
+    """An MCAP file with its damage.
 
-    Args:
-        data: The file, which starts with the MCAP magic.
+    The MCAP library's reader yields single messages (10 µs each) and stops at the first fault. Here
+    a chunk is one block of bytes, and a fault becomes a sentence.
 
     Attributes:
-        is_cut: The end of the file is missing.
-        problems: What is damaged, one sentence each; complete after ``records`` is exhausted.
+        is_cut: True if the end of the file is missing.
+        problems: Damage, one sentence each; complete after ``records`` is exhausted.
     """
 
     def __init__(self, data: FileBytes) -> None:
@@ -96,7 +92,7 @@ class Container:
             self._chunks.sort()
 
     def summary(self) -> Block:
-        """Returns the schemas and channels that the end of the file repeats, if it does."""
+        """Returns the schemas and channels repeated at the end of the file, if any."""
         pieces = [
             self._data[body - _RECORD.size : stop]
             for opcode, body, stop in self._walk(self._summary or self._end, self._end, [])
@@ -107,7 +103,7 @@ class Container:
     def records(self) -> Iterator[_Item]:
         """Yields blocks of messages and, as (opcode, fields), metadata and attachments, in order.
 
-        Chunks are decompressed and checked in threads, some ahead of the one that is yielded.
+        Threads decompress and check chunks ahead of the one that is yielded.
         """
         with ThreadPoolExecutor(2) as pool:
             ahead: deque[_Item | Future[Block]] = deque()
@@ -168,7 +164,7 @@ class Container:
             self.problems.append("the mark at the end of the data section is missing")
 
     def _walk(self, start: int, end: int, resume: list[int]) -> Iterator[tuple[int, int, int]]:
-        """Yields (opcode, start of body, end of body); after a fault goes on at ``resume``."""
+        """Yields (opcode, start of body, end of body); after a fault it continues at ``resume``."""
         position = start
         while position < end:
             head = self._data[position : min(position + _RECORD.size, end)]
@@ -185,7 +181,7 @@ class Container:
                 position = stop
                 continue
             following = next((offset for offset in resume if position < offset < end), None)
-            # a machine that lost power may leave zeros behind the last whole record
+            # after a power failure, zeros may follow the last whole record
             is_cut_here = self.is_cut and (opcode != 0 or self._data.is_zero_from(position))
             if not is_cut_here:
                 until = "the file's end" if following is None else f"byte {following}"
@@ -203,7 +199,7 @@ def _decompressed(compression: str, packed: bytes, size: int) -> bytes:
     if compression != "zstd":
         raise DamageError(f"its compression '{compression}' is not one of 'zstd' and none")
     try:
-        # zstandard allocates what the frame's own header claims
+        # zstandard allocates the size that the frame header claims
         if zstandard.frame_content_size(packed) not in (-1, size):
             raise DamageError("its size does not match")
         return zstandard.ZstdDecompressor().decompress(packed, max_output_size=size)

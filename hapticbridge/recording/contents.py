@@ -1,4 +1,4 @@
-"""What the records of a container mean: metadata, attachments, events, and runs of ticks."""
+"""Metadata, attachments, events and ticks of a container."""
 
 from __future__ import annotations
 
@@ -35,16 +35,16 @@ _CDR = int.from_bytes(layout.CDR_HEADER, "little")
 
 @dataclass
 class Contents:
-    """Gathers what the blocks of a container hold.
+    """Contents collected from a container's blocks.
 
     Attributes:
-        problems: What is damaged, one sentence each; added to.
-        take: Called with each run of records, ``TICK_DTYPE``, in their order.
+        problems: Damage, one sentence each; appended to.
+        take: Called with each run of records, ``TICK_DTYPE``, in order.
         events: Payload and JSON object of each event.
-        attachments: In their order.
-        meta: The metadata, once they were read.
-        digest: What the file says that its digest is.
-        refusal: Why the records are none of this version, once that is known.
+        attachments: Attachments in order.
+        meta: The metadata; None before they are read.
+        digest: Digest stored in the file.
+        refusal: Reason why the records are not of this version; None if they are.
     """
 
     problems: list[str]
@@ -59,14 +59,14 @@ class Contents:
 
     @property
     def has_ticks(self) -> bool:
-        """Whether there is a channel of records of this version."""
+        """True if there is a channel of records of this version."""
         return layout.TICK_TOPIC in self._topics.values()
 
     def add_metadata(self, fields: Fields) -> None:
         """Adds a metadata record.
 
         Raises:
-            DamageError: There is one of this name already, or it is shorter than its fields.
+            DamageError: Its name occurs twice, or it is shorter than its fields.
         """
         name, entries = fields.text(), fields.mapping()
         if name == layout.METADATA_NAME:
@@ -82,7 +82,7 @@ class Contents:
         """Adds an attachment.
 
         Raises:
-            DamageError: There is one of this name already, or it is shorter than its fields.
+            DamageError: Its name occurs twice, or it is shorter than its fields.
         """
         fields.raw(16)
         name, media_type = fields.text(), fields.text()
@@ -142,7 +142,7 @@ class Contents:
                 self._topics[channel] = topic
 
     def _add_ticks(self, data: bytes, position: int, channel: int) -> int:
-        """Adds the run of records that starts here; returns where it ends."""
+        """Adds the run of records that starts here; returns its end."""
         size, count = _MESSAGE_DTYPE.itemsize, 16
         start = position
         while True:

@@ -1,4 +1,4 @@
-"""The fields of one MCAP record, read in order; a record that lies about its size is damaged."""
+"""Fields of one MCAP record."""
 
 from __future__ import annotations
 
@@ -6,31 +6,25 @@ from hapticbridge.recording.file_bytes import FileBytes
 
 
 class DamageError(Exception):
-    """A record does not hold what its kind holds; never leaves this package."""
+    """A record contradicts its declared size or kind; internal to this package."""
 
 
 class Fields:
-    """Reads the fields of one record in order.
-
-    Args:
-        data: The bytes that hold the record's body.
-        start: Where the body starts.
-        stop: Where it ends.
-    """
+    """Sequential reader of one record's fields."""
 
     def __init__(self, data: bytes | FileBytes, start: int, stop: int) -> None:
         self._data, self._position, self._stop = data, start, stop
 
     @property
     def is_at_end(self) -> bool:
-        """Whether nothing is left."""
+        """True if no bytes are left."""
         return self._position >= self._stop
 
     def raw(self, size: int) -> bytes:
         """Returns the next bytes.
 
         Raises:
-            DamageError: The record is shorter. So it is with all that is read of it.
+            DamageError: The record is shorter; all other readers raise it too.
         """
         start = self._position
         if size > self._stop - start:
@@ -46,7 +40,7 @@ class Fields:
         """Returns the next text.
 
         Raises:
-            DamageError: It is not UTF-8, or cut.
+            DamageError: It is cut or not UTF-8.
         """
         try:
             return self.raw(self.number(4)).decode()
@@ -57,7 +51,7 @@ class Fields:
         """Returns the next map of texts.
 
         Raises:
-            DamageError: A key is there twice, a text is not UTF-8, or it is cut.
+            DamageError: A key occurs twice, a text is not UTF-8, or the map is cut.
         """
         size = self.number(4)
         inner = Fields(self._data, self._position, self._position + size)

@@ -1,4 +1,4 @@
-"""A file's bytes by their places, read when they are asked for."""
+"""Random access to a file's bytes."""
 
 from __future__ import annotations
 
@@ -11,18 +11,14 @@ from types import TracebackType
 from hapticbridge.errors import RecordingError
 
 WINDOW = 1 << 20
-"""Bytes that are read at once where a long stretch is only looked through: larger takes more
-memory, smaller more calls."""
+"""Bytes per read of a long stretch. A larger window takes more memory, a smaller one more calls."""
 
 
 class FileBytes:
     """A file as a sequence of bytes that is never in memory as a whole.
 
-    It is not mapped into memory: a bridge that records to the same file anew would cut it, and to
-    touch a mapped page behind the end ends the process. Slices may be read from several threads.
-
-    Args:
-        path: A regular file.
+    It is not memory-mapped: a bridge that overwrites the file would truncate it, and access to a
+    mapped page beyond the end kills the process. Slices may be read from several threads.
 
     Raises:
         RecordingError: It cannot be read.
@@ -60,7 +56,7 @@ class FileBytes:
         """Returns the bytes of a slice without a step.
 
         Raises:
-            RecordingError: They cannot be read, or the file became shorter meanwhile.
+            RecordingError: They cannot be read, or the file has become shorter.
         """
         start, stop, _ = places.indices(self._size)
         wanted = max(stop - start, 0)
@@ -68,7 +64,7 @@ class FileBytes:
         try:
             with self._lock:
                 self._file.seek(start)
-                # a read may return less than was asked for
+                # a read may return fewer bytes than requested
                 while len(pieces) < wanted and (piece := self._file.read(wanted - len(pieces))):
                     pieces += piece
         except OSError as error:
@@ -85,7 +81,7 @@ class FileBytes:
         return crc
 
     def is_zero_from(self, start: int) -> bool:
-        """Tells whether nothing but zeros stands behind a place."""
+        """Returns True if all bytes from a position on are zero."""
         return not any(any(self[at : at + WINDOW]) for at in range(start, self._size, WINDOW))
 
     def _refusal(self, error: Exception) -> RecordingError:

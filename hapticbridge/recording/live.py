@@ -1,4 +1,4 @@
-"""The live line of a run: one line that is redrawn on a terminal, plain lines elsewhere."""
+"""Live status line of a run."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from rich.text import Text
 from hapticbridge.tick import TickFlag
 
 REDRAW = 0.125
-"""Pause in s between two drawings on a terminal."""
+"""Time in s between two drawings on a terminal."""
 
 REPRINT = 2.0
-"""Pause in s between two plain lines."""
+"""Time in s between two plain lines."""
 
 
 class RunState:
-    """What the live line tells, gathered from the records."""
+    """State of a run for the status line, collected from records."""
 
     def __init__(self) -> None:
         self._last: NDArray[np.void] | None = None
@@ -55,17 +55,16 @@ class RunState:
 
 
 class _Console(Console):
-    """A console that reports a closed terminal instead of ending the process, as rich would."""
+    """Console that raises when the terminal is closed; rich would end the process."""
 
     def on_broken_pipe(self) -> None:
         raise BrokenPipeError(errno.EPIPE, "the terminal is gone")
 
 
 class LiveLine:
-    """Shows the state of a run; a stream that fails is left alone, the recording goes on.
+    """Status line of a run: redrawn on a terminal, printed as plain lines elsewhere.
 
-    Args:
-        stream: Where to; whether it is a terminal decides the way.
+    After an error the stream is no longer used, and the recording continues.
     """
 
     def __init__(self, stream: TextIO) -> None:
@@ -76,7 +75,7 @@ class LiveLine:
         self._live: Live | None = None
         try:
             if stream.isatty():
-                # standard output carries the answers to the bridge: rich must not redirect it
+                # rich must not redirect standard output, which carries the answers to the bridge
                 self._live = Live(
                     self._text(),
                     console=_Console(file=stream),
@@ -89,7 +88,7 @@ class LiveLine:
             self._stream = None
 
     def update(self, rows: NDArray[np.void]) -> None:
-        """Takes new records, also none, and draws when it is time to."""
+        """Adds new records, or none, and draws if it is time."""
         if rows.size:
             self._state.add(rows)
             self._is_fresh = True
@@ -97,7 +96,7 @@ class LiveLine:
             self._draw()
 
     def close(self) -> None:
-        """Draws the last state and leaves the terminal as it was."""
+        """Draws the last state and restores the terminal."""
         self._draw()
         try:
             if self._live is not None:

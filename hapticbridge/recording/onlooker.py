@@ -1,4 +1,4 @@
-"""Who may look at a run beside its recorder."""
+"""Second reader of a run."""
 
 from __future__ import annotations
 
@@ -9,7 +9,10 @@ from hapticbridge.recording.format import Attachment
 
 
 class Onlooker(Protocol):
-    """Looks at a run from another process; the loop neither waits for it nor asks it anything."""
+    """Optional second reader of the ring from another process, such as the live view.
+
+    The loop never waits for it.
+    """
 
     def start(
         self,
@@ -18,17 +21,14 @@ class Onlooker(Protocol):
         metadata: Mapping[str, str],
         attachments: Sequence[Attachment],
     ) -> None:
-        """Starts looking.
+        """Starts reading.
 
-        Args:
-            ring: Name of the ring, as ``Ring.attach`` takes it; what attaches must free nothing.
-            snapshot: Name of the scene's newest positions, as ``Snapshot.attach`` takes it.
-            metadata: Of the run, as a recording has them.
-            attachments: Likewise.
+        A reader must free nothing of the ring. ``snapshot`` names the shared memory with the
+        scene's positions. Metadata and attachments are those of a recording.
         """
 
     def event(self, event: Mapping[str, object]) -> None:
-        """Takes an event; must neither wait nor raise."""
+        """Receives an event; must neither block nor raise."""
 
     def close(self) -> None:
-        """Ends looking; must not raise."""
+        """Stops reading; must not raise."""

@@ -1,9 +1,4 @@
-"""The file under a recording: whole writes, a lock, and room kept for the end on a disk that fills.
-
-A disk that is full when a record must be written has room for nothing more, not even for the index
-that closes the file. So room is claimed ahead; when no more can be claimed, what is claimed takes
-all that still comes until the run has been told to end.
-"""
+"""Locked output file with reserved space."""
 
 from __future__ import annotations
 
@@ -19,32 +14,31 @@ if sys.platform != "win32":
     import fcntl
 
 RESERVE = 4 << 20
-"""In bytes, claimed ahead of the file's end. Records at 1 kHz are 0.4 MB/s before compression, and
-the loop looks at its recorder ten times a second: enough for 10 kHz, and for the index of hours."""
+"""Space in bytes reserved beyond the file's end. Records at 1 kHz take 0.4 MB/s before compression,
+and the loop checks its recorder ten times a second. It suffices for 10 kHz and for the index of
+hours."""
 
 _KEEP_SIZE, _PUNCH_HOLE = 1, 2  # FALLOC_FL_* of Linux
 
 
 class Output:
-    """A file that hands each write to the operating system whole and at once.
+    """Unbuffered file with a lock and reserved space.
 
-    The MCAP library writes a finished chunk in one call; a buffer in between would keep its end
-    until the next one, and a kill would lose it.
-
-    Args:
-        path: The file; what it holds is lost.
-        is_new: Refuse one that exists.
+    The MCAP library writes a finished chunk in one call; a buffer would hold its end back, and a
+    kill would lose it. A full disk has no space for the index that closes the file, so space is
+    reserved in advance. When no more can be reserved, the reserve takes the remaining data until
+    the run has ended. The content of an existing file is lost; ``is_new`` refuses it.
 
     Attributes:
-        is_full: Whether no more room could be claimed; ``RESERVE`` bytes are left then, or what is
-            left of them. Stays False where a file system cannot claim any.
+        is_full: True if no more space could be reserved; at most ``RESERVE`` bytes are then left.
+            Always False on a file system without reservation.
 
     Raises:
         OSError: It cannot be opened, or another bridge is recording to it.
     """
 
     def __init__(self, path: Path, *, is_new: bool) -> None:
-        # not truncated before it is locked: another bridge may be recording to the same file
+        # lock before truncating: another bridge may be recording to this file
         flags = os.O_WRONLY | os.O_CREAT | getattr(os, "O_BINARY", 0)
         flags |= os.O_EXCL if is_new else 0
         self._file = os.fdopen(os.open(path, flags, 0o666), "wb", buffering=0)
@@ -63,34 +57,34 @@ class Output:
         self.is_full = False
 
     def write(self, data: bytes) -> int:
-        """Writes all of it, then claims as much room again: a call in a third of a second."""
+        """Writes all data, then extends the reserve; about three calls per second."""
         view = memoryview(data)
         while view:
             written = self._file.write(view)
             view = view[written:]
         self._position += len(data)
-        if self._claims and data:  # no room at all cannot be claimed
+        if self._claims and data:  # a reservation of zero bytes is an error
             self._claim()
         return len(data)
 
     def tell(self) -> int:
-        """Returns how much was written."""
+        """Returns the number of bytes written."""
         return self._position
 
     def flush(self) -> None:
-        """Nothing is held back."""
+        """Does nothing; writes are unbuffered."""
 
     def sync(self) -> None:
-        """Waits until all of it is on the disk."""
+        """Waits until all data is on the disk."""
         if self._is_regular:
             os.fsync(self._file.fileno())
 
     def close(self) -> None:
-        """Gives back what was claimed and not used, and closes."""
+        """Releases the unused reserve and closes the file."""
         if self._claimed > self._position and not self._file.closed:
             rest = self._claimed - self._position
             self._allocate(_KEEP_SIZE | _PUNCH_HOLE, self._position, rest)
-            self._file.truncate(self._position)  # ext4 gives room behind the end back only so
+            self._file.truncate(self._position)  # ext4 releases space beyond the end only this way
         self._file.close()
 
     def _claim(self) -> None:
@@ -104,7 +98,7 @@ class Output:
             self._claims = False
 
     def _allocate(self, mode: int, start: int, size: int) -> int:
-        """Returns the error's number of Linux's fallocate, 0 for none."""
+        """Calls Linux's fallocate; returns the error number, or 0."""
         first, length = ctypes.c_int64(start), ctypes.c_int64(size)
         if self._fallocate is None:
             return errno.EOPNOTSUPP
@@ -114,7 +108,7 @@ class Output:
 
 
 def _fallocate() -> Callable[..., int] | None:
-    """Returns Linux's fallocate with offsets of 64 bits, which Python's os lacks; None without."""
+    """Returns Linux's 64-bit fallocate, which Python's os module lacks; None if unavailable."""
     libc = ctypes.CDLL(None, use_errno=True)
     for name in ("fallocate64", "fallocate"):  # not every C library has both
         if hasattr(libc, name):

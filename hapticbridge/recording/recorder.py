@@ -1,9 +1,8 @@
-"""The recorder as the bridge sees it: a process of its own behind the ring.
+"""Recorder as seen by the bridge: a separate process behind the ring.
 
-The process (``hapticbridge.recording.recorder_process``) is started as a new interpreter, not by
-``multiprocessing``, so a user's script needs no ``__main__`` guard. Configuration and events go
-through its standard input, its answers come back through its standard output, records through the
-shared-memory ring.
+The process (``hapticbridge.recording.recorder_process``) is a new interpreter instead of a
+``multiprocessing`` child, so a user's script needs no ``__main__`` guard. Its standard input
+carries configuration and events, its standard output the answers, the shared ring the records.
 """
 
 from __future__ import annotations
@@ -34,28 +33,27 @@ sys.modules["hapticbridge"] = package
 from hapticbridge.recording.recorder_process import run
 run()
 """
-# The package's own __init__ loads MuJoCo and numba (a second, 100 MB), which the recorder needs
-# not; and found by its path, it is this very package, whatever sys.path the child has.
+# The package's __init__ loads MuJoCo and numba (a second, 100 MB), which the recorder does not
+# need. The explicit path loads this very package with any sys.path of the child.
 
 
 class Recorder:
-    """Starts the recorder's process and talks to it, without ever waiting inside the loop.
+    """Starts the recorder's process and sends events to it without blocking the loop.
 
-    The constructor returns at once; the process starts (about a quarter of a second) while the
-    caller does something else, until ``wait_until_ready``. If the caller's process dies, the
-    recorder drains the ring, writes the event ``bridge_died``, closes the file and removes the
-    shared memory. To be used from one thread.
+    The constructor returns at once; the process starts within about a quarter of a second
+    (``wait_until_ready``). If the caller's process dies, the recorder drains the ring, writes the
+    event ``bridge_died``, closes the file and removes the shared memory. Use it from one thread.
 
     Args:
-        ring: A ring made by ``Ring.shared``; the caller closes it after the recorder.
+        ring: Ring from ``Ring.shared``; the caller closes it after the recorder.
         path: The recording, overwritten if it exists; None records nothing.
-        metadata: Names and values of the recording's metadata.
+        metadata: Metadata of the recording.
         attachments: Files that the recording carries.
-        live: Whether the process shows the state of the run on standard error.
-        epoch_ns: Unix time of the run's start, in ns; now if it is not given.
+        live: True shows the state of the run on standard error.
+        epoch_ns: Unix time of the run's start in ns; None takes the present.
 
     Attributes:
-        is_disk_full: Whether the disk is; the file then takes no more than a run that ends.
+        is_disk_full: True if the disk is full; the file then has space only for the end of the run.
 
     Raises:
         RecordingError: The ring is not shared, metadata or attachments cannot be written, or the
@@ -96,18 +94,17 @@ class Recorder:
         self._listener.start()
         pieces = [json.dumps(configuration).encode() + b"\n"]
         pieces += [item.data for item in attachments]
-        # in a thread of its own, because attachments are larger than what a pipe takes at once
+        # in a separate thread, because attachments exceed a pipe's buffer
         self._sender = threading.Thread(target=self._configure, args=(pieces,), daemon=True)
         self._sender.start()
 
     def wait_until_ready(self, timeout: float = 30.0) -> None:
-        """Waits until the file is open and carries its metadata and attachments.
+        """Waits until the file is open and has its metadata and attachments.
 
-        Args:
-            timeout: Longest wait in s.
+        ``timeout`` is the longest wait in s.
 
         Raises:
-            RecordingError: The file cannot be written, the process died, or time is over.
+            RecordingError: The file cannot be written, the process died, or the time is over.
         """
         try:
             answer = self._answers.get(timeout=timeout)
@@ -120,25 +117,23 @@ class Recorder:
             raise self._failure(answer)
 
     def event(self, event: Mapping[str, object], time_ns: int) -> None:
-        """Sends an event to the recording; never waits and never raises.
+        """Sends an event to the recording; never blocks and never raises.
 
-        Args:
-            event: What happened: ``event`` names it, the rest is its data.
-            time_ns: When, in ns since the start of the run.
+        ``event["event"]`` is its name; ``time_ns`` counts from the start of the run.
         """
         self._outbox += layout.event_payload(event, time_ns) + b"\n"
         self._send()
 
     def is_alive(self) -> bool:
-        """Returns whether the process runs; if not, ``close`` says why."""
+        """Returns True if the process runs; otherwise ``close`` raises the reason."""
         self._send()
         return not self._is_closed and self._process.poll() is None
 
     def close(self) -> None:
-        """Lets the process write all that is in the ring and finish the file.
+        """Waits until the process has written all records and finished the file.
 
-        To be called after the last record and event. The second call does nothing, and neither
-        does one after an error that was already raised.
+        Call it after the last record and event. A second call, or a call after a raised error, does
+        nothing.
 
         Raises:
             RecordingError: The process died, or could not write the file.
@@ -151,7 +146,7 @@ class Recorder:
             _set_blocking(self._input, True)
             _write(self._input, bytes(self._outbox) + b'{"close": true}\n')
         except OSError:
-            pass  # it died; its last answer or its exit status says why
+            pass  # the process died; its last answer or exit status holds the reason
         self._outbox.clear()
         answer: dict[str, Any] = {}
         while "closed" not in answer and "error" not in answer and "exited" not in answer:
@@ -166,10 +161,10 @@ class Recorder:
         if "error" in answer:
             return RecordingError(str(answer["error"]))
         status = self._process.returncode
-        how = f"killed by signal {-status}" if status < 0 else f"ended with status {status}"
+        how = f"was killed by signal {-status}" if status < 0 else f"ended with status {status}"
         return RecordingError(
-            f"the recorder's process was {how}; what it wrote is readable up to the last whole "
-            "chunk, and 'hapticbridge repair' makes a whole file of it"
+            f"the recorder's process {how}; the recording is readable up to the last whole "
+            "chunk; 'hapticbridge repair' makes it whole"
         )
 
     def _reap(self) -> None:
@@ -187,7 +182,7 @@ class Recorder:
             _set_blocking(self._input, False)
             self._is_configured = True
         except (OSError, ValueError):
-            pass  # it died or was closed before it was ready: ``wait_until_ready`` says so
+            pass  # it died or was closed before it was ready; ``wait_until_ready`` raises
 
     def _send(self) -> None:
         if not self._outbox or not self._is_configured or self._is_closed:
@@ -198,7 +193,7 @@ class Recorder:
         except BlockingIOError:
             pass  # the pipe is full: the next call tries again
         except OSError:
-            self._outbox.clear()  # it died: nobody reads events any more, ``close`` says why
+            self._outbox.clear()  # the process died; ``close`` raises the reason
 
     def _listen(self) -> None:
         with cast(IO[bytes], self._process.stdout) as answers:
@@ -215,7 +210,7 @@ def _start() -> subprocess.Popen[bytes]:
     package = str(Path(__file__).resolve().parents[1])
     try:
         return subprocess.Popen(
-            # -P: a file in the user's working folder must not stand in for a module
+            # -P: a file in the user's working folder must not replace a module
             [sys.executable, "-P", "-c", _BOOTSTRAP, package],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
@@ -234,6 +229,6 @@ def _write(stream: IO[bytes], data: bytes) -> None:
 
 
 def _set_blocking(stream: IO[bytes], is_blocking: bool) -> None:
-    # pipes of Windows know this from Python 3.12 on; before, a full pipe makes ``event`` wait
+    # on Windows from Python 3.12 on; before, a full pipe makes ``event`` block
     if sys.platform != "win32" or sys.version_info >= (3, 12):
         os.set_blocking(stream.fileno(), is_blocking)

@@ -1,9 +1,8 @@
-"""The recorder's process: drains the ring into the file, and outlives the bridge.
+"""Recorder's process: drains the ring into the file, and outlives the bridge.
 
-Started by ``hapticbridge.recording.recorder``, which tells it what to do through its standard
-input: one line of JSON, the attachments' bytes, then one line per event, and ``{"close": true}``.
-It answers on standard output with ``ready``, ``full``, ``closed`` or ``error``. If the input ends
-before it was told to close, the bridge died.
+``hapticbridge.recording.recorder`` starts it. Its standard input carries one line of JSON, the
+attachments' bytes, one line per event, and ``{"close": true}``. Its answers on standard output are
+``ready``, ``full``, ``closed`` or ``error``. If the input ends before ``close``, the bridge died.
 """
 
 from __future__ import annotations
@@ -26,16 +25,16 @@ from hapticbridge.recording.ring import Ring
 from hapticbridge.recording.writer import RecordingWriter
 
 POLL = 0.005
-"""Pause in s between looks into the ring: five records at 1 kHz."""
+"""Pause in s between reads of the ring: five records at 1 kHz."""
 
 BATCH = 64
-"""Most records that are taken at once; after so many the next look follows without a pause. What
-they need on the way to the file bounds the process's memory: with 4096 it grew by a megabyte when
-the machine first held it up for a second. Fewer cost time, 0.3 µs a record at 64."""
+"""Largest number of records taken at once; after a full batch the next read follows at once. The
+batch bounds the process's memory: with 4096 it grew by a megabyte after a stall of one second. A
+smaller batch costs time; at 64 it is 0.3 µs per record."""
 
 
 class _Session:
-    """One run from the recorder's side."""
+    """One run in the recorder's process."""
 
     def __init__(self, configuration: dict[str, Any], attachments: list[Attachment]) -> None:
         self.ring = Ring.attach(configuration["ring"])
@@ -59,7 +58,7 @@ class _Session:
         self._has_told = False
 
     def run(self, inbox: SimpleQueue[dict[str, Any] | None]) -> None:
-        """Records until the bridge says close, or is gone."""
+        """Records until the bridge closes or dies."""
         end = None
         while end is None:
             count = self._drain_once()
@@ -67,7 +66,7 @@ class _Session:
             end = self._handle(inbox)
             # a process that the bridge forked may hold the pipe open after the bridge's death
             if end is None and os.getppid() != self._parent:
-                time.sleep(0.1)  # what is still in the pipe arrives
+                time.sleep(0.1)  # lets the rest of the pipe arrive
                 end = self._handle(inbox) or "died"
             if end is None and count < BATCH:
                 time.sleep(POLL)
@@ -93,14 +92,14 @@ class _Session:
         return int(rows.size)
 
     def _tell_if_full(self) -> None:
-        """Says once that the disk is full; there is room for what comes until the bridge ends."""
+        """Reports a full disk once; the reserve holds the data until the bridge ends."""
         if self._writer is not None and self._writer.is_full and not self._has_told:
             self._has_told = True
             self._write_event({"event": "disk_full", "tick": self._last_tick}, self._last_time)
             _answer(full=True)
 
     def _handle(self, inbox: SimpleQueue[dict[str, Any] | None]) -> str | None:
-        """Writes the events that arrived; returns how the run ended, if it did."""
+        """Writes the events that arrived; returns how the run ended, or None."""
         while True:
             try:
                 message = inbox.get_nowait()
@@ -119,7 +118,7 @@ class _Session:
 
 def _listen(stream: IO[bytes], inbox: SimpleQueue[dict[str, Any] | None]) -> None:
     for line in stream:
-        # a line without its end is the last breath of a bridge that was killed while it wrote
+        # a line without its end comes from a bridge that was killed while writing
         if line.endswith(b"\n"):
             inbox.put(json.loads(line))
     inbox.put(None)
@@ -145,7 +144,7 @@ def _configuration(stream: IO[bytes]) -> tuple[dict[str, Any], list[Attachment]]
 
 
 def _calm() -> None:
-    """Gives up what the process must not share with the loop: its signals and its priority."""
+    """Ignores signals meant for the bridge, and drops the loop's real-time priority."""
     for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT"):
         if hasattr(signal, name):
             signal.signal(getattr(signal, name), signal.SIG_IGN)
@@ -185,6 +184,6 @@ def run() -> NoReturn:
         status = main()
     except BaseException:
         traceback.print_exc()
-    # at once: the listening thread may hold the lock of standard input, which an ordinary exit
+    # os._exit: the listening thread may hold the lock of standard input, which a normal exit
     # of the interpreter waits for
     os._exit(status)

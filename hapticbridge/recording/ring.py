@@ -1,8 +1,4 @@
-"""The shared-memory ring between the loop and whoever reads its records.
-
-One producer (the tick's kernel), one consumer (the recorder). Neither waits for the other: a full
-ring refuses the record, the producer counts that, and the audit sees the gap.
-"""
+"""Shared-memory ring between the loop and the recorder."""
 
 from __future__ import annotations
 
@@ -19,10 +15,10 @@ from hapticbridge.recording.ring_memory import attached, created, memory_folder
 from hapticbridge.tick import TICK_DTYPE
 
 HEAD = 0
-"""Index into ``Ring.cursors``: records written since the start; only the producer changes it."""
+"""Index of ``Ring.cursors`` with the number of records written; only the producer changes it."""
 
 TAIL = 1
-"""Index into ``Ring.cursors``: records read since the start; only the consumer changes it."""
+"""Index of ``Ring.cursors`` with the number of records read; only the consumer changes it."""
 
 _CURSORS = 8
 _MAGIC = int.from_bytes(b"hbring01", "little")
@@ -31,18 +27,20 @@ _ROWS_OFFSET = _HEADER.itemsize + 8 * _CURSORS
 
 
 class Ring:
-    """A ring of tick records, in this process's memory or shared between processes.
+    """Ring of tick records, in this process's memory or shared between processes.
 
-    The producer refuses when ``cursors[HEAD] - cursors[TAIL] >= capacity``; else it writes
-    ``rows[cursors[HEAD] % capacity]``, makes it visible (release fence), and only then adds one to
-    ``cursors[HEAD]``. A producer that dies inside a record therefore leaves no torn one behind.
+    It has one producer (the tick's kernel) and one consumer (the recorder); neither waits for the
+    other. The producer refuses a record if ``cursors[HEAD] - cursors[TAIL] >= capacity`` and counts
+    it, and the audit reports the gap. Otherwise it writes ``rows[cursors[HEAD] % capacity]``,
+    issues a release fence, and only then increments ``cursors[HEAD]``. A producer that dies inside
+    a record therefore leaves no torn one.
 
-    The memory stays mapped as long as any of its arrays is in use, also after ``close``.
+    The memory stays mapped while any of its arrays is in use, also after ``close``.
 
     Attributes:
-        rows: The records, shape (capacity,), ``TICK_DTYPE``.
+        rows: Records, shape (capacity,), ``TICK_DTYPE``.
         cursors: Shape (8,), int64; see ``HEAD`` and ``TAIL``, the rest is reserved and zero.
-        name: What ``attach`` takes (the path of the shared memory), or None for a local ring.
+        name: Name for ``attach`` (path of the shared memory); None for a local ring.
     """
 
     def __init__(
@@ -63,9 +61,6 @@ class Ring:
     def local(cls, capacity: int) -> Ring:
         """Returns a ring in this process's own memory.
 
-        Args:
-            capacity: Records that it holds, >= 1.
-
         Raises:
             RecordingError: The capacity is below 1.
         """
@@ -76,13 +71,10 @@ class Ring:
     def shared(cls, capacity: int) -> Ring:
         """Creates a ring in shared memory; ``close`` removes its name.
 
-        Segments that a killed process left behind are removed on the way.
-
-        Args:
-            capacity: Records that it holds, >= 1; one record takes 400 bytes.
+        Segments left by killed processes are removed. One record takes 400 bytes.
 
         Raises:
-            RecordingError: The capacity is below 1, or there is no room for it.
+            RecordingError: The capacity is below 1, or memory is insufficient.
         """
         _check_capacity(capacity)
         size = _ROWS_OFFSET + capacity * TICK_DTYPE.itemsize
@@ -102,10 +94,7 @@ class Ring:
 
     @classmethod
     def attach(cls, name: str) -> Ring:
-        """Opens the ring that another process created.
-
-        Args:
-            name: The other ring's ``name``.
+        """Opens a ring created by another process.
 
         Raises:
             RecordingError: There is no such ring, or it is not one of this version.
@@ -128,21 +117,18 @@ class Ring:
 
     @property
     def capacity(self) -> int:
-        """Records that the ring holds."""
+        """Number of records that the ring holds."""
         return int(self.rows.size)
 
     def pending(self) -> int:
-        """Returns how many records were written and not yet read."""
+        """Returns the number of records written and not yet read."""
         return int(self.cursors[HEAD] - self.cursors[TAIL])
 
     def append(self, rows: NDArray[np.void]) -> int:
-        """Writes records as the producer; the twin in Python of the kernel's compiled producer.
-
-        Args:
-            rows: Records, shape (n,), ``TICK_DTYPE``.
+        """Writes records as the producer, as the kernel's compiled producer does.
 
         Returns:
-            How many were taken, from the first on; the others met a full ring.
+            Number of records written, from the first on; a full ring refuses the rest.
         """
         head = int(self.cursors[HEAD])
         taken = min(int(rows.size), self.capacity - self.pending())
@@ -153,9 +139,6 @@ class Ring:
 
     def take(self, limit: int) -> NDArray[np.void]:
         """Reads records as the consumer, and frees their places.
-
-        Args:
-            limit: The most records to take, >= 1.
 
         Returns:
             A copy of the oldest unread records, oldest first; empty if there is none.
@@ -169,13 +152,10 @@ class Ring:
         return taken
 
     def latest(self, count: int) -> NDArray[np.void]:
-        """Copies the newest records that are still in the ring, read or not; frees nothing.
+        """Copies the newest records in the ring, read or not, without freeing them.
 
-        While the producer runs, ask for less than the capacity: the place of the oldest record is
-        the one that is written next.
-
-        Args:
-            count: The most records to copy, >= 0.
+        While the producer runs, request fewer than the capacity: the oldest record's place is
+        written next.
 
         Returns:
             The records, oldest first.
@@ -185,24 +165,21 @@ class Ring:
         start = max(0, head - self.capacity, head - count)
         copied = self._copy(start, head)
         self._fence()
-        # what the producer has overwritten since is no record of the past any more
+        # drop the records that the producer has overwritten meanwhile
         overwritten = int(self.cursors[HEAD]) - self.capacity - start
         return copied[overwritten:] if overwritten > 0 else copied
 
     def since(self, number: int) -> tuple[int, NDArray[np.void]]:
-        """Copies the records from a number on that are still in the ring; frees nothing.
+        """Copies the records from a number on that are still in the ring, without freeing them.
 
-        The number says where to go on, however many records come in between two calls.
-
-        Args:
-            number: Of the first record that is wanted, counted from the ring's start, >= 0.
+        Numbers count from the ring's start.
 
         Returns:
-            The number of the first record that is still there, and the records, oldest first.
+            Number of the first available record, and the records, oldest first.
         """
         head = int(self.cursors[HEAD])
         self._fence()
-        # the oldest place of a full ring is the one that is written next
+        # the oldest place of a full ring is written next
         start = max(min(number, head), head - self.capacity + 1)
         copied = self._copy(start, head)
         self._fence()
@@ -215,7 +192,7 @@ class Ring:
             self.unlink()
 
     def unlink(self) -> None:
-        """Removes the shared memory's name, also on behalf of an owner that died."""
+        """Removes the shared memory's name, also for an owner that died."""
         if self.name is not None:
             with contextlib.suppress(OSError):  # already gone, or Windows: still mapped
                 Path(self.name).unlink()
@@ -227,7 +204,7 @@ class Ring:
         return np.concatenate((self.rows[first:], self.rows[: first + count - self.capacity]))
 
     def _fence(self) -> None:
-        # Python has no memory fence; taking and leaving a lock is one on every processor
+        # Python has no memory fence; acquiring and releasing a lock acts as one
         with self._order:
             pass
 

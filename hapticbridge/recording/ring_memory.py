@@ -1,4 +1,4 @@
-"""The shared memory of a ring: a file in memory under a name, which is gone when nobody maps it."""
+"""Shared memory of a ring."""
 
 from __future__ import annotations
 
@@ -21,10 +21,11 @@ _PREFIX = "hapticbridge-ring-"
 
 
 def memory_folder() -> Path:
-    """Returns where shared memory lives: Linux's memory file system, else the temporary folder.
+    """Returns the folder of shared memory: Linux's memory file system, else the temporary folder.
 
-    Not ``multiprocessing.shared_memory``: before Python 3.13 its resource tracker also tracks
-    whoever attaches, removes the memory under its owner, and prints about leaks after a kill.
+    ``multiprocessing.shared_memory`` does not fit. Before Python 3.13 its resource tracker also
+    tracks attached processes, removes the memory under its owner, and prints about leaks after a
+    kill.
     """
     memory = Path("/dev/shm")
     usable = memory.is_dir() and os.access(memory, os.W_OK)
@@ -32,16 +33,12 @@ def memory_folder() -> Path:
 
 
 def created(folder: Path, size: int) -> tuple[mmap.mmap, Path]:
-    """Creates shared memory that is zero, under a name that nobody else has.
+    """Creates zeroed shared memory under a unique name.
 
-    Segments that a killed process left behind are removed on the way.
-
-    Args:
-        folder: Where.
-        size: In bytes.
+    Segments left by killed processes are removed. ``size`` is in bytes.
 
     Raises:
-        OSError: There is no room.
+        OSError: Memory is insufficient.
     """
     _sweep(folder)
     path = folder / f"{_PREFIX}{os.getpid()}-{secrets.token_hex(6)}"
@@ -49,10 +46,10 @@ def created(folder: Path, size: int) -> tuple[mmap.mmap, Path]:
         file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600)
         try:
             _lock(file)
-            # a sweep may have found the file in the instant before it was locked
+            # another process's sweep may have removed the file before it was locked
             if os.fstat(file).st_nlink == 0:
                 continue
-            # written out, so that a full file system says so here and not as a bus error in a tick
+            # write all of it, so that a full file system fails here, not as a bus error in a tick
             with open(file, "wb", closefd=False) as stream:
                 stream.write(bytes(size))
             memory = mmap.mmap(file, size)
@@ -61,16 +58,16 @@ def created(folder: Path, size: int) -> tuple[mmap.mmap, Path]:
             raise
         finally:
             os.close(file)
-        # every page is touched once, so that the loop meets no page fault
+        # touch every page once, so that the loop has no page fault
         np.frombuffer(memory, np.uint8)[:] = 0
         return memory, path
 
 
 def attached(name: str) -> mmap.mmap:
-    """Maps the shared memory that another process created.
+    """Maps shared memory created by another process.
 
     Raises:
-        RecordingError: There is none of that name, or it cannot be mapped.
+        RecordingError: It does not exist or cannot be mapped.
     """
     try:
         file = os.open(name, os.O_RDWR | getattr(os, "O_CLOEXEC", 0))
@@ -86,13 +83,13 @@ def attached(name: str) -> mmap.mmap:
 
 
 def _lock(file: int) -> None:
-    """Marks a segment as in use; the mapping keeps the mark until its process ends."""
+    """Marks a segment as in use until the process that maps it ends."""
     if sys.platform != "win32":
         fcntl.flock(file, fcntl.LOCK_SH)
 
 
 def _sweep(folder: Path) -> None:
-    """Removes segments that no living process maps: bridge and recorder were both killed."""
+    """Removes segments that no living process maps."""
     if sys.platform == "win32":
         return
     for path in folder.glob(f"{_PREFIX}*"):

@@ -1,4 +1,4 @@
-"""When the ticks of a run were due, on the clock of its events."""
+"""Due times of a run's ticks."""
 
 from __future__ import annotations
 
@@ -13,18 +13,14 @@ Array = NDArray[np.float64]
 
 
 def due_times(ticks: NDArray[np.void], period: float) -> Array:
-    """Returns when ticks were due, in s of the run's clock, missed deadlines among it.
+    """Returns the due times of ticks in s of the run's clock, with missed deadlines.
 
-    That is the clock of the events' ``time_ns``: without a missed deadline, (tick + 1) T. In a
-    damaged file deadlines may go back; then all are taken for as if none had been missed, so that
-    whatever is drawn over time can be drawn.
-
-    Args:
-        ticks: Records in their order, ``TICK_DTYPE``, (n,).
-        period: T in s.
+    This is the clock of the events' ``time_ns``; without a missed deadline it is (tick + 1) T. If
+    the deadlines of a damaged file run backwards, all are computed as if none had been missed, so
+    that plots over time remain possible. ``period`` is T in s.
 
     Returns:
-        Shape (n,), increasing where the ticks' numbers are.
+        Shape (n,), increasing if the ticks' numbers are.
     """
     due = ticks["deadline_ns"]
     if due.size and (due[0] <= 0 or (np.diff(due) <= 0).any()):
@@ -33,14 +29,10 @@ def due_times(ticks: NDArray[np.void], period: float) -> Array:
 
 
 class Timeline:
-    """The due times of a run's ticks, however many: it keeps only where deadlines were missed.
-
-    Args:
-        blocks: The run's records, block by block, ``TICK_DTYPE``.
-        period: T in s.
+    """Due times of any number of ticks; only missed deadlines are stored.
 
     Attributes:
-        duration: When the last tick was due, in s; 0 where there is none.
+        duration: Due time of the last tick in s; 0 without ticks.
     """
 
     def __init__(self, blocks: Iterable[NDArray[np.void]], period: float) -> None:
@@ -51,7 +43,7 @@ class Timeline:
                 continue
             part = np.concatenate([before, block])
             due, first = due_times(part, period), count - len(before)
-            # both sides of every step that is not a period, and the ends; the rest is straight
+            # keep both sides of every step that is not one period, and the ends
             gaps = np.flatnonzero(np.abs(np.diff(due) - period) > 0.5 * period)
             kept = sorted({0, *gaps.tolist(), *(gaps + 1).tolist(), len(part) - 1})
             rows += [first + row for row in kept]
@@ -62,9 +54,5 @@ class Timeline:
         self.duration = times[-1] if times else 0.0
 
     def row_at(self, time: float) -> int:
-        """Returns the row of the tick that was due nearest to a time in s; of the first before it.
-
-        Args:
-            time: From 0 to ``duration``.
-        """
+        """Returns the row of the tick due nearest to a time in s, from 0 to ``duration``."""
         return round(float(np.interp(time, self._times, self._rows)))

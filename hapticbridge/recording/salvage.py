@@ -1,8 +1,4 @@
-"""Makes a recording whole whose recorder died while the bridge lived on.
-
-The ring keeps the last seconds of records, read or not: what the recorder had taken and not yet
-written is still there.
-"""
+"""Completion of a recording whose recorder died."""
 
 from __future__ import annotations
 
@@ -20,15 +16,14 @@ from hapticbridge.recording.writer import RecordingWriter
 
 
 def salvage(path: Path, rows: NDArray[np.void], events: Sequence[Mapping[str, object]]) -> str:
-    """Writes a cut recording again, with the records and events that it lacks.
+    """Rewrites a cut recording with the records and events that it lacks.
 
-    Args:
-        path: The recording; replaced at once where all goes well, else left as it is.
-        rows: The newest records, oldest first, ``TICK_DTYPE``.
-        events: The newest events, oldest first, with ``time_ns``.
+    The ring keeps the last seconds of records, read or not, so records that the recorder had taken
+    but not written are still available. ``rows`` and ``events`` are the newest ones, oldest first.
+    The file is replaced on success, otherwise unchanged.
 
     Returns:
-        What became of it, as a clause.
+        The outcome, as a clause.
     """
     beside = path.with_name(path.name + ".salvaged")
     try:
@@ -37,7 +32,7 @@ def salvage(path: Path, rows: NDArray[np.void], events: Sequence[Mapping[str, ob
         last = int(ticks["tick"][-1]) if ticks.size else -1
         rest = rows[rows["tick"] > last]
         if rest.size and int(rest["tick"][0]) != last + 1:
-            return "the records behind that are lost"
+            return "the records after it are lost"
         epoch = recording.meta.get(layout.EPOCH_KEY, "0")
         writer = RecordingWriter(beside, recording.meta, attachments, int(epoch))
         writer.write_ticks(ticks)
@@ -52,9 +47,9 @@ def salvage(path: Path, rows: NDArray[np.void], events: Sequence[Mapping[str, ob
     except (RecordingError, OSError, ValueError):
         with contextlib.suppress(OSError):
             beside.unlink(missing_ok=True)
-        return "the records behind that could not be written"
+        return "the records after it could not be written"
     total = ticks.size + rest.size
-    return f"the bridge has done so: all {total} records are there"
+    return f"the bridge has repaired it: all {total} records are there"
 
 
 def _key(event: Mapping[str, object]) -> tuple[object, ...]:

@@ -1,4 +1,4 @@
-"""The bridge's end of a recording: records leave through a ring, events through a pipe."""
+"""Bridge's end of a recording."""
 
 from __future__ import annotations
 
@@ -20,47 +20,47 @@ from hapticbridge.recording.salvage import salvage
 from hapticbridge.tick import TickFlag
 
 RING_SECONDS, MOST_RECORDS = 8.0, 1 << 16
-"""How far the recorder may fall behind before a record is lost, in s and in records of 400 bytes;
-a trip hands the last second of them to whoever catches it."""
+"""Capacity of the ring in s, and at most in records of 400 bytes: the lag of the recorder before a
+record is lost. A trip's exception carries its last second."""
 
 NOBODY_READS = 1 << 62
-"""Tail of a ring without a recorder: it is never full and keeps the newest records."""
+"""Tail cursor of a ring without a recorder; the ring is never full and keeps the newest records."""
 
 RING_POLL = 1e-3
-"""How often a run in simulated time looks whether the recorder made room, in s."""
+"""Time in s between checks for space in the ring, in simulated time."""
 
 KEPT_EVENTS = 4096
-"""Events that can be written again should the recorder die; more cost memory alone."""
+"""Number of events kept to be written again if the recorder dies; more would only cost memory."""
 
-_ENDED = "the recorder ended in mid-run; the recording stops there"
-_FULL = "the disk is full; the recording ends here, and is whole"
+_ENDED = "the recorder ended during the run; the recording stops there"
+_FULL = "the disk is full; the recording ends here and is whole"
 
 
 class RecordStream:
-    """Where the loop leaves its records and events; it never waits in real time.
+    """Records leave through a ring, events through a pipe; the loop never waits in real time.
 
-    ``rows`` and ``cursors`` are what ``kernel.publish.publish`` writes to. Where a file or a status
-    line is asked for, the recorder's process reads them; else the ring keeps the newest records.
-    To be closed after the loop, whatever happened.
+    ``kernel.publish.publish`` writes to ``rows`` and ``cursors``. With a file or a status line the
+    recorder's process reads them; otherwise the ring keeps the newest records. Close it after the
+    loop in any case.
 
     Args:
         path: The recording, overwritten if it exists; None records nothing.
-        period: T in s; with it, how many records the ring must hold.
-        live: Whether the recorder's process shows the state of the run on standard error.
-        is_lossless: Whether the loop may wait for the recorder (simulated time) instead of losing
+        period: T in s, which determines the ring's capacity.
+        live: True shows the state of the run on standard error.
+        is_lossless: True if the loop may wait for the recorder (simulated time) instead of losing
             records.
-        onlooker: Who looks at the newest records beside the recorder, unasked and unwaited for.
-        snapshot: Name of the shared memory with the scene's positions, for the onlooker.
+        onlooker: Optional second reader of the ring, such as the live view. The loop never waits
+            for it.
 
     Attributes:
         rows: The ring's records, ``TICK_DTYPE``.
         cursors: The ring's cursors, ``kernel.publish.HEAD`` and ``TAIL``.
-        recorder: The recorder's process, once started; None where nobody reads.
+        recorder: The recorder's process once started; None without one.
         lost: Flag of the next record: ``DROPPED_BEFORE`` if the one before it was lost, else 0.
-        dropped: How many records were lost.
+        dropped: Number of lost records.
 
     Raises:
-        RecordingError: There is no room for the ring.
+        RecordingError: There is no memory for the ring.
     """
 
     def __init__(
@@ -88,7 +88,7 @@ class RecordStream:
 
     @property
     def is_read(self) -> bool:
-        """Whether anybody reads the records, so that ``start`` is to be called."""
+        """True if there is a reader, so that ``start`` must be called."""
         return self._is_read or self._onlooker is not None
 
     def start(self, metadata: Mapping[str, str], attachments: Sequence[Attachment]) -> None:
@@ -107,18 +107,18 @@ class RecordStream:
         self.tell({"event": "recording", "path": None if self._path is None else str(self._path)})
 
     def tell(self, news: Mapping[str, object]) -> None:
-        """Tells the onlooker alone, if there is one; never waits and never raises."""
+        """Sends news to the onlooker only; never blocks and never raises."""
         if self._onlooker is not None:
             self._onlooker.event(news)
 
     def makes_room(self, *, may_wait: bool) -> bool:
-        """Answers a ring that refused a record: try it again, or it is lost.
+        """Handles a record refused by a full ring.
 
-        Args:
-            may_wait: Whether the run still goes on; a run that was told to stop waits for nobody.
+        A run that was told to stop must not wait (``may_wait``).
 
         Returns:
-            True after a wait, in simulated time. False where the record is counted as lost.
+            True after a wait in simulated time, to try again. False if the record is counted as
+            lost.
 
         Raises:
             RecordingError: The recorder's process ended.
@@ -133,13 +133,9 @@ class RecordStream:
         return False
 
     def event(self, event: str, tick: int, time_ns: int, **details: object) -> None:
-        """Notes what happened, if anybody reads; never waits and never raises.
+        """Sends an event to all readers; never blocks and never raises.
 
-        Args:
-            event: Its name.
-            tick: The tick before which it happened.
-            time_ns: When, in ns since the start of the run.
-            **details: What else is to be known of it.
+        It happened before ``tick``; ``time_ns`` counts from the start of the run.
         """
         told = {"event": event, "tick": tick, **details}
         if self.recorder is not None:
@@ -149,10 +145,10 @@ class RecordStream:
             self._onlooker.event(told)
 
     def look(self) -> None:
-        """Looks whether the recorder still lives and has room; takes some microseconds.
+        """Checks that the recorder lives and its disk has space; takes some microseconds.
 
         Raises:
-            RecordingError: It does not, or its disk is full.
+            RecordingError: The recorder ended, or its disk is full.
         """
         if self.recorder is not None and self.recorder.is_disk_full:
             raise RecordingError(_FULL)
@@ -164,7 +160,7 @@ class RecordStream:
         return self._ring.latest(count)
 
     def close(self) -> None:
-        """Lets the recorder finish the file and removes the shared memory.
+        """Waits until the recorder has finished the file, and removes the shared memory.
 
         Raises:
             RecordingError: The recorder's process died, or could not write the file.

@@ -1,4 +1,4 @@
-"""Writes a recording (format: ``hapticbridge.recording.format``)."""
+"""Writer of recordings (format: ``hapticbridge.recording.format``)."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ from hapticbridge.recording.output import Output
 
 
 class RecordingWriter:
-    """Writes one recording; used by the recorder's process and by ``repair``.
+    """Writer of one recording, for the recorder's process and for ``repair``.
 
     Metadata and attachments are in the file when the constructor returns. Each finished chunk
-    reaches the operating system at once, so a kill loses the last unfinished chunk at most.
+    reaches the operating system at once, so a kill loses at most the last unfinished chunk.
 
     Args:
         path: The file; it is overwritten unless ``exclusive``.
         metadata: Names and values; ``epoch_ns`` is added.
         attachments: Files to carry, with different names.
-        epoch_ns: Unix time of the run's start, in ns.
-        exclusive: Refuse a file that exists.
+        epoch_ns: Unix time of the run's start in ns.
+        exclusive: True refuses an existing file.
 
     Raises:
-        RecordingError: The file cannot be written, or metadata or attachments are not writable.
+        RecordingError: The file cannot be written, or metadata or attachments are not valid.
     """
 
     def __init__(
@@ -95,14 +95,11 @@ class RecordingWriter:
 
     @property
     def is_full(self) -> bool:
-        """Whether the disk is: what is still written goes into room that was claimed before."""
+        """True if the disk is full; the rest goes into the reserve."""
         return self._output.is_full
 
     def write_ticks(self, rows: NDArray[np.void]) -> None:
-        """Appends records.
-
-        Args:
-            rows: Shape (n,), ``TICK_DTYPE``.
+        """Appends records, shape (n,), ``TICK_DTYPE``.
 
         Raises:
             RecordingError: The file cannot be written; it ends with its last whole chunk.
@@ -111,7 +108,7 @@ class RecordingWriter:
         payloads["cdr"] = np.void(layout.CDR_HEADER)
         payloads["record"] = rows
         packed, size = payloads.tobytes(), layout.PAYLOAD_DTYPE.itemsize
-        # a deadline before 1970 or beyond 2554 does not exist, but must not stop the recorder
+        # an impossible deadline (before 1970, after 2554) must not stop the recorder
         times = (rows["deadline_ns"].astype(np.uint64) + np.uint64(self._epoch % 2**64)).tolist()
         self._digest.add_ticks(rows)
         try:
@@ -130,9 +127,7 @@ class RecordingWriter:
     def write_event(self, event: Mapping[str, object], time_ns: int) -> None:
         """Appends an event.
 
-        Args:
-            event: What happened: ``event`` names it, the rest is its data.
-            time_ns: When, in ns since the start of the run.
+        ``event["event"]`` is its name; ``time_ns`` counts from the start of the run.
 
         Raises:
             RecordingError: The file cannot be written; it ends with its last whole chunk.
@@ -146,7 +141,7 @@ class RecordingWriter:
             raise self._failed(error) from error
 
     def close(self) -> None:
-        """Finishes the file: last chunk, digest, index; on disk when it returns.
+        """Finishes the file with last chunk, digest and index, and syncs it to the disk.
 
         Raises:
             RecordingError: The file cannot be written; it ends with its last whole chunk.
@@ -166,7 +161,7 @@ class RecordingWriter:
             self._release()
 
     def _failed(self, error: OSError) -> RecordingError:
-        # nothing may follow a half-written chunk: the file is then one that was cut there
+        # nothing may follow a half-written chunk; the file then counts as cut there
         self._is_closed = True
         self._release()
         return self._refusal(error)
@@ -183,7 +178,7 @@ class RecordingWriter:
 
 
 def check_contents(metadata: Mapping[str, str], attachments: Sequence[Attachment]) -> None:
-    """Checks what a recording is to carry.
+    """Checks metadata and attachments of a recording.
 
     Raises:
         RecordingError: A name or value is not Unicode text, or two attachments have one name.

@@ -91,11 +91,7 @@ class Method:
         """Returns the law's coupling for a requested one: B' = max(B − lag K h, 0).
 
         The integration adds lag K h again; rotation follows the same rule. The device needs b >= K
-        T/2 + B', so the subtracted damping allows more stiffness.
-
-        Args:
-            coupling: The requested coupling.
-            timestep: MuJoCo's time step h in s.
+        T/2 + B', so the subtracted damping allows more stiffness. ``timestep`` is MuJoCo's h in s.
 
         Raises:
             CouplingError: The time step is not finite and > 0.

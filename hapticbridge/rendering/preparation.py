@@ -58,11 +58,6 @@ def contact_stiffness_of(
 def check_scene(model: mujoco.MjModel, grip: str, method: Method) -> None:
     """Refuses a scene that a method cannot render or meter.
 
-    Args:
-        model: The compiled scene.
-        grip: Name of the site on the tool.
-        method: The rendering method.
-
     Raises:
         SceneError: The message names the obstacle in the scene.
     """

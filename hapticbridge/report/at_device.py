@@ -24,12 +24,7 @@ unit. One in fifty is jitter between two clocks."""
 
 
 def cause_at_device(evidence: Evidence, window: slice) -> Cause:
-    """Returns the likely cause of unpaid energy at the device.
-
-    Args:
-        evidence: Evidence of the run.
-        window: Ticks that lead to the moment.
-    """
+    """Returns the likely cause of unpaid energy at the device."""
     method = evidence.method
     hazard = Cause("method", f"method '{method.name}': {method.hazard}", SAFE_METHOD)
     if not method.has_law:

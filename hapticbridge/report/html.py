@@ -29,10 +29,7 @@ def check_page_name(path: Path) -> None:
 def write_page(path: Path, template: str, **told: object) -> None:
     """Writes a page; an existing file is replaced.
 
-    Args:
-        path: The file.
-        template: Name of a file in ``hapticbridge/templates``.
-        told: The template's variables.
+    ``template`` is a file in ``hapticbridge/templates``; ``told`` holds its variables.
 
     Raises:
         RecordingError: The page cannot be written, or not under this name.

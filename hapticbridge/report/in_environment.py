@@ -20,13 +20,7 @@ _SOFTER = "lower the stiffness, raise the rate, or make the contacts softer"
 
 
 def cause_in_environment(evidence: Evidence, report: AuditReport, window: slice) -> Cause:
-    """Returns the likely cause of energy created in the environment.
-
-    Args:
-        evidence: Evidence of the run.
-        report: The audit's verdict on it.
-        window: Ticks that lead to the moment.
-    """
+    """Returns the likely cause of energy created in the environment."""
     method = evidence.method
     gained = np.diff(evidence.created, prepend=0.0)[window].clip(min=0.0)
     touches = (evidence.ticks["contacts"] > 0)[window]

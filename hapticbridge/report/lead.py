@@ -15,9 +15,7 @@ PLACES = {
 def lead_sentence(report: AuditReport, worst: float | None) -> str:
     """Returns the main result of a run in one sentence.
 
-    Args:
-        report: The audit's verdict on it.
-        worst: Largest energy beyond the bound, in J; None if unknown.
+    ``worst`` is the largest energy beyond the bound in J; None if unknown.
     """
     if report.verdict == "invalid":
         return f"This recording proves nothing: {report.reason}"

@@ -38,10 +38,6 @@ from hapticbridge.report.timing import activities, draw_timing
 def telling_time(recording: Recording, report: AuditReport) -> float:
     """Returns the time in s of the fault, or else of the largest force.
 
-    Args:
-        recording: The recording.
-        report: The audit's verdict on it.
-
     Raises:
         RecordingError: The recording has no tick or no period.
     """
@@ -59,11 +55,8 @@ def write_report(
 ) -> None:
     """Writes one self-contained HTML page of less than 1 MB, for any length of run.
 
-    Args:
-        recording: The recording.
-        report: The audit's verdict on it.
-        path: The file; an existing one is replaced.
-        scene: PNG picture of the scene at ``telling_time``, or None.
+    ``scene`` is a PNG picture of the scene at ``telling_time``, or None. An existing file is
+    replaced.
 
     Raises:
         RecordingError: The page cannot be written, or not under this name.
@@ -120,12 +113,7 @@ def _drawn(evidence: Evidence, report: AuditReport) -> dict[str, Any]:
 
 
 def moment_of(evidence: Evidence, report: AuditReport) -> dict[str, Any] | None:
-    """Returns time, energy and cause of an active run's fault; None for any other run.
-
-    Args:
-        evidence: Evidence of the run.
-        report: The audit's verdict on it.
-    """
+    """Returns time, energy and cause of an active run's fault; None for any other run."""
     cause = likely_cause(evidence, report)
     if cause is None or report.tick is None:
         return None

@@ -21,11 +21,8 @@ def what_would_do(evidence: Evidence, *, is_late: bool = False) -> str:
     """Returns changes that satisfy the device condition, as a user would type them.
 
     Stiffness and damping are the requested ones, not the law's B'. Each is changed alone; a change
-    that does not help alone is left out.
-
-    Args:
-        evidence: Evidence of the run; the device's damping is known.
-        is_late: True if a delay is the cause, which a faster loop does not shorten.
+    that does not help alone is left out. A faster loop is no remedy for a delay (``is_late``). The
+    device's damping must be known.
     """
     found = []
     for axis, units in _UNITS.items():
@@ -53,11 +50,8 @@ _ROUNDING = 1e-9  # relative; keeps a limit found by bisection from losing a dig
 def _holds(evidence: Evidence, axis: str, part: str, share: float) -> bool:
     """Returns True if the condition on a kind of axis holds after one quantity is reduced.
 
-    Args:
-        evidence: Evidence of the run.
-        axis: A key of ``_UNITS``.
-        part: Quantity changed alone: ``stiffness``, ``damping`` or ``period``.
-        share: Share of the quantity that remains.
+    ``axis`` is a key of ``_UNITS``. ``part`` (``stiffness``, ``damping`` or ``period``) is reduced
+    to ``share`` of its value.
     """
     worst, felt, method = evidence.worst, evidence.asked, evidence.method
     period = worst.period * (share if part == "period" else 1.0)

@@ -23,12 +23,7 @@ def touched_pairs(
     """Returns the geoms that touched, those with most energy first; None if unknown.
 
     A record counts contacts without naming them, so the run is simulated again up to the window.
-
-    Args:
-        evidence: Evidence of the run.
-        report: The audit's verdict on it, with the result of the re-simulation.
-        window: Ticks to inspect.
-        gained: Energy created in the environment in each of them, (n,) in J.
+    ``gained`` is the energy created in each tick of the window, (n,) in J.
     """
     if not report.resimulation or report.resimulation.startswith(("not", "disagrees")):
         return None

@@ -20,10 +20,6 @@ class RecordedClock:
     """Clock that replays the times of a recording.
 
     Its device reports reading and writing.
-
-    Args:
-        ticks: Recorded rows, ``TICK_DTYPE``.
-        period: Recorded period in s.
     """
 
     name = SimulatedClock.name
@@ -64,9 +60,7 @@ class RecordedClock:
 class Outside:
     """Recorded buttons and stale samples, resampled to another rate.
 
-    Args:
-        ticks: Recorded rows, ``TICK_DTYPE``.
-        period: Recorded period in s.
+    ``period`` is the recorded period in s.
     """
 
     def __init__(self, ticks: NDArray[np.void], period: float) -> None:
@@ -103,14 +97,8 @@ class RecordedMotion(ReplayDevice):
     The motion is prescribed at any force, which is exact but no hand: it presses as deep into a
     stiffer wall as into the recorded one. The data sheet is the recorded device's, so that guard
     and controller act as with it. With recorded times and unchanged settings, the run equals the
-    recorded one in every bit.
-
-    Args:
-        ticks: Recorded rows, ``TICK_DTYPE``, at least two.
-        clock: Clock of the run.
-        period: Recorded period in s.
-        start: Device pose (7,) before the first tick.
-        info: Data sheet of the recorded device.
+    recorded one in every bit. At least two rows are needed; ``start`` is the device pose (7,)
+    before them.
 
     Raises:
         DeviceError: See ``ReplayDevice``.
@@ -147,13 +135,8 @@ class RecordedMotion(ReplayDevice):
 class ResampledMotion(TrajectoryDevice):
     """Device that replays the recorded motion at another rate.
 
-    Positions are interpolated linearly, orientations by slerp.
-
-    Args:
-        ticks: Recorded rows, ``TICK_DTYPE``, at least two.
-        period: Recorded period in s.
-        start: Device pose (7,) before the first tick.
-        info: Data sheet of the recorded device.
+    Positions are interpolated linearly, orientations by slerp. At least two rows are needed;
+    ``start`` is the device pose (7,) before them, ``period`` the recorded period in s.
     """
 
     def __init__(

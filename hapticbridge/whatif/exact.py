@@ -16,11 +16,6 @@ def that_gives(wanted: float, function: Callable[[float], float], guess: float) 
     A recording holds T and B', not the requested rate and B. Recomputed from 1/T and B' + K T/2, T
     and B' may differ in the last digit, and the repetition would no longer be exact.
 
-    Args:
-        wanted: Value to be reproduced.
-        function: Function from the input to the value.
-        guess: Approximate input.
-
     Returns:
         The input, or the guess if no neighbour gives the value.
     """

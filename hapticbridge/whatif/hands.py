@@ -34,14 +34,11 @@ def missing_for_closed_loop(info: DeviceInfo) -> str:
 
 
 class IdentifiedDevice(SimulatedDevice):
-    """The recorded device as its data sheet knows it, in a model hand that wants what it wanted.
+    """The recorded device by its data sheet, in a model hand with the recorded hand's intent.
 
-    Args:
-        info: The recorded device, with mass and damping (``missing_for_closed_loop``).
-        hand: Who holds it.
-        ticks: The recorded rows, ``TICK_DTYPE``, at least three.
-        period: The recorded loop's in s.
-        start: Device pose (7,) before the first tick, where it is held still until then.
+    Unlike a prescribed motion (``again``), the hand yields to the force. It needs mass and damping
+    (``missing_for_closed_loop``) and at least three rows. The device is held at the pose ``start``
+    (7,) until the first tick.
     """
 
     def __init__(

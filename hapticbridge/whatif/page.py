@@ -20,10 +20,7 @@ from hapticbridge.whatif.side_by_side import changes, rows, sentences
 def write_what_if(found: WhatIf, path: Path, scene: bytes | None = None) -> None:
     """Writes one self-contained HTML page of less than 1 MB, for any length of run.
 
-    Args:
-        found: Result of the what-if.
-        path: The file; an existing one is replaced.
-        scene: PNG picture of the recorded scene, or None.
+    ``scene`` is a PNG picture of the recorded scene, or None. An existing file is replaced.
 
     Raises:
         RecordingError: The page cannot be written, or not under this name.

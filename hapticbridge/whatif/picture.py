@@ -22,10 +22,6 @@ _STYLES = (("#555555", "-", 2.2), ("#1a5fb4", "-", 1.1), ("#b3261e", "--", 1.1))
 def figure_of(found: WhatIf, bins: int = BINS) -> Figure:
     """Draws force on the device, handle displacement, and the energies of both ports over time.
 
-    Args:
-        found: Result of the what-if.
-        bins: Number of bins per curve, see ``decimated``.
-
     Raises:
         RecordingError: A run holds a number that cannot be drawn.
     """

@@ -53,9 +53,7 @@ class RecordedRun:
     def of(cls, recording: Recording, folder: Path) -> RecordedRun:
         """Takes a recording apart.
 
-        Args:
-            recording: The recording.
-            folder: Folder for the scene's files.
+        The scene's files are unpacked to ``folder``.
 
         Raises:
             RecordingError: The recording does not describe its run, or carries no scene.

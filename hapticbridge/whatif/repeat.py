@@ -33,10 +33,6 @@ Event = Mapping[str, Any]
 class Repetition:
     """One repetition of a run with given settings.
 
-    Args:
-        run: The recorded run.
-        settings: Settings of the bridge.
-
     Attributes:
         settings: Settings of the bridge.
         warned: Warnings about the scene, one sentence each.
@@ -48,10 +44,10 @@ class Repetition:
         self.warned: tuple[str, ...] = ()
 
     def into(self, path: Path, device: Device, clock: Clock) -> tuple[float, str]:
-        """Runs into a file; returns the period in s, and why the guard stopped it or nothing.
+        """Runs into a file; returns the period in s, and the reason of the guard's stop or empty.
 
         Raises:
-            HapticBridgeError: The changed bridge is refused; the message says why.
+            HapticBridgeError: The changed bridge is refused; the message names the reason.
         """
         run, settings = self._run, self.settings
         bridge = Bridge(

@@ -12,9 +12,7 @@ from hapticbridge.recording import Recording
 def unpack_scene(recording: Recording, folder: Path) -> Path:
     """Writes a recording's scene files to a folder; returns the main file.
 
-    Args:
-        recording: The recording.
-        folder: Target folder, created if missing. Nothing is written outside it.
+    The folder is created if missing; nothing is written outside it.
 
     Raises:
         RecordingError: The recording carries no scene, or files that cannot be written there.
