@@ -1,12 +1,12 @@
-"""The verdict on a recording, from the recording alone. Never imports the bridge.
+"""Verdict on a recording, from the recording alone; never imports the bridge.
 
-``ask`` is what is called; read ``verdict`` first. It asks three things: is the file whole
-(``structure``), do its numbers agree with their second computation in plain NumPy (``balance``,
-held against them in ``physics`` and judged in ``judgement``), and does the scene do the same again
-(``replay``, ``rerun``, ``attached_scene``). The second computation goes block by block
-(``reached``): ``law`` is the coupling's, ``watched``, ``controlled``, ``limited`` and ``guarded``
-are the guard's, ``device_port`` what the device was given. ``interventions`` and ``ending`` read
-the events; ``report`` is what comes out.
+``ask`` is the entry point; read ``verdict`` first. It makes three checks: the file is whole
+(``structure``); its numbers agree with a second computation in plain NumPy (``balance``, compared
+in ``physics``, judged in ``judgement``); the scene repeats them (``replay``, ``rerun``,
+``attached_scene``). The second computation goes block by block (``reached``). ``law`` is the
+coupling's; ``watched``, ``controlled``, ``limited`` and ``guarded`` are the guard's;
+``device_port`` is the device's energy balance. ``interventions`` and ``ending`` read the events;
+``report`` is the result.
 """
 
 from typing import TYPE_CHECKING

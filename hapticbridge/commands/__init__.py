@@ -1,8 +1,8 @@
-"""What may be asked of a run while it goes on, and how it is done so that it can be repeated.
+"""Commands to a running bridge.
 
-Read ``command`` first, then its way: ``queue`` checks it, ``allowance`` and ``span`` against what
-the device bears, ``operator`` does it between two ticks, and ``change`` is what it was, as an event
-that the audit repeats.
+Read ``command`` first. ``queue`` checks and stores commands, ``allowance`` and ``span`` hold the
+device's limits, ``operator`` executes them between two ticks, and ``change`` defines the resulting
+events, which the audit repeats.
 """
 
 from hapticbridge.commands.allowed import CouplingLimits as CouplingLimits

@@ -1,11 +1,11 @@
-"""Recordings: the file, the process that writes it, and the ring before it.
+"""Recordings: the file, the recorder process, and the shared ring.
 
-Read ``format`` first: it says what a recording is. Records leave the loop through ``ring``
-(``ring_memory``), events through a pipe; ``stream`` is the loop's end of both, ``recorder`` and
-``recorder_process`` are the other. An ``onlooker`` may look on, and ``snapshot`` has the scene's
-positions for it. ``writer`` writes a file on top of ``output`` and ``chunk_index``; ``reader``
-reads one, whole or damaged, through ``file_bytes``, ``container``, ``fields`` and ``contents``;
-``recovery`` and ``salvage`` mend what was cut; ``run_time`` says when ticks were due.
+Read ``format`` first. Records leave the loop through ``ring`` (``ring_memory``), events through a
+pipe. ``stream`` is the loop's end of both; ``recorder`` and ``recorder_process`` are the other end,
+and an ``onlooker`` is an optional second reader. ``writer`` writes a file on top of ``output`` and
+``chunk_index``. ``reader`` reads one, whole or damaged, through ``file_bytes``, ``container``,
+``fields`` and ``contents``. ``recovery`` and ``salvage`` repair cut files; ``run_time`` computes
+due times.
 """
 
 from hapticbridge.recording.format import Attachment as Attachment

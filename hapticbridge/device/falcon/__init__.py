@@ -1,6 +1,6 @@
-"""The Novint Falcon, over USB.
+"""Novint Falcon, over USB.
 
-``driver`` is the device, ``finding`` how it is opened. ``packets`` are its 16 bytes each way,
-``motion`` what a tick does with them, by ``kinematics`` and ``statics``; ``boot``, ``start`` and
-``timing`` come before the loop.
+``driver`` is the device and ``finding`` opens it. ``packets`` encodes and decodes its 16 bytes in
+each direction. ``motion`` processes them in a tick, with ``kinematics`` and ``statics``. ``boot``,
+``start`` and ``timing`` run before the loop.
 """

@@ -1,5 +1,5 @@
-"""Haply's Inverse3 and its kin, through the maker's service.
+"""Haply's Inverse3 and related devices, through the maker's service.
 
-``driver`` is the device, ``messages`` what is said to the service; ``finding`` and ``timing`` come
-before the loop.
+``driver`` is the device and ``messages`` the protocol of the service. ``finding`` and ``timing``
+run before the loop.
 """

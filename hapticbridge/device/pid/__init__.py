@@ -1,5 +1,5 @@
-"""USB force-feedback sticks of the class PID.
+"""USB force-feedback sticks (class PID).
 
-``driver`` is the device; ``reports`` finds its reports in its own descriptor, ``effects`` pushes
-it, ``stick`` reads it, ``sheet`` says what is known, stated and assumed of it.
+``driver`` is the device. ``reports`` finds its reports in its descriptor, ``effects`` applies
+forces, ``stick`` reads it, and ``sheet`` makes its scale and data sheet.
 """

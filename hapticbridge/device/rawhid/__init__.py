@@ -1,5 +1,5 @@
-"""Home-made devices that speak the open protocol of ``device/rawhid.md``.
+"""Home-made devices with the open protocol of ``device/rawhid.md``.
 
-``driver`` is the device; ``frame`` is the protocol in bytes, ``stream`` what comes of it, ``sheet``
-what the device says of itself, ``finding`` how it is opened.
+``driver`` is the device and ``frame`` the protocol in bytes. ``stream`` decodes its states,
+``sheet`` reads its data sheet, and ``finding`` opens it.
 """

@@ -1,6 +1,7 @@
-"""What carries bytes to devices, and what finds them: HID, USB, WebSocket.
+"""Transports to devices, and their discovery: HID, USB, WebSocket.
 
-``hid``, ``usb`` and ``websocket`` carry; ``hid_search`` and ``usb_search`` (``usb_bus``) find.
-``hid_requests``, ``hid_descriptor`` and ``hid_layout`` are a HID device's account of itself,
-``hex_log`` keeps what went over the wire, ``usb_context`` ends libusb in the right order.
+``hid``, ``usb`` and ``websocket`` carry data; ``hid_search`` and ``usb_search`` (with ``usb_bus``)
+find devices. ``hid_requests``, ``hid_descriptor`` and ``hid_layout`` read a HID device's own
+description. ``hex_log`` records the transferred bytes. ``usb_context`` ends libusb in the right
+order.
 """
