@@ -16,17 +16,18 @@ from hapticbridge.kernel.parameters import SLACK_SHARE, RunParameters, checked_s
 from hapticbridge.rendering import Method, default_method
 from hapticbridge.theory.bounds import minimum_damping, stiffest_coupling
 
-# What a device's own rate and the age of its samples ask of its damping, beyond the loop's.
+# Additional device damping required by the device's own update rate and delay.
 
-_WHOLE = 1e-9  # of a tick: a delay that is this little above whole ticks is as many
+_WHOLE = 1e-9
+"""Excess over a whole number of ticks that counts as rounding, in ticks."""
 
 
 def felt_period(info: DeviceInfo, period: float) -> float:
-    """Returns for how long in s a device feels one wrench: a loop's period, or its own if longer.
+    """Returns the time in s for which a wrench acts: the loop's period, or the device's if longer.
 
     Args:
-        info: The device; one whose motion is prescribed feels nothing.
-        period: The loop's, in s.
+        info: The device; for a prescribed motion the loop's period is returned.
+        period: The loop's period in s.
     """
     if info.rate is None or info.is_prescribed:
         return period
@@ -35,11 +36,11 @@ def felt_period(info: DeviceInfo, period: float) -> float:
 
 
 def delay_ticks(info: DeviceInfo, period: float) -> int | None:
-    """Returns after how many whole ticks a wrench answers a sample; None where that is unknown.
+    """Returns the whole ticks from a sample to the resulting wrench; None if unknown.
 
     Args:
         info: The device.
-        period: The loop's, in s.
+        period: The loop's period in s.
     """
     if info.delay is None:
         return None
@@ -52,19 +53,20 @@ def damping_for_delay(
     period: float,
     axis: Literal["translation", "rotation"] = "translation",
 ) -> float:
-    """Returns how much more damping b the delay asks for, in N s/m or N m s/rad.
+    """Returns the additional damping required by the delay, in N s/m or N m s/rad.
 
         Δb = max(0, sup_θ [(K T/2) sin((2d + 1)θ/2)/sin(θ/2) − B cos((d + 1)θ)] − (K T/2 + B))
 
-    d the delay in ticks, T the period that is felt; for B = 0 it is K d T. With it the device bears
-    a wall behind the coupling, which is necessary. For any scene no finite damping is enough, so
-    nobody can certify a device with a delay. An unknown delay adds nothing, and certifies nothing.
+    d is the delay in ticks, T the result of ``felt_period``; for B = 0, Δb = K d T. With it the
+    device is passive against a wall, which is necessary. For a general scene no finite damping
+    suffices, so a device with a delay cannot be certified. An unknown delay adds nothing and cannot
+    be certified either.
 
     Args:
         info: The device.
         coupling: K and B of the law.
-        period: The loop's, in s.
-        axis: Which gains to take.
+        period: The loop's period in s.
+        axis: Kind of axis, which selects the pair of K and B.
 
     Raises:
         CouplingError: The delay is longer than 50 ticks.

@@ -150,10 +150,6 @@ def compare(first: str | Path, second: str | Path) -> Comparison:
     Clock times and the flags ``OVERRUN`` and ``DROPPED_BEFORE`` are ignored, because they differ
     between any two real runs.
 
-    Args:
-        first: A recording.
-        second: Another recording.
-
     Raises:
         RecordingError: One of them cannot be read, has no period, or has ticks out of order.
     """

@@ -24,12 +24,7 @@ from hapticbridge.run_description import meta_float
 
 
 class Sink(Protocol):
-    """A table being written.
-
-    Args:
-        path: The file to write.
-        recording: Source of metadata and events.
-    """
+    """A table being written."""
 
     def __init__(self, path: Path, recording: RecordingFile) -> None: ...
 
@@ -196,11 +191,11 @@ FORMATS: dict[str, tuple[type[Sink], tuple[str, ...]]] = {
 
 
 EVERYTHING = (-math.inf, math.inf)
-"""Span in s of the run's clock that leaves nothing out."""
+"""Unlimited span in s of the run's clock."""
 
 _ROUNDING = 0.5e-9
-"""Half a nanosecond, in s. Recorded times are whole nanoseconds, so that a tick due at 0.3 s counts
-as due then, however 0.3 is rounded."""
+"""Half a nanosecond, in s. Recorded times are whole nanoseconds, so a tick due at 0.3 s counts as
+due then with any rounding of 0.3."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -257,8 +252,8 @@ def export(
         form: One of ``FORMATS``.
         target: File with an extension of the format; None takes the recording's name with the
             usual one.
-        span: First time and end in s of the run's clock, the end excluded. Only ticks due and
-            events in between are written; metadata ``cut`` then holds the two times.
+        span: Start and end in s of the run's clock, the end excluded. Only ticks due and events
+            in it are written; metadata ``cut`` then holds the two times.
         overwrite: True replaces existing files.
 
     Raises:
@@ -313,9 +308,9 @@ def time_of(event: Mapping[str, Any]) -> float:
 
 
 def _piece(recording: RecordingFile, span: tuple[float, float]) -> RecordingFile:
-    """Returns the description of a recording with the events of a span alone."""
+    """Returns the description of a recording with only the events of a span."""
     start, end = span
-    if not start < end:  # nor where one is not a number
+    if not start < end:  # also refuses NaN
         raise RecordingError(
             f"the piece from {start:g} s to {end:g} s is empty; its end must be later"
         )

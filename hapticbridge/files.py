@@ -19,12 +19,8 @@ def import_extra(
 ) -> Any:
     """Imports a module of an optional package.
 
-    Args:
-        module: Dotted name of the module.
-        purpose: Feature that needs it, for the message.
-        extra: The project's extra that installs it.
-        error: Exception to raise.
-        package: Name of the package for the user; the module's first part by default.
+    ``extra`` is the project's extra that installs it. ``purpose`` and ``package`` name the feature
+    and the package in the message; ``package`` defaults to the module's first part.
 
     Raises:
         HapticBridgeError: ``error``, with the command that installs the package.
@@ -45,8 +41,7 @@ def import_extra(
 def finite_or_null(value: Any) -> Any:
     """Replaces every number that is not finite by None.
 
-    Args:
-        value: Numbers, text, and nested mappings, lists and tuples of them; tuples become lists.
+    Mappings, lists and tuples may be nested; tuples become lists.
     """
     if isinstance(value, Mapping):
         return {key: finite_or_null(inner) for key, inner in value.items()}
@@ -60,11 +55,8 @@ def atomic_write(path: Path) -> Iterator[Path]:
     """Yields a temporary path; after the block the file replaces the target.
 
     If writing fails or is interrupted, an existing file is left unchanged and no partial file
-    remains.
-
-    Args:
-        path: The target; a link is followed. An existing path that is not a regular file, such as a
-            pipe or /dev/stdout, is written directly.
+    remains. A link is followed. An existing path that is not a regular file, such as a pipe or
+    /dev/stdout, is written directly.
 
     Raises:
         OSError: The file cannot replace the target.

@@ -202,12 +202,8 @@ def wait_until_still(
 def refuse_simulated_time(device: DeviceInfo | str, clock: Clock) -> None:
     """Refuses a simulated clock for a device bound to real time.
 
-    Such a device has motors, or follows a live hand without end and with a delay.
-
-    Args:
-        device: Data sheet, or device string before the device is opened and homed; all hardware is
-            bound to real time.
-        clock: Clock of the run.
+    Such a device has motors, or follows a live hand without end and with a delay. A device string
+    is checked before the device is opened and homed; all hardware is bound to real time.
 
     Raises:
         DeviceError: The device is bound to real time and the clock is simulated.
@@ -230,11 +226,6 @@ def refuse_stretched_start(
     state: NDArray[np.void], sample: NDArray[np.void], limits: Limits
 ) -> None:
     """Refuses a start at which the coupling would already exceed the force limit.
-
-    Args:
-        state: Kernel state (``STATE_DTYPE``, one element) before the first tick.
-        sample: Device sample, shape (1,), ``SAMPLE_DTYPE``.
-        limits: Limits of the run.
 
     Raises:
         DeviceError: The message names the handle's distance from the grip, and the grip's position.
@@ -280,9 +271,7 @@ _DIVERGED = (
 def trip_reason(code: int, tick: int) -> str:
     """Describes why the kernel refused a tick.
 
-    Args:
-        code: Result of ``before_step`` or ``after_step``, not ``OK``.
-        tick: Number of the tick.
+    ``code`` is a result of ``before_step`` or ``after_step``, not ``OK``.
     """
     return f"tick {tick}: {_REASONS.get(code, _DIVERGED)}"
 
@@ -290,10 +279,8 @@ def trip_reason(code: int, tick: int) -> str:
 def with_remedy(reason: str) -> str:
     """Appends the remedy to a reason, for the message to the user.
 
-    Exception and recording keep the bare reason, because it is compared when the run is repeated.
-
-    Args:
-        reason: Result of ``trip_reason``; any other text is returned unchanged.
+    Exception and recording keep the bare reason, because it is compared when the run is repeated. A
+    reason that is not from ``trip_reason`` is returned unchanged.
     """
     for code, remedy in _REMEDIES.items():
         if reason.endswith(_REASONS[code]):
@@ -344,9 +331,7 @@ tick of 1 kHz is 3000."""
 def button_mask(button: int | None, what: str) -> int:
     """Returns the bit of a button; 0 for None.
 
-    Args:
-        button: Number of the button, from 0.
-        what: Purpose of the button, for the message.
+    ``what`` names the button's purpose for the message.
 
     Raises:
         DeviceError: The number is out of range.

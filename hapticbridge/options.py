@@ -120,18 +120,18 @@ def run_parameters(
     """Returns the parameters of a run that starts now.
 
     Args:
-        scene: As ``rendering.prepare`` left it: its grip is where the handle starts.
-        coupling: What the user should feel.
-        method: How.
+        scene: Scene after ``rendering.prepare``; the handle starts at its grip.
+        coupling: Requested coupling.
+        method: Rendering method.
         first: The device's first sample, ``SAMPLE_DTYPE``, shape (1,).
         period: T in s.
-        felt: What ``rendering.prepare`` returned.
+        felt: Result of ``rendering.prepare``.
         substeps: MuJoCo steps per tick.
-        info: The device, for its damping; None where nothing is known of it.
-        limits: On the wrench that is sent.
-        workspace: The map from the device's frame to the scene's.
-        contact_stiffness: K_c in N/m of a tool without mass; None takes the coupling's stiffness.
-        guarding: What the guard does within a tick.
+        info: The device, for its damping; None if unknown.
+        limits: Limits of the wrench.
+        workspace: Map from the device's frame to the scene's.
+        contact_stiffness: K_c in N/m for a massless tool; None takes the coupling's stiffness.
+        guarding: Guard parameters.
 
     Raises:
         HapticBridgeError: A value is out of range.

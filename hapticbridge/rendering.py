@@ -113,11 +113,7 @@ class Method:
         """Returns the law's coupling for a requested one: B' = max(B − lag K h, 0).
 
         The integration adds lag K h again; rotation follows the same rule. The device needs b >= K
-        T/2 + B', so the subtracted damping allows more stiffness.
-
-        Args:
-            coupling: The requested coupling.
-            timestep: MuJoCo's time step h in s.
+        T/2 + B', so the subtracted damping allows more stiffness. ``timestep`` is MuJoCo's h in s.
 
         Raises:
             CouplingError: The time step is not finite and > 0.
@@ -325,11 +321,6 @@ def resolve_contact_stiffness(
 
 def check_scene(model: mujoco.MjModel, grip: str, method: Method) -> None:
     """Refuses a scene that a method cannot render or meter.
-
-    Args:
-        model: The compiled scene.
-        grip: Name of the site on the tool.
-        method: The rendering method.
 
     Raises:
         SceneError: The message names the obstacle in the scene.

@@ -1,6 +1,6 @@
-"""What a recording says about its run, and the run's parameters read back from it.
+"""Run description in a recording, and run parameters read back from it.
 
-Metadata are strings; numbers in them are written so that they read back to the same double.
+Metadata are strings; their numbers read back to the same double.
 """
 
 from __future__ import annotations
@@ -28,33 +28,33 @@ from hapticbridge.recording import Attachment
 from hapticbridge.rendering import Method, method_named
 from hapticbridge.scene import Scene
 
-# Where a run starts: MuJoCo's whole state, the compiled model, and what the ledger counts from.
+# Start of a run: MuJoCo's state, compiled model, and energies.
 
 STATE_ATTACHMENT = "start_state.f64"
 
 STARTS = {"handle_start": 7, "tool_start": 7, "start_kinetic": 1, "start_potential": 1}
-"""What the ledger counts from, with its count of numbers: poses in m, energies in J."""
+"""Start values of the energy balance, with their number of elements: poses in m, energies in J."""
 
 _STORED = {"start_kinetic": "kinetic", "start_potential": "potential"}
 _STATE = mujoco.mjtState.mjSTATE_INTEGRATION
 
 
 def compiled_model(model: mujoco.MjModel) -> bytes:
-    """Returns the bytes of ``mj_saveModel``, the same in every compilation of one scene."""
+    """Returns the bytes of ``mj_saveModel``, equal in every compilation of one scene."""
     buffer = np.zeros(mujoco.mj_sizeModel(model), dtype=np.uint8)
     mujoco.mj_saveModel(model, None, buffer)
     return buffer.tobytes()
 
 
 def start_state(model: mujoco.MjModel, data: mujoco.MjData) -> NDArray[np.float64]:
-    """Returns everything that MuJoCo's next step depends on."""
+    """Returns the full state on which MuJoCo's next step depends."""
     state = np.zeros(mujoco.mj_stateSize(model, _STATE))
     mujoco.mj_getState(model, data, state, _STATE)
     return state
 
 
 def restore_state(model: mujoco.MjModel, data: mujoco.MjData, state: bytes) -> None:
-    """Puts data to a start that ``start_state`` returned.
+    """Sets data to a state from ``start_state``.
 
     Raises:
         RecordingError: The bytes are not a state of this model.
@@ -68,12 +68,12 @@ def restore_state(model: mujoco.MjModel, data: mujoco.MjData, state: bytes) -> N
     mujoco.mj_resetData(model, data)
     mujoco.mj_setState(model, data, np.frombuffer(state, dtype="<f8").astype(np.float64), _STATE)
     mujoco.mj_forward(model, data)
-    # mj_forward solves once more and would leave another warm start than the run began with
+    # mj_forward runs the solver and changes the warm start, so the state is set again
     mujoco.mj_setState(model, data, np.frombuffer(state, dtype="<f8").astype(np.float64), _STATE)
 
 
 def start_of(state: NDArray[np.void], name: str) -> list[float]:
-    """Returns one of ``STARTS`` from the kernel's state, as long as no tick has run."""
+    """Returns one of ``STARTS`` from the kernel's state before the first tick."""
     if name in _STORED:
         return [float(state[_STORED[name]][0])]
     body = name.removesuffix("_start")
@@ -81,13 +81,13 @@ def start_of(state: NDArray[np.void], name: str) -> list[float]:
     return [float(value) for value in pose]
 
 
-# Numbers of a recording's metadata, read back to the same double or refused in a sentence.
+# Numbers of a recording's metadata.
 
 _MOST_TICKS = 2**31
 
 
 def meta_float(meta: Mapping[str, str], name: str) -> float:
-    """Returns a number of the metadata.
+    """Returns a number of the metadata, equal to the last bit.
 
     Raises:
         RecordingError: It is missing, not a number or not finite.
@@ -127,7 +127,7 @@ def meta_start(meta: Mapping[str, str], name: str) -> list[float]:
     """Returns one of ``STARTS`` from the metadata.
 
     Raises:
-        RecordingError: It is missing, or not as many finite numbers.
+        RecordingError: It is missing, or has a wrong number of values.
     """
     if STARTS[name] == 1:
         return [meta_float(meta, name)]
@@ -146,11 +146,11 @@ def meta_count(meta: Mapping[str, str], name: str) -> int:
     return int(value)
 
 
-# What a run was computed with: versions of programs, and the processor.
+# Software versions and processor of a run.
 
 
 def versions() -> dict[str, str]:
-    """Returns the versions that decide whether a run can be repeated to the bit."""
+    """Returns the versions on which a bit-exact repetition depends."""
     packages = ("hapticbridge", "mujoco", "numba", "numpy", "scipy", "mcap")
     found = {name: _version_of(name) for name in packages}
     return found | {"python": platform.python_version()}
@@ -160,7 +160,7 @@ _version_of = cache(version)  # parses the package's metadata: 2 ms each
 
 
 def processor() -> str:
-    """Returns the processor's model, where the system tells it."""
+    """Returns the processor's model, or its architecture if the system does not report it."""
     try:
         with open("/proc/cpuinfo", encoding="utf-8") as lines:  # noqa: PTH123 - not a file to keep
             for line in lines:
@@ -175,7 +175,7 @@ MODEL_ATTACHMENT = "model.mjb"
 SOURCE_PREFIX = "scene/"
 
 _MID_RUN = "mid-run"
-"""Metadata ``began`` of a recording of an earlier version that begins while its run goes on."""
+"""Value of metadata ``began`` in recordings of earlier versions that begin during a run."""
 
 _FLOATS = ("scale", "force_scale", "force_limit", "torque_limit", "contact_stiffness")
 _POSES = ("device_origin", "handle_origin", "device_start")
@@ -183,9 +183,10 @@ _GAINS = ("stiffness", "damping", "rotational_stiffness", "rotational_damping")
 
 
 def attachments(scene: Scene) -> list[Attachment]:
-    """Returns the scene's sources, its compiled model and its start, as the recording keeps them.
+    """Returns the scene's sources, compiled model and start state as attachments.
 
-    Call it after the scene was prepared and reset: gains and timestep are part of the model.
+    Call it after the scene was prepared and reset, because gains and timestep are part of the
+    model.
     """
     kept = [
         Attachment(SOURCE_PREFIX + source.name, "application/octet-stream", source.data)
@@ -207,7 +208,7 @@ def describe_run(
     device: DeviceInfo,
     clock: str,
 ) -> dict[str, str]:
-    """Returns the recording's metadata; see ``parameters_of`` for the way back."""
+    """Returns the recording's metadata; ``parameters_of`` is the inverse."""
     coupling = parameters.coupling
     felt = parameters.felt
     meta = {name: repr(float(getattr(parameters, name))) for name in _FLOATS}
@@ -240,7 +241,7 @@ def describe_run(
 
 
 def _felt(meta: Mapping[str, str], method: Method) -> Coupling | None:
-    """Returns the coupling that a weld truly was; None for methods that have the one asked for."""
+    """Returns a weld's measured coupling; None for other methods."""
     if method.scheme != WELD:
         return None
     return Coupling(*meta_numbers(meta, "felt", len(_GAINS)))
@@ -250,13 +251,12 @@ def parameters_of(meta: Mapping[str, str]) -> RunParameters:
     """Returns the parameters of a recorded run.
 
     Raises:
-        RecordingError: Something is missing or out of range, or the recording begins in mid-run, as
-            those of earlier versions could.
+        RecordingError: A value is missing or out of range.
     """
     if meta.get("began") == _MID_RUN:
         raise RecordingError(
             "the recording begins in mid-run, which only earlier versions of hapticbridge recorded "
-            "and judge; 'hapticbridge export' still reads its ticks"
+            "and judged; 'hapticbridge export' still reads its ticks"
         )
     try:
         method = method_named(meta.get("method", ""))

@@ -27,10 +27,6 @@ from hapticbridge.theory.compensation import IMPLICIT_LAG, effective_damping
 def is_always_held(model: mujoco.MjModel, grip: str) -> bool:
     """Returns True if a lossless coupling stays implicit because the tool is never free.
 
-    Args:
-        model: The compiled scene with its handle.
-        grip: Name of the site on the tool.
-
     References:
         ``kernel.tree.ToolTree.is_never_free`` lists the causes.
     """
@@ -272,21 +268,7 @@ class Summary:
         stopped_by: str,
         recording: Path | None,
     ) -> Summary:
-        """Reads the summary of a run out of the kernel's state and the loop's counters.
-
-        Args:
-            state: ``kernel.layout.STATE_DTYPE``, one element.
-            parameters: Of the run.
-            info: The device.
-            method: How the tool was rendered.
-            asked: The coupling asked for.
-            ticks: Ticks that were done.
-            overruns: Ticks that started a period or more after their deadline.
-            skipped: Deadlines that were skipped for it.
-            dropped: Records that were lost.
-            stopped_by: What ended the run.
-            recording: The file, if one was written.
-        """
+        """Builds the summary of a run from the kernel's state and the loop's counters."""
         ledger = Ledger.of(state)
         conditions = run_conditions(info, parameters, method)
         return cls(

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hapticbridge.sweep.points import Point, Value, grid
+from hapticbridge.sweep.points import Value, grid
 from hapticbridge.sweep.sweep import sweep
 
 LAST_IS_DONE = threading.Event()
@@ -53,14 +53,6 @@ def bound(point: Mapping[str, float]) -> dict[str, Value]:
     }
 
 
-def bound_of_all(points: list[Point]) -> list[dict[str, Value]]:
-    return [bound(point) for point in points]  # type: ignore[arg-type]
-
-
-def one_too_few(points: list[Point]) -> list[dict[str, Value]]:
-    return [{"x": 1.0} for _ in points[1:]]
-
-
 def last_ends_first(point: Mapping[str, int]) -> dict[str, Value]:
     if point["n"] == 0:
         assert LAST_IS_DONE.wait(20)
@@ -81,6 +73,8 @@ def counted(point: Mapping[str, float]) -> dict[str, Value]:
         threading.Event().wait()
     if point["n"] == 7 and once("die"):
         os._exit(9)
+    if point["n"] in (3, 4) and (scratch() / "poison").exists():
+        os._exit(9)
     if point["n"] == 7 and once("ctrl-c"):
         raise KeyboardInterrupt
     return {"third": point["n"] * point["gain"] / 3}
@@ -93,8 +87,8 @@ def oddities(point: Mapping[str, int]) -> object:
         {"x": [1.0]},
         {"n": 1.0},
         {"x": 2**70},
-        {"": 1.0},
-        {"x": "x" * 20_000},
+        {1: 1.0},
+        {"x": "\ud800"},
         {"x": 2, "late": "text"},
     ][point["n"]]
 
@@ -108,7 +102,9 @@ if __name__ == "__mp_main__" and once("start"):  # a worker that starts imports 
     threading.Event().wait(0.1)  # Python looks at signals now and then
 
 if __name__ == "__main__":
+    import sweep_functions
+
     try:
-        sweep(counted, COUNTED, folder=scratch() / "parts", chunk=1)
+        sweep(sweep_functions.counted, COUNTED, results=scratch() / "kept", chunk=1)
     except KeyboardInterrupt:
         sys.exit(77)

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from audit_cases import recorded, rewritten, tapped
 from cli_cases import Called
+from sweep_runs import is_same
 
 from hapticbridge.audit import AuditReport, audit
 from hapticbridge.audit.batch import (
@@ -181,18 +182,18 @@ def test_the_table_is_sorted_by_margin_and_hides_nothing(runs: Path) -> None:
 def test_any_executor_gives_the_same_table(runs: Path) -> None:
     files = find_recordings([runs])
     with ThreadPoolExecutor(2) as pool:
-        assert audit_all(files, executor=pool).equals(audit_all(files, jobs=1))
+        assert is_same(audit_all(files, executor=pool), audit_all(files, jobs=1))
 
 
 def test_jobs_are_processes_at_most(monkeypatch: pytest.MonkeyPatch, runs: Path) -> None:
     counts = []
 
     class Counting:
-        def __init__(self, count: int, *_arguments: Any, **_options: Any) -> None:
+        def __init__(self, count: int) -> None:
             counts.append(count)
             raise OSError("no processes in this test")
 
-    monkeypatch.setattr(sweep, "ProcessPoolExecutor", Counting)
+    monkeypatch.setattr(sweep, "_Processes", Counting)
     monkeypatch.setattr(sweep, "cores", lambda: 64)
     files = find_recordings([runs])
     for jobs, expected in ((3, 3), (50, len(files))):

@@ -209,7 +209,7 @@ def test_a_hid_device_is_listed_by_the_kernels_word_where_hidapi_is_missing(
     assert (device.family, device.serial) == ("rawhid", "77")
     code, _, err = call("run", "peg_in_hole", "--device", "rawhid")
     assert code == 2
-    assert "hidapi cannot be loaded; 'pip install hidapi' brings it" in err
+    assert "hidapi cannot be loaded; 'pip install hidapi' installs it" in err
 
 
 @pytest.mark.parametrize(
@@ -264,7 +264,7 @@ def test_running_on_a_device_that_is_not_there_is_one_sentence_that_helps(
 @pytest.mark.parametrize(
     ("name", "words"),
     [
-        ("haply", "the Inverse Service does not run: nobody answers at localhost:"),
+        ("haply", "the Inverse Service does not run: no answer at localhost:"),
         ("forcedimension", "the library '/no/such.so' cannot be loaded"),
     ],
 )
@@ -294,7 +294,7 @@ def test_a_class_gets_a_rule_for_each_product_that_is_plugged_in(
     bus: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert "# pid: " in udev_rules()
-    assert "# none is plugged in: plug it in, and write these rules again" in udev_rules()
+    assert "# none is connected: plug it in, and write these rules again" in udev_rules()
     seam = HidSeam(PidStick(serial="A"), PidStick(serial="B"), PidStick())
     seam.plugged[2].product = 0x4802
     monkeypatch.setattr(hid_search, "hid_api", lambda: seam)

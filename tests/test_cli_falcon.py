@@ -20,7 +20,10 @@ from hapticbridge.device.transport import usb as usb_search
         ),
         ("falcon:damping=-1", "error: damping = -1.0: must be a finite number >= 0 N s/m"),
         ("falcon:firmware=/no/image,damping=2", "error: firmware = '/no/image': cannot be read"),
-        ("falcon:colour=red", "unknown option 'colour' of the falcon device; there are 'damping'"),
+        (
+            "falcon:colour=red",
+            "unknown option 'colour' of the falcon device; choose one of 'damping'",
+        ),
     ],
 )
 def test_a_falcon_that_cannot_be_had_is_one_sentence_and_exit_code_2(

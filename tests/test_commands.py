@@ -79,8 +79,8 @@ def test_an_unknown_damping_is_the_one_that_the_default_coupling_takes() -> None
     allowed = allowance(damping=None)
     span = allowed.translation
     assert span.most_stiffness(0.0) == pytest.approx(2 * span.damping / T, rel=1e-9)
-    assert "taken for it" in allowed.reason()
-    assert "taken for it" not in allowance().reason()
+    assert "(assumed; it is unknown)" in allowed.reason()
+    assert "assumed" not in allowance().reason()
 
 
 def test_the_softest_coupling_still_shows_the_whole_force() -> None:
@@ -193,7 +193,7 @@ def test_a_loop_that_takes_nothing_is_told_nothing_more() -> None:
         time.now += 1.0
         queue.offer(Switch(force=True), "test")
     time.now += 1.0
-    with pytest.raises(CommandError, match="stands still"):
+    with pytest.raises(CommandError, match="it stalls"):
         queue.offer(Switch(force=False), "test")
     assert len(queue.waiting) == MOST_WAITING
     assert all(command == Switch(force=True) for command, _ in queue.waiting)
@@ -202,7 +202,7 @@ def test_a_loop_that_takes_nothing_is_told_nothing_more() -> None:
 def test_what_the_run_cannot_do_is_refused() -> None:
     with pytest.raises(CommandError, match="not recorded"):
         CommandQueue(allowance(), is_recorded=False).offer(Mark(), "test")
-    with pytest.raises(CommandError, match="without mass"):
+    with pytest.raises(CommandError, match="massless tool"):
         CommandQueue(allowance("direct")).offer(Reset(), "test")
 
 

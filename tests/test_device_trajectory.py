@@ -110,14 +110,14 @@ TURNED = "t,x,y,z,qw,qx,qy,qz\n"
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("", "the file is empty; a header t,x,y,z and two rows are needed"),
+        ("", "the file is empty; it needs a header t,x,y,z and two rows"),
         ("# only this\n", "the file is empty"),
         (HEADER, "line 1: the file ends after 0 of at least two rows"),
         (HEADER + "0,1,2,3\n", "line 2: the file ends after 1 of at least two rows"),
         ("t,x,z\n0,0,0\n1,0,0\n", "line 1: column y is missing; a header with the columns t,x,y,z"),
         ("#\ntime,x,y,z\n", "line 2: column t is missing"),
         ("t,x,y,z,w\n", "line 1: unknown column 'w'"),
-        ("t,x,y,z,x\n", "line 1: column x is there twice"),
+        ("t,x,y,z,x\n", "line 1: column x occurs twice"),
         ("t,x,y,z,qw,qx\n", "line 1: column qy, qz is missing; an orientation needs all"),
         ("0,0,0,0\n1,0,0,0\n", "line 1: numbers where a header"),
         (HEADER + "0,0,0,0\n\n1,0,zero,0\n", "line 4: column 'y' holds 'zero'"),
@@ -232,7 +232,7 @@ def test_a_recording_is_opened_by_its_name_or_its_first_bytes(tmp_path: Path) ->
     writer = RecordingWriter(tmp_path / "old.mcap", {}, (), 0)
     writer.write_ticks(ticks)
     writer.close()
-    with pytest.raises(DeviceError, match=r"old\.mcap: the recording does not say its period"):
+    with pytest.raises(DeviceError, match=r"old\.mcap: the recording lacks its period"):
         open_device(f"trajectory:{tmp_path / 'old.mcap'}")
     with pytest.raises(RecordingError, match=r"none\.mcap"):
         open_device(f"trajectory:{tmp_path / 'none.mcap'}")

@@ -108,7 +108,7 @@ def test_no_force_is_sent_until_it_is_taken_and_a_force_once(refused: int) -> No
         bench.time.until(bench.time.now + PERIOD)
         assert bench.model.motors == (0, 0, 0)
     else:
-        with pytest.raises(DeviceLost, match="does not take that it is to give no force"):
+        with pytest.raises(DeviceLost, match="did not accept zero force"):
             device.write(np.zeros(6))
 
 

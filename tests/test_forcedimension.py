@@ -107,12 +107,16 @@ def test_of_all_limits_that_are_known_the_lower_holds(
 
 def test_a_limit_that_nobody_knows_must_be_named() -> None:
     stub = Stub(206)
-    with pytest.raises(DeviceError, match=r"largest force of sigma\.3; name it with force_limit="):
+    with pytest.raises(
+        DeviceError, match=r"largest force of sigma\.3 is unknown; set it with force_lim"
+    ):
         stub.opened()
     assert stub.call("closed") == 1
     assert stub.opened(numbers={"force_limit": 3.0}).info.force_limit == 3.0
     stub = Stub(108)
-    with pytest.raises(DeviceError, match=r"largest torque of lambda\.7; name it with torque_lim"):
+    with pytest.raises(
+        DeviceError, match=r"largest torque of lambda\.7 is unknown; set it with torq"
+    ):
         stub.opened()
     assert {model.turns for kind, model in MODELS.items() if kind not in (104, 105, 108, 109)} == {
         False
@@ -219,7 +223,7 @@ def test_a_pose_that_is_none_is_not_reported(kind: int, value: float) -> None:
 
 def test_a_mirrored_orientation_is_no_rotation() -> None:
     assert quaternion_of([1, 0, 0, 0, 1, 0, 0, 0, 1], "it") == (1.0, 0.0, 0.0, 0.0)
-    with pytest.raises(DeviceError, match="it reports an orientation that is no rotation"):
+    with pytest.raises(DeviceError, match="it reports an orientation that is not a rotation"):
         quaternion_of([1, 0, 0, 0, 1, 0, 0, 0, -1], "it")
 
 
@@ -249,9 +253,9 @@ def test_what_the_library_does_not_know_comes_from_the_profile_of_its_model() ->
         device.close()
         assert device.info.resolution == resolution
         assert device.info.damping is None
-    missing = [sentence for sentence in told if "there is no profile" in sentence]
+    missing = [sentence for sentence in told if "no profile of" in sentence]
     (sentence,) = missing
-    assert "there is no profile of 'lambda.3'; there are 'delta.3', 'lambda.7'" in sentence
+    assert "no profile of 'lambda.3' exists; profiles: 'delta.3', 'lambda.7'" in sentence
 
 
 def test_a_spec_names_the_library_the_device_and_its_numbers() -> None:
@@ -283,7 +287,7 @@ def test_the_library_is_named_by_option_variable_or_found(
 ) -> None:
     stub = Stub()
     monkeypatch.setenv(VARIABLE, stub.file)
-    assert forcedimension.medium() == f"Force Dimension's library is there: {stub.file}"
+    assert forcedimension.medium() == f"Force Dimension's library was found: {stub.file}"
     (plugged,) = forcedimension.find()
     assert (plugged.path, plugged.problem) == ("0", None)
     monkeypatch.delenv(VARIABLE)

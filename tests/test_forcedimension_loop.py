@@ -54,7 +54,7 @@ def test_the_loop_is_the_same_in_every_run(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("hook", "value", "words"),
-    [("fail", 1, "gone or failed"), ("spoil", float("nan"), "reports a position that is none")],
+    [("fail", 1, "gone or failed"), ("spoil", float("nan"), "reports an impossible position")],
 )
 def test_whatever_breaks_trips_with_every_row_kept(
     tmp_path: Path, hook: str, value: float, words: str

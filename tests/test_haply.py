@@ -225,11 +225,11 @@ def test_after_a_stall_the_pose_is_the_present_one_and_no_force_of_before_is_sen
 @pytest.mark.parametrize(
     ("answer", "error", "words"),
     [
-        ("{", DeviceError, "sent what is no JSON object"),
-        ("[" * 5000, DeviceError, "sent what is no JSON object"),
-        ("[1]", DeviceError, "sent what is no JSON object"),
+        ("{", DeviceError, "is not a JSON object"),
+        ("[" * 5000, DeviceError, "is not a JSON object"),
+        ("[1]", DeviceError, "is not a JSON object"),
         ("{}", DeviceLost, "does not list it any more"),
-        ('{"inverse3": 3}', DeviceError, "what are no devices"),
+        ('{"inverse3": 3}', DeviceError, "lists invalid devices"),
         ('{"inverse3": [{"device_id": "049D"}]}', DeviceError, "reports no position"),
         (
             '{"inverse3": [{"device_id": "049D", "state": {"cursor_position": '
@@ -413,7 +413,7 @@ def test_no_service_no_websocket_and_no_package_are_one_sentence_each(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     port = free_port()
-    with pytest.raises(DeviceError, match=f"does not run: nobody answers at localhost:{port}"):
+    with pytest.raises(DeviceError, match=f"does not run: no answer at localhost:{port}"):
         open_device(f"haply:service=localhost:{port}")
     assert haply.find(("localhost", port)) == []
     assert "does not run" in haply.medium(("localhost", port))

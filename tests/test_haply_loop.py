@@ -49,7 +49,7 @@ def test_the_loop_is_the_same_in_every_run(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("answer", "words"),
-    [(None, "closed|dropped"), ("{", "no JSON object"), ('{"inverse3":[]}', "does not list it")],
+    [(None, "closed|dropped"), ("{", "not a JSON object"), ('{"inverse3":[]}', "does not list it")],
 )
 def test_whatever_breaks_trips_with_every_row_kept(
     tmp_path: Path, answer: str | None, words: str

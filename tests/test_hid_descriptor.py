@@ -116,15 +116,15 @@ def test_a_value_that_is_written_is_read_back_and_nothing_else_moves(data: st.Da
 @pytest.mark.parametrize(
     ("raw", "words"),
     [
-        (b"", "a report descriptor of 0 bytes: it must have 1 to 4096"),
-        (bytes(LONGEST_DESCRIPTOR + 1), "a report descriptor of 4097 bytes"),
+        (b"", "a report descriptor has 0 bytes; it must have 1 to 4096"),
+        (bytes(LONGEST_DESCRIPTOR + 1), "a report descriptor has 4097 bytes"),
         (b"\x05", "ends within the item at byte 0"),
         (b"\x05\x01\x27\x01\x02", "ends within the item at byte 2"),
         (b"\xfe\x05", "ends within the item at byte 0"),
-        (b"\xc0", "ends a collection it never began"),
-        (b"\xb4", "restores a state it never kept"),
-        (b"\x77\xff\xff\xff\x7f\x95\x01\x81\x02", "with a report of 2147483647 bits"),
-        (b"\x86\x00\x01\x75\x08\x95\x01\x81\x02", "with a report number of 256"),
+        (b"\xc0", "ends a collection that never began"),
+        (b"\xb4", "restores a state that it never stored"),
+        (b"\x77\xff\xff\xff\x7f\x95\x01\x81\x02", "has a report of 2147483647 bits"),
+        (b"\x86\x00\x01\x75\x08\x95\x01\x81\x02", "has the report number 256"),
     ],
 )
 def test_what_is_no_descriptor_is_refused_in_one_sentence(raw: bytes, words: str) -> None:

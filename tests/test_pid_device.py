@@ -114,7 +114,7 @@ def test_a_stick_that_says_nothing_at_rest_is_asked_where_it_stands() -> None:
             return None
 
     device, _, _ = opened(Mute(is_chatty=False))
-    with pytest.raises(DeviceError, match="does not say where it stands; move it and start again"):
+    with pytest.raises(DeviceError, match="does not report its position; move it and start again"):
         device.start(PERIOD)
 
 
@@ -211,7 +211,7 @@ def test_what_another_program_left_in_the_stick_is_cleared() -> None:
     ("model", "words"),
     [
         (PidStick(room=1, most=10), "has no room for another effect; unplug it"),
-        (PidStick(room=1), "plays 1 effect at a time; two are needed, one for each axis"),
+        (PidStick(room=1), "plays 1 effect at a time; two are needed, one per axis"),
     ],
 )
 def test_a_stick_without_room_for_two_effects_is_refused(model: PidStick, words: str) -> None:
@@ -259,7 +259,7 @@ def test_what_nobody_says_is_assumed_aloud_and_leaves_the_bound_unjudged() -> No
     info = open_pid({}, told.append, seam).info
     assert (info.force_limit, info.damping, info.mass, info.delay) == (10.0, None, None, None)
     (sentence,) = told
-    assert "full scale is taken for 10 N and its travel for 100 mm" in sentence
+    assert "10 N at full scale and a travel of 100 mm are assumed" in sentence
     assert "newtons= and travel= state it" in sentence
     told.clear()
     known = open_pid({**SCALE, "damping": 1.5, "mass": 0.3, "friction": 0.2}, told.append, seam)

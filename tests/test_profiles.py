@@ -195,7 +195,7 @@ HEAD = 'format = 1\nname = "n"\ndevice = "falcon"\n'
         ("format = ", "is not TOML"),
         ("", "format must be 1"),
         ('format = 1\ndevice = "falcon"\n', "name = ''"),
-        (HEAD + "colour = 3\n", "it holds 'colour'; it may hold 'damping'"),
+        (HEAD + "colour = 3\n", "unknown tables 'colour'; valid tables: 'damping'"),
         (HEAD + 'axes = ["z", "x"]\n', "axes = ['z', 'x']"),
         (HEAD + 'models = "omega.3"\n', "models = 'omega.3': must be a list of texts"),
         (HEAD + 'models = [""]\n', "models = ['']: must be"),
@@ -221,7 +221,7 @@ def test_a_bad_profile_is_refused_with_its_file_and_place(
     with pytest.raises(DeviceError) as error:
         read_profile(path)
     assert str(path) in str(error.value) and words in str(error.value)
-    with pytest.raises(DeviceError, match="unknown profile 'falcn'; there are 'delta3'"):
+    with pytest.raises(DeviceError, match="unknown profile 'falcn'; choose one of 'delta3'"):
         profile_named("falcn")
     with pytest.raises(DeviceError, match=r"cannot read profile '.*no\.toml'"):
         profile_named(str(tmp_path / "no.toml"))

@@ -57,13 +57,13 @@ def test_what_the_user_knows_goes_before_what_the_device_says() -> None:
 @pytest.mark.parametrize(
     ("claims", "words"),
     [
-        (Claims(force_limit=NAN), "does not say its force_limit"),
-        (Claims(torque_limit=NAN), "does not say its torque_limit"),
-        (Claims(speed_limit=NAN), "does not say its speed_limit"),
-        (Claims(rate=NAN), "does not say its rate"),
-        (Claims(mass=-1.0), "claims what cannot be: mass = -1.0"),
-        (Claims(axes=0), "claims what cannot be: axes"),
-        (Claims(axes=64), "claims what cannot be: axes"),
+        (Claims(force_limit=NAN), "does not report its force_limit"),
+        (Claims(torque_limit=NAN), "does not report its torque_limit"),
+        (Claims(speed_limit=NAN), "does not report its speed_limit"),
+        (Claims(rate=NAN), "does not report its rate"),
+        (Claims(mass=-1.0), "reports an impossible data sheet: mass = -1.0"),
+        (Claims(axes=0), "reports an impossible data sheet: axes"),
+        (Claims(axes=64), "reports an impossible data sheet: axes"),
     ],
 )
 def test_a_sheet_without_what_nobody_can_guess_is_refused(claims: Claims, words: str) -> None:
@@ -82,7 +82,7 @@ def test_one_that_does_not_speak_the_protocol_or_another_version_is_refused() ->
         def output(self, report: bytes, now: float) -> None:
             """Takes no notice."""
 
-    with pytest.raises(DeviceError, match=r"does not answer as .*rawhid\.md says"):
+    with pytest.raises(DeviceError, match=r"does not answer by the protocol .*rawhid\.md"):
         opened(Mute())
 
     class Newer(RawHid):
@@ -233,14 +233,14 @@ def test_a_fault_and_a_restart_end_the_run_and_a_wrapping_clock_does_not() -> No
     device, model, seam = still()
     read(device, seam)
     model._clock_start_us -= round(1e6 * seam.now)
-    with pytest.raises(DeviceError, match="has restarted in mid-run"):
+    with pytest.raises(DeviceError, match="has restarted during the run"):
         read(device, seam)
 
 
 def test_a_device_that_must_be_homed_or_sends_nothing_does_not_start() -> None:
     device, model, _ = opened()
     model.status = 16
-    with pytest.raises(DeviceError, match="does not know its pose yet: home or calibrate it"):
+    with pytest.raises(DeviceError, match="has no valid pose yet: home or calibrate it"):
         device.start(PERIOD)
     model.status = 8
     with pytest.raises(DeviceError, match="reports a fault of its own"):

@@ -17,10 +17,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hapticbridge.errors import HapticBridgeError
+from hapticbridge.lab.folder import prepared_folder
 from hapticbridge.lab.paper import coupling, impact, integrators, transmission_line
 from hapticbridge.lab.paper.section import PAGE, Check, Relation, number
 from hapticbridge.lab.paper.walk import STEPS
-from hapticbridge.sweep.results import prepared_folder
 from hapticbridge.theory.sampled_loop import stability_limit
 
 SCRIPT = Path(__file__).parents[1] / "scripts" / "reproduce_paper"
@@ -217,8 +217,8 @@ def test_a_folder_without_permission_is_refused(
         raise PermissionError(13, "Permission denied")
 
     # permissions do not hold for root, who runs tests in containers
-    monkeypatch.setattr("hapticbridge.sweep.results.tempfile.TemporaryFile", refuse)
-    with pytest.raises(HapticBridgeError, match=r"cannot write into .*: Permission denied"):
+    monkeypatch.setattr("hapticbridge.lab.folder.tempfile.TemporaryFile", refuse)
+    with pytest.raises(HapticBridgeError, match=r"cannot write .*: Permission denied"):
         prepared_folder(tmp_path)
 
 

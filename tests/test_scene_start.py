@@ -29,11 +29,11 @@ def resting(height: float) -> str:
 
 def test_tool_inside_something_is_refused_with_pair_and_depth(tmp_path: Path) -> None:
     message = refusal_of(tmp_path, resting(0.0098))
-    assert "0.2 mm inside" in message
+    assert "overlap by 0.2 mm" in message
     assert "geom 'table' and geom 'ball'" in message
     unnamed = resting(0.005).replace('name="ball"', "").replace("name='table'", "")
     message = refusal_of(tmp_path, unnamed)
-    assert "5 mm inside" in message
+    assert "overlap by 5 mm" in message
     assert "geom 0 of the world and geom 1 of body 'tool'" in message
 
 
@@ -56,7 +56,7 @@ def test_start_is_judged_at_keyframe_home(tmp_path: Path) -> None:
     deep = "<keyframe><key name='{}' qpos='0 0 0.005 1 0 0 0'/></keyframe>"
     text = resting(1.0).replace("</mujoco>", deep + "</mujoco>")
     load_scene(scene_file(tmp_path, text.format("other")))
-    assert "5 mm inside" in refusal_of(tmp_path, text.format("home"))
+    assert "overlap by 5 mm" in refusal_of(tmp_path, text.format("home"))
 
 
 def test_other_bodies_may_start_in_contact_and_a_tool_inside_a_cloth_may_not(

@@ -135,9 +135,10 @@ def test_the_table_is_kept_even_if_reading_it_fails(tmp_path: Path) -> None:
 def test_parts_of_other_code_or_another_mujoco_are_refused(tmp_path: Path, what: str) -> None:
     with ThreadPoolExecutor(1) as pool:
         run_map(SQUARES, tmp_path, executor=pool)
-        manifest = tmp_path / "squares.parts" / "sweep.json"
-        found = json.loads(manifest.read_text(encoding="utf-8"))
-        manifest.write_text(json.dumps(found | {what: "older"}), encoding="utf-8")
+        path = tmp_path / "squares.parts"
+        first, *rest = path.read_text(encoding="utf-8").splitlines()
+        found = json.dumps(json.loads(first) | {what: "older"})
+        path.write_text("\n".join([found, *rest, ""]), encoding="utf-8")
         with pytest.raises(StudyError, match="other sources or another MuJoCo"):
             run_map(SQUARES, tmp_path, executor=pool)
 

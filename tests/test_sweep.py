@@ -1,15 +1,18 @@
-"""A sweep gives the same table on any workers."""
+"""A sweep gives the same table on any workers and after any interruption."""
 
 from __future__ import annotations
 
-import concurrent.futures
 import csv
 import functools
 import math
 import os
+import signal
+import socket
+import subprocess
 import sys
+import threading
 from collections.abc import Callable
-from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from concurrent.futures import BrokenExecutor, Executor, Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +21,14 @@ import pytest
 import sweep_functions as functions
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from sweep_runs import POINTS, computed, serial
+from sweep_runs import POINTS, computed, is_same, kept, serial
 
 from hapticbridge.errors import StudyError
-from hapticbridge.sweep.points import grid, plain, point_key
-from hapticbridge.sweep.results import Outcome, ResultFolder
-from hapticbridge.sweep.sweep import InThisProcess, cores, sweep
+from hapticbridge.signals import holding_interrupts
+from hapticbridge.sweep import Interrupted, grid, sweep
+from hapticbridge.sweep.points import plain, point_key
+from hapticbridge.sweep.results import Outcome, ResultFile
+from hapticbridge.sweep.sweep import WORKER_DIED, cores
 
 
 def test_the_table_holds_what_a_plain_loop_gives() -> None:
@@ -69,21 +74,11 @@ def test_a_result_that_no_point_gave_is_missing_or_empty() -> None:
 def test_every_executor_gives_the_same_bits(tmp_path: Path) -> None:
     expected = serial()
     with ThreadPoolExecutor(3) as threads:
-        assert sweep(functions.bound, POINTS, executor=threads, chunk=1).equals(expected)
-        batched = sweep(functions.bound_of_all, POINTS, batched=True, executor=threads, chunk=4)
-        assert batched.equals(expected)
-    assert sweep(functions.bound, POINTS).equals(expected)  # processes
-    for form in ("csv", "parquet"):
-        for _ in range(2):  # computed, then read
-            kept = sweep(
-                functions.bound,
-                POINTS,
-                folder=tmp_path / form,
-                format=form,
-                chunk=2,
-                executor=InThisProcess(),
-            )
-            assert kept.equals(expected)
+        assert is_same(sweep(functions.bound, POINTS, executor=threads, chunk=1), expected)
+    assert is_same(sweep(functions.bound, POINTS, jobs=2), expected)
+    for _ in range(2):  # computed, then read
+        again = sweep(functions.bound, POINTS, results=tmp_path / "kept", chunk=2, jobs=1)
+        assert is_same(again, expected)
 
 
 def test_a_dask_cluster_of_two_workers_gives_the_same_bits() -> None:
@@ -92,7 +87,7 @@ def test_a_dask_cluster_of_two_workers_gives_the_same_bits() -> None:
         n_workers=2, processes=True, threads_per_worker=1, dashboard_address=None
     ) as cluster:
         table = sweep(functions.bound, POINTS, scheduler=cluster.scheduler_address, chunk=1)
-        assert table.equals(serial())
+        assert is_same(table, serial())
 
 
 def test_the_order_of_rows_is_that_of_points_whatever_ends_first() -> None:
@@ -108,41 +103,33 @@ def test_a_failed_point_records_why_and_stops_nothing(tmp_path: Path) -> None:
     assert (table["stiffness"][row], table["damping"][row]) == (3000.0, 0.2)
     assert table["error"][row] == 'ValueError: no\r\n"bound", at 1.7\\udc80'
     assert math.isnan(table["needed"][row])
-    assert math.isnan(table["passive"][row])
     assert table["verdict"][row] == ""
     rest = table.select(~table.failed)
     assert len(rest) == len(POINTS) - 1
-    assert set(rest["passive"]) <= {0.0, 1.0}
     table.write(tmp_path / "table.csv")
-    with (tmp_path / "table.csv").open(newline="") as file:
+    with (tmp_path / "table.csv").open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     assert [float(line["needed"]) for line in rows if not line["error"]] == rest["needed"].tolist()
 
 
 def test_results_that_no_table_can_hold_are_failures_of_their_point(tmp_path: Path) -> None:
     for _ in range(2):
-        table = sweep(
-            functions.oddities, grid(n=range(8)), folder=tmp_path, executor=InThisProcess()
-        )
+        table = sweep(functions.oddities, grid(n=range(8)), results=tmp_path / "kept", jobs=1)
         assert table.failed.tolist() == [False, *[True] * 6, False]
-        assert table.results == ("x", "extra", "late")
         np.testing.assert_equal(table["x"], [1.5, *[math.nan] * 6, 2.0])
         assert table["late"].tolist() == [""] * 7 + ["text"]
     assert "not a mapping" in table["error"][1]
     assert "name of another column" in table["error"][3]
-    short = sweep(functions.one_too_few, grid(n=range(3)), batched=True, executor=InThisProcess())
-    assert all("returned 0 results for 1 points" in text for text in short["error"])
 
 
 def test_other_points_reuse_those_that_are_known(scratch: Path) -> None:
     reports: list[tuple[int, int]] = []
-    more = grid(n=range(6, 15), gain=[0.1])
-    sweep(functions.counted, functions.COUNTED, folder=scratch / "parts", executor=InThisProcess())
+    sweep(functions.counted, functions.COUNTED, results=scratch / "kept", jobs=1)
     table = sweep(
         functions.counted,
-        more,
-        folder=scratch / "parts",
-        executor=InThisProcess(),
+        grid(n=range(6, 15), gain=[0.1]),
+        results=scratch / "kept",
+        jobs=1,
         progress=lambda done, total: reports.append((done, total)),
     )
     assert set(computed(scratch).values()) == {1}
@@ -158,25 +145,23 @@ VALUES = st.one_of(
 
 @settings(max_examples=60)
 @given(values=st.lists(st.tuples(VALUES, VALUES), min_size=1, max_size=5))
-@example(
-    values=[("", "\n"), ("a\rb", "x"), (-0.0, 5e-324), (True, "True"), (1, 1.0), ("", "nan\0")]
-)
-@pytest.mark.parametrize("form", ["csv", "parquet"])
-def test_every_value_comes_back_from_a_part_with_its_bits(
-    tmp_path_factory: pytest.TempPathFactory, form: str, values: list[tuple[Any, Any]]
+@example(values=[("", "\n"), ("a\rb", "x"), (-0.0, 5e-324), (True, "True"), (1, 1.0)])
+def test_every_value_comes_back_from_the_file_with_its_bits(
+    tmp_path_factory: pytest.TempPathFactory, values: list[tuple[Any, Any]]
 ) -> None:
     def bits(value: object) -> str:
         return value.hex() if isinstance(value, float) else repr(value)
 
-    folder = ResultFolder(tmp_path_factory.mktemp("parts"), "f", form)
-    points = {point_key(point): point for point in grid(n=range(len(values)))}
-    outcomes = [Outcome({"a": plain(a), "b": plain(b)}, "") for a, b in values]
+    path = tmp_path_factory.mktemp("results") / "kept"
+    points = grid(n=range(len(values)))
+    outcomes = [Outcome({"a": plain(a), "b": plain(b)}) for a, b in values]
     outcomes[0] = Outcome({"b": outcomes[0].results["b"]}, "why")
-    folder.add(points, outcomes)
-    back = folder.read(points)
-    for key, outcome in zip(points, outcomes, strict=True):
-        assert back[key].error == outcome.error
-        assert {name: bits(value) for name, value in back[key].results.items()} == {
+    ResultFile(path, "f").add(points, outcomes)
+    back = ResultFile(path, "f").read([*map(point_key, points)])
+    for point, outcome in zip(points, outcomes, strict=True):
+        assert back[point_key(point)].error == outcome.error
+        read = back[point_key(point)].results
+        assert {name: bits(value) for name, value in read.items()} == {
             name: bits(value) for name, value in outcome.results.items()
         }
 
@@ -189,15 +174,11 @@ def test_two_floats_have_one_key_exactly_when_they_have_the_same_bits(
     first: float, second: float
 ) -> None:
     assert (point_key({"x": first}) == point_key({"x": second})) == (first.hex() == second.hex())
-    above = math.nextafter(first, math.inf)
-    assert point_key({"x": first}) != point_key({"x": above})
+    assert point_key({"x": first}) != point_key({"x": math.nextafter(first, math.inf)})
     assert point_key({"x": first, "y": second}) == point_key({"y": second, "x": first})
 
 
-def test_keys_stay_what_they_are_between_versions() -> None:
-    # folders of earlier sweeps depend on it
-    key = point_key({"n": 1, "gain": 0.1, "on": True, "tool": "µ"})
-    assert key == "863837771cc3867d0a4eed0183a1843b"
+def test_values_of_different_types_have_different_keys() -> None:
     assert len({point_key({"n": value}) for value in (1, 1.0, True, "1")}) == 4
 
 
@@ -210,26 +191,208 @@ def test_a_grid_turns_its_last_axis_fastest() -> None:
     assert type(points[0]["b"]) is float
 
 
-def test_few_tasks_are_in_flight_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    flying: list[tuple[Future[Any], Callable[[], Any]]] = []
-    most: list[int] = []
+@pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
+@pytest.mark.parametrize(("marker", "code"), [("kill", -9), ("interrupt", 77)])
+def test_a_sweep_that_was_killed_goes_on_and_computes_nothing_twice(
+    scratch: Path, marker: str, code: int
+) -> None:
+    (scratch / marker).touch()
+    program = [sys.executable, functions.__file__]
+    # the pipe ends only when the last worker is gone, so this also sees that no orphan stays
+    killed = subprocess.run(
+        program, capture_output=True, timeout=60, start_new_session=True, check=False
+    )
+    assert killed.returncode == code, killed.stderr
+    assert marker == "kill" or not killed.stderr
+    path = scratch / "kept"
+    count = len(kept(path))
+    assert 0 < count < len(functions.COUNTED)
+    resumed = sweep(functions.counted, functions.COUNTED, results=path, jobs=1)
+    often = computed(scratch)
+    # in flight were at most two tasks a worker; they are computed again, and no kept point is
+    assert sum(often.values()) - len(functions.COUNTED) <= len(functions.COUNTED) - count
+    assert sum(times > 1 for times in often.values()) <= 2 * (os.cpu_count() or 1)
+    assert is_same(resumed, serial(functions.counted, functions.COUNTED))
 
-    class Idle(Executor):
-        """Works only while somebody waits."""
 
+@pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
+def test_ctrl_c_while_workers_start_ends_them_without_a_word(scratch: Path) -> None:
+    (scratch / "start").touch()
+    program = [sys.executable, functions.__file__]
+    stopped = subprocess.run(
+        program, capture_output=True, timeout=60, start_new_session=True, check=False
+    )
+    assert not (scratch / "start").exists()
+    assert (stopped.returncode, stopped.stdout, stopped.stderr) == (77, b"", b"")
+    assert kept(scratch / "kept") == []
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
+def test_interrupts_are_held_for_a_while_and_then_arrive() -> None:
+    def is_held() -> bool:
+        return signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, ())
+
+    def interrupt() -> None:
+        gate.wait()
+        signal.raise_signal(signal.SIGINT)  # this thread takes what the main thread holds back
+
+    done, gate = [], threading.Event()
+    other = threading.Thread(target=interrupt)
+    other.start()
+    with pytest.raises(KeyboardInterrupt), holding_interrupts():
+        assert is_held()
+        with holding_interrupts():
+            gate.set()
+            other.join()
+        done.append("all of it")
+    assert done
+    assert not is_held()
+
+
+def test_a_worker_that_is_killed_once_costs_nothing(scratch: Path) -> None:
+    (scratch / "die").touch()
+    table = sweep(functions.counted, functions.COUNTED, chunk=4, jobs=2)
+    assert not (scratch / "die").exists()
+    assert is_same(table, serial(functions.counted, functions.COUNTED))
+
+
+def test_points_that_end_their_worker_are_found_and_recorded(scratch: Path) -> None:
+    (scratch / "poison").touch()
+    table = sweep(functions.counted, functions.COUNTED, chunk=3, jobs=2)
+    assert table["n"][table.failed].tolist() == [3, 4]
+    assert set(table["error"][table.failed]) == {WORKER_DIED}
+
+
+def test_ctrl_c_keeps_what_is_done(scratch: Path) -> None:
+    (scratch / "ctrl-c").touch()
+    again = functools.partial(
+        sweep,
+        functions.counted,
+        functions.COUNTED,
+        results=scratch / "kept",
+        jobs=1,
+        chunk=2,
+    )
+    with pytest.raises(Interrupted) as stop:
+        again()
+    assert len(kept(scratch / "kept")) == 6
+    whole = serial(functions.counted, functions.COUNTED)
+    assert is_same(stop.value.table, whole.select(np.arange(6)))
+    assert is_same(again(), whole)
+    assert computed(scratch)[5] == 2  # once in the file, once in the serial run
+
+
+def test_a_line_that_a_crash_has_cut_is_computed_again(scratch: Path) -> None:
+    path = scratch / "kept"
+    again = functools.partial(
+        sweep, functions.counted, functions.COUNTED, results=path, jobs=1, chunk=1
+    )
+    expected = again()
+    path.write_bytes(path.read_bytes()[:-9])
+    for _ in range(2):
+        assert is_same(again(), expected)
+    assert computed(scratch)[11] == 2
+
+
+def test_an_executor_of_somebody_else_that_breaks_is_one_sentence() -> None:
+    class Broken(Executor):
         def submit(self, task: Callable[..., Any], /, *args: Any, **named: Any) -> Future[Any]:
-            flying.append((Future(), functools.partial(task, *args, **named)))
-            return flying[-1][0]
+            raise BrokenExecutor
 
-    def wait(*arguments: Any, **named: Any) -> Any:
-        most.append(len(flying))
-        while flying:
-            future, work = flying.pop()
-            future.set_result(work())
-        return concurrent.futures.wait(*arguments, **named)
+    with pytest.raises(StudyError, match=r"one of .*'stiffness': 1000.*fresh executor"):
+        sweep(functions.bound, POINTS, executor=Broken())
+    with ThreadPoolExecutor(1) as threads:
+        pass
+    with pytest.raises(StudyError, match="takes no tasks"):
+        sweep(functions.bound, POINTS, executor=threads)
 
-    monkeypatch.setattr(sys.modules["hapticbridge.sweep.sweep"], "wait_for", wait)
-    half_more = functools.partial(functions.plus, more=0.5)
-    table = sweep(half_more, grid(n=range(500)), executor=Idle(), chunk=1)
-    assert table["sum"].tolist() == [n + 0.5 for n in range(500)]
-    assert max(most) == 64
+
+def test_a_file_of_another_function_or_version_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "kept"
+    sweep(functions.bound, POINTS, results=path, jobs=1)
+    with pytest.raises(StudyError, match=r"holds a sweep of sweep_functions\.bound .* start anew"):
+        sweep(functions.counted, POINTS, results=path, jobs=1)
+    one, two = (functools.partial(functions.plus, more=more) for more in (1, 1 + 2**-52))
+    points = grid(n=[1])
+    sweep(one, points, results=tmp_path / "plus", jobs=1)
+    with pytest.raises(StudyError, match=r"more=1\.0000000000000002"):
+        sweep(two, points, results=tmp_path / "plus", jobs=1)
+    path.write_text(path.read_text().replace('"hapticbridge": "', '"hapticbridge": "9'))
+    with pytest.raises(StudyError, match="by hapticbridge 9"):
+        sweep(functions.bound, POINTS, results=path, jobs=1)
+    path.write_text("[]")
+    with pytest.raises(StudyError, match="holds a sweep of None"):
+        sweep(functions.bound, POINTS, results=path, jobs=1)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        ({"points": []}, "no points"),
+        ({"points": [{"n": 1}, {"n": 2}, {"n": np.int64(1)}]}, "point 2 is there twice"),
+        ({"points": [{"n": math.nan}]}, "point 0: parameter 'n' is nan; it must be finite"),
+        ({"points": [{"n": math.inf}]}, "must be finite"),
+        ({"points": [{"n": [1]}]}, "neither a number nor a flag nor text"),
+        ({"points": [{"n": 2**64}]}, "64 bits"),
+        ({"points": [{"n": "\ud800"}]}, "surrogates"),
+        ({"points": [{"n": 1}, {"m": 1}]}, "point 1 has the parameters m"),
+        ({"points": [{}]}, "must be a mapping"),
+        ({"points": [3]}, "must be a mapping"),
+        ({"points": [{"error": 1}]}, "adds that column"),
+        ({"chunk": 0}, "whole number >= 1"),
+        ({"chunk": True}, "whole number >= 1"),
+        ({"scheduler": "tcp://127.0.0.1:1", "executor": Executor()}, "give one of them"),
+        ({"function": lambda point: point}, "top level of a module"),
+        ({"function": functools.partial(print, Future())}, "cannot be sent"),
+    ],
+)
+def test_what_cannot_be_swept_is_refused_with_a_sentence(
+    arguments: dict[str, Any], sentence: str
+) -> None:
+    usual: dict[str, Any] = {"function": functions.bound, "points": POINTS, "jobs": 1}
+    with pytest.raises(StudyError, match=sentence):
+        sweep(**(usual | arguments))
+
+
+def test_axes_that_span_no_grid_are_refused() -> None:
+    unusable: list[dict[str, Any]] = [{}, {"a": []}, {"a": [math.nan]}, {"a": np.eye(2)}]
+    for axes in unusable:
+        with pytest.raises(StudyError, match="axis"):
+            grid(**axes)
+
+
+def test_a_file_that_cannot_be_used_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    for path in (tmp_path, tmp_path / "file" / "below", Path("/proc/nowhere/kept")):
+        with pytest.raises(StudyError, match="cannot be written"):
+            sweep(functions.bound, POINTS, results=path, jobs=1)
+    with pytest.raises(StudyError, match="cannot be written"):
+        serial().write(tmp_path / "no" / "where.csv")
+    with pytest.raises(StudyError, match="the formats are 'csv', 'parquet'"):
+        serial().write(tmp_path / "table.hdf5")
+
+
+def test_what_is_not_installed_is_named_with_the_command_that_installs_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("pyarrow", "pyarrow.parquet", "distributed"):
+        monkeypatch.setitem(sys.modules, name, None)
+    with pytest.raises(StudyError, match=r"pip install 'hapticbridge\[tables\]'"):
+        serial().write(tmp_path / "table.parquet")
+    with pytest.raises(StudyError, match=r"pip install 'hapticbridge\[cluster\]'"):
+        sweep(functions.bound, POINTS, scheduler="tcp://127.0.0.1:1")
+
+
+def test_a_scheduler_that_does_not_answer_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The port is closed, the protocol is unknown, or a server stays silent."""
+    distributed = pytest.importorskip("distributed")
+    monkeypatch.setattr(sys.modules["hapticbridge.sweep.sweep"], "_PATIENCE", 0.2)
+    # a client that was refused is given up after 10 s, with a traceback that cannot be caught
+    monkeypatch.setattr(distributed, "Client", None)
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        port = silent.getsockname()[1]
+        for address in ("tcp://127.0.0.1:1", "nonsense://x", f"tcp://127.0.0.1:{port}"):
+            with pytest.raises(StudyError, match="no dask scheduler answers") as refusal:
+                sweep(functions.bound, POINTS, scheduler=address)
+            assert address in str(refusal.value)
+            assert "()" not in str(refusal.value)

@@ -92,7 +92,9 @@ def test_what_cannot_be_opened_says_why() -> None:
     seam = HidSeam(EchoHid())
     (plugged,) = find(ECHO, seam)
     seam.plugged.clear()
-    with pytest.raises(DeviceError, match="cannot be opened; it may be in use or just unplugged"):
+    with pytest.raises(
+        DeviceError, match="cannot be opened; it may be in use by another program or"
+    ):
         HidLink.open(plugged, seam)
 
 
@@ -181,7 +183,7 @@ def test_a_report_of_set_up_is_sent_before_the_call_returns_and_what_waited_is_d
     link.send(b"set-up")
     assert handle.sent == [b"old", b"set-up"]
     handle.result = -1
-    with pytest.raises(DeviceLost, match="slow did not take a report"):
+    with pytest.raises(DeviceLost, match="slow did not accept a report"):
         link.send(b"set-up")
     link.close()
 
@@ -208,7 +210,7 @@ def test_a_device_that_takes_no_report_any_more_is_lost(monkeypatch: pytest.Monk
     link = HidLink(handle, "stuck")
     link.write(b"a")
     handle.entered.acquire()
-    with pytest.raises(DeviceLost, match="stuck takes no reports any more"):
+    with pytest.raises(DeviceLost, match="stuck accepts no reports any more"):
         link.write(b"b")
     link.close()
     assert not handle.is_closed  # the thread is still inside hidapi, which uses what this frees
@@ -224,7 +226,7 @@ def test_a_failed_overlapped_write_is_told_by_the_next_call() -> None:
     assert link._writer is not None
     link._writer.join(5.0)
     for call in (lambda: link.write(b"b"), link.take):
-        with pytest.raises(DeviceLost, match="gone is gone: it took no report"):
+        with pytest.raises(DeviceLost, match="gone is gone: it did not accept a report"):
             call()
     link.close()
     assert handle.is_closed

@@ -229,7 +229,7 @@ def test_a_halted_endpoint_is_said_to_be_one(opened: Open) -> None:
     model = falcon()
     link = opened(Host(model))
     model.halted |= {READ_FROM}
-    assert "refuses to go on (endpoint halted)" in lost(link)
+    assert "has halted its endpoint" in lost(link)
 
 
 def test_a_write_that_is_not_taken_in_time_is_no_loss_and_one_that_fails_is(opened: Open) -> None:

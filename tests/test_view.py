@@ -35,7 +35,7 @@ from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.film_process import Stage
 from hapticbridge.recording import Attachment, Ring, read_recording
 from hapticbridge.recording.snapshot import Snapshot
-from hapticbridge.view.trace import LINES, Trace
+from hapticbridge.view.page import LINES, Trace
 from hapticbridge.view.window import Address, Window
 
 pytest.importorskip("viser", reason="needs the extra 'view'")
@@ -46,9 +46,9 @@ from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 
 from hapticbridge.view.geometry import Tendons
+from hapticbridge.view.page import Sight
 from hapticbridge.view.process import LiveRun, run_of
 from hapticbridge.view.replay import Replay, Theatre, contacts_of
-from hapticbridge.view.sight import Sight
 
 # viser's threads and sockets end with the process
 pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")

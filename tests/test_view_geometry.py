@@ -30,8 +30,7 @@ from hapticbridge.view.geometry import (
     shell,
     terrain,
 )
-from hapticbridge.view.ghost import FARTHEST, LONGEST_ARROW, Ghost, linear
-from hapticbridge.view.sight import Sight
+from hapticbridge.view.page import FARTHEST, LONGEST_ARROW, Ghost, Sight, linear
 
 Array = NDArray[np.float64]
 

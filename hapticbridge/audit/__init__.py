@@ -1,4 +1,4 @@
-"""The verdict on a recording, from the recording alone. Never imports the bridge.
+"""Verdict on a recording, from the recording alone; never imports the bridge.
 
 Read ``verdict`` first. It checks that the file is whole (``structure``), computes the energies
 again in plain NumPy (``energy``), checks the recorded motion against the coupling law (``motion``)

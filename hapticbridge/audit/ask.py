@@ -1,4 +1,4 @@
-"""The audit as it is called: its promise, without what it takes to keep it."""
+"""Public entry point of the audit; heavy imports are deferred to the first call."""
 
 from __future__ import annotations
 
@@ -12,21 +12,22 @@ if TYPE_CHECKING:
 def audit(path: str | Path, *, strict: bool = False) -> AuditReport:
     """Judges a recording from the file alone.
 
-    Structure (checksums, schema, contiguous ticks, finite numbers, digest), the wrench against the
-    coupling law, energies recomputed from poses and wrenches, the device condition, and, where the
-    versions match, a re-simulation that must agree bit for bit. Unless the device condition proves
-    the device's port, it is judged by what happened: the verdict is ``active`` from the tick on at
-    which the device was given more than its damping burns and scene and coupling give up.
+    The audit checks the structure (checksums, schema, contiguous ticks, finite numbers, digest),
+    the wrench against the coupling law, energies recomputed from poses and wrenches, and the device
+    condition. If the versions match, a re-simulation must agree bit for bit. A device port that the
+    device condition does not prove safe is judged by its energy. The verdict is ``active`` from the
+    tick at which the device has received more than its damping dissipates and scene and coupling
+    release.
 
-    The file is read block by block, three times: for its digest and events, for its structure, and
-    for everything else. So memory does not grow with the recording's length, but for its events.
+    The file is read three times, block by block: digest and events, structure, everything else.
+    Memory grows only with the number of events.
 
     Args:
         path: The recording.
-        strict: Accept only (14) itself, not the slack that the device condition leaves.
+        strict: True accepts only (14) itself, not the slack that the device condition leaves.
 
     Raises:
-        RecordingError: The file is not a recording at all.
+        RecordingError: The file is not a recording.
     """
     from hapticbridge.audit.verdict import verdict_on  # noqa: PLC0415 - takes seconds
 

@@ -19,7 +19,7 @@ from hapticbridge.errors import RecordingError, StudyError, choices
 from hapticbridge.files import finite_or_null
 from hapticbridge.sweep.points import Value
 from hapticbridge.sweep.results import Interrupted, Table, check_format
-from hapticbridge.sweep.sweep import InThisProcess, sweep
+from hapticbridge.sweep.sweep import sweep
 
 FEW = 8
 """Recordings below which no processes are started: each takes 3 s to start, as long as the audit
@@ -90,9 +90,8 @@ def audit_all(
     """
     if not paths:
         raise RecordingError("audit needs at least one recording")
-    is_alone = jobs == 1 or (jobs is None and len(paths) < FEW)
-    if is_alone and executor is None and scheduler is None:
-        executor = InThisProcess()
+    if jobs is None and len(paths) < FEW:
+        jobs = 1
     try:
         table = sweep(
             partial(audit_point, strict=strict),
@@ -176,8 +175,7 @@ def write_audits(table: Table, path: Path) -> None:
     columns = {n: c for n, c in table.columns.items() if n not in (_REPORT, "error")}
     if path.suffix != ".json":
         kept = {**columns, "error": table["error"]}
-        results = tuple(name for name in table.results if name in columns)
-        Table(kept, table.parameters, results).write(path, units=_UNITS)
+        Table(kept).write(path, units=_UNITS)
         return
     values = {name: column.tolist() for name, column in columns.items()}
     rows = [dict(zip(values, row, strict=True)) for row in zip(*values.values(), strict=True)]
@@ -202,8 +200,7 @@ def _with_failures(table: Table) -> Table:
         "exit_code": np.where(table.failed, 2, table.numbers("exit_code")),
         "margin": np.where(table.failed, np.nan, table.numbers("margin")),
     }
-    results = tuple(dict.fromkeys([*table.results, *filled]))
-    return Table({**table.columns, **filled}, table.parameters, results)
+    return Table({**table.columns, **filled})
 
 
 def _sorted(table: Table) -> Table:

@@ -1,8 +1,8 @@
-"""A second opinion on a recording's physics: plain NumPy over the recorded poses and wrenches.
+"""Second computation of a recording's energies, in plain NumPy over recorded poses and wrenches.
 
-Written apart from the kernel on purpose. It uses other formulas where there are any (rotation
-vectors by matrices of quaternion products over whole arrays), so that one mistake does not hide
-the other. A long recording is judged block by block: ``Reached`` is what one hands to the next.
+It is written apart from the kernel on purpose, with other formulas where possible (quaternion
+products over whole arrays), so that one mistake does not hide another. Long recordings are judged
+block by block; ``Reached`` carries the state.
 """
 
 from __future__ import annotations
@@ -17,11 +17,7 @@ from hapticbridge.audit.guard import Guarded, limits_on_tool, spring_energy
 from hapticbridge.audit.motion import Motion, steps, summed, turn_between, turns, wrench_by_law
 from hapticbridge.kernel.parameters import RunParameters
 
-# What a device was given that nothing paid for, from recorded poses and wrenches.
-#
-# Over a run the device may keep what its damping burns, what the scene gives up and what the
-# coupling's spring gives up; a hand can take no more out. What exceeds that comes from the
-# wrench being held between the samples, and is the fault of the port ``device``.
+# Energy balance of the device port, from recorded poses and wrenches.
 
 
 def burnt_by_damping(
@@ -31,19 +27,19 @@ def burnt_by_damping(
     interval: Array,
     is_running: NDArray[np.bool_],
 ) -> Array:
-    """Returns b‖δp‖²/t of each tick, the least that the device's damping burns, (n,) in J.
+    """Returns b‖δp‖²/t of each tick, the least dissipation of the device's damping, (n,) in J.
 
-    t is the time between two samples, T at least: a damper that moves by δp within t burns no less
-    than at constant speed, and a missed deadline makes t longer. Dry friction is not counted: an
-    encoder's steps do not tell how far the device slid.
+    t is the time between two samples, at least T. A damper that moves by δp within t dissipates no
+    less than at constant speed; a missed deadline makes t longer. Dry friction is not counted,
+    because encoder steps do not show how far the device slid.
 
     Args:
-        parameters: The run's; the damping is known.
+        parameters: Run parameters with known damping.
         moved: δp of each tick, (n, 3) in m.
-        turned: Its rotation vectors, (n, 3) in rad.
+        turned: Rotation vectors of each tick, (n, 3) in rad.
         interval: t as recorded, (n,) in s.
-        is_running: Where the tick's duration is known: a jump before the first tick or in a pause
-            took an unknown time, and burns nothing here.
+        is_running: True for ticks of known duration. A jump before the first tick or in a pause
+            took an unknown time and dissipates nothing here.
     """
     burnt = (parameters.device_damping or 0.0) * np.sum(moved**2, axis=1)
     burnt += (parameters.device_rotational_damping or 0.0) * np.sum(turned**2, axis=1)
@@ -52,7 +48,7 @@ def burnt_by_damping(
 
 
 def passed_shares(ticks: NDArray[np.void], parameters: RunParameters) -> tuple[Array, Array]:
-    """Returns the share of force and of torque that the guard let through, (n,) each."""
+    """Returns the shares of force and torque that the guard transmitted, (n,) each."""
     scales = (parameters.force_scale, parameters.force_scale / parameters.scale)
     shares = []
     for part, scale in zip((slice(0, 3), slice(3, 6)), scales, strict=True):
@@ -77,35 +73,37 @@ def stored_in_coupling(
     share_before: float = 0.0,
     has_end: bool = True,
 ) -> tuple[Array, Array]:
-    """Returns what coupling and tool took up of what the handle gave, in J of the scene.
+    """Returns the energy stored in coupling and tool from the handle, in J of the scene.
 
         Σ c_k w_k + r_k V(e_k) − Σ max(0, r_k − r_{k−1}) (V(e_k) + ½‖δe_k‖²_{B/T}) − Σ W_k
 
-    V is the energy of a spring whose force stops growing at the limit, ½ K e² below it. With b >=
-    K T/2 + B and no limit in play, what the device is given less what it burns and plus this is
-    never above zero, whatever hand and tool do: the identity behind (6), in which V(e) at the end
-    stands on the left. The last sum is what a force that is switched on finds stretched already,
-    in a ramp or after a jump of the device before its first tick. W_k = r_{k−1} (V_k(p_k) −
-    V_{k−1}(p_k)), p = h_k − x_{k−1}, is what a command did to the spring by changing K
-    (``kernel.tuning``): neither scene nor coupling gave that up.
+    V is the energy of a spring whose force stops growing at the limit, ½ K e² below it. Let E be
+    the energy given to the device minus its dissipation plus this result. With b >= K T/2 + B and
+    no active limit, E is never above zero, for any hand and tool. This is the identity behind (6),
+    with V(e) at the end on the left. What exceeds zero comes from the wrench held between samples
+    and is the fault of the port ``device``.
+
+    The second sum is the energy already stretched into the spring when the force is switched on, in
+    a ramp or after a jump of the device before its first tick. W_k = r_{k−1} (V_k(p_k) −
+    V_{k−1}(p_k)), p = h_k − x_{k−1}, is the work of a command that changes K (``kernel.tuning``);
+    neither scene nor coupling released it.
 
     Args:
-        parameters: The run's, of a method with a coupling law and one law a tick.
+        parameters: Run parameters of a method with a coupling law and one law per tick.
         gains: K, B', K_r and B'_r in the tick before each and in each, (n, 4) each.
         pulled: p in m and as rotation vectors, (n, 3) each.
         stretch: e in m and as rotation vectors, (n, 3) each.
-        stretched: Their changes in each tick.
-        work: Of force and of torque on the tool in each tick, (n,) each in J.
-        passed: c, the share of force and of torque that the guard let through, (n,) each.
+        stretched: Change of e in each tick.
+        work: Work w of force and of torque on the tool in each tick, (n,) each in J.
+        passed: c, the share of force and of torque that the guard transmitted, (n,) each.
         since_start: Ticks since the force began to rise, (n,).
-        share: r, the share of the wrench that is let through while it rises or fades, (n,).
+        share: r, the share of the wrench transmitted by ramp and fading, (n,).
         share_before: r of the tick before the first of these.
-        has_end: Whether r_k V(e_k) is counted. It stands for what a device at e_k could still be
-            given; where the device is no longer there, because the sample is old, only what it was
-            given by then counts.
+        has_end: True counts r_k V(e_k), which a device at e_k could still receive. With an old
+            sample the device is elsewhere, and only the energy given so far counts.
 
     Returns:
-        What is summed over the ticks, each tick's part of it, and r V(e); (n,) each.
+        The summand of each tick, and r V(e); (n,) each.
 
     References:
         Brown & Colgate 1997, eq. (6); here summed over time instead of frequency by frequency.
@@ -132,13 +130,9 @@ def work_of_commands(
     pulled: tuple[Array, Array],
     share_before: Array,
 ) -> Array:
-    """Returns W_k of ``stored_in_coupling``, what commands did to the springs, (n,) in J.
+    """Returns W_k of ``stored_in_coupling``, the work of commands on the springs, (n,) in J.
 
-    Args:
-        parameters: The run's.
-        gains: K, B', K_r and B'_r in the tick before each and in each, (n, 4) each.
-        pulled: h_k − x_{k−1} in m and as rotation vectors, (n, 3) each.
-        share_before: The share of the wrench that was let through in the tick before each, (n,).
+    Arguments are those of ``stored_in_coupling``; ``share_before`` has one value per tick.
     """
     work = np.zeros(len(share_before))
     for column, limit, p in zip((0, 2), limits_on_tool(parameters), pulled, strict=True):
@@ -149,7 +143,7 @@ def work_of_commands(
     return share_before * work
 
 
-# What one block of records hands to the next.
+# Audit state carried from one block of records to the next.
 
 SUMS = (
     "coupling_work",
@@ -162,22 +156,22 @@ SUMS = (
     "kept",
     "commanded",
 )
-"""What is summed over ticks."""
+"""Names of the cumulative energies."""
 
 
 @dataclass(frozen=True, slots=True)
 class Reached:
-    """Where a recording has got to: what the balance of its next ticks begins with.
+    """State of the balance after the previous tick.
 
     Attributes:
-        handle: Handle pose (7,) in the tick before.
+        handle: Handle pose (7,).
         tool: Tool pose (7,).
         device: Device pose (7,).
-        sent: Wrench that was sent to the device, (6,).
-        start_energy: Kinetic plus potential energy before the first tick, in J.
-        share: Of the wrench that the ramp let through.
-        guarded: Where the guard has got to.
-        sums: The cumulative energies so far, in J.
+        sent: Wrench sent to the device, (6,).
+        start_energy: Kinetic, potential and elastic energy before the first tick, in J.
+        share: Share of the wrench that ramp and fading transmitted.
+        guarded: State of the guard.
+        sums: Cumulative energies in J.
     """
 
     handle: Array
@@ -193,13 +187,9 @@ class Reached:
     def at_start(
         cls, parameters: RunParameters, handle: Array, tool: Array, start_energy: float
     ) -> Reached:
-        """Returns what the first tick begins with.
+        """Returns the state before the first tick.
 
-        Args:
-            parameters: The run's.
-            handle: Handle pose (7,) before the first tick.
-            tool: Tool pose (7,) before the first tick.
-            start_energy: Kinetic plus potential energy before the first tick, in J.
+        ``start_energy`` is kinetic plus potential energy, in J.
         """
         device = np.array(parameters.device_start)
         guarded = Guarded.at_start(parameters, handle, tool, start_energy)
@@ -210,36 +200,37 @@ class Reached:
 Array = NDArray[np.float64]
 
 SLACK_SHARE = 0.5
-"""Share of the slack that counts where several laws are computed in a tick, without unit: as
-``certificate.required_damping`` assumes."""
+"""Share of the slack that counts with several laws per tick, without unit; equal to the assumption
+of ``certificate.required_damping``."""
 
 
 @dataclass(frozen=True, slots=True)
 class EnergyBalance:
-    """What the recorded poses and wrenches say by themselves.
+    """Quantities computed from recorded poses and wrenches.
 
-    Cumulative is from the first tick of the recording on, however many ticks came before these.
+    Cumulative values count from the first tick of the recording.
 
     Attributes:
-        wrench_on_tool: The coupling law at the recorded poses, (n, 6) in N and N m; the recorded
-            wrench itself where the recorded poses alone do not tell it.
-        wrench_on_device: What the guard should have sent for the recorded wrench, (n, 6).
-        injected_damping: What the passivity controller should have added at most on an axis of
-            translation and of rotation, (n, 2) in N s/m and N m s/rad.
-        handle_position: Where the recorded device pose puts the handle, (n, 3) in m.
-        handle_turn: By how much the recorded handle is turned from where it should be, (n,) in rad.
-        coupling_work: Cumulative Σ f·δx + τ·δφ of the recorded wrench, (n,) in J; as recorded
-            where it is summed over several laws a tick.
+        wrench_on_tool: Wrench of the coupling law at the recorded poses, (n, 6) in N and N m; the
+            recorded wrench if poses alone do not determine it.
+        wrench_on_device: Wrench that the guard should have sent for the recorded one, (n, 6).
+        injected_damping: Largest damping that the passivity controller should have added on an axis
+            of translation and of rotation, (n, 2) in N s/m and N m s/rad.
+        handle_position: Handle position computed from the recorded device pose, (n, 3) in m.
+        handle_turn: Angle between recorded and computed handle orientation, (n,) in rad.
+        coupling_work: Cumulative Σ f·δx + τ·δφ of the recorded wrench, (n,) in J; as recorded if
+            several laws per tick are summed.
         throughput: Cumulative Σ |f·δx + τ·δφ|, (n,) in J.
         device_energy: Cumulative energy given to the device by the recorded wrenches, (n,) in J.
-        device_throughput: The same with absolute values.
-        environment_energy: S_k − S_start − works, with ``coupling_work`` from here, (n,) in J.
+        device_throughput: Cumulative sum of that energy's absolute values, (n,) in J.
+        environment_energy: S_k − S_start − works, with the ``coupling_work`` above, (n,) in J.
         slack: Σ ½‖δx‖²_{K+B/T} + ½‖δφ‖²_{K_r+B_r/T}, (n,) in J.
-        kicked: What the device was given beyond what its damping burns and scene and coupling
-            give up, (n,) in J; zero for an unknown damping, or several laws a tick. Behind a
-            coupling law what the environment created is not in it: that is the other port's.
-        commanded: What commands that changed the coupling gave to what is felt, (n,) in J.
-        reached: What the balance of the next ticks begins with.
+        kicked: Energy given to the device beyond its dissipation and the energy released by scene
+            and coupling, (n,) in J. Zero for an unknown damping or several laws per tick. With a
+            coupling law, energy created by the environment is not included; it belongs to the other
+            port.
+        commanded: Energy that commands added to the effective coupling, (n,) in J.
+        reached: State at the end of these ticks.
     """
 
     wrench_on_tool: Array
@@ -268,16 +259,16 @@ class EnergyBalance:
         late: int = 0,
         following: NDArray[np.void] | None = None,
     ) -> EnergyBalance:
-        """Computes everything from records.
+        """Computes the balance of consecutive records.
 
         Args:
             ticks: Records without gaps, ``TICK_DTYPE``, at least one.
-            parameters: The run's.
-            before: What the ticks before them left.
-            outside: What was done to the run while it went on.
-            late: After how many ticks a wrench answers a sample: what was sent in row k acted on
-                the motion between rows k + late and k + late + 1.
-            following: The records after these, as many as ``late``, or fewer where they end.
+            parameters: Run parameters.
+            before: State before these ticks.
+            outside: External actions during the run.
+            late: Delay in ticks: the wrench of row k acted on the motion between rows k + late and
+                k + late + 1.
+            following: The next ``late`` records, or fewer at the end.
         """
         sums = before.sums
         numbers = ticks["tick"]
@@ -292,7 +283,7 @@ class EnergyBalance:
             np.sum(recorded[:, 3:] * motion.tool_turn, axis=1),
         )
         work = works[0] + works[1]
-        # over several laws a tick the work is a sum that their mean does not tell
+        # with several laws per tick the mean wrench does not determine the summed work
         coupling_work = (
             ticks["coupling_work"] if parameters.laws > 1 else summed(work, sums["coupling_work"])
         )
@@ -315,7 +306,7 @@ class EnergyBalance:
         slack = summed(slack, sums["slack"])
         expected, guarded = before.guarded.after(ticks, outside, created - slack)
         seen = expected.seen
-        kept, lost = coupling_work, created  # without a law, all that the scene took up
+        kept, lost = coupling_work, created  # without a law, all energy stored in the scene
         kept_sum = np.zeros(len(ticks))
         turned = np.zeros(len(ticks))
         if parameters.has_law:
@@ -323,8 +314,8 @@ class EnergyBalance:
             pulled = motion.pulled, motion.turned
             share_before = np.concatenate([[before.share], seen.share[:-1]])
             turned = work_of_commands(parameters, around, pulled, share_before)
-            # the slack pays for what the environment creates, but a ramp or a limit lets through
-            # only a share of the slack: counted here, it would blame a device that bears its law
+            # The slack covers energy created by the environment, but a ramp or a limit passes only
+            # a share of the slack. Counted here, it would blame a device that bears its coupling.
             lost = np.minimum(created, 0.0)
             parts, held = stored_in_coupling(
                 parameters,
@@ -387,9 +378,9 @@ class EnergyBalance:
 
 
 def _slack_gains(parameters: RunParameters, gains: Array) -> tuple[Array, Array]:
-    """Returns K + B/T and K_r + B_r/T of the coupling that the tool was held by, (n,) each.
+    """Returns K + B/T and K_r + B_r/T of the coupling, (n,) each.
 
-    With n laws a tick only half of K/n + B/T counts; without a coupling law nothing does.
+    With n laws per tick only half of K/n + B/T counts; without a coupling law both are 0.
     """
     if not parameters.has_law:
         return np.zeros(len(gains)), np.zeros(len(gains))
@@ -400,7 +391,7 @@ def _slack_gains(parameters: RunParameters, gains: Array) -> tuple[Array, Array]
 
 
 def _kicked(parameters: RunParameters, given: Array, burnt: Array, taken: Array) -> Array:
-    """Returns Σ w·δp − Σ b‖δp‖²/t + what scene and coupling took up, in the device's scale."""
+    """Returns Σ w·δp − Σ b‖δp‖²/t + energy stored in scene and coupling, in the device's scale."""
     if parameters.device_damping is None or (parameters.has_law and parameters.laws > 1):
         return np.zeros(len(given))
     return np.asarray(given - burnt + parameters.force_scale / parameters.scale * taken)
@@ -409,7 +400,7 @@ def _kicked(parameters: RunParameters, given: Array, burnt: Array, taken: Array)
 def _later(
     ticks: NDArray[np.void], following: NDArray[np.void] | None, late: int
 ) -> tuple[Array, Array]:
-    """Returns the device's steps and turns ``late`` rows on; none where the records end by then."""
+    """Returns the device's steps and turns ``late`` rows later; zeros after the last record."""
     rows = ticks if following is None else np.concatenate([ticks, following])
     moved = []
     for field, of in (("device_position", steps), ("device_quaternion", turns)):

@@ -1,7 +1,7 @@
-"""What was done to a run from outside while it went on, tick by tick, from its events alone.
+"""External actions during a run, from its events.
 
-The second reading of those events: ``commands.change`` applies them one after the other to the
-kernel, here they become arrays over ticks.
+This is the second reading of the events: ``commands.change`` applies them one by one to the kernel;
+here they become arrays over ticks.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ class RunEvents:
     """Pauses, resets, switches and couplings of a run.
 
     Attributes:
-        parameters: Of the run as it began.
-        home: Tool pose (7,) to which a reset puts tool and handle.
-        resumed: Ticks at which the run went on after a pause without force.
-        resets: Ticks before which the scene was put back to its start.
-        couplings: What the coupling was or became, K and B' of the law, in order.
+        parameters: Run parameters at the start.
+        home: Pose (7,) of tool and handle after a reset.
+        resumed: Ticks at which the run resumed after a pause without force.
+        resets: Ticks before which the scene was reset.
+        couplings: Couplings of the law (K and B') in order, the initial one first.
     """
 
     parameters: RunParameters
@@ -52,15 +52,12 @@ class RunEvents:
     def of(
         cls, events: Iterable[Mapping[str, Any]], parameters: RunParameters, home: Array
     ) -> RunEvents:
-        """Reads events.
+        """Reads the events of a recording.
 
-        Args:
-            events: Of a recording, in order.
-            parameters: Of the run as it began.
-            home: Tool pose (7,) before its first tick.
+        ``home`` is the tool pose (7,) before the first tick.
 
         Raises:
-            RecordingError: One of them is damaged.
+            RecordingError: An event is damaged.
         """
         told: dict[str, list[Mapping[str, Any]]] = {
             name: [] for name in ("resume", "reset", "coupling", "switch")
@@ -101,14 +98,14 @@ class RunEvents:
         return np.concatenate([[0], bits])[last + 1]
 
     def is_reset(self, numbers: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Returns which of some ticks began with a reset."""
+        """Returns True for each tick that began with a reset."""
         return np.isin(numbers, self.resets)
 
     def sentences(self, given: float | None = None) -> tuple[str, ...]:
-        """Returns what is to be said of a coupling that was changed, if it was.
+        """Describes changes of the coupling; empty without any.
 
-        Args:
-            given: What that gave to what is felt, in J; None while it is not known.
+        ``given`` is the energy that they added to the effective coupling, in J; None if not yet
+        known.
         """
         count = len(self.couplings) - 1
         if count < 1:
@@ -126,10 +123,9 @@ class RunEvents:
         )
 
     def worst(self, info: DeviceInfo, method: Method) -> RunParameters:
-        """Returns the run's parameters with the coupling that asks most of the device.
+        """Returns the run's parameters with the most demanding coupling, per kind of axis.
 
-        In translation and in rotation each; what is asked is convex in the coupling, so that none
-        between two of them asks for more.
+        The required damping is convex in the coupling, so no intermediate coupling needs more.
         """
         parameters = self.parameters
         if len(self.couplings) < 2:

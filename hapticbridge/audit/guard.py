@@ -1,7 +1,7 @@
-"""What the guard should have sent, and where the handle should have been, from records alone.
+"""Second computation of the guard, from records alone.
 
-The second computation of what ``kernel.watch``, ``kernel.account`` and ``kernel.wrench`` do tick by
-tick, over whole arrays, block by block.
+It repeats over whole arrays, block by block, what ``kernel.watch``, ``kernel.account`` and
+``kernel.wrench`` do tick by tick.
 """
 
 from __future__ import annotations
@@ -21,11 +21,10 @@ from hapticbridge.kernel.parameters import DAMPER, ENVIRONMENT, RunParameters
 from hapticbridge.kernel.passivity_controller import BOUND, SWINGS, TANK_START, THRESHOLD, WINDOW
 from hapticbridge.record import TickFlag
 
-# Limits on norm and change, as ``kernel.wrench`` applies them, from records alone.
+# Second computation of the wrench limits.
 
 
 def _limited(vector: Array, limit: float) -> Array:
-    """Shortens what is longer than the limit."""
     norm = np.linalg.norm(vector, axis=-1, keepdims=True)
     return np.asarray(vector * np.where(norm > limit, limit / np.maximum(norm, 1e-300), 1.0))
 
@@ -38,15 +37,15 @@ def chained(
     starts: NDArray[np.bool_],
     first: Array,
 ) -> Array:
-    """Limits a vector where its change since the row before, as that was sent, is bounded.
+    """Limits norm and change of a vector; the change counts from the row before as sent.
 
     Args:
-        vector: (n, 3).
-        change: Most change of each component, (n, 3); inf where there is no bound.
+        vector: Vectors, (n, 3).
+        change: Largest change of each component, (n, 3); inf without a bound.
         limit: Largest norm.
         rise: Largest norm of the change.
-        starts: Rows before which it was zero.
-        first: What was sent before the first row, (3,).
+        starts: Rows that start from zero.
+        first: Vector sent before the first row, (3,).
     """
     sent = _limited(vector, limit)
     before = np.concatenate([first[None], sent[:-1]])
@@ -69,7 +68,7 @@ def chained(
 
 
 def limits_on_tool(parameters: RunParameters) -> tuple[float, float]:
-    """Returns force and torque on the tool at which no more reaches the device, N and N m."""
+    """Returns force and torque on the tool at the device's limits, in N and N m."""
     return (
         parameters.force_limit / parameters.force_scale,
         parameters.torque_limit * parameters.scale / parameters.force_scale,
@@ -77,33 +76,29 @@ def limits_on_tool(parameters: RunParameters) -> tuple[float, float]:
 
 
 def spring_energy(stiffness: Array, length: Array, limit: float) -> Array:
-    """Returns ∫ min(K e, limit) de, in J; for each K and length, (n,) each."""
+    """Returns ∫ min(K e, limit) de in J, for each K and length, (n,) each."""
     at_limit = np.divide(limit, stiffness, out=np.full_like(length, np.inf), where=stiffness > 0)
     elastic = np.minimum(length, at_limit)
     return np.asarray(0.5 * stiffness * elastic**2 + limit * (length - elastic))
 
 
-# When the handle must have followed the device, from records alone, block by block.
-#
-# The second computation of what ``kernel.watch`` does tick by tick, over whole arrays.
+# Second computation of the watch on device samples.
 
 Flags = NDArray[np.bool_]
 
 _ROUNDING = 1e-6
-"""In ticks of a ramp: by how much two sums of parts of them may differ."""
+"""Largest rounding difference of two sums, in ticks of a ramp."""
 
 
 def has_flag(ticks: NDArray[np.void], flag: TickFlag) -> Flags:
-    """Returns in which records a flag is set."""
+    """Returns True for each record with a flag."""
     return np.asarray((ticks["flags"] & int(flag)) != 0)
 
 
 def run_lengths(is_on: Flags, before: int) -> NDArray[np.int64]:
-    """Returns for each row how many rows up to it are on without a gap.
+    """Returns the length of the uninterrupted run of True values up to each row.
 
-    Args:
-        is_on: Of these rows.
-        before: How many before the first of them.
+    ``before`` is the length of the run before the first row.
     """
     index = np.arange(1, len(is_on) + 1)
     return np.asarray(index - np.maximum.accumulate(np.where(is_on, -before, index)))
@@ -111,16 +106,16 @@ def run_lengths(is_on: Flags, before: int) -> NDArray[np.int64]:
 
 @dataclass(frozen=True, slots=True)
 class Seen:
-    """What the watch saw in some ticks.
+    """Result of the watch for some ticks.
 
     Attributes:
-        first: Which are the first of a run, after a start or a pause without force.
-        interval: Time in s since the device's last new sample, T at least between two readings.
+        first: True for the first tick after a start or a pause without force.
+        interval: Time in s since the device's last new sample, at least T between two readings.
         since_start: Ticks since the wrench began to rise.
-        ramp: In how many ticks it rises: slowly after a start, soon after a re-seating.
-        silence: For how many ticks it has been fading.
-        flags: Where the flags must be set that records repeat.
-        share: Of the wrench that is let through while it rises or fades.
+        ramp: Length of the rise in ticks: long after a start, short after a re-anchoring.
+        silence: Number of ticks for which the wrench has been fading.
+        flags: Expected values of redundant flags.
+        share: Share of the wrench transmitted by ramp and fading.
     """
 
     first: Flags
@@ -134,19 +129,19 @@ class Seen:
 
 @dataclass(slots=True)
 class Watch:
-    """Where the watch has got to.
+    """State of the watch after the previous tick.
 
     Attributes:
-        parameters: The run's.
-        device: Device pose (7,) in the tick before.
-        read_ns: When the device was read then.
-        stale: How many ticks in a row had nothing new.
-        silent: For how many ticks the wrench has been fading.
-        since_news: Time in s of those without news.
-        is_released: Whether the handle did not follow.
-        start: The tick at which the wrench began to rise.
-        is_soon: Whether it then rose soon.
-        risen: How far it has risen by now, in ticks of a ramp.
+        parameters: Run parameters.
+        device: Device pose (7,).
+        read_ns: Time of the device reading.
+        stale: Number of consecutive ticks without a new sample.
+        silent: Number of ticks for which the wrench has been fading.
+        since_news: Time in s without a new sample.
+        is_released: True if the handle did not follow the device.
+        start: Tick at which the wrench began to rise.
+        is_soon: True if that rise was a short one.
+        risen: Progress of the rise, in ticks of a ramp.
     """
 
     parameters: RunParameters
@@ -162,17 +157,12 @@ class Watch:
 
     @classmethod
     def at_start(cls, parameters: RunParameters) -> Watch:
-        """Returns what the first tick begins with."""
+        """Returns the state before the first tick."""
         is_released = parameters.guarding.dead_man != 0
         return cls(parameters, np.array(parameters.device_start), is_released=is_released)
 
     def after(self, ticks: NDArray[np.void], outside: RunEvents) -> tuple[Seen, Watch]:
-        """Looks at the next records, ``TICK_DTYPE``, at least one.
-
-        Args:
-            ticks: The records.
-            outside: What was done to the run while it went on.
-        """
+        """Evaluates the next records, ``TICK_DTYPE``, at least one."""
         guarding, period = self.parameters.guarding, self.parameters.period
         index = np.arange(len(ticks))
         first = (ticks["tick"] == 0) | np.isin(ticks["tick"], outside.resumed)
@@ -182,7 +172,7 @@ class Watch:
         stale = run_lengths(is_stale, self.stale)
         interval = elapsed.copy()
         interval[0] += self.since_news
-        # one after the other, so that the sums do not depend on where a block ends
+        # added one by one, so that the sums do not depend on the blocks
         for k in (1 + np.flatnonzero(is_stale[:-1])).tolist():
             interval[k] += interval[k - 1]
 
@@ -232,21 +222,19 @@ class Watch:
         return seen, then
 
     def _risen(self, pace: Array, last: NDArray[np.int64], full: Array) -> Array:
-        """Returns how far the wrench has risen, in ticks of a ramp.
+        """Returns the progress of the rise, in ticks of a ramp.
 
-        Args:
-            pace: How far it may rise in each tick, (n,).
-            last: Row in which it began, -1 for before these.
-            full: How far it can, (n,).
+        ``pace`` is the largest progress in each tick. The rise began in row ``last``, −1 before
+        these rows, and ends at ``full``.
         """
         gone = np.cumsum(pace)
         before = np.where(last >= 0, gone[last] - pace[last], -self.risen)
         return np.minimum(gone - before, full)
 
     def _pace(self, ticks: NDArray[np.void], outside: RunEvents, begins: Flags) -> Array:
-        """Returns how far the wrench may rise in each tick, in ticks of a ramp, (n,).
+        """Returns the largest progress in each tick, in ticks of a ramp, (n,).
 
-        min(1, V_0/V) where the coupling holds V, as the records have handle and tool.
+        It is min(1, V_0/V) for the energy V stored in the coupling at the recorded poses.
         """
         parameters, pace = self.parameters, np.ones(len(ticks))
         most = parameters.guarding.ramp_energy
@@ -267,24 +255,22 @@ class Watch:
 
 
 def _ramps(ticks: NDArray[np.void], risen: Array, full: Array) -> Flags:
-    """Returns where the flag must be set; where rounding decides, what the record says."""
+    """Returns the expected flag; where rounding decides, the recorded one."""
     is_close = (np.abs(risen - full) < _ROUNDING) & (risen != np.rint(risen))
     return np.where(is_close, has_flag(ticks, TickFlag.RAMPING), risen < full)
 
 
-# What the passivity controller should have made of the wrench, from records alone.
-#
-# The second computation of ``kernel.account``, over whole arrays, block by block.
+# Second computation of the passivity controller.
 
 
 class Controlled(NamedTuple):
-    """What the controller makes of the wrench.
+    """Wrench after the passivity controller.
 
     Attributes:
-        wrench: With damping or the tank's share, (n, 6).
-        change: By how much each component may change from tick to tick, (n, 6); inf: at will.
-        injected: The most damping added on an axis of translation and of rotation, (n, 2) in
-            N s/m and N m s/rad.
+        wrench: Wrench with damping or the tank's share, (n, 6).
+        change: Largest change of each component from tick to tick, (n, 6); inf without a bound.
+        injected: Largest damping added on an axis of translation and of rotation, (n, 2) in N s/m
+            and N m s/rad.
     """
 
     wrench: Array
@@ -294,19 +280,20 @@ class Controlled(NamedTuple):
 
 @dataclass(slots=True)
 class Account:
-    """Where the energy account has got to.
+    """State of the passivity observer.
 
     Attributes:
-        parameters: The run's.
-        own: What the scene stored in the tick before, but for what its motors and users put in, J.
-        sent: Wrench (6,) that was sent then.
-        gained: What the account gets for that tick, in J.
-        account: In J.
-        axes: Accounts (6,) of the axes, in J.
-        velocity: Of the device in the tick before, (6,).
-        over: What the environment had created beyond the slack then, in J.
-        excess: The same, of which no more than the surplus was ever saved, in J.
-        reversed: Where the motion of each axis was reversed in the last ticks, (n, 6).
+        parameters: Run parameters.
+        own: Energy stored in the scene after the previous tick without the work of motors and
+            users, in J.
+        sent: Wrench (6,) sent in the previous tick.
+        gained: Contribution of the scene to the account in the previous tick, in J.
+        account: Observed energy in J.
+        axes: Observed energies (6,) of the axes, in J.
+        velocity: Device velocity (6,) in the previous tick.
+        over: Energy created by the environment beyond the slack so far, in J.
+        excess: That energy with savings capped at the credit limit, in J.
+        reversed: Reversals of the motion of each axis in the last ticks, (n, 6).
     """
 
     parameters: RunParameters
@@ -329,15 +316,15 @@ class Account:
         resumed: Array,
         excess: Array,
     ) -> tuple[Controlled, Account]:
-        """Says what the controller makes of the wrenches of the next records, at least one.
+        """Computes the controller's effect on the wrenches of the next records, at least one.
 
         Args:
             ticks: The records, ``TICK_DTYPE``.
-            wrench: What the coupling asks to be sent, (n, 6).
-            seen: What the watch saw.
-            device: Device pose (7,) in the tick before.
-            resumed: Ticks at which the run went on after a pause without force.
-            excess: What the environment has created beyond the slack, (n,) in J.
+            wrench: Wrench requested by the coupling, (n, 6).
+            seen: Result of the watch.
+            device: Device pose (7,) in the previous tick.
+            resumed: Ticks at which the run resumed after a pause without force.
+            excess: Energy created by the environment beyond the slack, (n,) in J.
         """
         then = copy.copy(self)
         parameters, guarding = self.parameters, self.parameters.guarding
@@ -379,13 +366,13 @@ class Account:
         held = wrench - damping * velocity
         if guarding.controller == ENVIRONMENT:
             return Controlled(held, change, _largest(damping)), then
-        # the tank comes last, and only where no axis is bounded
+        # the tank comes last, and only if no axis is bounded
         pays = (debt > 0) & ~swings.any(axis=1)
         share = np.where(pays, _tank_share(parameters, held, velocity, account), 1.0)
         return Controlled(held * share[:, None], change, _largest(damping)), then
 
     def _gained(self, ticks: NDArray[np.void], wrench: Array, share: Array) -> Array:
-        """Returns what the account gets for each tick: what the scene took up of what was felt."""
+        """Returns the scene's contribution per tick: stored energy times transmitted share."""
         own = ticks["kinetic"] + ticks["potential"] - ticks["actuator_work"]
         own = own - ticks["external_work"]
         change = np.diff(own, prepend=self.own)
@@ -403,12 +390,12 @@ def capped_sum(values: Array, surplus: float, before: float | Array = 0.0) -> Ar
 
 
 def _largest(damping: Array) -> Array:
-    """Returns the largest of three axes of either kind, (n, 2)."""
+    """Returns the largest of three axes of each kind, (n, 2)."""
     return np.asarray(damping.reshape(-1, 2, 3).max(axis=2))
 
 
 def _tank_share(parameters: RunParameters, wrench: Array, velocity: Array, account: Array) -> Array:
-    """Returns the share of the wrench that the tank pays for, (n,)."""
+    """Returns the share of the wrench that the tank covers, (n,)."""
     work = parameters.period * np.sum(wrench * velocity, axis=1)
     level = np.maximum(TANK_START - account, 0.0)
     return np.where(work > level, level / np.where(work > level, work, 1.0), 1.0)
@@ -419,15 +406,15 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Expected:
-    """What should stand in some records.
+    """Expected content of some records.
 
     Attributes:
-        position: Of the handle, (n, 3) in m.
-        orientation: Of the handle, (n, 4).
-        wrench: That was sent to the device, (n, 6).
-        injected: The most damping that the controller added on an axis of translation and of
+        position: Handle position, (n, 3) in m.
+        orientation: Handle orientation, (n, 4).
+        wrench: Wrench sent to the device, (n, 6).
+        injected: Largest damping that the controller added on an axis of translation and of
             rotation, (n, 2) in N s/m and N m s/rad.
-        seen: What the watch saw.
+        seen: Result of the watch.
     """
 
     position: Array
@@ -439,17 +426,17 @@ class Expected:
 
 @dataclass(slots=True)
 class Guarded:
-    """Where the guard has got to.
+    """State of the guard after the previous tick.
 
     Attributes:
-        parameters: The run's.
-        watch: Where the watch has got to.
-        handle: Handle pose (7,) in the tick before.
-        tool: Tool pose (7,) then.
-        origin: Device pose that belongs to ``target``.
-        target: Handle pose.
-        account: Where the energy account has got to.
-        slewed: The wrench (6,) before ramp and fading.
+        parameters: Run parameters.
+        watch: State of the watch.
+        handle: Handle pose (7,).
+        tool: Tool pose (7,).
+        origin: Device pose at the last anchoring.
+        target: Handle pose at the last anchoring.
+        account: State of the passivity observer.
+        slewed: Wrench (6,) before ramp and fading.
     """
 
     parameters: RunParameters
@@ -465,7 +452,7 @@ class Guarded:
     def at_start(
         cls, parameters: RunParameters, handle: Array, tool: Array, start_energy: float
     ) -> Guarded:
-        """Returns what the first tick begins with; see ``Reached.at_start``."""
+        """Returns the state before the first tick; see ``Reached.at_start``."""
         origin, target = np.array(parameters.device_origin), np.array(parameters.handle_origin)
         watch = Watch.at_start(parameters)
         account = Account(parameters, start_energy)
@@ -474,12 +461,9 @@ class Guarded:
     def after(
         self, ticks: NDArray[np.void], outside: RunEvents, excess: Array
     ) -> tuple[Expected, Guarded]:
-        """Says what the next records, ``TICK_DTYPE``, at least one, should hold.
+        """Computes the expected content of the next records, ``TICK_DTYPE``, at least one.
 
-        Args:
-            ticks: The records.
-            outside: What was done to the run while it went on.
-            excess: What the environment has created beyond the slack, (n,) in J.
+        ``excess`` is the energy created by the environment beyond the slack, (n,) in J.
         """
         then = copy.copy(self)
         seen, then.watch = self.watch.after(ticks, outside)
@@ -521,8 +505,8 @@ class Guarded:
     def _follow(self, ticks: NDArray[np.void], outside: RunEvents) -> tuple[Array, Array]:
         """Maps the recorded device poses into the scene: h = h_0 + scale · A (p − p_0).
 
-        p_0 and h_0 are the device's pose and the tool's where the coupling was last re-seated;
-        while a clutch holds it, the handle stays where it was.
+        p_0 and h_0 are the device's and the tool's pose at the last anchoring. During a clutch the
+        handle keeps its pose.
         """
         parameters, count = self.parameters, len(ticks)
         handle, tool, device = (_poses(ticks, name) for name in ("handle", "tool", "device"))

@@ -1,4 +1,4 @@
-"""The coupling law at recorded poses, and the motion that it speaks of."""
+"""Coupling law at recorded poses."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from hapticbridge.audit.events import RunEvents
 from hapticbridge.record import TickFlag
 
-# From tick to tick, over whole arrays: steps, turns and sums.
+# Steps, turns and sums over whole arrays.
 
 
 def quaternion_product(a: Array, b: Array) -> Array:
@@ -26,7 +26,7 @@ def conjugate(q: Array) -> Array:
 
 
 def turn_between(a: Array, b: Array) -> Array:
-    """Returns the rotation vectors (…, 3) in the world frame that take a to b, in rad."""
+    """Returns the rotation vectors (…, 3) in the world frame from a to b, in rad."""
     q = quaternion_product(b, conjugate(a))
     q = np.where(q[..., :1] < 0, -q, q)
     sine = np.linalg.norm(q[..., 1:], axis=-1, keepdims=True)
@@ -42,15 +42,14 @@ def steps(values: Array, before: Array) -> Array:
 
 
 def turns(values: Array, before: Array) -> Array:
-    """Returns the rotation vectors from each orientation's predecessor to it."""
+    """Returns the rotation vector from each orientation's predecessor to it."""
     return turn_between(np.concatenate([before[None], values[:-1]]), values)
 
 
 def summed(values: Array, before: float) -> Array:
-    """Returns the sums up to each of the values, of what was before too.
+    """Returns cumulative sums that start from an earlier sum.
 
-    They are added one after the other, so that sums over blocks are those over the whole, to the
-    bit.
+    Values are added one by one, so that sums over blocks equal those over the whole to the bit.
     """
     return np.cumsum(np.concatenate([[before], values]))[1:]
 
@@ -66,19 +65,19 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """How handle and tool moved, (n, 3) each in m and as rotation vectors in rad.
+    """Motion of handle and tool, (n, 3) each, in m and as rotation vectors in rad.
 
     Attributes:
         handle_step: h_k − h_{k−1}.
         tool_step: x_k − x_{k−1}.
-        handle_turn: The handle's turn in each tick.
-        tool_turn: The tool's.
+        handle_turn: Rotation of the handle in each tick.
+        tool_turn: Rotation of the tool in each tick.
         stretch: h − x.
-        twist: The turn that takes the tool to the handle.
-        twist_before: The same in the tick before each.
+        twist: Rotation from the tool to the handle.
+        twist_before: Rotation from the tool to the handle in the previous tick.
         pulled: h_k − x_{k−1}, the stretch after the handle's step and before the tool's.
-        turned: The turn that takes the tool of the tick before to the handle.
-        carried: The tool's turn in each tick as quaternions, (n, 4).
+        turned: Rotation from the previous tick's tool to the handle.
+        carried: Rotation of the tool in each tick as quaternions, (n, 4).
     """
 
     handle_step: Array
@@ -94,14 +93,10 @@ class Motion:
 
     @classmethod
     def of(cls, ticks: NDArray[np.void], handle: Array, tool: Array, outside: RunEvents) -> Motion:
-        """Returns the motion of records.
+        """Computes the motion of consecutive records.
 
-        Args:
-            ticks: ``TICK_DTYPE``.
-            handle: Handle pose (7,) before the first of them.
-            tool: Tool pose (7,), likewise.
-            outside: What was done to the run; a reset puts both poses to another place before a
-                tick, and that is no motion.
+        ``handle`` and ``tool`` are the poses (7,) before the first record. The jump of a reset is
+        no motion.
         """
         handle_before = poses_before(ticks, "handle", handle, outside)
         tool_before = poses_before(ticks, "tool", tool, outside)
@@ -121,18 +116,15 @@ class Motion:
 
     @property
     def stretched(self) -> tuple[Array, Array]:
-        """How the coupling was stretched and twisted in each tick."""
+        """Change of stretch and twist in each tick."""
         return self.handle_step - self.tool_step, self.handle_turn - self.tool_turn
 
 
 def wrench_by_law(ticks: NDArray[np.void], gains: Array, period: float, motion: Motion) -> Array:
-    """Returns the wrench on the tool that the coupling gives, (n, 6) in N and N m.
+    """Returns the coupling's wrench on the tool, (n, 6) in N and N m.
 
-    Args:
-        ticks: Records with one law each; their flags say which rule the torque follows.
-        gains: K, B', K_r and B'_r in each of them, (n, 4).
-        period: T in s.
-        motion: Of the records.
+    Each record has one law; its flags select the rule of the torque. ``gains`` holds K, B', K_r and
+    B'_r, (n, 4).
     """
     step, turn = motion.stretched
     k, b, k_r, b_r = (gains[:, column, None] for column in range(4))
@@ -140,7 +132,7 @@ def wrench_by_law(ticks: NDArray[np.void], gains: Array, period: float, motion: 
     torque = k_r * motion.twist + b_r / period * turn
     is_midpoint = (ticks["flags"] & int(TickFlag.MIDPOINT)) != 0
     if np.any(is_midpoint):
-        # the turn that takes the tool from the tick before to this one carries what was then
+        # quantities of the previous tick are rotated with the tool's turn
         carried = motion.carried
         spring = 0.5 * (motion.twist + rotate(carried, motion.twist_before))
         midway = 0.5 * (motion.handle_turn + rotate(carried, motion.handle_turn)) - motion.tool_turn
@@ -150,13 +142,9 @@ def wrench_by_law(ticks: NDArray[np.void], gains: Array, period: float, motion: 
 
 
 def poses_before(ticks: NDArray[np.void], body: str, before: Array, outside: RunEvents) -> Array:
-    """Returns the poses from which the motion of records begins, (n, 7).
+    """Returns the pose before each tick, (n, 7).
 
-    Args:
-        ticks: ``TICK_DTYPE``.
-        body: ``handle`` or ``tool``.
-        before: Its pose (7,) before the first of them.
-        outside: What was done to the run.
+    ``before`` is the pose (7,) of the body (``handle`` or ``tool``) before the first record.
     """
     poses = np.concatenate([ticks[f"{body}_position"], ticks[f"{body}_quaternion"]], axis=1)
     poses = np.concatenate([before[None], poses[:-1]])

@@ -1,4 +1,4 @@
-"""Simulates a recorded run again from what its recording holds, and compares every number."""
+"""Re-simulation of a recorded run, compared in every number."""
 
 from __future__ import annotations
 
@@ -35,19 +35,19 @@ from hapticbridge.run_description import (
     versions,
 )
 
-# The scene that a recording carries, held against what its metadata say of it.
+# Checks of the attached scene against the metadata.
 
 FOREIGN_TOLERANCE = 1e-9
-"""Allowed difference, relative to a field's largest value, where the processor differs: other
-vector instructions round differently. Larger would hide tampering, smaller would refuse honest
-recordings."""
+"""Allowed difference on another processor, relative to a field's largest value; other vector
+instructions round differently. A larger tolerance would hide tampering, a smaller one would refuse
+honest recordings."""
 
 
 def attached_model(recording: RecordingFile, parameters: RunParameters) -> mujoco.MjModel:
-    """Loads the attached model, which must be that of the metadata.
+    """Loads the attached model and checks it against the metadata.
 
     Raises:
-        RecordingError: It is not, or cannot be loaded.
+        RecordingError: It contradicts the metadata or cannot be loaded.
     """
     content = recording.attachments[MODEL_ATTACHMENT]
     if hashlib.sha256(content).hexdigest() != recording.meta.get("scene_sha256"):
@@ -88,10 +88,10 @@ def attached_model(recording: RecordingFile, parameters: RunParameters) -> mujoc
 
 
 def check_start(recording: RecordingFile, state: NDArray[np.void]) -> None:
-    """Refuses metadata that do not repeat the start of the attached scene.
+    """Refuses metadata that contradict the start of the attached scene.
 
     Raises:
-        RecordingError: They do not.
+        RecordingError: They do.
     """
     for name in STARTS:
         recorded = meta_start(recording.meta, name)
@@ -105,36 +105,33 @@ def check_start(recording: RecordingFile, state: NDArray[np.void]) -> None:
 
 
 def is_same_processor(recording: RecordingFile) -> bool:
-    """Returns whether a run was recorded on this model of processor, as far as it says."""
+    """Returns True if the recording's processor model is this one or not stated."""
     try:
         return bool(json.loads(recording.meta["host"])["processor"] == processor())
     except (KeyError, TypeError, ValueError, RecursionError):
         return True
 
 
-# A recorded run, simulated again: the whole scene at every tick, not only what was recorded.
+# Re-simulation of a recorded run with its whole scene.
 
 DECISIVE = ("hapticbridge", "mujoco", "numba")
-"""Packages whose versions must match for a run to be repeated to the bit."""
+"""Packages whose versions must match for a repetition to the bit."""
 
 _CHANGES = ("input", "resume", *COMMANDED)
-"""Events that change what the next ticks compute."""
+"""Events that change the computation of later ticks."""
 
 
 class Resimulator:
-    """Simulates a recorded device motion again, through what the recording carries.
+    """Simulation of a recorded device motion in the attached scene.
 
-    Args:
-        recording: What is simulated again, without an ``obstacle``. Its events are taken as they
-            fall due; more may be told with ``note``.
-        parameters: Of the recorded run.
+    The recording must have no ``obstacle``. Its events are applied when due; ``note`` adds more.
 
     Attributes:
         model: The attached scene.
-        data: Its state after the last tick that was simulated.
+        data: Its state after the last simulated tick.
         binding: The kernel's state bound to both.
-        done: How many ticks that are.
-        is_over: Whether a sample or a result was not finite, so that nothing follows.
+        done: Number of simulated ticks.
+        is_over: True after a sample or result that is not finite; nothing follows.
 
     Raises:
         RecordingError: The attachments contradict the metadata, so the file was changed.
@@ -149,8 +146,7 @@ class Resimulator:
         self.done, self.is_over = 0, False
         self.model = model = attached_model(recording, parameters)
         self.data = data = mujoco.MjData(model)
-        # an error inside the C symbol would end the process, so MuJoCo takes its first step in
-        # Python
+        # an error inside the C function would end the process; the first step in Python raises
         self._start = start = recording.attachments[STATE_ATTACHMENT]
         method = method_named(recording.meta.get("method", ""))
         restore_state(model, data, start)
@@ -162,11 +158,11 @@ class Resimulator:
 
     @property
     def slack(self) -> float:
-        """What the environment may have created by now, in J."""
+        """Energy that the environment may have created so far, in J."""
         return float(self.binding.state["slack"][0])
 
     def note(self, event: Mapping[str, Any]) -> None:
-        """Takes an event of a run that still goes on; those that change nothing are passed over."""
+        """Adds an event of a running run; events without effect on the simulation are ignored."""
         if event.get("event") in _CHANGES:
             self._changes.append(event)
         if event.get("event") == "resume":
@@ -175,11 +171,10 @@ class Resimulator:
     def add(self, ticks: NDArray[np.void]) -> NDArray[np.void]:
         """Simulates the next ticks.
 
-        Args:
-            ticks: Their records, ``TICK_DTYPE``, at least one; only what came from outside is used.
+        Only the external inputs of the records are used.
 
         Returns:
-            Records as simulated; fewer where it ``is_over``.
+            Simulated records; fewer if it ``is_over``.
 
         Raises:
             RecordingError: An event among them is damaged.
@@ -198,7 +193,7 @@ class Resimulator:
             end = len(ticks)
             if self._changes:
                 end = min(self._due(self._changes[0]) - self.done, end)
-            if end < done:  # in a run that goes on, news may be slower than records
+            if end < done:  # in a running run, events may arrive after records
                 raise RecordingError(f"an event before tick {self.done + done} came after it")
             state, row, part = self.binding.state, self.binding.row, slice(done, end)
             count = simulate_recorded(
@@ -222,7 +217,7 @@ class Resimulator:
             self._apply(self._changes.popleft())
 
     def _elapsed(self, ticks: NDArray[np.void]) -> NDArray[np.float64]:
-        """Returns the times between two readings in s, as the live loop counted them."""
+        """Returns the times in s between two readings, as counted by the live loop."""
         read = ticks["read_ns"]
         before = np.concatenate([[self._read_ns], read[:-1]])
         before[np.isin(ticks["tick"], self._resumed)] = 0
@@ -252,7 +247,7 @@ class Resimulator:
 
 
 def obstacle(recording: RecordingFile) -> str:
-    """Returns why a run cannot be simulated again here, or nothing."""
+    """Returns the reason why a run cannot be simulated again here; empty if it can."""
     try:
         recorded = dict(json.loads(recording.meta.get("versions", "")))
     except (ValueError, TypeError, RecursionError):
@@ -268,7 +263,7 @@ def obstacle(recording: RecordingFile) -> str:
 NOT_RUN = "not re-simulated"
 
 _OUTSIDE = int(TickFlag.OVERRUN | TickFlag.DROPPED_BEFORE | TickFlag.STALE_SAMPLE)
-"""Flags that the clock, the recorder and the device set, not the simulation."""
+"""Flags set by clock, recorder and device instead of the simulation."""
 
 _COMPARED = tuple(name for name in TICK_DTYPE.names or () if name not in CLOCK_FIELDS)
 
@@ -280,9 +275,9 @@ class Replay:
     Attributes:
         agreement: ``bit for bit``, ``within 1e-9 (other processor)``, ``disagrees``, or ``not
             re-simulated: …`` with the reason.
-        tick: First tick at which it disagrees, or None.
-        field: The first field of that tick that disagrees.
-        difference: By how much.
+        tick: First tick that disagrees, or None.
+        field: First field of that tick that disagrees.
+        difference: Size of the disagreement.
     """
 
     agreement: str
@@ -292,23 +287,19 @@ class Replay:
 
     @property
     def has_run(self) -> bool:
-        """Whether there was a re-simulation."""
+        """True if there was a re-simulation."""
         return not self.agreement.startswith(NOT_RUN)
 
     @property
     def disagrees(self) -> bool:
-        """Whether the recording is not what the scene does under the recorded motion."""
+        """True if the scene does not repeat the recording under the recorded motion."""
         return self.tick is not None
 
 
 class Resimulation:
-    """Simulates the recorded device motion again, block by block.
+    """Re-simulation of the recorded device motion, block by block.
 
-    What differs is kept as it comes; ``outcome`` tells. All fields are compared but the clock's.
-
-    Args:
-        recording: What is simulated again.
-        parameters: Of the recorded run.
+    All fields except the clock's are compared; ``outcome`` returns the result.
 
     Raises:
         RecordingError: The attachments contradict the metadata, so the file was changed.
@@ -336,10 +327,10 @@ class Resimulation:
         self._compare(ticks[: len(again)], again, start)
 
     def outcome(self) -> Replay:
-        """Says how the records agree with what was simulated, when there are no more.
+        """Returns the agreement after the last record.
 
         Raises:
-            RecordingError: An event after the last of them is damaged.
+            RecordingError: An event after the last record is damaged.
         """
         if self._obstacle:
             return Replay(f"{NOT_RUN}: {self._obstacle}")

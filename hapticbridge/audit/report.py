@@ -1,4 +1,4 @@
-"""What an audit found, in one object."""
+"""Result of an audit."""
 
 from __future__ import annotations
 
@@ -13,35 +13,35 @@ from hapticbridge.files import finite_or_null
 
 @dataclass(frozen=True, slots=True)
 class AuditReport:
-    """What an audit found.
+    """Result of an audit.
 
     Attributes:
         path: The recording.
         verdict: ``passive``, ``active`` or ``invalid``.
         environment: ``strict`` (BC97 (14) held), ``within slack`` or ``active``; None if invalid.
-        certified: Whether the recorded device bears the coupling; None where its damping is
-            unknown or its motion is prescribed.
+        certified: True if the recorded device bears the coupling; None if its damping is unknown or
+            its motion is prescribed.
         reason: The verdict in a sentence.
         tick: First tick at fault, or None.
-        port: The port at fault, ``environment`` or ``device``, or the field.
-        joules: Energy at fault: created beyond what is allowed, or the mismatch.
-        slack_share: Largest share of the slack that was used, 0 if strict.
+        port: Port at fault, ``environment`` or ``device``, or the field.
+        joules: Energy at fault in J: created beyond the bound, or the mismatch.
+        slack_share: Largest share of the slack that was used; 0 if strict.
         resimulation: ``bit for bit``, ``within 1e-9 (other processor)``, ``disagrees`` or ``not
             re-simulated: …``.
-        is_cut: The file lacks its end; the verdict is on what it holds.
+        is_cut: True if the file lacks its end; the verdict is on the rest.
         ticks: Number of records.
-        duration: Time of the run's clock at the last of them in s, missed deadlines among it; where
-            their times cannot be, their number times the period.
-        conditions: The device condition per kind of axis, as sentences.
-        rendered: What was felt away from contact, or everywhere if the tool was never let go, and
-            what was used, as sentences.
-        unchecked: What records alone do not tell and only the re-simulation confirms, or nothing;
-            without a re-simulation such a recording is not called passive but invalid.
-        damping_margin: Least share of the device's damping that the coupling leaves, 1 − needed / b
-            over the kinds of axis; below 0 where it needs more than there is, None where b is
-            unknown or the motion prescribed.
+        duration: Time of the run's clock at the last record in s, with missed deadlines. If the
+            recorded times are impossible, the number of records times the period.
+        conditions: Device condition per kind of axis, as sentences.
+        rendered: Sentences on effective and law coupling. They hold away from contact, or
+            everywhere if the tool was never released.
+        unchecked: Parts that only the re-simulation confirms; empty if there are none. Without a
+            re-simulation such a recording is invalid instead of passive.
+        damping_margin: Smallest share of the device's damping that the coupling leaves, 1 − needed
+            / b over the kinds of axis. It is negative if more is needed than available; None if b
+            is unknown or the motion prescribed.
         energies: Energies at the end, in J.
-        events: How many events of each kind.
+        events: Number of events of each kind.
     """
 
     path: Path
@@ -76,16 +76,16 @@ class AuditReport:
 
     @property
     def exit_code(self) -> int:
-        """0 if passive and certified or the device is unknown, else 1."""
+        """0 if passive and either certified or of unknown device, else 1."""
         return 0 if self.verdict == "passive" and self.certified is not False else 1
 
     @property
     def margin(self) -> float:
-        """How far the run was from a negative verdict: the least share that was left of anything.
+        """Smallest unused share of the slack (1 − ``slack_share``) and of the device's damping.
 
-        Of the slack that the coupling affords (1 − ``slack_share``) and of the device's damping
-        (``damping_margin``, where it is known): 1 where nothing was used, 0 at the limit, negative
-        beyond. Never above 0 where the verdict is active, NaN where it is invalid.
+        1 means nothing was used, 0 is the limit, negative values are beyond it. The device's share
+        is ``damping_margin``, if known. The margin is never above 0 for an active verdict, and NaN
+        for an invalid one.
         """
         if self.verdict == "invalid":
             return math.nan
@@ -98,12 +98,9 @@ class AuditReport:
 
 
 def verdict_words(verdict: str, environment: str, port: str) -> str:
-    """Returns a verdict with what goes beside it: how passive a run was, or where it was active.
+    """Returns a verdict with its environment or port, as ``passive (strict)``.
 
-    Args:
-        verdict: As ``AuditReport`` has it; so are the others.
-        environment: Nothing where it is not known.
-        port: Likewise.
+    An unknown environment or port is empty.
     """
     beside = {"passive": environment, "active": port}.get(verdict)
     return f"{verdict} ({beside})" if beside else verdict

@@ -1,4 +1,4 @@
-"""Is a recording whole: damage, digest, gaps, numbers that cannot be, times and flags."""
+"""Structure checks of a recording: damage, digest, gaps, numbers, times and flags."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from hapticbridge.record import CLOCK_FIELDS, TICK_DTYPE, TickFlag
 from hapticbridge.recording import RecordingFile
 
 TOLERANCE = 1e-9
-"""Relative difference, and absolute one in SI units, between a recorded number and its second
-computation in NumPy. Rounding of 10⁵ summed works stays below it; a changed digit that matters does
-not. It is also the tolerance of (14) itself."""
+"""Tolerance between a recorded number and its second computation: relative, and absolute in SI
+units. Rounding of 10⁵ summed works stays below it; a relevant changed digit does not. It is also
+the tolerance of (14) itself."""
 
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """What is wrong with a recording.
+    """A fault of a recording.
 
     Attributes:
-        reason: A sentence.
-        tick: The first tick at fault, or None.
-        port: The field or port at fault.
+        reason: Description in a sentence.
+        tick: First tick at fault, or None.
+        port: Field or port at fault.
         joules: Energy at fault, in J.
     """
 
@@ -40,7 +40,7 @@ class Fault:
 
 
 def file_fault(recording: RecordingFile) -> Fault | None:
-    """Returns what makes the file as a whole no record of a run, or nothing."""
+    """Returns a fault of the file as a whole, or None."""
     if recording.problems:
         return Fault("the file is damaged: " + "; ".join(recording.problems))
     if not recording.is_cut:
@@ -51,7 +51,7 @@ def file_fault(recording: RecordingFile) -> Fault | None:
     if not recording.count:
         return Fault("the recording holds no tick")
     last = recording.last_tick
-    # the last rows may be lost while the event behind them is not: it was in an earlier chunk
+    # the last rows may be lost although a later event is kept, if that was in an earlier chunk
     may_lack = recording.is_cut or any(e.get("event") == "repaired" for e in recording.events)
     for event in recording.events:
         tick = event.get("tick")
@@ -66,14 +66,10 @@ def file_fault(recording: RecordingFile) -> Fault | None:
 def structure_fault(
     blocks: Iterable[NDArray[np.void]], parameters: RunParameters, outside: RunEvents
 ) -> Fault | None:
-    """Returns the first thing that makes records no plausible ones of a run.
+    """Returns the first fault that makes records implausible, or None.
 
-    Numbers that cannot be go before times, times before flags, each at its earliest tick.
-
-    Args:
-        blocks: The records in order, ``TICK_DTYPE``, none of the blocks empty.
-        parameters: Of the recorded run.
-        outside: What was done to the run while it went on.
+    Impossible numbers come before times, times before flags, each at its earliest tick. No block
+    may be empty.
     """
     found: dict[int, Fault] = {}
     before: NDArray[np.void] = np.zeros(0, TICK_DTYPE)
@@ -94,13 +90,9 @@ def structure_fault(
 
 
 def _first(is_wrong: NDArray[np.bool_], start: int, text: str, port: str) -> Fault | None:
-    """Returns the fault of the first record that is wrong, if one is.
+    """Returns the fault of the first wrong record, or None.
 
-    Args:
-        is_wrong: Per record.
-        start: Tick of the first of them.
-        text: A sentence with ``{}`` for the tick.
-        port: The field at fault.
+    ``text`` has ``{}`` for the tick.
     """
     if not is_wrong.any():
         return None
@@ -111,7 +103,7 @@ def _first(is_wrong: NDArray[np.bool_], start: int, text: str, port: str) -> Fau
 def _command_faults(
     ticks: NDArray[np.void], count: int, outside: RunEvents
 ) -> Iterator[Fault | None]:
-    """Holds the bits of commands in the records against the events that set them."""
+    """Compares the command bits of the records with the events that set them."""
     wrong = (ticks["buttons"] & ~DEVICE_BUTTONS) != outside.buttons(ticks["tick"])
     text = "buttons of tick {} do not show what the events commanded"
     yield _first(wrong, count, text, "buttons")
@@ -175,7 +167,7 @@ def _wrong_deadline(
 def _flag_faults(
     ticks: NDArray[np.void], before: NDArray[np.void], count: int, seen: Seen
 ) -> Iterator[Fault | None]:
-    """Holds those flags that other fields repeat against them."""
+    """Compares redundant flags with the fields that imply them."""
     expected = {
         TickFlag.DROPPED_BEFORE: np.zeros(len(ticks), bool),  # the ticks are contiguous
         TickFlag.CONTACT: ticks["contacts"] > 0,

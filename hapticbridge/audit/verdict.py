@@ -1,4 +1,4 @@
-"""Judges a recording: is it whole, is it what it says, and was the environment passive?"""
+"""Verdict on a recording."""
 
 from __future__ import annotations
 
@@ -35,15 +35,11 @@ from hapticbridge.rendering import Method, method_named
 from hapticbridge.run_description import STARTS, meta_start, parameters_of
 from hapticbridge.summary import coupling_sentences, was_never_lossless
 
-# How a recorded run ended, where it was not as it was asked to.
+# Unusual endings of a run.
 
 
 def how_it_ended(events: Sequence[Mapping[str, Any]]) -> str:
-    """Returns a clause that names the event which ended the run; empty for an ordinary end.
-
-    Args:
-        events: The recording's.
-    """
+    """Returns a clause that names the event that ended the run; empty for an ordinary end."""
     clauses = []
     for event in events:
         name, reason = event.get("event"), event.get("reason")
@@ -52,7 +48,7 @@ def how_it_ended(events: Sequence[Mapping[str, Any]]) -> str:
         elif name == "bridge_died":
             clauses.append(f"the bridge died after tick {event.get('tick')}")
         elif name == "recorder_died":
-            clauses.append("the recorder died in mid-run")
+            clauses.append("the recorder died during the run")
         elif name == "suspended":
             clauses.append(f"the machine was asleep for {event.get('seconds', 0):.3g} s")
         elif name == "stop" and event.get("signal"):
@@ -60,26 +56,26 @@ def how_it_ended(events: Sequence[Mapping[str, Any]]) -> str:
         elif name == "stop" and reason not in ("duration", "signal", "caller", None, ""):
             clauses.append(f"stopped by {_short(reason)}")
     has_trip = any(event.get("event") == "trip" for event in events)
-    if has_trip:  # what is raised then is the same in other words
+    if has_trip:  # its exception is reported as a stop too
         clauses = [clause for clause in clauses if not clause.startswith("stopped by")]
     return "; ".join(clauses)
 
 
 def _short(reason: object) -> str:
-    """Returns the text of a reason without the tick that it begins with, as a file may hold it."""
+    """Returns a reason's text without its leading tick, limited in length."""
     text = str(reason)
     head, mark, rest = text.partition(": ")
     return rest[:200] if mark and head.startswith("tick ") else text[:200]
 
 
-# Was the environment passive, and the device's port: the verdict on energies, block by block.
+# Verdict on energies, block by block.
 
 _RECORDED = ("kinetic", "potential", "actuator_work", "external_work")
 
 
 @dataclass(frozen=True, slots=True)
 class _Excess:
-    """When a limit was first exceeded, and by how many joules."""
+    """First tick beyond a limit, and the excess in J."""
 
     tick: int
     joules: float
@@ -87,14 +83,14 @@ class _Excess:
 
 @dataclass(slots=True)
 class PassivityVerdict:
-    """Gathers what decides the verdict while a recording passes by.
+    """Verdict collected over the blocks of a recording.
 
     Attributes:
-        is_watched: Whether the device's port is judged by what happened. A device that meets its
-            condition needs no watch behind a coupling law: that is the proof.
+        is_watched: True if the device port is judged by its energy. A device that meets its
+            condition behind a coupling law is proven safe without it.
         energies: Energies after the newest tick, in J.
         slack_share: Largest share of the slack that was used.
-        commanded: What commands gave to the coupling by the newest tick, in J.
+        commanded: Energy that commands have added to the coupling, in J.
     """
 
     is_watched: bool
@@ -106,7 +102,7 @@ class PassivityVerdict:
     _kicked: _Excess | None = None
 
     def add(self, ticks: NDArray[np.void], balance: EnergyBalance) -> None:
-        """Adds records, at least one, and their balance."""
+        """Adds at least one record with its balance."""
         created = balance.environment_energy
         rounding = TOLERANCE * (1 + balance.throughput)
         unstrict = created > rounding
@@ -130,10 +126,9 @@ class PassivityVerdict:
         }
 
     def findings(self, *, strict: bool) -> dict[str, Any]:
-        """Returns the fields of ``AuditReport`` that say what the energies mean.
+        """Returns the fields of ``AuditReport`` that follow from the energies.
 
-        Args:
-            strict: Accept only (14) itself.
+        ``strict`` accepts only (14) itself.
         """
         unstrict, active, kicked = self._unstrict, self._active, self._kicked
         if kicked is not None and not (active is not None and active.tick <= kicked.tick):
@@ -148,7 +143,7 @@ class PassivityVerdict:
                 "slack_share": self.slack_share,
             }
         if unstrict is None:
-            # within rounding it may be above zero; + 0.0 for zero itself, which has a sign
+            # rounding may leave it above zero; + 0.0 removes the sign of zero
             lost = max(-self.energies["environment_energy"], 0.0) + 0.0
             return {
                 "verdict": "passive",
@@ -179,27 +174,22 @@ class PassivityVerdict:
 
 
 def _first(is_beyond: NDArray[np.bool_], joules: NDArray[np.float64], start: int) -> _Excess | None:
-    """Returns the first of these ticks that is beyond a limit; ``start`` is the first one."""
+    """Returns the first tick beyond a limit; ``start`` is the number of the first tick."""
     if not is_beyond.any():
         return None
     at = int(np.argmax(is_beyond))
     return _Excess(start + at, float(joules[at]))
 
 
-# Do the records agree with their second computation: wrench law, poses, energies.
+# Comparison of records with their second computation.
 
 CONTROLLED_TOLERANCE = 1e-5
-"""Relative difference while the passivity controller acts: it divides a small debt by a squared
-small velocity, which takes five digits of a sum's rounding. The re-simulation tells the rest."""
+"""Relative tolerance while the passivity controller acts. It divides a small debt by a squared
+small velocity, which costs five digits. The re-simulation checks the rest."""
 
 
 def physics_fault(ticks: NDArray[np.void], balance: EnergyBalance) -> Fault | None:
-    """Returns the earliest disagreement between records and their second computation.
-
-    Args:
-        ticks: Records without gaps, ``TICK_DTYPE``.
-        balance: What their poses and wrenches say by themselves.
-    """
+    """Returns the earliest disagreement between records and their second computation, or None."""
     start = int(ticks["tick"][0])
     vectors = (
         ("handle_position", balance.handle_position, "m", "device pose and scale"),
@@ -263,7 +253,7 @@ def _first_fault(
     unit: str,
     by: str,
 ) -> Fault | None:
-    wrong = ~(difference <= allowed)  # also where a sum overflowed to NaN
+    wrong = ~(difference <= allowed)  # True also for NaN from an overflow
     if not wrong.any():
         return None
     at = int(np.argmax(wrong))
@@ -276,12 +266,12 @@ def _first_fault(
     )
 
 
-@np.errstate(all="ignore")  # numbers of a damaged file overflow; what comes out is then a fault
+@np.errstate(all="ignore")  # numbers of a damaged file may overflow; the result is then a fault
 def verdict_on(path: str | Path, *, strict: bool) -> AuditReport:
-    """Judges a recording; see ``audit.audit``, which everybody calls.
+    """Judges a recording; implements ``audit.audit``.
 
     Raises:
-        RecordingError: The file is not a recording at all.
+        RecordingError: The file is not a recording.
     """
     recording = open_recording(path)
     facts: dict[str, Any] = {
@@ -324,8 +314,8 @@ def verdict_on(path: str | Path, *, strict: bool) -> AuditReport:
     if outcome.disagrees:
         reason = (
             f"simulated again, tick {outcome.tick} differs in {outcome.field} by "
-            f"{outcome.difference:.3g}: the recording was changed, or in mid-run the scene, other "
-            "than by set_input"
+            f"{outcome.difference:.3g}: the recording was changed, or the scene was changed during "
+            "the run other than by set_input"
         )
         return _invalid(facts, Fault(reason, outcome.tick, outcome.field))
     report = AuditReport(**facts, **passed.judgement.findings(strict=strict))
@@ -380,14 +370,14 @@ def _device_facts(
                 is_always_held=was_never_lossless(recording.count, recording.flags),
             ),
         }
-    except HapticBridgeError as error:  # numbers beyond what the theory computes with
+    except HapticBridgeError as error:  # numbers outside the theory's range
         raise RecordingError(f"the metadata are out of range: {error}") from None
 
 
 def _unchecked(parameters: RunParameters, method: Method) -> str:
-    """Says what only the re-simulation can confirm, because records alone do not tell it."""
+    """Returns the part that only the re-simulation confirms; empty if there is none."""
     if not method.has_coupling:
-        return "the wrench is the contacts': checked by re-simulation alone"
+        return "the wrench comes from contacts: checked by re-simulation alone"
     if not method.has_law:
         return "the wrench is MuJoCo's constraint force: checked by re-simulation alone"
     if parameters.laws > 1:
@@ -408,14 +398,14 @@ def _invalid(facts: dict[str, Any], fault: Fault) -> AuditReport:
 
 
 class _Passed:
-    """What a recording's ticks tell while they pass by."""
+    """Checks of a recording's ticks, block by block."""
 
     def __init__(
         self, recording: RecordingFile, parameters: RunParameters, *, is_watched: bool
     ) -> None:
         self._recording, self._parameters = recording, parameters
         self.judgement, self.duration = PassivityVerdict(is_watched), 0.0
-        # the complaint of the re-simulation waits until the records themselves have been judged
+        # an error of the re-simulation is raised after the records themselves have been judged
         self._error: RecordingError | None = None
         try:
             self._simulation = Resimulation(recording, parameters)
@@ -423,14 +413,12 @@ class _Passed:
             self._error = error
 
     def by(self, outside: RunEvents, late: int) -> Fault | None:
-        """Looks at every tick; returns the earliest fault of the records themselves.
+        """Checks every tick; returns the earliest fault of the records themselves.
 
-        Args:
-            outside: What was done to the run while it went on.
-            late: After how many ticks a wrench answers a sample.
+        ``late`` is the delay in ticks from a sample to the wrench that answers it.
 
         Raises:
-            RecordingError: The metadata do not say what the ledger counts from.
+            RecordingError: The metadata lack the start of the energy balance.
         """
         starts = {name: np.array(meta_start(self._recording.meta, name)) for name in STARTS}
         energy = float(starts["start_kinetic"][0] + starts["start_potential"][0])
@@ -452,7 +440,7 @@ class _Passed:
         return fault
 
     def outcome(self) -> Replay:
-        """Says how the re-simulation agrees.
+        """Returns the agreement of the re-simulation.
 
         Raises:
             RecordingError: The file was changed.
@@ -465,7 +453,7 @@ class _Passed:
 def _with_following(
     blocks: Iterable[NDArray[np.void]], count: int
 ) -> Iterator[tuple[NDArray[np.void], NDArray[np.void]]]:
-    """Yields blocks, each with as many of the records after it, or fewer where they end."""
+    """Yields each block with up to ``count`` of the following records."""
     waiting: deque[NDArray[np.void]] = deque()
     for block in chain(blocks, [None]):
         if block is not None:

@@ -32,10 +32,8 @@ RECORDING = ".mcap"
 def motion_for(scene: Scene, path: str | Path | None = None) -> Motion | None:
     """Returns the handle's motion relative to its first pose.
 
-    Args:
-        scene: The scene under check.
-        path: CSV file (``t,x,y,z[,qw,qx,qy,qz]``) or recording; None takes ``NAME.csv`` beside the
-            scene.
+    ``path`` is a CSV file (``t,x,y,z[,qw,qx,qy,qz]``) or a recording; None takes ``NAME.csv``
+    beside the scene.
 
     Returns:
         The motion; None if no file was named and none lies beside the scene.

@@ -75,9 +75,7 @@ class Growth:
 def growth_of(counts: NDArray[np.int64], times: NDArray[np.float64]) -> Growth:
     """Returns the median time by count, and a line weighted by the number of ticks.
 
-    Args:
-        counts: Shape (n,).
-        times: Shape (n,), in s.
+    Both arrays have shape (n,); times are in s.
     """
     steps = []
     for count in np.unique(counts).tolist():
@@ -159,15 +157,8 @@ def measure_cost(
     """Times a scene under its motion: whole ticks as in the live loop, then the stages.
 
     A tick is the bridge's arithmetic before and after MuJoCo's step, the step, and the hand-over of
-    the record. Device and recorder are left out.
-
-    Args:
-        scene: Changed in place: reset, with the coupling's gains and the time step set.
-        samples: Poses relative to the first, ``SAMPLE_DTYPE``.
-        coupling: K and B.
-        period: T in s.
-        clock: Returns the time in ns.
-        progress: Called with the number of ticks done and the total.
+    the record. Device and recorder are left out. Arguments are those of ``rehearse``. ``clock``
+    returns the time in ns; ``progress`` is called with the number of ticks done and the total.
 
     Raises:
         SceneError: A value is out of range, or a result is not finite.

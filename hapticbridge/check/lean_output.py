@@ -233,9 +233,7 @@ def lean_facts(lean: Lean, written: VariantVerdict | None = None) -> dict[str, o
 def check_table(path: Path, scenes: Iterable[Path]) -> None:
     """Checks that a table can be written, before the search starts.
 
-    Args:
-        path: The file.
-        scenes: MJCF files, existing or to be written.
+    ``scenes`` are MJCF files, existing or to be written.
 
     Raises:
         SceneError: Its name does not end in .csv, its folder does not exist, or it would be read as
@@ -294,11 +292,6 @@ def write_lean(lean: Lean, path: Path, *, overwrite: bool = False) -> VariantVer
     Included files become part of it, asset paths are relative to its folder, and its comment lists
     the changes. MuJoCo writes numbers with 6 digits, so the file differs from the judged version by
     rounding. It is therefore read back and judged again.
-
-    Args:
-        lean: Result of ``find_lean``.
-        path: The file.
-        overwrite: True replaces an existing file.
 
     Returns:
         The written scene against the original.

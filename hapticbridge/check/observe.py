@@ -106,11 +106,7 @@ def reached_trees(model: mujoco.MjModel, tool: int, met: set[tuple[int, int]]) -
     """Returns the kinematic trees that can influence the tool's tree, including it.
 
     Contacts, equality constraints and tendons join trees. In a scene with flexes all trees count.
-
-    Args:
-        model: The compiled scene.
-        tool: The tool's kinematic tree.
-        met: Ids of the geoms that met.
+    ``met`` holds pairs of geom ids.
     """
     if model.nflex:  # contacts of a flex are not listed by geom
         return set(range(model.ntree))
@@ -346,12 +342,8 @@ def observe(
 ) -> Observation:
     """Leads a scene through a motion, as ``rehearse`` does, and inspects every step.
 
-    Args:
-        scene: Changed in place: reset, with the coupling's gains and the time step set.
-        samples: Poses relative to the first, ``SAMPLE_DTYPE``.
-        coupling: K and B.
-        period: T in s.
-        progress: Called with the number of ticks done and the total.
+    Arguments are those of ``rehearse``; ``progress`` is called with the number of ticks done and
+    the total.
 
     Raises:
         SceneError: A value is out of range, or a result is not finite; the message names the tick.

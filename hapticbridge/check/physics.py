@@ -45,9 +45,7 @@ def rotation_vector(start: ArrayLike, now: ArrayLike) -> Array:
 def pose_in(frame: Array, pose: Array) -> Array:
     """Returns a pose in the coordinates of a frame: position in m and quaternion, shape (7,).
 
-    Args:
-        frame: Pose of the frame, shape (7,).
-        pose: Pose in the same coordinates as ``frame``.
+    Both poses have shape (7,) and common coordinates.
     """
     position, turn, found = np.zeros(3), np.zeros(4), np.zeros(7)
     mujoco.mju_negPose(position, turn, frame[:3], frame[3:])

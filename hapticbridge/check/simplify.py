@@ -452,10 +452,7 @@ def _error(kind: mujoco.mjtGeom, size: Array, local: Array, volume: float, radiu
 def signed_distance(kind: mujoco.mjtGeom, size: Array, points: Array) -> Array:
     """Returns the distance of points from a primitive's surface, in m; negative inside.
 
-    Args:
-        kind: Box, cylinder, capsule or sphere.
-        size: MuJoCo's sizes, in m.
-        points: Points in the primitive's frame, in m, shape (n, 3).
+    ``size`` holds MuJoCo's sizes in m; points are in the primitive's frame, in m, shape (n, 3).
     """
     if kind in (_GEOM.mjGEOM_SPHERE, _GEOM.mjGEOM_CAPSULE):
         length = size[1] if kind == _GEOM.mjGEOM_CAPSULE else 0.0

@@ -45,9 +45,7 @@ class Places:
     def __init__(self, source: SceneSource, model: mujoco.MjModel) -> None:
         """Reads the files.
 
-        Args:
-            source: The scene as it was read.
-            model: Model compiled from it, with or without the bridge's handle.
+        The model may contain the bridge's handle.
         """
         self._spec, self._model = source.spec, model
         self._files = [

@@ -62,9 +62,7 @@ class MotionTrace:
 def witness(draft: SceneVariant, motion: Motion) -> MotionTrace:
     """Leads a scene through a motion tick by tick and records its trace.
 
-    Args:
-        draft: Version whose bodies, joints and geoms all have names.
-        motion: Motion of the handle.
+    All bodies, joints and geoms of the draft need names.
 
     Raises:
         SceneError: The scene does not compile, or a result is not finite.

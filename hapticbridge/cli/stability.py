@@ -23,7 +23,7 @@ class Stability:
 
     Theory is drawn on top of measurement. Writes NAME.png, NAME.csv and NAME.json into the folder.
     What is done stays in NAME.parts: begun again after a stop, a map goes on from there. After a
-    change of hapticbridge or MuJoCo the old parts are refused: give another folder or delete them.
+    change of hapticbridge or MuJoCo the old file is refused: give another folder or delete them.
 
     Example:
         hapticbridge stability coupling --out maps

@@ -1,4 +1,4 @@
-"""Which couplings a device allows while it is felt."""
+"""Couplings that may be selected during a run on a given device."""
 
 from __future__ import annotations
 
@@ -19,49 +19,48 @@ from hapticbridge.errors import CommandError, CouplingError
 from hapticbridge.guard import Limits
 from hapticbridge.rendering import Method
 
-# How stiff and damped a coupling may be along one kind of axis: where sliders end, and why.
+# Largest stiffness and damping that a device tolerates, for translation or rotation.
 
 SOFTEST = 0.05
-"""Least stiffness that can be asked for, as a share of the largest; no unit. Softer, a hand no
-longer feels where the tool is; but a run that began softer may stay so."""
+"""Smallest selectable stiffness as a share of the largest, without unit. A softer coupling no
+longer shows the hand where the tool is. A run that began softer may stay so."""
 
 UNITS = {
     "translation": ("N/m", "N s/m"),
     "rotation": ("N m/rad", "N m s/rad"),
 }
-"""Of stiffness and damping."""
+"""Units of stiffness and damping by kind of axis."""
 
 _PREFIX = {"translation": "", "rotation": "rotational "}
 
 _HALVINGS = 60
-"""Of a search for a limit: beyond the 53 bits of a double there is nothing left to halve."""
+"""Number of bisections of a limit; more exceed the 53 bits of a double."""
 
 _POINTS, _HIGHEST = 40, 1e3
-"""Of the table of needs: points, and the largest ratio B'/(K T)."""
+"""Number of points, and largest ratio B'/(K T), of the table of required damping."""
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True)
 class AxisCouplingLimits:
-    """What of stiffness and damping the device allows, along one kind of axis.
+    """Limits of stiffness and damping along one kind of axis.
 
-    The condition is b >= s (K T/2 + B'), s = s_h s_f in translation and s_f/s_h in rotation, B'
-    what the method uses of the B asked for, more where the device answers late or several laws are
-    computed in a tick (``certificate.required_damping``).
+    They follow from the device condition b >= s (K T/2 + B'), with s = s_h s_f for translation and
+    s_f/s_h for rotation. B' is the damping of the law. With a delay or several laws per tick the
+    requirement is larger and has no closed form (``certificate.required_damping``).
 
     Attributes:
         axis: ``translation`` or ``rotation``.
-        info: The device; an unknown damping is taken for the one that the default coupling takes
-            (``certificate.assumed_damping``).
-        method: How the tool is rendered.
-        start: The coupling that the run began with, as asked for.
+        info: The device; unknown damping is replaced by ``certificate.assumed_damping``.
+        method: The rendering method.
+        start: Requested coupling at the start of the run.
         period: T in s.
         scale: s_h, handle motion per device motion.
         force_scale: s_f, force on the device per force on the tool.
         substeps: MuJoCo steps per tick.
-        effort: The run's limit of force in N or of torque in N m.
-        reach: How far the device may be from the tool before the run is stopped, in m or rad.
+        effort: Force limit in N, or torque limit in N m.
+        reach: Stretch limit in m, or angle limit in rad.
     """
 
     axis: Literal["translation", "rotation"]
@@ -77,20 +76,20 @@ class AxisCouplingLimits:
 
     @property
     def names(self) -> tuple[str, str]:
-        """Of the coupling's stiffness and damping, as its fields."""
+        """Names of stiffness and damping in ``Coupling``."""
         prefix = _PREFIX[self.axis].replace(" ", "_")
         return f"{prefix}stiffness", f"{prefix}damping"
 
     @property
     def leverage(self) -> float:
-        """How much stiffer the coupling is for the device than for the tool."""
+        """Factor s from the tool's to the device's coupling."""
         if self.axis == "translation":
             return self.scale * self.force_scale
         return self.force_scale / self.scale
 
     @property
     def damping(self) -> float:
-        """The device's damping b in N s/m or N m s/rad that is counted on."""
+        """Device damping b in N s/m or N m s/rad, or the assumed one."""
         return assumed_damping(self.info)[self.axis == "rotation"]
 
     def gains(self, coupling: Coupling) -> tuple[float, float]:
@@ -99,15 +98,15 @@ class AxisCouplingLimits:
         return stiffness, damping
 
     def put(self, coupling: Coupling, stiffness: float, damping: float) -> Coupling:
-        """Returns a coupling with another stiffness and damping along these axes."""
+        """Returns a coupling with other stiffness and damping along these axes."""
         return replace(coupling, **dict(zip(self.names, (stiffness, damping), strict=True)))
 
     @cached_property
     def _table(self) -> tuple[Array, Array]:
-        """Ratios B'/K in s, and what a device needs for K = 1 at each.
+        """Ratios B'/K in s, and the required damping for K = 1 at each.
 
-        The need is convex and homogeneous in K and B', so that a line between two points of it lies
-        above: what is read off in between is never too little.
+        The requirement is convex and homogeneous in (K, B'), so linear interpolation never
+        underestimates it.
         """
         linear, angular = assumed_damping(self.info)
         known = replace(self.info, damping=linear, rotational_damping=angular)
@@ -122,42 +121,42 @@ class AxisCouplingLimits:
             try:
                 need = required_axis_damping(known, asked, self.period, *scales, laws, self.method)
                 needs.append(need[self.axis == "rotation"])
-            except CouplingError:  # a delay that no damping makes up for
+            except CouplingError:  # no damping compensates this delay
                 needs.append(math.inf)
         return ratios, np.array(needs)
 
     def needed(self, stiffness: float, damping: float) -> float:
-        """Returns the damping b in N s/m or N m s/rad that a device needs for what is asked.
+        """Returns the device damping b in N s/m or N m s/rad that requested gains need.
 
-        In some microseconds, once it was asked before: a refusal must not take the loop's time.
+        It takes microseconds after the first call, because a refusal must not slow the loop.
         """
         asked = self.put(self.start, stiffness, damping)
         stiffness, damping = self.gains(self.method.used(asked, self.period / self.substeps))
         ratios, needs = self._table
         highest = float(ratios[-1])
         ratio = min(damping / stiffness, highest) if stiffness > 0.0 else highest
-        more = damping - ratio * stiffness  # B' beyond the table adds to the need
+        more = damping - ratio * stiffness  # B' beyond the table
         return (
             stiffness * float(np.interp(ratio, ratios, needs)) + float(needs[-1]) / highest * more
         )
 
     def most_stiffness(self, damping: float) -> float:
-        """Returns the largest stiffness that goes with a damping; 0 where none does."""
+        """Returns the largest stiffness for a damping; 0 if there is none."""
         most = 4.0 * self.damping / (self.period * self.leverage)
         return _largest(most, lambda stiffness: self.needed(stiffness, damping), self.damping)
 
     def most_damping(self, stiffness: float) -> float:
-        """Returns the largest damping that goes with a stiffness; 0 where none does."""
+        """Returns the largest damping for a stiffness; 0 if there is none."""
         most = 4.0 * self.damping / self.leverage
         return _largest(most, lambda damping: self.needed(stiffness, damping), self.damping)
 
     @cached_property
     def least_stiffness(self) -> float:
-        """The least stiffness: that which the run began with, or less.
+        """Smallest selectable stiffness, at most that of the run's start.
 
-        K >= F/(s · reach), for the guard stops a run whose coupling is too long before its force is
-        full; and no less than ``SOFTEST`` of the largest. Were it more than what the run began
-        with, a touch of the damping alone would make the coupling stiffer.
+        K >= F/(s · reach), because the guard stops a run whose coupling is too long before its
+        force is full; and K >= ``SOFTEST`` of the largest. If it exceeded the start's stiffness, a
+        change of the damping alone would stiffen the coupling.
         """
         reach = self.leverage * self.reach
         softest = SOFTEST * self.most_stiffness(0.0)
@@ -166,10 +165,10 @@ class AxisCouplingLimits:
         return min(softest, self.gains(self.start)[0])
 
     def check(self, stiffness: float, damping: float) -> None:
-        """Refuses what the device does not allow.
+        """Refuses gains that the device does not allow.
 
         Raises:
-            CommandError: Says what is too much, and the bound.
+            CommandError: The message names the excessive value and the bound.
         """
         (unit, damper), prefix = UNITS[self.axis], _PREFIX[self.axis]
         least = self.least_stiffness
@@ -187,7 +186,7 @@ class AxisCouplingLimits:
 
 
 def _largest(most: float, needed: Callable[[float], float], limit: float) -> float:
-    """Returns the largest argument in [0, most] at which what is needed stays below a limit."""
+    """Returns the largest argument in [0, most] whose requirement stays below a limit."""
     low, high = 0.0, most
     if not needed(low + 1e-9 * most) <= limit:
         return 0.0
@@ -199,17 +198,17 @@ def _largest(most: float, needed: Callable[[float], float], limit: float) -> flo
 
 @dataclass(frozen=True, kw_only=True)
 class CouplingLimits:
-    """What of stiffness and damping the device allows, in translation and where it turns.
+    """Limits of stiffness and damping on a device, in translation and rotation.
 
     Attributes:
         info: The device.
-        method: How the tool is rendered.
-        start: The coupling that the run began with, as asked for.
+        method: The rendering method.
+        start: Requested coupling at the start of the run.
         period: T in s.
         scale: s_h, handle motion per device motion.
         force_scale: s_f, force on the device per force on the tool.
         substeps: MuJoCo steps per tick.
-        limits: Of the run.
+        limits: Limits of the run.
     """
 
     info: DeviceInfo
@@ -223,7 +222,7 @@ class CouplingLimits:
 
     @cached_property
     def translation(self) -> AxisCouplingLimits:
-        """How stiff and damped it may be along the axes."""
+        """Limits in translation."""
         limits = self.limits
         return AxisCouplingLimits(
             axis="translation", effort=limits.force, reach=limits.stretch, **self._common
@@ -231,7 +230,7 @@ class CouplingLimits:
 
     @cached_property
     def rotation(self) -> AxisCouplingLimits | None:
-        """Likewise about them; None where the device feels no torque."""
+        """Limits in rotation; None for a device without torque."""
         if not self.info.turns:
             return None
         limits = self.limits
@@ -246,11 +245,11 @@ class CouplingLimits:
 
     @property
     def spans(self) -> tuple[AxisCouplingLimits, ...]:
-        """Those that there are."""
+        """Limits of the available kinds of axis."""
         return (self.translation, *(() if self.rotation is None else (self.rotation,)))
 
     def felt(self, command: Couple, now: Coupling) -> Coupling:
-        """Returns the coupling that is to be felt after a command; what it leaves out stays."""
+        """Returns the requested coupling after a command; omitted gains keep their values."""
         felt = self.translation.put(now, command.stiffness, command.damping)
         stiffness, damping = command.rotational_stiffness, command.rotational_damping
         if self.rotation is None or stiffness is None or damping is None:
@@ -258,28 +257,28 @@ class CouplingLimits:
         return self.rotation.put(felt, stiffness, damping)
 
     def used(self, felt: Coupling) -> Coupling:
-        """Returns the coupling of the law for one that is to be felt."""
+        """Returns the law's coupling for a requested one."""
         return self.method.used(felt, self.period / self.substeps)
 
     def reason(self) -> str:
-        """Returns why the sliders end where they do, in a sentence."""
+        """Returns the reason of the slider limits, in a sentence."""
         is_known = self.info.damping and (self.info.rotational_damping or not self.info.turns)
-        known = "" if is_known else " (taken for it, it is not known)"
+        known = "" if is_known else " (assumed; it is unknown)"
         dampings = " and ".join(f"{span.damping:.3g} {UNITS[span.axis][1]}" for span in self.spans)
         return (
-            f"They end where the device's damping of {dampings}{known} just bears what is felt "
-            "between two samples; beyond, a hand could feel the coupling push by itself."
+            f"They end where the device's damping of {dampings}{known} just suffices. Beyond, the "
+            "coupling could push the hand by itself."
         )
 
     def check(self, command: Couple) -> None:
-        """Refuses what the device does not allow.
+        """Refuses gains that the device does not allow.
 
         Raises:
-            CommandError: Says what is too much, and the bound.
+            CommandError: The message names the excessive value and the bound.
         """
         if not self.method.has_law:
             raise CommandError(
-                f"method '{self.method.name}' has no coupling law that could be changed in mid-run"
+                f"method '{self.method.name}' has no coupling law to change during a run"
             )
         self.translation.check(command.stiffness, command.damping)
         stiffness, damping = command.rotational_stiffness, command.rotational_damping

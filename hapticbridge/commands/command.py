@@ -1,4 +1,4 @@
-"""The commands, and how they are written on a wire: one line of JSON each."""
+"""Commands, and their wire format: one line of JSON each."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ from hapticbridge.arguments import Arguments, shown
 from hapticbridge.errors import CommandError, choices
 
 LONGEST_LINE = 250
-"""Bytes of a line; the longest command has some 170."""
+"""Largest size of a line in bytes; the longest command has about 170."""
 
 _ARGUMENTS = Arguments(CommandError)
 
 
 @dataclass(frozen=True, slots=True)
 class Couple:
-    """Give the coupling another stiffness and damping, slowly.
+    """Command that changes stiffness and damping of the coupling gradually.
 
     Attributes:
-        stiffness: K in N/m that is to be felt, finite and > 0.
-        damping: B in N s/m that is to be felt, finite and >= 0.
-        rotational_stiffness: K_r in N m/rad likewise, finite and >= 0.
-        rotational_damping: B_r in N m s/rad likewise. Both or neither, which leaves them as they
-            are: a bound holds for the two together.
+        stiffness: Requested K in N/m, finite and > 0.
+        damping: Requested B in N s/m, finite and >= 0.
+        rotational_stiffness: Requested K_r in N m/rad, finite and >= 0; None keeps it.
+        rotational_damping: Requested B_r in N m s/rad, finite and >= 0; None keeps it. Both
+            rotational gains are given or neither, because their bound is a joint one.
 
     Raises:
         CommandError: A value is out of range.
@@ -43,18 +43,18 @@ class Couple:
         if turning == (None, None):
             return
         if turning[0] is None or turning[1] is None:
-            raise CommandError("rotational stiffness and damping are asked for together")
+            raise CommandError("give rotational stiffness and damping together, or neither")
         _ARGUMENTS.number("rotational stiffness", turning[0], "N m/rad", least=0.0)
         _ARGUMENTS.number("rotational damping", turning[1], "N m s/rad", least=0.0)
 
 
 @dataclass(frozen=True, slots=True)
 class Switch:
-    """Turn the force off or on, or hold or let go the clutch; None leaves it as it is.
+    """Command that switches force or clutch; None keeps a switch as it is.
 
     Attributes:
-        force: Whether the device is pushed at all.
-        clutch: Whether the device moves without the handle.
+        force: True enables force on the device.
+        clutch: True lets the device move without the handle.
 
     Raises:
         CommandError: A value is neither true nor false.
@@ -72,25 +72,25 @@ class Switch:
 
 @dataclass(frozen=True, slots=True)
 class Reset:
-    """Put the scene back to where the run started; the force fades before and rises after."""
+    """Command that resets the scene; the force fades before and rises after."""
 
 
 @dataclass(frozen=True, slots=True)
 class Mark:
-    """Mark a moment: an event ``mark`` in the recording, which ``export`` can cut there."""
+    """Command that marks a moment: an event ``mark`` in the recording; ``export`` can cut there."""
 
 
 @dataclass(frozen=True, slots=True)
 class Stop:
-    """End the run."""
+    """Command that ends the run."""
 
 
 @dataclass(frozen=True, slots=True)
 class Repeat:
-    """Do what events of another run's recording did; not to be asked for over a wire.
+    """Internal command that repeats recorded events; not accepted over the wire.
 
     Attributes:
-        events: Of ``change.CHANGES``, in their order; all are done before the same tick.
+        events: Events of ``change.CHANGES`` in order, all applied before one tick.
     """
 
     events: tuple[Mapping[str, Any], ...]
@@ -108,16 +108,17 @@ KINDS: dict[str, type[Command]] = {
 
 
 def line_of(command: Command) -> bytes:
-    """Returns a command as a line."""
+    """Returns a command as a line of JSON."""
     name = next(name for name, kind in KINDS.items() if isinstance(command, kind))
     return json.dumps({"command": name, **asdict(command)}).encode() + b"\n"
 
 
 def command_of(line: bytes) -> Command:
-    """Reads a line.
+    """Parses a line.
 
     Raises:
-        CommandError: It is too long, no command, or has other values than that command takes.
+        CommandError: The line is too long, not a command, or has values that the command does not
+            take.
     """
     if len(line) > LONGEST_LINE:
         raise CommandError(f"a command has at most {LONGEST_LINE} bytes")
@@ -126,7 +127,9 @@ def command_of(line: bytes) -> Command:
         name = said.pop("command")
         kind = KINDS[name]
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
-        raise CommandError(f"{shown(line)} is no command; there are {choices(KINDS)}") from None
+        raise CommandError(
+            f"{shown(line)} is not a command; choose one of {choices(KINDS)}"
+        ) from None
     try:
         return kind(**said)
     except TypeError:

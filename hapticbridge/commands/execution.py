@@ -1,4 +1,4 @@
-"""The way of a command into the loop: checked, slowed down, and kept where the loop looks."""
+"""Thread-safe queue of validated, rate-limited commands."""
 
 from __future__ import annotations
 
@@ -21,34 +21,27 @@ from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.rendering import Method
 from hapticbridge.run_description import restore_state
 
-# What a command changes in a run, as the event that a recording keeps and a re-simulation
-# repeats.
-#
-# coupling stiffness, damping, rotational_stiffness, rotational_damping of the law; ticks switch
-# force, clutch; fading where the force comes back after a reset reset (nothing: the scene goes
-# back to where the run began)
-#
-# The loop applies the very event that it then records, so both ways are one.
+# Events of commands: recorded, and repeated by a re-simulation.
 
 CHANGES = ("coupling", "switch", "reset")
-"""Events that commands leave behind."""
+"""Names of the events that commands cause."""
 
 TUNING_TIME = 0.5
-"""In s: how long a change of the coupling takes, however small. From 2000 to 2400 N/m at 10 N the
-spring gains 4 mJ, 8 mW; from 200 to 2400 N/m 0.23 J, which the energy limit of the guard stops.
-Shorter is felt as a blow, longer as a slider that drags behind."""
+"""Duration in s of any change of the coupling. From 2000 to 2400 N/m at 10 N the spring gains 4 mJ,
+8 mW; from 200 to 2400 N/m 0.23 J, which the guard's energy limit stops. A shorter change feels like
+a blow, a longer one like a lagging slider."""
 
 
 def tuning_ticks(period: float) -> int:
-    """Returns in how many ticks of ``period`` seconds a coupling changes."""
+    """Returns the duration of a change of the coupling in ticks of ``period`` seconds."""
     return max(round(TUNING_TIME / period), 1)
 
 
 def coupling_in(event: Mapping[str, Any], parameters: RunParameters) -> Coupling:
-    """Returns the coupling that an event ``coupling`` names.
+    """Returns the coupling of an event ``coupling``.
 
     Raises:
-        RecordingError: It names none, the run has no coupling law, or it changes too fast.
+        RecordingError: It has none, the run has no coupling law, or its duration is wrong.
     """
     tick = event.get("tick")
     try:
@@ -66,10 +59,10 @@ def coupling_in(event: Mapping[str, Any], parameters: RunParameters) -> Coupling
 
 
 def bits_in(event: Mapping[str, Any]) -> int:
-    """Returns the bits of a record's ``buttons`` that an event ``switch`` asks for.
+    """Returns the bits of a record's ``buttons`` for an event ``switch``.
 
     Raises:
-        RecordingError: It does not say.
+        RecordingError: The event is damaged.
     """
     force, clutch = event.get("force"), event.get("clutch")
     if not isinstance(force, bool) or not isinstance(clutch, bool):
@@ -81,15 +74,10 @@ def bits_in(event: Mapping[str, Any]) -> int:
 
 
 class EventApplier:
-    """Applies the events of commands to a run, be it live or simulated again.
+    """Applies events of commands to a live or simulated run.
 
-    Args:
-        binding: The run's.
-        model: Of the scene.
-        data: Likewise.
-        method: How the tool is rendered.
-        parameters: Of the run, as it began.
-        start: The scene's state at the start (``provenance.start_state``), as bytes.
+    The loop applies the event that it records, so live run and re-simulation share one path.
+    ``start`` is the scene's state at the start (``provenance.start_state``), as bytes.
     """
 
     def __init__(
@@ -105,7 +93,7 @@ class EventApplier:
         self._method, self._parameters, self._start = method, parameters, start
 
     def apply(self, event: Mapping[str, Any]) -> None:
-        """Does what an event of ``CHANGES`` says, before the tick that it names.
+        """Applies an event of ``CHANGES`` before the tick that it names.
 
         Raises:
             RecordingError: The event is damaged.
@@ -126,32 +114,33 @@ class EventApplier:
 
 
 MOST_WAITING = 8
-"""Commands that may wait for the loop, which takes one a tick; a loop that leaves more undone
-stands still."""
+"""Largest number of waiting commands. The loop takes one per tick; more waiting ones mean that it
+stalls."""
 
 INTERVAL = 0.05
-"""In s, least time between two commands. A slider that is dragged needs no more than 20 a second to
-look smooth, and each takes the loop some 20 µs; a flood must not become a load."""
+"""Shortest time in s between two commands. A dragged slider looks smooth at 20 per second; each
+command costs the loop about 20 µs, and a flood must not become a load."""
 
 RESET_INTERVAL = 1.0
-"""Least time in s between two resets. The force fades before each and rises after it, which takes
-half a second. A shorter interval lets resets follow each other without any force between them."""
+"""Shortest time in s between two resets. The force fades before each and rises after it, which
+takes half a second. With a shorter interval, resets could follow each other without any force
+between them."""
 
 
 class CommandQueue:
-    """Commands between whoever gives them and the loop; nothing unchecked ever gets in.
+    """Queue of commands between their senders and the loop; every command in it is validated.
 
-    Any thread may ``offer``. The loop alone takes: it looks whether ``waiting`` is empty, which
-    takes no lock and allocates nothing, and pops from its left end, which the interpreter does in
-    one piece. The queue never holds more than ``MOST_WAITING``.
+    Any thread may ``offer``; only the loop takes. The loop tests whether ``waiting`` is empty,
+    which needs no lock and no allocation, and pops from its left end, which the interpreter does
+    atomically. The queue holds at most ``MOST_WAITING`` commands.
 
     Args:
-        allowance: What the device allows.
-        is_recorded: Whether the run is recorded, so that it can be marked.
-        now: Time in s, that never runs backwards.
+        allowance: Limits of the coupling on the device.
+        is_recorded: True for a recorded run, which can be marked.
+        now: Returns the time in s; it never runs backwards.
 
     Attributes:
-        waiting: Commands in their order, each with who gave it.
+        waiting: Commands in order, each with its origin.
     """
 
     def __init__(
@@ -164,25 +153,23 @@ class CommandQueue:
         self.allowance = allowance
         self.waiting: deque[tuple[Command | Repeat, str]] = deque(maxlen=MOST_WAITING)
         self._is_recorded, self._now = is_recorded, now
-        self._offering = threading.Lock()  # never the loop's
+        self._offering = threading.Lock()  # never taken by the loop
         self._last = self._last_reset = -float("inf")
 
     def warm_up(self) -> None:
-        """Computes what takes long, so that no command is the first one."""
+        """Computes the tables of limits in advance, so that the first command is not slow."""
         if self.allowance.method.has_law:
             for span in self.allowance.spans:
                 span.needed(span.least_stiffness, 0.0)
 
     def offer(self, command: Command, by: str) -> None:
-        """Hands a command over, or refuses it.
+        """Adds a command, or refuses it.
 
-        Args:
-            command: What is asked for.
-            by: Who asks, for the recording.
+        ``by`` is the command's origin, for the recording.
 
         Raises:
-            CommandError: It exceeds what the device allows, comes too soon after the last one, or
-                the loop does not take any.
+            CommandError: It exceeds the device's limits, follows the last one too soon, or the loop
+                stalls.
         """
         self._check(command)
         is_reset = isinstance(command, Reset)
@@ -193,9 +180,9 @@ class CommandQueue:
                 self._last_reset + RESET_INTERVAL - now if is_reset else 0.0,
             )
             if early > 0:
-                raise CommandError(f"the last command is too recent; ask again in {early:.2f} s")
+                raise CommandError(f"the last command is too recent; try again in {early:.2f} s")
             if len(self.waiting) >= MOST_WAITING:
-                raise CommandError("the loop takes no commands; it stands still")
+                raise CommandError("the loop takes no commands because it stalls; try again later")
             self._last = now
             if is_reset:
                 self._last_reset = now
@@ -205,28 +192,24 @@ class CommandQueue:
         if isinstance(command, Couple):
             self.allowance.check(command)
         elif isinstance(command, Reset) and not self.allowance.method.has_coupling:
-            raise CommandError(
-                "a tool without mass is where the hand is; there is nothing to reset"
-            )
+            raise CommandError("a massless tool follows the hand, so there is nothing to reset")
         elif isinstance(command, Mark) and not self._is_recorded:
             raise CommandError("this run is not recorded; start it with a recording to mark it")
 
 
-# What the loop does with the commands that wait: at which tick, in which order.
+# Execution of waiting commands, in order and at their ticks.
 
 Tell = Callable[..., None]
 
 
 class CommandExecutor:
-    """Takes one command a tick and does it; what must not happen under force waits until it faded.
+    """Executes one command per tick; commands that need zero force wait until it has faded.
 
-    Args:
-        queue: Where the commands wait.
-        tell: Notes an event of the present tick: its name, then its details.
+    ``tell`` records an event of the present tick: its name, then its details.
 
     Attributes:
-        felt: The coupling that is to be felt, once its change is over.
-        later: Resets that wait until the force has faded: tick, and who gave it.
+        felt: Requested coupling at the end of its present change.
+        later: Postponed commands: tick, command, origin.
     """
 
     def __init__(self, queue: CommandQueue, tell: Tell) -> None:
@@ -239,15 +222,13 @@ class CommandExecutor:
 
     @property
     def used(self) -> Coupling:
-        """The coupling of the law, once its change is over."""
+        """Law's coupling at the end of its present change."""
         return self._queue.allowance.used(self.felt)
 
     def begin(self, repeater: EventApplier, fade_ticks: int) -> None:
-        """Takes up a run at its first tick.
+        """Starts a run at its first tick.
 
-        Args:
-            repeater: Of the run.
-            fade_ticks: In how many ticks its force fades.
+        The force fades within ``fade_ticks``.
         """
         self._repeater, self._fade_ticks = repeater, fade_ticks
         self.later.clear()
@@ -255,11 +236,11 @@ class CommandExecutor:
             self._switch("run")
 
     def act(self, tick: int) -> None:
-        """Does what is due before a tick."""
+        """Executes the command that is due before a tick."""
         if self.later:
             due, by = self.later[0]
             if tick < due:
-                return  # in the order that they were given
+                return  # commands keep their order
             self.later.popleft()
             self._do({"event": "reset", "by": by})
             self._switch(by)
@@ -288,7 +269,7 @@ class CommandExecutor:
     def _switch(self, by: str, *, is_fading: bool = False) -> None:
         force = self._has_force and not is_fading
         event = {"event": "switch", "force": force, "clutch": self._is_clutched, "by": by}
-        # of a force that is only away for a moment; nobody asked for it to be off
+        # a force that fades for a moment only was not switched off by a command
         self._do(event | ({"fading": True} if is_fading else {}))
 
     def _do(self, event: dict[str, Any]) -> None:

@@ -1,4 +1,4 @@
-"""What a haptic device is to the bridge: a protocol of four calls."""
+"""Protocol of a haptic device: four calls."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from numpy.typing import NDArray
 
 from hapticbridge.errors import DeviceError, choices
 
-# A haptic device's data sheet, as guard, certificate and recording use it.
+# Data sheet of a haptic device.
 
 
 def checked_number(name: str, value: object, unit: str, *, is_positive: bool = False) -> float:
-    """Returns a device's parameter as a float, or says what would be valid.
+    """Returns a device's parameter as a float.
 
     Args:
-        name: The parameter as the user knows it.
+        name: Name of the parameter in messages.
         value: A real number, finite and >= 0 (> 0 with ``is_positive``).
         unit: The parameter's unit, for the message.
-        is_positive: Whether zero is refused too.
+        is_positive: True to refuse zero.
 
     Raises:
-        DeviceError: The value is no number, not finite, or out of range.
+        DeviceError: The value is not a number, not finite, or out of range.
     """
     bound = "> 0" if is_positive else ">= 0"
     message = f"{name} = {value!r}: must be a finite number {bound}" + (f" {unit}" if unit else "")
@@ -41,10 +41,10 @@ def checked_number(name: str, value: object, unit: str, *, is_positive: bool = F
 
 
 def checked_period(period: float) -> float:
-    """Returns the loop's period in s, finite and > 0.
+    """Returns the loop's period in s if it is finite and > 0.
 
     Raises:
-        DeviceError: It is not.
+        DeviceError: The period is not finite or not > 0.
     """
     return checked_number("the loop's period", period, "s", is_positive=True)
 
@@ -67,23 +67,23 @@ DATA_SHEET_UNITS = {
 """SI units of the numbers in a device's data sheet."""
 
 AXES = ("x", "y", "z", "rx", "ry", "rz")
-"""Axes that a device may move along (x, y, z) and turn about (rx, ry, rz), in its own frame."""
+"""Axes of a device in its own frame: translation (x, y, z) and rotation (rx, ry, rz)."""
 
 USUAL_FORCE_LIMIT, USUAL_TORQUE_LIMIT, USUAL_SPEED_LIMIT = 10.0, 0.5, 5.0
-"""In N, N m and m/s, for the sheets of devices that have no figure of their own: what a desktop
-device gives, and a speed that no hand reaches, but a fault does. Where there is no motor, a limit
-of force or torque limits only what is recorded."""
+"""Default limits in N, N m and m/s for sheets without a figure of their own. Force and torque are
+those of a desktop device; only a fault exceeds the speed. For a device without motors the limits of
+force and torque apply only to the recording."""
 
 _NEVER_UNKNOWN = ("force_limit", "torque_limit", "speed_limit")
 _POSITIVE = ("mass", "rotational_inertia", "rate", "reach")
 
 
 def stated_numbers(options: Mapping[str, object], names: Iterable[str]) -> dict[str, float]:
-    """Returns those numbers of the data sheet that a device's options state.
+    """Returns the numbers of the data sheet that a device's options state.
 
     Args:
-        options: By name; None stands for one that is not stated.
-        names: Of ``DATA_SHEET_UNITS``, which of them are looked for.
+        options: Options by name; None stands for an option that is not set.
+        names: Keys of ``DATA_SHEET_UNITS`` to look for.
 
     Raises:
         DeviceError: A number is out of range.
@@ -97,31 +97,31 @@ def _checked(name: str, value: object) -> float:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DeviceInfo:
-    """A device's data sheet, as the guard uses it and the recording keeps it.
+    """Data sheet of a device, used by the guard and stored in the recording.
 
     Attributes:
-        name: What it is called, not empty.
-        axes: Which of ``AXES`` it moves along and turns about, in that order, at least one. What
-            is not there stays where it is, and no wrench acts on it.
-        mass: Inertia felt at the handle in kg, > 0; None where unknown.
-        damping: Physical damping b at the handle in N s/m, >= 0; None where unknown or where
-            the motion is prescribed. The bound b >= KT/2 + B' is judged against it.
-        rotational_inertia: In kg m², > 0; None where unknown.
-        rotational_damping: In N m s/rad, >= 0; None where unknown.
-        friction: Coulomb friction per axis in N, >= 0; None where unknown.
-        resolution: Step of the reported position in m, >= 0 (0: none); None where unknown.
-        force_limit: Largest force in N that the device may be sent, by norm, >= 0.
-        torque_limit: Largest torque in N m, by norm, >= 0.
-        speed_limit: Fastest motion in m/s that the device can make, >= 0.
-        rate: The device's own rate in Hz, > 0; None where it follows the bridge.
-        delay: How old a sample is when the loop reads it, plus the time until a written wrench
-            acts, in s, >= 0; None where unknown.
-        is_prescribed: Whether its motion does not react to force.
-        is_real: Whether it moves a motor in somebody's hand.
-        duration: Time in s after which its motion ends by itself, >= 0; None where it does not.
-        serial: The unit's serial number; empty where it has none.
-        reach: Distance in m from the origin of its frame, > 0, beyond which it has no place to be
-            but at its stops; None where unknown.
+        name: Name of the device, not empty.
+        axes: Axes out of ``AXES``, in that order, at least one. Missing axes do not move, and no
+            wrench acts on them.
+        mass: Inertia at the handle in kg, > 0; None if unknown.
+        damping: Physical damping b at the handle in N s/m, >= 0; None if unknown or if the motion
+            is prescribed. The condition b >= KT/2 + B' is checked against it.
+        rotational_inertia: Rotational inertia at the handle in kg m², > 0; None if unknown.
+        rotational_damping: Rotational damping at the handle in N m s/rad, >= 0; None if unknown.
+        friction: Coulomb friction per axis in N, >= 0; None if unknown.
+        resolution: Step of the reported position in m, >= 0 (0: none); None if unknown.
+        force_limit: Largest norm of a commanded force in N, >= 0.
+        torque_limit: Largest norm of a commanded torque in N m, >= 0.
+        speed_limit: Largest possible speed in m/s, >= 0.
+        rate: The device's own rate in Hz, > 0; None if it follows the bridge.
+        delay: Age of a sample when the loop reads it, plus the time until a written wrench acts, in
+            s, >= 0; None if unknown.
+        is_prescribed: True if the motion does not react to force.
+        is_real: True if motors act on a person's hand.
+        duration: Time in s after which the motion ends by itself, >= 0; None if it does not.
+        serial: The unit's serial number; empty if it has none.
+        reach: Largest possible distance in m from the origin of its frame, > 0; beyond it are only
+            the stops. None if unknown.
 
     Raises:
         DeviceError: A value is of the wrong type, not finite, or out of range.
@@ -169,26 +169,26 @@ class DeviceInfo:
 
     @property
     def degrees_of_freedom(self) -> int:
-        """How many axes it has."""
+        """Number of axes."""
         return len(self.axes)
 
     @property
     def moves(self) -> bool:
-        """Whether it moves along any axis."""
+        """True if it moves along any axis."""
         return any(axis in self.axes for axis in AXES[:3])
 
     @property
     def turns(self) -> bool:
-        """Whether it turns about any axis."""
+        """True if it turns about any axis."""
         return any(axis in self.axes for axis in AXES[3:])
 
     @property
     def burning_damping(self) -> tuple[float | None, float | None]:
-        """What the device burns energy with: b in N s/m and in N m s/rad; None, None where unknown.
+        """Damping that dissipates energy, in N s/m and N m s/rad; (None, None) if unknown.
 
-        Unknown on one kind of axis is unknown altogether: nobody can tell which of them took the
-        energy. A device without rotation needs none for it; one whose motion is prescribed keeps
-        nothing of what it is given.
+        If one kind of axis is unknown, both are, because the energy cannot be assigned to an axis.
+        A device without rotation has no rotational part. A prescribed motion stores and dissipates
+        nothing.
         """
         is_complete = self.rotational_damping is not None or not self.turns
         if self.is_prescribed or not is_complete:
@@ -196,16 +196,16 @@ class DeviceInfo:
         return self.damping, self.rotational_damping
 
     def to_json(self) -> str:
-        """Returns the sheet as one JSON object: a key per attribute, null where unknown."""
+        """Returns the sheet as one JSON object: a key per attribute, null if unknown."""
         return json.dumps(dataclasses.asdict(self), allow_nan=False)
 
     @classmethod
     def from_json(cls, text: str) -> DeviceInfo:
-        """Reads what ``to_json`` wrote.
+        """Returns the sheet from the text of ``to_json``.
 
         Raises:
-            DeviceError: The text is not a JSON object with these keys (``serial`` and ``reach`` may
-                be missing), or a value is invalid.
+            DeviceError: The text is not a JSON object with these keys (``serial`` and ``reach`` are
+                optional), or a value is invalid.
         """
         try:
             values = json.loads(text)
@@ -216,21 +216,20 @@ class DeviceInfo:
         names = {field.name for field in dataclasses.fields(cls)}
         if unknown := values.keys() - names:
             raise DeviceError(
-                f"device data holds {choices(unknown)}, which it does not know; "
-                f"it knows {choices(names)}"
+                f"device data holds unknown keys {choices(unknown)}; valid keys: {choices(names)}"
             )
         needed = {f.name for f in dataclasses.fields(cls) if f.default is dataclasses.MISSING}
         if missing := needed - values.keys():
-            raise DeviceError(f"device data lacks {choices(missing)}")
+            raise DeviceError(f"device data lacks the keys {choices(missing)}")
         return cls(**values)
 
 
 class Device(Protocol):
-    """Where the handle's motion comes from and where the wrench goes.
+    """Source of the handle's motion and sink of the wrench.
 
-    The loop calls ``start`` once, then in each tick ``read`` and later ``write``; ``close`` ends.
-    The sample of tick k is the state at the time k · period. A wrench written in tick k acts from
-    then on until the next write.
+    The loop calls ``start`` once, then ``read`` and later ``write`` in each tick, and finally
+    ``close``. The sample of tick k is the state at time k · period. A wrench written in tick k acts
+    until the next write.
 
     Attributes:
         info: The device's data sheet, complete before ``start``.
@@ -239,7 +238,7 @@ class Device(Protocol):
     info: DeviceInfo
 
     def start(self, period: float) -> NDArray[np.void]:
-        """Brings the device to its initial state, from which two runs are identical.
+        """Brings the device to its initial state, from which runs are reproducible.
 
         Args:
             period: The loop's period in s, finite and > 0.
@@ -252,17 +251,16 @@ class Device(Protocol):
         """
 
     def read(self, sample: NDArray[np.void]) -> int:
-        """Fills in the newest sample.
+        """Writes the newest sample.
 
         Args:
-            sample: Shape (1,), ``SAMPLE_DTYPE``, filled in place.
+            sample: Output, shape (1,), ``SAMPLE_DTYPE``.
 
         Returns:
-            0 where the sample is new, ``TickFlag.STALE_SAMPLE`` where the device had nothing new
-            since the last read and the sample repeats it.
+            0 for a new sample; ``TickFlag.STALE_SAMPLE`` if the sample repeats the last one.
 
         Raises:
-            DeviceLost: It is gone, or has been silent too long.
+            DeviceLost: The device is gone, or silent for too long.
         """
 
     def write(self, wrench: NDArray[np.float64]) -> None:
@@ -270,10 +268,10 @@ class Device(Protocol):
 
         Args:
             wrench: Shape (6,): force in N, torque in N m, on the device, in the device's frame.
-                What it has no axis for it leaves out.
+                Components without an axis are ignored.
 
         Raises:
-            DeviceLost: It is gone.
+            DeviceLost: The device is gone.
         """
 
     def close(self) -> None:

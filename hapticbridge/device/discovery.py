@@ -13,12 +13,12 @@ RULES_FILE = "/etc/udev/rules.d/70-hapticbridge.rules"
 
 
 def plugged_devices() -> list[FoundDevice]:
-    """Lists every device of every family that is plugged in; empty where there is no USB."""
+    """Lists every connected device of every family; empty without USB."""
     return [device for family in all_families() for device in plugged_of(family)]
 
 
 def plugged_of(family: Driver) -> list[FoundDevice]:
-    """Lists a family's devices that are plugged in, with what keeps each from being opened."""
+    """Lists a family's connected devices, with the reason if one cannot be opened."""
     if family.find is not None:
         return family.find()
     if family.transport == "hid":
@@ -27,7 +27,7 @@ def plugged_of(family: Driver) -> list[FoundDevice]:
 
 
 def blind_spots() -> list[str]:
-    """Says what keeps devices from being seen at all, one sentence each; empty where nothing."""
+    """Returns the reasons why devices cannot be detected at all, one sentence each."""
     spots = []
     if hid_search.hid_api() is None:
         spots.append("hidapi cannot be loaded, so HID devices are not seen: 'pip install hidapi'")
@@ -39,11 +39,11 @@ def blind_spots() -> list[str]:
 
 
 def udev_rules() -> str:
-    """Returns the udev rules that let whoever sits at the machine open these devices.
+    """Returns the udev rules that let a local user open these devices.
 
-    A HID device is matched by its kernel name, ``BUS:VENDOR:PRODUCT.NUMBER``, which it has over
-    Bluetooth too, where there is no USB parent to look at. A rule cannot ask a device what it can
-    do, so a family that is a class gets a rule for each of its devices that is plugged in.
+    A HID device is matched by its kernel name, ``BUS:VENDOR:PRODUCT.NUMBER``. It exists over
+    Bluetooth too, where there is no USB parent. A rule cannot read a device's capabilities, so a
+    family that is a device class gets one rule per connected device.
     """
     lines = [
         "# Lets whoever sits at the machine open haptic devices. Written by",
@@ -74,6 +74,6 @@ def udev_rules() -> str:
 
 
 def _ids_plugged_in(family: Driver) -> tuple[UsbId, ...]:
-    """Returns the products of a family that are plugged in, each once."""
+    """Returns the connected products of a family, each once."""
     found = {(one.vendor, one.product): one.name for one in plugged_of(family)}
     return tuple(UsbId(*numbers, name) for numbers, name in sorted(found.items()))

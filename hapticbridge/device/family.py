@@ -1,4 +1,4 @@
-"""What kinds of hardware the project drives, and what of it is plugged in: two plain records."""
+"""Records of supported and connected devices."""
 
 from __future__ import annotations
 
@@ -12,24 +12,25 @@ from hapticbridge.device.base import Device
 from hapticbridge.errors import DeviceError, choices
 
 Notify = Callable[[str], None]
-"""Takes a sentence for the user while a device is opened or started: a prompt, how far it is."""
+"""Receives a message for the user while a device is opened or started: an instruction or
+progress."""
 
 RULES_COMMAND = "hapticbridge devices --udev-rules"
-"""What prints the udev rules; sentences about a missing permission name it."""
+"""Command that prints the udev rules; messages about a missing permission name it."""
 
 
 def ignore_message(_sentence: str) -> None:
-    """Says nothing: where a script opens a device, nobody may be reading."""
+    """Discards the message, for scripts without a reader."""
 
 
 @dataclass(frozen=True, slots=True)
 class UsbId:
-    """A vendor's and product's number on the USB bus, and what is sold under it.
+    """USB vendor and product id, with the model's name.
 
     Attributes:
-        vendor: 16 bits.
-        product: 16 bits.
-        model: The maker's name for it.
+        vendor: Vendor id, 16 bits.
+        product: Product id, 16 bits.
+        model: The maker's name of the product.
     """
 
     vendor: int
@@ -42,28 +43,28 @@ class UsbId:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Driver:
-    """Devices that one codec drives: an entry in the list of what is supported.
+    """Driver of a kind of device: an entry in the list of supported hardware.
 
     Attributes:
-        name: What ``open_device`` knows it by.
-        about: What it is, in a few words.
-        ids: Every product of the family, none where it is a class.
-        transport: ``hid`` (hidapi), ``usb`` (pyusb), ``service`` (a program of the maker's that
-            runs beside us) or ``library`` (one of the maker's that is loaded).
-        axes: Which axes it has, in words, because it may differ from unit to unit.
-        force: What force it can show, in words.
-        rate: How often it reports, in words.
-        on_stall: What becomes of its force while this machine stands still, in words; empty where
-            it gives none. Nothing in this program can act then: only what runs in the device.
-        options: Names that ``open`` understands.
-        open: Finds the device and opens it; takes the options and whom to tell.
-        usage: Usage page and usage of the HID collection that speaks the protocol, where a product
-            has several; None where any will do.
-        find: Lists what is plugged in, where neither hidapi nor pyusb can tell.
-        medium: Says in a sentence whether the service or library is there, likewise.
-        sought: What is looked for, in words, where numbers on the USB bus do not say it.
-        recognises: Tells from a HID report descriptor whether a device is one of them, for a family
-            that is a class and has no list of products; None for all others.
+        name: Name in ``open_device``.
+        about: Description, in a few words.
+        ids: Every product of the family; empty for a device class.
+        transport: ``hid`` (hidapi), ``usb`` (pyusb), ``service`` (the maker's background program)
+            or ``library`` (the maker's library).
+        axes: Axes in words, because they may differ between units.
+        force: Available force, in words.
+        rate: Rate of reports, in words.
+        on_stall: Fate of the force while the host is stalled, in words; empty without force. The
+            host cannot act then, only the device itself.
+        options: Options of ``open``.
+        open: Finds and opens the device; its arguments are the options and a receiver of messages.
+        usage: Usage page and usage of the HID collection with the protocol, if a product has
+            several; None if any fits.
+        find: Lists the connected devices if neither hidapi nor pyusb can.
+        medium: Returns a sentence on whether the service or library is present.
+        sought: Description of the devices looked for, if USB ids do not describe them.
+        recognises: Recognises a device class by its HID report descriptor; None for families with a
+            list of products.
     """
 
     name: str
@@ -83,7 +84,7 @@ class Driver:
     recognises: Callable[[bytes], bool] | None = None
 
     def model(self, vendor: int, product: int) -> str | None:
-        """Returns the model that has these numbers, or None if it is none of the family."""
+        """Returns the model with these ids, or None if it is not of the family."""
         for usb_id in self.ids:
             if (usb_id.vendor, usb_id.product) == (vendor, product):
                 return usb_id.model
@@ -92,17 +93,17 @@ class Driver:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FoundDevice:
-    """A device that is plugged in.
+    """A connected device.
 
     Attributes:
-        family: The family's name.
-        name: What the device calls itself, else the model's name; printable, and so is the serial.
-        serial: Its serial number, empty where it has none or does not tell.
-        path: Where it is opened: a device node.
-        vendor: Its numbers on the USB bus; 0 where whoever lists it does not tell.
-        product: Likewise.
-        transport: As the family's.
-        problem: Why it cannot be opened, and what to do, in one sentence; None where it can.
+        family: Name of the family.
+        name: Name that the device reports, else the model's name; printable, as is the serial.
+        serial: Serial number; empty if it has none or does not report it.
+        path: Device node by which it is opened.
+        vendor: USB vendor id; 0 if unknown.
+        product: USB product id; 0 if unknown.
+        transport: Transport of the family.
+        problem: Reason why it cannot be opened, with the remedy, in one sentence; None if it can.
     """
 
     family: str
@@ -125,20 +126,20 @@ class FoundDevice:
 
 
 def printable(text: str) -> str:
-    """Returns text that a device sent, without codes that a terminal would obey."""
+    """Returns a device's text without control codes for a terminal."""
     return "".join(letter if letter.isprintable() else "�" for letter in text).strip()
 
 
 def permission_problem(path: str) -> str:
-    """Says that a node may not be opened, and how to get that permission."""
+    """Returns a sentence about the missing permission to open a node, with the remedy."""
     return (
         f"no permission to open {path}; '{RULES_COMMAND}' prints the rule that grants it to "
-        "whoever sits at the machine"
+        "local users of the machine"
     )
 
 
 def access_problem(path: str) -> str | None:
-    """Says why this user cannot open a node that the kernel has told of; None where nothing."""
+    """Returns the reason why this user cannot open a node of the kernel; None if there is none."""
     if os.access(path, os.R_OK | os.W_OK):
         return None
     if not Path(path).exists():
@@ -152,13 +153,13 @@ def select_device(
     """Returns the device to open.
 
     Args:
-        family: What was looked for.
-        plugged: What of it is plugged in.
-        serial: The serial number, or path, that the user asked for; None: there must be just one.
+        family: The family that was looked for.
+        plugged: Its connected devices.
+        serial: Serial number or path; None: exactly one device must be connected.
 
     Raises:
-        DeviceError: None is plugged in, or not that one, or several and none was asked for, or it
-            may not be opened; says what to do.
+        DeviceError: No such device is connected, several are and none is selected, or it cannot be
+            opened. The message names the remedy.
     """
     if not plugged:
         vendors = ", ".join(sorted({f"{usb_id.vendor:04x}" for usb_id in family.ids}))
@@ -166,7 +167,7 @@ def select_device(
         if len(family.ids) == 1:
             looked = str(family.ids[0])
         elif family.recognises is not None:
-            looked = "any product, by what it says it can do"
+            looked = "any product, by the capabilities that it reports"
         looked = family.sought or looked
         raise DeviceError(
             f"no device '{family.name}' is plugged in (looked for {looked}); 'hapticbridge "

@@ -1,19 +1,19 @@
-"""Profiles: what is known of a kind of device, or of one unit, each number with its source.
+"""Device profile: properties of a device type or of one unit, each number with its source.
 
-A profile is a TOML file (``profile_search`` says where). It fills in what a driver cannot know,
-above all the damping b.
+A profile is a TOML file (``profile_search`` lists the places). It supplies numbers that a driver
+cannot read, above all the damping b.
 
     format = 1
     name = "Novint Falcon"
-    device = "falcon"            # the driver it is for
+    device = "falcon"            # name of the driver
     serial = "FT000001"          # only in a profile of one unit
-    models = ["omega.3"]         # what the driver calls those it holds for; none: for all
+    models = ["omega.3"]         # models as named by the driver; none: all models
 
     [damping]                    # one table per number of the data sheet, SI units
     value = 1.7                  # or "unknown"
-    interval = [1.6, 1.8]        # where it was measured: 95 %
+    interval = [1.6, 1.8]        # 95 % interval of a measured value
     unit = "N s/m"
-    source = "identified on 2026-03-01, 12 s per axis, nobody holding it"
+    source = "identified on 2026-03-01, 12 s per axis, without a hand"
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from hapticbridge.device.base import AXES, DATA_SHEET_UNITS, DeviceInfo, checked
 from hapticbridge.errors import DeviceError, choices
 
 FORMAT = 1
-"""Version of the file's layout that is read and written."""
+"""Version of the file format."""
 
 UNITS = {name: unit for name, unit in DATA_SHEET_UNITS.items() if name != "duration"} | {
     "workspace": "m",
@@ -41,11 +41,11 @@ UNITS = {name: unit for name, unit in DATA_SHEET_UNITS.items() if name != "durat
     "stiffness_offered": "N/m",
     "damping_offered": "N s/m",
 }
-"""SI units of the numbers that a profile may hold. ``workspace`` is three lengths; what a maker or
-a library offers as largest stiffness and damping is kept to be shown, and bounds nothing."""
+"""SI units of the numbers in a profile. ``workspace`` has three lengths. The largest stiffness and
+damping stated by a maker or a library are shown and bound nothing."""
 
 LOWER_END = ("damping", "rotational_damping", "friction", "mass", "rotational_inertia")
-"""Of these the guarantee takes the lower end of the interval: more would promise too much."""
+"""Numbers for which the guarantee uses the lower end of the interval, the cautious one."""
 
 _TEXTS = ("name", "device", "serial", "about")
 
@@ -55,9 +55,9 @@ class Quantity:
     """A number of a profile.
 
     Attributes:
-        value: One number, three lengths (``workspace``), or None where unknown.
-        source: Where it comes from, not empty.
-        interval: Where the true value lies with 95 %, or None.
+        value: One number, three lengths (``workspace``), or None if unknown.
+        source: Source of the number, not empty.
+        interval: 95 % interval of the true value, or None.
     """
 
     value: float | tuple[float, ...] | None
@@ -67,17 +67,17 @@ class Quantity:
 
 @dataclass(frozen=True, slots=True)
 class Profile:
-    """What is known of a device.
+    """Known properties of a device.
 
     Attributes:
-        name: What it is called.
-        device: Name of the driver, as ``--device`` takes it.
-        serial: Of the unit; empty for a kind.
-        axes: Which of ``AXES`` it has; None where the driver tells.
-        about: What else there is to say, in a sentence; may be empty.
-        quantities: By name, see ``UNITS``.
+        name: Name of the device.
+        device: Name of the driver, as for ``--device``.
+        serial: Serial number of the unit; empty for a device type.
+        axes: Axes out of ``AXES``; None if the driver reports them.
+        about: Further description in a sentence; may be empty.
+        quantities: Numbers by name, see ``UNITS``.
         path: The file.
-        models: What the driver calls the models that it holds for; empty where for all.
+        models: Models for which it holds, as named by the driver; empty for all.
     """
 
     name: str
@@ -90,17 +90,17 @@ class Profile:
     models: tuple[str, ...] = ()
 
     def is_for(self, model: str) -> bool:
-        """Returns whether it holds for a model, as the driver calls it; "" stands for any."""
+        """Returns whether it holds for a model; an empty model stands for any."""
         return not model or not self.models or self.names(model)
 
     def names(self, model: str) -> bool:
-        """Returns whether it names a model, in whatever case."""
+        """Returns whether it names a model, ignoring case."""
         return model.casefold() in (known.casefold() for known in self.models)
 
     def fill(self, info: DeviceInfo) -> DeviceInfo:
-        """Returns a data sheet with what was unknown in it filled in.
+        """Returns a data sheet with its unknown values filled in.
 
-        What the driver knows stays, but limits: the lower one holds.
+        Values from the driver are kept, except for limits, where the lower one is used.
 
         Raises:
             DeviceError: A value is out of the data sheet's range.
@@ -120,7 +120,7 @@ class Profile:
         return dataclasses.replace(info, **known)
 
     def to_toml(self) -> str:
-        """Returns the file's text, which ``read_profile`` reads back as the same profile."""
+        """Returns the file's text, which ``read_profile`` converts back to an equal profile."""
         plain: dict[str, object] = {"format": FORMAT}
         plain |= {name: getattr(self, name) for name in _TEXTS if getattr(self, name)}
         if self.axes is not None:
@@ -146,7 +146,7 @@ def read_profile(path: Path) -> Profile:
     """Reads a profile.
 
     Raises:
-        DeviceError: The file cannot be read, or says where it is not valid.
+        DeviceError: The file cannot be read or is not valid; the message names the place.
     """
     try:
         raw = tomllib.loads(path.read_text(encoding="utf-8"))
@@ -176,7 +176,7 @@ def _profile(raw: dict[str, object], path: Path) -> Profile:
     if not isinstance(models, list) or not all(isinstance(m, str) and m for m in models):
         raise DeviceError(f"models = {models!r}: must be a list of texts that are not empty")
     if unknown := raw.keys() - UNITS.keys():
-        raise DeviceError(f"it holds {choices(unknown)}; it may hold {choices(UNITS)}")
+        raise DeviceError(f"unknown tables {choices(unknown)}; valid tables: {choices(UNITS)}")
     return Profile(
         axes=None if axes is None else tuple(axes),
         quantities={name: _quantity(name, table) for name, table in raw.items()},
@@ -193,7 +193,7 @@ def _quantity(name: str, table: object) -> Quantity:
         raise DeviceError(f"[{name}] unit = {table['unit']!r}: must be {UNITS[name]!r}")
     source = table.get("source")
     if not isinstance(source, str) or not source:
-        raise DeviceError(f"[{name}] needs a source: where the number comes from")
+        raise DeviceError(f"[{name}] needs a source: the origin of the number, as a text")
     raw, interval = table.get("value"), table.get("interval")
     value: float | tuple[float, ...] | None = None
     if name == "workspace" and isinstance(raw, list):
@@ -216,21 +216,21 @@ def _is_number(value: object) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
-# Which profile is whose: shipped ones, and the user's own before them.
-#
-# Shipped profiles lie beside this module in ``profiles/``; a user's own, which ``identify``
-# writes, in the platform's configuration folder.
+# Search of profiles: the user's own take precedence over shipped ones.
 
 SHIPPED = Path(__file__).parent / "profiles"
 
 
 def own_folder() -> Path:
-    """Returns the folder of the user's own profiles; it need not exist."""
+    """Returns the folder of the user's own profiles, which may not exist.
+
+    It is in the platform's configuration folder; ``identify`` writes profiles there.
+    """
     return Path(platformdirs.user_config_dir("hapticbridge", appauthor=False)) / "devices"
 
 
 def profiles() -> dict[str, Path]:
-    """Returns all profiles by name, the user's own in the place of shipped ones."""
+    """Returns all profiles by name; the user's own replace shipped ones of equal name."""
     found = {path.stem: path for path in sorted(SHIPPED.glob("*.toml"))}
     found |= {path.stem: path for path in sorted(own_folder().glob("*.toml"))}
     return found
@@ -240,26 +240,28 @@ def profile_named(name: str) -> Profile:
     """Returns a profile by name, or from a file.
 
     Raises:
-        DeviceError: There is none of that name, or it is not valid.
+        DeviceError: No profile has that name, or it is not valid.
     """
     known = profiles()
     if name in known:
         return read_profile(known[name])
     if name.endswith(".toml"):
         return read_profile(Path(name))
-    raise DeviceError(f"unknown profile '{name}'; there are {choices(known)}, or a .toml file")
+    raise DeviceError(
+        f"unknown profile '{name}'; choose one of {choices(known)}, or name a .toml file"
+    )
 
 
 def profile_of(device: str, serial: str = "", model: str = "") -> Profile | None:
-    """Returns the profile of a unit, else that of its model, else that of its driver, else None.
+    """Returns the profile of a unit, else of its driver or model, else None.
 
-    A user's ``DEVICE-SERIAL.toml`` goes before ``DEVICE.toml``, which goes before the shipped one
-    that names the model; a file of the user's with its name goes in its place.
+    The order is the user's ``DEVICE-SERIAL.toml``, then ``DEVICE.toml``, then the shipped profile
+    that names the model. A user's file with the name of a shipped profile replaces it.
 
     Args:
         device: Name of the driver.
-        serial: Of the unit; may be empty.
-        model: What the driver calls it; empty: only a profile for all models of the driver.
+        serial: Serial number of the unit; may be empty.
+        model: Model as named by the driver; empty: only a profile for all models of the driver.
 
     Raises:
         DeviceError: The file is not valid.
@@ -273,7 +275,7 @@ def profile_of(device: str, serial: str = "", model: str = "") -> Profile | None
 
 
 def modelled(device: str) -> tuple[str, ...]:
-    """Returns the models of a driver that there are profiles for.
+    """Returns the models of a driver that have profiles.
 
     Raises:
         DeviceError: A file is not valid.
@@ -282,7 +284,7 @@ def modelled(device: str) -> tuple[str, ...]:
 
 
 def _by_model(device: str) -> list[Profile]:
-    # only names that are shipped: a broken file of the user's for another device is not read here
+    # only shipped names, so that a user's broken file for another device is not read here
     known = profiles()
     found = [read_profile(known[path.stem]) for path in sorted(SHIPPED.glob("*.toml"))]
     return [profile for profile in found if profile.device == device and profile.models]

@@ -1,4 +1,4 @@
-"""Devices by name, as the command line and scripts ask for them."""
+"""Devices by name, for the command line and scripts."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from hapticbridge.device.trajectory import ReplayDevice, TrajectoryDevice, read_
 from hapticbridge.errors import DeviceError, choices
 from hapticbridge.scene import Scene
 
-# Table of the hardware drivers. A driver is imported when one of its devices is asked for.
+# Table of the hardware drivers. A driver is imported when one of its devices is opened.
 
 DRIVERS = {
     "falcon": "hapticbridge.device.falcon.device",
@@ -45,10 +45,10 @@ def all_families() -> tuple[Driver, ...]:
     return tuple(family for name in DRIVERS if (family := family_named(name)) is not None)
 
 
-# ``name=value,name=value``: what a user types after a device's name and a colon.
+# Options of a device specification: ``name=value,name=value``.
 
 FILES = ("path",)
-"""Options that take all that comes after them: the file's name, commas too."""
+"""Options that take all remaining text as a file's name, commas included."""
 
 TEXTS = ("hand", "serial", "firmware", "log", "profile", "reverse", "service", "library")
 """Options that are text up to the next comma; a serial number may have leading zeros."""
@@ -58,7 +58,7 @@ WHOLE = ("delay",)
 
 
 def parsed(device: str, text: str, valid: Iterable[str]) -> dict[str, object]:
-    """Reads what stands after a device's name.
+    """Parses the options after a device's name.
 
     Args:
         device: The name.
@@ -66,8 +66,8 @@ def parsed(device: str, text: str, valid: Iterable[str]) -> dict[str, object]:
         valid: Options that the device has.
 
     Raises:
-        DeviceError: A part is no ``name=value``, a name is there twice or unknown, or a value is no
-            number.
+        DeviceError: A part is not ``name=value``, a name occurs twice or is unknown, or a value is
+            not a number.
     """
     names = tuple(valid)
     values: dict[str, object] = {}
@@ -75,9 +75,9 @@ def parsed(device: str, text: str, valid: Iterable[str]) -> dict[str, object]:
         name, equals, text = text.partition("=")
         name = name.strip()
         if not equals:
-            raise DeviceError(f"'{name}' is no option; options are written name=value")
+            raise DeviceError(f"'{name}' is not an option; write options as name=value")
         if name in values:
-            raise DeviceError(f"{name} is there twice")
+            raise DeviceError(f"option '{name}' is set twice; set it once")
         refuse_unknown(device, [name], names)
         if name in FILES:
             value, text = text, ""
@@ -98,16 +98,16 @@ def _value(name: str, text: str) -> object:
 
 
 def refuse_unknown(device: str, options: Iterable[str], valid: Iterable[str]) -> None:
-    """Refuses an option that a device does not have, by its name.
+    """Refuses an option that a device does not have.
 
     Raises:
-        DeviceError: Names the first one, and those that there are.
+        DeviceError: Names the first unknown option, and the valid ones.
     """
     names = tuple(valid)
     unknown = [name for name in options if name not in names]
     if unknown:
         raise DeviceError(
-            f"unknown option '{unknown[0]}' of the {device} device; there are {choices(names)}"
+            f"unknown option '{unknown[0]}' of the {device} device; choose one of {choices(names)}"
         )
 
 
@@ -119,37 +119,37 @@ _LIMITS = ("force_limit", "torque_limit", "speed_limit")
 
 
 def open_device(spec: str, *, tell: Notify = ignore_message, **options: object) -> Device:
-    """Opens a device by what a user would type.
+    """Opens a device by its specification.
 
-    Specifications are a name, or a name, a colon and what the device needs to know:
+    A specification is a name, or a name, a colon and details of the device:
 
     - ``simulated``, ``simulated:damping=5,friction=0.1``: a ``SimulatedDevice`` with these
       parameters, numbers in SI units. ``hand_mass``, ``hand_damping``, ``hand_stiffness``,
       ``hand_rotational_inertia``, ``hand_rotational_damping`` and ``hand_rotational_stiffness``
-      change its hand, ``hand=none`` lets it go. ``path=FILE`` comes last: all after it is the
-      file's name.
+      change its hand, ``hand=none`` removes it. ``path=FILE`` must be last: all text after it is
+      the file's name.
     - ``trajectory:FILE``: follows a CSV file (``read_motion``) or repeats the device motion of a
-      recording. All after the colon is the file's name, commas and colons too.
-    - a device that is plugged in, by its family's name (``hapticbridge devices`` lists them), with
-      options that the family has: ``spacemouse:speed=0.1,turn=1,dead_band=0.05``,
+      recording. All text after the colon is the file's name, with commas and colons.
+    - a connected device, by the name of its family (``hapticbridge devices`` lists them), with
+      options of that family: ``spacemouse:speed=0.1,turn=1,dead_band=0.05``,
       ``rawhid:serial=12345,damping=2``, ``falcon:firmware=FILE``, ``pid:newtons=4,travel=0.08``,
-      ``haply:serial=049D``, ``forcedimension:library=FILE``. ``serial`` picks one of several,
-      ``log=FILE`` keeps what went over the wire. What its driver does not know comes from the
-      profile of the unit or its kind, or from that of ``profile=NAME`` (or a file, or ``none``).
+      ``haply:serial=049D``, ``forcedimension:library=FILE``. ``serial`` selects one of several,
+      ``log=FILE`` records the transferred bytes. Numbers unknown to the driver come from the
+      profile of the unit or its model, or from ``profile=NAME`` (or a file, or ``none``).
 
     Args:
         spec: The specification.
-        tell: Takes sentences for the user while the device is opened: what to do, how far it is.
-        **options: The same parameters from code. What the specification says goes first; a
+        tell: Receives messages for the user while the device is opened: instructions and progress.
+        **options: The parameters as keyword arguments; the specification takes precedence. A
             trajectory takes ``force_limit`` (N), ``torque_limit`` (N m) and ``speed_limit`` (m/s).
 
     Returns:
-        The device, not yet started. A real one is claimed, so that a missing one is refused at
+        The device, not yet started. A real device is claimed, so that a missing one is refused at
         once.
 
     Raises:
         DeviceError: The name, an option or a value is not valid, the file is not a motion, or the
-            device is not plugged in or may not be opened.
+            device is not connected or cannot be opened.
         RecordingError: The file is a recording that cannot be read.
     """
     name, _, rest = spec.partition(":")
@@ -167,7 +167,7 @@ def open_device(spec: str, *, tell: Notify = ignore_message, **options: object) 
                 model = device.info.name
                 chosen = profile_of(name, device.info.serial, model)
                 if chosen is None and (models := modelled(name)):
-                    tell(f"there is no profile of '{model}'; there are {choices(models)}")
+                    tell(f"no profile of '{model}' exists; profiles: {choices(models)}")
             if chosen is not None:
                 device.info = chosen.fill(device.info)
         except BaseException:
@@ -176,24 +176,24 @@ def open_device(spec: str, *, tell: Notify = ignore_message, **options: object) 
         return device
     if name not in _OPENERS:
         names = choices([*_OPENERS, *DRIVERS])
-        raise DeviceError(f"unknown device '{name}'; there are {names}")
+        raise DeviceError(f"unknown device '{name}'; choose one of {names}")
     return _OPENERS[name](rest, options)
 
 
 def device_for(scene: Scene, spec: str, tell: Notify = ignore_message) -> Device:
-    """Opens a device for a scene; the simulated one does what the scene is there for.
+    """Opens a device for a scene; a simulated device takes its hand and its path from the scene.
 
-    Its hand is the one that the scene asks for (``scene_hand``) and follows ``NAME.csv`` beside the
-    scene, if there is one. Every option in the specification goes before what the scene says.
+    The hand is the scene's (``scene_hand``) and follows ``NAME.csv`` beside the scene, if present.
+    Every option in the specification takes precedence over the scene.
 
     Args:
         scene: The scene that the device will move in.
-        spec: What ``open_device`` understands.
-        tell: Takes sentences for the user, likewise.
+        spec: A specification for ``open_device``.
+        tell: Receives messages for the user.
 
     Raises:
-        DeviceError: See ``open_device``.
-        SceneError: The scene asks for a hand that cannot be.
+        DeviceError: As for ``open_device``.
+        SceneError: The scene specifies an impossible hand.
     """
     name, _, rest = spec.partition(":")
     if name != "simulated":
@@ -236,15 +236,17 @@ def _open_trajectory(rest: str, options: Mapping[str, object]) -> Device:
     path = Path(rest)
     if not _is_recording(path):
         return TrajectoryDevice(read_motion(path), **limits)
-    # devices stand left of recordings and know nothing of files' formats; only whoever asks for a
-    # recording by name needs the reader
+    # imported here, because the package device must not depend on recordings; only the replay of a
+    # recording needs the reader
     from hapticbridge.recording import read_recording  # noqa: PLC0415
 
     recording = read_recording(path)
     try:
         period = float(recording.meta["period_s"])
     except (KeyError, ValueError):
-        raise DeviceError(f"{path}: the recording does not say its period (period_s)") from None
+        raise DeviceError(
+            f"{path}: the recording lacks its period (period_s), so it cannot be replayed"
+        ) from None
     return ReplayDevice(recording.ticks, period, name=str(path), **limits)
 
 
@@ -255,7 +257,7 @@ _OPENERS: dict[str, Callable[[str, Mapping[str, object]], Device]] = {
 
 
 def _is_recording(path: Path) -> bool:
-    """Tells a recording by its first bytes; by its name if it is too short for them."""
+    """Recognises a recording by its first bytes, or by its suffix."""
     if path.suffix == ".mcap":
         return True
     try:
@@ -264,4 +266,4 @@ def _is_recording(path: Path) -> bool:
         with path.open("rb") as file:
             return file.read(len(_MCAP_MAGIC)) == _MCAP_MAGIC
     except (OSError, ValueError):
-        return False  # whoever reads it as a motion says why it cannot be
+        return False  # reading it as a motion then reports the reason

@@ -1,4 +1,4 @@
-"""3Dconnexion SpaceMouse: six axes of input, as a rate of motion; it has no motors."""
+"""3Dconnexion SpaceMouse: six axes of input as a rate of motion, without motors."""
 
 from __future__ import annotations
 
@@ -27,10 +27,7 @@ from hapticbridge.errors import DeviceError
 from hapticbridge.pose import Quaternion, canonical, product, quaternion_exp
 from hapticbridge.record import SAMPLE_DTYPE
 
-# Which products of two vendors are a SpaceMouse, or were called so before.
-#
-# The maker's CadMouse (256f: c650, c651, c654 to c658, c664, c665, c668) are two-dimensional
-# mice and are left out. Source: spacenavd of December 2025 and pyspacemouse of June 2026.
+# Products of the SpaceMouse family.
 
 _LOGITECH = {
     0xC603: "SpaceMouse Plus XT",
@@ -64,16 +61,20 @@ IDS = (
     *(UsbId(0x046D, product, model) for product, model in _LOGITECH.items()),
     *(UsbId(0x256F, product, model) for product, model in _3DCONNEXION.items()),
 )
-"""All of them: Logitech's own numbers first, then the maker's since it stands alone."""
+"""All products: Logitech's ids first, then 3Dconnexion's. The CadMouse models (256f: c650, c651,
+c654 to c658, c664, c665, c668) are two-dimensional mice and are left out. Source: spacenavd of
+December 2025 and pyspacemouse of June 2026."""
 
 
-# What a SpaceMouse reports: three layouts that tell themselves apart by number and length.
+# Input reports of a SpaceMouse.
 
 FULL_SCALE = 350
-"""Counts at full deflection of the puck (spacenavd, 2025). A few more can come and are clamped."""
+"""Counts at full deflection of the puck (spacenavd, 2025). Slightly larger counts can come and are
+clamped."""
 
 MOST_BUTTON_BYTES = 6
-"""A SpaceMouse Enterprise has 31 buttons; 48 fit into a record's integer with room to spare."""
+"""Bytes of buttons that are read. A SpaceMouse Enterprise has 31 buttons; 48 bits fit into a
+record's integer."""
 
 LED_ON, LED_OFF = bytes([4, 1]), bytes([4, 0])
 """Output report 4: the light in the base."""
@@ -84,7 +85,7 @@ _THREE, _SIX = struct.Struct("<3h"), struct.Struct("<6h")
 
 
 class Deflection(NamedTuple):
-    """How far the puck is pushed along or turned about some of its axes.
+    """Deflection of the puck along or about some of its axes.
 
     The maker's axes: x to the right, y towards the user, z down; rotations about them.
 
@@ -98,27 +99,27 @@ class Deflection(NamedTuple):
 
 
 class Buttons(NamedTuple):
-    """Which buttons are down.
+    """Pressed buttons.
 
     Attributes:
-        bits: One bit each; which key is which bit differs from model to model.
+        bits: One bit per button; the assignment differs between models.
     """
 
     bits: int
 
 
 def decoded(report: bytes) -> Deflection | Buttons | None:
-    """Reads one report.
+    """Decodes one report.
 
-    Report 1 is the translation; where it has 13 bytes (wireless models, the receiver, newer
-    firmware) it is translation and rotation. Report 2 is the rotation of older wired models, which
-    send both in pairs. Length tells them apart, not the product: one product was sold with both.
+    Report 1 is the translation; with 13 bytes (wireless models, the receiver, newer firmware) it
+    holds translation and rotation. Report 2 is the rotation of older wired models, which send both
+    in pairs. The layouts are distinguished by length, because one product was sold with both.
 
     Args:
         report: Any bytes, the report's number first.
 
     Returns:
-        None for what is none of these.
+        None for any other report.
     """
     if len(report) < 2:
         return None
@@ -135,11 +136,12 @@ def decoded(report: bytes) -> Deflection | Buttons | None:
 def share(count: int, dead_band: float) -> float:
     """Returns a deflection as a share of full scale, −1 to 1, 0 within the dead band.
 
-    sign(c) · max(0, |c| − d)/(1 − d) with c = count/350 clamped to ±1: continuous at the band's
-    edge, so nothing jumps where the puck leaves it.
+        sign(c) · max(0, |c| − d)/(1 − d),    c = count/350 clamped to ±1
+
+    It is continuous at the edge of the dead band.
 
     Args:
-        count: As reported.
+        count: Reported count.
         dead_band: d, share of full scale that counts as rest, 0 <= d < 1.
     """
     size = min(abs(count) / FULL_SCALE, 1.0)
@@ -149,40 +151,41 @@ def share(count: int, dead_band: float) -> float:
 
 
 SPEED, TURN = 0.05, 0.8
-"""m/s and rad/s at full deflection, unless the user says otherwise: 10 cm, the reach of a desktop
-device, in two seconds, and a quarter of a turn likewise."""
+"""Default speed in m/s and turn rate in rad/s at full deflection. They cover 10 cm, the reach of a
+desktop device, and a quarter of a turn in two seconds."""
 
 DEAD_BAND = 0.05
-"""Share of full deflection that counts as rest: 17 counts. A hand that pushes along one axis spills
-some per cent into the others, and a worn puck does not return to zero."""
+"""Share of full deflection that counts as rest, without unit: 17 counts. A push along one axis
+moves the others by some per cent, and a worn puck does not return to zero."""
 
 HELD = 0.5
-"""In s. A deflected puck repeats its report some hundred times a second; one that has said nothing
-for this long is out of reach, and must not go on moving the tool. Not verified on hardware."""
+"""Time without a report after which a deflection counts as zero, in s. A deflected puck repeats its
+report some hundred times a second; a silent one is out of radio range and must not move the tool.
+Not verified on hardware."""
 
-# the maker's y points to the user and z down, the bridge's away and up: half a turn about x, which
-# maps rotations as it maps translations
+# The maker's y points to the user and z down, the bridge's y away and z up. This is half a turn
+# about x, which maps rotations and translations alike.
 _TO_BRIDGE = np.array([1.0, -1.0, -1.0, 1.0, -1.0, -1.0])
 
 
 class SpaceMouseDevice:
-    """A handle that moves as long as the puck is pushed, at a speed proportional to it.
+    """A handle that moves while the puck is deflected, at a proportional speed.
 
         p ← p + v T,   R ← exp(ω T) R
 
-    with v and ω from the deflection beyond the dead band, both in the frame of the base: x to the
-    right, y away from the user, z up. R is composed exactly. The device feels nothing: its motion
-    is prescribed, and what the tool is pushed with is shown and recorded. At rest it sends nothing,
-    which is no sign of its being unplugged.
+    v and ω follow from the deflection beyond the dead band, both in the frame of the base: x to the
+    right, y away from the user, z up. R is composed exactly. The motion is prescribed and does not
+    react to force; the wrench on the tool is shown and recorded. A puck at rest sends nothing, so
+    silence does not mean that it is unplugged.
 
     Args:
-        link: Reports to and from it, open.
-        name: What it is called.
-        speed: In m/s at full deflection of one axis, > 0.
-        turn: In rad/s, likewise.
-        dead_band: Share of full deflection that counts as rest, 0 to below 1.
-        force_limit: In N, >= 0, for the data sheet: what the recorded wrench is limited to.
-        torque_limit: In N m, >= 0, likewise.
+        link: Open link for its reports.
+        name: Name of the device.
+        speed: Speed in m/s at full deflection of one axis, > 0.
+        turn: Turn rate in rad/s at full deflection of one axis, > 0.
+        dead_band: Share of full deflection that counts as rest, 0 <= dead_band < 1.
+        force_limit: Force limit of the data sheet in N, >= 0; it limits the recorded wrench.
+        torque_limit: Torque limit of the data sheet in N m, >= 0; it limits the recorded wrench.
 
     Raises:
         DeviceError: A number is out of range.
@@ -229,7 +232,7 @@ class SpaceMouseDevice:
         self._to_origin()
 
     def start(self, period: float) -> NDArray[np.void]:
-        """Puts the handle to the origin, and the light on.
+        """Places the handle at the origin and switches the light on.
 
         Args:
             period: The loop's period in s, finite and > 0.
@@ -238,8 +241,8 @@ class SpaceMouseDevice:
             The pose before the first tick, shape (1,), ``SAMPLE_DTYPE``.
 
         Raises:
-            DeviceError: The period is not.
-            DeviceLost: It is gone.
+            DeviceError: The period is not valid.
+            DeviceLost: The device is gone.
         """
         self._period = checked_period(period)
         self._link.take()
@@ -251,20 +254,20 @@ class SpaceMouseDevice:
         return sample
 
     def read(self, sample: NDArray[np.void]) -> int:
-        """Moves the handle by one period (the first call does not) and reports its pose.
+        """Moves the handle by one period (not at the first call) and returns its pose.
 
         Args:
-            sample: Shape (1,), ``SAMPLE_DTYPE``, filled in place.
+            sample: Output, shape (1,), ``SAMPLE_DTYPE``.
 
         Returns:
-            0: the pose is that of this tick, whether the puck has spoken or not.
+            0: the pose is always that of this tick, with or without a report.
 
         Raises:
-            DeviceError: ``start`` has not been called.
+            DeviceError: The device was not started.
             DeviceLost: The device is gone.
         """
         if self._period == 0.0:
-            raise DeviceError(f"{self._name} is read before it was started")
+            raise DeviceError(f"{self._name} is read before it was started; call start() first")
         if self._has_begun:
             self._silence += self._period
             if self._silence > HELD:
@@ -279,10 +282,10 @@ class SpaceMouseDevice:
         return 0
 
     def write(self, wrench: NDArray[np.float64]) -> None:
-        """Ignores the wrench: there is no motor."""
+        """Ignores the wrench, because there is no motor."""
 
     def close(self) -> None:
-        """Puts the light out and lets the device go."""
+        """Switches the light off and releases the device."""
         if self._is_open:
             self._is_open = False
             self._light(LED_OFF)
@@ -311,7 +314,7 @@ class SpaceMouseDevice:
         sample[0] = (self._position, self._quaternion, self._buttons)
 
     def _light(self, report: bytes) -> None:
-        """Switches the light; some models have none, and nothing depends on it."""
+        """Switches the light; models without one are ignored."""
         with contextlib.suppress(DeviceError):
             self._link.write(report)
 
@@ -322,14 +325,14 @@ def open_spacemouse(
     """Finds and opens a SpaceMouse.
 
     Args:
-        options: ``serial``, ``log``, and numbers that ``SpaceMouseDevice`` takes.
-        api: hidapi or what stands for it.
+        options: ``serial``, ``log``, and numbers of ``SpaceMouseDevice``.
+        api: hidapi or a substitute.
 
     Raises:
-        DeviceError: There is none, it cannot be opened, or a number is out of range.
+        DeviceError: No SpaceMouse is found, it cannot be opened, or a number is out of range.
     """
     plugged = select_device(FAMILY, find(FAMILY, api), options.get("serial"))
-    # not overlapped: it is written to only before the loop and after it
+    # not overlapped: reports are written only before and after the loop
     link = HidLink.open(plugged, api, is_overlapped=False, log=HexLog.asked(options))
     numbers: dict[str, float] = {
         key: value  # type: ignore[misc] # checked by the device
@@ -349,7 +352,7 @@ _NUMBERS = ("speed", "turn", "dead_band", "force_limit", "torque_limit")
 
 FAMILY = Driver(
     name="spacemouse",
-    about="3Dconnexion SpaceMouse and its ancestors: input only, its rate moves the handle",
+    about="3Dconnexion SpaceMouse and earlier models: input only, its rate moves the handle",
     ids=IDS,
     transport="hid",
     axes="6, by rate",

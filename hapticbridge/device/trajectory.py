@@ -1,4 +1,4 @@
-"""Devices whose motion is given beforehand: from a table of poses, or from a recording."""
+"""Devices with a prescribed motion, from a table of poses or a recording."""
 
 from __future__ import annotations
 
@@ -34,36 +34,37 @@ from hapticbridge.pose import (
 )
 from hapticbridge.record import SAMPLE_DTYPE
 
-# A prescribed motion: poses over time, interpolated within a tick.
+# Prescribed motion: poses over time, interpolated within a tick.
 
 TIME_AND_POSITION = ("t", "x", "y", "z")
 ORIENTATION = ("qw", "qx", "qy", "qz")
 NORM_TOLERANCE = 1e-3
-"""How far a quaternion's norm may be from 1: room for four printed digits, not for a mistake."""
+"""Largest deviation of a quaternion's norm from 1, without unit. It admits four printed digits, but
+no mistake."""
 LARGEST_NUMBER = 1e12
-"""No time in s and no position in m is beyond this; sums and differences stay finite."""
+"""Largest magnitude of a time in s or a position in m; sums and differences remain finite."""
 
 
 class Motion:
-    """Poses at increasing times, linear and by slerp in between, at rest after the last.
+    """Poses at increasing times, interpolated linearly and by slerp, constant after the last.
 
     Attributes:
-        table: Shape (n, 8), n >= 2: time in s from the first row (so it starts at 0), position
-            in m, unit quaternion (w, x, y, z) with w >= 0.
+        table: Shape (n, 8), n >= 2: time in s from the first row (starting at 0), position in m,
+            unit quaternion (w, x, y, z) with w >= 0.
     """
 
     def __init__(
         self, times: ArrayLike, positions: ArrayLike, quaternions: ArrayLike | None = None
     ) -> None:
-        """Takes a motion from arrays.
+        """Creates a motion from arrays.
 
         Args:
             times: Shape (n,), in s, n >= 2, finite and strictly increasing.
-            positions: Shape (n, 3), in m, finite. Neither is beyond ±1e12.
+            positions: Shape (n, 3), in m, finite. Times and positions must be within ±1e12.
             quaternions: Shape (n, 4), (w, x, y, z), of norm 1 within 1e-3; None: no rotation.
 
         Raises:
-            DeviceError: A shape or value is not as above; the message names the row, from 0.
+            DeviceError: A shape or value is not valid; the message names the row, from 0.
         """
         columns = [np.asarray(times, dtype=np.float64), np.asarray(positions, dtype=np.float64)]
         count = columns[0].size
@@ -90,7 +91,7 @@ class Motion:
         return float(self.table[-1, 0])
 
     def relative(self) -> Motion:
-        """Returns the motion from its first pose: p − p_0, and q ⊗ q_0⁻¹ in the same axes."""
+        """Returns the motion relative to its first pose: p − p_0 and q ⊗ q_0⁻¹."""
         return Motion(
             self.table[:, 0],
             self.table[:, 1:4] - self.table[0, 1:4],
@@ -99,7 +100,7 @@ class Motion:
 
 
 def first_fault(table: NDArray[np.float64]) -> tuple[int, str] | None:
-    """Returns the first row that is no part of a motion, and why; None where all are."""
+    """Returns the first invalid row of a motion and the reason; None if all rows are valid."""
     faults: list[tuple[int, str]] = []
     is_good = np.abs(table) <= LARGEST_NUMBER
     if not is_good.all():
@@ -135,7 +136,6 @@ def first_fault(table: NDArray[np.float64]) -> tuple[int, str] | None:
 
 @compiled
 def _normalise(table: NDArray[np.float64]) -> None:
-    """Scales the quaternions of a table to norm 1 and w >= 0."""
     for row in table:
         row[4], row[5], row[6], row[7] = canonical((row[4], row[5], row[6], row[7]))
 
@@ -163,9 +163,9 @@ def pose_at(table: NDArray[np.float64], time: float, cursor: int) -> tuple[int, 
 
     Args:
         table: ``Motion.table``.
-        time: In s from the first row, >= 0; at and beyond the last row the last pose holds.
-        cursor: The row that an earlier call with no later time returned, or 0: rows before it
-            are not searched again.
+        time: Time in s from the first row, >= 0; from the last row on, the last pose is returned.
+        cursor: Row returned by an earlier call with an equal or earlier time, or 0; the search
+            starts there.
 
     Returns:
         The row at or before the time, the position in m, and the quaternion.
@@ -191,20 +191,23 @@ def pose_at(table: NDArray[np.float64], time: float, cursor: int) -> tuple[int, 
 
 
 LISSAJOUS_AMPLITUDE = 0.01
-"""Half the width of the default motion along each axis, in m."""
+"""Amplitude of the default motion along each axis in m."""
 LISSAJOUS_ROTATION = 0.1
-"""Largest angle of the default motion about each axis, in rad."""
+"""Amplitude of the default motion about each axis in rad."""
 LISSAJOUS_EASE = 2.0
-"""The default motion grows from rest to its full size in this time, in s."""
-_FREQUENCIES = (0.23, 0.31, 0.41, 0.17, 0.13, 0.19)  # Hz: slow, and no two in a simple ratio
+"""Time in s in which the default motion grows from rest to its full amplitude."""
+_FREQUENCIES = (0.23, 0.31, 0.41, 0.17, 0.13, 0.19)
+"""Frequencies of the default motion per axis in Hz: slow, without simple ratios."""
 
 
 @compiled
 def lissajous(time: float) -> tuple[Vector, Quaternion]:
     """Returns the default motion: a slow Lissajous figure that starts at rest.
 
-    Each axis, of translation and of the rotation vector, is A s²(3 − 2s) sin(2πft) with its own
-    f below 0.5 Hz and s = min(t/2 s, 1), A = 1 cm or 0.1 rad. The fastest motion is 4.1 cm/s.
+        A s²(3 − 2s) sin(2πft),    s = min(t/2 s, 1)
+
+    for each axis of translation and of the rotation vector, with its own f below 0.5 Hz and A = 1
+    cm or 0.1 rad. The largest speed is 4.1 cm/s.
     """
     growth = min(time / LISSAJOUS_EASE, 1.0)
     ease = growth * growth * (3.0 - 2.0 * growth)
@@ -225,7 +228,7 @@ def lissajous(time: float) -> tuple[Vector, Quaternion]:
     )
 
 
-# Reads a motion from a CSV file, and says in which line a bad one is wrong.
+# Motion from a CSV file.
 
 
 def read_motion(path: str | os.PathLike[str]) -> Motion:
@@ -233,7 +236,7 @@ def read_motion(path: str | os.PathLike[str]) -> Motion:
 
     The first line that is neither empty nor a comment (``#``) names the columns, in any order:
     ``t,x,y,z`` in s and m, and either all or none of ``qw,qx,qy,qz``. Every further line is a row
-    of numbers; times strictly increase; the rate is free.
+    of numbers. Times must strictly increase; the rate is free.
 
     Args:
         path: The file, UTF-8.
@@ -242,7 +245,7 @@ def read_motion(path: str | os.PathLike[str]) -> Motion:
         The motion, its times counted from the first row.
 
     Raises:
-        DeviceError: The file cannot be read, or a line is not as above; the message names it.
+        DeviceError: The file cannot be read, or a line is not valid; the message names it.
     """
     path = Path(path)
     lines = _read_lines(path)
@@ -253,7 +256,7 @@ def read_motion(path: str | os.PathLike[str]) -> Motion:
     )
     header = next(numbered, None)
     if header is None:
-        raise DeviceError(f"{path}: the file is empty; a header t,x,y,z and two rows are needed")
+        raise DeviceError(f"{path}: the file is empty; it needs a header t,x,y,z and two rows")
     names = _column_names(f"{path}, line {header[0]}", header[1])
     width = len(names)
     numbers: list[int] = []
@@ -292,7 +295,7 @@ def read_motion(path: str | os.PathLike[str]) -> Motion:
 
 
 def _read_lines(path: Path) -> list[str]:
-    """Reads a text file; lines end in any of the usual ways, a byte-order mark is dropped."""
+    """Reads a text file with any line ending; a byte-order mark is dropped."""
     try:
         mode = path.stat().st_mode
         if not stat.S_ISREG(mode):
@@ -310,8 +313,8 @@ def _read_lines(path: Path) -> list[str]:
 
 
 def _column_names(where: str, line: str) -> list[str]:
-    """Returns the columns that a header names, or says what is wrong with them."""
-    # some programs quote the names of columns, none quotes numbers
+    """Returns the valid column names of a header."""
+    # some programs quote column names, but not numbers
     names = [field.strip().strip("\"'").strip().lower() for field in line.split(",")]
     needed = "a header with the columns t,x,y,z and optionally qw,qx,qy,qz is needed"
     if all(_is_number(name) for name in names):
@@ -323,7 +326,7 @@ def _column_names(where: str, line: str) -> list[str]:
         raise DeviceError(f"{where}: unknown column {unknown[0]!r:.40}; {needed}")
     if len(set(names)) < len(names):
         twice = next(name for name in names if names.count(name) > 1)
-        raise DeviceError(f"{where}: column {twice} is there twice")
+        raise DeviceError(f"{where}: column {twice} occurs twice; remove one of them")
     missing = [name for name in ORIENTATION if name not in names]
     if 0 < len(missing) < len(ORIENTATION):
         raise DeviceError(
@@ -343,14 +346,15 @@ def _is_number(text: str) -> bool:
 
 _STATE_DTYPE = np.dtype([("tick", "<i8"), ("cursor", "<i8"), ("period", "<f8")])
 
-_PERIOD_TOLERANCE = 1e-9  # relative: a period in whole ns and its decimal text differ by rounding
+_PERIOD_TOLERANCE = 1e-9
+"""Relative difference of periods that counts as rounding, as between whole ns and decimal text."""
 
 
 @compiled
 def _next_sample(
     states: NDArray[np.void], motion: NDArray[np.float64], samples: NDArray[np.void]
 ) -> None:
-    """Reports the pose at the time of the tick, and moves on to the next."""
+    """Writes the pose at the time of the tick, and advances to the next tick."""
     s = states[0]
     sample = samples[0]
     s.cursor, position, quaternion = pose_at(motion, s.tick * s.period, s.cursor)
@@ -390,17 +394,17 @@ def _prescribed(
 
 
 class TrajectoryDevice:
-    """Follows a motion whatever the force: the sample of tick k is its pose at k · period.
+    """Device that follows a motion under any force; sample k is the pose at k · period.
 
-    Between the motion's rows the position is interpolated linearly and the orientation by slerp;
-    after the last row it stays there. The poses are reported as the motion holds them; whether
-    they count from the first one is the bridge's choice.
+    Between the motion's rows the position is interpolated linearly and the orientation by slerp.
+    After the last row the pose is constant. Poses are reported as stored; the bridge may take them
+    relative to the first one.
 
     Args:
         motion: Poses over time (``read_motion`` reads them from a CSV file).
-        force_limit: In N, >= 0, for the data sheet: what the recorded wrench is limited to.
-        torque_limit: In N m, >= 0, likewise.
-        speed_limit: In m/s, >= 0, for the data sheet.
+        force_limit: Force limit of the data sheet in N, >= 0; it limits the recorded wrench.
+        torque_limit: Torque limit of the data sheet in N m, >= 0; it limits the recorded wrench.
+        speed_limit: Speed limit of the data sheet in m/s, >= 0.
 
     Raises:
         DeviceError: A limit is out of range.
@@ -426,7 +430,7 @@ class TrajectoryDevice:
         self._is_started = False
 
     def start(self, period: float) -> NDArray[np.void]:
-        """Goes to the first row, and compiles what the loop will call.
+        """Goes to the first row, and compiles the functions of the loop.
 
         Args:
             period: The loop's period in s, finite and > 0.
@@ -435,7 +439,7 @@ class TrajectoryDevice:
             The pose before the first tick, shape (1,), ``SAMPLE_DTYPE``.
 
         Raises:
-            DeviceError: The period is not.
+            DeviceError: The period is not valid.
         """
         self._states[0] = (0, 0, checked_period(period))
         sample = np.zeros(1, SAMPLE_DTYPE)
@@ -445,43 +449,43 @@ class TrajectoryDevice:
         return sample
 
     def read(self, sample: NDArray[np.void]) -> int:
-        """Reports the pose of this tick, no buttons.
+        """Returns the pose of this tick, without buttons.
 
         Args:
-            sample: Shape (1,), ``SAMPLE_DTYPE``, filled in place.
+            sample: Output, shape (1,), ``SAMPLE_DTYPE``.
 
         Raises:
-            DeviceError: ``start`` has not been called.
+            DeviceError: The device was not started.
         """
         if not self._is_started:
-            raise DeviceError("the trajectory is read before it was started")
+            raise DeviceError("the trajectory is read before it was started; call start() first")
         self._advance(self._states, self._table, sample)
         return 0
 
     def write(self, wrench: NDArray[np.float64]) -> None:
-        """Ignores the wrench: the motion is prescribed."""
+        """Ignores the wrench, because the motion is prescribed."""
 
     def close(self) -> None:
-        """Does nothing: there is nothing to release."""
+        """Does nothing, because the device holds no resources."""
 
 
 class ReplayDevice:
-    """Repeats the device motion of a recording sample by sample, buttons included.
+    """Device that repeats a recording's device motion sample by sample, with buttons.
 
-    Sample k is that of the recording's row k, to the bit; after the last one it stays there. A
-    deadline that the recorded run missed does not come back as time.
+    Sample k equals row k of the recording, bit for bit; after the last row the sample is constant.
+    Missed deadlines of the recorded run are not reproduced as time.
 
     Args:
         ticks: The recording's rows, ``TICK_DTYPE``, at least two.
         period: The recorded loop's period in s; ``start`` accepts no other.
-        name: What the recording is called in messages.
-        force_limit: In N, >= 0, for the data sheet: what the recorded wrench is limited to.
-        torque_limit: In N m, >= 0, likewise.
-        speed_limit: In m/s, >= 0, for the data sheet.
+        name: Name of the recording in messages.
+        force_limit: Force limit of the data sheet in N, >= 0; it limits the recorded wrench.
+        torque_limit: Torque limit of the data sheet in N m, >= 0; it limits the recorded wrench.
+        speed_limit: Speed limit of the data sheet in m/s, >= 0.
 
     Raises:
-        DeviceError: There are fewer than two rows, rows are missing in between, a pose is not
-            finite or no rotation, or a limit or the period is out of range.
+        DeviceError: Fewer than two rows, missing rows, a pose that is not finite or not a rotation,
+            or a limit or period out of range.
     """
 
     def __init__(
@@ -530,13 +534,13 @@ class ReplayDevice:
         """Goes to the first row.
 
         Args:
-            period: The loop's period in s: that of the recording.
+            period: The loop's period in s, equal to the recording's.
 
         Returns:
             The pose before the first tick, shape (1,), ``SAMPLE_DTYPE``.
 
         Raises:
-            DeviceError: It is another.
+            DeviceError: The period differs.
         """
         if abs(checked_period(period) - self._period) > _PERIOD_TOLERANCE * self._period:
             raise DeviceError(
@@ -548,24 +552,24 @@ class ReplayDevice:
         return np.asarray(self._samples[:1].copy())
 
     def read(self, sample: NDArray[np.void]) -> int:
-        """Reports the recorded sample of this tick.
+        """Returns the recorded sample of this tick.
 
         Args:
-            sample: Shape (1,), ``SAMPLE_DTYPE``, filled in place.
+            sample: Output, shape (1,), ``SAMPLE_DTYPE``.
 
         Raises:
-            DeviceError: ``start`` has not been called.
+            DeviceError: The device was not started.
         """
         tick = self._tick
         if tick < 0:
-            raise DeviceError(f"{self._name} is read before it was started")
+            raise DeviceError(f"{self._name} is read before it was started; call start() first")
         sample[0] = self._samples[tick]
         if tick + 1 < len(self._samples):
             self._tick = tick + 1
         return 0
 
     def write(self, wrench: NDArray[np.float64]) -> None:
-        """Ignores the wrench: the motion is prescribed."""
+        """Ignores the wrench, because the motion is prescribed."""
 
     def close(self) -> None:
-        """Does nothing: there is nothing to release."""
+        """Does nothing, because the device holds no resources."""

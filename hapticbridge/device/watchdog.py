@@ -1,4 +1,4 @@
-"""How long device and program may hear nothing of each other before either takes it for the end."""
+"""Watchdog timeouts between host and device."""
 
 from __future__ import annotations
 
@@ -8,13 +8,7 @@ import subprocess
 import sys
 from typing import IO, cast
 
-# A process of its own that says zero to a device when the bridge can no longer.
-#
-# A bridge that is killed (SIGKILL), or whose interpreter crashes, runs no line of its own any
-# more. A child that holds a second handle to the same device node sees its end of a pipe close,
-# or that it has another parent, and then writes the reports it was given. It is possible where
-# two processes may hold one device: hidraw. USB interfaces belong to the one that claimed them;
-# there the device's own watchdog is all there is.
+# Guardian process that writes a zero-force report if the bridge process dies.
 
 _CHILD = """
 import os, select, signal, sys, time
@@ -34,26 +28,31 @@ if not is_told or not os.read(0, 1):
                 pass
         time.sleep(0.002)
 """
-# three times, because a report of the dead bridge may still be on its way behind the first
+# three times, because a report of the dead bridge may still follow the first one
 
 POLL = 0.01
-"""In s: how often the child looks whether the bridge is still its parent. The end of the pipe comes
-at once, but not where a process that the bridge forked holds the pipe open after it; then the force
-stays for so long. Each look takes some microseconds, on another core."""
+"""Time in s between checks that the bridge is still the child's parent. A closed pipe is detected
+at once, unless a process forked by the bridge holds it open; the force then lasts for this time.
+Each check takes some microseconds on another core."""
 
 PATIENCE = 5.0
-"""In s: how long the child may take to end; it needs a millisecond."""
+"""Longest time in s for the child to end; it needs about a millisecond."""
 
 
 class ForceOffGuardian:
-    """Holds reports that are written to a device node if this process ends without ``close``.
+    """Child process that writes reports to a device node if this process ends without ``close``.
+
+    A bridge that is killed (SIGKILL) or crashes runs no code of its own any more. The child holds a
+    second handle to the device node. It detects the closed pipe or a new parent, and then writes
+    the reports. This requires a node that two processes can hold, such as hidraw. A USB interface
+    belongs to one process; there the device's own watchdog is the only protection.
 
     Args:
         path: The device node; opened once more, for writing.
-        reports: What is written, each with its number first.
+        reports: Reports to write, each starting with its number.
 
     Raises:
-        OSError: The node cannot be opened again, or no process started.
+        OSError: The node cannot be opened again, or no process can be started.
     """
 
     def __init__(self, path: str, *reports: bytes) -> None:
@@ -65,15 +64,15 @@ class ForceOffGuardian:
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 pass_fds=(node,),
-                start_new_session=True,  # Ctrl-C ends the bridge, which then says close
+                start_new_session=True,  # Ctrl-C ends the bridge, which then calls close
                 bufsize=0,
             )
         finally:
             os.close(node)
-        cast(IO[bytes], self._process.stdout).read(1)  # from here on it heeds the pipe
+        cast(IO[bytes], self._process.stdout).read(1)  # the child now watches the pipe
 
     def close(self) -> None:
-        """Tells the child that nothing needs to be said; may be called more than once."""
+        """Ends the child without writing the reports; may be called more than once."""
         process = self._process
         if process.stdin is None or process.stdin.closed:
             return
@@ -87,13 +86,13 @@ class ForceOffGuardian:
 
 
 def guard_device_node(path: str, *reports: bytes) -> ForceOffGuardian | None:
-    """Returns a ``ForceOffGuardian`` where two processes may hold the node; None elsewhere.
+    """Returns a ``ForceOffGuardian`` if two processes can hold the node; otherwise None.
 
-    The device's own watchdog is there in any case, or its effects end by themselves.
+    Without it, the device's own watchdog or the limited duration of its effects ends the force.
 
     Args:
         path: The device node.
-        reports: What takes the force away, each with its number first.
+        reports: Reports that end the force, each starting with its number.
     """
     if not path.startswith("/dev/hidraw"):
         return None
@@ -104,28 +103,29 @@ def guard_device_node(path: str, *reports: bytes) -> ForceOffGuardian | None:
 
 
 SILENCE = 0.05
-"""In s: fifty samples at 1 kHz. Shorter would take an ordinary kernel's stalls for a lost device,
-longer would leave the last force on the motors for longer."""
+"""Time without a new sample after which a device counts as lost, in s: fifty samples at 1 kHz. At a
+shorter time, stalls of an ordinary kernel would look like a lost device. At a longer one, the last
+force would stay on the motors for longer."""
 
 
 SHORTEST_WATCHDOG, WATCHDOG_PERIODS = 0.02, 10
-"""The watchdog asked for is ten periods of the loop, but not less than 20 ms: an ordinary kernel
-stalls a loop for some ms now and then, and a force that drops out each time would rattle."""
+"""Shortest watchdog of a device in s, and watchdog in periods of the loop; the longer time is
+requested. An ordinary kernel stalls a loop for some ms now and then. A force that drops out each
+time would rattle."""
 
 
 class SilenceDetector:
-    """Tells a device that has fallen silent from a loop that was away.
+    """Detector of a silent device that ignores pauses of the loop.
 
-    A device is silent once it has given nothing new for ``SILENCE``, asked all the while. Where the
-    loop itself has not read for so much longer than its period, nobody asked: the count begins
-    anew.
+    A device is silent if it sends nothing new for ``SILENCE`` although it is read. If the loop
+    itself pauses for longer than its period plus ``SILENCE``, the count restarts.
 
     Args:
         now: Time in s on the link's clock, at the device's first sample.
-        period: The loop's in s; 0 where it is far below ``SILENCE``.
+        period: The loop's period in s; 0 if it is far below ``SILENCE``.
 
     Attributes:
-        silence: Time in s since the device gave something new.
+        silence: Time in s since the last new sample.
     """
 
     def __init__(self, now: float, period: float = 0.0) -> None:
@@ -134,11 +134,11 @@ class SilenceDetector:
         self.silence = 0.0
 
     def is_silent(self, now: float, *, is_new: bool) -> bool:
-        """Notes a reading; returns whether the device has been silent for too long.
+        """Records a reading; returns whether the device has been silent for too long.
 
         Args:
-            now: Time in s on the same clock.
-            is_new: Whether this reading brought something new.
+            now: Time in s on the link's clock.
+            is_new: True if this reading brought a new sample.
         """
         was_away = self.was_away(now)
         self._read = now
@@ -148,21 +148,21 @@ class SilenceDetector:
         return self.silence > SILENCE
 
     def was_away(self, now: float) -> bool:
-        """Returns whether the loop has not read for so long that nobody asked the device.
+        """Returns whether the loop has paused without reading the device.
 
-        What a device that answers questions has said since is then as old as the last question: a
-        loop that goes by it finds the hand where it was, and two ticks later somewhere else.
+        A device that replies to requests then holds an answer as old as its last request. Used by
+        the loop, it would place the hand at its old position, and elsewhere two ticks later.
 
         Args:
-            now: Time in s on the same clock, before the reading is noted.
+            now: Time in s on the link's clock, before ``is_silent`` records the reading.
         """
         return now - self._read > SILENCE + self._period
 
 
 def watchdog_time(period: float) -> float:
-    """Returns for how long in s a device should go on with a force that is not renewed.
+    """Returns the time in s for which a device should hold a force that is not renewed.
 
     Args:
-        period: The loop's in s.
+        period: The loop's period in s.
     """
     return max(SHORTEST_WATCHDOG, WATCHDOG_PERIODS * period)

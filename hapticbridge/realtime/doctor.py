@@ -62,10 +62,7 @@ def refusal(priority: int, *, locks_memory: bool) -> str:
     """Returns the reason why the program cannot run here; empty if it can.
 
     It is part of the kernel developers' real-time tests (Debian: ``apt install rt-tests``).
-
-    Args:
-        priority: The loop's priority under SCHED_FIFO; 0 if that was refused.
-        locks_memory: True if the loop may lock its memory.
+    ``priority`` is 0 if SCHED_FIFO was refused.
     """
     if not is_there():
         return "it is not installed"
@@ -85,12 +82,7 @@ def run(
 ) -> NDArray[np.int64] | str:
     """Runs one thread at the loop's priority; returns the lateness of each tick in ns.
 
-    Args:
-        period_ns: Period in ns; the program takes whole µs.
-        ticks: Number of wake-ups; the program skips missed deadlines.
-        priority: Priority under SCHED_FIFO, 1 to 99.
-        locks_memory: True to lock its memory.
-        core: Core to run on; None leaves it free.
+    The program takes whole µs and skips missed deadlines. Without ``core`` the thread may move.
 
     Returns:
         The lateness, or the reason of a failure in words.
@@ -179,11 +171,7 @@ def findings(
 ) -> tuple[Finding, ...]:
     """Inspects the machine; properties that the system does not show become findings too.
 
-    Args:
-        system: Roots of the kernel's file systems.
-        grants: Results of the loop's real-time requests.
-        stolen: Time in s that the host took from all cores during the measurement.
-        duration: Duration of the measurement in s, > 0.
+    ``stolen`` is the time in s that the host took from all cores during ``duration`` s.
     """
     return (
         *(Finding(g.name, g.is_granted, g.sentence, g.remedy) for g in grants),
@@ -380,9 +368,7 @@ class Wakeups:
 def clock_turn(period_ns: int, ticks: int) -> tuple[NDArray[np.int64], int]:
     """Waits with the bridge's own clock, which sleeps and then spins.
 
-    Args:
-        period_ns: Period in ns.
-        ticks: Number of deadlines, including skipped ones.
+    The number of ticks includes skipped deadlines.
 
     Returns:
         Lateness of each tick in ns, and number of skipped deadlines.
@@ -464,11 +450,8 @@ def diagnose(
 ) -> Diagnosis:
     """Measures this machine.
 
-    Args:
-        rate: Ticks per second.
-        duration: Duration of the whole measurement in s, 1 to 3600; the loops share it.
-        system: Roots of the kernel's file systems.
-        tell: Called with the time done and the whole time, in s.
+    The duration in s, 1 to 3600, is shared by the loops. ``tell`` is called with the time done and
+    the whole time, in s.
 
     Raises:
         HapticBridgeError: Rate or duration is out of range.
@@ -524,10 +507,7 @@ def judged(
 ) -> tuple[str, str]:
     """Returns the verdict and its sentence.
 
-    Args:
-        lateness: Lateness by loop, at least ``bridge`` and ``bare sleep``.
-        found: Findings about the system.
-        rate: Rate in Hz.
+    ``lateness_above_baseline`` holds at least ``bridge`` and ``bare sleep``.
     """
     mine, period = lateness["bridge"], 1.0 / rate
     allowed = LATE_SHARE * period

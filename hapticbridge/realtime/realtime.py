@@ -80,9 +80,7 @@ class Lateness:
 def lateness_of(late_ns: ArrayLike, missed: int) -> Lateness:
     """Returns the percentiles of times from deadline to wake-up.
 
-    Args:
-        late_ns: Times in ns, at least one; 0 or less counts as on time.
-        missed: Number of skipped deadlines.
+    Times are in ns; 0 or less counts as on time.
 
     Raises:
         HapticBridgeError: There are no times.
@@ -126,13 +124,7 @@ def check_pace(
     """Refuses a scene that cannot hold the rate on a real device; warns on others.
 
     A missed deadline prolongs the hold, and the condition b > KT/2 + B' then needs more damping.
-
-    Args:
-        scene: Prepared scene; its state is not changed.
-        method: Rendering method.
-        period: T in s.
-        substeps: MuJoCo steps per tick.
-        is_real: True if the device drives a motor in a person's hand.
+    The scene must be prepared; it is not changed.
 
     Raises:
         SceneError: The steps of a tick take longer than the period; the message names a possible
@@ -210,9 +202,7 @@ FILTER = (
 def way_to_pin(core: int, reason: int | None) -> str:
     """Returns the remedy for a refused core.
 
-    Args:
-        core: Number of the core.
-        reason: ``errno`` of the refusal; None if the number is out of range.
+    ``reason`` is the ``errno`` of the refusal; None if the number is out of range.
     """
     if not 0 <= core < (os.cpu_count() or 1):
         return f"choose a core from 0 to {(os.cpu_count() or 1) - 1}"
@@ -261,10 +251,7 @@ class Grant:
 def wants_real_time(asked: bool | None, clock: Clock, *, is_real: bool) -> bool:
     """Decides if a run requests real time.
 
-    Args:
-        asked: The user's choice; None requests it for a real device on a real clock.
-        clock: Clock of the loop.
-        is_real: True if the device drives a motor in a person's hand.
+    ``asked`` is the user's choice; None requests it for a device with motors on a real clock.
 
     Raises:
         HapticBridgeError: Real time was requested with a clock that is not real.
@@ -293,11 +280,8 @@ def memory_at_rest() -> Iterator[tuple[Grant, ...]]:
 def real_time(core: int | None = None) -> Iterator[tuple[Grant, ...]]:
     """Requests real time for the calling thread; undone at the end.
 
-    Threads and processes started meanwhile do not inherit the priority.
-
-    Args:
-        core: Core to run on; None takes an isolated core, or else the last allowed one, because the
-            first serves most interrupts.
+    Threads and processes started meanwhile do not inherit the priority. Without ``core`` it takes
+    an isolated core, or else the last allowed one, because the first serves most interrupts.
 
     Yields:
         One result per request.

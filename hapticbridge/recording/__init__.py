@@ -1,4 +1,4 @@
-"""Recordings: the file, the process that writes it, and the ring before it.
+"""Recordings: the file, the recorder process, and the shared ring.
 
 Read ``format`` first, the definition of a recording. Records leave the loop through ``ring``,
 events through a pipe. ``recorder`` is the loop's end of both, ``recorder_process`` the other;

@@ -1,8 +1,4 @@
-"""The MCAP container, read defensively: chunks, checksums, and what is damaged.
-
-The MCAP library's reader yields one message at a time (10 µs each) and stops at the first fault;
-here a chunk comes out as one block of bytes, and a fault becomes a sentence.
-"""
+"""Tolerant reader of the MCAP container."""
 
 from __future__ import annotations
 
@@ -24,21 +20,17 @@ from mcap.writer import MCAP0_MAGIC
 
 from hapticbridge.errors import RecordingError
 
-# A file's bytes by their places, read when they are asked for.
+# Random access to a file's bytes.
 
 WINDOW = 1 << 20
-"""Bytes that are read at once where a long stretch is only looked through: larger takes more
-memory, smaller more calls."""
+"""Bytes per read of a long stretch. A larger window takes more memory, a smaller one more calls."""
 
 
 class FileBytes:
     """A file as a sequence of bytes that is never in memory as a whole.
 
-    It is not mapped into memory: a bridge that records to the same file anew would cut it, and to
-    touch a mapped page behind the end ends the process. Slices may be read from several threads.
-
-    Args:
-        path: A regular file.
+    It is not memory-mapped: a bridge that overwrites the file would truncate it, and access to a
+    mapped page beyond the end kills the process. Slices may be read from several threads.
 
     Raises:
         RecordingError: It cannot be read.
@@ -76,7 +68,7 @@ class FileBytes:
         """Returns the bytes of a slice without a step.
 
         Raises:
-            RecordingError: They cannot be read, or the file became shorter meanwhile.
+            RecordingError: They cannot be read, or the file has become shorter.
         """
         start, stop, _ = places.indices(self._size)
         wanted = max(stop - start, 0)
@@ -84,7 +76,7 @@ class FileBytes:
         try:
             with self._lock:
                 self._file.seek(start)
-                # a read may return less than was asked for
+                # a read may return fewer bytes than requested
                 while len(pieces) < wanted and (piece := self._file.read(wanted - len(pieces))):
                     pieces += piece
         except OSError as error:
@@ -101,7 +93,7 @@ class FileBytes:
         return crc
 
     def is_zero_from(self, start: int) -> bool:
-        """Tells whether nothing but zeros stands behind a place."""
+        """Returns True if all bytes from a position on are zero."""
         return not any(any(self[at : at + WINDOW]) for at in range(start, self._size, WINDOW))
 
     def _refusal(self, error: Exception) -> RecordingError:
@@ -109,35 +101,29 @@ class FileBytes:
         return RecordingError(f"cannot read the recording {self._path}: {reason}")
 
 
-# The fields of one MCAP record, read in order; a record that lies about its size is damaged.
+# Fields of one MCAP record.
 
 
 class DamageError(Exception):
-    """A record does not hold what its kind holds; never leaves this package."""
+    """A record contradicts its declared size or kind; internal to this package."""
 
 
 class Fields:
-    """Reads the fields of one record in order.
-
-    Args:
-        data: The bytes that hold the record's body.
-        start: Where the body starts.
-        stop: Where it ends.
-    """
+    """Sequential reader of one record's fields."""
 
     def __init__(self, data: bytes | FileBytes, start: int, stop: int) -> None:
         self._data, self._position, self._stop = data, start, stop
 
     @property
     def is_at_end(self) -> bool:
-        """Whether nothing is left."""
+        """True if no bytes are left."""
         return self._position >= self._stop
 
     def raw(self, size: int) -> bytes:
         """Returns the next bytes.
 
         Raises:
-            DamageError: The record is shorter. So it is with all that is read of it.
+            DamageError: The record is shorter; all other readers raise it too.
         """
         start = self._position
         if size > self._stop - start:
@@ -153,7 +139,7 @@ class Fields:
         """Returns the next text.
 
         Raises:
-            DamageError: It is not UTF-8, or cut.
+            DamageError: It is cut or not UTF-8.
         """
         try:
             return self.raw(self.number(4)).decode()
@@ -164,7 +150,7 @@ class Fields:
         """Returns the next map of texts.
 
         Raises:
-            DamageError: A key is there twice, a text is not UTF-8, or it is cut.
+            DamageError: A key occurs twice, a text is not UTF-8, or the map is cut.
         """
         size = self.number(4)
         inner = Fields(self._data, self._position, self._position + size)
@@ -179,27 +165,27 @@ class Fields:
 
 
 MAGIC = MCAP0_MAGIC
-"""How an MCAP file starts and ends."""
+"""First and last bytes of an MCAP file."""
 
 MAX_CHUNK_SIZE = 1 << 28
-"""The largest chunk that is decompressed, in bytes; a damaged size must not exhaust memory."""
+"""Largest chunk in bytes that is decompressed; a damaged size must not exhaust memory."""
 
 _RECORD = struct.Struct("<BQ")
 _CHUNK = struct.Struct("<QQQI")
 _FOOTER = struct.Struct("<QQI")
 _FOOTER_SIZE = _RECORD.size + _FOOTER.size
 _AHEAD = 64
-"""Chunks that are unpacked before they are asked for: some 8 MB of records at 128 kB each."""
+"""Number of chunks decompressed in advance: about 8 MB of records at 128 kB each."""
 
 
 @dataclass(frozen=True)
 class Block:
-    """Schema, channel and message records that belong together: a chunk, or loose ones.
+    """Schema, channel and message records of a chunk, or loose ones.
 
     Attributes:
-        label: How to name it in a sentence.
-        data: The records' bytes.
-        fault: What is wrong with it, or empty.
+        label: Name for messages.
+        data: Bytes of the records.
+        fault: Description of damage, or empty.
     """
 
     label: str
@@ -211,14 +197,14 @@ _Item: TypeAlias = Block | tuple[int, Fields]
 
 
 class Container:
-    """An MCAP file.
+    """An MCAP file with its damage.
 
-    Args:
-        data: The file, which starts with the MCAP magic.
+    The MCAP library's reader yields single messages (10 µs each) and stops at the first fault. Here
+    a chunk is one block of bytes, and a fault becomes a sentence.
 
     Attributes:
-        is_cut: The end of the file is missing.
-        problems: What is damaged, one sentence each; complete after ``records`` is exhausted.
+        is_cut: True if the end of the file is missing.
+        problems: Damage, one sentence each; complete after ``records`` is exhausted.
     """
 
     def __init__(self, data: FileBytes) -> None:
@@ -253,7 +239,7 @@ class Container:
             self._chunks.sort()
 
     def summary(self) -> Block:
-        """Returns the schemas and channels that the end of the file repeats, if it does."""
+        """Returns the schemas and channels repeated at the end of the file, if any."""
         pieces = [
             self._data[body - _RECORD.size : stop]
             for opcode, body, stop in self._walk(self._summary or self._end, self._end, [])
@@ -264,7 +250,7 @@ class Container:
     def records(self) -> Iterator[_Item]:
         """Yields blocks of messages and, as (opcode, fields), metadata and attachments, in order.
 
-        Chunks are decompressed and checked in threads, some ahead of the one that is yielded.
+        Threads decompress and check chunks ahead of the one that is yielded.
         """
         with ThreadPoolExecutor(2) as pool:
             ahead: deque[_Item | Future[Block]] = deque()
@@ -325,7 +311,7 @@ class Container:
             self.problems.append("the mark at the end of the data section is missing")
 
     def _walk(self, start: int, end: int, resume: list[int]) -> Iterator[tuple[int, int, int]]:
-        """Yields (opcode, start of body, end of body); after a fault goes on at ``resume``."""
+        """Yields (opcode, start of body, end of body); after a fault it continues at ``resume``."""
         position = start
         while position < end:
             head = self._data[position : min(position + _RECORD.size, end)]
@@ -342,7 +328,7 @@ class Container:
                 position = stop
                 continue
             following = next((offset for offset in resume if position < offset < end), None)
-            # a machine that lost power may leave zeros behind the last whole record
+            # after a power failure, zeros may follow the last whole record
             is_cut_here = self.is_cut and (opcode != 0 or self._data.is_zero_from(position))
             if not is_cut_here:
                 until = "the file's end" if following is None else f"byte {following}"
@@ -360,7 +346,7 @@ def _decompressed(compression: str, packed: bytes, size: int) -> bytes:
     if compression != "zstd":
         raise DamageError(f"its compression '{compression}' is not one of 'zstd' and none")
     try:
-        # zstandard allocates what the frame's own header claims
+        # zstandard allocates the size that the frame header claims
         if zstandard.frame_content_size(packed) not in (-1, size):
             raise DamageError("its size does not match")
         return zstandard.ZstdDecompressor().decompress(packed, max_output_size=size)

@@ -1,14 +1,14 @@
-"""What a recording is, in bytes: names, schemas, payloads, and the digest over all of it.
+"""Recording format: names, schemas, payloads and digest.
 
 A recording is an MCAP file (https://mcap.dev/spec), zstd, chunks of 128 kB:
 
-- metadata record ``hapticbridge`` and the attachments first, before any chunk, so that a file that
-  was cut still has them;
-- topic ``/tick``, encoding ``cdr``, schema ``hapticbridge/msg/Tick`` (``ros2msg``): 4 header bytes
-  and one packed ``TICK_DTYPE`` record (every field is 8 bytes wide, so CDR adds no padding);
-- topic ``/event``, encoding ``json``: one object per event, with ``event`` (what happened) and
-  ``time_ns`` (since the start of the run);
-- metadata record ``hapticbridge.digest`` last, with ``sha256`` (see ``Digest``).
+- The metadata record ``hapticbridge`` and the attachments come before any chunk, so that a cut file
+still has them.
+- Topic ``/tick``, encoding ``cdr``, schema ``hapticbridge/msg/Tick`` (``ros2msg``): 4 header bytes
+and one packed ``TICK_DTYPE`` record. Every field is 8 bytes wide, so CDR adds no padding.
+- Topic ``/event``, encoding ``json``: one object per event, with ``event`` (its name) and
+``time_ns`` (since the start of the run).
+- The metadata record ``hapticbridge.digest`` comes last, with ``sha256`` (see ``Digest``).
 
 The log time of a message is ``epoch_ns`` (in the metadata: Unix time of the run's start) plus the
 tick's ``deadline_ns`` or the event's ``time_ns``.
@@ -27,24 +27,20 @@ from numpy.typing import NDArray
 
 from hapticbridge.record import TICK_DTYPE
 
-# When the ticks of a run were due, on the clock of its events.
+# Due times of a run's ticks.
 
 Array = NDArray[np.float64]
 
 
 def due_times(ticks: NDArray[np.void], period: float) -> Array:
-    """Returns when ticks were due, in s of the run's clock, missed deadlines among it.
+    """Returns the due times of ticks in s of the run's clock, with missed deadlines.
 
-    That is the clock of the events' ``time_ns``: without a missed deadline, (tick + 1) T. In a
-    damaged file deadlines may go back; then all are taken for as if none had been missed, so that
-    whatever is drawn over time can be drawn.
-
-    Args:
-        ticks: Records in their order, ``TICK_DTYPE``, (n,).
-        period: T in s.
+    This is the clock of the events' ``time_ns``; without a missed deadline it is (tick + 1) T. If
+    the deadlines of a damaged file run backwards, all are computed as if none had been missed, so
+    that plots over time remain possible. ``period`` is T in s.
 
     Returns:
-        Shape (n,), increasing where the ticks' numbers are.
+        Shape (n,), increasing if the ticks' numbers are.
     """
     due = ticks["deadline_ns"]
     if due.size and (due[0] <= 0 or (np.diff(due) <= 0).any()):
@@ -53,14 +49,10 @@ def due_times(ticks: NDArray[np.void], period: float) -> Array:
 
 
 class Timeline:
-    """The due times of a run's ticks, however many: it keeps only where deadlines were missed.
-
-    Args:
-        blocks: The run's records, block by block, ``TICK_DTYPE``.
-        period: T in s.
+    """Due times of any number of ticks; only missed deadlines are stored.
 
     Attributes:
-        duration: When the last tick was due, in s; 0 where there is none.
+        duration: Due time of the last tick in s; 0 without ticks.
     """
 
     def __init__(self, blocks: Iterable[NDArray[np.void]], period: float) -> None:
@@ -71,7 +63,7 @@ class Timeline:
                 continue
             part = np.concatenate([before, block])
             due, first = due_times(part, period), count - len(before)
-            # both sides of every step that is not a period, and the ends; the rest is straight
+            # keep both sides of every step that is not one period, and the ends
             gaps = np.flatnonzero(np.abs(np.diff(due) - period) > 0.5 * period)
             kept = sorted({0, *gaps.tolist(), *(gaps + 1).tolist(), len(part) - 1})
             rows += [first + row for row in kept]
@@ -82,11 +74,7 @@ class Timeline:
         self.duration = times[-1] if times else 0.0
 
     def row_at(self, time: float) -> int:
-        """Returns the row of the tick that was due nearest to a time in s; of the first before it.
-
-        Args:
-            time: From 0 to ``duration``.
-        """
+        """Returns the row of the tick due nearest to a time in s, from 0 to ``duration``."""
         return round(float(np.interp(time, self._times, self._rows)))
 
 
@@ -109,11 +97,11 @@ DIGEST_KEY = "sha256"
 EPOCH_KEY = "epoch_ns"
 
 CHUNK_SIZE = 128 * 1024
-"""Size in bytes, before compression, at which a chunk is finished: 0.3 s of ticks at 1 kHz, the
-most that is lost if the recorder is killed."""
+"""Uncompressed size in bytes at which a chunk is finished: 0.3 s of ticks at 1 kHz. It is the
+largest loss if the recorder is killed."""
 
 CDR_HEADER = b"\x00\x01\x00\x00"
-"""Little-endian CDR, no options; the record after it starts at alignment 0."""
+"""Header of little-endian CDR without options; the record after it starts at alignment 0."""
 
 PAYLOAD_DTYPE = np.dtype([("cdr", "V4"), ("record", TICK_DTYPE)])
 """Payload of a message on ``/tick``."""
@@ -126,9 +114,9 @@ class Attachment:
     """A file carried inside the recording.
 
     Attributes:
-        name: Its name, unique in the recording.
-        media_type: Its MIME type.
-        data: Its bytes, as they are.
+        name: Name, unique in the recording.
+        media_type: MIME type.
+        data: Content.
     """
 
     name: str
@@ -149,12 +137,9 @@ def tick_schema() -> bytes:
 def event_payload(event: Mapping[str, object], time_ns: int) -> bytes:
     """Returns the JSON of an event.
 
-    What JSON cannot hold becomes text instead of an error (``"nan"``, ``"inf"``, the ``str`` of an
-    unknown object), because the event of a trip is about such a number and must arrive.
-
-    Args:
-        event: What happened; ``time_ns`` is added.
-        time_ns: When, in ns since the start of the run.
+    Values that JSON cannot hold become text (``"nan"``, ``"inf"``, the ``str`` of an unknown
+    object) instead of an error. The event of a trip is about such a number and must arrive.
+    ``time_ns`` counts from the start of the run.
     """
     plain = _plain({**event, "time_ns": int(time_ns)})
     return json.dumps(plain, separators=(",", ":"), allow_nan=False).encode()
@@ -175,17 +160,17 @@ def _plain(value: object) -> object:
 
 
 class Digest:
-    """SHA-256 over everything that matters in a recording, whatever the container's layout.
+    """SHA-256 of a recording's contents, independent of the container's layout.
 
     It is the SHA-256 of ``hapticbridge digest 1``, a newline, and four SHA-256 of 32 bytes each:
 
     1. metadata: for each key in sorted order, key and value;
     2. attachments: for each name in sorted order, name, media type and data;
-    3. ticks: all records in order, packed, without their CDR headers and with nothing between;
+    3. ticks: all records in order, packed, without CDR headers or separators;
     4. events: each JSON payload in order.
 
-    In 1, 2 and 4 every piece (text as UTF-8) follows its length as 8 bytes, little-endian, so no
-    two different contents are hashed as the same bytes.
+    In 1, 2 and 4 every piece (text as UTF-8) follows its length as 8 bytes, little-endian.
+    Different contents therefore never give equal bytes.
     """
 
     def __init__(
@@ -196,7 +181,7 @@ class Digest:
         self.describe(metadata or {}, attachments)
 
     def describe(self, metadata: Mapping[str, str], attachments: Iterable[Attachment]) -> None:
-        """Sets metadata and attachments: a reader knows them only at the end of a damaged file."""
+        """Sets metadata and attachments, which are known only at the end of a damaged file."""
         self._metadata = hashlib.sha256()
         for key in sorted(metadata):
             _add(self._metadata, key.encode())
@@ -216,7 +201,7 @@ class Digest:
         _add(self._events, payload)
 
     def hexdigest(self) -> str:
-        """Returns the digest of what was added so far, as 64 hexadecimal digits."""
+        """Returns the digest of the contents so far, as 64 hexadecimal digits."""
         whole = hashlib.sha256(b"hapticbridge digest 1\n")
         for part in (self._metadata, self._attachments, self._ticks, self._events):
             whole.update(part.digest())

@@ -1,8 +1,4 @@
-"""Reads a recording, whole, cut or damaged; all at once, or its ticks block by block.
-
-Reading is vectorised: a run of messages on ``/tick`` inside a chunk is one structured view, so
-ten minutes at 1 kHz (600 000 records) take about a second.
-"""
+"""Reader of recordings, whole, cut or damaged."""
 
 from __future__ import annotations
 
@@ -22,7 +18,7 @@ from hapticbridge.recording import format as layout
 from hapticbridge.recording.container import MAGIC, Block, Container, DamageError, Fields, FileBytes
 from hapticbridge.recording.format import Attachment
 
-# What the records of a container mean: metadata, attachments, events, and runs of ticks.
+# Metadata, attachments, events and ticks of a container.
 
 _MESSAGE_DTYPE = np.dtype(
     [
@@ -43,16 +39,16 @@ _CDR = int.from_bytes(layout.CDR_HEADER, "little")
 
 @dataclass
 class Contents:
-    """Gathers what the blocks of a container hold.
+    """Contents collected from a container's blocks.
 
     Attributes:
-        problems: What is damaged, one sentence each; added to.
-        take: Called with each run of records, ``TICK_DTYPE``, in their order.
+        problems: Damage, one sentence each; appended to.
+        take: Called with each run of records, ``TICK_DTYPE``, in order.
         events: Payload and JSON object of each event.
-        attachments: In their order.
-        meta: The metadata, once they were read.
-        digest: What the file says that its digest is.
-        refusal: Why the records are none of this version, once that is known.
+        attachments: Attachments in order.
+        meta: The metadata; None before they are read.
+        digest: Digest stored in the file.
+        refusal: Reason why the records are not of this version; None if they are.
     """
 
     problems: list[str]
@@ -67,14 +63,14 @@ class Contents:
 
     @property
     def has_ticks(self) -> bool:
-        """Whether there is a channel of records of this version."""
+        """True if there is a channel of records of this version."""
         return layout.TICK_TOPIC in self._topics.values()
 
     def add_metadata(self, fields: Fields) -> None:
         """Adds a metadata record.
 
         Raises:
-            DamageError: There is one of this name already, or it is shorter than its fields.
+            DamageError: Its name occurs twice, or it is shorter than its fields.
         """
         name, entries = fields.text(), fields.mapping()
         if name == layout.METADATA_NAME:
@@ -90,7 +86,7 @@ class Contents:
         """Adds an attachment.
 
         Raises:
-            DamageError: There is one of this name already, or it is shorter than its fields.
+            DamageError: Its name occurs twice, or it is shorter than its fields.
         """
         fields.raw(16)
         name, media_type = fields.text(), fields.text()
@@ -150,7 +146,7 @@ class Contents:
                 self._topics[channel] = topic
 
     def _add_ticks(self, data: bytes, position: int, channel: int) -> int:
-        """Adds the run of records that starts here; returns where it ends."""
+        """Adds the run of records that starts here; returns its end."""
         size, count = _MESSAGE_DTYPE.itemsize, 16
         start = position
         while True:
@@ -183,28 +179,28 @@ class Contents:
 
 
 BLOCK = 1 << 14
-"""Records that are read at once where a recording is not read whole: 16 s at 1 kHz, 6.5 MB. Larger
-blocks take more memory, smaller ones more time."""
+"""Number of records per block: 16 s at 1 kHz, 6.5 MB. Larger blocks take more memory, smaller ones
+more time."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class RecordingFile:
-    """What a recording holds beside its ticks, which are read from the file when asked for.
+    """A recording whose ticks are read from the file on request.
 
     Attributes:
         path: The file.
-        count: How many records it holds.
+        count: Number of records.
         last_tick: Number of the last record's tick; -1 without records.
-        flags: All flags that any record has.
-        events: Its events in order; each has ``event`` and ``time_ns`` (since the run's start).
-        meta: Metadata as text; empty if it was damaged.
+        flags: Union of all records' flags.
+        events: Events in order, with ``event`` and ``time_ns`` (since the run's start).
+        meta: Metadata as text; empty if damaged.
         attachments: Attached files by name.
-        is_cut: The end of the file is missing (recorder or machine died); everything up to the
-            last whole chunk is here.
-        digest: The SHA-256 that was written at the end, or None.
-        computed_digest: The same, computed from what was read.
-        problems: What is damaged, one sentence each; empty for an undamaged file, also a cut one.
-            The comparison of the two digests is left to the reader's user.
+        is_cut: True if the end of the file is missing because recorder or machine died; everything
+            up to the last whole chunk is available.
+        digest: SHA-256 stored at the end, or None.
+        computed_digest: SHA-256 of the contents that were read.
+        problems: Damage, one sentence each; empty for an undamaged file, even a cut one. The caller
+            compares the two digests.
     """
 
     path: Path
@@ -220,15 +216,13 @@ class RecordingFile:
     problems: tuple[str, ...]
 
     def blocks(self, size: int | None = None) -> Iterator[NDArray[np.void]]:
-        """Yields the records in order, ``TICK_DTYPE``, in blocks of one size; the last is shorter.
+        """Yields the records in order, ``TICK_DTYPE``, in blocks of equal size (the last: shorter).
 
-        A block is the caller's to keep.
-
-        Args:
-            size: Records, >= 1; ``BLOCK`` by default.
+        The caller may keep a block. ``size`` is the number of records per block, ``BLOCK`` by
+        default.
 
         Raises:
-            RecordingError: The file cannot be read, or is not what it was when it was opened.
+            RecordingError: The file cannot be read, or has changed since it was opened.
         """
         size = size or BLOCK
         runs: list[NDArray[np.void]] = []
@@ -247,39 +241,34 @@ class RecordingFile:
 
 @dataclass(frozen=True, kw_only=True)
 class Recording(RecordingFile):
-    """What a recording holds, all of it in memory.
+    """A recording with all ticks in memory.
 
     Attributes:
-        ticks: Its records in order, shape (n,), ``TICK_DTYPE``.
+        ticks: Records in order, shape (n,), ``TICK_DTYPE``.
     """
 
     ticks: NDArray[np.void]
 
 
 def read_recording(path: str | Path) -> Recording:
-    """Reads a recording.
+    """Reads a recording into memory.
 
-    A file that was cut is read up to its last whole chunk. Damage is reported in ``problems``,
-    and what can be read around it is kept.
-
-    Args:
-        path: The file.
-
-    Returns:
-        What it holds.
+    A cut file is read up to its last whole chunk. Damage is listed in ``problems``; readable parts
+    around it are kept. Messages of a chunk are read as one structured view, so ten minutes at 1 kHz
+    (600 000 records) take about a second.
 
     Raises:
-        RecordingError: There is no such file, it cannot be read, or it is not a recording of
-            this version.
+        RecordingError: The file does not exist, cannot be read, or is not a recording of this
+            version.
     """
     return read_with_attachments(Path(path))[0]
 
 
 def open_recording(path: str | Path) -> RecordingFile:
-    """As ``read_recording``, but for the ticks: memory does not grow with the recording's length.
+    """Opens a recording without loading its ticks, in memory independent of its length.
 
-    The file is read through once, for its digest, its events and what is damaged. Events are kept;
-    a run with an input in every tick has as many of them.
+    The file is read once for its digest, events and damage. Events are kept in memory; a run with
+    an input in every tick has one per tick.
 
     Raises:
         RecordingError: As for ``read_recording``.
@@ -289,7 +278,7 @@ def open_recording(path: str | Path) -> RecordingFile:
 
 
 def read_with_attachments(path: Path) -> tuple[Recording, list[Attachment]]:
-    """As ``read_recording``, with the attachments as they stand in the file, in their order."""
+    """Reads a recording, and its attachments in file order."""
     runs: list[NDArray[np.void]] = []
     facts, attachments = _described(path, runs, keeps=True)
     return Recording(**facts, ticks=_joined(runs)), attachments
@@ -298,12 +287,9 @@ def read_with_attachments(path: Path) -> tuple[Recording, list[Attachment]]:
 def _described(
     path: Path, runs: list[NDArray[np.void]], *, keeps: bool = False
 ) -> tuple[dict[str, Any], list[Attachment]]:
-    """Reads a file through; returns the fields of ``RecordingFile``, and the attachments.
+    """Reads a file; returns the fields of ``RecordingFile``, and the attachments.
 
-    Args:
-        path: The file.
-        runs: Gets the records, run by run.
-        keeps: Whether it does.
+    ``runs`` receives the records if ``keeps``.
     """
     digest = layout.Digest()
     count, last, flags = 0, -1, 0
@@ -319,7 +305,7 @@ def _described(
 
     *_, (container, contents) = _passes(path, take)
     if not contents.has_ticks:
-        # a file that was cut inside its first chunk has no schema yet, but says what it is
+        # a file cut inside its first chunk has no schema yet, but has metadata
         if contents.refusal or contents.meta is None or not container.is_cut:
             reason = contents.refusal or f"it has no topic {layout.TICK_TOPIC}"
             raise RecordingError(f"{path} is not a recording that can be read: {reason}")
@@ -348,7 +334,7 @@ def _described(
 def _passes(
     path: Path, take: Callable[[NDArray[np.void]], None]
 ) -> Iterator[tuple[Container, Contents]]:
-    """Reads a file through, and yields the same two after every part of it."""
+    """Reads a file; yields its container and contents after every part."""
     with FileBytes(path) as data:
         if data[: len(MAGIC)] != MAGIC:
             what = "it is empty" if not len(data) else "it does not start with the MCAP magic"
@@ -375,7 +361,7 @@ def _add_described(contents: Contents, opcode: int, fields: Fields) -> None:
 
 
 def _joined(runs: list[NDArray[np.void]]) -> NDArray[np.void]:
-    """Returns runs as one array; the list is emptied, so that memory never holds both."""
+    """Joins runs into one array and empties the list, so that memory never holds both."""
     gathered = np.empty(sum(run.size for run in runs), TICK_DTYPE)
     stop = gathered.size
     while runs:
@@ -388,7 +374,7 @@ def _joined(runs: list[NDArray[np.void]]) -> NDArray[np.void]:
 def _cut(
     runs: list[NDArray[np.void]], size: int
 ) -> tuple[NDArray[np.void], list[NDArray[np.void]]]:
-    """Returns the first ``size`` records of runs as one array, and the runs that are left."""
+    """Returns the first ``size`` records of runs as one array, and the remaining runs."""
     left, head = size, []
     for index, run in enumerate(runs):
         head.append(run[:left])

@@ -1,9 +1,8 @@
-"""The recorder as the bridge sees it: a process of its own behind the ring.
+"""Recorder as seen by the bridge: a separate process behind the ring.
 
-The process (``hapticbridge.recording.recorder_process``) is started as a new interpreter, not by
-``multiprocessing``, so a user's script needs no ``__main__`` guard. Configuration and events go
-through its standard input, its answers come back through its standard output, records through the
-shared-memory ring.
+The process (``hapticbridge.recording.recorder_process``) is a new interpreter instead of a
+``multiprocessing`` child, so a user's script needs no ``__main__`` guard. Its standard input
+carries configuration and events, its standard output the answers, the shared ring the records.
 """
 
 from __future__ import annotations
@@ -32,11 +31,14 @@ from hapticbridge.recording.reader import read_with_attachments
 from hapticbridge.recording.ring import TAIL, Ring
 from hapticbridge.recording.writer import RecordingWriter, check_contents
 
-# Who may look at a run beside its recorder.
+# Second reader of a run.
 
 
 class RingObserver(Protocol):
-    """Looks at a run from another process; the loop neither waits for it nor asks it anything."""
+    """Optional second reader of the ring from another process, such as the live view.
+
+    The loop never waits for it.
+    """
 
     def start(
         self,
@@ -45,38 +47,31 @@ class RingObserver(Protocol):
         metadata: Mapping[str, str],
         attachments: Sequence[Attachment],
     ) -> None:
-        """Starts looking.
+        """Starts reading.
 
-        Args:
-            ring: Name of the ring, as ``Ring.attach`` takes it; what attaches must free nothing.
-            snapshot: Name of the scene's newest positions, as ``Snapshot.attach`` takes it.
-            metadata: Of the run, as a recording has them.
-            attachments: Likewise.
+        A reader must free nothing of the ring. ``snapshot`` names the shared memory with the
+        scene's positions. Metadata and attachments are those of a recording.
         """
 
     def event(self, event: Mapping[str, object]) -> None:
-        """Takes an event; must neither wait nor raise."""
+        """Receives an event; must neither block nor raise."""
 
     def close(self) -> None:
-        """Ends looking; must not raise."""
+        """Stops reading; must not raise."""
 
 
-# Makes a recording whole whose recorder died while the bridge lived on.
-#
-# The ring keeps the last seconds of records, read or not: what the recorder had taken and not
-# yet written is still there.
+# Completion of a recording whose recorder died.
 
 
 def salvage(path: Path, rows: NDArray[np.void], events: Sequence[Mapping[str, object]]) -> str:
-    """Writes a cut recording again, with the records and events that it lacks.
+    """Rewrites a cut recording with the records and events that it lacks.
 
-    Args:
-        path: The recording; replaced at once where all goes well, else left as it is.
-        rows: The newest records, oldest first, ``TICK_DTYPE``.
-        events: The newest events, oldest first, with ``time_ns``.
+    The ring keeps the last seconds of records, read or not, so records that the recorder had taken
+    but not written are still available. ``rows`` and ``events`` are the newest ones, oldest first.
+    The file is replaced on success, otherwise unchanged.
 
     Returns:
-        What became of it, as a clause.
+        The outcome, as a clause.
     """
     beside = path.with_name(path.name + ".salvaged")
     try:
@@ -85,7 +80,7 @@ def salvage(path: Path, rows: NDArray[np.void], events: Sequence[Mapping[str, ob
         last = int(ticks["tick"][-1]) if ticks.size else -1
         rest = rows[rows["tick"] > last]
         if rest.size and int(rest["tick"][0]) != last + 1:
-            return "the records behind that are lost"
+            return "the records after it are lost"
         epoch = recording.meta.get(layout.EPOCH_KEY, "0")
         writer = RecordingWriter(beside, recording.meta, attachments, int(epoch))
         writer.write_ticks(ticks)
@@ -100,9 +95,9 @@ def salvage(path: Path, rows: NDArray[np.void], events: Sequence[Mapping[str, ob
     except (RecordingError, OSError, ValueError):
         with contextlib.suppress(OSError):
             beside.unlink(missing_ok=True)
-        return "the records behind that could not be written"
+        return "the records after it could not be written"
     total = ticks.size + rest.size
-    return f"the bridge has done so: all {total} records are there"
+    return f"the bridge has repaired it: all {total} records are there"
 
 
 def _key(event: Mapping[str, object]) -> tuple[object, ...]:
@@ -117,28 +112,27 @@ sys.modules["hapticbridge"] = package
 from hapticbridge.recording.recorder_process import run
 run()
 """
-# The package's own __init__ loads MuJoCo and numba (a second, 100 MB), which the recorder needs
-# not; and found by its path, it is this very package, whatever sys.path the child has.
+# The package's __init__ loads MuJoCo and numba (a second, 100 MB), which the recorder does not
+# need. The explicit path loads this very package with any sys.path of the child.
 
 
 class Recorder:
-    """Starts the recorder's process and talks to it, without ever waiting inside the loop.
+    """Starts the recorder's process and sends events to it without blocking the loop.
 
-    The constructor returns at once; the process starts (about a quarter of a second) while the
-    caller does something else, until ``wait_until_ready``. If the caller's process dies, the
-    recorder drains the ring, writes the event ``bridge_died``, closes the file and removes the
-    shared memory. To be used from one thread.
+    The constructor returns at once; the process starts within about a quarter of a second
+    (``wait_until_ready``). If the caller's process dies, the recorder drains the ring, writes the
+    event ``bridge_died``, closes the file and removes the shared memory. Use it from one thread.
 
     Args:
-        ring: A ring made by ``Ring.shared``; the caller closes it after the recorder.
+        ring: Ring from ``Ring.shared``; the caller closes it after the recorder.
         path: The recording, overwritten if it exists; None records nothing.
-        metadata: Names and values of the recording's metadata.
+        metadata: Metadata of the recording.
         attachments: Files that the recording carries.
-        live: Whether the process shows the state of the run on standard error.
-        epoch_ns: Unix time of the run's start, in ns; now if it is not given.
+        live: True shows the state of the run on standard error.
+        epoch_ns: Unix time of the run's start in ns; None takes the present.
 
     Attributes:
-        is_disk_full: Whether the disk is; the file then takes no more than a run that ends.
+        is_disk_full: True if the disk is full; the file then has space only for the end of the run.
 
     Raises:
         RecordingError: The ring is not shared, metadata or attachments cannot be written, or the
@@ -179,18 +173,17 @@ class Recorder:
         self._listener.start()
         pieces = [json.dumps(configuration).encode() + b"\n"]
         pieces += [item.data for item in attachments]
-        # in a thread of its own, because attachments are larger than what a pipe takes at once
+        # in a separate thread, because attachments exceed a pipe's buffer
         self._sender = threading.Thread(target=self._configure, args=(pieces,), daemon=True)
         self._sender.start()
 
     def wait_until_ready(self, timeout: float = 30.0) -> None:
-        """Waits until the file is open and carries its metadata and attachments.
+        """Waits until the file is open and has its metadata and attachments.
 
-        Args:
-            timeout: Longest wait in s.
+        ``timeout`` is the longest wait in s.
 
         Raises:
-            RecordingError: The file cannot be written, the process died, or time is over.
+            RecordingError: The file cannot be written, the process died, or the time is over.
         """
         try:
             answer = self._answers.get(timeout=timeout)
@@ -203,25 +196,23 @@ class Recorder:
             raise self._failure(answer)
 
     def event(self, event: Mapping[str, object], time_ns: int) -> None:
-        """Sends an event to the recording; never waits and never raises.
+        """Sends an event to the recording; never blocks and never raises.
 
-        Args:
-            event: What happened: ``event`` names it, the rest is its data.
-            time_ns: When, in ns since the start of the run.
+        ``event["event"]`` is its name; ``time_ns`` counts from the start of the run.
         """
         self._outbox += layout.event_payload(event, time_ns) + b"\n"
         self._send()
 
     def is_alive(self) -> bool:
-        """Returns whether the process runs; if not, ``close`` says why."""
+        """Returns True if the process runs; otherwise ``close`` raises the reason."""
         self._send()
         return not self._is_closed and self._process.poll() is None
 
     def close(self) -> None:
-        """Lets the process write all that is in the ring and finish the file.
+        """Waits until the process has written all records and finished the file.
 
-        To be called after the last record and event. The second call does nothing, and neither
-        does one after an error that was already raised.
+        Call it after the last record and event. A second call, or a call after a raised error, does
+        nothing.
 
         Raises:
             RecordingError: The process died, or could not write the file.
@@ -234,7 +225,7 @@ class Recorder:
             _set_blocking(self._input, True)
             _write(self._input, bytes(self._outbox) + b'{"close": true}\n')
         except OSError:
-            pass  # it died; its last answer or its exit status says why
+            pass  # the process died; its last answer or exit status holds the reason
         self._outbox.clear()
         answer: dict[str, Any] = {}
         while "closed" not in answer and "error" not in answer and "exited" not in answer:
@@ -249,10 +240,10 @@ class Recorder:
         if "error" in answer:
             return RecordingError(str(answer["error"]))
         status = self._process.returncode
-        how = f"killed by signal {-status}" if status < 0 else f"ended with status {status}"
+        how = f"was killed by signal {-status}" if status < 0 else f"ended with status {status}"
         return RecordingError(
-            f"the recorder's process was {how}; what it wrote is readable up to the last whole "
-            "chunk, and 'hapticbridge repair' makes a whole file of it"
+            f"the recorder's process {how}; the recording is readable up to the last whole "
+            "chunk; 'hapticbridge repair' makes it whole"
         )
 
     def _reap(self) -> None:
@@ -270,7 +261,7 @@ class Recorder:
             _set_blocking(self._input, False)
             self._is_configured = True
         except (OSError, ValueError):
-            pass  # it died or was closed before it was ready: ``wait_until_ready`` says so
+            pass  # it died or was closed before it was ready; ``wait_until_ready`` raises
 
     def _send(self) -> None:
         if not self._outbox or not self._is_configured or self._is_closed:
@@ -281,7 +272,7 @@ class Recorder:
         except BlockingIOError:
             pass  # the pipe is full: the next call tries again
         except OSError:
-            self._outbox.clear()  # it died: nobody reads events any more, ``close`` says why
+            self._outbox.clear()  # the process died; ``close`` raises the reason
 
     def _listen(self) -> None:
         with cast(IO[bytes], self._process.stdout) as answers:
@@ -298,7 +289,7 @@ def _start() -> subprocess.Popen[bytes]:
     package = str(Path(__file__).resolve().parents[1])
     try:
         return subprocess.Popen(
-            # -P: a file in the user's working folder must not stand in for a module
+            # -P: a file in the user's working folder must not replace a module
             [sys.executable, "-P", "-c", _BOOTSTRAP, package],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
@@ -317,55 +308,55 @@ def _write(stream: IO[bytes], data: bytes) -> None:
 
 
 def _set_blocking(stream: IO[bytes], is_blocking: bool) -> None:
-    # pipes of Windows know this from Python 3.12 on; before, a full pipe makes ``event`` wait
+    # on Windows from Python 3.12 on; before, a full pipe makes ``event`` block
     if sys.platform != "win32" or sys.version_info >= (3, 12):
         os.set_blocking(stream.fileno(), is_blocking)
 
 
-# The bridge's end of a recording: records leave through a ring, events through a pipe.
+# Bridge's end of a recording.
 
 RING_SECONDS, MOST_RECORDS = 8.0, 1 << 16
-"""How far the recorder may fall behind before a record is lost, in s and in records of 400 bytes;
-a trip hands the last second of them to whoever catches it."""
+"""Capacity of the ring in s, and at most in records of 400 bytes: the lag of the recorder before a
+record is lost. A trip's exception carries its last second."""
 
 NOBODY_READS = 1 << 62
-"""Tail of a ring without a recorder: it is never full and keeps the newest records."""
+"""Tail cursor of a ring without a recorder; the ring is never full and keeps the newest records."""
 
 RING_POLL = 1e-3
-"""How often a run in simulated time looks whether the recorder made room, in s."""
+"""Time in s between checks for space in the ring, in simulated time."""
 
 KEPT_EVENTS = 4096
-"""Events that can be written again should the recorder die; more cost memory alone."""
+"""Number of events kept to be written again if the recorder dies; more would only cost memory."""
 
-_ENDED = "the recorder ended in mid-run; the recording stops there"
-_FULL = "the disk is full; the recording ends here, and is whole"
+_ENDED = "the recorder ended during the run; the recording stops there"
+_FULL = "the disk is full; the recording ends here and is whole"
 
 
 class RecordStream:
-    """Where the loop leaves its records and events; it never waits in real time.
+    """Records leave through a ring, events through a pipe; the loop never waits in real time.
 
-    ``rows`` and ``cursors`` are what ``kernel.publish.publish`` writes to. Where a file or a status
-    line is asked for, the recorder's process reads them; else the ring keeps the newest records.
-    To be closed after the loop, whatever happened.
+    ``kernel.publish.publish`` writes to ``rows`` and ``cursors``. With a file or a status line the
+    recorder's process reads them; otherwise the ring keeps the newest records. Close it after the
+    loop in any case.
 
     Args:
         path: The recording, overwritten if it exists; None records nothing.
-        period: T in s; with it, how many records the ring must hold.
-        live: Whether the recorder's process shows the state of the run on standard error.
-        is_lossless: Whether the loop may wait for the recorder (simulated time) instead of losing
+        period: T in s, which determines the ring's capacity.
+        live: True shows the state of the run on standard error.
+        is_lossless: True if the loop may wait for the recorder (simulated time) instead of losing
             records.
-        onlooker: Who looks at the newest records beside the recorder, unasked and unwaited for.
-        snapshot: Name of the shared memory with the scene's positions, for the onlooker.
+        onlooker: Optional second reader of the ring, such as the live view. The loop never waits
+            for it.
 
     Attributes:
         rows: The ring's records, ``TICK_DTYPE``.
         cursors: The ring's cursors, ``kernel.publish.HEAD`` and ``TAIL``.
-        recorder: The recorder's process, once started; None where nobody reads.
+        recorder: The recorder's process once started; None without one.
         lost: Flag of the next record: ``DROPPED_BEFORE`` if the one before it was lost, else 0.
-        dropped: How many records were lost.
+        dropped: Number of lost records.
 
     Raises:
-        RecordingError: There is no room for the ring.
+        RecordingError: There is no memory for the ring.
     """
 
     def __init__(
@@ -393,7 +384,7 @@ class RecordStream:
 
     @property
     def is_read(self) -> bool:
-        """Whether anybody reads the records, so that ``start`` is to be called."""
+        """True if there is a reader, so that ``start`` must be called."""
         return self._is_read or self._onlooker is not None
 
     def start(self, metadata: Mapping[str, str], attachments: Sequence[Attachment]) -> None:
@@ -412,18 +403,18 @@ class RecordStream:
         self.tell({"event": "recording", "path": None if self._path is None else str(self._path)})
 
     def tell(self, news: Mapping[str, object]) -> None:
-        """Tells the onlooker alone, if there is one; never waits and never raises."""
+        """Sends news to the onlooker only; never blocks and never raises."""
         if self._onlooker is not None:
             self._onlooker.event(news)
 
     def makes_room(self, *, may_wait: bool) -> bool:
-        """Answers a ring that refused a record: try it again, or it is lost.
+        """Handles a record refused by a full ring.
 
-        Args:
-            may_wait: Whether the run still goes on; a run that was told to stop waits for nobody.
+        A run that was told to stop must not wait (``may_wait``).
 
         Returns:
-            True after a wait, in simulated time. False where the record is counted as lost.
+            True after a wait in simulated time, to try again. False if the record is counted as
+            lost.
 
         Raises:
             RecordingError: The recorder's process ended.
@@ -438,13 +429,9 @@ class RecordStream:
         return False
 
     def event(self, event: str, tick: int, time_ns: int, **details: object) -> None:
-        """Notes what happened, if anybody reads; never waits and never raises.
+        """Sends an event to all readers; never blocks and never raises.
 
-        Args:
-            event: Its name.
-            tick: The tick before which it happened.
-            time_ns: When, in ns since the start of the run.
-            **details: What else is to be known of it.
+        It happened before ``tick``; ``time_ns`` counts from the start of the run.
         """
         told = {"event": event, "tick": tick, **details}
         if self.recorder is not None:
@@ -454,10 +441,10 @@ class RecordStream:
             self._onlooker.event(told)
 
     def look(self) -> None:
-        """Looks whether the recorder still lives and has room; takes some microseconds.
+        """Checks that the recorder lives and its disk has space; takes some microseconds.
 
         Raises:
-            RecordingError: It does not, or its disk is full.
+            RecordingError: The recorder ended, or its disk is full.
         """
         if self.recorder is not None and self.recorder.is_disk_full:
             raise RecordingError(_FULL)
@@ -469,7 +456,7 @@ class RecordStream:
         return self._ring.latest(count)
 
     def close(self) -> None:
-        """Lets the recorder finish the file and removes the shared memory.
+        """Waits until the recorder has finished the file, and removes the shared memory.
 
         Raises:
             RecordingError: The recorder's process died, or could not write the file.

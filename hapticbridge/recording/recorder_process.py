@@ -1,9 +1,8 @@
-"""The recorder's process: drains the ring into the file, and outlives the bridge.
+"""Recorder's process: drains the ring into the file, and outlives the bridge.
 
-Started by ``hapticbridge.recording.recorder``, which tells it what to do through its standard
-input: one line of JSON, the attachments' bytes, then one line per event, and ``{"close": true}``.
-It answers on standard output with ``ready``, ``full``, ``closed`` or ``error``. If the input ends
-before it was told to close, the bridge died.
+``hapticbridge.recording.recorder`` starts it. Its standard input carries one line of JSON, the
+attachments' bytes, one line per event, and ``{"close": true}``. Its answers on standard output are
+``ready``, ``full``, ``closed`` or ``error``. If the input ends before ``close``, the bridge died.
 """
 
 from __future__ import annotations
@@ -33,17 +32,17 @@ from hapticbridge.recording.format import Attachment
 from hapticbridge.recording.ring import Ring
 from hapticbridge.recording.writer import RecordingWriter
 
-# The live line of a run: one line that is redrawn on a terminal, plain lines elsewhere.
+# Live status line of a run.
 
 REDRAW = 0.125
-"""Pause in s between two drawings on a terminal."""
+"""Time in s between two drawings on a terminal."""
 
 REPRINT = 2.0
-"""Pause in s between two plain lines."""
+"""Time in s between two plain lines."""
 
 
 class RunState:
-    """What the live line tells, gathered from the records."""
+    """State of a run for the status line, collected from records."""
 
     def __init__(self) -> None:
         self._last: NDArray[np.void] | None = None
@@ -76,17 +75,16 @@ class RunState:
 
 
 class _Console(Console):
-    """A console that reports a closed terminal instead of ending the process, as rich would."""
+    """Console that raises when the terminal is closed; rich would end the process."""
 
     def on_broken_pipe(self) -> None:
         raise BrokenPipeError(errno.EPIPE, "the terminal is gone")
 
 
 class LiveLine:
-    """Shows the state of a run; a stream that fails is left alone, the recording goes on.
+    """Status line of a run: redrawn on a terminal, printed as plain lines elsewhere.
 
-    Args:
-        stream: Where to; whether it is a terminal decides the way.
+    After an error the stream is no longer used, and the recording continues.
     """
 
     def __init__(self, stream: TextIO) -> None:
@@ -97,7 +95,7 @@ class LiveLine:
         self._live: Live | None = None
         try:
             if stream.isatty():
-                # standard output carries the answers to the bridge: rich must not redirect it
+                # rich must not redirect standard output, which carries the answers to the bridge
                 self._live = Live(
                     self._text(),
                     console=_Console(file=stream),
@@ -110,7 +108,7 @@ class LiveLine:
             self._stream = None
 
     def update(self, rows: NDArray[np.void]) -> None:
-        """Takes new records, also none, and draws when it is time to."""
+        """Adds new records, or none, and draws if it is time."""
         if rows.size:
             self._state.add(rows)
             self._is_fresh = True
@@ -118,7 +116,7 @@ class LiveLine:
             self._draw()
 
     def close(self) -> None:
-        """Draws the last state and leaves the terminal as it was."""
+        """Draws the last state and restores the terminal."""
         self._draw()
         try:
             if self._live is not None:
@@ -148,16 +146,16 @@ def _millijoule(energy: float) -> str:
 
 
 POLL = 0.005
-"""Pause in s between looks into the ring: five records at 1 kHz."""
+"""Pause in s between reads of the ring: five records at 1 kHz."""
 
 BATCH = 64
-"""Most records that are taken at once; after so many the next look follows without a pause. What
-they need on the way to the file bounds the process's memory: with 4096 it grew by a megabyte when
-the machine first held it up for a second. Fewer cost time, 0.3 µs a record at 64."""
+"""Largest number of records taken at once; after a full batch the next read follows at once. The
+batch bounds the process's memory: with 4096 it grew by a megabyte after a stall of one second. A
+smaller batch costs time; at 64 it is 0.3 µs per record."""
 
 
 class _Session:
-    """One run from the recorder's side."""
+    """One run in the recorder's process."""
 
     def __init__(self, configuration: dict[str, Any], attachments: list[Attachment]) -> None:
         self.ring = Ring.attach(configuration["ring"])
@@ -180,7 +178,7 @@ class _Session:
         self._has_told = False
 
     def run(self, inbox: SimpleQueue[dict[str, Any] | None]) -> None:
-        """Records until the bridge says close, or is gone."""
+        """Records until the bridge closes or dies."""
         end = None
         while end is None:
             count = self._drain_once()
@@ -188,7 +186,7 @@ class _Session:
             end = self._handle(inbox)
             # a process that the bridge forked may hold the pipe open after the bridge's death
             if end is None and os.getppid() != self._parent:
-                time.sleep(0.1)  # what is still in the pipe arrives
+                time.sleep(0.1)  # lets the rest of the pipe arrive
                 end = self._handle(inbox) or "died"
             if end is None and count < BATCH:
                 time.sleep(POLL)
@@ -214,14 +212,14 @@ class _Session:
         return int(rows.size)
 
     def _tell_if_full(self) -> None:
-        """Says once that the disk is full; there is room for what comes until the bridge ends."""
+        """Reports a full disk once; the reserve holds the data until the bridge ends."""
         if self._writer is not None and self._writer.is_full and not self._has_told:
             self._has_told = True
             self._write_event({"event": "disk_full", "tick": self._last_tick}, self._last_time)
             _answer(full=True)
 
     def _handle(self, inbox: SimpleQueue[dict[str, Any] | None]) -> str | None:
-        """Writes the events that arrived; returns how the run ended, if it did."""
+        """Writes the events that arrived; returns how the run ended, or None."""
         while True:
             try:
                 message = inbox.get_nowait()
@@ -240,7 +238,7 @@ class _Session:
 
 def _listen(stream: IO[bytes], inbox: SimpleQueue[dict[str, Any] | None]) -> None:
     for line in stream:
-        # a line without its end is the last breath of a bridge that was killed while it wrote
+        # a line without its end comes from a bridge that was killed while writing
         if line.endswith(b"\n"):
             inbox.put(json.loads(line))
     inbox.put(None)
@@ -266,7 +264,7 @@ def _configuration(stream: IO[bytes]) -> tuple[dict[str, Any], list[Attachment]]
 
 
 def _calm() -> None:
-    """Gives up what the process must not share with the loop: its signals and its priority."""
+    """Ignores signals meant for the bridge, and drops the loop's real-time priority."""
     for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT"):
         if hasattr(signal, name):
             signal.signal(getattr(signal, name), signal.SIG_IGN)
@@ -306,6 +304,6 @@ def run() -> NoReturn:
         status = main()
     except BaseException:
         traceback.print_exc()
-    # at once: the listening thread may hold the lock of standard input, which an ordinary exit
+    # os._exit: the listening thread may hold the lock of standard input, which a normal exit
     # of the interpreter waits for
     os._exit(status)

@@ -1,4 +1,4 @@
-"""Mends a recording that was cut when its recorder or machine died."""
+"""Repair of a cut recording."""
 
 from __future__ import annotations
 
@@ -11,18 +11,14 @@ from hapticbridge.recording.reader import Recording, read_recording, read_with_a
 from hapticbridge.recording.writer import RecordingWriter
 
 _BATCH = 4096
-"""Records that are written at once: larger takes more memory, smaller more time."""
+"""Records written at once. A larger batch takes more memory, a smaller one more time."""
 
 
 def repair(path: str | Path, output: str | Path) -> Recording:
     """Writes a cut recording again as a whole one.
 
-    Metadata, attachments, and all whole records and events are kept; an event ``repaired`` says
-    what was done, and the digest is that of what is left.
-
-    Args:
-        path: A recording that was cut.
-        output: The new file; it must not exist.
+    Metadata, attachments, and all whole records and events are kept. An event ``repaired``
+    describes the repair, and the digest is computed anew.
 
     Returns:
         The new recording, as read back.
@@ -34,7 +30,7 @@ def repair(path: str | Path, output: str | Path) -> Recording:
     path, output = Path(path), Path(output)
     recording, attachments = read_with_attachments(path)
     if not recording.is_cut:
-        raise RecordingError(f"{path} is not cut: there is nothing to repair")
+        raise RecordingError(f"{path} is not cut, so there is nothing to repair")
     epoch = recording.meta.get(layout.EPOCH_KEY, "")
     writer = RecordingWriter(
         output,

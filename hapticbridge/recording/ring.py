@@ -1,8 +1,4 @@
-"""The shared-memory ring between the loop and whoever reads its records.
-
-One producer (the tick's kernel), one consumer (the recorder). Neither waits for the other: a full
-ring refuses the record, the producer counts that, and the audit sees the gap.
-"""
+"""Shared-memory ring between the loop and the recorder."""
 
 from __future__ import annotations
 
@@ -21,7 +17,7 @@ from numpy.typing import NDArray
 from hapticbridge.errors import RecordingError
 from hapticbridge.record import TICK_DTYPE
 
-# The shared memory of a ring: a file in memory under a name, which is gone when nobody maps it.
+# Shared memory of a ring.
 
 if sys.platform != "win32":
     import fcntl
@@ -30,10 +26,11 @@ _PREFIX = "hapticbridge-ring-"
 
 
 def memory_folder() -> Path:
-    """Returns where shared memory lives: Linux's memory file system, else the temporary folder.
+    """Returns the folder of shared memory: Linux's memory file system, else the temporary folder.
 
-    Not ``multiprocessing.shared_memory``: before Python 3.13 its resource tracker also tracks
-    whoever attaches, removes the memory under its owner, and prints about leaks after a kill.
+    ``multiprocessing.shared_memory`` does not fit. Before Python 3.13 its resource tracker also
+    tracks attached processes, removes the memory under its owner, and prints about leaks after a
+    kill.
     """
     memory = Path("/dev/shm")
     usable = memory.is_dir() and os.access(memory, os.W_OK)
@@ -41,16 +38,12 @@ def memory_folder() -> Path:
 
 
 def created(folder: Path, size: int) -> tuple[mmap.mmap, Path]:
-    """Creates shared memory that is zero, under a name that nobody else has.
+    """Creates zeroed shared memory under a unique name.
 
-    Segments that a killed process left behind are removed on the way.
-
-    Args:
-        folder: Where.
-        size: In bytes.
+    Segments left by killed processes are removed. ``size`` is in bytes.
 
     Raises:
-        OSError: There is no room.
+        OSError: Memory is insufficient.
     """
     _sweep(folder)
     path = folder / f"{_PREFIX}{os.getpid()}-{secrets.token_hex(6)}"
@@ -58,10 +51,10 @@ def created(folder: Path, size: int) -> tuple[mmap.mmap, Path]:
         file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600)
         try:
             _lock(file)
-            # a sweep may have found the file in the instant before it was locked
+            # another process's sweep may have removed the file before it was locked
             if os.fstat(file).st_nlink == 0:
                 continue
-            # written out, so that a full file system says so here and not as a bus error in a tick
+            # write all of it, so that a full file system fails here, not as a bus error in a tick
             with open(file, "wb", closefd=False) as stream:
                 stream.write(bytes(size))
             memory = mmap.mmap(file, size)
@@ -70,16 +63,16 @@ def created(folder: Path, size: int) -> tuple[mmap.mmap, Path]:
             raise
         finally:
             os.close(file)
-        # every page is touched once, so that the loop meets no page fault
+        # touch every page once, so that the loop has no page fault
         np.frombuffer(memory, np.uint8)[:] = 0
         return memory, path
 
 
 def attached(name: str) -> mmap.mmap:
-    """Maps the shared memory that another process created.
+    """Maps shared memory created by another process.
 
     Raises:
-        RecordingError: There is none of that name, or it cannot be mapped.
+        RecordingError: It does not exist or cannot be mapped.
     """
     try:
         file = os.open(name, os.O_RDWR | getattr(os, "O_CLOEXEC", 0))
@@ -95,13 +88,13 @@ def attached(name: str) -> mmap.mmap:
 
 
 def _lock(file: int) -> None:
-    """Marks a segment as in use; the mapping keeps the mark until its process ends."""
+    """Marks a segment as in use until the process that maps it ends."""
     if sys.platform != "win32":
         fcntl.flock(file, fcntl.LOCK_SH)
 
 
 def _sweep(folder: Path) -> None:
-    """Removes segments that no living process maps: bridge and recorder were both killed."""
+    """Removes segments that no living process maps."""
     if sys.platform == "win32":
         return
     for path in folder.glob(f"{_PREFIX}*"):
@@ -115,10 +108,10 @@ def _sweep(folder: Path) -> None:
 
 
 HEAD = 0
-"""Index into ``Ring.cursors``: records written since the start; only the producer changes it."""
+"""Index of ``Ring.cursors`` with the number of records written; only the producer changes it."""
 
 TAIL = 1
-"""Index into ``Ring.cursors``: records read since the start; only the consumer changes it."""
+"""Index of ``Ring.cursors`` with the number of records read; only the consumer changes it."""
 
 _CURSORS = 8
 _MAGIC = int.from_bytes(b"hbring01", "little")
@@ -127,18 +120,20 @@ _ROWS_OFFSET = _HEADER.itemsize + 8 * _CURSORS
 
 
 class Ring:
-    """A ring of tick records, in this process's memory or shared between processes.
+    """Ring of tick records, in this process's memory or shared between processes.
 
-    The producer refuses when ``cursors[HEAD] - cursors[TAIL] >= capacity``; else it writes
-    ``rows[cursors[HEAD] % capacity]``, makes it visible (release fence), and only then adds one to
-    ``cursors[HEAD]``. A producer that dies inside a record therefore leaves no torn one behind.
+    It has one producer (the tick's kernel) and one consumer (the recorder); neither waits for the
+    other. The producer refuses a record if ``cursors[HEAD] - cursors[TAIL] >= capacity`` and counts
+    it, and the audit reports the gap. Otherwise it writes ``rows[cursors[HEAD] % capacity]``,
+    issues a release fence, and only then increments ``cursors[HEAD]``. A producer that dies inside
+    a record therefore leaves no torn one.
 
-    The memory stays mapped as long as any of its arrays is in use, also after ``close``.
+    The memory stays mapped while any of its arrays is in use, also after ``close``.
 
     Attributes:
-        rows: The records, shape (capacity,), ``TICK_DTYPE``.
+        rows: Records, shape (capacity,), ``TICK_DTYPE``.
         cursors: Shape (8,), int64; see ``HEAD`` and ``TAIL``, the rest is reserved and zero.
-        name: What ``attach`` takes (the path of the shared memory), or None for a local ring.
+        name: Name for ``attach`` (path of the shared memory); None for a local ring.
     """
 
     def __init__(
@@ -159,9 +154,6 @@ class Ring:
     def local(cls, capacity: int) -> Ring:
         """Returns a ring in this process's own memory.
 
-        Args:
-            capacity: Records that it holds, >= 1.
-
         Raises:
             RecordingError: The capacity is below 1.
         """
@@ -172,13 +164,10 @@ class Ring:
     def shared(cls, capacity: int) -> Ring:
         """Creates a ring in shared memory; ``close`` removes its name.
 
-        Segments that a killed process left behind are removed on the way.
-
-        Args:
-            capacity: Records that it holds, >= 1; one record takes 400 bytes.
+        Segments left by killed processes are removed. One record takes 400 bytes.
 
         Raises:
-            RecordingError: The capacity is below 1, or there is no room for it.
+            RecordingError: The capacity is below 1, or memory is insufficient.
         """
         _check_capacity(capacity)
         size = _ROWS_OFFSET + capacity * TICK_DTYPE.itemsize
@@ -198,10 +187,7 @@ class Ring:
 
     @classmethod
     def attach(cls, name: str) -> Ring:
-        """Opens the ring that another process created.
-
-        Args:
-            name: The other ring's ``name``.
+        """Opens a ring created by another process.
 
         Raises:
             RecordingError: There is no such ring, or it is not one of this version.
@@ -224,21 +210,18 @@ class Ring:
 
     @property
     def capacity(self) -> int:
-        """Records that the ring holds."""
+        """Number of records that the ring holds."""
         return int(self.rows.size)
 
     def pending(self) -> int:
-        """Returns how many records were written and not yet read."""
+        """Returns the number of records written and not yet read."""
         return int(self.cursors[HEAD] - self.cursors[TAIL])
 
     def append(self, rows: NDArray[np.void]) -> int:
-        """Writes records as the producer; the twin in Python of the kernel's compiled producer.
-
-        Args:
-            rows: Records, shape (n,), ``TICK_DTYPE``.
+        """Writes records as the producer, as the kernel's compiled producer does.
 
         Returns:
-            How many were taken, from the first on; the others met a full ring.
+            Number of records written, from the first on; a full ring refuses the rest.
         """
         head = int(self.cursors[HEAD])
         taken = min(int(rows.size), self.capacity - self.pending())
@@ -249,9 +232,6 @@ class Ring:
 
     def take(self, limit: int) -> NDArray[np.void]:
         """Reads records as the consumer, and frees their places.
-
-        Args:
-            limit: The most records to take, >= 1.
 
         Returns:
             A copy of the oldest unread records, oldest first; empty if there is none.
@@ -265,13 +245,10 @@ class Ring:
         return taken
 
     def latest(self, count: int) -> NDArray[np.void]:
-        """Copies the newest records that are still in the ring, read or not; frees nothing.
+        """Copies the newest records in the ring, read or not, without freeing them.
 
-        While the producer runs, ask for less than the capacity: the place of the oldest record is
-        the one that is written next.
-
-        Args:
-            count: The most records to copy, >= 0.
+        While the producer runs, request fewer than the capacity: the oldest record's place is
+        written next.
 
         Returns:
             The records, oldest first.
@@ -281,24 +258,21 @@ class Ring:
         start = max(0, head - self.capacity, head - count)
         copied = self._copy(start, head)
         self._fence()
-        # what the producer has overwritten since is no record of the past any more
+        # drop the records that the producer has overwritten meanwhile
         overwritten = int(self.cursors[HEAD]) - self.capacity - start
         return copied[overwritten:] if overwritten > 0 else copied
 
     def since(self, number: int) -> tuple[int, NDArray[np.void]]:
-        """Copies the records from a number on that are still in the ring; frees nothing.
+        """Copies the records from a number on that are still in the ring, without freeing them.
 
-        The number says where to go on, however many records come in between two calls.
-
-        Args:
-            number: Of the first record that is wanted, counted from the ring's start, >= 0.
+        Numbers count from the ring's start.
 
         Returns:
-            The number of the first record that is still there, and the records, oldest first.
+            Number of the first available record, and the records, oldest first.
         """
         head = int(self.cursors[HEAD])
         self._fence()
-        # the oldest place of a full ring is the one that is written next
+        # the oldest place of a full ring is written next
         start = max(min(number, head), head - self.capacity + 1)
         copied = self._copy(start, head)
         self._fence()
@@ -311,7 +285,7 @@ class Ring:
             self.unlink()
 
     def unlink(self) -> None:
-        """Removes the shared memory's name, also on behalf of an owner that died."""
+        """Removes the shared memory's name, also for an owner that died."""
         if self.name is not None:
             with contextlib.suppress(OSError):  # already gone, or Windows: still mapped
                 Path(self.name).unlink()
@@ -323,7 +297,7 @@ class Ring:
         return np.concatenate((self.rows[first:], self.rows[: first + count - self.capacity]))
 
     def _fence(self) -> None:
-        # Python has no memory fence; taking and leaving a lock is one on every processor
+        # Python has no memory fence; acquiring and releasing a lock acts as one
         with self._order:
             pass
 

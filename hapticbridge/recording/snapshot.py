@@ -1,9 +1,4 @@
-"""Shared memory with the newest positions of a scene, beside the ring of records.
-
-A record has the poses of handle and tool. A view draws all bodies, so the loop also publishes the
-generalised positions, mocap poses and contacts of one tick, some 30 times a second. Only the newest
-picture is kept. The loop never waits: a reader that meets a picture being written reads again.
-"""
+"""Shared memory with the newest positions of a scene."""
 
 from __future__ import annotations
 
@@ -21,18 +16,19 @@ from hapticbridge.errors import RecordingError
 from hapticbridge.recording.ring import attached, created, memory_folder
 
 SEQUENCE, NUMBER, CONTACTS = 0, 1, 2
-"""Indices into ``Snapshot.head``: the sequence, odd while the loop writes; the number of the
-record of the same tick in the ring, counted from the ring's start; how many contacts there are."""
+"""Indices into ``Snapshot.head``. The sequence is odd while the loop writes. The number is that
+of the tick's record in the ring, counted from the ring's start. The third is the number of
+contacts."""
 
 MOST_CONTACTS = 32
-"""Largest number of contacts in a picture. More are a heap in which no single one is seen."""
+"""Largest number of contacts in a picture; in a larger heap no single one can be distinguished."""
 
 _HEAD = 8
 _ATTEMPTS = 100
 
 
 def snapshot_dtype(model: mujoco.MjModel) -> np.dtype[np.void]:
-    """Returns the layout of a picture of a scene: all numbers are 64-bit floats."""
+    """Returns the layout of a scene's picture; all numbers are 64-bit floats."""
     return np.dtype(
         [
             ("slack", "<f8"),
@@ -69,16 +65,15 @@ class Picture:
 class Snapshot:
     """The newest picture of a scene, in shared memory or in this process's own.
 
-    Args:
-        memory: Bytes of ``size_of(model)``, zero at first.
-        model: The scene.
-        name: Path of the shared memory, or None.
-        is_owner: Whether ``close`` removes the name.
+    A record has the poses of handle and tool only. A view draws all bodies, so the loop also
+    publishes the generalised positions, mocap poses and contacts of one tick, about 30 times per
+    second. The loop never waits; a reader that meets a write reads again. ``memory`` has
+    ``size_of(model)`` zeroed bytes; an owner removes the name on ``close``.
 
     Attributes:
         head: Shape (8,), int64; see ``SEQUENCE``.
-        numbers: Shape (n,), float64, as ``snapshot_dtype`` lays them out.
-        name: Path that ``attach`` takes, or None for memory of this process alone.
+        numbers: Shape (n,), float64, in the layout of ``snapshot_dtype``.
+        name: Path for ``attach``; None for memory of this process alone.
     """
 
     def __init__(
@@ -96,7 +91,7 @@ class Snapshot:
         """Creates shared memory for a scene; ``close`` removes its name.
 
         Raises:
-            RecordingError: There is no room for it.
+            RecordingError: Memory is insufficient.
         """
         size = size_of(model)
         folder = memory_folder()
@@ -111,10 +106,10 @@ class Snapshot:
 
     @classmethod
     def attach(cls, name: str, model: mujoco.MjModel) -> Snapshot:
-        """Opens the shared memory that another process created.
+        """Opens shared memory created by another process.
 
         Raises:
-            RecordingError: There is none of this name, or it is of another scene.
+            RecordingError: It does not exist, or belongs to another scene.
         """
         memory = attached(name)
         if len(memory) != size_of(model):
@@ -150,7 +145,7 @@ class Snapshot:
                 Path(self.name).unlink()
 
     def _fence(self) -> None:
-        # Python has no memory fence; taking and leaving a lock is one on every processor
+        # Python has no memory fence; acquiring and releasing a lock acts as one
         with self._order:
             pass
 

@@ -1,4 +1,4 @@
-"""Writes a recording (format: ``hapticbridge.recording.format``)."""
+"""Writer of recordings (format: ``hapticbridge.recording.format``)."""
 
 from __future__ import annotations
 
@@ -22,35 +22,30 @@ from hapticbridge.errors import RecordingError
 from hapticbridge.recording import format as layout
 from hapticbridge.recording.format import Attachment
 
-# The index of a recording's chunks while it is being written: on disk, not in memory.
-#
-# An MCAP file ends with the place of each of its chunks, so that a reader finds a time without
-# reading all that comes before. The MCAP library keeps these entries as objects until the file
-# is finished: 0.9 kB a chunk, 10 MB an hour at 1 kHz, for as long as the run lasts.
+# Chunk index on disk.
 
 
 class ChunkIndexFile:
-    """Stands in for the list in which the MCAP library keeps the index.
+    """Replacement of the MCAP library's chunk index that uses disk instead of memory.
 
-    Entries wait in a file without a name, beside the recording where that is possible, and go when
-    it is closed or its process dies. One entry is about 100 bytes.
-
-    Args:
-        folder: Where the recording is.
+    An MCAP file ends with the position of each chunk, for access by time. The library keeps these
+    entries as objects until the file is closed: 0.9 kB per chunk, 10 MB per hour at 1 kHz. Here an
+    entry takes about 100 bytes in an unnamed temporary file, beside the recording if possible. The
+    file vanishes when it is closed or its process dies.
 
     Raises:
-        OSError: No file can be made, there or where temporary files belong.
+        OSError: No file can be created, there or in the temporary folder.
     """
 
     def __init__(self, folder: Path) -> None:
         self._file = _nameless_file(folder)
 
     def take_over(self, writer: Writer) -> None:
-        """Replaces the library's list, which is private, in the only place that names it."""
+        """Replaces the library's private list; this is the only place that names it."""
         writer._Writer__chunk_indices = self  # type: ignore[attr-defined]
 
     def append(self, entry: ChunkIndex) -> None:
-        """Takes the entry of a finished chunk.
+        """Adds the entry of a finished chunk.
 
         Raises:
             OSError: The disk is full.
@@ -62,24 +57,24 @@ class ChunkIndexFile:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     def __iter__(self) -> Iterator[_Entries]:
-        """Yields all entries as one, which the library writes into the summary."""
+        """Yields all entries as one object, which the library writes into the summary."""
         self._file.seek(0)
         yield _Entries(self._file.read())
 
     def close(self) -> None:
-        """Frees the file."""
+        """Deletes the file."""
         self._file.close()
 
 
 def _nameless_file(folder: Path) -> IO[bytes]:
     try:
         return tempfile.TemporaryFile(dir=folder, buffering=0)
-    except OSError:  # one may write to a file or device in a folder that takes no others
+    except OSError:  # the recording's folder may not allow new files
         return tempfile.TemporaryFile(buffering=0)
 
 
 class _Entries:
-    """Entries that need no packing any more."""
+    """Packed entries."""
 
     def __init__(self, data: bytes) -> None:
         self._data = data
@@ -88,43 +83,37 @@ class _Entries:
         stream.write(self._data)
 
 
-# The file under a recording: whole writes, a lock, and room kept for the end on a disk that
-# fills.
-#
-# A disk that is full when a record must be written has room for nothing more, not even for the
-# index that closes the file. So room is claimed ahead; when no more can be claimed, what is
-# claimed takes all that still comes until the run has been told to end.
+# Locked output file with reserved space.
 
 if sys.platform != "win32":
     import fcntl
 
 RESERVE = 4 << 20
-"""In bytes, claimed ahead of the file's end. Records at 1 kHz are 0.4 MB/s before compression, and
-the loop looks at its recorder ten times a second: enough for 10 kHz, and for the index of hours."""
+"""Space in bytes reserved beyond the file's end. Records at 1 kHz take 0.4 MB/s before compression,
+and the loop checks its recorder ten times a second. It suffices for 10 kHz and for the index of
+hours."""
 
 _KEEP_SIZE, _PUNCH_HOLE = 1, 2  # FALLOC_FL_* of Linux
 
 
 class Output:
-    """A file that hands each write to the operating system whole and at once.
+    """Unbuffered file with a lock and reserved space.
 
-    The MCAP library writes a finished chunk in one call; a buffer in between would keep its end
-    until the next one, and a kill would lose it.
-
-    Args:
-        path: The file; what it holds is lost.
-        is_new: Refuse one that exists.
+    The MCAP library writes a finished chunk in one call; a buffer would hold its end back, and a
+    kill would lose it. A full disk has no space for the index that closes the file, so space is
+    reserved in advance. When no more can be reserved, the reserve takes the remaining data until
+    the run has ended. The content of an existing file is lost; ``is_new`` refuses it.
 
     Attributes:
-        is_full: Whether no more room could be claimed; ``RESERVE`` bytes are left then, or what is
-            left of them. Stays False where a file system cannot claim any.
+        is_full: True if no more space could be reserved; at most ``RESERVE`` bytes are then left.
+            Always False on a file system without reservation.
 
     Raises:
         OSError: It cannot be opened, or another bridge is recording to it.
     """
 
     def __init__(self, path: Path, *, is_new: bool) -> None:
-        # not truncated before it is locked: another bridge may be recording to the same file
+        # lock before truncating: another bridge may be recording to this file
         flags = os.O_WRONLY | os.O_CREAT | getattr(os, "O_BINARY", 0)
         flags |= os.O_EXCL if is_new else 0
         self._file = os.fdopen(os.open(path, flags, 0o666), "wb", buffering=0)
@@ -143,34 +132,34 @@ class Output:
         self.is_full = False
 
     def write(self, data: bytes) -> int:
-        """Writes all of it, then claims as much room again: a call in a third of a second."""
+        """Writes all data, then extends the reserve; about three calls per second."""
         view = memoryview(data)
         while view:
             written = self._file.write(view)
             view = view[written:]
         self._position += len(data)
-        if self._claims and data:  # no room at all cannot be claimed
+        if self._claims and data:  # a reservation of zero bytes is an error
             self._claim()
         return len(data)
 
     def tell(self) -> int:
-        """Returns how much was written."""
+        """Returns the number of bytes written."""
         return self._position
 
     def flush(self) -> None:
-        """Nothing is held back."""
+        """Does nothing; writes are unbuffered."""
 
     def sync(self) -> None:
-        """Waits until all of it is on the disk."""
+        """Waits until all data is on the disk."""
         if self._is_regular:
             os.fsync(self._file.fileno())
 
     def close(self) -> None:
-        """Gives back what was claimed and not used, and closes."""
+        """Releases the unused reserve and closes the file."""
         if self._claimed > self._position and not self._file.closed:
             rest = self._claimed - self._position
             self._allocate(_KEEP_SIZE | _PUNCH_HOLE, self._position, rest)
-            self._file.truncate(self._position)  # ext4 gives room behind the end back only so
+            self._file.truncate(self._position)  # ext4 releases space beyond the end only this way
         self._file.close()
 
     def _claim(self) -> None:
@@ -184,7 +173,7 @@ class Output:
             self._claims = False
 
     def _allocate(self, mode: int, start: int, size: int) -> int:
-        """Returns the error's number of Linux's fallocate, 0 for none."""
+        """Calls Linux's fallocate; returns the error number, or 0."""
         first, length = ctypes.c_int64(start), ctypes.c_int64(size)
         if self._fallocate is None:
             return errno.EOPNOTSUPP
@@ -194,7 +183,7 @@ class Output:
 
 
 def _fallocate() -> Callable[..., int] | None:
-    """Returns Linux's fallocate with offsets of 64 bits, which Python's os lacks; None without."""
+    """Returns Linux's 64-bit fallocate, which Python's os module lacks; None if unavailable."""
     libc = ctypes.CDLL(None, use_errno=True)
     for name in ("fallocate64", "fallocate"):  # not every C library has both
         if hasattr(libc, name):
@@ -204,20 +193,20 @@ def _fallocate() -> Callable[..., int] | None:
 
 
 class RecordingWriter:
-    """Writes one recording; used by the recorder's process and by ``repair``.
+    """Writer of one recording, for the recorder's process and for ``repair``.
 
     Metadata and attachments are in the file when the constructor returns. Each finished chunk
-    reaches the operating system at once, so a kill loses the last unfinished chunk at most.
+    reaches the operating system at once, so a kill loses at most the last unfinished chunk.
 
     Args:
         path: The file; it is overwritten unless ``exclusive``.
         metadata: Names and values; ``epoch_ns`` is added.
         attachments: Files to carry, with different names.
-        epoch_ns: Unix time of the run's start, in ns.
-        exclusive: Refuse a file that exists.
+        epoch_ns: Unix time of the run's start in ns.
+        exclusive: True refuses an existing file.
 
     Raises:
-        RecordingError: The file cannot be written, or metadata or attachments are not writable.
+        RecordingError: The file cannot be written, or metadata or attachments are not valid.
     """
 
     def __init__(
@@ -280,14 +269,11 @@ class RecordingWriter:
 
     @property
     def is_full(self) -> bool:
-        """Whether the disk is: what is still written goes into room that was claimed before."""
+        """True if the disk is full; the rest goes into the reserve."""
         return self._output.is_full
 
     def write_ticks(self, rows: NDArray[np.void]) -> None:
-        """Appends records.
-
-        Args:
-            rows: Shape (n,), ``TICK_DTYPE``.
+        """Appends records, shape (n,), ``TICK_DTYPE``.
 
         Raises:
             RecordingError: The file cannot be written; it ends with its last whole chunk.
@@ -296,7 +282,7 @@ class RecordingWriter:
         payloads["cdr"] = np.void(layout.CDR_HEADER)
         payloads["record"] = rows
         packed, size = payloads.tobytes(), layout.PAYLOAD_DTYPE.itemsize
-        # a deadline before 1970 or beyond 2554 does not exist, but must not stop the recorder
+        # an impossible deadline (before 1970, after 2554) must not stop the recorder
         times = (rows["deadline_ns"].astype(np.uint64) + np.uint64(self._epoch % 2**64)).tolist()
         self._digest.add_ticks(rows)
         try:
@@ -315,9 +301,7 @@ class RecordingWriter:
     def write_event(self, event: Mapping[str, object], time_ns: int) -> None:
         """Appends an event.
 
-        Args:
-            event: What happened: ``event`` names it, the rest is its data.
-            time_ns: When, in ns since the start of the run.
+        ``event["event"]`` is its name; ``time_ns`` counts from the start of the run.
 
         Raises:
             RecordingError: The file cannot be written; it ends with its last whole chunk.
@@ -331,7 +315,7 @@ class RecordingWriter:
             raise self._failed(error) from error
 
     def close(self) -> None:
-        """Finishes the file: last chunk, digest, index; on disk when it returns.
+        """Finishes the file with last chunk, digest and index, and syncs it to the disk.
 
         Raises:
             RecordingError: The file cannot be written; it ends with its last whole chunk.
@@ -351,7 +335,7 @@ class RecordingWriter:
             self._release()
 
     def _failed(self, error: OSError) -> RecordingError:
-        # nothing may follow a half-written chunk: the file is then one that was cut there
+        # nothing may follow a half-written chunk; the file then counts as cut there
         self._is_closed = True
         self._release()
         return self._refusal(error)
@@ -368,7 +352,7 @@ class RecordingWriter:
 
 
 def check_contents(metadata: Mapping[str, str], attachments: Sequence[Attachment]) -> None:
-    """Checks what a recording is to carry.
+    """Checks metadata and attachments of a recording.
 
     Raises:
         RecordingError: A name or value is not Unicode text, or two attachments have one name.

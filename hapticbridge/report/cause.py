@@ -79,11 +79,8 @@ def what_would_do(evidence: Evidence, *, is_late: bool = False) -> str:
     """Returns changes that satisfy the device condition, as a user would type them.
 
     Stiffness and damping are the requested ones, not the law's B'. Each is changed alone; a change
-    that does not help alone is left out.
-
-    Args:
-        evidence: Evidence of the run; the device's damping is known.
-        is_late: True if a delay is the cause, which a faster loop does not shorten.
+    that does not help alone is left out. A faster loop is no remedy for a delay (``is_late``). The
+    device's damping must be known.
     """
     found = []
     for axis, units in _SETTING_UNITS.items():
@@ -111,11 +108,8 @@ _ROUNDING = 1e-9  # relative; keeps a limit found by bisection from losing a dig
 def _holds(evidence: Evidence, axis: str, part: str, share: float) -> bool:
     """Returns True if the condition on a kind of axis holds after one quantity is reduced.
 
-    Args:
-        evidence: Evidence of the run.
-        axis: A key of ``_SETTING_UNITS``.
-        part: Quantity changed alone: ``stiffness``, ``damping`` or ``period``.
-        share: Share of the quantity that remains.
+    ``axis`` is a key of ``_SETTING_UNITS``. ``part`` (``stiffness``, ``damping`` or ``period``) is
+    reduced to ``share`` of its value.
     """
     worst, felt, method = evidence.worst, evidence.asked, evidence.method
     period = worst.period * (share if part == "period" else 1.0)
@@ -167,12 +161,7 @@ unit. One in fifty is jitter between two clocks."""
 
 
 def cause_at_device(evidence: Evidence, window: slice) -> Cause:
-    """Returns the likely cause of unpaid energy at the device.
-
-    Args:
-        evidence: Evidence of the run.
-        window: Ticks that lead to the moment.
-    """
+    """Returns the likely cause of unpaid energy at the device."""
     method = evidence.method
     hazard = Cause("method", f"method '{method.name}': {method.hazard}", SAFE_METHOD)
     if not method.has_law:
@@ -322,12 +311,7 @@ def touched_pairs(
     """Returns the geoms that touched, those with most energy first; None if unknown.
 
     A record counts contacts without naming them, so the run is simulated again up to the window.
-
-    Args:
-        evidence: Evidence of the run.
-        report: The audit's verdict on it, with the result of the re-simulation.
-        window: Ticks to inspect.
-        gained: Energy created in the environment in each of them, (n,) in J.
+    ``gained`` is the energy created in each tick of the window, (n,) in J.
     """
     if not report.resimulation or report.resimulation.startswith(("not", "disagrees")):
         return None
@@ -359,13 +343,7 @@ _SOFTER = "lower the stiffness, raise the rate, or make the contacts softer"
 
 
 def cause_in_environment(evidence: Evidence, report: AuditReport, window: slice) -> Cause:
-    """Returns the likely cause of energy created in the environment.
-
-    Args:
-        evidence: Evidence of the run.
-        report: The audit's verdict on it.
-        window: Ticks that lead to the moment.
-    """
+    """Returns the likely cause of energy created in the environment."""
     method = evidence.method
     gained = np.diff(evidence.created, prepend=0.0)[window].clip(min=0.0)
     touches = (evidence.ticks["contacts"] > 0)[window]

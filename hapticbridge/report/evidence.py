@@ -214,8 +214,7 @@ class Evidence:
     def judged(self, report: AuditReport) -> tuple[Array, Array]:
         """Returns the energy of the port at fault and its bound, (n,) in J each.
 
-        Args:
-            report: The audit's verdict ``active``.
+        The verdict must be ``active``.
         """
         if report.port == "device":
             return self.kicked, np.zeros_like(self.kicked)

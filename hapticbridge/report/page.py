@@ -58,10 +58,7 @@ def check_page_name(path: Path) -> None:
 def write_page(path: Path, template: str, **told: object) -> None:
     """Writes a page; an existing file is replaced.
 
-    Args:
-        path: The file.
-        template: Name of a file in ``hapticbridge/templates``.
-        told: The template's variables.
+    ``template`` is a file in ``hapticbridge/templates``; ``told`` holds its variables.
 
     Raises:
         RecordingError: The page cannot be written, or not under this name.
@@ -91,9 +88,7 @@ PLACES = {
 def lead_sentence(report: AuditReport, worst: float | None) -> str:
     """Returns the main result of a run in one sentence.
 
-    Args:
-        report: The audit's verdict on it.
-        worst: Largest energy beyond the bound, in J; None if unknown.
+    ``worst`` is the largest energy beyond the bound in J; None if unknown.
     """
     if report.verdict == "invalid":
         return f"This recording proves nothing: {report.reason}"
@@ -139,10 +134,6 @@ def _of_the_device(report: AuditReport) -> list[str]:
 def telling_time(recording: Recording, report: AuditReport) -> float:
     """Returns the time in s of the fault, or else of the largest force.
 
-    Args:
-        recording: The recording.
-        report: The audit's verdict on it.
-
     Raises:
         RecordingError: The recording has no tick or no period.
     """
@@ -160,11 +151,8 @@ def write_report(
 ) -> None:
     """Writes one self-contained HTML page of less than 1 MB, for any length of run.
 
-    Args:
-        recording: The recording.
-        report: The audit's verdict on it.
-        path: The file; an existing one is replaced.
-        scene: PNG picture of the scene at ``telling_time``, or None.
+    ``scene`` is a PNG picture of the scene at ``telling_time``, or None. An existing file is
+    replaced.
 
     Raises:
         RecordingError: The page cannot be written, or not under this name.
@@ -221,12 +209,7 @@ def _drawn(evidence: Evidence, report: AuditReport) -> dict[str, Any]:
 
 
 def moment_of(evidence: Evidence, report: AuditReport) -> dict[str, Any] | None:
-    """Returns time, energy and cause of an active run's fault; None for any other run.
-
-    Args:
-        evidence: Evidence of the run.
-        report: The audit's verdict on it.
-    """
+    """Returns time, energy and cause of an active run's fault; None for any other run."""
     cause = likely_cause(evidence, report)
     if cause is None or report.tick is None:
         return None

@@ -101,9 +101,7 @@ ZOOM = 60
 def draw_moment(evidence: Evidence, report: AuditReport) -> Figure:
     """Draws the ticks around the one at which a port became active.
 
-    Args:
-        evidence: Evidence of the run.
-        report: The audit's verdict ``active``, with a tick of the run.
+    The verdict is ``active``, at a tick of the run.
     """
     tick = report.tick or 0
     around = slice(max(0, tick - ZOOM), tick + ZOOM + 1)

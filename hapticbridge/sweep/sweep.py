@@ -1,4 +1,4 @@
-"""Applies a function to many points, on many workers, and can go on after a kill."""
+"""A function applied to many points on any executor, resumed from a file of results."""
 
 from __future__ import annotations
 
@@ -10,138 +10,240 @@ import multiprocessing
 import os
 import pickle
 import signal
-import sys
 import threading
-from collections import Counter, deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from concurrent.futures import (
     FIRST_COMPLETED,
     BrokenExecutor,
-    CancelledError,
     Executor,
     Future,
     ProcessPoolExecutor,
     ThreadPoolExecutor,
+    wait,
 )
-from concurrent.futures import wait as wait_for
-from multiprocessing.connection import wait
-from pathlib import Path
+from multiprocessing import connection
 from typing import Any
-
-import numpy as np
 
 from hapticbridge.errors import StudyError
 from hapticbridge.files import import_extra
 from hapticbridge.signals import holding_interrupts
-from hapticbridge.sweep.points import RESERVED, Point, Value, checked_points, plain
-from hapticbridge.sweep.results import (
-    Interrupted,
-    Outcome,
-    ResultFolder,
-    Table,
-    check_format,
-    table_of,
-)
+from hapticbridge.sweep.points import Point, Value, checked_points, plain, point_key
+from hapticbridge.sweep.results import Interrupted, Outcome, ResultFile, Table, table_of
+
+WORKER_DIED = "WorkerDied: its process ended twice while it computed this point"
+
+_CHUNKS_PER_CORE = 32
+"""Tasks per core by default. A kill then costs at most 3 % of a sweep."""
+
+_LARGEST_CHUNK = 256
+"""Points per task at most. Above it, sending and writing cost less than 10 µs per point."""
+
+_IN_FLIGHT = 64
+"""Tasks in flight on an executor of unknown size. More workers than that would idle."""
 
 _LONGEST_ERROR = 1000
 """Letters of an error that are kept."""
 
-WORKER_DIED = "WorkerDied: the worker process ended while it computed this point, twice"
+_PATIENCE = 3.0
+"""Time in s for a dask scheduler to answer. A local one takes 0.05 s; a far one needs more."""
+
+_WORKERS_PATIENCE = 5.0
+"""Time in s for a dask scheduler to have a worker. One that was just started takes 2 s."""
+
+_ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+"""Environment of the sweep's own processes, unless the user set it. There is one process per core;
+with more threads, OpenBLAS spins 0.1 s after every matrix exponential and the map ``contact`` takes
+twice as long."""
+
+_Finished = Generator[tuple[list[Point], list[Outcome]], None, None]
 
 
-def run_task(function: Callable[[Any], Any], batched: bool, points: list[Point]) -> list[Outcome]:
-    """Applies a function to points, in a worker.
+def sweep(
+    function: Callable[[Any], Any],
+    points: Iterable[Mapping[str, object]],
+    *,
+    results: str | os.PathLike[str] | None = None,
+    chunk: int | None = None,
+    executor: Executor | None = None,
+    scheduler: str | None = None,
+    jobs: int | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Table:
+    """Applies a function to every point and returns a table of the results.
 
-    Where a batch fails as a whole, its points are computed one at a time, so that only those
-    that fail alone are recorded as failed.
+    The table depends on the function and the points alone: not on the executor, the size of tasks
+    or an interruption. A point whose function raises gets a row with the ``error``. If one of this
+    sweep's processes dies, the points that it may have held are computed again, each in a process
+    of its own; a point whose process dies again gets a row with an ``error``. Ctrl-C keeps the
+    points that are done.
 
     Args:
-        function: Takes one point, or a list of them where ``batched``.
-        batched: See ``function``.
-        points: The points of this task.
-
-    Returns:
-        What became of each point. Nothing that the function raises gets out, KeyboardInterrupt
-        excepted.
-    """
-    if not batched:
-        return [_alone(function, point) for point in points]
-    try:
-        answers = _batch(function, points)
-    except (Exception, SystemExit) as error:
-        if len(points) == 1:
-            return [_failure(error)]
-        return [done for point in points for done in run_task(function, True, [point])]
-    return [_checked(answer, point) for answer, point in zip(answers, points, strict=True)]
-
-
-def qualified_name(function: Callable[[Any], Any]) -> str:
-    """Returns a name by which a function is known again, in another process and on another day.
-
-    A ``functools.partial`` is named by its function and the ``repr`` of its arguments.
+        function: Takes a point (a dict of parameters) and returns a mapping of results: numbers
+            (NaN and infinity too), flags or text. It stands at the top level of a module, or is a
+            ``functools.partial`` of such a one. Its random numbers must come from the point.
+        points: Mappings of parameters to finite numbers, flags or text; all with the same names.
+            See ``grid``.
+        results: File that keeps the results. Points that it holds, failed ones too, are not
+            computed again. One sweep at a time may use a file.
+        chunk: Points per task, >= 1; by default 1/32 of a core's share, 256 at most.
+        executor: Any executor; it stays open. By default fresh processes, one per core.
+        scheduler: Address of a dask.distributed scheduler (extra ``cluster``) instead.
+        jobs: Processes at most, >= 1; 1 works in this process.
+        progress: Called with the numbers of finished and of all points, first before any task.
 
     Raises:
-        StudyError: The function does not stand at the top level of a module, or cannot be sent to
-            another process.
+        StudyError: The points, the function, the file or the workers cannot be used.
+        Interrupted: Ctrl-C, with the rows of the points that are done; KeyboardInterrupt where
+            none is.
     """
-    if isinstance(function, functools.partial):
-        with np.printoptions(threshold=sys.maxsize, floatmode="unique"):
-            settings = [repr(value) for value in function.args]
-            settings += [f"{name}={value!r}" for name, value in sorted(function.keywords.items())]
-        name = f"{qualified_name(function.func)}({', '.join(settings)})"
-    else:
-        inner = getattr(function, "__qualname__", type(function).__name__)
-        module = getattr(function, "__module__", None) or "?"
-        if "<" in inner or not hasattr(function, "__qualname__"):
-            raise StudyError(
-                f"{inner} of {module} cannot be swept: workers import the function, so it must be "
-                "defined at the top level of a module (or be a functools.partial of such a one)"
-            )
-        if module == "__main__":
-            module = Path(getattr(sys.modules[module], "__file__", None) or "__main__").stem
-        name = f"{module}.{inner}"
+    name = _name_of(function)
+    wanted = checked_points(points)
+    if executor is not None and scheduler is not None:
+        raise StudyError("executor and scheduler were both given; give one of them")
+    for word, count in (("chunk", chunk), ("jobs", jobs)):
+        if count is not None and (type(count) is not int or count < 1):
+            raise StudyError(f"{word} is {count!r:.60}; it must be a whole number >= 1")
+    kept = None if results is None else ResultFile(results, name)
+    done = {} if kept is None else kept.read(wanted)
+    report = progress or (lambda _done, _all: None)
+    report(len(done), len(wanted))
+    missing = [point for key, point in wanted.items() if key not in done]
+    size = chunk or min(_LARGEST_CHUNK, math.ceil(len(missing) / (_CHUNKS_PER_CORE * cores())))
+    chunks = deque(missing[start : start + size] for start in range(0, len(missing), size or 1))
+
+    def rows() -> Table:
+        ready = [key for key in wanted if key in done]
+        return table_of([wanted[key] for key in ready], [done[key] for key in ready])
+
     try:
-        pickle.dumps(function)
-    except Exception as error:
-        raise StudyError(f"{name:.200} cannot be sent to a worker: {error}") from None
-    return name
+        with contextlib.closing(_computed(function, chunks, executor, scheduler, jobs)) as finished:
+            for computed, outcomes in finished:
+                if kept is not None:
+                    kept.add(computed, outcomes)
+                done.update(zip(map(point_key, computed), outcomes, strict=True))
+                report(len(done), len(wanted))
+    except KeyboardInterrupt:
+        if done:
+            raise Interrupted(rows()) from None
+        raise
+    return rows()
 
 
-def _batch(function: Callable[[Any], Any], points: Sequence[Point]) -> list[object]:
-    answers = list(function([dict(point) for point in points]))
-    if len(answers) != len(points):
-        raise ValueError(f"the function returned {len(answers)} results for {len(points)} points")
-    return answers
+def cores() -> int:
+    """Returns the number of cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def _computed(
+    function: Callable[[Any], Any],
+    chunks: deque[list[Point]],
+    executor: Executor | None,
+    scheduler: str | None,
+    jobs: int | None,
+) -> _Finished:
+    """Yields chunks with their outcomes as they are finished; empties ``chunks``."""
+    if executor is None and scheduler is None and jobs == 1:
+        while chunks:
+            chunk = chunks.popleft()
+            yield chunk, _outcomes(function, chunk)
+    elif executor is not None:
+        _refuse_lost((yield from _submitted(executor, function, chunks, _IN_FLIGHT)))
+    elif scheduler is not None:
+        with _cluster(scheduler) as (workers, count):
+            _refuse_lost((yield from _submitted(workers, function, chunks, 2 * count)))
+    while chunks:
+        count = min(jobs or cores(), len(chunks))
+        with _processes(function, count) as pool:
+            # one task waits behind each that runs, so that no process is ever without work
+            lost = yield from _submitted(pool, function, chunks, 2 * count)
+        for point in lost:
+            yield [point], [_alone(function, point)]
+
+
+def _submitted(
+    executor: Executor, function: Callable[[Any], Any], chunks: deque[list[Point]], depth: int
+) -> Generator[tuple[list[Point], list[Outcome]], None, list[Point]]:
+    """Computes chunks until none is left or the executor breaks.
+
+    Returns:
+        The points that were in flight when the executor broke.
+    """
+    running: dict[Future[list[Outcome]], list[Point]] = {}
+    lost: list[Point] = []
+    try:
+        while running or (chunks and not lost):
+            while chunks and not lost and len(running) < depth:
+                try:
+                    running[executor.submit(_outcomes, function, chunks[0])] = chunks[0]
+                except BrokenExecutor:
+                    lost = chunks[0]
+                except RuntimeError as error:
+                    raise StudyError(f"the executor takes no tasks: {error}") from None
+                chunks.popleft()
+            for future in wait(running, return_when=FIRST_COMPLETED).done:
+                chunk = running[future]
+                error = future.exception()
+                if isinstance(error, BrokenExecutor):
+                    lost = [*lost, *chunk]
+                elif error is not None:
+                    yield chunk, [_failure(error)] * len(chunk)
+                else:
+                    yield chunk, future.result()
+                del running[future]
+    except KeyboardInterrupt:
+        for future in running:
+            future.cancel()
+        with holding_interrupts():
+            for future in wait(running).done:
+                if not future.cancelled() and future.exception() is None:
+                    yield running[future], future.result()
+        raise
+    return lost
+
+
+def _refuse_lost(points: list[Point]) -> None:
+    if points:
+        raise StudyError(
+            f"a worker of the executor died while it computed one of {points!r:.300}; sweep again "
+            "with a fresh executor, and with a file of results to keep what is done"
+        )
 
 
 def _alone(function: Callable[[Any], Any], point: Point) -> Outcome:
-    try:
-        answer = function(dict(point))
-    except (Exception, SystemExit) as error:  # whatever it is, it is recorded
-        return _failure(error)
-    return _checked(answer, point)
+    """Computes a point in a process of its own."""
+    with _processes(function, 1) as pool:
+        try:
+            return pool.submit(_outcomes, function, [point]).result()[0]
+        except BrokenExecutor:
+            return Outcome({}, WORKER_DIED)
 
 
-def _checked(answer: object, point: Point) -> Outcome:
-    try:
-        return Outcome(_results(answer, point))
-    except ValueError as error:
-        return _failure(error)
+def _outcomes(function: Callable[[Any], Any], points: list[Point]) -> list[Outcome]:
+    """Applies a function to points, in a worker. Only KeyboardInterrupt leaves it."""
+    outcomes = []
+    for point in points:
+        try:
+            outcomes.append(Outcome(_results(function(dict(point)), point)))
+        except (Exception, SystemExit) as error:
+            outcomes.append(_failure(error))
+    return outcomes
 
 
 def _results(answer: object, point: Point) -> dict[str, Value]:
-    """Returns what a function gave back with plain values.
+    """Returns the results of a point with plain values.
 
     Raises:
-        ValueError: It is no mapping of names to numbers, flags or text, or a name is taken.
+        TypeError: They are no mapping with names.
+        ValueError: A value is no number, flag or text, or a name is taken.
     """
-    if not isinstance(answer, Mapping):
-        raise ValueError(f"the function returned {answer!r:.60}, not a mapping of results")  # noqa: TRY004
-    found: dict[str, Value] = {}
+    if not isinstance(answer, Mapping) or not all(isinstance(name, str) for name in answer):
+        raise TypeError(f"the function returned {answer!r:.60}, not a mapping of named results")
+    found = {}
     for name, value in answer.items():
-        if not isinstance(name, str) or not name or not name.isprintable():
-            raise ValueError(f"result {name!r:.60} has no name; it must be printable text")
-        if name in RESERVED or name in point:
+        if name == "error" or name in point:
             raise ValueError(f"result '{name}' has the name of another column")
         try:
             found[name] = plain(value)
@@ -151,496 +253,128 @@ def _results(answer: object, point: Point) -> dict[str, Value]:
 
 
 def _failure(error: BaseException) -> Outcome:
-    """Returns what is recorded of a point that failed: the error's type and message."""
-    try:
-        text = f"{type(error).__name__}: {error}"
-    except Exception:
-        text = type(error).__name__
-    # a lone surrogate has no bytes and could not be written down
+    """Returns the outcome of a failed point: type and message of its error."""
+    text = f"{type(error).__name__}: {error}"
+    # a lone surrogate has no bytes and could not be written
     return Outcome({}, text[:_LONGEST_ERROR].encode(errors="backslashreplace").decode())
 
 
-IN_FLIGHT = 64
-"""Tasks in flight where the number of workers is not known: more workers than that would idle."""
+def _name_of(function: Callable[[Any], Any]) -> str:
+    """Returns a name that identifies a function, with the arguments of a ``functools.partial``.
 
-
-def cores() -> int:
-    """Returns how many cores this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
-
-
-class InThisProcess(Executor):
-    """Works while it submits: for few tasks, where a process would take longer to start."""
-
-    def submit(self, task: Callable[..., Any], /, *arguments: Any, **named: Any) -> Future[Any]:
-        """Does the task; what it raises is the future's."""
-        future: Future[Any] = Future()
-        try:
-            future.set_result(task(*arguments, **named))
-        except Exception as error:
-            future.set_exception(error)
-        return future
-
-
-class Workers:
-    """An executor that somebody else owns.
-
-    Attributes:
-        depth: How many tasks to keep in flight.
+    Raises:
+        StudyError: The function does not stand at the top level of a module, or cannot be sent to
+            another process.
     """
-
-    def __init__(self, executor: Executor, depth: int = IN_FLIGHT) -> None:
-        self.executor = executor
-        self.depth = depth
-
-    def submit(self, task: Callable[..., Any], *arguments: object) -> Future[Any]:
-        """Hands one task over.
-
-        Raises:
-            BrokenExecutor: A worker died; ``restart`` is next.
-            StudyError: The executor takes no more tasks.
-        """
-        try:
-            return self.executor.submit(task, *arguments)
-        except BrokenExecutor:
-            raise
-        except RuntimeError as error:
-            raise StudyError(f"the executor takes no tasks: {error}") from None
-
-    def restart(self) -> None:
-        """Puts fresh workers in the place of dead ones.
-
-        Raises:
-            StudyError: That cannot be done.
-        """
-        raise StudyError(
-            "a worker of the executor died and it takes no more tasks; sweep again with a fresh "
-            "one, and a folder to keep what is done"
-        )
-
-    def is_death(self, error: BaseException) -> bool:
-        """Tells whether a task's error means that its worker died, not that the task is wrong."""
-        return isinstance(error, BrokenExecutor)
-
-    def stop(self) -> None:
-        """Waits for tasks that cannot be cancelled, where these workers are the sweep's own."""
-
-    def close(self) -> None:
-        """Gives back what was opened."""
+    if isinstance(function, functools.partial):
+        given = [*map(repr, function.args)]
+        given += [f"{name}={value!r}" for name, value in sorted(function.keywords.items())]
+        name = f"{_name_of(function.func)}({', '.join(given)})"
+    else:
+        name = f"{function.__module__}.{getattr(function, '__qualname__', '<object>')}"
+        if "<" in name:
+            raise StudyError(
+                f"{name} cannot be swept: workers import the function, so it must be defined at "
+                "the top level of a module (or be a functools.partial of such a one)"
+            )
+    try:
+        pickle.dumps(function)
+    except Exception as error:
+        raise StudyError(f"{name:.200} cannot be sent to a worker: {error}") from None
+    return name
 
 
-_PATIENCE = 3.0
-"""Seconds for a dask scheduler to answer; a local one takes 0.05 s. Shorter refuses a far one."""
-
-_WORKERS_PATIENCE = 5.0
-"""Seconds for a dask scheduler to have a worker: one that was just started takes 2 s."""
-
-
-class ClusterWorkers(Workers):
-    """The workers of a running dask.distributed cluster.
+@contextlib.contextmanager
+def _cluster(scheduler: str) -> Iterator[tuple[Executor, int]]:
+    """Connects to a dask.distributed cluster; yields its executor and its number of cores.
 
     Raises:
         StudyError: dask is not installed, no scheduler answers, or it has no workers.
     """
+    distributed = import_extra("distributed", "a scheduler", "cluster", StudyError, "dask")
 
-    def __init__(self, scheduler: str) -> None:
-        distributed = import_extra("distributed", "a scheduler", "cluster", StudyError, "dask")
+    async def reach() -> None:
+        comm = await distributed.comm.connect(scheduler, timeout=_PATIENCE)
+        await comm.close()
+
+    try:
+        # A client that was refused takes 10 s to be given up and prints a traceback, so it is
+        # opened only where something answers. The thread: this one may run a loop already.
+        with ThreadPoolExecutor(1) as thread:
+            thread.submit(asyncio.run, asyncio.wait_for(reach(), _PATIENCE)).result()
+        client = distributed.Client(scheduler, timeout=_PATIENCE, set_as_default=False)
+    except Exception as error:
+        why = str(error) or f"nothing came within {_PATIENCE:g} s"
+        raise StudyError(
+            f"no dask scheduler answers at {scheduler!r:.100} ({why:.200}); its address looks "
+            "like tcp://host:8786"
+        ) from None
+    with client:
         try:
-            # asked beforehand, because a client that was refused takes 10 s to be given up, and
-            # ends in a traceback; in a thread of its own, because this one may run a loop already
-            with ThreadPoolExecutor(1) as thread:
-                thread.submit(asyncio.run, _identity(distributed, scheduler)).result()
-            self._client = distributed.Client(scheduler, timeout=_PATIENCE, set_as_default=False)
-        except Exception as error:  # something else may listen there and answer anything
-            why = str(error) or f"nothing came within {_PATIENCE:g} s"
-            raise StudyError(
-                f"no dask scheduler answers at {scheduler!r:.100} ({why:.200}); its address looks "
-                "like tcp://host:8786"
-            ) from None
-        try:
-            self._client.wait_for_workers(1, timeout=_WORKERS_PATIENCE)
+            client.wait_for_workers(1, timeout=_WORKERS_PATIENCE)
         except OSError:
-            self._client.close()
             raise StudyError(
                 f"the dask scheduler at {scheduler} has no workers; start some with: "
                 f"dask worker {scheduler}"
             ) from None
-        self._death = distributed.scheduler.KilledWorker
-        count = sum(self._client.ncores().values())
         # a task may have side effects that the caller counts on: never answered from a cache
-        executor = self._client.get_executor(pure=False)
-        super().__init__(executor, depth=max(IN_FLIGHT, 2 * count))
-
-    def restart(self) -> None:
-        """The scheduler has started fresh workers itself."""
-
-    def is_death(self, error: BaseException) -> bool:
-        """See ``Workers.is_death``."""
-        return isinstance(error, self._death)
-
-    def close(self) -> None:
-        """See ``Workers.close``."""
-        self._client.close()
+        yield client.get_executor(pure=False), sum(client.ncores().values())
 
 
-async def _identity(distributed: Any, scheduler: str) -> None:
-    """Asks a dask scheduler who it is.
+class _Processes(ProcessPoolExecutor):
+    """Processes with one thread for linear algebra each, that end with this one.
 
-    Raises:
-        Exception: It does not answer in time, or not as a scheduler.
-    """
-    arguments = distributed.Security().get_connection_args("client")
-    async with distributed.rpc(scheduler, connection_args=arguments) as asked:
-        answer = await asyncio.wait_for(asked.identity(), _PATIENCE)
-    if answer["type"] != "Scheduler":
-        raise ValueError(f"a {answer['type']} answers there")
-
-
-_ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
-"""Set for the sweep's own processes unless the user did: there is one a core already. With more,
-the idle threads of OpenBLAS spin for 0.1 s after every matrix exponential, which is one a
-closed-loop run; the map ``contact`` took twice as long."""
-
-
-class ProcessWorkers(Workers):
-    """Processes of this sweep's own, started afresh (spawn).
-
-    A forked process would inherit the locks of the threads that NumPy, MuJoCo and numba start.
-
-    Raises:
-        StudyError: The processes cannot start, or cannot import the function.
+    They are started afresh (spawn): a forked process would inherit the locks of the threads that
+    NumPy, MuJoCo and numba start.
     """
 
-    def __init__(self, function: Callable[[Any], Any], tasks: int, jobs: int | None = None) -> None:
-        self._function = function
-        self._count = max(1, min(jobs or cores(), tasks))
-        # one task waits behind each that runs, so that no process is ever without work
-        super().__init__(self._pool(), depth=2 * self._count)
-        self._probe()
+    def __init__(self, count: int) -> None:
+        super().__init__(count, multiprocessing.get_context("spawn"), _start_process)
 
-    def submit(self, task: Callable[..., Any], *arguments: object) -> Future[Any]:
-        """See ``Workers.submit``; a pool starts its processes one by one, as tasks come."""
-        # libraries read the environment as they load
-        with holding_interrupts(), _environment(_ONE_THREAD):
-            return super().submit(task, *arguments)
-
-    def restart(self) -> None:
-        """See ``Workers.restart``."""
-        self.executor.shutdown(wait=True, cancel_futures=True)
-        self.executor = self._pool()
-        self._probe()
-
-    def stop(self) -> None:
-        """See ``Workers.stop``."""
-        self.executor.shutdown(wait=True, cancel_futures=True)
-
-    def close(self) -> None:
-        """See ``Workers.close``."""
-        self.stop()
-
-    def _pool(self) -> ProcessPoolExecutor:
-        context = multiprocessing.get_context("spawn")
-        return ProcessPoolExecutor(self._count, context, initializer=_start_process)
-
-    def _probe(self) -> None:
-        """Makes sure that a process starts and knows the function, before any point is blamed."""
-        try:
-            self.submit(callable, self._function).result()
-        except (BrokenExecutor, OSError):
-            self.close()
-            raise StudyError(
-                "worker processes end as soon as they start: each imports the module of the "
-                "swept function and the main program, so both must be importable files, and a "
-                "program must call sweep below `if __name__ == '__main__':`"
-            ) from None
-        except BaseException:
-            self.close()
-            raise
+    def submit(self, task: Callable[..., Any], /, *args: Any, **named: Any) -> Future[Any]:
+        """Hands a task over; a process that starts for it holds Ctrl-C back while it imports."""
+        missing = {name: value for name, value in _ONE_THREAD.items() if name not in os.environ}
+        with holding_interrupts():
+            os.environ.update(missing)
+            try:
+                return super().submit(task, *args, **named)
+            finally:
+                for name in missing:
+                    del os.environ[name]
 
 
 @contextlib.contextmanager
-def _environment(variables: Mapping[str, str]) -> Iterator[None]:
-    """Sets environment variables that are not set yet, for the processes that start meanwhile."""
-    missing = {name: value for name, value in variables.items() if name not in os.environ}
-    os.environ.update(missing)
+def _processes(function: Callable[[Any], Any], count: int) -> Iterator[Executor]:
+    """Opens processes of this sweep's own.
+
+    Raises:
+        StudyError: They cannot start, or cannot import the function.
+    """
+    pool = _Processes(count)
     try:
-        yield
+        try:
+            pool.submit(callable, function).result()
+        except BrokenExecutor:
+            raise StudyError(
+                "worker processes end as soon as they start: each imports the module of the swept "
+                "function and the main program, so both must be importable files, and a program "
+                "must call sweep below `if __name__ == '__main__':`"
+            ) from None
+        yield pool
     finally:
-        for name in missing:
-            os.environ.pop(name, None)
+        pool.shutdown(wait=True, cancel_futures=True)
 
 
 def _start_process() -> None:
-    """Prepares a worker process: it goes with Ctrl-C, silently, and with its parent."""
+    """Prepares a worker process, which ends silently on Ctrl-C and with its parent."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     if hasattr(signal, "pthread_sigmask"):
-        # held back while it started; one that came meanwhile ends it here
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     threading.Thread(target=_leave_with_parent, daemon=True).start()
 
 
 def _leave_with_parent() -> None:
-    """Ends this process when its parent is gone.
-
-    After kill -9 of the parent nobody tells a pool's processes to end, and each holds the pipe
-    open on which it waits.
-    """
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        wait([parent.sentinel])
+    """Ends this process when its parent has ended; a pool's processes would wait for ever."""
+    if parent := multiprocessing.parent_process():
+        connection.wait([parent.sentinel])
         os._exit(1)
-
-
-@contextlib.contextmanager
-def hired(
-    function: Callable[[Any], Any],
-    executor: Executor | None,
-    scheduler: str | None,
-    tasks: int,
-    jobs: int | None = None,
-) -> Iterator[Workers]:
-    """Opens the workers of a sweep and closes those that it opened.
-
-    Raises:
-        StudyError: They cannot be had.
-    """
-    if executor is not None:
-        workers = Workers(executor)
-    elif scheduler is not None:
-        workers = ClusterWorkers(scheduler)
-    else:
-        workers = ProcessWorkers(function, tasks, jobs)
-    try:
-        yield workers
-    finally:
-        workers.close()
-
-
-Chunk = dict[str, Point]
-"""The points of one task, by their keys."""
-
-_CHUNKS_PER_CORE = 32
-"""Tasks a core where nobody chooses: a kill then costs some 3 % of a sweep at most."""
-
-_LARGEST_CHUNK = 256
-"""Points; beyond that the share of sending and writing a part is below 10 µs a point anyway."""
-
-_LIVES = 2
-"""A point whose worker dies is tried once more: the system may have killed it for memory."""
-
-
-def sweep(
-    function: Callable[[Any], Any],
-    points: Iterable[Mapping[str, object]],
-    *,
-    batched: bool = False,
-    folder: str | os.PathLike[str] | None = None,
-    format: str = "csv",  # noqa: A002 - the word that a caller expects
-    chunk: int | None = None,
-    executor: Executor | None = None,
-    scheduler: str | None = None,
-    jobs: int | None = None,
-    progress: Callable[[int, int], None] | None = None,
-) -> Table:
-    """Applies a function to every point and returns a table of what it returned.
-
-    The table depends on the function and the points alone: not on the executor, the size of
-    tasks, the order in which they end, or on how often the sweep was killed and begun again.
-
-    With a folder, what is done is kept there, a part a task, each written whole or not at all. A
-    sweep with the same folder and function takes the points it finds from there and computes the
-    others. The function is known by its name, hapticbridge's version and sources, and
-    MuJoCo's version; after a change of other code take another folder.
-    Failed points are kept too, and not tried again. One sweep at a time
-    may use a folder.
-
-    What goes wrong: a point whose function raises gets a row with the ``error``. So does a point
-    that ends its worker process twice; the others of its task are computed again. Ctrl-C keeps
-    what is done, cancels what waits, and raises ``Interrupted`` with those rows, or, without any,
-    KeyboardInterrupt. In a terminal it ends this sweep's own processes with it; where it reaches
-    this process alone, tasks that were handed to them, two a core at most, are waited for and kept.
-
-    Args:
-        function: Takes a point (a dict of parameters) and returns a mapping of results: numbers
-            (NaN and infinity too), flags or text. It stands at the top level of a module, or is a
-            ``functools.partial`` of such a one. Its own random numbers must come from the point.
-        points: Mappings of parameters to finite numbers, flags or text; all with the same names,
-            none twice. See ``grid``.
-        batched: The function takes a list of points and returns a list of as many results, so
-            that threads inside one task can share them. Where it raises, its points are given
-            to it one by one.
-        folder: Where parts are kept; made if missing.
-        format: Of the parts: "csv", or "parquet" (needs the extra ``tables``).
-        chunk: Points a task, >= 1; by default 1/32 of a core's share, 256 at most.
-        executor: Any executor; it stays open. By default a pool of fresh processes, as many as
-            the cores that this process may use.
-        scheduler: Address of a running dask.distributed cluster (needs the extra ``cluster``),
-            instead of an executor.
-        jobs: Processes at most where neither is given, >= 1; by default as many as there are cores.
-        progress: Called with the points done and all points, at the start and after every task.
-
-    Returns:
-        A table with a row a point, in their order.
-
-    Raises:
-        StudyError: The points, the function, the format, the folder or the workers cannot be
-            used, or the folder holds another sweep.
-    """
-    name = qualified_name(function)
-    wanted = checked_points(points)
-    check_format(format)
-    if executor is not None and scheduler is not None:
-        raise StudyError("executor and scheduler were both given; give one of them")
-    for word, count in (("chunk", chunk), ("jobs", jobs)):
-        if count is not None and (
-            isinstance(count, bool) or not isinstance(count, int) or count < 1
-        ):
-            raise StudyError(f"{word} is {count!r:.60}; it must be a whole number >= 1")
-    parameters = tuple(next(iter(wanted.values())))
-    done: dict[str, Outcome] = {}
-    kept = None
-    if folder is not None:
-        kept = ResultFolder(folder, name, format)
-        done = kept.read(wanted)
-        kept.describe(parameters, (), len(wanted))
-    report = progress or _silent
-    report(len(done), len(wanted))
-
-    def keep(chunk: Chunk, outcomes: list[Outcome]) -> None:
-        if kept is not None:
-            kept.add(chunk, outcomes)
-        done.update(zip(chunk, outcomes, strict=True))
-        report(len(done), len(wanted))
-
-    def rows() -> Table:
-        keys = [key for key in wanted if key in done]
-        return table_of([wanted[key] for key in keys], [done[key] for key in keys])
-
-    missing = {key: point for key, point in wanted.items() if key not in done}
-    if missing:
-        chunks = deque(_cut(missing, chunk or _usual_chunk(len(missing))))
-        try:
-            with hired(function, executor, scheduler, len(chunks), jobs) as workers:
-                _Shift(workers, function, batched, keep).work(chunks)
-        except KeyboardInterrupt:
-            if done:
-                raise Interrupted(rows()) from None
-            raise
-    table = rows()
-    if kept is not None:
-        kept.describe(parameters, table.results, len(wanted))
-    return table
-
-
-class _Shift:
-    """The tasks in flight, and what is known of those whose workers died."""
-
-    def __init__(
-        self,
-        workers: Workers,
-        function: Callable[[Any], Any],
-        batched: bool,
-        keep: Callable[[Chunk, list[Outcome]], None],
-    ) -> None:
-        self._workers = workers
-        self._function = function
-        self._batched = batched
-        self._keep = keep
-        self._running: dict[Future[list[Outcome]], Chunk] = {}
-        # chunks that were in flight when a worker died; they run alone, to find the culprit
-        self._suspects: deque[Chunk] = deque()
-        self._deaths: Counter[str] = Counter()
-
-    def work(self, chunks: deque[Chunk]) -> None:
-        """Computes all chunks, or keeps what is done and raises."""
-        try:
-            while chunks or self._suspects or self._running:
-                if not self._submit(chunks):
-                    self._collect(wait_for(self._running, return_when=FIRST_COMPLETED).done)
-        except BaseException:
-            self._wind_up()
-            raise
-
-    def _submit(self, chunks: deque[Chunk]) -> bool:
-        """Hands out one chunk; tells whether there is nothing to wait for yet."""
-        source, depth = (self._suspects, 1) if self._suspects else (chunks, self._workers.depth)
-        if not source or len(self._running) >= depth:
-            return False
-        points = list(source[0].values())
-        try:
-            future = self._workers.submit(run_task, self._function, self._batched, points)
-        except BrokenExecutor:
-            if self._running:
-                return False
-            self._workers.restart()
-            return True
-        self._running[future] = source.popleft()
-        if future.done():  # an executor that works while it submits: keep it now
-            self._collect({future})
-        return True
-
-    def _collect(self, finished: set[Future[list[Outcome]]]) -> None:
-        """Keeps what is done; sorts out the tasks whose worker died."""
-        dead = [chunk for future in finished if (chunk := self._settle(future))]
-        if not dead:
-            return
-        if any(isinstance(future.exception(), BrokenExecutor) for future in finished):
-            # a pool that lost one process gives all of its tasks up
-            finished = wait_for(self._running).done
-            dead += [chunk for future in finished if (chunk := self._settle(future))]
-            self._workers.restart()
-        if len(dead) > 1:
-            self._suspects.extend(dead)
-        elif len(dead[0]) > 1:
-            self._suspects.extendleft(reversed(list(_cut(dead[0], 1))))
-        else:
-            (key,) = dead[0]
-            self._deaths[key] += 1
-            if self._deaths[key] < _LIVES:
-                self._suspects.appendleft(dead[0])
-            else:
-                self._keep(dead[0], [Outcome({}, WORKER_DIED)])
-
-    def _settle(self, future: Future[list[Outcome]]) -> Chunk | None:
-        """Keeps a finished task's outcomes, or returns its points if its worker died."""
-        chunk = self._running[future]
-        try:
-            outcomes = future.result()
-        except (Exception, CancelledError) as error:
-            del self._running[future]
-            if self._workers.is_death(error):
-                return chunk
-            raise StudyError(
-                f"the workers could not run a task ({type(error).__name__}: {error!s:.300})"
-            ) from error
-        self._keep(chunk, outcomes)
-        del self._running[future]  # not before: Ctrl-C may come at any moment
-        return None
-
-    def _wind_up(self) -> None:
-        """Cancels what waits and keeps what is done; nothing here hides the first error."""
-        with holding_interrupts():  # a second Ctrl-C would lose what the first one keeps
-            for future in self._running:
-                future.cancel()
-            self._workers.stop()
-            for future, chunk in self._running.items():
-                if future.done() and not future.cancelled() and future.exception() is None:
-                    with contextlib.suppress(Exception):
-                        self._keep(chunk, future.result())
-
-
-def _cut(points: Chunk, size: int) -> Iterator[Chunk]:
-    """Yields points in chunks, in their order."""
-    keys = list(points)
-    for start in range(0, len(keys), size):
-        yield {key: points[key] for key in keys[start : start + size]}
-
-
-def _usual_chunk(count: int) -> int:
-    return min(_LARGEST_CHUNK, math.ceil(count / (_CHUNKS_PER_CORE * cores())))
-
-
-def _silent(_done: int, _total: int) -> None:
-    """Says nothing: the library draws no progress."""

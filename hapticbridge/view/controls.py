@@ -19,7 +19,7 @@ from typing import Any
 import viser
 
 from hapticbridge.commands import Command, Couple, CouplingLimits, Mark, Reset, Switch
-from hapticbridge.commands.allowed import UNITS
+from hapticbridge.commands.allowed import UNITS, AxisCouplingLimits
 from hapticbridge.commands.command import Stop, line_of
 from hapticbridge.commands.execution import INTERVAL
 from hapticbridge.coupling import Coupling
@@ -28,7 +28,6 @@ from hapticbridge.errors import CommandError
 from hapticbridge.guard import Limits
 from hapticbridge.rendering import method_named
 from hapticbridge.run_description import parameters_of
-from hapticbridge.view.sliders import SYMBOLS, Sliders, by_hand
 
 PACE = 2.0 * INTERVAL
 """In s, least time between two lines to the bridge. At its own limit a line that was held up and
@@ -36,6 +35,18 @@ the next one would come too close, and be refused."""
 
 STILL = 0.5
 """In s: for so long after the last touch a slider is not put anywhere; it may be in a hand."""
+
+FINENESS = 1e-3
+"""Least step of a slider as a share of its largest value, rounded down to a power of ten. A finer
+one is not felt, a coarser one is."""
+
+_ROUNDING = 1.0 + 1e-9  # a bound of 2 that was found as 1.9999999999 is one of 2
+
+SYMBOLS = {"translation": ("K", "B"), "rotation": ("K_r", "B_r")}
+_WORDS = {
+    "translation": ("stiffness", "damping"),
+    "rotation": ("turning stiffness", "turning damping"),
+}
 
 
 def allowance_of(metadata: Mapping[str, str]) -> CouplingLimits:
@@ -95,6 +106,84 @@ class Outlet:
                     command = self._waiting.pop(kind)
                 os.write(self._file, line_of(command))
                 time.sleep(PACE)
+
+
+class Sliders:
+    """Stiffness and damping along one kind of axis.
+
+    Args:
+        gui: Where.
+        span: What the device allows.
+        want: Called when a hand has moved one of them.
+
+    Attributes:
+        span: Likewise.
+    """
+
+    def __init__(
+        self, gui: viser.GuiApi, span: AxisCouplingLimits, want: Callable[[], None]
+    ) -> None:
+        self.span = span
+        stiffness, damping = span.gains(span.start)
+        self._steps = (
+            _step(max(span.most_stiffness(0.0), stiffness)),
+            _step(max(span.most_damping(span.least_stiffness), damping)),
+        )
+        least = _up(span.least_stiffness, self._steps[0])
+        most = self._ends(stiffness, damping, least)
+        labels = [
+            f"{word} {symbol} ({unit})"
+            for word, symbol, unit in zip(
+                _WORDS[span.axis], SYMBOLS[span.axis], UNITS[span.axis], strict=True
+            )
+        ]
+        shown = self._shown(stiffness, damping, (least, 0.0), most)
+        self._stiffness = gui.add_slider(labels[0], least, most[0], self._steps[0], shown[0])
+        self._damping = gui.add_slider(labels[1], 0.0, most[1], self._steps[1], shown[1])
+        self._stiffness.on_update(by_hand(want))
+        self._damping.on_update(by_hand(want))
+
+    @property
+    def value(self) -> tuple[float, float]:
+        """What they show; whatever a browser has sent."""
+        return self._stiffness.value, self._damping.value
+
+    def show(self, stiffness: float, damping: float) -> None:
+        """Puts them to a stiffness and damping."""
+        self.bound(stiffness, damping)
+        most = self._stiffness.max, self._damping.max
+        shown = self._shown(stiffness, damping, (self._stiffness.min, 0.0), most)
+        self._stiffness.value, self._damping.value = shown
+
+    def bound(self, stiffness: float, damping: float) -> None:
+        """Puts the end of each to where the other one lets it go."""
+        self._stiffness.max, self._damping.max = self._ends(stiffness, damping, self._stiffness.min)
+
+    def ends(self) -> str:
+        """Says where they end."""
+        symbols, units = SYMBOLS[self.span.axis], UNITS[self.span.axis]
+        return (
+            f"{symbols[0]} ends at {self._stiffness.max:g} {units[0]}, "
+            f"{symbols[1]} at {self._damping.max:g} {units[1]}"
+        )
+
+    def _shown(
+        self,
+        stiffness: float,
+        damping: float,
+        least: tuple[float, float],
+        most: tuple[float, float],
+    ) -> tuple[float, float]:
+        near = (_near(v, step) for v, step in zip((stiffness, damping), self._steps, strict=True))
+        first, second = (min(max(*pair), end) for *pair, end in zip(near, least, most, strict=True))
+        return first, second
+
+    def _ends(self, stiffness: float, damping: float, least: float) -> tuple[float, float]:
+        steps, span = self._steps, self.span
+        return (
+            max(_down(span.most_stiffness(damping), steps[0]), least + steps[0]),
+            max(_down(span.most_damping(stiffness), steps[1]), steps[1]),
+        )
 
 
 class Controls:
@@ -214,3 +303,32 @@ class Controls:
 
     def _show_switches(self) -> None:
         self._force.value, self._clutch.value = self._is_forced, self._is_clutched
+
+
+def by_hand(act: Callable[[], None]) -> Callable[[viser.GuiEvent[Any]], None]:
+    """Returns a callback that acts on what a browser changed, and not on what this process did.
+
+    viser tells of both; what a run was given by others would come back to it as a wish.
+    """
+
+    def acts(event: viser.GuiEvent[Any]) -> None:
+        if event.client_id is not None:
+            act()
+
+    return acts
+
+
+def _step(most: float) -> float:
+    return float(f"1e{math.floor(math.log10(FINENESS * most)):d}")
+
+
+def _near(value: float, step: float) -> float:
+    return float(f"{round(value / step) * step:.12g}")
+
+
+def _up(value: float, step: float) -> float:
+    return float(f"{math.ceil(value / step / _ROUNDING) * step:.12g}")
+
+
+def _down(value: float, step: float) -> float:
+    return float(f"{math.floor(value * _ROUNDING / step) * step:.12g}")

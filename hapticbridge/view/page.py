@@ -1,24 +1,44 @@
-"""The page: the scene in three dimensions, curves beside it."""
+"""The page: the scene in three dimensions with the coupling, and curves beside it."""
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import mujoco
 import numpy as np
 import viser
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from hapticbridge.film_process import force_colour
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.rendering import method_named
 from hapticbridge.summary import coupling_sentences, is_always_held
-from hapticbridge.view.geometry import NOT_DRAWN, Tendons, props_of
-from hapticbridge.view.ghost import LONGEST_ARROW, Ghost, linear
-from hapticbridge.view.sight import Sight
-from hapticbridge.view.trace import PLOTS
+from hapticbridge.view.geometry import (
+    NOT_DRAWN,
+    POINTS,
+    Surfaces,
+    Tendons,
+    coil,
+    enlargement,
+    props_of,
+    shell,
+)
 
 Array = NDArray[np.float64]
+
+PLOTS: tuple[tuple[str, tuple[str, ...]], ...] = (
+    ("Force (N)", ("on the tool",)),
+    ("Energy per port (mJ)", ("coupling", "device", "environment")),
+    ("Passivity margin (mJ)", ("allowed − created",)),
+    ("Lateness of a tick (µs)", ("latest",)),
+)
+"""Title with unit of each plot, and the names of its lines."""
+
+LINES = sum(len(names) for _, names in PLOTS)
+"""Number of lines in all plots."""
 
 COLOURS = ("#1a5fb4", "#b3261e", "#2e7d32", "#e66100")
 
@@ -33,6 +53,207 @@ _COLOURS_MEAN = (
 
 _CONTACT = (77, 208, 225)
 """Colour of contacts, red, green and blue of 255."""
+
+FARTHEST = 0.25
+"""Length of the spring at the longest stretch so far, as a share of the scene's extent."""
+
+LONGEST_ARROW = 0.5
+"""Length of the arrow of the largest force, as a share of the scene's extent."""
+
+_BLUE, _HAND = (26, 95, 180), (230, 97, 0)
+
+
+@dataclass(frozen=True, slots=True)
+class Sight:
+    """One instant of a run in world coordinates, ready to be drawn.
+
+    Attributes:
+        time: Time of the run's clock in s at which the tick was due.
+        places: Positions of the bodies, (nbody, 3) in m.
+        turns: Orientations of the bodies, quaternions (nbody, 4).
+        handle: Position of the handle, (3,) in m.
+        handle_turn: Orientation of the handle, a quaternion (4,).
+        grip: Position of the grip on the tool, (3,) in m.
+        force: Force on the tool, (3,) in N; the hand feels the opposite.
+        contact_places: Positions of the contacts, (n, 3) in m.
+        contact_forces: Forces of the contacts, (n, 3) in N.
+        tendons: Straight pieces of each visible tendon, (m, 2, 3) in m.
+    """
+
+    time: float
+    places: Array
+    turns: Array
+    handle: Array
+    handle_turn: Array
+    grip: Array
+    force: Array
+    contact_places: Array
+    contact_forces: Array
+    tendons: tuple[NDArray[np.float32], ...] = ()
+
+    @classmethod
+    def of(
+        cls,
+        model: mujoco.MjModel,
+        data: mujoco.MjData,
+        row: NDArray[np.void],
+        tendons: Tendons,
+        contacts: Array,
+    ) -> Sight:
+        """Returns the instant of a scene.
+
+        Args:
+            model: The scene.
+            data: Positions after the tick; the poses of bodies are computed here.
+            row: Record of the tick, one element of ``TICK_DTYPE``.
+            tendons: The scene's.
+            contacts: Position in m and force in N of each contact, (n, 2, 3).
+        """
+        mujoco.mj_kinematics(model, data)
+        return cls(
+            time=1e-9 * float(row["deadline_ns"][0]),
+            places=data.xpos.copy(),
+            turns=data.xquat.copy(),
+            handle=row["handle_position"][0].copy(),
+            handle_turn=row["handle_quaternion"][0].copy(),
+            grip=row["tool_position"][0].copy(),
+            force=row["wrench_on_tool"][0, :3].copy(),
+            contact_places=contacts[:, 0],
+            contact_forces=contacts[:, 1],
+            tendons=tendons.pieces(data),
+        )
+
+
+class Trace:
+    """Curves of a run, thinned without losing a peak.
+
+    Each look adds one point: the largest force and lateness since the last look, and the energies
+    now.
+
+    Args:
+        length: Points that are kept, >= 2; None keeps all.
+    """
+
+    def __init__(self, length: int | None = None) -> None:
+        self._points: deque[tuple[float, ...]] = deque(maxlen=length)
+
+    def add(self, rows: NDArray[np.void], slack: float) -> None:
+        """Adds a point.
+
+        Args:
+            rows: Records since the last look, at least one.
+            slack: What the environment may have created by now, in J; NaN where unknown.
+        """
+        last = rows[-1]
+        if self._points and 1e-9 * float(last["deadline_ns"]) < self._points[-1][0]:
+            self._points.clear()  # the run began anew
+        created = float(last["environment_energy"])
+        late = rows["wake_ns"] - rows["deadline_ns"]
+        self._points.append(
+            (
+                1e-9 * float(last["deadline_ns"]),
+                float(np.linalg.norm(rows["wrench_on_tool"][:, :3], axis=1).max()),
+                1e3 * float(last["coupling_work"]),
+                1e3 * float(last["device_energy"]),
+                1e3 * created,
+                1e3 * (slack - created),
+                1e-3 * float(late.max()),
+            )
+        )
+
+    def __len__(self) -> int:
+        return len(self._points)
+
+    def curves(self) -> tuple[Array, list[Array]]:
+        """Returns times in s, and the lines of ``PLOTS`` in its units, newest last."""
+        table = np.array(self._points, dtype=np.float64).reshape(len(self._points), 1 + LINES)
+        return table[:, 0].copy(), [table[:, 1 + line].copy() for line in range(LINES)]
+
+
+class Ghost:
+    """Drawing of the coupling: a ghost at the handle, a spring, an arrow for the force.
+
+    Handle and tool are rarely farther apart than a few tenths of a millimetre, which no picture
+    shows. So the ghost is a shell around the tool, where the tool would be if the coupling were not
+    stretched. The spring goes from its surface towards the tool, several times as long as the
+    stretch; the page says how many times. A stretch that can be seen is drawn from handle to tool.
+
+    Args:
+        scene: viser's scene.
+        model: The scene of the run.
+        grip: Name of the site on the tool.
+
+    Attributes:
+        times: Length of the drawn spring divided by the stretch.
+    """
+
+    def __init__(self, scene: viser.SceneApi, model: mujoco.MjModel, grip: str) -> None:
+        self._extent = extent = float(model.stat.extent)
+        self._shell = shell(model, grip)
+        self._longest, self.times = 0.0, 1
+        self._handle = scene.add_frame("/handle", show_axes=False)
+        faces = np.asarray(self._shell.faces)
+        corners = np.asarray(self._shell.vertices)
+        self._surfaces = Surfaces(corners[faces])
+        scene.add_mesh_simple("/handle/shell", corners, faces, color=_BLUE, opacity=0.3)
+        nothing = np.zeros((POINTS, 2, 3), dtype=np.float32)
+        self._spring = scene.add_line_segments(
+            "/coupling", nothing, (0, 0, 0), thickness=0.012 * extent
+        )
+        self._arrow = scene.add_arrows(
+            "/force in the hand",
+            nothing[:1],
+            linear(_HAND),
+            shaft_radius=0.01 * extent,
+            head_radius=0.025 * extent,
+            head_length=0.06 * extent,
+        )
+
+    def allow(self, stretch: float) -> None:
+        """Makes room for a distance between handle and tool, in m."""
+        self._longest = max(self._longest, stretch)
+        self.times = enlargement(FARTHEST * self._extent, self._longest)
+
+    def show(self, sight: Sight, reference: float) -> None:
+        """Draws an instant.
+
+        Args:
+            sight: The instant.
+            reference: The force in N that is drawn longest and reddest, > 0.
+        """
+        strength = float(np.linalg.norm(sight.force))
+        way = sight.grip - sight.handle
+        stretch = float(np.linalg.norm(way))
+        self.allow(stretch)
+        self._handle.position, self._handle.wxyz = sight.handle, sight.handle_turn
+        colour = linear(255.0 * force_colour(strength, reference))
+        # it begins outside of what the hand holds, unless it truly ends at the tool
+        start = sight.handle
+        if self.times > 1 and stretch > 0.0:
+            turn = np.zeros(9)
+            mujoco.mju_quat2Mat(turn, sight.handle_turn)
+            along = way / stretch
+            aside = self._surfaces.way_out(turn.reshape(3, 3).T @ along)
+            start = start + aside * along
+        end = start + self.times * way
+        self._spring.points = coil(start, end, 0.02 * self._extent).astype(np.float32)
+        self._spring.colors = np.full((POINTS, 2, 3), colour, dtype=np.uint8)
+        self._arrow.visible = strength > 1e-3 * reference
+        if self._arrow.visible:
+            reach = LONGEST_ARROW * self._extent / max(reference, strength)
+            points = np.array([[end, end - reach * sight.force]])
+            self._arrow.points = points.astype(np.float32)
+
+
+def linear(colour: ArrayLike) -> tuple[int, int, int]:
+    """Returns a colour as viser wants it for lines and arrows, which it draws lighter than it is.
+
+    It takes their numbers, 0 to 255, for shares of light and not for sRGB.
+    """
+    share = np.asarray(colour, dtype=np.float64) / 255.0
+    light = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
+    red, green, blue = np.round(255.0 * light).astype(int).tolist()
+    return red, green, blue
 
 
 class Page:

@@ -27,10 +27,8 @@ from hapticbridge.recording.snapshot import Snapshot
 from hapticbridge.run_description import parameters_of
 from hapticbridge.view.controls import Controls, Outlet, allowance_of
 from hapticbridge.view.geometry import Tendons
-from hapticbridge.view.page import Page
+from hapticbridge.view.page import Page, Sight, Trace
 from hapticbridge.view.server import serve
-from hapticbridge.view.sight import Sight
-from hapticbridge.view.trace import Trace
 from hapticbridge.view.window import Address
 
 FRAME = 1 / 30

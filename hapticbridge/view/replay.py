@@ -16,10 +16,8 @@ from numpy.typing import NDArray
 from hapticbridge.film_process import Stage
 from hapticbridge.recording.snapshot import MOST_CONTACTS
 from hapticbridge.view.geometry import Tendons
-from hapticbridge.view.page import Page
+from hapticbridge.view.page import Page, Sight, Trace
 from hapticbridge.view.server import serve, stop
-from hapticbridge.view.sight import Sight
-from hapticbridge.view.trace import Trace
 from hapticbridge.view.window import Address
 
 FRAME = 1 / 30

@@ -74,10 +74,6 @@ _STYLES = (("#555555", "-", 2.2), ("#1a5fb4", "-", 1.1), ("#b3261e", "--", 1.1))
 def figure_of(found: WhatIf, bins: int = BINS) -> Figure:
     """Draws force on the device, handle displacement, and the energies of both ports over time.
 
-    Args:
-        found: Result of the what-if.
-        bins: Number of bins per curve, see ``decimated``.
-
     Raises:
         RecordingError: A run holds a number that cannot be drawn.
     """
@@ -142,10 +138,7 @@ def draw_what_if(found: WhatIf, path: Path) -> None:
 def write_what_if(found: WhatIf, path: Path, scene: bytes | None = None) -> None:
     """Writes one self-contained HTML page of less than 1 MB, for any length of run.
 
-    Args:
-        found: Result of the what-if.
-        path: The file; an existing one is replaced.
-        scene: PNG picture of the recorded scene, or None.
+    ``scene`` is a PNG picture of the recorded scene, or None. An existing file is replaced.
 
     Raises:
         RecordingError: The page cannot be written, or not under this name.

@@ -39,11 +39,6 @@ def invert_exactly(wanted: float, function: Callable[[float], float], guess: flo
     A recording holds T and B', not the requested rate and B. Recomputed from 1/T and B' + K T/2, T
     and B' may differ in the last digit, and the repetition would no longer be exact.
 
-    Args:
-        wanted: Value to be reproduced.
-        function: Function from the input to the value.
-        guess: Approximate input.
-
     Returns:
         The input, or the guess if no neighbour gives the value.
     """
@@ -62,9 +57,7 @@ def invert_exactly(wanted: float, function: Callable[[float], float], guess: flo
 def unpack_scene(recording: Recording, folder: Path) -> Path:
     """Writes a recording's scene files to a folder; returns the main file.
 
-    Args:
-        recording: The recording.
-        folder: Target folder, created if missing. Nothing is written outside it.
+    The folder is created if missing; nothing is written outside it.
 
     Raises:
         RecordingError: The recording carries no scene, or files that cannot be written there.
@@ -115,9 +108,7 @@ class RecordedRun:
     def of(cls, recording: Recording, folder: Path) -> RecordedRun:
         """Takes a recording apart.
 
-        Args:
-            recording: The recording.
-            folder: Folder for the scene's files.
+        The scene's files are unpacked to ``folder``.
 
         Raises:
             RecordingError: The recording does not describe its run, or carries no scene.

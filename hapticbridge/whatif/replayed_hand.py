@@ -41,10 +41,6 @@ class RecordedClock:
     """Clock that replays the times of a recording.
 
     Its device reports reading and writing.
-
-    Args:
-        ticks: Recorded rows, ``TICK_DTYPE``.
-        period: Recorded period in s.
     """
 
     name = SimulatedClock.name
@@ -85,9 +81,7 @@ class RecordedClock:
 class Outside:
     """Recorded buttons and stale samples, resampled to another rate.
 
-    Args:
-        ticks: Recorded rows, ``TICK_DTYPE``.
-        period: Recorded period in s.
+    ``period`` is the recorded period in s.
     """
 
     def __init__(self, ticks: NDArray[np.void], period: float) -> None:
@@ -124,14 +118,8 @@ class RecordedMotion(ReplayDevice):
     The motion is prescribed at any force, which is exact but no hand: it presses as deep into a
     stiffer wall as into the recorded one. The data sheet is the recorded device's, so that guard
     and controller act as with it. With recorded times and unchanged settings, the run equals the
-    recorded one in every bit.
-
-    Args:
-        ticks: Recorded rows, ``TICK_DTYPE``, at least two.
-        clock: Clock of the run.
-        period: Recorded period in s.
-        start: Device pose (7,) before the first tick.
-        info: Data sheet of the recorded device.
+    recorded one in every bit. At least two rows are needed; ``start`` is the device pose (7,)
+    before them.
 
     Raises:
         DeviceError: See ``ReplayDevice``.
@@ -168,13 +156,8 @@ class RecordedMotion(ReplayDevice):
 class ResampledMotion(TrajectoryDevice):
     """Device that replays the recorded motion at another rate.
 
-    Positions are interpolated linearly, orientations by slerp.
-
-    Args:
-        ticks: Recorded rows, ``TICK_DTYPE``, at least two.
-        period: Recorded period in s.
-        start: Device pose (7,) before the first tick.
-        info: Data sheet of the recorded device.
+    Positions are interpolated linearly, orientations by slerp. At least two rows are needed;
+    ``start`` is the device pose (7,) before them, ``period`` the recorded period in s.
     """
 
     def __init__(
@@ -213,21 +196,7 @@ def _unattended(info: DeviceInfo, own: DeviceInfo) -> DeviceInfo:
     return replace(info, is_real=False, duration=own.duration)
 
 
-# Where a recorded hand wanted to be.
-#
-# A recorded hand cannot be known, only what it did. Two things can be made of the force that it
-# must have applied, f = m a + b v − w (m and b the device's, w the wrench that it was sent).
-# Applied again as it was, as a function of time, it is the force of a hand without stiffness and
-# damping: a millinewton too much at the start, and it drifts away without end. So it is taken
-# for that of a hand as in ``device.Hand``, a measured arm or the one that the scene asks for,
-# which pulls with spring and damper towards where its owner wants to be. Where that is, p,
-# follows from the motion,
-#
-# b_h p' + k_h p = (m + m_h) a + (b + b_h) v + k_h x − w + f_c sign(v),
-#
-# so that the hand would have moved as recorded. What is assumed is how it gives way to other
-# forces than the recorded ones. p is smoothed: a person's intent is slow, and the second
-# derivative of rounded positions is noise.
+# Intended motion of a recorded hand.
 
 INTENT = 8e-3
 """Standard deviation in s of the Gaussian that smooths the hand's intended motion. It halves motion
@@ -242,17 +211,23 @@ def intended(
     period: float,
     start: tuple[float, ...],
 ) -> Array:
-    """Returns where the hand wanted to be, as a ``Motion.table`` counted from the start.
+    """Returns the hand's intended motion p, as a ``Motion.table`` relative to the start.
 
-    Rotation follows the same law with rotation vectors from the start's orientation in the place of
-    positions: exact about one axis, and good as long as angles stay well below π.
+    A recording shows the motion of a hand, not its intent. The hand must have applied f = m a + b v
+    − w, with the device's m and b and the wrench w sent to it. Replayed as a function of time, f is
+    a hand without stiffness and damping: a millinewton too much makes it drift away without end.
+    The hand is therefore modelled as ``device.Hand``, a measured arm or the scene's own, which
+    pulls with spring and damper towards p:
 
-    Args:
-        info: The device.
-        hand: Who is taken to have held it.
-        ticks: The recorded rows.
-        period: Of the recorded loop, in s.
-        start: Device pose (7,) before the first tick.
+        b_h p' + k_h p = (m + m_h) a + (b + b_h) v + k_h x − w + f_c sign(v)
+
+    This p reproduces the recorded motion; the response to other forces is an assumption of the
+    model. p is smoothed, because a person's intent is slow and the second derivative of rounded
+    positions is noise.
+
+    Rotation follows the same law with rotation vectors from the start's orientation. It is exact
+    about one axis, and a good approximation for angles well below π. ``start`` is the device pose
+    (7,) before the first tick.
     """
     origin = Rotation.from_quat(np.array(start[3:]), scalar_first=True)
     turned = Rotation.from_quat(ticks["device_quaternion"], scalar_first=True) * origin.inv()
@@ -306,7 +281,7 @@ def _wanted(
 ) -> Array:
     """Solves b_h p' + k_h p = M a + β v + k_h x − w + f_c sign(v) for p, by the bilinear rule.
 
-    It is stable, and at half the rate, where central differences are noise, it answers nothing.
+    The rule is stable, and it suppresses the noise of central differences at half the rate.
     """
     inertia, damping, hand_damping, stiffness, friction = law
     padded = np.concatenate([moved[:1], moved, moved[-1:]])
@@ -314,11 +289,11 @@ def _wanted(
     acceleration = (padded[2:] - 2 * moved + padded[:-2]) / period**2
     pull = inertia * acceleration + damping * velocity + stiffness * moved - force
     pull += friction * np.sign(velocity)
-    if hand_damping == 0.0:  # one that only weighs something wants nothing
+    if hand_damping == 0.0:  # a hand with mass alone has no intent
         wanted = pull / stiffness if stiffness else moved
     else:
         pole = 2 * hand_damping / period + stiffness
-        # the filter starts as if what is wanted had always been where it is at the start
+        # the filter starts from a constant intended position
         first = pull[:1] / stiffness if stiffness else moved[:1]
         rest = first - pull[:1] / pole
         wanted, _ = lfilter([1.0, 1.0], [pole, 2 * stiffness - pole], pull, axis=0, zi=rest)
@@ -336,10 +311,6 @@ Event = Mapping[str, Any]
 class Repetition:
     """One repetition of a run with given settings.
 
-    Args:
-        run: The recorded run.
-        settings: Settings of the bridge.
-
     Attributes:
         settings: Settings of the bridge.
         warned: Warnings about the scene, one sentence each.
@@ -351,10 +322,10 @@ class Repetition:
         self.warned: tuple[str, ...] = ()
 
     def into(self, path: Path, device: Device, clock: Clock) -> tuple[float, str]:
-        """Runs into a file; returns the period in s, and why the guard stopped it or nothing.
+        """Runs into a file; returns the period in s, and the reason of the guard's stop or empty.
 
         Raises:
-            HapticBridgeError: The changed bridge is refused; the message says why.
+            HapticBridgeError: The changed bridge is refused; the message names the reason.
         """
         run, settings = self._run, self.settings
         bridge = Bridge(
@@ -481,14 +452,11 @@ def missing_for_closed_loop(info: DeviceInfo) -> str:
 
 
 class IdentifiedDevice(SimulatedDevice):
-    """The recorded device as its data sheet knows it, in a model hand that wants what it wanted.
+    """The recorded device by its data sheet, in a model hand with the recorded hand's intent.
 
-    Args:
-        info: The recorded device, with mass and damping (``missing_for_closed_loop``).
-        hand: Who holds it.
-        ticks: The recorded rows, ``TICK_DTYPE``, at least three.
-        period: The recorded loop's in s.
-        start: Device pose (7,) before the first tick, where it is held still until then.
+    Unlike a prescribed motion (``again``), the hand yields to the force. It needs mass and damping
+    (``missing_for_closed_loop``) and at least three rows. The device is held at the pose ``start``
+    (7,) until the first tick.
     """
 
     def __init__(

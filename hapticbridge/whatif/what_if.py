@@ -123,22 +123,21 @@ def what_if(
 ) -> WhatIf:
     """Simulates a recorded run again with a changed bridge.
 
-    Twice: with the recorded motion of the device, whatever the forces (``prescribed``, see
-    ``again``), and, where the device's mass and damping are known, in a closed loop of that device
-    and a model hand which wants what the recorded hand wanted (``hands``). Inputs of the scene,
-    buttons, commands and pauses come again at their times. All runs are judged by the same audit.
-    Memory holds all of them.
+    There are two simulations. ``prescribed`` follows the recorded motion of the device at any force
+    (``again``). The closed loop couples the device, if its mass and damping are known, to a model
+    hand with the recorded hand's intent (``hands``). Inputs of the scene, buttons, commands and
+    pauses are repeated at their times. One audit judges all runs, and memory holds all of them.
 
     Args:
-        path: The recording, neither damaged nor changed; it carries its scene.
-        changes: New values by name: ``changes.UNITS``, or the scene's own parameters. None runs the
-            recorded settings again: prescribed, they give the recorded run in every bit.
-        strict: As for ``audit``, which judges all runs.
-        progress: Called with the runs done, all of them, and the one that begins.
+        path: The recording, undamaged and unchanged; it carries its scene.
+        changes: New values by name: ``changes.UNITS``, or the scene's own parameters. Without
+            changes the prescribed run equals the recorded one in every bit.
+        strict: As for ``audit``.
+        progress: Called with the number of runs done, their total, and the name of the next one.
 
     Raises:
         RecordingError: The recording cannot be judged or simulated, or a change is unknown.
-        HapticBridgeError: The changed bridge is refused; the message says why.
+        HapticBridgeError: The changed bridge is refused; the message names the reason.
     """
     tell = progress or _silent
     tell(0, 4, "auditing what was recorded")

@@ -142,7 +142,7 @@ def test_a_falcon_with_the_wrong_program_is_refused(plug_usb: Plug, tmp_path: Pa
     plug_usb(unloaded_falcon)
     file = tmp_path / "wrong.bin"
     file.write_bytes(PROGRAM[::-1])
-    with pytest.raises(DeviceError, match="no firmware for it"):
+    with pytest.raises(DeviceError, match="with its firmware"):
         _opened(f"falcon:firmware={file}")
 
 

@@ -1,14 +1,14 @@
-"""The Novint Falcon: three translations with force, over USB.
+"""Novint Falcon: three translations with force, over USB.
 
-Its replies answer the packet before: force and question go out together, and while one reply waits
-in the serial bridge the next question is under way. So one packet goes out in each tick, at the
-loop's rate, and what has come by then is read. A packet is answered, and its force acts, when it
-arrives; so from a sample to the force that answers it as many whole ticks pass as a reply needs to
-come back: two at 1 kHz, because the bridge holds a reply for up to 1 ms.
+A packet carries the force and requests the encoders; its reply comes one packet later. While one
+reply waits in the serial bridge, the next request is on its way. So each tick sends one packet and
+reads the replies that have arrived. A packet is answered, and its force acts, on arrival. From a
+sample to the resulting force therefore as many whole ticks pass as a reply takes: two at 1 kHz,
+because the bridge holds a reply for up to 1 ms.
 
 The device's frame: x to the right, y away from the user, z up, in m from the middle of the
-workspace, 0.125 m before the base. Axes, signs and bits are as libnifalcon's source has them: no
-real Falcon has moved under this code yet.
+workspace, 0.125 m before the base. Axes, signs and bits follow libnifalcon's source. The driver has
+not been verified on hardware.
 """
 
 from __future__ import annotations
@@ -59,60 +59,64 @@ from hapticbridge.errors import DeviceError, DeviceLost
 from hapticbridge.jit import direct
 from hapticbridge.record import SAMPLE_DTYPE, TickFlag
 
-# How fast a Falcon answers, measured on the unit before the loop begins.
+# Measured timing of a Falcon.
 
 TIME = 0.1
-"""In s: how long each of the two measurements takes."""
+"""Length of each of the two measurements in s."""
 
 UNDER_WAY = 2
-"""Questions kept under way while the rate is measured: one is there when a reply leaves."""
+"""Number of requests kept on their way while the rate is measured, so that one waits when a reply
+leaves."""
 
 PACE = 1.07e-3
-"""In s: from question to question while the delay is measured. A little more than the bridge's
-timer of 1 ms, so that the questions sweep over all its phases."""
+"""Time in s between requests while the delay is measured. It is slightly longer than the bridge's
+timer of 1 ms, so that the requests sweep over all its phases."""
 
 SHARE = 0.95
-"""Share of replies that came back within the delay, no unit. The longest are the host's own stalls,
+"""Share of replies within the delay, without unit. The slowest replies are stalls of the host,
 which the loop counts as missed deadlines."""
 
 TRIES = 3
-"""How often the timing is measured before a Falcon counts as silent: a reply can be lost on the
-serial line, and a busy host can stall for as long as one is waited for."""
+"""Number of measurements before a Falcon counts as silent. A reply can be lost on the serial line,
+and a busy host can stall for longer than the timeout."""
 
-_ANSWER_TIME = 0.05  # s, longer is silence
+_ANSWER_TIME = 0.05
+"""Longest wait for a reply in s; a longer pause counts as silence."""
 
 
 def measured_timing(link: Link, stream: ReplyStream, name: str) -> tuple[float, float]:
-    """Returns at what rate replies are delivered, and within what time they come.
+    """Measures the rate of deliveries and the delay of replies.
 
-    The rate is deliveries per second with ``UNDER_WAY`` questions always asked; several replies
-    that came together are one delivery. The delay is the time from a question to its reply that
-    ``SHARE`` of the replies kept, one question at a time.
+    The rate is the number of deliveries per second with ``UNDER_WAY`` requests always on their way;
+    replies that arrive together are one delivery. The delay is the time from a request to its
+    reply, with one request at a time, that the share ``SHARE`` of the replies meets.
 
-    A question asks for the encoders and carries the force, so both are as old as each other: where
-    the loop sends one per tick, the force that answers a sample acts the delay later, rounded up to
-    whole ticks, beyond the one tick for which it is held.
+    A packet both requests the encoders and carries the force, so both have this delay. With one
+    packet per tick, the force that responds to a sample acts after the delay, rounded up to whole
+    ticks, beyond the one tick for which it is held.
 
     Args:
-        link: To a Falcon that speaks.
-        stream: Takes its replies.
-        name: What errors call it.
+        link: Link to a running Falcon.
+        stream: Receives the replies.
+        name: Name of the device in messages.
 
     Returns:
         The rate in Hz and the delay in s.
 
     Raises:
-        DeviceLost: It fell silent.
+        DeviceLost: The device stopped replying.
     """
     for _ in range(TRIES):
         rate = _rate(link, stream)
         if rate is not None and (delay := _delay(link, stream)) is not None:
             return rate, delay
-    raise DeviceLost(f"{name}: fell silent while its timing was measured")
+    raise DeviceLost(
+        f"{name}: fell silent while its timing was measured; check its cable and its power"
+    )
 
 
 def _rate(link: Link, stream: ReplyStream) -> float | None:
-    """Measures the rate in Hz; None where a reply did not come."""
+    """Measures the rate in Hz; None if a reply is missing."""
     for _ in range(UNDER_WAY):
         send_question(link)
     begin = last = link.now()
@@ -128,12 +132,12 @@ def _rate(link: Link, stream: ReplyStream) -> float | None:
         for _ in range(found):
             send_question(link)
     for _ in range(UNDER_WAY):
-        answers(link, stream, 2 * PACE)  # the last ones, which nobody waited for
+        answers(link, stream, 2 * PACE)  # drain the last replies
     return (deliveries - 1) / (last - begin)
 
 
 def _delay(link: Link, stream: ReplyStream) -> float | None:
-    """Measures the delay in s; None likewise."""
+    """Measures the delay in s; None if a reply is missing."""
     times = []
     end = link.now() + TIME
     while (begin := link.now()) < end:
@@ -148,23 +152,23 @@ def _delay(link: Link, stream: ReplyStream) -> float | None:
 
 
 class FalconDevice:
-    """A Falcon that is open: it speaks, has found its zeros, and its timing has been measured.
+    """An open Falcon: booted, homed, and with measured timing.
 
-    The sheet's ``rate`` is how often replies were delivered with two questions always under way,
-    its ``delay`` the time within which 95 % of 0.1 s of replies came back, asked at all phases of
-    the bridge's timer (``timing``). Mass, damping and friction are not known of any unit;
-    who measured them gives them. The resolution follows from the geometry in the middle of the
-    workspace.
+    The sheet's ``rate`` is the rate of deliveries with two requests always on their way. Its
+    ``delay`` is the time within which 95 % of the replies in 0.1 s came back, over all phases of
+    the bridge's timer (``timing``). Mass, damping and friction are unknown unless the user states
+    measured values. The resolution follows from the geometry in the middle of the workspace.
 
     Args:
-        link: To the Falcon.
-        name: What errors call it.
-        firmware: File with its program, for one that has none; None: it must have it.
-        mass, damping, friction: At the grip in kg, N s/m and N, or None.
-        tell: Told what the user should know or do.
+        link: Link to the Falcon.
+        name: Name of the device in messages.
+        firmware: Firmware file for a device without firmware; None if it has its firmware.
+        mass, damping, friction: Values at the grip in kg, N s/m and N, or None.
+        tell: Receives messages for the user.
 
     Raises:
-        DeviceError: It has no program and none was named, does not take it, or was not homed.
+        DeviceError: The device has no firmware and no file was named, it refuses the firmware, or
+            it was not homed.
     """
 
     def __init__(
@@ -214,17 +218,18 @@ class FalconDevice:
         self._asked = self._asked_before = self._sampled_after = 0.0
 
     def start(self, period: float) -> NDArray[np.void]:
-        """Asks for the pose, without force, and compiles what the loop will call.
+        """Reads the pose, without force, and compiles the functions of the loop.
 
         Args:
             period: The loop's period in s, at most 0.02.
 
         Raises:
-            DeviceError: The period is out of range, no grip has its encoders, or it is gone.
+            DeviceError: The period is out of range, the encoders match no position of the grip, or
+                the device is gone.
         """
         if checked_period(period) > LONGEST_PERIOD:
             raise DeviceError(
-                f"{self._name}: is asked once a tick, so the rate must be at least "
+                f"{self._name}: is polled once per tick, so the rate must be at least "
                 f"{1 / LONGEST_PERIOD:g} Hz, not {1 / period:g} Hz"
             )
         motion, reply, sample = self._motion, self._stream.reply, self._last
@@ -236,8 +241,8 @@ class FalconDevice:
             raise silent(self._name)
         if self._believe(motion, reply, sample, np.inf) != BELIEVED:
             raise DeviceError(
-                f"{self._name}: encoders at {reply['encoders'][0].tolist()} are no position of the "
-                "grip; switch its power off and on, so that it is homed again"
+                f"{self._name}: encoder counts {reply['encoders'][0].tolist()} match no position "
+                "of the grip; switch its power off and on to home it again"
             )
         now = self._link.now()
         self._watch = SilenceDetector(now)
@@ -246,22 +251,22 @@ class FalconDevice:
         return sample.copy()
 
     def read(self, sample: NDArray[np.void]) -> int:
-        """Reports the newest reply's pose and buttons (1 right, 2 forward, 4 centre, 8 left).
+        """Returns the pose and buttons of the newest reply (1 right, 2 forward, 4 centre, 8 left).
 
-        What cannot be is not believed and counts as nothing new: encoders that no grip position
-        has, or a jump faster than 3 m/s. Waits only after the loop stood still (``ask_anew``).
+        Impossible replies count as no reply: encoders that match no position of the grip, or a jump
+        faster than 3 m/s. The call waits only after a pause of the loop (``ask_anew``).
 
         Args:
-            sample: Shape (1,), ``SAMPLE_DTYPE``, filled in place.
+            sample: Output, shape (1,), ``SAMPLE_DTYPE``.
 
         Returns:
-            0, or ``TickFlag.STALE_SAMPLE`` where the sample repeats the last one.
+            0, or ``TickFlag.STALE_SAMPLE`` if the sample repeats the last one.
 
         Raises:
-            DeviceError: It was not started, is gone, or gave nothing to believe for 50 ms.
+            DeviceError: The device was not started, is gone, or sent no valid reply for 50 ms.
         """
         if not self._is_started:
-            raise DeviceError(f"{self._name} is read before it was started")
+            raise DeviceError(f"{self._name} is read before it was started; call start() first")
         found = 0
         for packet in self._link.take():
             found += self._stream.feed(packet)
@@ -271,7 +276,7 @@ class FalconDevice:
         now = self._link.now()
         is_believed = False
         if found:
-            # a reply may be to the last question or the one before: no older than that is its pose
+            # the reply answers the last request or the one before, so its pose is at most that old
             elapsed, self._sampled_after = now - self._sampled_after, self._asked_before
             verdict = self._believe(self._motion, self._stream.reply, self._last, elapsed)
             is_believed = verdict == BELIEVED
@@ -281,15 +286,15 @@ class FalconDevice:
         return 0 if is_believed else int(TickFlag.STALE_SAMPLE)
 
     def write(self, wrench: NDArray[np.float64]) -> None:
-        """Sends a force, and with it the next question; the torque is left out.
+        """Sends a force together with the next request; the torque is ignored.
 
-        What is not taken in time is left out; but no force at all is sent until it is taken.
+        A packet that is not accepted in time is dropped, except for zero force, which is repeated.
 
         Args:
             wrench: Shape (6,), in the device's frame.
 
         Raises:
-            DeviceLost: It is gone, or does not take that it is to give no force.
+            DeviceLost: The device is gone, or does not accept zero force.
         """
         self._command(self._motion, wrench, self._bytes)
         self._asked_before, self._asked = self._asked, self._link.now()
@@ -297,37 +302,37 @@ class FalconDevice:
             insist(self._link, self._packet, self._name)
 
     def close(self) -> None:
-        """Commands zero force, puts the lights out and lets the device go."""
+        """Commands zero force, switches the lights off and releases the device."""
         if not self._is_open:
             return
         self._is_open = self._is_started = False
         try:
-            for _ in range(2):  # the first reply may be to a question of the loop's
+            for _ in range(2):  # the first reply may answer a request of the loop
                 ask(self._link, self._stream, 0, SILENCE)
         except DeviceLost:
-            pass  # whoever pulled the plug also took the force away
+            pass  # an unplugged device has no force
         finally:
             self._link.close()
 
 
-# Novint's Falcon: finding one among what is plugged in.
+# Discovery of a Falcon.
 
 
 def open_falcon(options: Mapping[str, object], tell: Notify, backend: Any = None) -> FalconDevice:
     """Finds a Falcon and opens it.
 
     Args:
-        options: Those of ``FAMILY``: names of files and numbers in SI units.
-        tell: Told what the user should know or do.
-        backend: A pyusb backend; None takes libusb.
+        options: Options of ``FAMILY``: names of files and numbers in SI units.
+        tell: Receives messages for the user.
+        backend: A pyusb backend; None selects libusb.
 
     Raises:
-        DeviceError: There is none, it cannot be opened, is lost, or an option is not valid.
+        DeviceError: No Falcon is found, it cannot be opened or is lost, or an option is not valid.
     """
     numbers = stated_numbers(options, _NUMBERS)
     firmware = str(options["firmware"]) if options.get("firmware") else None
     if firmware is not None:
-        read_firmware(firmware)  # a wrong name is said before anything moves
+        read_firmware(firmware)  # report a wrong file name before anything moves
     plugged = select_device(FAMILY, find(FAMILY, backend), options.get("serial"))
     log = HexLog.asked(options)
     link = UsbLink.open(

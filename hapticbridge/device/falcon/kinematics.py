@@ -1,22 +1,22 @@
 """Geometry of the Falcon's three legs: thigh angles and grip position.
 
-The maker's frame, in metres: z out of the base towards the user along the machine's axis, x to the
-right, y up; all three thighs at the encoders' zero put the grip at (0, 0, 0.1346). Leg i is turned
-by φ_i about z; in its own frame (u outwards, v sideways, w = z), measured from the hip's axis,
+The maker's frame, in m: z from the base towards the user along the machine's axis, x to the right,
+y up. With all three thighs at the encoders' zero the grip is at (0, 0, 0.1346). Leg i is rotated by
+φ_i about z. In its own frame (u outwards, v sideways, w = z), measured from the hip's axis,
 
     u = x cos φ + y sin φ − r,    v = −x sin φ + y cos φ − s,    w = z
 
 The thigh of length a swings by θ in the plane (u, w). The shin is a parallelogram of side b that
-leans sideways by v + f, between two short links d and e along the leg's plane, and ends at the grip
-plate, c inwards of the grip's own point. The leg closes where
+leans sideways by v + f, between two short links d and e along the leg's plane. It ends at the grip
+plate, c inwards of the grip's own point. The leg closes if
 
     h(p, θ) = √((u + c − a cos θ)² + (w − a sin θ)²) − L(v) = 0,    L(v) = √(b² − (v + f)²) + d + e
 
-h is a length: its gradient along p is nearly of length one, so Newton's steps are well scaled.
-Because of d + e this is no sphere, and the grip's position has no closed form; θ has.
+h is a length. Its gradient along p has nearly unit length, so Newton's steps are well scaled.
+Because of d + e the surface is not a sphere: the grip's position has no closed form, but θ has.
 
-Every function says by its result whether there is an answer; none returns a number that is not
-finite.
+Every function reports by its result whether a solution exists, and none returns a non-finite
+number.
 
 References:
     Stamper 1997 (the mechanism); the lengths are those of libnifalcon's source (2019).
@@ -33,51 +33,54 @@ from hapticbridge.device.falcon.protocol import Request, encode
 from hapticbridge.jit import compiled
 
 THIGH, SHIN = 0.060, 0.1025
-"""a and b in m: thigh, and the parallelogram's long side."""
+"""Lengths a and b in m: thigh, and long side of the parallelogram."""
 
 PLATE, LINKS = 0.01443, 2 * 0.01125
-"""c and d + e in m: from the grip's point to the plate's joint, and the two links of the shin."""
+"""Lengths c and d + e in m: from the grip's point to the plate's joint, and the two links of the
+shin."""
 
 SIDEWAYS, HIP_OUT, HIP_SIDEWAYS = -0.025, 0.0400, -0.02309
-"""f, r and s in m: the plate's joint beside the leg's plane, the hip's axis outwards and beside."""
+"""Offsets f, r and s in m: the plate's joint sideways of the leg's plane, and the hip's axis
+outwards and sideways."""
 
 LEG_ANGLES = np.radians([105.0, -15.0, -135.0])
-"""φ in rad: a third of a turn apart, 15° off the maker's frame."""
+"""Angles φ in rad: a third of a turn apart, 15° off the maker's frame."""
 
 RADIANS_PER_COUNT = 2 * math.pi / (4 * 320) * 0.01425 / 0.110
-"""Thigh angle per encoder count: 320 slots read four times a turn, on a shaft of 14.25 mm that
-drives a sector of 110 mm. 6.36e-4 rad."""
+"""Thigh angle in rad per encoder count, 6.36e-4: 320 slots with four counts each per turn, on a
+shaft of 14.25 mm that drives a sector of 110 mm."""
 
 ZERO_ANGLE = math.radians(35.0)
 """Thigh angle in rad at which a homed encoder reads 0."""
 
 LARGEST_RADIUS, NEAREST, FARTHEST = 0.075, 0.060, 0.190
-"""In m: distance from the axis and along it beyond which no grip is believed to be. The workspace
-is 0.1 m wide and 0.075 to 0.175 m from the base; more is a wrong encoder, less would refuse a grip
-that leans at its stop."""
+"""Limits of a plausible grip position in m: distance from the axis, and smallest and largest
+distance along it. The workspace is 0.1 m wide and reaches from 0.075 to 0.175 m. Positions beyond
+the limits mean a wrong encoder; tighter limits would refuse a grip that leans at its stop."""
 
 STEPS = 12
-"""Newton steps at most; from the middle of the workspace 6 reach its corners, 2 are usual."""
+"""Largest number of Newton steps. From the middle of the workspace 6 reach its corners, 2 are
+usual."""
 
 LONGEST_STEP = 0.02
-"""In m: Newton's steps are cut to it, a fifth of the workspace, so that the first one from far away
-does not leave the place where the legs can lean."""
+"""Longest Newton step in m: a fifth of the workspace. A longer first step could leave the region in
+which the legs can lean."""
 
 CLOSED = 1e-14
-"""In m: how well the legs must close. Rounding leaves 3e-17; a fifth of an atom is far below any
+"""Largest closure error of the legs in m. Rounding leaves 3e-17, and the limit is far below an
 encoder's step."""
 
 FLATTEST = 0.03
-"""Smallest |det| of the legs' directions, and smallest lever as a share of the thigh, no unit. In
-the middle of the workspace they are 0.8 and 0.98, at its rim 0.07 and 0.05; at 0 a leg is stretched
-or folded, and two positions answer to the same angles."""
+"""Smallest |det| of the legs' directions, and smallest lever relative to the thigh, without unit.
+In the middle of the workspace they are 0.8 and 0.98, at its rim 0.07 and 0.05. At 0 a leg is
+stretched or folded, and two positions have equal angles."""
 
 _COS, _SIN = np.cos(LEG_ANGLES), np.sin(LEG_ANGLES)
 
 
 @compiled
 def is_within_reach(position: NDArray[np.float64]) -> bool:
-    """Returns whether a grip can be there: near enough to the axis, and neither too near nor far.
+    """Returns whether a grip position is plausible.
 
     Args:
         position: Shape (3,), in m.
@@ -88,15 +91,15 @@ def is_within_reach(position: NDArray[np.float64]) -> bool:
 
 @compiled
 def inverse(position: NDArray[np.float64], angles: NDArray[np.float64]) -> bool:
-    """Writes the thigh angles of a grip position; returns whether every leg reaches it.
+    """Computes the thigh angles of a grip position; returns whether every leg reaches it.
 
         θ = atan2(w, u + c) − arccos((ρ² + a² − L²) / (2 a ρ)),    ρ² = (u + c)² + w²
 
-    the smaller of the two angles: the knee outside.
+    This is the smaller of the two angles, with the knee outside.
 
     Args:
         position: Shape (3,), in m, in the maker's frame.
-        angles: Shape (3,), in rad, filled in place; unchanged where there is no answer.
+        angles: Output, shape (3,), in rad; unchanged without a solution.
     """
     found = np.empty(3)
     for i in range(3):
@@ -124,14 +127,14 @@ def closure(
     gradients: NDArray[np.float64],
     levers: NDArray[np.float64],
 ) -> bool:
-    """Writes how far each leg is from closing, and how that changes; returns whether it can be.
+    """Computes the closure error of each leg and its derivatives; returns whether they exist.
 
     Args:
         position: Shape (3,), in m.
         angles: Shape (3,), in rad.
-        gaps: h of each leg in m, shape (3,), filled in place.
-        gradients: ∂h/∂p, a row per leg, no unit, shape (3, 3), filled in place.
-        levers: ∂h/∂θ in m, shape (3,), filled in place; negative with the knee outside.
+        gaps: Output: h of each leg in m, shape (3,).
+        gradients: Output: ∂h/∂p, a row per leg, without unit, shape (3, 3).
+        levers: Output: ∂h/∂θ in m, shape (3,); negative with the knee outside.
     """
     for i in range(3):
         out = position[0] * _COS[i] + position[1] * _SIN[i] - HIP_OUT + PLATE
@@ -161,7 +164,7 @@ def solve(
     Args:
         rows: Shape (3, 3).
         right: Shape (3,).
-        answer: Shape (3,), filled in place; unchanged where the determinant is 0.
+        answer: Output, shape (3,); unchanged for a determinant of 0.
     """
     a, b, c = rows[0], rows[1], rows[2]
     x0, x1, x2 = (
@@ -190,15 +193,14 @@ def solve(
 
 @compiled
 def forward(angles: NDArray[np.float64], position: NDArray[np.float64]) -> bool:
-    """Moves a grip position to where the thigh angles put it; returns whether that is anywhere.
+    """Computes the grip position of the thigh angles; returns whether it exists.
 
-    Newton's method on the three closures, from the position that is there: in a loop the last one.
-    The answer must lie within the reach, have every knee outside, and be no place where a leg is
-    stretched or folded.
+    Newton's method on the three closures starts from the current position, in a loop the last one.
+    The solution must be plausible, have every knee outside, and have no leg stretched or folded.
 
     Args:
         angles: Shape (3,), in rad.
-        position: Shape (3,), in m: where to begin; moved in place, unchanged without an answer.
+        position: Start and output, shape (3,), in m; unchanged without a solution.
     """
     point, step = position.copy(), np.empty(3)
     gaps, gradients, levers = np.empty(3), np.empty((3, 3)), np.empty(3)
@@ -221,22 +223,22 @@ def forward(angles: NDArray[np.float64], position: NDArray[np.float64]) -> bool:
     return False
 
 
-# Forces at the Falcon's grip and torques at its thighs, by virtual work.
+# Statics of the Falcon's legs.
 
 
 @compiled
 def jacobian(
     position: NDArray[np.float64], angles: NDArray[np.float64], matrix: NDArray[np.float64]
 ) -> bool:
-    """Writes ∂θ/∂p = −(∂h/∂θ)⁻¹ ∂h/∂p at a pose where the legs close.
+    """Computes ∂θ/∂p = −(∂h/∂θ)⁻¹ ∂h/∂p at a pose where the legs close.
 
     Args:
         position: Shape (3,), in m.
         angles: Shape (3,), in rad, those of the position.
-        matrix: Shape (3, 3), in rad/m, filled in place.
+        matrix: Output, shape (3, 3), in rad/m.
 
     Returns:
-        Whether there is one: no leg is stretched or folded.
+        False if a leg is stretched or folded.
     """
     gaps, gradients, levers = np.empty(3), np.empty((3, 3)), np.empty(3)
     if not closure(position, angles, gaps, gradients, levers):
@@ -257,7 +259,7 @@ def thigh_torques(
     force: NDArray[np.float64],
     torques: NDArray[np.float64],
 ) -> bool:
-    """Writes the thigh torques that push the grip with a force: τ = J⁻ᵀ F, J = ∂θ/∂p.
+    """Computes the thigh torques of a force at the grip: τ = J⁻ᵀ F, J = ∂θ/∂p.
 
     By virtual work τ·δθ = F·δp for every motion.
 
@@ -265,10 +267,10 @@ def thigh_torques(
         position: Shape (3,), in m.
         angles: Shape (3,), in rad, those of the position.
         force: Shape (3,), in N, in the maker's frame.
-        torques: Shape (3,), in N m, filled in place; zero where there is no answer.
+        torques: Output, shape (3,), in N m; zero without a solution.
 
     Returns:
-        Whether there is an answer.
+        Whether a solution exists.
     """
     torques[:] = 0.0
     gaps, gradients, levers = np.empty(3), np.empty((3, 3)), np.empty(3)
@@ -282,40 +284,40 @@ def thigh_torques(
     return True
 
 
-# What a tick does with a Falcon's packets: encoders to a pose to believe, force to motors.
+# Poses and forces of a Falcon from its packets.
 
 MOTION_DTYPE = np.dtype([("position", "<f8", 3), ("angles", "<f8", 3), ("motors", "<i8", 3)])
-"""What is carried from tick to tick: the grip in the maker's frame in m, its thigh angles in rad,
-and the motor units of the last command."""
+"""State carried from tick to tick: position of the grip in the maker's frame in m, its thigh angles
+in rad, and the motor units of the last command."""
 
 PLACE = (0.0, 0.0, 0.125)
 """Middle of the workspace in the maker's frame, in m: half way between 0.075 and 0.175 from the
-base. The device's frame begins there."""
+base. It is the origin of the device's frame."""
 
 UNITS_PER_TORQUE = -1e4
-"""Motor units per N m at the thigh, of libnifalcon: its sign, and its scale, which nobody published
-a calibration of."""
+"""Motor units per N m at the thigh, with sign, from libnifalcon. No calibration of the scale is
+published."""
 
 MOTOR_LIMIT = 4096.0
-"""Motor units that a motor is sent at most. 9 N along the axis take 2259 on each, 9 N across it
-5200 on one; libnifalcon's users clamp at about as much."""
+"""Largest command to a motor in motor units. 9 N along the axis take 2259 on each motor, 9 N across
+it 5200 on one. Programs based on libnifalcon clamp at a similar value."""
 
 FORCE_LIMIT = 8.0
-"""In N: what CHAI3D lets applications ask of a Falcon; the maker's figure is above 8.9 N."""
+"""Largest force in N: the value that CHAI3D allows for a Falcon. The maker states above 8.9 N."""
 
 SPEED_LIMIT = 3.0
-"""In m/s: faster motion is not believed. No figure was found; a hand that crosses the 0.1 m of the
-workspace in 33 ms is at its end."""
+"""Largest plausible speed in m/s. No figure is published; a hand at this speed crosses the
+workspace of 0.1 m in 33 ms."""
 
 MOST_COUNTS = 3000
-"""Counts either side of zero that a thigh can turn to: -74° to 144°. The workspace takes -66° to
-114°; a whole turn further the same place would follow."""
+"""Largest encoder count of a thigh on either side of zero: -74° to 144°. The workspace takes -66°
+to 114°. One more turn would lead to the same position again."""
 
 FLAGS = int(Request.GREEN)
-"""The light while the loop runs."""
+"""Light during the loop, as ``Request`` bits."""
 
 BELIEVED, OUT_OF_REACH, JUMP = 0, 1, 2
-"""What ``believe`` makes of a reply."""
+"""Results of ``believe``."""
 
 
 @compiled
@@ -325,14 +327,14 @@ def believe(
     samples: NDArray[np.void],
     elapsed: float,
 ) -> int:
-    """Turns a reply into a sample in the device's frame, if the grip can be there.
+    """Converts a reply into a sample in the device's frame, if it is plausible.
 
     Args:
-        motions: Shape (1,), ``MOTION_DTYPE``; moved on only where the reply is believed.
+        motions: Shape (1,), ``MOTION_DTYPE``; updated only by a plausible reply.
         replies: Shape (1,), ``REPLY_DTYPE``.
-        samples: Shape (1,), ``SAMPLE_DTYPE``, filled in place likewise.
-        elapsed: Longest time in s that can lie between this pose and the one of the reply before;
-            inf believes any place within reach.
+        samples: Output, shape (1,), ``SAMPLE_DTYPE``; updated only by a plausible reply.
+        elapsed: Longest possible time in s since the pose of the previous reply; inf accepts any
+            position within reach.
 
     Returns:
         ``BELIEVED``, ``OUT_OF_REACH`` or ``JUMP``.
@@ -365,15 +367,16 @@ def believe(
 def command(
     motions: NDArray[np.void], wrench: NDArray[np.float64], packet: NDArray[np.uint8]
 ) -> None:
-    """Writes the packet that pushes the grip with a force, where it was last believed to be.
+    """Encodes the packet that applies a force at the last plausible grip position.
 
-    Where a motor would be asked for more than its limit, all three are scaled down together: the
-    force becomes smaller and keeps its direction.
+    If a motor would exceed its limit, all three are scaled down together, which keeps the direction
+    of the force.
 
     Args:
         motions: Shape (1,), ``MOTION_DTYPE``; its motor units are set.
-        wrench: Shape (6,) in the device's frame; the force counts, in N. Not finite is no force.
-        packet: Shape (16,), filled in place.
+        wrench: Shape (6,) in the device's frame, in N and N m. Only the force is used; a non-finite
+            force becomes zero.
+        packet: Output, shape (16,).
     """
     motion = motions[0]
     force, torques = np.empty(3), np.empty(3)
@@ -391,7 +394,7 @@ def command(
 
 
 def resolution() -> float:
-    """Returns the longest way in m that one encoder step can be, in the middle of the workspace."""
+    """Returns the largest displacement in m of one encoder step, in the middle of the workspace."""
     position, angles, matrix = np.array(PLACE), np.empty(3), np.empty((3, 3))
     inverse(position, angles)
     jacobian(position, angles, matrix)

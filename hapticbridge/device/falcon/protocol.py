@@ -1,21 +1,21 @@
-"""The Falcon's run packets: 16 printable bytes each way, found again after anything.
+"""Packet format of the Falcon: 16 printable bytes in each direction.
 
     <  MMMM MMMM MMMM  F  A  >      to the device: three motors, flags
     <  EEEE EEEE EEEE  F  ?  >      from it: three encoders, flags, one byte of unknown use
 
-A number is 16 bits in two's complement, as four nibbles, the lowest first, each 0x41 + nibble; the
-flags are one byte, 0x41 + flags. The device speaks only when asked: one reply per request. There
-is no checksum. A reply is believed if it begins and ends as it must, 16 bytes apart, with nothing
-but nibbles between; what lies before it is dropped. '<' and '>' are no nibbles, so a reply with a
-byte lost or put in cannot pass for one.
+A number has 16 bits in two's complement, sent as four nibbles, the lowest first, each as 0x41 +
+nibble. The flags are one byte, 0x41 + flags. The device sends one reply per request, without a
+checksum. A reply is valid if '<' and '>' are 16 bytes apart with only nibbles between; bytes before
+it are dropped. Because '<' and '>' are not nibbles, a reply with a lost or inserted byte is never
+valid.
 
-It reaches the host through an FTDI bridge in USB packets of 64 bytes at most, each of which begins
-with two bytes of modem status; one of only these says that there is nothing to say.
+Replies arrive through an FTDI bridge in USB packets of at most 64 bytes. Each begins with two bytes
+of modem status; a packet of only these carries no data.
 
 References:
-    libnifalcon's source (2019). Two of its statements contradict each other: the flag for homing is
-    0x01 in the code and 0x10 in a comment, the lights are green 2, blue 4, red 8 in the code and
-    red 2, green 4, blue 8 in a comment. The code's values are used here; no device has been asked.
+    libnifalcon's source (2019). It contradicts itself twice: the flag for homing is 0x01 in the
+    code and 0x10 in a comment; the lights are green 2, blue 4, red 8 in the code and red 2, green
+    4, blue 8 in a comment. The code's values are used here; not verified on hardware.
 """
 
 from __future__ import annotations
@@ -34,27 +34,27 @@ from hapticbridge.errors import DeviceError, DeviceLost
 from hapticbridge.jit import compiled
 
 SIZE = 16
-"""Bytes of a packet, either way."""
+"""Bytes per packet, in each direction."""
 
 STATUS = 2
 """Bytes of modem status before the data of each USB packet from an FTDI bridge."""
 
 LARGEST = 32767
-"""Largest number, either sign, that a packet carries."""
+"""Largest magnitude of a number in a packet."""
 
 REPLY_DTYPE = np.dtype([("encoders", "<i8", 3), ("buttons", "<i8"), ("homed", "<i8")])
-"""A reply: encoder counts; grip buttons as bits (1 right, 2 forward, 4 centre, 8 left); and a bit
-per encoder that has found its zero, true only while homing is on."""
+"""Reply: encoder counts; grip buttons as bits (1 right, 2 forward, 4 centre, 8 left); and a bit per
+encoder that has found its zero, valid only while homing is on."""
 
 _FIRST, _LAST, _ZERO = ord("<"), ord(">"), 0x41
-_ROOM = 4096  # bytes of tail and news together: far more than a USB packet, so nothing is cut
+_ROOM = 4096  # bytes of buffer: far more than a USB packet, so nothing is cut
 
 
 class Request(IntFlag):
     """Flags of a packet to the device.
 
     Attributes:
-        HOMING: Each encoder is set to 0 where it passes its index mark.
+        HOMING: Each encoder is set to 0 at its index mark.
         GREEN: The green light.
         BLUE: The blue light.
         RED: The red light.
@@ -68,12 +68,12 @@ class Request(IntFlag):
 
 @compiled
 def encode(motors: NDArray[np.int64], flags: int, packet: NDArray[np.uint8]) -> None:
-    """Writes a packet to the device.
+    """Encodes a packet to the device.
 
     Args:
-        motors: Shape (3,), motor units; what a packet cannot carry becomes its nearest.
+        motors: Shape (3,), motor units, clamped to the range of a packet.
         flags: ``Request`` bits, 0 to 15.
-        packet: Shape (16,), filled in place.
+        packet: Output, shape (16,).
     """
     packet[0], packet[14], packet[15] = _FIRST, _ZERO, _LAST
     packet[13] = _ZERO + (flags & 15)
@@ -97,16 +97,16 @@ def _is_reply(data: NDArray[np.uint8], at: int) -> bool:
 def newest_reply(
     data: NDArray[np.uint8], count: int, replies: NDArray[np.void]
 ) -> tuple[int, int, int]:
-    """Decodes the last reply in a stream of bytes, whatever stands around it.
+    """Decodes the last reply in a stream of bytes.
 
     Args:
-        data: The stream, of which the first ``count`` bytes count.
-        count: How many.
-        replies: Shape (1,), ``REPLY_DTYPE``, filled in place; unchanged where there is no reply.
+        data: The stream.
+        count: Number of valid bytes in ``data``.
+        replies: Output, shape (1,), ``REPLY_DTYPE``; unchanged without a reply.
 
     Returns:
-        How many bytes are done with, how many replies there were, and how many bytes belonged to
-        none. The rest may be the beginning of a reply: fewer than 16 bytes.
+        Number of consumed bytes, of replies, and of bytes that belonged to no reply. The remaining
+        bytes may be the beginning of a reply: fewer than 16.
     """
     at, found, dropped, last = 0, 0, 0, -1
     while at + SIZE <= count:
@@ -133,11 +133,11 @@ def newest_reply(
 
 
 class ReplyStream:
-    """Puts USB packets together to replies and keeps the newest.
+    """Assembles replies from USB packets and keeps the newest.
 
     Attributes:
-        reply: The newest, shape (1,), ``REPLY_DTYPE``.
-        dropped: Bytes so far that belonged to no reply.
+        reply: Newest reply, shape (1,), ``REPLY_DTYPE``.
+        dropped: Number of bytes so far that belonged to no reply.
     """
 
     def __init__(self) -> None:
@@ -147,10 +147,10 @@ class ReplyStream:
         self._count = 0
 
     def feed(self, packet: bytes) -> int:
-        """Takes a USB packet; returns how many replies it completed.
+        """Consumes a USB packet; returns the number of replies that it completed.
 
         Args:
-            packet: With its status bytes; of any content, and of 4081 bytes at most.
+            packet: Packet with its status bytes, of any content, at most 4081 bytes.
         """
         news = len(packet) - STATUS
         if news <= 0:
@@ -165,45 +165,36 @@ class ReplyStream:
         return found
 
     def clear(self) -> None:
-        """Forgets the beginning of a reply that was under way."""
+        """Discards the beginning of an incomplete reply."""
         self._count = 0
 
 
-# How a Falcon is brought to speak: its serial bridge, its loader, and one question at a time.
-#
-# The Falcon is a signal processor behind an FTDI serial bridge. Without power it forgets its
-# program, so the host sends it: at 9600 baud the loader is greeted, at 140000 baud it takes the
-# program in pieces and sends each back, which is all the check there is; then both go to 1.5
-# Mbaud and packets (``packets``). The program is the maker's and is not shipped here.
-#
-# Requests of the bridge, all without data (FTDI's names and numbers): 0 reset (value 1 empties
-# what came from the device, 2 what goes to it), 1 modem lines, 2 flow control, 3 baud rate, 4
-# data format, 6 event character, 9 latency timer in ms.
-#
-# References: libnifalcon's source (2019) for the sequence. No device has been asked.
+# Boot protocol of a Falcon: serial bridge and loader.
 
 READ_FROM, WRITE_TO = 0x81, 0x02
 """Addresses of its bulk endpoints."""
 
 LARGEST_FIRMWARE = 65536
-"""In bytes. The four images known have 7324 to 8492; a larger file is another file."""
+"""Largest firmware file in bytes. The four known images have 7324 to 8492 bytes; a larger file is
+not firmware."""
 
 CHUNK = 62
-"""Bytes of the program per piece: what fits beside the status bytes into one packet back."""
+"""Bytes of firmware per piece. The returned piece fits into one packet together with the status
+bytes."""
 
 GREETINGS = 100
-"""How often the loader is greeted, as libnifalcon does, before it is given up: 10 s in all."""
+"""Number of greetings to the loader, as in libnifalcon, before the boot fails: 10 s in all."""
 
 ANSWER_TIME = 0.1
-"""In s: how long one answer is waited for. The slowest, a piece of the program at 140000 baud, is
-on the line for 9 ms, there and back, and in the bridge for up to 16."""
+"""Longest wait for one answer of the loader in s. The slowest answer, a piece of firmware at 140000
+baud, takes 9 ms on the line in both directions and up to 16 ms in the bridge."""
 
 PROBES = 20
-"""Packets that a Falcon is asked with before it counts as not speaking: the first ones after a
-change of baud rate may be lost."""
+"""Number of packets without a reply after which a Falcon counts as not running. The first packets
+after a change of baud rate may be lost."""
 
 PROBE_TIME = 0.02
-"""In s: how long each of them is waited for; a reply is there within 1.3 ms."""
+"""Longest wait for the reply to a probe in s; a reply takes up to 1.3 ms."""
 
 _RESET, _MODEM, _FLOW, _BAUD, _FORMAT, _EVENT, _LATENCY = 0, 1, 2, 3, 4, 6, 9
 _EMPTY_INPUT, _EMPTY_OUTPUT = 1, 2
@@ -211,37 +202,42 @@ _DTR_LOW, _DTR_HIGH, _RTS_LOW = 0x0100, 0x0101, 0x0200
 _BAUD_GREETING, _BAUD_LOADING, _BAUD_RUNNING = 0x4138, 0x0015, 0x0002
 _HELLO, _HELLO_ANSWER, _LOAD = b"\x0aC\x0d", b"\x0aD,\x0d", b"A"
 _EVENT_AT_END = 0x0100 | ord(">")
-_WRITE_MS = 100  # outside the loop a write may take its time
+_WRITE_MS = 100  # writes outside the loop are not urgent
 _NO_MOTORS = np.zeros(3, np.int64)
 
 
 class Link(Protocol):
-    """What the codec needs of a USB link; ``UsbLink`` is the real one."""
+    """USB link of a Falcon; ``UsbLink`` is the real one."""
 
     def now(self) -> float:
-        """Returns the time in s of a clock that only grows."""
+        """Returns the time of a monotonic clock in s."""
 
     def control(self, request: int, value: int) -> None:
-        """Sends a vendor's request without data."""
+        """Sends a vendor request without data.
+
+        The serial bridge is an FTDI chip. Its requests have FTDI's names and numbers: 0 reset
+        (value 1 clears the data from the device, 2 the data to it), 1 modem lines, 2 flow control,
+        3 baud rate, 4 data format, 6 event character, 9 latency timer in ms.
+        """
 
     def write(self, packet: array.array[int], timeout_ms: int = ...) -> bool:
-        """Sends a packet; returns False where the device did not take it in time."""
+        """Sends a packet; returns False if the device did not accept it in time."""
 
     def take(self) -> list[bytes]:
-        """Returns the packets that came since the last call, without waiting."""
+        """Returns the packets received since the last call, without waiting."""
 
     def wait(self, timeout: float) -> None:
-        """Returns as soon as a packet is there, at the latest after ``timeout`` s."""
+        """Returns as soon as a packet is available, at the latest after ``timeout`` s."""
 
     def close(self) -> None:
-        """Lets the device go."""
+        """Releases the device."""
 
 
 def read_firmware(path: str) -> bytes:
-    """Reads a program for the Falcon.
+    """Reads a firmware file for the Falcon. The firmware belongs to the maker and is not shipped.
 
     Raises:
-        DeviceError: There is no such file, it cannot be read, or it cannot be one.
+        DeviceError: The file does not exist, cannot be read, or has an impossible size.
     """
     try:
         image = Path(path).read_bytes()
@@ -257,10 +253,10 @@ def read_firmware(path: str) -> bytes:
 
 
 def enter_run_mode(link: Link) -> None:
-    """Sets the bridge to packets: 1.5 Mbaud, and the shortest wait before it passes a reply on.
+    """Sets the bridge to packets at 1.5 Mbaud with the shortest latency.
 
-    That wait, the latency timer, is 1 ms. The event character asks the bridge to pass on at once
-    what ends with '>'; whether a Falcon's bridge heeds it is measured, not assumed.
+    The latency timer is set to 1 ms. The event character requests immediate delivery of data that
+    ends with '>'. Whether a Falcon's bridge obeys it is measured (``measured_timing``).
     """
     link.control(_LATENCY, 1)
     link.control(_BAUD, _BAUD_RUNNING)
@@ -270,7 +266,7 @@ def enter_run_mode(link: Link) -> None:
 
 
 def send_question(link: Link, flags: int = 0) -> None:
-    """Sends a packet without force, and waits for nothing; ``flags`` are ``Request`` bits."""
+    """Sends a packet without force and returns at once; ``flags`` are ``Request`` bits."""
     packet = array.array("B", bytes(SIZE))
     encode(_NO_MOTORS, flags, np.frombuffer(packet, np.uint8))
     link.write(packet, _WRITE_MS)
@@ -280,24 +276,24 @@ def ask(link: Link, stream: ReplyStream, flags: int, timeout: float) -> bool:
     """Sends a packet without force and waits for the reply.
 
     Args:
-        link: To the Falcon, in run mode.
-        stream: Takes the reply.
+        link: Link to the Falcon, in run mode.
+        stream: Receives the reply.
         flags: ``Request`` bits.
         timeout: Longest wait in s.
 
     Returns:
-        Whether there was a reply in time.
+        True if a reply came in time.
     """
     send_question(link, flags)
     return answers(link, stream, timeout) > 0
 
 
 def answers(link: Link, stream: ReplyStream, timeout: float) -> int:
-    """Waits until at least one reply is there; returns how many there are, 0 if none comes.
+    """Waits for at least one reply and returns the number of replies, 0 after a timeout.
 
     Args:
-        link: To the Falcon, in run mode.
-        stream: Takes them.
+        link: Link to the Falcon, in run mode.
+        stream: Receives the replies.
         timeout: Longest wait in s.
     """
     end = link.now() + timeout
@@ -310,28 +306,34 @@ def answers(link: Link, stream: ReplyStream, timeout: float) -> int:
 
 
 def speaks(link: Link, stream: ReplyStream) -> bool:
-    """Returns whether a Falcon in run mode answers packets: whether it has its program."""
+    """Returns whether a Falcon in run mode answers packets, that is whether it has its firmware."""
     return any(ask(link, stream, 0, PROBE_TIME) for _ in range(PROBES))
 
 
 def upload(link: Link, image: bytes, name: str, tell: Notify) -> None:
-    """Gives a Falcon its program.
+    """Loads the firmware into a Falcon, which loses it without power.
+
+    At 9600 baud the loader is greeted. At 140000 baud it receives the firmware in pieces and
+    returns each, which is the only check.
 
     Args:
-        link: To the Falcon.
-        image: The program.
-        name: What errors call the device.
-        tell: Told how far it is, at every quarter.
+        link: Link to the Falcon.
+        image: The firmware.
+        name: Name of the device in messages.
+        tell: Receives the progress, at every quarter.
 
     Raises:
-        DeviceError: The loader does not answer, or sent back something else than was sent.
-        DeviceLost: It is gone.
+        DeviceError: The loader does not answer, or returned other bytes than it received.
+        DeviceLost: The device is gone.
+
+    References:
+        libnifalcon's source (2019) for the sequence; not verified on hardware.
     """
     _greet(link, name)
     link.control(_MODEM, _DTR_LOW)
     link.control(_BAUD, _BAUD_LOADING)
     if _echo(link, _LOAD) != _LOAD:
-        raise DeviceError(f"{name}: its loader does not begin to load; switch its power off and on")
+        raise DeviceError(f"{name}: its loader does not start to load; switch its power off and on")
     quarter = 0
     for start in range(0, len(image), CHUNK):
         piece = image[start : start + CHUNK]
@@ -361,14 +363,14 @@ def _greet(link: Link, name: str) -> None:
         link.control(request, value)
     link.take()
     for _ in range(GREETINGS):
-        # a zero byte may come before the answer, from the line's being switched
+        # switching the line may insert a zero byte before the answer
         if _echo(link, _HELLO, len(_HELLO_ANSWER)).lstrip(b"\0") == _HELLO_ANSWER:
             return
     raise DeviceError(f"{name}: its loader does not answer; switch its power off and on")
 
 
 def _echo(link: Link, data: bytes, length: int | None = None) -> bytes:
-    """Sends bytes; returns what comes back within ``ANSWER_TIME``, as many by default."""
+    """Sends bytes and returns the answer within ``ANSWER_TIME``, by default of equal length."""
     wanted = len(data) if length is None else length
     link.write(array.array("B", data), _WRITE_MS)
     end = link.now() + ANSWER_TIME
@@ -388,63 +390,66 @@ def _difference(sent: bytes, echo: bytes, start: int) -> str:
     return f"{len(echo)} bytes for the {len(sent)} from byte {start} on"
 
 
-# A Falcon from plugged in to ready: its program, and the zeros of its encoders.
-#
-# And what is said to it outside the ticks: no force.
+# Start of a Falcon: firmware and homing.
 
 LONGEST_PERIOD = 0.02
-"""In s. It is asked once a tick; slower, two lost replies would already count as silence."""
+"""Longest period of the loop in s. The device is polled once per tick; at a longer period two lost
+replies would already count as silence."""
 
 ZERO_TRIES = 20
-"""How often a packet without force is sent again that was not taken, for 1 ms each: no watchdog of
-a Falcon is known, so the force before it would stay."""
+"""Number of attempts, of 1 ms each, to send a zero force that was not accepted. No watchdog of a
+Falcon is known, so the previous force would remain."""
 
 HOMING_TIME = 60.0
-"""In s: how long the user has to move the grip through its range."""
+"""Time in s in which the user must move the grip through its range."""
 
 _ALL = 7  # a bit per encoder
 
 
 def silent(name: str) -> DeviceLost:
-    """Returns the error that a Falcon has fallen silent."""
-    return DeviceLost(f"{name}: gave no usable reply for {1e3 * SILENCE:g} ms")
+    """Returns the error of a Falcon that stopped replying."""
+    return DeviceLost(
+        f"{name}: gave no usable reply for {1e3 * SILENCE:g} ms; check its cable and its power"
+    )
 
 
 def insist(link: Link, packet: array.array[int], name: str) -> None:
-    """Sends a packet without force that was not taken until it is.
+    """Repeats a zero-force packet until it is accepted.
 
     Args:
-        link: To the Falcon.
-        packet: Of no force.
-        name: What errors call it.
+        link: Link to the Falcon.
+        packet: Packet without force.
+        name: Name of the device in messages.
 
     Raises:
-        DeviceLost: It is gone, or takes none in ``ZERO_TRIES``.
+        DeviceLost: The device is gone, or refused ``ZERO_TRIES`` attempts.
     """
     if not any(link.write(packet) for _ in range(ZERO_TRIES)):
-        raise DeviceLost(f"{name}: does not take that it is to give no force")
+        raise DeviceLost(
+            f"{name}: did not accept zero force in {ZERO_TRIES} attempts; switch its power off"
+        )
 
 
 def ask_anew(link: Link, stream: ReplyStream, name: str) -> float:
-    """Takes the force away and asks where the grip is now, after the loop stood still.
+    """Commands zero force and reads the pose again, after a pause of the loop.
 
-    Nothing takes the force of a Falcon away while its host stands still. The reply that waits is to
-    a question from before that; a coupling that is re-seated by it is stretched, as soon as the
-    next reply comes, by all that the hand has moved since.
+    A Falcon keeps its last force while the host pauses, and the waiting reply holds an outdated
+    pose. If the handle were re-anchored there, the next reply would stretch the coupling by the
+    hand's motion in the meantime.
 
     Args:
-        link: To a Falcon that speaks.
-        stream: Takes its replies; the newest is then to a question asked here.
-        name: What errors call it.
+        link: Link to a running Falcon.
+        stream: Receives the replies; the newest then answers a request of this call.
+        name: Name of the device in messages.
 
     Returns:
-        When it was first asked, in s: the pose is no older.
+        Time of the first request in s; the pose is not older.
 
     Raises:
-        DeviceLost: It is gone, or silent.
+        DeviceLost: The device is gone or silent.
     """
     asked = link.now()
-    for _ in range(2):  # the first reply may be to a question of the loop's
+    for _ in range(2):  # the first reply may answer a request of the loop
         if not ask(link, stream, Request.GREEN, SILENCE):
             raise silent(name)
     return asked
@@ -453,18 +458,18 @@ def ask_anew(link: Link, stream: ReplyStream, name: str) -> float:
 def bring_up(
     link: Link, stream: ReplyStream, name: str, firmware: str | None, tell: Notify
 ) -> None:
-    """Makes a Falcon speak: asks it first, and sends its program only where it does not answer.
+    """Brings a Falcon into run mode, and loads its firmware if it does not answer.
 
     Args:
-        link: To the Falcon.
-        stream: Takes its replies.
-        name: What errors call it.
-        firmware: File with its program, or None.
-        tell: Told how far the program is.
+        link: Link to the Falcon.
+        stream: Receives the replies.
+        name: Name of the device in messages.
+        firmware: Firmware file, or None.
+        tell: Receives the progress.
 
     Raises:
-        DeviceError: It has no program, and none was named or it does not run.
-        DeviceLost: It is gone.
+        DeviceError: The device has no firmware, and no file was named or the file does not run.
+        DeviceLost: The device is gone.
     """
     image = None if firmware is None else read_firmware(firmware)
     enter_run_mode(link)
@@ -472,30 +477,30 @@ def bring_up(
         return
     if image is None:
         raise DeviceError(
-            f"{name}: has no firmware (it forgets it without power); name the file with "
-            "the maker's program: falcon:firmware=FILE"
+            f"{name}: has no firmware (it loses it without power); name the maker's firmware "
+            "file: falcon:firmware=FILE"
         )
     upload(link, image, name, tell)
     enter_run_mode(link)
     stream.clear()
     if not speaks(link, stream):
         raise DeviceError(
-            f"{name}: took '{firmware}', and does not answer; it is no firmware for it"
+            f"{name}: accepted '{firmware}' but does not answer; name a file with its firmware"
         )
 
 
 def home(link: Link, stream: ReplyStream, name: str, tell: Notify) -> None:
-    """Waits until every encoder has passed its zero; asks the user to see to it.
+    """Waits until the user has moved every encoder through its zero.
 
     Args:
-        link: To a Falcon that speaks.
-        stream: Takes its replies.
-        name: What errors call it.
-        tell: Told what the user has to do.
+        link: Link to a running Falcon.
+        stream: Receives the replies.
+        name: Name of the device in messages.
+        tell: Receives the instruction to the user.
 
     Raises:
-        DeviceError: Nobody did within ``HOMING_TIME``.
-        DeviceLost: It is gone, or fell silent.
+        DeviceError: The grip was not moved within ``HOMING_TIME``.
+        DeviceLost: The device is gone or silent.
     """
     end, is_told = link.now() + HOMING_TIME, False
     heard = link.now()

@@ -1,17 +1,17 @@
-"""Force Dimension's omega, delta, sigma and lambda, through the maker's own library.
+"""Force Dimension's omega, delta, sigma and lambda, through the maker's library.
 
-The library is not part of this project; the user has it from the maker (``library``). Calls
-talk to the device before they return, so a sample is as old as its call and a force acts when its
-call ends: the sheet's delay is what both together take.
+The library is not part of this project; users obtain it from the maker (``library``). A call
+communicates with the device before it returns. A sample is therefore as old as its call, and a
+force acts when its call ends. The sheet's delay is the duration of both calls.
 
 The device's frame is the library's: the origin in the middle of the workspace, x towards the user,
-y to the right, z up. A wrist with motors (sigma.7, lambda.7) is three more axes; its orientation
-comes as a matrix (``dhdGetPositionAndOrientationFrame``), because the library's angles are those of
-joints. A wrist without motors (omega.6 and omega.7) is left out: what it turns would put energy
-into the scene that no motor answers for. The maker's gravity compensation is switched on unless
-``gravity=0`` says otherwise: a force that depends on the position alone, so it gives no energy.
+y to the right, z up. A wrist with motors (sigma.7, lambda.7) adds three axes. Its orientation is
+read as a matrix (``dhdGetPositionAndOrientationFrame``), because the library's angles are joint
+angles. A wrist without motors (omega.6 and omega.7) is ignored: its rotation would put energy into
+the scene without a motor to balance it. The maker's gravity compensation is on unless ``gravity=0``
+is set. It depends on the position only, so it generates no energy.
 
-No real device has moved under this code yet.
+The driver has not been verified on hardware.
 """
 
 from __future__ import annotations
@@ -59,34 +59,34 @@ from hapticbridge.record import SAMPLE_DTYPE, TickFlag
 MEASURED = (
     "mass", "damping", "rotational_inertia", "rotational_damping", "friction", "resolution",
 )  # fmt: skip
-"""Numbers of the data sheet that nobody knows but who measured them."""
+"""Numbers of the data sheet that are known only from a measurement."""
 
 FARTHEST = 10.0
-"""In m: a position beyond is none."""
+"""Largest plausible coordinate in m."""
 
 
 class ForceDimensionDevice:
-    """A device that is open.
+    """An open Force Dimension device.
 
-    The sheet's ``rate`` is how often a sample was read and a force written, its ``delay`` the time
-    that 95 % of these took (``Dhd.timing``); its limits are the lower ones of what the
-    library says, and of what was asked or is known of the model. The mass that the library knows
-    is the one that its gravity compensation carries: it is told, and is not the inertia felt.
+    The sheet's ``rate`` is the rate of exchanges of a sample and a force; its ``delay`` is the time
+    that 95 % of the exchanges met (``Dhd.timing``). Each limit is the lower of the library's limit
+    and the user's or the model's value. The library's mass is the one carried by gravity
+    compensation. It is reported to the user and is not the inertia at the handle.
 
     Args:
         dhd: The library.
-        index: Which of its devices, from 0.
-        gravity: Whether the maker's gravity compensation is on.
-        numbers: Of the data sheet, by name.
-        tell: Told what the device is and what was set.
+        index: Number of the device in the library, from 0.
+        gravity: True to enable the maker's gravity compensation.
+        numbers: Numbers of the data sheet, by name.
+        tell: Receives a description of the device and its settings.
 
     Attributes:
-        effector_mass: What the gravity compensation carries, in kg; None where it is not known.
-        saturated: Writes at which a motor was at its end.
+        effector_mass: Mass carried by gravity compensation in kg; None if unknown.
+        saturated: Number of writes that saturated a motor.
 
     Raises:
-        DeviceError: It cannot be opened, or a limit that nobody can guess is missing.
-        DeviceLost: It is gone.
+        DeviceError: The device cannot be opened, or a required limit is unknown.
+        DeviceLost: The device is gone.
     """
 
     def __init__(
@@ -154,11 +154,11 @@ class ForceDimensionDevice:
         """Sets the watchdog, switches the motors on without force, and reads the pose.
 
         Args:
-            period: The loop's period in s, finite and > 0, below what the watchdog bears.
+            period: The loop's period in s, finite and > 0, at most half of the longest watchdog.
 
         Raises:
-            DeviceError: The period is not, or the device reports no pose.
-            DeviceLost: It is gone.
+            DeviceError: The period is out of range, or the device reports no pose.
+            DeviceLost: The device is gone.
         """
         longest = MOST_WATCHDOG * WATCHDOG_STEP
         if checked_period(period) > 0.5 * longest:
@@ -169,8 +169,8 @@ class ForceDimensionDevice:
         steps = min(math.ceil(watchdog_time(period) / WATCHDOG_STEP), MOST_WATCHDOG)
         if not self._dhd.has_watchdog(self._id, steps):
             self._tell(
-                f"{self._name} has no watchdog ({self._dhd.last_error()}): a program that hangs "
-                "would leave its last force on"
+                f"{self._name} has no watchdog ({self._dhd.last_error()}): its last force would "
+                "remain if the program hangs"
             )
         self._send((0.0,) * 6)
         self._require("dhdEnableForce", 1)
@@ -178,27 +178,30 @@ class ForceDimensionDevice:
         begin = self._dhd.now()
         while self._get() == TIMEGUARD:
             if self._dhd.now() - begin > SILENCE:
-                raise DeviceLost(f"{self._name} gives no fresh sample")
+                raise DeviceLost(
+                    f"{self._name} gives no fresh sample within {1e3 * SILENCE:g} ms of its "
+                    "start; check its cable and its power"
+                )
         self._fill()
         self._watch = SilenceDetector(self._dhd.now())
         self._is_started = True
         return self._sample.copy()
 
     def read(self, sample: NDArray[np.void]) -> int:
-        """Reads the pose; blocks for as long as the library does.
+        """Reads the pose; blocks as long as the library does.
 
         Args:
-            sample: Shape (1,), ``SAMPLE_DTYPE``, filled in place.
+            sample: Output, shape (1,), ``SAMPLE_DTYPE``.
 
         Returns:
-            0, or ``TickFlag.STALE_SAMPLE`` where the library had no newer sample.
+            0, or ``TickFlag.STALE_SAMPLE`` if the library had no newer sample.
 
         Raises:
-            DeviceError: ``start`` has not been called, or what came is no pose.
+            DeviceError: The device was not started, or reports an invalid pose.
             DeviceLost: The library reports an error, or no fresh sample for ``SILENCE``.
         """
         if not self._is_started:
-            raise DeviceError(f"{self._name} is read before it was started")
+            raise DeviceError(f"{self._name} is read before it was started; call start() first")
         is_fresh = self._get() != TIMEGUARD
         now = self._dhd.now()
         if is_fresh:
@@ -209,13 +212,13 @@ class ForceDimensionDevice:
         return 0 if is_fresh else int(TickFlag.STALE_SAMPLE)
 
     def write(self, wrench: NDArray[np.float64]) -> None:
-        """Commands a wrench, on the axes that have motors.
+        """Commands a wrench on the axes that have motors.
 
         Args:
             wrench: Shape (6,), in the device's frame.
 
         Raises:
-            DeviceError: It is not finite.
+            DeviceError: The wrench is not finite.
             DeviceLost: The library reports an error.
         """
         values = wrench.tolist()
@@ -224,7 +227,7 @@ class ForceDimensionDevice:
         self.saturated += self._send(values) == SATURATED
 
     def close(self) -> None:
-        """Commands zero force, switches the motors off and lets the device go."""
+        """Commands zero force, switches the motors off and releases the device."""
         if not self._is_open:
             return
         self._is_open = self._is_started = False
@@ -233,7 +236,7 @@ class ForceDimensionDevice:
             ("dhdEnableForce", (0,)),
             ("dhdClose", ()),
         ):
-            self._dhd[name](*arguments, self._id)  # what fails here, its watchdog does
+            self._dhd[name](*arguments, self._id)  # if a call fails, the watchdog ends the force
 
     def _get(self) -> int:
         if self._turns:
@@ -254,14 +257,17 @@ class ForceDimensionDevice:
     def _fill(self) -> None:
         x, y, z = (number.value for number in self._place)
         if not all(abs(value) < FARTHEST for value in (x, y, z)):
-            raise DeviceError(f"{self._name} reports a position that is none: {x}, {y}, {z}")
+            raise DeviceError(
+                f"{self._name} reports an impossible position: {x}, {y}, {z} m; each must be "
+                f"within {FARTHEST:g} m"
+            )
         self._sample["position"] = (x, y, z)
         self._sample["buttons"] = self._dhd["dhdGetButtonMask"](self._id) & 0xFFFF
         if self._turns:
             self._sample["quaternion"] = quaternion_of(self._frame[:], self._name)
 
 
-# Force Dimension's devices: finding the maker's library and its devices, and opening one.
+# Discovery of Force Dimension's devices.
 
 _NUMBERS = (*MEASURED, "force_limit", "torque_limit")
 
@@ -270,13 +276,13 @@ def open_forcedimension(options: Mapping[str, object], tell: Notify) -> ForceDim
     """Loads the library and opens one of its devices.
 
     Args:
-        options: ``library`` (its file), ``serial`` (the device's place in the library's list, from
-            0, where there are several), ``gravity`` (1 or 0), and numbers of the data sheet.
-        tell: Told what the device is and what was set.
+        options: ``library`` (its file), ``serial`` (number of the device in the library's list,
+            from 0, if there are several), ``gravity`` (1 or 0), and numbers of the data sheet.
+        tell: Receives a description of the device and its settings.
 
     Raises:
-        DeviceError: There is no library or no device, or an option is not valid.
-        DeviceLost: It is gone.
+        DeviceError: No library or no device is found, or an option is not valid.
+        DeviceLost: The device is gone.
     """
     numbers = stated_numbers(options, _NUMBERS)
     gravity = options.get("gravity", 1.0)
@@ -290,7 +296,7 @@ def open_forcedimension(options: Mapping[str, object], tell: Notify) -> ForceDim
 
 
 def find() -> list[FoundDevice]:
-    """Lists the devices that the library has; without it, those that the kernel knows."""
+    """Lists the library's devices, or the kernel's list without the library."""
     try:
         return _listed(Dhd(located()))
     except DeviceError as error:
@@ -298,9 +304,9 @@ def find() -> list[FoundDevice]:
 
 
 def medium() -> str:
-    """Says in a sentence whether the library is there."""
+    """Returns a sentence on whether the library was found."""
     try:
-        return f"Force Dimension's library is there: {Dhd(located()).path}"
+        return f"Force Dimension's library was found: {Dhd(located()).path}"
     except DeviceError as error:
         return str(error)
 
@@ -327,14 +333,15 @@ FAMILY = Driver(
     ids=(UsbId(0x1451, 0x0402, "Force Dimension omega"),),
     transport="library",
     axes="x, y, z; with rx, ry, rz where the wrist has motors",
-    force="what the library says, else 12 N (omega, sigma, lambda) or 20 N (delta)",
-    rate="4 kHz, as the maker says",
-    on_stall=f"its watchdog takes the force away after {1e3 * SHORTEST_WATCHDOG:g} ms; one that "
-    "has none is named when it is started",
+    force="the library's limit, else 12 N (omega, sigma, lambda) or 20 N (delta)",
+    rate="4 kHz, as stated by the maker",
+    on_stall=f"its watchdog ends the force after {1e3 * SHORTEST_WATCHDOG:g} ms; a device without "
+    "one is reported at its start",
     options=("library", "serial", "gravity", *_NUMBERS),
     open=open_forcedimension,
     find=find,
     medium=medium,
     sought="a device of Force Dimension's library",
 )
-"""Its products' numbers on the USB bus are not all known; the library finds them by itself."""
+"""Driver of Force Dimension's devices. Not all of their USB ids are known, so the library finds
+them."""

@@ -1,9 +1,10 @@
-"""Force Dimension's own library (DHD), loaded at run time: none of it is part of this project.
+"""Bindings of Force Dimension's library (DHD), loaded at run time.
 
-Signatures, types and codes as the SDK's header ``dhdc.h`` and its public Python bindings have them.
-Every call ends with the device's number. Getters and setters return a negative number where they
-failed, 0, or a positive one as a warning. Each talks to the device before it returns: how long
-that may take is up to the library, and cannot be bounded from here.
+The library is not part of this project. Signatures, types and codes follow the SDK's header
+``dhdc.h`` and its public Python bindings. The last argument of every call is the device's number.
+Getters and setters return a negative number on failure, 0, or a positive number as a warning. Each
+communicates with the device before it returns. The duration is up to the library and cannot be
+bounded here.
 """
 
 from __future__ import annotations
@@ -25,21 +26,22 @@ from hapticbridge.device.base import USUAL_TORQUE_LIMIT
 from hapticbridge.errors import DeviceError
 from hapticbridge.pose import Quaternion, canonical
 
-# What Force Dimension's library calls its devices, and what is known of each beforehand.
+# Device types of Force Dimension's library.
 
 ROTATION_ERROR = 1e-3
-"""Of R Rᵀ, without unit: more is no rotation, whatever rounded it."""
+"""Largest deviation of R Rᵀ from the identity, without unit. A larger one is not due to
+rounding."""
 
 
 @dataclass(frozen=True, slots=True)
 class Model:
-    """A kind of device.
+    """Properties of a device type.
 
     Attributes:
-        name: The maker's.
-        turns: Whether its wrist has motors.
-        force: Largest force in N, where the library sets no limit; None where none was found.
-        torque: Largest torque in N m, likewise.
+        name: The maker's name.
+        turns: True if its wrist has motors.
+        force: Largest force in N if the library sets no limit; None if unknown.
+        torque: Largest torque in N m if the library sets no limit; None if unknown.
     """
 
     name: str
@@ -63,24 +65,24 @@ MODELS = {
     203: Model("lambda.3"),
     206: Model("sigma.3"),
 }
-"""By ``dhdGetSystemType``: numbers of the SDK's header. Forces and torques are what CHAI3D lets
-programs ask of each; the maker's own figures are as large or larger."""
+"""Device types by ``dhdGetSystemType``, numbered as in the SDK's header. Forces and torques are
+those that CHAI3D allows; the maker's own figures are equal or larger."""
 
 
 def limits_of(
     model: Model, told: Sequence[float], asked: Mapping[str, float]
 ) -> tuple[float, float]:
-    """Returns the largest force in N and torque in N m that a device may be sent.
+    """Returns the largest force in N and torque in N m that may be commanded.
 
-    The lower holds of what the library says and of what was asked, or is known of the model.
+    Each is the lower of the library's limit and the user's or the model's value.
 
     Args:
-        model: The device's.
-        told: What the library says of each; it is negative where it sets no limit.
-        asked: Numbers of the data sheet that the user named.
+        model: Type of the device.
+        told: The library's limits of force and torque; negative if it sets no limit.
+        asked: Numbers of the data sheet set by the user.
 
     Raises:
-        DeviceError: Nobody knows.
+        DeviceError: No source states a limit.
     """
     limits = {"force": 0.0, "torque": USUAL_TORQUE_LIMIT}
     usual = {"force": model.force, "torque": model.torque}
@@ -91,8 +93,7 @@ def limits_of(
         known = [end for end in ends if end is not None]
         if not known:
             raise DeviceError(
-                f"neither the library nor this project knows the largest {name} of {model.name}; "
-                f"name it with {name}_limit="
+                f"the largest {name} of {model.name} is unknown; set it with {name}_limit="
             )
         limits[name] = min(known)
     return limits["force"], limits["torque"]
@@ -103,10 +104,10 @@ def quaternion_of(frame: Sequence[float], name: str) -> Quaternion:
 
     Args:
         frame: Nine numbers, row by row.
-        name: What errors call the device.
+        name: Name of the device in messages.
 
     Raises:
-        DeviceError: The matrix is no rotation, or a number in it is not finite.
+        DeviceError: The matrix is not a rotation, or a number in it is not finite.
     """
     flat = np.array(frame)
     matrix = flat.reshape(3, 3)
@@ -114,7 +115,9 @@ def quaternion_of(frame: Sequence[float], name: str) -> Quaternion:
     if not is_finite or not (
         np.abs(matrix @ matrix.T - np.eye(3)).max() < ROTATION_ERROR and np.linalg.det(matrix) > 0
     ):
-        raise DeviceError(f"{name} reports an orientation that is no rotation")
+        raise DeviceError(
+            f"{name} reports an orientation that is not a rotation; check its cable and restart it"
+        )
     quaternion = np.empty(4)
     mujoco.mju_mat2Quat(quaternion, flat)
     w, x, y, z = (quaternion / np.linalg.norm(quaternion)).tolist()
@@ -122,19 +125,19 @@ def quaternion_of(frame: Sequence[float], name: str) -> Quaternion:
 
 
 VARIABLE = "HAPTICBRIDGE_DHD"
-"""Environment variable that names the library's file where the option ``library`` does not."""
+"""Environment variable with the library's file, used without the option ``library``."""
 
 FRESH, TIMEGUARD, SATURATED = 0, 1, 2
-"""Codes: done; a getter had no newer sample; a motor is at its end."""
+"""Return codes: success; no newer sample; a motor is saturated."""
 
 MOST_WATCHDOG = 255
-"""Largest watchdog, in steps of ``WATCHDOG_STEP``: its argument is a byte."""
+"""Largest watchdog in steps of ``WATCHDOG_STEP``: the argument is a byte."""
 
 WATCHDOG_STEP = 125e-6
-"""In s."""
+"""Step of the watchdog in s."""
 
 TIMING, SHARE = 0.1, 0.95
-"""Time in s for which exchanges are measured, and the share of them that keeps the delay."""
+"""Time in s for which exchanges are measured, and share of them, without unit, within the delay."""
 
 _NUMBERS = POINTER(c_double)
 
@@ -160,24 +163,24 @@ FUNCTIONS: dict[str, tuple[Any, tuple[Any, ...]]] = {
     "dhdGetTime": (c_double, ()),
     "dhdErrorGetLastStr": (c_char_p, ()),
 }
-"""What is called, with the type of the result and those of the arguments."""
+"""Functions that are called, with the types of result and arguments."""
 
 NAMES = {
     "linux": ("libdrd.so.3", "libdrd.so", "libdhd.so.3", "libdhd.so"),
     "darwin": ("libdrd.dylib", "libdhd.dylib"),
     "win32": ("drd64.dll", "dhd64.dll"),
 }
-"""Usual names of its files, by ``sys.platform``. DRD holds all of DHD."""
+"""Usual file names of the library, by ``sys.platform``. DRD contains all of DHD."""
 
 
 class Dhd:
-    """The library, loaded, with every function that is used bound to its signature.
+    """The loaded library, with every used function bound to its signature.
 
     Args:
         path: Its file.
 
     Raises:
-        DeviceError: It cannot be loaded, or lacks a function.
+        DeviceError: The library cannot be loaded, or lacks a function.
     """
 
     def __init__(self, path: str) -> None:
@@ -204,24 +207,24 @@ class Dhd:
         return self._functions[name]
 
     def now(self) -> float:
-        """Returns the time in s of the library's own clock."""
+        """Returns the time of the library's own clock in s."""
         return float(self["dhdGetTime"]())
 
     def last_error(self) -> str:
-        """Returns what the library says of its last error."""
+        """Returns the library's description of its last error."""
         text = self["dhdErrorGetLastStr"]()
-        return text.decode(errors="replace") if text else "it does not say why"
+        return text.decode(errors="replace") if text else "no reason reported"
 
     def require(self, name: str, *arguments: Any, what: str) -> int:
-        """Calls a function; returns its code, 0 or a warning.
+        """Calls a function and returns its code, 0 or a warning.
 
         Args:
-            name: Of ``FUNCTIONS``.
-            *arguments: The function's.
-            what: What could not be done if it fails, for the message.
+            name: Key of ``FUNCTIONS``.
+            *arguments: Arguments of the function.
+            what: Description of the failure, for the message.
 
         Raises:
-            DeviceError: It failed; says what the library says.
+            DeviceError: The function failed; the message contains the library's description.
         """
         code = int(self[name](*arguments))
         if code < 0:
@@ -229,11 +232,11 @@ class Dhd:
         return code
 
     def has_watchdog(self, device: int, steps: int) -> bool:
-        """Sets a device's watchdog; returns False where it has none.
+        """Sets a device's watchdog; returns False if it has none.
 
         Args:
-            device: Its number.
-            steps: Of ``WATCHDOG_STEP``, 1 to ``MOST_WATCHDOG``. A force that is this old ends.
+            device: Number of the device.
+            steps: Age in ``WATCHDOG_STEP`` at which a force ends, 1 to ``MOST_WATCHDOG``.
         """
         self["dhdEnableExpertMode"]()
         code = int(self["dhdSetWatchdog"](steps, device))
@@ -241,10 +244,10 @@ class Dhd:
         return code >= 0
 
     def timing(self, exchange: Callable[[], object]) -> tuple[float, float]:
-        """Returns how often an exchange can be made, in Hz, and the time in s that most kept.
+        """Measures the rate of exchanges in Hz and the time in s that the share ``SHARE`` meets.
 
         Args:
-            exchange: Reads a sample and writes a force; made for ``TIMING``.
+            exchange: Reads a sample and writes a force; repeated for ``TIMING``.
         """
         times = []
         begin = last = self.now()
@@ -261,10 +264,11 @@ def located(library: object = None) -> str:
     """Returns the library's file.
 
     Args:
-        library: What the user named; None: the environment variable, else the usual names.
+        library: File named by the user; None selects the environment variable, else the usual
+            names.
 
     Raises:
-        DeviceError: None is found; says where to get it and how to name it.
+        DeviceError: The library was not found; the message names its source and the option.
     """
     named = library or os.environ.get(VARIABLE)
     if named:

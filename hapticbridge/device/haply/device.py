@@ -1,17 +1,18 @@
-"""Haply Inverse3 and its kin: three translations with force, through the maker's own service.
+"""Haply Inverse3 and related devices: three translations with force, through the maker's service.
 
-The service answers each message with the state it had when the message came. So a force goes out in
-each tick, and its answer is read at the next: force and question go together, as with the Falcon,
-and the force that answers a sample acts as many whole ticks later as an answer needs to come back.
-At most ``MOST_UNDER_WAY`` messages wait for their answers; where the service is slower than the
-loop, the newest force waits for its turn and older ones are left out, so nothing queues up.
+The service answers each message with the device's state when the message arrived. So each tick
+sends a force, and its answer is read in the next tick. As with the Falcon, one message carries the
+force and requests the state. The force that responds to a sample acts as many whole ticks later as
+an answer takes. At most ``MOST_UNDER_WAY`` messages wait for answers. If the service is slower than
+the loop, only the newest force waits and older ones are dropped, so nothing queues up.
 
 The service filters forces. Its force gate and its damping are set when the device is opened, the
-first by the option ``force_gate`` (what gain switches the gate off is nowhere said; 0 is sent); its
-oscillation damper and its global force scale cannot be set from here, and are named to the user.
+force gate by the option ``force_gate``. The gain that disables the gate is not documented; 0 is
+sent. Its oscillation damper and its global force scale cannot be set from here and are reported to
+the user.
 
-Positions are in the service's own frame, right-handed; which way its axes point depends on the
-preset and basis chosen there. No real device has moved under this code yet.
+Positions are in the service's right-handed frame, whose axes depend on the preset and basis chosen
+there. The driver has not been verified on hardware.
 """
 
 from __future__ import annotations
@@ -39,41 +40,41 @@ from hapticbridge.device.watchdog import SILENCE, SilenceDetector
 from hapticbridge.errors import DeviceError, DeviceLost
 from hapticbridge.record import SAMPLE_DTYPE, TickFlag
 
-# How fast a service answers, measured before the loop begins.
+# Measured timing of the service.
 
 TIME = 0.1
-"""In s: how long each of the two measurements takes."""
+"""Length of each of the two measurements in s."""
 
 UNDER_WAY = 2
-"""Messages kept under way while the rate is measured, as in the loop."""
+"""Number of messages kept on their way while the rate is measured, as in the loop."""
 
 SHARE = 0.95
-"""Share of answers that came within the delay, no unit. The longest are the host's own stalls,
+"""Share of answers within the delay, without unit. The slowest answers are stalls of the host,
 which the loop counts as missed deadlines."""
 
 PACE = 1e-3
-"""In s, from message to message while the delay is measured: a loop's period, so that threads sleep
-in between as they will in the loop."""
+"""Time in s between messages while the delay is measured: a period of the loop, so that threads
+sleep in between as in the loop."""
 
-_ANSWER_TIME = 0.05  # s, longer is silence
+_ANSWER_TIME = 0.05
+"""Longest wait for an answer in s; a longer pause counts as silence."""
 
 
 def measured_timing(link: Link, message: str, name: str) -> tuple[float, float]:
-    """Returns at what rate states are delivered, and within what time they come.
+    """Measures the rate of states and the delay of answers.
 
-    A message carries a force and asks for the state, so both are as old as each other; see
-    ``timing``, where the same holds.
+    A message both carries a force and requests the state, so both have this delay.
 
     Args:
-        link: To a service; no message is under way.
-        message: One without force.
-        name: What errors call the device.
+        link: Link to a service without messages on their way.
+        message: Message without force.
+        name: Name of the device in messages.
 
     Returns:
         The rate in Hz and the delay in s.
 
     Raises:
-        DeviceLost: It fell silent.
+        DeviceLost: The service stopped answering.
     """
     return _rate(link, message, name), _delay(link, message, name)
 
@@ -100,50 +101,54 @@ def _delay(link: Link, message: str, name: str) -> float:
         link.send(message)
         _answer(link, name)
         times.append(link.now() - begin)
-        link.wait(max(begin + PACE - link.now(), 0.0))  # nothing comes: it only sleeps
+        link.wait(max(begin + PACE - link.now(), 0.0))  # no answer is due, so this only sleeps
     times.sort()
     return times[math.ceil(SHARE * len(times)) - 1]
 
 
 def _answer(link: Link, name: str) -> None:
     if link.wait(_ANSWER_TIME) is None:
-        raise DeviceLost(f"{name}: fell silent while its timing was measured")
+        raise DeviceLost(
+            f"{name}: fell silent while its timing was measured; restart the Inverse Service"
+        )
 
 
 FORCE_LIMIT = 2.0
-"""In N: what Isaac Lab's driver limits itself to. The maker publishes no continuous force; more is
-to be asked for with the option ``force_limit``."""
+"""Largest force in N, as in Isaac Lab's driver. The maker publishes no continuous force; the option
+``force_limit`` sets a larger one."""
 
 FIRST_ANSWER = 1.0
-"""In s: longest wait for the list of devices and for the first state."""
+"""Longest wait in s for the list of devices and for the first state."""
 
 LONGEST_PERIOD = 0.02
-"""In s. A force holds only for its message; slower, the device falls idle between two ticks."""
+"""Longest period of the loop in s. A force lasts only for its message; at a longer period the
+device would idle between two ticks."""
 
 MOST_UNDER_WAY = 2
-"""Messages without an answer yet. One would leave the service idle while its answer travels."""
+"""Largest number of messages without an answer. With one, the service would idle while its answer
+travels."""
 
 
 class HaplyDevice:
-    """A device of the service that is open: its filters are set, its timing has been measured.
+    """An open device of the service, with its filters set and its timing measured.
 
-    The sheet's ``rate`` is how often states came with two messages always under way, its ``delay``
-    the time within which 95 % of the answers to single messages came. Mass, damping, friction and
-    resolution are not published; who measured them gives them.
+    The sheet's ``rate`` is the rate of states with two messages always on their way. Its ``delay``
+    is the time within which 95 % of the answers to single messages came. Mass, damping, friction
+    and resolution are not published; they are unknown unless the user states measured values.
 
     Args:
-        link: To the service, connected; the list of devices has been read from it.
+        link: Connected link to the service, after the list of devices was read.
         listed: The device.
         force_gate: Gain of the service's force gate, without unit, >= 0.
-        numbers: Of the data sheet, by name.
-        tell: Told what the service does to forces.
+        numbers: Numbers of the data sheet, by name.
+        tell: Receives a description of the service's force filters.
 
     Attributes:
-        held_back: Forces that were left out because the service was slower than the loop.
+        held_back: Number of forces dropped because the service was slower than the loop.
 
     Raises:
-        DeviceError: The service scales positions, or does not answer as it should.
-        DeviceLost: It is gone.
+        DeviceError: The service scales positions, or its answer is invalid.
+        DeviceLost: The service is gone.
     """
 
     def __init__(
@@ -194,14 +199,14 @@ class HaplyDevice:
         self._watch = SilenceDetector(link.now())
 
     def start(self, period: float) -> NDArray[np.void]:
-        """Asks for the state, without force.
+        """Requests the state, without force.
 
         Args:
             period: The loop's period in s, at most ``LONGEST_PERIOD``.
 
         Raises:
             DeviceError: The period is out of range, or the service reports no position.
-            DeviceLost: It is gone or silent.
+            DeviceLost: The service is gone or silent.
         """
         if checked_period(period) > LONGEST_PERIOD:
             raise DeviceError(
@@ -216,41 +221,41 @@ class HaplyDevice:
         return self._sample.copy()
 
     def read(self, sample: NDArray[np.void]) -> int:
-        """Reports the newest state that has come.
-
-        Waits for none, but for the answer to a new question after the loop stood still.
+        """Returns the newest state; waits only after a pause of the loop, for a new answer.
 
         Args:
-            sample: Shape (1,), ``SAMPLE_DTYPE``, filled in place.
+            sample: Output, shape (1,), ``SAMPLE_DTYPE``.
 
         Returns:
-            0, or ``TickFlag.STALE_SAMPLE`` where the sample repeats the last one.
+            0, or ``TickFlag.STALE_SAMPLE`` if the sample repeats the last one.
 
         Raises:
-            DeviceError: ``start`` has not been called, or what came is no state.
-            DeviceLost: The connection has dropped, the device is not listed any more, or nothing
-                was answered for ``SILENCE``.
+            DeviceError: The device was not started, or an answer is not a state.
+            DeviceLost: The connection was lost, the device is no longer listed, or no answer came
+                for ``SILENCE``.
         """
         if not self._is_started:
-            raise DeviceError(f"{self._name} is read before it was started")
+            raise DeviceError(f"{self._name} is read before it was started; call start() first")
         is_late = self._watch.was_away(self._link.now())
         newest = self._asked_anew() if is_late else self._take()
         if newest is not None:
             self._fill(newest)
         if self._watch.is_silent(self._link.now(), is_new=newest is not None):
-            raise DeviceLost(f"{SERVICE} has not answered for {1e3 * SILENCE:g} ms")
+            raise DeviceLost(
+                f"{SERVICE} has not answered for {1e3 * SILENCE:g} ms; check that it runs"
+            )
         sample[0] = self._sample[0]
         return int(TickFlag.STALE_SAMPLE) if newest is None else 0
 
     def write(self, wrench: NDArray[np.float64]) -> None:
-        """Sends a force, and with it the next question; the torque is left out.
+        """Sends a force together with the next request; the torque is ignored.
 
         Args:
             wrench: Shape (6,), in the service's frame.
 
         Raises:
             DeviceError: The force is not finite.
-            DeviceLost: The connection has dropped.
+            DeviceLost: The connection was lost.
         """
         force = tuple(wrench[:3].tolist())
         if not all(map(math.isfinite, force)):
@@ -260,7 +265,7 @@ class HaplyDevice:
         self._send_pending()
 
     def close(self) -> None:
-        """Commands zero force, waits for its answer up to ``SILENCE``, and ends the connection."""
+        """Commands zero force, waits up to ``SILENCE`` for the answer, and disconnects."""
         if not self._is_open:
             return
         self._is_open = self._is_started = False
@@ -270,12 +275,12 @@ class HaplyDevice:
             for _ in range(self._under_way + 1):
                 self._link.wait(SILENCE)
         except DeviceLost:
-            pass  # who sends no forces any more leaves the device idle
+            pass  # without messages the device idles
         finally:
             self._link.close()
 
     def _take(self) -> str | None:
-        """Takes all answers, sends a force that waited for one; returns the newest answer."""
+        """Returns the newest of all waiting answers, after sending a pending force."""
         answers = self._link.take()
         self._under_way = max(self._under_way - len(answers), 0)
         if answers and self._pending is not None:
@@ -283,10 +288,9 @@ class HaplyDevice:
         return answers[-1] if answers else None
 
     def _asked_anew(self) -> str | None:
-        """Asks for the state without force, after the loop stood still; returns the answer.
+        """Requests the state without force after a pause of the loop; returns the answer.
 
-        What waits to be read answers a question from before that, and a force that still waits to
-        be sent is as old.
+        Waiting answers and a pending force are older than the pause and are discarded.
         """
         self._pending = None
         self._take()
@@ -307,14 +311,14 @@ class HaplyDevice:
         self._pending = None
 
     def _ask(self, message: str) -> str:
-        """Sends a message and waits for its answer."""
+        """Sends a message and returns its answer."""
         self._link.send(message)
         answer = None
         for _ in range(self._under_way + 1):
             answer = self._link.wait(FIRST_ANSWER)
         self._under_way = 0
         if answer is None:
-            raise DeviceLost(f"{SERVICE} does not answer")
+            raise DeviceLost(f"{SERVICE} does not answer within {FIRST_ANSWER:g} s; restart it")
         return answer
 
     def _fill(self, message: str) -> None:
@@ -323,10 +327,10 @@ class HaplyDevice:
         self._sample["buttons"] = state.buttons
 
 
-# Haply's Inverse3 and its kin: finding them in the maker's service, and opening one.
+# Discovery of Haply's devices in the maker's service.
 
 PLACE = ("localhost", 10001)
-"""Where the service listens unless its configuration says otherwise."""
+"""Default host and port of the service."""
 
 _NUMBERS = ("mass", "damping", "friction", "resolution", "force_limit")
 
@@ -337,11 +341,11 @@ def open_haply(options: Mapping[str, object], tell: Notify) -> HaplyDevice:
     Args:
         options: ``service`` (HOST:PORT), ``serial`` (the service's device_id), ``force_gate``,
             ``log`` (a file for the messages), and numbers of the data sheet.
-        tell: Told what the service does to forces.
+        tell: Receives a description of the service's force filters.
 
     Raises:
         DeviceError: The service does not run, lists no such device, or an option is not valid.
-        DeviceLost: It is gone.
+        DeviceLost: The service is gone.
     """
     host, port = _place(options.get("service"))
     link = WebSocketLink.open(host, port, SERVICE, HexLog.asked(options))
@@ -349,7 +353,7 @@ def open_haply(options: Mapping[str, object], tell: Notify) -> HaplyDevice:
 
 
 def opened(link: Link, options: Mapping[str, object], tell: Notify) -> HaplyDevice:
-    """Opens a device of a service that is connected; see ``open_haply``."""
+    """Opens a device of a connected service; arguments as for ``open_haply``."""
     try:
         numbers = stated_numbers(options, _NUMBERS)
         force_gate = checked_number("force_gate", options.get("force_gate", 0.0), "")
@@ -363,7 +367,7 @@ def opened(link: Link, options: Mapping[str, object], tell: Notify) -> HaplyDevi
 
 
 def find(place: tuple[str, int] = PLACE) -> list[FoundDevice]:
-    """Lists the devices that the service has; empty where it does not run."""
+    """Lists the devices of the service; empty if it does not run."""
     try:
         link = WebSocketLink.open(*place, SERVICE, HexLog(""))
     except DeviceError:
@@ -377,7 +381,7 @@ def find(place: tuple[str, int] = PLACE) -> list[FoundDevice]:
 
 
 def medium(place: tuple[str, int] = PLACE) -> str:
-    """Says in a sentence whether the service runs."""
+    """Returns a sentence on whether the service runs."""
     if websocket_client() is None:
         return EXTRA
     try:
@@ -408,7 +412,7 @@ def _plugged(device: Listed) -> FoundDevice:
 
 
 def _place(service: object) -> tuple[str, int]:
-    """Returns host and port of HOST:PORT; either may be missing."""
+    """Returns host and port of HOST:PORT; both are optional."""
     if service is None:
         return PLACE
     host, _, port = str(service).rpartition(":") if ":" in str(service) else (service, "", PLACE[1])
@@ -427,9 +431,9 @@ FAMILY = Driver(
     ids=(),
     transport="service",
     axes="x, y, z",
-    force=f"{FORCE_LIMIT:g} N unless force_limit says more",
+    force=f"{FORCE_LIMIT:g} N, or more with force_limit",
     rate="1 kHz",
-    on_stall="the maker's service lets it idle; after how long is not documented",
+    on_stall="the maker's service ends the force; the time until then is not documented",
     options=("service", "serial", "force_gate", *_NUMBERS, "log"),
     open=open_haply,
     find=find,

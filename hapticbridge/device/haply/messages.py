@@ -1,13 +1,13 @@
-"""The Inverse Service's messages: its list of devices, their states, and what is sent to them.
+"""Messages of the Inverse Service: list of devices, states and forces.
 
-Service 3.5, as its documentation has it: JSON over a WebSocket on port 10001. On connection the
-service sends an inventory, then exactly one state for each message that it gets. A force holds for
-its message; who sends none any more leaves the device idle. Lengths in m, forces in N.
+The protocol is that of service 3.5, as documented by the maker: JSON over a WebSocket on port
+10001. On connection the service sends an inventory, then exactly one state per received message. A
+force lasts for its message; without messages the device idles. Lengths in m, forces in N.
 
     {"session_id": 7, "inverse3": [{"device_id": "049D", "config": {...}, "state": {...}}]}
     {"inverse3": [{"device_id": "049D", "commands": {"set_cursor_force": {"vector": {...}}}}]}
 
-Services before 3.5 list no filters in the configuration and call the force ``values``.
+Services before 3.5 list no filters in the configuration and use the key ``values`` for the force.
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ from hapticbridge.device.transport.websocket import decoded
 from hapticbridge.errors import DeviceError, DeviceLost
 
 SERVICE = "the Inverse Service"
-"""What errors call it."""
+"""Name of the service in messages."""
 
 FARTHEST = 10.0
-"""In m: a position beyond is none. No arm is that long."""
+"""Largest plausible coordinate in m; no arm is that long."""
 
 GRIPS = ("wireless_verse_grip", "verse_grip")
-"""Where the handle's buttons may be listed; the first handle that is listed counts."""
+"""Keys under which the handle's buttons may be listed; the first handle is used."""
 
 BUTTONS = ("a", "b", "c")
 """Bits 0, 1 and 2 of a sample's buttons."""
 
-_ID = re.compile(r"[0-9A-Za-z_-]{1,64}")  # it becomes part of a profile's file name
+_ID = re.compile(r"[0-9A-Za-z_-]{1,64}")  # part of a profile's file name
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,11 +42,11 @@ class Listed:
     """A device of the inventory.
 
     Attributes:
-        device_id: What the service knows it by.
-        kind: ``inverse3``, ``minverse`` and the like.
-        force_key: What the service calls a force.
-        filters: What its own filters were set to, by name; None where the service has none to set.
-        is_scaled: Whether it reports other lengths than the cursor's own.
+        device_id: Identifier of the device in the service.
+        kind: ``inverse3``, ``minverse`` or another type.
+        force_key: Key of a force in messages.
+        filters: Previous settings of the service's filters, by name; None if it has none.
+        is_scaled: True if the service scales the cursor's position.
     """
 
     device_id: str
@@ -58,10 +58,10 @@ class Listed:
 
 @dataclass(frozen=True, slots=True)
 class State:
-    """What a state message says of one device.
+    """State of one device.
 
     Attributes:
-        position: Of the cursor in m.
+        position: Position of the cursor in m.
         buttons: Bit 0 is a, bit 1 b, bit 2 c.
     """
 
@@ -70,10 +70,10 @@ class State:
 
 
 def inventory(message: str) -> list[Listed]:
-    """Returns the devices that the service's first message lists.
+    """Returns the devices listed in the service's first message.
 
     Raises:
-        DeviceError: It is no inventory.
+        DeviceError: The message is not an inventory.
     """
     told = decoded(message, SERVICE)
     if "session_id" not in told and "inverse3" not in told:
@@ -82,11 +82,11 @@ def inventory(message: str) -> list[Listed]:
 
 
 def state(message: str, device_id: str) -> State:
-    """Returns what a state message says of a device.
+    """Returns a device's state from a state message.
 
     Raises:
-        DeviceError: It is no state message, or a number in it is none.
-        DeviceLost: The device is not in it any more.
+        DeviceError: The message is not a state message, or a number is invalid.
+        DeviceLost: The device is no longer listed.
     """
     told = decoded(message, SERVICE)
     for entry in _entries(told, "inverse3"):
@@ -96,11 +96,11 @@ def state(message: str, device_id: str) -> State:
 
 
 def first_message(listed: Listed, gate_gain: float) -> str:
-    """Returns what is sent first: who we are, the service's filters set, and no force.
+    """Returns the first message: session name, filter settings, and zero force.
 
     Args:
         listed: The device.
-        gate_gain: Of the force gate, without unit.
+        gate_gain: Gain of the force gate, without unit.
     """
     device: dict[str, Any] = {"device_id": listed.device_id}
     if listed.filters is not None:
@@ -115,21 +115,21 @@ def refuse_scaled(listed: Listed) -> None:
     """Refuses a device whose positions the service scales.
 
     Raises:
-        DeviceError: It does.
+        DeviceError: The service scales its positions.
     """
     if listed.is_scaled:
         raise DeviceError(
-            f"{SERVICE} scales the positions of {listed.device_id}, so force times motion would be "
-            "no work; set the scale of its mount and transform to 1"
+            f"{SERVICE} scales the positions of {listed.device_id}, so force times motion would "
+            "not be work; set the scale of its mount and transform to 1"
         )
 
 
 def told_filters(listed: Listed, gate_gain: float) -> str:
-    """Says what the service does to forces, for the user."""
+    """Returns a sentence for the user on the service's force filters."""
     if listed.filters is None:
         return (
-            f"{SERVICE} is older than 3.5: whatever it filters forces with stays as it is, and "
-            "the certificate does not know of it"
+            f"{SERVICE} is older than 3.5: its force filters stay as they are, and the certificate "
+            "does not account for them"
         )
     before = ", ".join(
         f"{name} was {'unknown' if value is None else f'{value:g}'}"
@@ -146,7 +146,7 @@ def force_message(listed: Listed, force: Sequence[float]) -> str:
 
     Args:
         listed: The device.
-        force: In N, finite, three numbers.
+        force: Three finite numbers in N.
     """
     x, y, z = force
     return (
@@ -186,7 +186,7 @@ def _is_scaled(place: object) -> bool:
 def _entries(told: dict[str, Any], key: str) -> list[dict[str, Any]]:
     entries = told.get(key, [])
     if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
-        raise DeviceError(f"{SERVICE} lists under '{key}' what are no devices: {entries!r:.60}")
+        raise DeviceError(f"{SERVICE} lists invalid devices under '{key}': {entries!r:.60}")
     return entries
 
 

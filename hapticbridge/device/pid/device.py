@@ -1,4 +1,4 @@
-"""USB force-feedback sticks of the class PID: two axes, a constant force streamed to each."""
+"""USB force-feedback sticks (class PID): two axes, each with a streamed constant force."""
 
 from __future__ import annotations
 
@@ -49,40 +49,41 @@ from hapticbridge.device.watchdog import ForceOffGuardian, guard_device_node
 from hapticbridge.errors import DeviceError, DeviceLost
 from hapticbridge.record import SAMPLE_DTYPE, TickFlag
 
-# The two constant-force effects by which a stick is pushed, and how they end by themselves.
+# Constant-force effects of a stick.
 
 ANGLES = (270.0, 180.0)
-"""Degrees from north, clockwise, that the force of the x and y effect comes from: a positive one
-pushes to the right, and away from the user. The standard's words; never tried on a real stick."""
+"""Origins of the forces of the x and y effect in degrees clockwise from north, as the standard
+defines it. A positive force pushes to the right and away from the user. Not verified on
+hardware."""
 
 LOADS, LOAD_MS = 60, 1
-"""How often a device is asked what became of an effect, as often as Linux does, and how long is
-waited in between, in ms."""
+"""Number of queries for the result of a created effect (as in Linux), and the pause between them in
+ms."""
 
 RESTART, LIFE = 0.02, 5
-"""An effect is started anew every 20 ms and would end by itself after five times that: a host that
-has died lets go within 0.1 s, and four restarts may be lost on the way."""
+"""Time in s between restarts of an effect, and its duration in restarts. If the host dies, the
+force ends within 0.1 s; four restarts may be lost without an effect."""
 
 RESTART_REPORTS = 5
-"""On a slow bus restarts come no oftener than every five reports per effect, so that they take at
+"""Smallest number of reports per effect between restarts on a slow bus, so that restarts take at
 most a fifth of it."""
 
 SLOWEST_INTERVAL = 8e-3
-"""In s, where the interval is unknown: old sticks take 125 reports a second."""
+"""Assumed time per report in s if it is unknown: old sticks accept 125 reports a second."""
 
 
 class Effects:
-    """Creates an effect per axis, streams their forces, and keeps them alive.
+    """One constant-force effect per axis, with streamed force and limited duration.
 
     Args:
-        link: Reports to the device, open.
-        name: What errors call it.
+        link: Open link to the device.
+        name: Name of the device in messages.
         reports: Its reports.
-        interval: Time in s that a report to it takes, None where unknown.
+        interval: Time in s per report to the device, None if unknown.
 
     Raises:
         DeviceError: The device has no room for two effects, or refuses them.
-        DeviceLost: It is gone.
+        DeviceLost: The device is gone.
     """
 
     def __init__(
@@ -105,14 +106,14 @@ class Effects:
         self._ticks = self._every = 0
 
     def start(self, period: float) -> None:
-        """Gives the effects their direction and their life, and starts them without force.
+        """Sets direction and duration of the effects and starts them without force.
 
         Args:
-            period: The loop's, in s.
+            period: The loop's period in s.
         """
         self._every, self._ticks = max(int(self._restart / period), 1), 0
         reports = self._reports
-        # never shorter than a restart comes: a slow loop would drop its force between two ticks
+        # at least LIFE periods: a slow loop would otherwise lose its force between two ticks
         life = max(self.life, min(LIFE * period, reports.longest()))
         for index, angle, magnitude, start in zip(
             self._indices, ANGLES, self._magnitudes, self._starts, strict=True
@@ -123,10 +124,10 @@ class Effects:
         self._sent = [0] * len(ANGLES)
 
     def push(self, shares: Sequence[float]) -> None:
-        """Sends the forces that have changed, and restarts the effects when it is time.
+        """Sends changed forces, and restarts the effects when due.
 
         Args:
-            shares: Of full scale per axis, finite; beyond -1 to 1 it is full scale.
+            shares: Share of full scale per axis, finite, clipped to [-1, 1].
         """
         self._ticks += 1
         is_due = self._ticks >= self._every
@@ -143,7 +144,7 @@ class Effects:
                 self._link.write(start, len(ANGLES) + axis)
 
     def farewell(self) -> tuple[bytes, ...]:
-        """Returns what takes the force away, the effects too, and switches the motors off."""
+        """Returns the reports that end the force, free the effects and disable the motors."""
         reports = self._reports
         said: list[bytes | None] = []
         for index, magnitude in zip(self._indices, self._magnitudes, strict=True):
@@ -154,7 +155,7 @@ class Effects:
         return tuple(report for report in said if report is not None)
 
     def close(self) -> None:
-        """Sends the ``farewell``."""
+        """Sends the reports of ``farewell``."""
         for report in self.farewell():
             self._send(report)
 
@@ -168,14 +169,16 @@ class Effects:
         most = self._reports.most_effects(answer) if answer else None
         if most is not None and most < count:
             raise DeviceError(
-                f"{self._name} plays {most} effect at a time; two are needed, one for each axis"
+                f"{self._name} plays {most} effect at a time; two are needed, one per axis"
             )
 
     def _created(self) -> int:
         """Creates an effect in the device; returns its index."""
         requests = self._link.requests
         if not requests.set_feature(self._reports.create()):
-            raise DeviceError(f"{self._name} refuses to create a constant force")
+            raise DeviceError(
+                f"{self._name} refuses to create a constant force; unplug it and plug it in again"
+            )
         for _ in range(LOADS):
             answer = requests.feature(*self._reports.load)
             status, index = self._reports.loaded(answer) if answer else (None, 0)
@@ -190,30 +193,30 @@ class Effects:
         raise DeviceError(f"{self._name} does not create the constant force that it offers")
 
 
-# What is known, stated and assumed of a force-feedback stick: its scales and its data sheet.
+# Scale and data sheet of a force-feedback stick.
 
 ASSUMED_NEWTONS = 10.0
-"""Full scale in N that is assumed where nobody says it: more than an ordinary stick has, so that
-what is asked for comes out weaker. A stronger one exists; only a force gauge tells."""
+"""Assumed force at full scale in N: more than that of an ordinary stick, so that forces come out
+weaker than commanded. Stronger sticks exist; only a force gauge shows the true value."""
 
 ASSUMED_TRAVEL = 0.1
-"""In m from stop to stop, likewise: a grip some 12 cm above its pivot that turns by 24° to each
-side."""
+"""Assumed travel from stop to stop in m: a grip some 12 cm above its pivot that turns by 24° to
+each side."""
 
 CHANGES = ("mass", "damping", "friction")
-"""Numbers of the data sheet that the user may know."""
+"""Numbers of the data sheet that the user may state."""
 
 _AXES = ("x", "y")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scale:
-    """What a stick's counts are in metres and newtons.
+    """Scale of a stick's counts in metres and newtons.
 
     Attributes:
         newtons: Force at full scale in N, > 0.
-        travel: From stop to stop of each axis in m, > 0.
-        signs: Of the force per axis, shape (2,), -1 where the firmware turns it round.
+        travel: Travel of each axis from stop to stop in m, > 0.
+        signs: Sign of the force per axis, shape (2,); -1 if the firmware reverses it.
     """
 
     newtons: float
@@ -224,22 +227,22 @@ class Scale:
 def scale_of(
     options: Mapping[str, object], serial: str, model: str, tell: Notify
 ) -> tuple[Scale, dict[str, object]]:
-    """Returns the scale, and what else of the options is for the data sheet.
+    """Returns the scale, and the options for the data sheet.
 
-    What the user says goes first, then the profile of the unit or its model (``force_limit``:
-    newtons at full scale; ``workspace``: travel), then an assumption, of which the user is told.
-    What a profile was measured with must not be changed: its b would be in other units than the
-    force.
+    The user's options take precedence over the profile of the unit or its model (``force_limit``:
+    newtons at full scale; ``workspace``: travel). Without either, a value is assumed and reported.
+    The scale of a measured profile cannot be changed, because its b would then have other units
+    than the force.
 
     Args:
-        options: As given to ``open_device``.
-        serial: The unit's.
-        model: What the stick calls itself; the profile of another model is not taken.
-        tell: Takes the sentence.
+        options: Options of ``open_device``.
+        serial: Serial number of the unit.
+        model: Name that the stick reports; the profile of another model is not used.
+        tell: Receives the message about an assumed scale.
 
     Raises:
-        DeviceError: A number is out of range, contradicts the profile, or states what nobody can
-            know without the scale.
+        DeviceError: A number is out of range, contradicts the profile, or is stated without the
+            scale on which it depends.
     """
     measured = _measured_with(options.get("profile"), serial, model)
     for name, value in measured.items():
@@ -254,14 +257,14 @@ def scale_of(
     missing = [f"{name}=" for name, value in stated.items() if value is None]
     if changes and missing:
         raise DeviceError(
-            f"{next(iter(changes))} is in newtons and metres, of which a stick knows nothing: say "
-            f"{' and '.join(missing)} too"
+            f"{next(iter(changes))} is in newtons and metres, and a stick has no scale for them: "
+            f"state {' and '.join(missing)} too"
         )
     if missing:
         tell(
-            f"nobody says how strong or how wide this stick is: full scale is taken for "
-            f"{ASSUMED_NEWTONS:g} N and its travel for {1e3 * ASSUMED_TRAVEL:g} mm where not "
-            f"stated; {' and '.join(missing)} state it"
+            f"the strength or the travel of this stick is unknown: {ASSUMED_NEWTONS:g} N at full "
+            f"scale and a travel of {1e3 * ASSUMED_TRAVEL:g} mm are assumed unless stated; "
+            f"{' and '.join(missing)} state it"
         )
     newtons, travel = (
         checked_number(name, assumed if value is None else value, unit, is_positive=True)
@@ -277,7 +280,7 @@ def scale_of(
 
 
 def _measured_with(named: object, serial: str, model: str) -> dict[str, float | None]:
-    """Returns the scale that a profile's numbers are in; None where it does not say."""
+    """Returns the scale of a profile's numbers; None for an unknown part."""
     profile = profile_of("pid", serial, model) if named is None else None
     if named not in (None, "none"):
         profile = profile_named(str(named))
@@ -297,18 +300,18 @@ def data_sheet(
     intervals: tuple[float | None, float | None],
     known: dict[str, Any],
 ) -> DeviceInfo:
-    """Makes a data sheet.
+    """Returns the data sheet of a stick.
 
-    Its rate is that of a force on both axes, two reports: the loop's period counts as no shorter in
-    b >= KT/2 + B. Its delay is unknown, because no firmware says its own.
+    Its rate is that of a force on both axes, two reports. In b >= KT/2 + B the loop's period counts
+    as no shorter than that. Its delay is unknown, because no firmware reports it.
 
     Args:
-        name: What the device is called.
+        name: Name of the device.
         serial: Its serial number.
         scale: Newtons and metres.
-        step: Least change of deflection per axis, of -1 to 1.
-        intervals: Time per report from and to the device, in s; None where unknown.
-        known: Of ``CHANGES``.
+        step: Smallest change of deflection per axis, of -1 to 1.
+        intervals: Time per report from and to the device, in s; None if unknown.
+        known: Numbers of ``CHANGES``.
 
     Raises:
         DeviceError: A number is out of range.
@@ -335,13 +338,14 @@ def data_sheet(
     )
 
 
-# Where a force-feedback stick stands: its X and Y axes and its buttons, found by usage.
+# Axes and buttons of a force-feedback stick, found by usage.
 
 X, Y = 0x00010030, 0x00010031
-"""Usages of the axes on the page of generic desktop controls: to the right, and to the user."""
+"""Usages of the axes on the page of generic desktop controls: to the right, and towards the
+user."""
 
 MOST_BUTTONS = 63
-"""Buttons that are told apart, as many as a sample has bits for."""
+"""Largest number of buttons: the bits of a sample."""
 
 _CONTROLLERS = {page << 16 | usage for page, usage in CONTROLLERS}
 _BUTTON_PAGE = 9
@@ -349,23 +353,23 @@ _BUTTON_PAGE = 9
 
 
 class Stick:
-    """Takes input reports one by one.
+    """Decoder of a stick's input reports.
 
     Args:
-        layout: The device's reports.
+        layout: Layout of the device's reports.
 
     Attributes:
-        deflection: To the right and towards the user, each -1 to 1.
-        buttons: A bit each, the first one lowest.
-        step: Least change of deflection that each axis can report.
+        deflection: Deflection to the right and towards the user, each -1 to 1.
+        buttons: One bit per button, the first one lowest.
+        step: Smallest change of deflection per axis.
         report: Number and length in bytes of the report with the X axis.
 
     Raises:
-        DeviceError: It has no X or Y, or its force does not act on both.
+        DeviceError: The stick has no X or Y, or its force does not act on both.
     """
 
     def __init__(self, layout: Layout) -> None:
-        # some have a mouse or a keyboard beside the stick, with an X and Y of their own
+        # some devices contain a mouse or a keyboard with an X and Y of its own
         fields = [
             field
             for field in layout.fields
@@ -383,7 +387,7 @@ class Stick:
                 raise DeviceError("its axes have no range")
         if not {X, Y} <= forced_axes(layout):
             raise DeviceError(
-                "its force does not act on both X and Y; it is no stick but a wheel or the like"
+                "its force does not act on both X and Y; it is not a stick but a wheel or similar"
             )
         self._buttons = _buttons(fields)
         self._places = (*self._axes, *(place for _, place in self._buttons))
@@ -394,12 +398,12 @@ class Stick:
         self.buttons = 0
 
     def takes(self, report: bytes) -> bool:
-        """Takes a report; returns whether it was one that says where an axis stands."""
+        """Decodes a report; returns whether it held the position of an axis."""
         number = as_number(self._layout, report)
         came, bits = number & 0xFF, 8 * (len(report) + (not self._layout.is_numbered))
         mine = [place for place in self._places if place.field.report == came]
         if not mine or any(place.offset + place.field.size > bits for place in mine):
-            return False  # none of ours, or cut short
+            return False  # an unrelated or truncated report
         is_new = False
         for axis, place in enumerate(self._axes):
             if place.field.report == came:
@@ -415,7 +419,7 @@ class Stick:
 
 
 def _buttons(fields: list[Field]) -> list[tuple[int, Place]]:
-    """Returns the first buttons: which bit each one has in a sample, and where it lies."""
+    """Returns the first buttons: bit in a sample, and place in the report."""
     found = []
     for field in fields:
         for index, usage in enumerate(field.usages[: field.count]):
@@ -426,51 +430,51 @@ def _buttons(fields: list[Field]) -> list[tuple[int, Place]]:
 
 
 LOOKS, LOOK_MS = 20, 10
-"""At the start reports are waited for 20 times, up to 10 ms each: 0.2 s for a stick at rest that
-says nothing, less for one that streams."""
+"""Number and length in ms of the waits for reports at the start: 0.2 s for a silent stick at rest,
+less for one that streams."""
 
 STREAMING = 15
-"""Of those, how many must bring a report from a stick that streams; one that speaks only when it is
-moved brings none in a hand that keeps still. Taking the one for the other costs a flag, no more."""
+"""Smallest number of these waits that bring a report from a streaming stick. A stick that reports
+only changes brings none in a still hand. A wrong classification costs only a flag."""
 
 SLOTS = 4
 """Kinds of report in the loop: force and restart, for each of two effects."""
 
 
 class PidDevice:
-    """A force-feedback stick, its two axes taken for x (to the right) and y (away from the user).
+    """Force-feedback stick; its axes are x (to the right) and y (away from the user).
 
         p = travel/2 (X, −Y),   counts = full · F/newtons
 
-    with X and Y the deflection, -1 to 1. Nothing in the standard says newtons or metres, so both
-    are stated (``Scale``). If they are off by a factor, every force or every length is, and with
-    them K, B and the b that ``identify`` measures: b >= KT/2 + B holds or fails all the same.
+    X and Y are the deflection, -1 to 1. The standard has no units of force or length, so both
+    scales are stated (``Scale``). If a scale is wrong by a factor, every force or length is, and
+    with it K, B and the b that ``identify`` measures. The condition b >= KT/2 + B is not affected.
 
-    Each axis has a constant-force effect of its own with a fixed direction, so a tick sends one
-    short report per axis whose count has changed, at most two. One effect with a direction would
-    need SetEffect (some 18 bytes) as soon as the angle changes, and SetConstantForce. Pushing a peg
-    into its hole that is 1.62 reports a tick, against 1.44 with two effects; and between the two of
-    a tick its force would point elsewhere, where that of two effects is on its way.
+    Each axis has a constant-force effect of its own with a fixed direction. A tick therefore sends
+    one short report per axis whose count has changed, at most two. A single effect with a direction
+    would need SetEffect (some 18 bytes) at each change of angle, and SetConstantForce. Pushing a
+    peg into its hole that takes 1.62 reports a tick, compared to 1.44 with two effects. Between its
+    two reports the force would also point in a wrong direction.
 
-    A silent stick is one at rest: many report only what changes. A pulled plug is an error of the
-    next call.
+    A silent stick is at rest, because many sticks report only changes. An unplugged stick raises an
+    error at the next call.
 
     Args:
-        link: Reports to and from it, open, with ``SLOTS``.
-        name: What errors call it.
+        link: Open link for its reports, with ``SLOTS``.
+        name: Name of the device in messages.
         scale: Newtons, metres, and signs.
-        known: ``mass``, ``damping``, ``friction`` of the data sheet, where the user knows them.
-        intervals: How often it is asked and told, in s; None where that is unknown.
+        known: ``mass``, ``damping``, ``friction`` of the data sheet, as stated by the user.
+        intervals: Polling intervals for reports from and to the device in s; None if unknown.
         serial: Its serial number.
 
     Attributes:
         info: Its data sheet.
-        last_word: Takes the force away should this process die; None where no other process can,
-            and the effects' own end (``Effects.life``) does it alone.
-        workspace: Its travel along x, y and (it has none) z in m, as stated or assumed.
+        last_word: Ends the force if this process dies. None if no second process can open the node;
+            then only the effects' duration (``Effects.life``) ends it.
+        workspace: Travel along x, y and z in m, as stated or assumed (it has no z).
 
     Raises:
-        DeviceError: It does not do what is needed; says what.
+        DeviceError: The stick lacks a required capability; the message names it.
     """
 
     def __init__(
@@ -502,7 +506,7 @@ class PidDevice:
         self.last_word: ForceOffGuardian | None = None
 
     def start(self, period: float) -> NDArray[np.void]:
-        """Starts the effects with no force, and finds out where the stick stands.
+        """Starts the effects without force, and reads the stick's position.
 
         Args:
             period: The loop's period in s, finite and > 0.
@@ -511,8 +515,8 @@ class PidDevice:
             The pose before the first tick, shape (1,), ``SAMPLE_DTYPE``.
 
         Raises:
-            DeviceError: The period is not, or the stick does not say where it stands.
-            DeviceLost: It is gone.
+            DeviceError: The period is not valid, or the stick does not report its position.
+            DeviceLost: The device is gone.
         """
         checked_period(period)
         self._effects.start(period)
@@ -522,26 +526,26 @@ class PidDevice:
         if not came and not self._stick.takes(
             self._link.requests.input_report(*self._stick.report)
         ):
-            raise DeviceError(f"{self._name} does not say where it stands; move it and start again")
+            raise DeviceError(f"{self._name} does not report its position; move it and start again")
         self._has_started = True
         self._fill()
         return self._sample.copy()
 
     def read(self, sample: NDArray[np.void]) -> int:
-        """Reports where the stick stands; waits for nothing.
+        """Returns the stick's position without waiting.
 
         Args:
-            sample: Shape (1,), ``SAMPLE_DTYPE``, filled in place.
+            sample: Output, shape (1,), ``SAMPLE_DTYPE``.
 
         Returns:
-            0, or ``STALE_SAMPLE`` where a stick that streams has sent nothing since the last read.
+            0, or ``STALE_SAMPLE`` if a streaming stick has sent nothing since the last read.
 
         Raises:
             DeviceLost: The device is gone.
-            DeviceError: It has not been started.
+            DeviceError: The device was not started.
         """
         if not self._has_started:
-            raise DeviceError(f"{self._name} is read before it was started")
+            raise DeviceError(f"{self._name} is read before it was started; call start() first")
         is_new = False
         for report in self._link.take():
             is_new |= self._stick.takes(report)
@@ -551,7 +555,7 @@ class PidDevice:
         return 0 if is_new or not self._streams else int(TickFlag.STALE_SAMPLE)
 
     def write(self, wrench: NDArray[np.float64]) -> None:
-        """Commands a force along x and y, each up to full scale.
+        """Commands a force along x and y, each clipped to full scale.
 
         Args:
             wrench: Shape (6,): force in N, torque in N m, on the device, in the device's frame.
@@ -566,12 +570,12 @@ class PidDevice:
         self._effects.push(shares.tolist())
 
     def close(self) -> None:
-        """Stops the effects, switches the motors off and lets the device go."""
+        """Stops the effects, switches the motors off and releases the device."""
         if not self._is_open:
             return
         self._is_open = False
         try:
-            with contextlib.suppress(DeviceLost):  # then the effects' own end does it
+            with contextlib.suppress(DeviceLost):  # a lost device ends its effects by itself
                 self._effects.close()
         finally:
             self._link.close()
@@ -579,7 +583,7 @@ class PidDevice:
                 self.last_word.close()
 
     def leave_last_word(self, path: str) -> None:
-        """Has another process hold what takes the force away, where two may hold the node.
+        """Starts a guardian process that ends the force, if two processes can hold the node.
 
         Args:
             path: The device node.
@@ -598,11 +602,11 @@ def open_pid(options: Mapping[str, object], tell: Notify, api: HidApi | None = N
     Args:
         options: ``serial``, ``log``, ``newtons``, ``travel``, ``reverse``, ``profile``, and numbers
             of the data sheet, ``CHANGES``.
-        tell: Told what had to be assumed.
-        api: hidapi or what stands for it; its reports are then not sent by a thread.
+        tell: Receives a message about assumed values.
+        api: hidapi or a substitute; reports are then sent without a thread.
 
     Raises:
-        DeviceError: There is none, it cannot be opened, or it cannot do what is needed.
+        DeviceError: No stick is found, it cannot be opened, or it lacks a required capability.
     """
     plugged = select_device(FAMILY, find(FAMILY, api), options.get("serial"))
     scale, known = scale_of(options, plugged.serial, str(plugged), tell)
@@ -632,11 +636,11 @@ FAMILY = Driver(
     ids=(),
     transport="hid",
     axes="2",
-    force="a share of full scale; newtons= says what that is",
+    force="a share of full scale, which newtons= states",
     rate="125 Hz to 1 kHz, one axis at a time",
     on_stall="its effects end by themselves after 0.1 s, on a slow bus after up to 0.4 s",
     options=("serial", "log", "newtons", "travel", "reverse", "profile", *CHANGES),
     open=open_pid,
     recognises=has_force_feedback,
 )
-"""A class: recognised by its report descriptor, not by a list of products."""
+"""Driver of a device class: devices are recognised by their report descriptor, not by a list."""

@@ -1,10 +1,11 @@
-"""The reports of USB force feedback (class PID), found by usage in a device's own descriptor.
+"""Reports of USB force feedback (class PID), found by usage in a device's descriptor.
 
-Report numbers, widths, ranges and the order of fields differ from device to device; only usages
-are the standard's. A constant force is streamed so: the device's actuators are enabled; an effect
-of type constant is created in it (a feature report to it, a feature report back with the effect's
-index); SetEffect gives it its direction and how long it plays; EffectOperation starts it; from then
-on SetConstantForce alone changes it.
+Report numbers, widths, ranges and the order of fields differ between devices; only usages are
+standardised. A constant force is streamed as follows:
+
+1. DeviceControl enables the device's actuators. 2. CreateNewEffect creates an effect of type
+constant, and BlockLoad returns its index. Both are feature reports. 3. SetEffect sets its direction
+and its duration. 4. EffectOperation starts it. 5. From then on SetConstantForce alone changes it.
 
 References:
     USB-IF, Device Class Definition for Physical Interface Devices (PID) 1.0, sections 4 and 5.
@@ -46,20 +47,20 @@ DEVICE_CONTROL, CONTROL = _P | 0x95, _P | 0x96
 ENABLE, DISABLE, STOP_ALL, RESET = _P | 0x97, _P | 0x98, _P | 0x99, _P | 0x9A
 
 _MILLI = -3
-"""Power of ten, in s, of durations whose unit the device does not name: all drivers take ms."""
+"""Power of ten, in s, of durations without a unit in the descriptor: all drivers assume ms."""
 
 _FULL_TURN = 360.0  # degrees, the standard's unit of directions
 
 
 @dataclass(frozen=True, slots=True)
 class Magnitude:
-    """The report that changes one effect's force.
+    """Report that changes one effect's force.
 
     Attributes:
         blank: The report with a force of zero, as a number.
-        place: Where the force lies.
-        full: Largest magnitude in counts that it has in both directions.
-        length: Of the report in bytes.
+        place: Place of the force in the report.
+        full: Largest magnitude in counts available in both directions.
+        length: Length of the report in bytes.
     """
 
     blank: int
@@ -73,13 +74,14 @@ class Magnitude:
 
 
 class PidReports:
-    """Writes and reads the reports of one device.
+    """Encoder and decoder of one device's reports.
 
     Args:
-        layout: Its reports.
+        layout: Layout of its reports.
 
     Raises:
-        DeviceError: They lack what a streamed constant force needs; says what.
+        DeviceError: The reports lack a requirement of a streamed constant force; the message names
+            it.
     """
 
     def __init__(self, layout: Layout) -> None:
@@ -115,12 +117,12 @@ class PidReports:
             raise DeviceError("its durations have no range")
 
     def control(self, usage: int) -> bytes | None:
-        """Returns the report that enables, disables, stops or resets; None where it has none."""
+        """Returns the report that enables, disables, stops or resets; None if it is missing."""
         bits = chosen_bits(self._control, usage)
         return None if bits is None else self._report(self._control, bits)
 
     def full_gain(self) -> bytes | None:
-        """Returns the report that sets the device's own gain to its most, None without one."""
+        """Returns the report that sets the device's gain to its maximum, or None."""
         place = place_of(self._gain, DEVICE_GAIN)
         if place is None:
             return None
@@ -132,43 +134,43 @@ class PidReports:
 
     @property
     def load(self) -> tuple[int, int]:
-        """Number and length in bytes of the feature report that says what came of it."""
+        """Number and length in bytes of the feature report with the result of a creation."""
         return self._asked(self._load)
 
     @property
     def pool(self) -> tuple[int, int] | None:
-        """Number and length of the feature report that says how many effects there can be."""
+        """Number and length in bytes of the feature report with the number of possible effects."""
         return self._asked(self._pool) if place_of(self._pool, MOST_EFFECTS) else None
 
     def loaded(self, answer: bytes) -> tuple[int | None, int]:
-        """Returns what became of a created effect: ``LOADED``, ``FULL``, another; and its index."""
+        """Returns the result of a creation (``LOADED``, ``FULL``, other) and the effect's index."""
         report = as_number(self._layout, answer)
         return chosen_usage(self._status, report), self._loaded_index.read(report)
 
     def most_effects(self, answer: bytes) -> int | None:
-        """Returns how many effects can play at once; None where that is not said."""
+        """Returns the number of effects that can play at once; None if unknown."""
         place = place_of(self._pool, MOST_EFFECTS)
         return None if place is None else place.read(as_number(self._layout, answer)) or None
 
     def longest(self) -> float:
-        """Returns the longest finite duration in s that an effect can have."""
-        # the greatest value may stand for 'for ever', as 65535 does
+        """Returns the longest finite duration in s of an effect."""
+        # the largest value may mean an infinite duration, as 65535 does
         return (self._duration.field.maximum - 1) * self._second_per_count
 
     def set_effect(self, index: int, angle: float, duration: float) -> bytes:
-        """Returns the report that makes an effect what it is; it plays with full gain.
+        """Returns the report with an effect's properties; it plays with full gain.
 
         Args:
-            index: The effect's.
-            angle: Where the force comes from, in degrees from north (away from the user),
-                clockwise: 0 pushes towards the user, 90 to the left.
-            duration: How long it plays after a start, in s, at most ``longest``.
+            index: Index of the effect.
+            angle: Origin of the force in degrees clockwise from north (away from the user): 0
+                pushes towards the user, 90 to the left.
+            duration: Duration in s after a start, at most ``longest``.
         """
         field = self._direction.field
         turns = angle / _FULL_TURN % 1.0
         places = {
             self._duration: max(round(duration / self._second_per_count), 1),
-            # one more than the range: 0 to 255 and 0 to 35999 leave out the full turn
+            # plus one, because ranges such as 0 to 255 and 0 to 35999 exclude the full turn
             self._direction: field.minimum + round(turns * (field.maximum - field.minimum + 1)),
         }
         for usage, value in ((BLOCK_INDEX, index), (GAIN, 1 << 31), (DIRECTION_ENABLE, 1)):
@@ -179,14 +181,14 @@ class PidReports:
         return self._report(self._set_effect, filled(places) | kind)
 
     def magnitude(self, index: int) -> Magnitude:
-        """Returns what makes an effect's SetConstantForce reports."""
+        """Returns the template of an effect's SetConstantForce reports."""
         place = place_of(self._set_force, BLOCK_INDEX)
         blank = self._report(self._set_force, 0 if place is None else place.bits(index))
         full = min(self._force.field.maximum, -self._force.field.minimum)
         return Magnitude(int.from_bytes(blank, "little"), self._force, full, len(blank))
 
     def operate(self, index: int, usage: int) -> bytes:
-        """Returns the report that starts (once, anew if it plays) or stops an effect."""
+        """Returns the report that starts an effect once, or anew if it plays, or stops it."""
         bits = chosen_bits(self._operation, usage) or 0
         for wanted, value in ((BLOCK_INDEX, index), (LOOP_COUNT, 1)):
             place = place_of(self._operation, wanted)
@@ -195,7 +197,7 @@ class PidReports:
         return self._report(self._operation, bits)
 
     def free(self, index: int) -> bytes | None:
-        """Returns the report that gives an effect's memory back; None where it has none."""
+        """Returns the report that frees an effect's memory; None if the device lacks it."""
         place = place_of(self._free, BLOCK_INDEX)
         return None if place is None else self._report(self._free, place.bits(index))
 
@@ -226,7 +228,7 @@ class PidReports:
 
 
 def has_force_feedback(descriptor: bytes) -> bool:
-    """Tells whether a report descriptor has anything of force feedback that a host may send."""
+    """Returns whether a report descriptor has force-feedback reports to the device."""
     try:
         layout = Layout(descriptor)
     except DeviceError:
@@ -245,7 +247,7 @@ def _inside(fields: list[Field], collection: int) -> list[Field]:
 
 
 def _direction(fields: list[Field]) -> Place | None:
-    """Returns where the first angle of a direction lies: in its collection, or by its usage."""
+    """Returns the place of a direction's first angle, from its collection or by its usage."""
     for field in fields:
         if DIRECTION in field.collections and field.usages:
             return Place(field, 8 + field.offset)

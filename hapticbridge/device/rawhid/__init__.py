@@ -1,4 +1,4 @@
-"""Home-made devices that speak the open protocol of ``device/rawhid.md``.
+"""Home-made devices with the open protocol of ``device/rawhid.md``.
 
 ``device`` is the driver, ``protocol`` the frames in bytes.
 """

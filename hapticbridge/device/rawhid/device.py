@@ -1,4 +1,4 @@
-"""Home-made devices that speak the open protocol of ``rawhid.md``: 1 to 6 axes, 64-byte frames."""
+"""Home-made devices with the open protocol of ``rawhid.md``: 1 to 6 axes, 64-byte frames."""
 
 from __future__ import annotations
 
@@ -46,14 +46,14 @@ from hapticbridge.errors import DeviceError, DeviceLost
 from hapticbridge.pose import canonical, quaternion_exp
 from hapticbridge.record import SAMPLE_DTYPE, TickFlag
 
-# What a raw HID device says of itself when it is asked, and the data sheet made of it.
+# Data sheet of a raw HID device.
 
 ASKS, ASK_WAIT_MS = 10, 100
-"""How often a page of the sheet is asked for before giving up, and how long each answer is waited
-for, in ms: a device that still boots has a second for each."""
+"""Number of requests for a page of the sheet, and wait for each answer in ms. A booting device has
+a second per page."""
 
 POLLING = 1e-3
-"""In s: a full-speed device is asked once a millisecond, in each direction."""
+"""Polling interval of a full-speed device in s, in each direction."""
 
 _MUST_SAY = ("rate", "speed_limit")
 CHANGES = (
@@ -67,19 +67,19 @@ CHANGES = (
     "torque_limit",
     "speed_limit",
 )
-"""Numbers of the data sheet that the user may know better than the device."""
+"""Numbers of the data sheet that the user may replace."""
 
 
 def asked(link: Link, name: str) -> tuple[Numbers, str]:
-    """Asks a device for both pages of its sheet.
+    """Requests both pages of a device's sheet.
 
     Args:
-        link: Reports to and from the device, open.
-        name: What errors call it.
+        link: Open link for its reports.
+        name: Name of the device in messages.
 
     Raises:
-        DeviceError: It does not answer, or speaks another version of the protocol.
-        DeviceLost: It is gone.
+        DeviceError: The device does not answer, or has another version of the protocol.
+        DeviceLost: The device is gone.
     """
     numbers, title = _page(link, name, NUMBERS_PAGE), _page(link, name, NAME_PAGE)
     assert isinstance(numbers, Numbers)
@@ -96,15 +96,15 @@ def _page(link: Link, name: str, page: int) -> Numbers | str:
             if (version := version_of(report)) not in (None, VERSION):
                 raise DeviceError(
                     f"{name} speaks version {version} of the raw HID protocol; "
-                    f"this is version {VERSION}"
+                    f"version {VERSION} is required, so update its firmware"
                 )
     raise DeviceError(
-        f"{name} does not answer as hapticbridge/device/rawhid.md says; is its firmware on it?"
+        f"{name} does not answer by the protocol hapticbridge/device/rawhid.md; check its firmware"
     )
 
 
 def reports(link: Link, timeout_ms: int) -> Iterator[bytes]:
-    """Yields reports as they come, for about that time: one a millisecond, or waiting."""
+    """Yields reports as they come, for about ``timeout_ms``; a report counts as 1 ms."""
     left = timeout_ms
     while left > 0:
         report = link.wait(min(left, 10))
@@ -114,16 +114,16 @@ def reports(link: Link, timeout_ms: int) -> Iterator[bytes]:
 
 
 def data_sheet(name: str, numbers: Numbers, title: str, changes: dict[str, Any]) -> DeviceInfo:
-    """Makes a data sheet of what the device says of itself and what the user knows better.
+    """Returns the data sheet from the device's numbers and the user's changes.
 
     Args:
-        name: What errors call it.
+        name: Name of the device in messages.
         numbers: Page 0.
         title: Page 1.
-        changes: Of ``CHANGES``, by name.
+        changes: Numbers of ``CHANGES``, by name.
 
     Raises:
-        DeviceError: A number that nobody can guess is missing, or one is out of range.
+        DeviceError: A required number is missing, or one is out of range.
     """
     known: dict[str, Any] = numbers.known()
     axes = numbers.axis_names
@@ -135,8 +135,8 @@ def data_sheet(name: str, numbers: Numbers, title: str, changes: dict[str, Any])
     known |= changes
     must = [*_MUST_SAY, *["force_limit"] * moves, *["torque_limit"] * turns]
     if missing := [field for field in must if known[field] is None]:
-        raise DeviceError(f"{name} does not say its {missing[0]}, and nobody can guess it")
-    # what the device adds by itself, a state that is one of its periods old, and the bus both ways
+        raise DeviceError(f"{name} does not report its {missing[0]}, which is required")
+    # the device's own delay, plus a state up to one of its periods old, plus the bus both ways
     delay = known.pop("delay")
     try:
         return DeviceInfo(
@@ -149,26 +149,26 @@ def data_sheet(name: str, numbers: Numbers, title: str, changes: dict[str, Any])
             **known,
         )
     except (DeviceError, ZeroDivisionError) as error:
-        raise DeviceError(f"{name} claims what cannot be: {error}") from None
+        raise DeviceError(f"{name} reports an impossible data sheet: {error}") from None
 
 
-# The state frames of a raw HID device as they come: the newest, and what was lost on the way.
+# State frames of a raw HID device.
 
 _HALF_A_TURN = 0x80000000
-"""Of the device's clock, in µs: a step forwards by more is taken for one backwards."""
+"""Half the range of the device's clock in µs; a larger step forwards counts as a step backwards."""
 
 
 class StateStream:
-    """Takes reports one by one and counts.
+    """Decoder and counter of state frames.
 
     Args:
-        name: What errors call the device.
+        name: Name of the device in messages.
 
     Attributes:
-        newest: The state that came last; None before the first.
-        lost: State frames that never came, by their sequence.
-        damaged: Reports that were no valid frame.
-        repeated: State frames that came twice.
+        newest: Newest state; None before the first.
+        lost: Number of missing state frames, by their sequence.
+        damaged: Number of reports that were not valid frames.
+        repeated: Number of state frames that came twice.
     """
 
     def __init__(self, name: str) -> None:
@@ -177,7 +177,7 @@ class StateStream:
         self.lost = self.damaged = self.repeated = 0
 
     def takes(self, report: bytes) -> bool:
-        """Takes a report; returns whether it was a state frame that is newer than the last one.
+        """Decodes a report; returns whether it was a new state frame.
 
         Raises:
             DeviceError: The device has restarted, or a number is not finite.
@@ -193,7 +193,7 @@ class StateStream:
                 return False
             if (state.time_us - last.time_us) & _HALF_A_TURN:
                 raise DeviceError(
-                    f"{self._name} has restarted in mid-run; its pose may count from elsewhere"
+                    f"{self._name} has restarted during the run; its pose may have a new origin"
                 )
             self.lost += (state.sequence - last.sequence - 1) & 0xFFFF
         if not state.is_finite or max(map(abs, state.numbers)) > LARGEST:
@@ -208,28 +208,27 @@ NO_WRENCH = (0.0,) * 6
 
 
 class RawHidDevice:
-    """A device that streams its state and obeys the newest force frame.
+    """A device that streams its state and applies the newest force frame.
 
-    The device sends a state frame at its own rate, without being asked; ``read`` takes the newest
-    that has come. Of frames lost on the way the newest one still is right, so they are counted and
-    nothing else; a frame with a wrong CRC is dropped and counted; a number that is not finite, a
-    fault that the device reports, or a clock that runs backwards (it has restarted, and may count
-    its pose from another place) ends the run.
+    The device sends state frames at its own rate; ``read`` returns the newest. Lost frames are
+    counted only, because the newest remains valid. A frame with a wrong CRC is dropped and counted.
+    The run ends on a non-finite number, a reported fault, or a clock that runs backwards. The last
+    means a restart, after which the pose may have another origin.
 
     Args:
-        link: Reports to and from the device, open.
-        name: What errors call it.
-        changes: Numbers of the data sheet that go before what the device says of itself.
-        now: Returns the time in s of a clock that only grows.
+        link: Open link for its reports.
+        name: Name of the device in messages.
+        changes: Numbers of the data sheet that replace those of the device.
+        now: Returns the time of a monotonic clock in s.
 
     Attributes:
         info: Its data sheet.
-        last_word: Says zero to it should this process die; None where no other process can.
-        states: The newest state, and how many were lost or damaged on the way.
+        last_word: Commands zero force if this process dies; None if no second process can.
+        states: Newest state, and numbers of lost and damaged frames.
 
     Raises:
-        DeviceError: It does not speak the protocol, another version of it, or its data sheet is
-            incomplete or out of range.
+        DeviceError: The device has another protocol or version, or its data sheet is incomplete or
+            out of range.
     """
 
     def __init__(
@@ -251,7 +250,7 @@ class RawHidDevice:
         self.last_word: ForceOffGuardian | None = None
 
     def start(self, period: float) -> NDArray[np.void]:
-        """Waits for a state frame that is newer than this call.
+        """Waits for a state frame newer than this call.
 
         Args:
             period: The loop's period in s, finite and > 0.
@@ -260,8 +259,8 @@ class RawHidDevice:
             The pose before the first tick, shape (1,), ``SAMPLE_DTYPE``.
 
         Raises:
-            DeviceError: The period is not, the device sends nothing, must be homed first, or
-                reports a fault.
+            DeviceError: The period is not valid, or the device sends nothing, must be homed first,
+                or reports a fault.
         """
         period = checked_period(period)
         self._watchdog_ms = min(math.ceil(1e3 * watchdog_time(period)), LONGEST_WATCHDOG_MS)
@@ -272,11 +271,13 @@ class RawHidDevice:
             if states.takes(report):
                 break
         if states.newest is None:
-            raise DeviceError(f"{self._name} sends no state frames")
+            raise DeviceError(
+                f"{self._name} sends no state frames within {FIRST_STATE_MS} ms; check its firmware"
+            )
         if states.newest.status & Status.NOT_READY:
             raise DeviceError(
-                f"{self._name} does not know its pose yet: home or calibrate it, as its builder "
-                "says, and start again"
+                f"{self._name} has no valid pose yet: home or calibrate it as its builder "
+                "describes, and start again"
             )
         self._refuse_fault(states.newest)
         self._fill(states.newest)
@@ -284,30 +285,30 @@ class RawHidDevice:
         return self._sample.copy()
 
     def read(self, sample: NDArray[np.void]) -> int:
-        """Reports the newest pose that has come; waits for none.
+        """Returns the newest pose without waiting.
 
         Args:
-            sample: Shape (1,), ``SAMPLE_DTYPE``, filled in place.
+            sample: Output, shape (1,), ``SAMPLE_DTYPE``.
 
         Returns:
-            0, or ``STALE_SAMPLE`` where no valid frame has come since the last read.
+            0, or ``STALE_SAMPLE`` if no valid frame has come since the last read.
 
         Raises:
             DeviceLost: The device is gone, or silent for longer than ``SILENCE``.
-            DeviceError: It has not been started, has restarted, reports a fault, or a number that
-                is not finite.
+            DeviceError: The device was not started, has restarted, reports a fault, or sent a
+                non-finite number.
         """
         states = self.states
         if states.newest is None:
-            raise DeviceError(f"{self._name} is read before it was started")
+            raise DeviceError(f"{self._name} is read before it was started; call start() first")
         is_new = False
         for report in self._link.take():
             is_new |= states.takes(report)
-        if not self._has_begun:  # between the start and the loop nobody took what was sent
+        if not self._has_begun:  # frames between the start and the loop do not count as lost
             self._has_begun, states.lost = True, 0
         if self._watch.is_silent(self._now(), is_new=is_new):
             silence = 1e3 * self._watch.silence
-            raise DeviceLost(f"{self._name} has sent nothing for {silence:.0f} ms")
+            raise DeviceLost(f"{self._name} has sent nothing for {silence:.0f} ms; check its cable")
         if not is_new:
             sample[0] = self._sample[0]
             return int(TickFlag.STALE_SAMPLE)
@@ -317,7 +318,7 @@ class RawHidDevice:
         return 0
 
     def write(self, wrench: NDArray[np.float64]) -> None:
-        """Commands a wrench, on the axes that the device has.
+        """Commands a wrench on the axes that the device has.
 
         Args:
             wrench: Shape (6,): force in N, torque in N m, on the device, in the device's frame.
@@ -332,14 +333,14 @@ class RawHidDevice:
         self._send(force_frame(self._next(), values, self._watchdog_ms))
 
     def close(self) -> None:
-        """Switches the motors off and lets the device go."""
+        """Switches the motors off and releases the device."""
         if not self._is_open:
             return
         self._is_open = False
         try:
             self._send(force_frame(self._next(), NO_WRENCH, 1, is_enabled=False))
         except DeviceLost:
-            pass  # its own watchdog does it
+            pass  # the device's own watchdog ends the force
         finally:
             self._link.close()
             if self.last_word is not None:
@@ -347,7 +348,7 @@ class RawHidDevice:
 
     @property
     def velocity(self) -> NDArray[np.float64]:
-        """Velocity in m/s and angular velocity in rad/s as last reported, shape (6,); 0 before."""
+        """Last reported velocity in m/s and angular velocity in rad/s, shape (6,); initially 0."""
         state = self.states.newest
         numbers = (0.0,) * 12 if state is None else state.numbers
         moving: NDArray[np.float64] = np.array(numbers[6:]) * self._mask
@@ -355,7 +356,7 @@ class RawHidDevice:
 
     @property
     def on_the_way(self) -> int:
-        """How many force frames the device had not obeyed yet when it sent its newest state."""
+        """Number of force frames that the device had not yet applied at its newest state."""
         state = self.states.newest
         return 0 if state is None else (self._sequence - state.echo) & 0xFFFF
 
@@ -363,11 +364,12 @@ class RawHidDevice:
         if state.status & (Status.FAULT | Status.NOT_READY):
             what = "a fault of its own" if state.status & Status.FAULT else "that its pose was lost"
             raise DeviceError(
-                f"{self._name} reports {what} (status 0x{state.status:02x}) and gives no force"
+                f"{self._name} reports {what} (status 0x{state.status:02x}) and gives no force; "
+                "restart and home it"
             )
 
     def _fill(self, state: State) -> None:
-        """Makes a sample of a state; axes that the device lacks stay where they are."""
+        """Converts a state into a sample; axes that the device lacks do not move."""
         pose = self._mask * state.numbers[:6]
         sample = self._sample[0]
         sample["position"] = pose[:3]
@@ -380,10 +382,10 @@ class RawHidDevice:
         return self._sequence
 
     def _send(self, frame: bytes) -> None:
-        self._link.write(b"\0" + frame)  # reports without a number: hidapi wants a 0 in front
+        self._link.write(b"\0" + frame)  # hidapi requires a leading 0 for reports without a number
 
 
-# Home-made devices that speak the open protocol: finding one among what is plugged in.
+# Discovery of home-made devices.
 
 
 def open_rawhid(
@@ -395,12 +397,12 @@ def open_rawhid(
     """Finds and opens a raw HID device.
 
     Args:
-        options: ``serial``, ``log``, and numbers of the data sheet that go before its own.
-        api: hidapi or what stands for it; its reports are then not sent by a thread.
-        now: Returns the time in s of a clock that only grows.
+        options: ``serial``, ``log``, and numbers of the data sheet that replace its own.
+        api: hidapi or a substitute; reports are then sent without a thread.
+        now: Returns the time of a monotonic clock in s.
 
     Raises:
-        DeviceError: There is none, or it cannot be opened or does not speak the protocol.
+        DeviceError: No device is found, it cannot be opened, or it has another protocol.
     """
     plugged = select_device(FAMILY, find(FAMILY, api), options.get("serial"))
     link = HidLink.open(plugged, api, is_overlapped=api is None, log=HexLog.asked(options))
@@ -419,7 +421,7 @@ def open_rawhid(
 
 FAMILY = Driver(
     name="rawhid",
-    about="home-made devices that speak hapticbridge/device/rawhid.md (Teensy and the like)",
+    about="home-made devices with the protocol hapticbridge/device/rawhid.md (as on Teensy)",
     ids=(UsbId(0x16C0, 0x0486, "Teensy raw HID"),),
     transport="hid",
     axes="1 to 6, as built",
@@ -427,8 +429,9 @@ FAMILY = Driver(
     rate="to 1 kHz, as built",
     options=("serial", "log", *CHANGES),
     open=open_rawhid,
-    on_stall=f"its watchdog takes the force away after {1e3 * SHORTEST_WATCHDOG:g} ms, if it was "
-    "built as the protocol says",
+    on_stall=f"its watchdog ends the force after {1e3 * SHORTEST_WATCHDOG:g} ms, if it was built "
+    "to the protocol",
     usage=(0xFFAB, 0x0200),
 )
-"""Teensy's raw HID interface; its second interface (usage page FFC9) is an emulated serial port."""
+"""Driver of home-made devices with Teensy's raw HID interface. Its second interface (usage page
+FFC9) is an emulated serial port."""

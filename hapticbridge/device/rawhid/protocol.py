@@ -1,4 +1,4 @@
-"""The frames of ``rawhid.md``: 64 bytes each way, little-endian, checked by a CRC."""
+"""Frames of ``rawhid.md``: 64 bytes in each direction, little-endian, with a CRC."""
 
 from __future__ import annotations
 
@@ -14,26 +14,28 @@ from hapticbridge.device.base import AXES
 from hapticbridge.device.family import printable
 
 FRAME_BYTES = 64
-"""What a full-speed interrupt transfer carries, and Teensy's raw HID report holds."""
+"""Bytes per frame: the limit of a full-speed interrupt transfer and of Teensy's raw HID report."""
 
 MAGIC, VERSION = 0x48, 1
 """First two bytes of every frame."""
 
 LONGEST_WATCHDOG_MS = 1000
-"""A device obeys no longer time: a second is what a hand can still hold against."""
+"""Largest watchdog in ms that a device accepts. A hand can still hold against a force for a
+second."""
 
 LARGEST = 1e30
-"""Of any number in a frame: float32 ends at 3.4e38, and nothing that is felt is near this."""
+"""Largest magnitude of a number in a frame, in its unit. It lies below the end of float32, 3.4e38,
+and far above any real value."""
 
 
 class Kind(IntEnum):
-    """Byte 2 of a frame.
+    """Kind of a frame, byte 2.
 
     Attributes:
-        STATE: From the device: where it is.
-        SHEET: From the device: what it is, page by page, when it was asked.
-        FORCE: To the device.
-        ASK: To the device: send a page of the sheet.
+        STATE: From the device: its state.
+        SHEET: From the device: a requested page of its data sheet.
+        FORCE: To the device: a wrench.
+        ASK: To the device: request for a page of the sheet.
     """
 
     STATE = 0x53
@@ -43,15 +45,15 @@ class Kind(IntEnum):
 
 
 class Status(IntFlag):
-    """Byte 3 of a state frame.
+    """Status of the device, byte 3 of a state frame.
 
     Attributes:
         ENABLED: The motors follow the newest force frame.
         WATCHDOG: The watchdog has zeroed the wrench since the newest force frame.
-        SATURATED: The motors could not give all of it.
-        FAULT: The device found itself broken (encoder, driver, temperature) and gives no force.
-        NOT_READY: The pose is not valid yet: it must be homed or calibrated first.
-        DAMAGED: A frame with a wrong CRC has come since the newest good one.
+        SATURATED: The motors could not apply the whole wrench.
+        FAULT: The device has detected a fault (encoder, driver, temperature) and gives no force.
+        NOT_READY: The pose is not valid yet: the device must be homed or calibrated first.
+        DAMAGED: A frame with a wrong CRC has come since the newest valid one.
     """
 
     ENABLED = 1
@@ -63,10 +65,10 @@ class Status(IntFlag):
 
 
 ENABLE = 1
-"""Byte 3 of a force frame: the motors may act."""
+"""Byte 3 of a force frame that enables the motors."""
 
 NUMBERS_PAGE, NAME_PAGE = 0, 1
-"""Pages of the sheet, byte 3 of a frame that asks for one or holds one."""
+"""Pages of the sheet, byte 3 of a frame that requests or holds one."""
 
 NAME_BYTES = 54
 
@@ -78,16 +80,16 @@ _CRC = struct.Struct("<H")
 
 
 class State(NamedTuple):
-    """Where the device is.
+    """State of the device.
 
     Attributes:
         status: ``Status`` bits.
-        sequence: 0 to 65535, one more per state frame, then 0 again.
-        buttons: One bit each, 16.
+        sequence: 0 to 65535, incremented per state frame, then 0 again.
+        buttons: 16 bits, one per button.
         time_us: The device's clock when the pose was latched, in µs modulo 2^32 (71.6 min).
         numbers: Position in m, rotation vector in rad, velocity in m/s, angular velocity in rad/s:
             3 each, in the device's frame.
-        echo: Sequence of the newest force frame that the device obeys.
+        echo: Sequence of the newest force frame that the device applies.
     """
 
     status: int
@@ -99,26 +101,26 @@ class State(NamedTuple):
 
     @property
     def is_finite(self) -> bool:
-        """Whether every number is one."""
+        """True if all numbers are finite."""
         return all(map(math.isfinite, self.numbers))
 
 
 class Numbers(NamedTuple):
-    """What the device says of itself, page 0: NaN where it does not know.
+    """Page 0 of the device's data sheet; NaN for unknown numbers.
 
     Attributes:
-        axes: Bit i set: it has axis i of ``device.AXES``.
-        rate: State frames per second.
-        mass: In kg.
-        damping: In N s/m.
-        rotational_inertia: In kg m².
-        rotational_damping: In N m s/rad.
-        friction: In N, per axis.
-        resolution: In m.
-        force_limit: In N, by norm.
-        torque_limit: In N m, by norm.
-        speed_limit: In m/s.
-        delay: In s, what the device itself adds: from latching a pose to sending it, plus from
+        axes: Bit i is set if it has axis i of ``device.AXES``.
+        rate: Rate of state frames in Hz.
+        mass: Mass in kg.
+        damping: Damping in N s/m.
+        rotational_inertia: Rotational inertia in kg m².
+        rotational_damping: Rotational damping in N m s/rad.
+        friction: Coulomb friction per axis in N.
+        resolution: Step of the position in m.
+        force_limit: Largest norm of the force in N.
+        torque_limit: Largest norm of the torque in N m.
+        speed_limit: Largest speed in m/s.
+        delay: Delay of the device itself in s: from latching a pose to sending it, plus from
             receiving a force to the motors.
     """
 
@@ -136,10 +138,10 @@ class Numbers(NamedTuple):
     delay: float
 
     def known(self) -> dict[str, float | None]:
-        """Returns the numbers by name, None for what is not a number."""
+        """Returns the numbers by name, None for NaN and infinity."""
         values = self._asdict()
         del values["axes"]
-        # as short as a float32 allows: 0.1 and not 0.10000000149, which nobody typed
+        # shortest text of the float32: 0.1 instead of 0.10000000149
         return {
             name: float(str(np.float32(value))) if math.isfinite(value) else None
             for name, value in values.items()
@@ -147,7 +149,7 @@ class Numbers(NamedTuple):
 
     @property
     def axis_names(self) -> tuple[str, ...]:
-        """The axes by name, in the order of ``device.AXES``."""
+        """Axes by name, in the order of ``device.AXES``."""
         return tuple(name for i, name in enumerate(AXES) if self.axes >> i & 1)
 
 
@@ -164,20 +166,21 @@ def force_frame(
     Args:
         sequence: 0 to 65535.
         wrench: Force in N and torque in N m on the device, in its frame; 6 finite numbers.
-        watchdog_ms: After how many ms without a force frame the device gives none, 1 to 1000.
-        is_enabled: Whether the motors may act at all.
+        watchdog_ms: Time in ms without a force frame after which the device ends the force, 1 to
+            1000.
+        is_enabled: False to disable the motors.
     """
     flags = ENABLE if is_enabled else 0
     return _sealed(_FORCE.pack(MAGIC, VERSION, Kind.FORCE, flags, sequence, watchdog_ms, *wrench))
 
 
 def ask_frame(sequence: int, page: int) -> bytes:
-    """Returns the frame that asks for a page of the sheet."""
+    """Returns the frame that requests a page of the sheet."""
     return _sealed(_FORCE.pack(MAGIC, VERSION, Kind.ASK, page, sequence, 0, *[0.0] * 6))
 
 
 def state_frame(state: State) -> bytes:
-    """Returns a state frame, as a device sends it."""
+    """Returns a device's state frame."""
     return _sealed(
         _STATE.pack(
             MAGIC,
@@ -194,12 +197,12 @@ def state_frame(state: State) -> bytes:
 
 
 def sheet_frames(sequence: int, numbers: Numbers, name: str) -> tuple[bytes, bytes]:
-    """Returns both pages of a sheet, as a device sends them.
+    """Returns both pages of a device's sheet.
 
     Args:
-        sequence: Of the frame that asked.
+        sequence: Sequence of the request.
         numbers: Page 0.
-        name: Page 1, at most 54 bytes in UTF-8; what is longer is cut.
+        name: Page 1, in UTF-8; truncated to 54 bytes.
     """
     head = MAGIC, VERSION, Kind.SHEET
     text = name.encode()[:NAME_BYTES].decode(errors="ignore").encode()
@@ -214,7 +217,7 @@ def _sealed(body: bytes) -> bytes:
 
 
 def version_of(frame: bytes) -> int | None:
-    """Returns the protocol's version that a frame is of, or None if it is no undamaged frame."""
+    """Returns the protocol version of a frame, or None if it is damaged or not a frame."""
     if len(frame) != FRAME_BYTES or frame[0] != MAGIC:
         return None
     (crc,) = _CRC.unpack_from(frame, FRAME_BYTES - 2)
@@ -222,14 +225,14 @@ def version_of(frame: bytes) -> int | None:
 
 
 def decoded(frame: bytes) -> State | Numbers | str | None:
-    """Reads what a device sent.
+    """Decodes a frame from the device.
 
     Args:
         frame: Any bytes.
 
     Returns:
-        A state, page 0 of the sheet, the name of page 1; None for everything else: of another
-        length, version or kind, or damaged. Numbers may be anything that a float32 holds.
+        A state, page 0 of the sheet, or the name of page 1. None for another length, version or
+        kind, or a damaged frame. Numbers may be any float32.
     """
     if version_of(frame) != VERSION:
         return None

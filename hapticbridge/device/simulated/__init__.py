@@ -1,4 +1,4 @@
-"""A simulated device in a simulated hand.
+"""Simulated device in a simulated hand.
 
 ``device`` is the driver, ``dynamics`` its exact compiled step, ``hand`` the parameters of the hand.
 """

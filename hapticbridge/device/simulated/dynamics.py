@@ -1,4 +1,4 @@
-"""The simulated device's state, and its step from one sample to the next, compiled."""
+"""State of a simulated device, and its compiled step from one sample to the next."""
 
 from __future__ import annotations
 
@@ -25,31 +25,20 @@ from hapticbridge.pose import (
     vector_of,
 )
 
-# One axis of a device in a hand, moved exactly over a time in which its force is held.
-#
-# M v' = F − s f_c − b v − b_h (v − ṗ) − k_h (x − p), x' = v, s = sign(v)
-#
-# with the inertia M of device and hand, the device's damping b, the hand's damping b_h and
-# stiffness k_h towards a target p of constant velocity ṗ, and Coulomb friction f_c. The relative
-# velocity r = v − ṗ obeys the homogeneous M r'' + (b + b_h) r' + k_h r = 0 with r'(0) = a, the
-# acceleration at the start. So for any time h
-#
-# x(h) = x + h ṗ + d_0 r + d_1 a, v(h) = v − (k_h/M) d_1 r + c_1 a
-#
-# where d_0, d_1 and c_1 are elements of one matrix exponential, found once per run. Written as
-# increments, nothing cancels where the axis is nearly at rest.
+# Exact motion of one axis of a device in a hand.
 
 Record: TypeAlias = Any
-"""A structured scalar inside compiled code, where fields are attributes; NumPy's type has none."""
+"""Structured scalar inside compiled code, where fields are attributes. NumPy's type has none."""
 
 LEVELS = 41
-"""Friction looks for events in dyadic parts of the period, from T to T/2^40: 1e-15 s at 1 kHz."""
+"""Number of dyadic parts of the period in which friction locates events, from T to T/2^40: 1e-15 s
+at 1 kHz."""
 _COARSEST_LEVEL = 6
-"""Finest first part with friction, T/2^6: an axis that swings faster would need more phases than
-are allowed."""
+"""Finest first part with friction, T/2^6. A faster axis would need more phases than
+``_MOST_PHASES``."""
 
 _MOST_PHASES = 64
-"""Of slipping and sticking within a period; the bound is there so that the loop ends."""
+"""Largest number of slipping and sticking phases within a period, which bounds the loop."""
 
 AXIS_DTYPE = np.dtype(
     [
@@ -62,10 +51,9 @@ AXIS_DTYPE = np.dtype(
         ("steps", "<f8", (LEVELS, 5)),
     ]
 )
-"""The law of motion of an axis: M, b, b_h, k_h and f_c in SI units, and per level i of time
-h = T/2^i the numbers h, d_0, d_1, −(k_h/M) d_1 and c_1 (beyond i = 0 only with friction).
-``first_level``: the longest time in which
-the acceleration changes its sign at most once."""
+"""Law of motion of an axis: M, b, b_h, k_h and f_c in SI units. Per level i of time h = T/2^i it
+holds the numbers h, d_0, d_1, −(k_h/M) d_1 and c_1 (beyond i = 0 only with friction).
+``first_level`` is the longest time in which the acceleration changes its sign at most once."""
 
 
 def sampled_axis(
@@ -79,11 +67,23 @@ def sampled_axis(
 ) -> NDArray[np.void]:
     """Returns the law of motion of an axis for a period, as one ``AXIS_DTYPE`` scalar array.
 
+        M v' = F − s f_c − b v − b_h (v − ṗ) − k_h (x − p),        x' = v,    s = sign(v)
+
+    M is the inertia of device and hand, b the device's damping, b_h and k_h the hand's damping and
+    stiffness. The target p has the constant velocity ṗ; f_c is Coulomb friction. The relative
+    velocity r = v − ṗ obeys the homogeneous M r'' + (b + b_h) r' + k_h r = 0 with r'(0) = a, the
+    initial acceleration. So for any time h
+
+        x(h) = x + h ṗ + d_0 r + d_1 a,        v(h) = v − (k_h/M) d_1 r + c_1 a
+
+    d_0, d_1 and c_1 are elements of one matrix exponential, computed once per run. The form as
+    increments avoids cancellation near rest.
+
     Args:
         period: T in s, > 0.
         inertia: M in kg (or kg m²), > 0.
         damping: b in N s/m (or N m s/rad), >= 0.
-        hand_damping: b_h, likewise.
+        hand_damping: b_h in N s/m (or N m s/rad), >= 0.
         stiffness: k_h in N/m (or N m/rad), >= 0.
         friction: f_c in N (or N m), >= 0.
 
@@ -96,10 +96,10 @@ def sampled_axis(
     axis["hand_damping"] = hand_damping
     axis["stiffness"] = stiffness
     axis["friction"] = friction
-    # without friction only whole periods are stepped
+    # without friction only whole periods are needed
     levels = LEVELS if friction > 0.0 else 1
     times = period / 2.0 ** np.arange(levels)
-    # (∫r/h, r, h r') over the time h as unit: elements of order one at every level
+    # state (∫r/h, r, h r') in units of h, so that all elements are of order one at every level
     generator = np.zeros((levels, 3, 3))
     generator[:, 0, 1] = generator[:, 1, 2] = 1.0
     generator[:, 2, 1] = -stiffness / inertia * times**2
@@ -115,7 +115,7 @@ def sampled_axis(
     steps[:, 4] = times * transition[:, 1, 2]
     decay = (damping + hand_damping) / (2.0 * inertia)
     swing = math.sqrt(max(stiffness / inertia - decay * decay, 0.0))
-    # r' vanishes at most once within half a swing, π/swing; half of that is on the safe side
+    # r' vanishes at most once within half a swing, π/swing; half of that leaves a margin
     quarters = swing * period / (0.5 * math.pi)
     first_level = max(0, math.ceil(math.log2(quarters))) if quarters > 0.0 else 0
     if friction > 0.0 and first_level > _COARSEST_LEVEL:
@@ -134,7 +134,7 @@ def moved(
     """Returns the increments of position and velocity over the time of a level, without friction.
 
     Args:
-        axis: The law of motion, ``AXIS_DTYPE``.
+        axis: Law of motion, ``AXIS_DTYPE``.
         level: 0 for the whole period, i for T/2^i.
         relative_velocity: v − ṗ at the start.
         acceleration: v' at the start.
@@ -167,14 +167,14 @@ def _slide(
     drift: float,
     direction: float,
 ) -> tuple[int, float, float, float]:
-    """Slides in one direction until the velocity vanishes or the time is over.
+    """Slides in one direction until the velocity vanishes or the time ends.
 
-    A step is taken if the velocity keeps its sign at its end, and cannot have left and come back
-    within (the acceleration turns from against the motion to along it); else a step of half the
-    time is tried, which brackets the event down to T/2^40.
+    A step is accepted if the velocity keeps its sign at its end and cannot have vanished in
+    between. It can have if the acceleration changes from against the motion to along it. Otherwise
+    half the time is tried, which brackets the event down to T/2^40.
 
     Returns:
-        The units of T/2^40 left, the distance travelled, the new stretch x − p, the new velocity.
+        Remaining time in units of T/2^40, distance travelled, new stretch x − p, new velocity.
     """
     travel = 0.0
     friction = direction * axis.friction
@@ -187,7 +187,7 @@ def _slide(
             continue
         start = acceleration_at(axis, force - friction, stretch, velocity, drift)
         if velocity == 0.0:
-            # at the very moment of breaking away rounding must not pull it back
+            # at the moment of breaking away, rounding must not reverse the acceleration
             start = direction * max(direction * start, 0.0)
         dx, dv = moved(axis, level, velocity - drift, start, drift)
         next_stretch = stretch + (dx - units * axis.steps[LEVELS - 1, 0] * drift)
@@ -210,8 +210,8 @@ def _slide(
             if level < LEVELS - 1:
                 level += 1
             else:
-                # The event was a dip that did not reach zero, and is behind. There is no other
-                # within half a swing; what rounding shows there must not be searched again.
+                # The event was a dip that did not reach zero, and has passed. Within half a swing
+                # there is no other; rounding errors must not start another search.
                 is_past_dip = True
                 is_bracketed = False
                 level = axis.first_level
@@ -224,11 +224,11 @@ def moved_with_friction(
 ) -> tuple[float, float]:
     """Returns the increment of position and the new velocity after one period, with friction.
 
-    At rest the axis sticks while |F + b_h ṗ − k_h (x − p)| <= f_c; the moment at which the target
-    pulls it loose is found in closed form, the moment at which it comes to rest by bisection.
+    At rest the axis sticks while |F + b_h ṗ − k_h (x − p)| <= f_c. The moment of breaking away is
+    found in closed form, the moment of coming to rest by bisection.
 
     Args:
-        axis: The law of motion, ``AXIS_DTYPE``.
+        axis: Law of motion, ``AXIS_DTYPE``.
         force: F in N, held.
         stretch: x − p in m at the start.
         velocity: v in m/s at the start.
@@ -265,8 +265,8 @@ MAX_DELAY = 100
 """Largest output delay in samples."""
 
 FREE, IN_A_HAND, ON_A_LINE = 0, 1, 2
-"""Who holds the device: nobody, a hand of inertia, damper and spring, or a lossless line tuned to
-be the worst passive hand."""
+"""Holder of the device: none, a hand of inertia, damper and spring, or the lossless line of the
+worst passive hand."""
 
 STATE_DTYPE = np.dtype(
     [
@@ -292,14 +292,14 @@ STATE_DTYPE = np.dtype(
         ("held_before", "<f8", 6),
     ]
 )
-"""What the step reads and writes. ``written`` is the newest wrench; ``on_the_way`` is a ring of
-``delay`` + 1 wrenches between the write and the motors; ``holder``: ``FREE``, ``IN_A_HAND`` or
-``ON_A_LINE``; the lines hold p, q, r of v_k = p v_{k−1} + q F_k + r F_{k−1}."""
+"""State of the step. ``written`` is the newest wrench; ``on_the_way`` is a ring of ``delay`` + 1
+wrenches between the write and the motors; ``holder`` is ``FREE``, ``IN_A_HAND`` or ``ON_A_LINE``.
+The lines hold p, q, r of v_k = p v_{k−1} + q F_k + r F_{k−1}."""
 
 
 @compiled
 def _translate(s: Record, wrench: NDArray[np.float64], target: Vector) -> None:
-    """Moves the position by one period, each axis on its own."""
+    """Advances the position by one period, each axis separately."""
     axis = s.translation
     for i in range(3):
         drift = (target[i] - s.target_position[i]) / s.period
@@ -317,7 +317,7 @@ def _translate(s: Record, wrench: NDArray[np.float64], target: Vector) -> None:
 
 @compiled
 def _turn_about(s: Record, i: int, torque: float, angle: float, drift: float) -> float:
-    """Returns the turn about one axis over one period, and updates its velocity."""
+    """Returns the rotation about one axis over one period, and updates its velocity."""
     velocity = s.angular_velocity[i]
     acceleration = acceleration_at(s.rotation, torque, angle, velocity, drift)
     turn, gain = moved(s.rotation, 0, velocity - drift, acceleration, drift)
@@ -327,7 +327,7 @@ def _turn_about(s: Record, i: int, torque: float, angle: float, drift: float) ->
 
 @compiled
 def _rotate(s: Record, wrench: NDArray[np.float64], target: Quaternion) -> None:
-    """Turns the orientation by one period, along the axes of the device's frame."""
+    """Advances the orientation by one period, along the axes of the device's frame."""
     old, q = quaternion_of(s.target_quaternion), quaternion_of(s.quaternion)
     drift = scaled(1.0 / s.period, rotation_between(old, target))
     angle = rotation_between(old, q)
@@ -342,7 +342,7 @@ def _rotate(s: Record, wrench: NDArray[np.float64], target: Quaternion) -> None:
 
 @compiled
 def _follow_lines(s: Record, wrench: NDArray[np.float64]) -> None:
-    """Moves every axis by one period as device and worst hand do together (``WorstHand``)."""
+    """Advances all axes by one period with device and worst hand together (``WorstHand``)."""
     line = s.translation_line
     for i in range(3):
         s.velocity[i] = line[0] * s.velocity[i] + line[1] * wrench[i] + line[2] * s.held_before[i]
@@ -363,10 +363,10 @@ def _follow_lines(s: Record, wrench: NDArray[np.float64]) -> None:
 def next_sample(
     states: NDArray[np.void], motion: NDArray[np.float64], samples: NDArray[np.void]
 ) -> None:
-    """Moves device and hand by one period (not before the first sample) and reports the pose."""
+    """Advances device and hand by one period (not before the first sample) and writes the pose."""
     s = states[0]
     if s.tick > 0:
-        # the wrench written in tick k - 1 leaves the line of delay + 1 places in tick k + delay
+        # the wrench written in tick k - 1 leaves the ring of delay + 1 places in tick k + delay
         line = s.delay + 1
         entry = s.on_the_way[(s.tick - 1) % line]
         for i in range(6):
@@ -400,5 +400,5 @@ def next_sample(
 
 @compiled
 def _rounded(value: float, step: float) -> float:
-    """Returns the nearest multiple of a step, the value itself where the step is zero."""
+    """Returns the nearest multiple of a step, or the value itself for a step of zero."""
     return step * np.round(value / step) if step > 0.0 else value

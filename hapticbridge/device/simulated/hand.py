@@ -1,4 +1,4 @@
-"""The hand that holds a simulated device: inertia, damper and spring."""
+"""Hand that holds a simulated device: inertia, damper and spring."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from hapticbridge.errors import DeviceError
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Hand:
-    """A hand on the handle: inertia that moves with it, spring and damper to a moving target.
+    """A hand: inertia fixed to the handle, with spring and damper to a moving target.
 
-    The defaults are one measured arm at a handle; the rotational values are a guess of the same
+    The defaults are one measured arm at a handle. The rotational values are estimates of similar
     character (half a swing per second, well damped).
 
     Attributes:
-        mass: In kg, >= 0, rigidly on the handle.
-        damping: In N s/m, >= 0, against the target's velocity.
-        stiffness: In N/m, >= 0.
-        rotational_inertia: In kg m², >= 0.
-        rotational_damping: In N m s/rad, >= 0.
-        rotational_stiffness: In N m/rad, >= 0.
+        mass: Mass in kg, >= 0, fixed to the handle.
+        damping: Damping in N s/m, >= 0, relative to the target's velocity.
+        stiffness: Stiffness in N/m, >= 0.
+        rotational_inertia: Rotational inertia in kg m², >= 0.
+        rotational_damping: Rotational damping in N m s/rad, >= 0.
+        rotational_stiffness: Rotational stiffness in N m/rad, >= 0.
 
     Raises:
         DeviceError: A value is not finite or negative.
@@ -64,17 +64,17 @@ HAND_RANGES = {
     "rotational_damping": (2e-3, 0.2),
     "rotational_stiffness": (0.1, 10.0),
 }
-"""Between which hands are drawn, in the units of ``Hand``: from two fingers that hardly hold to an
-arm that grips hard, around the measured arm of the defaults. Every one of them is passive."""
+"""Ranges of random hands in the units of ``Hand``: from two fingers that hardly hold to an arm that
+grips hard, around the measured arm of the defaults. Every hand in them is passive."""
 
 
 def random_hand(seed: int) -> Hand:
-    """Returns a random passive hand, the same for the same seed.
+    """Returns a random passive hand that depends on the seed only.
 
-    Every value is drawn by itself, evenly in its logarithm, from its ``HAND_RANGES``.
+    Every value is drawn independently, evenly in its logarithm, from its ``HAND_RANGES``.
 
     Args:
-        seed: >= 0.
+        seed: Whole number >= 0.
 
     Raises:
         DeviceError: The seed is not a whole number >= 0.

@@ -1,4 +1,4 @@
-"""Reports to and from a HID device through hidapi: bounded waits, and one seam for tests."""
+"""Reports to and from a HID device through hidapi, with bounded waits."""
 
 from __future__ import annotations
 
@@ -17,47 +17,47 @@ from hapticbridge.device.transport.trace import HexLog
 from hapticbridge.device.transport.usb import members, on_the_bus
 from hapticbridge.errors import DeviceError, DeviceLost
 
-# hidapi, and the HID devices that it and the kernel say are plugged in.
+# Connected HID devices, from hidapi and the kernel.
 
 NO_NODE = (
     "the kernel gives it no hidraw node; load its driver (for 046d: 'sudo modprobe hid_logitech') "
     "and plug it in again"
 )
-NO_HIDAPI = "hidapi cannot be loaded; 'pip install hidapi' brings it"
+NO_HIDAPI = "hidapi cannot be loaded; 'pip install hidapi' installs it"
 
 CLASS = Path("/sys/class/hidraw")
-"""Where Linux shows HID devices to everybody; absent on other systems."""
+"""Folder in which Linux shows HID devices to all users; absent on other systems."""
 
 CONTROLLERS = frozenset({(0x01, 0x04), (0x01, 0x05), (0x0F, 0x01)})
-"""Usage page and usage of joysticks, game pads and physical interface devices: what a family that
-has no list of products looks at more closely. Others (keyboards!) are not opened to be asked."""
+"""Usage page and usage of joysticks, game pads and physical interface devices. A family without a
+list of products inspects only these; others, such as keyboards, are not opened."""
 
 _INTERVAL, _UNITS = re.compile(r"(\d+)(ms|us)"), {"ms": 1e-3, "us": 1e-6}
 
 
 class HidHandle(Protocol):
-    """An open device, as cython-hidapi offers it: the seam at which tests put a model."""
+    """An open device, as in cython-hidapi; tests replace it by a model."""
 
     def open_path(self, path: bytes) -> None:
-        """Opens the device; OSError where it cannot."""
+        """Opens the device; raises OSError on failure."""
 
     def set_nonblocking(self, enable: int) -> int:
-        """Makes ``read`` without a time return at once."""
+        """Makes ``read`` without a timeout return at once."""
 
     def read(self, max_length: int, timeout_ms: int = 0) -> Sequence[int]:
-        """Returns one report, or nothing; waits at most ``timeout_ms``."""
+        """Returns one report, or an empty one after ``timeout_ms``."""
 
     def write(self, data: bytes) -> int:
-        """Sends one report; its first byte is its number, 0 where reports have none."""
+        """Sends one report; its first byte is its number, 0 if reports have none."""
 
     def send_feature_report(self, data: bytes) -> int:
-        """Sets a feature report; likewise."""
+        """Sends a feature report; its first byte is its number, 0 if reports have none."""
 
     def get_feature_report(self, report_num: int, max_length: int) -> Sequence[int]:
-        """Asks for a feature report."""
+        """Requests a feature report."""
 
     def get_input_report(self, report_num: int, max_length: int) -> Sequence[int]:
-        """Asks for an input report."""
+        """Requests an input report."""
 
     def get_report_descriptor(self) -> Sequence[int]:
         """Returns the device's report descriptor."""
@@ -67,21 +67,20 @@ class HidHandle(Protocol):
 
 
 class HidApi(Protocol):
-    """hidapi's module: what is plugged in, and a handle to open."""
+    """hidapi's module: list of connected devices, and handles to open them."""
 
     def enumerate(self, vendor_id: int = 0, product_id: int = 0) -> list[dict[str, Any]]:
-        """Lists the HID collections that are plugged in."""
+        """Lists the connected HID collections."""
 
     def device(self) -> HidHandle:
         """Returns a handle that is not open yet."""
 
 
 def hid_api() -> HidApi | None:
-    """Returns hidapi's module, or None where it is not installed or cannot be loaded.
+    """Returns hidapi's module, or None if it is not installed or cannot be loaded.
 
-    On Linux it is ``hidraw``. The wheel's ``hid`` goes through a bundled libusb of 2016, which
-    scans the bus once at import, takes the device from the kernel's driver, and is three times
-    slower.
+    On Linux it is ``hidraw``. The wheel's ``hid`` uses a bundled libusb of 2016. That scans the bus
+    once at import, detaches the kernel's driver, and is three times slower.
     """
     for name in ("hidraw", "hid") if sys.platform == "linux" else ("hid",):
         try:
@@ -92,12 +91,12 @@ def hid_api() -> HidApi | None:
 
 
 def find(family: Driver, api: HidApi | None = None) -> list[FoundDevice]:
-    """Lists the family's devices that are plugged in, with what keeps each from being opened.
+    """Lists the family's connected devices, with the reason if one cannot be opened.
 
     Args:
-        family: What to look for.
-        api: hidapi or what stands for it; None takes the real one. Only then the USB bus is asked
-            too, for devices without a hidraw node, and for all of them where hidapi is missing.
+        family: The family to look for.
+        api: hidapi or a substitute; None selects the real one. Only then the USB bus is searched
+            too, for devices without a hidraw node, and for all of them without hidapi.
 
     Returns:
         One entry per device.
@@ -109,7 +108,7 @@ def find(family: Driver, api: HidApi | None = None) -> list[FoundDevice]:
         usage = entry.get("usage_page"), entry.get("usage")
         raw = entry["path"]
         path = raw.decode(errors="replace") if isinstance(raw, bytes) else str(raw)
-        # hidapi names one node once per top-level collection
+        # hidapi lists a node once per top-level collection
         if path in found or family.usage not in (None, usage):
             continue
         if family.recognises is None:
@@ -139,9 +138,9 @@ def find(family: Driver, api: HidApi | None = None) -> list[FoundDevice]:
 
 
 def report_descriptor(path: str, api: HidApi | None) -> bytes:
-    """Returns a device's report descriptor, empty where nobody tells.
+    """Returns a device's report descriptor, empty if it is not available.
 
-    Linux shows it to everybody in sysfs, so nothing is opened there.
+    Linux shows it to all users in sysfs, so nothing is opened there.
     """
     try:
         return (CLASS / Path(path).name / "device/report_descriptor").read_bytes()
@@ -161,7 +160,7 @@ def report_descriptor(path: str, api: HidApi | None) -> bytes:
 
 
 def descriptor_of(handle: HidHandle) -> bytes:
-    """Returns the report descriptor of an open device, empty where hidapi does not tell."""
+    """Returns the report descriptor of an open device, empty if hidapi does not provide it."""
     try:
         return bytes(handle.get_report_descriptor())
     except (OSError, ValueError, AttributeError):  # hidapi before 0.14 has no such call
@@ -169,13 +168,13 @@ def descriptor_of(handle: HidHandle) -> bytes:
 
 
 def polling(path: str) -> tuple[float | None, float | None]:
-    """Returns how often the host asks a device for a report and offers it one, in s each.
+    """Returns the polling intervals for reports from and to a device, in s each.
 
     Args:
         path: A hidraw node.
 
     Returns:
-        None where the kernel does not say, and for a device without that endpoint.
+        None if the kernel does not list it, and for a device without that endpoint.
     """
     found: dict[str, float] = {}
     try:
@@ -185,20 +184,20 @@ def polling(path: str) -> tuple[float | None, float | None]:
             if (told := _INTERVAL.fullmatch(interval)) is not None:
                 found[direction] = int(told[1]) * _UNITS[told[2]]
     except (OSError, ValueError):
-        pass  # it was just unplugged
+        pass  # the device was just unplugged
     return found.get("in"), found.get("out")
 
 
-# What a HID device is asked outside the loop: feature reports, and its own description.
+# Requests to a HID device outside the loop.
 
 
 def is_taken(send: Callable[[bytes], int], report: bytes, log: HexLog) -> bool:
-    """Hands a report to one of hidapi's calls; returns whether the device took it.
+    """Sends a report by one of hidapi's calls; returns whether the device accepted it.
 
     Args:
         send: The call: ``write``, or ``send_feature_report``.
-        report: Its number first, 0 where the device's reports have none.
-        log: Keeps it.
+        report: Report starting with its number, 0 if the device's reports have none.
+        log: Log of the transferred bytes.
     """
     if log.is_on:
         log.add(">", report)
@@ -209,32 +208,32 @@ def is_taken(send: Callable[[bytes], int], report: bytes, log: HexLog) -> bool:
 
 
 class HidRequests:
-    """Requests that wait for their answer, some ms on USB; nothing for a loop.
+    """Requests that wait some ms for an answer on USB, so not for use in a loop.
 
-    A device that does not answer is no error here: the answer is empty.
+    A device that does not answer raises no error; the answer is empty.
 
     Args:
-        handle: The device, open.
-        log: Keeps what goes over the wire.
+        handle: The open device.
+        log: Log of the transferred bytes.
     """
 
     def __init__(self, handle: HidHandle, log: HexLog) -> None:
         self._handle, self._log = handle, log
 
     def set_feature(self, report: bytes) -> bool:
-        """Sends a feature report, its number first; returns whether the device took it."""
+        """Sends a feature report, its number first; returns whether the device accepted it."""
         return is_taken(self._handle.send_feature_report, report, self._log)
 
     def feature(self, number: int, length: int) -> bytes:
-        """Asks for a feature report; returns it, its number first, or nothing."""
+        """Requests a feature report; returns it with its number first, or an empty answer."""
         return self._answer(self._handle.get_feature_report, number, length)
 
     def input_report(self, number: int, length: int) -> bytes:
-        """Asks for an input report instead of waiting for it; returns it likewise, or nothing."""
+        """Requests an input report instead of waiting for one; returns it as ``feature`` does."""
         return self._answer(self._handle.get_input_report, number, length)
 
     def report_descriptor(self) -> bytes:
-        """Returns what the device says of its reports, or nothing."""
+        """Returns the device's report descriptor, or an empty answer."""
         return descriptor_of(self._handle)
 
     def _answer(self, ask: Callable[[int, int], Sequence[int]], number: int, length: int) -> bytes:
@@ -248,53 +247,54 @@ class HidRequests:
 
 
 LONGEST_REPORT = 256
-"""In bytes. Full-speed reports have at most 64; a longer one would be cut, and its check fail."""
+"""Largest report in bytes. Full-speed reports have at most 64; a longer one would be truncated and
+fail its check."""
 
 QUEUE = 63
-"""Reports that Linux keeps per open device (HIDRAW_BUFFER_SIZE, a ring with one free place). Of
-those that come when it is full it drops the new ones, so a full queue is an old one. It is also the
-most that is taken at once: a device that sends faster than it is read must not hold the loop."""
+"""Number of reports that Linux keeps per open device (HIDRAW_BUFFER_SIZE, a ring with one free
+place). When it is full, Linux drops new reports, so a full queue holds old ones. It is also the
+most that is taken at once, so that a fast device cannot block the loop."""
 
 FRESH_MS = 2
-"""In ms: how long a report is waited for after a full queue. At 1 kHz one comes within 1 ms."""
+"""Longest wait in ms for a new report after a full queue. At 1 kHz one comes within 1 ms."""
 
 LONGEST_WRITE = 0.05
-"""In s. A full-speed device is asked every millisecond, so a report that is not taken in 50 of them
-never will be; Linux gives up only after 5 s."""
+"""Longest time in s for a device to accept a report. A full-speed device is polled every
+millisecond, so after 50 polls it never will; Linux gives up only after 5 s."""
 
 
 class Link(Protocol):
-    """What a device needs of a transport: ``HidLink``, or what stands for it."""
+    """Report transport of a device; ``HidLink`` is the real one."""
 
     def take(self) -> list[bytes]:
-        """Returns the reports that have come, without waiting."""
+        """Returns the received reports without waiting."""
 
     def wait(self, timeout_ms: int) -> bytes:
-        """Returns the next report, or nothing after that time."""
+        """Returns the next report, or an empty one after the timeout."""
 
     def write(self, report: bytes) -> None:
-        """Sends a report, its number first."""
+        """Sends a report, starting with its number."""
 
     def close(self) -> None:
-        """Lets the device go."""
+        """Releases the device."""
 
 
 class HidLink:
     """An open HID device: newest reports without waiting, and reports to it.
 
-    Nothing here waits longer than it says. hidapi's ``write`` returns when the device has taken the
-    report, up to a millisecond later on full speed, and 5 s later where the device has hung; so a
-    link that is overlapped hands each report to a thread, which sends the newest one it has.
+    All waits are bounded. hidapi's ``write`` returns when the device has accepted the report: up to
+    a millisecond later on full speed, and 5 s later from a hung device. An overlapped link
+    therefore passes each report to a thread, which sends the newest.
 
     Args:
-        handle: The device, open.
-        name: What errors call it.
-        is_overlapped: Whether reports are sent by a thread. Without it ``write`` is hidapi's own.
-        log: Keeps what goes over the wire.
-        slots: How many kinds of report there are of which each newest one is to be sent, >= 1.
+        handle: The open device.
+        name: Name of the device in messages.
+        is_overlapped: True to send reports from a thread; otherwise ``write`` is hidapi's own.
+        log: Log of the transferred bytes.
+        slots: Number of kinds of report, >= 1; of each kind only the newest is sent.
 
     Attributes:
-        requests: Asks the device and sets its features, waiting for the answer.
+        requests: Requests that wait for the device's answer.
     """
 
     def __init__(
@@ -312,7 +312,7 @@ class HidLink:
         self.requests = HidRequests(handle, self._log)
         self._is_open = True
         self._lost = ""
-        # in each the newest wins, and they take turns
+        # one slot per kind of report, each with the newest only; slots take turns
         self._outgoing: list[deque[bytes]] = [deque(maxlen=1) for _ in range(slots)]
         self._wake, self._is_idle = threading.Event(), threading.Event()
         self._is_idle.set()
@@ -336,7 +336,7 @@ class HidLink:
         """Opens a device that was found.
 
         Raises:
-            DeviceError: It cannot be opened; says why and what to do.
+            DeviceError: The device cannot be opened; the message names reason and remedy.
         """
         module = hid_api() if api is None else api
         if plugged.problem is not None or module is None:
@@ -346,15 +346,16 @@ class HidLink:
             handle.open_path(plugged.path.encode())
         except (OSError, ValueError):
             raise DeviceError(
-                f"{plugged} at {plugged.path} cannot be opened; it may be in use or just unplugged"
+                f"{plugged} at {plugged.path} cannot be opened; it may be in use by another "
+                "program or just unplugged"
             ) from None
         return cls(handle, str(plugged), is_overlapped=is_overlapped, log=log, slots=slots)
 
     def take(self) -> list[bytes]:
-        """Returns the reports that have come since the last call, oldest first, without waiting.
+        """Returns the reports since the last call, oldest first, without waiting.
 
-        Only after a pause so long that the kernel's queue is full, and all in it old, a new one is
-        waited for, up to ``FRESH_MS``.
+        After a long pause the kernel's queue is full of old reports. Only then does the call wait
+        for a new one, up to ``FRESH_MS``.
 
         Raises:
             DeviceLost: The device is gone.
@@ -367,10 +368,10 @@ class HidLink:
         return reports
 
     def wait(self, timeout_ms: int) -> bytes:
-        """Returns the next report; empty if none comes in time.
+        """Returns the next report; empty after the timeout.
 
         Args:
-            timeout_ms: Longest time to wait in ms, >= 1.
+            timeout_ms: Longest wait in ms, >= 1.
 
         Raises:
             DeviceLost: The device is gone.
@@ -378,40 +379,45 @@ class HidLink:
         return self._read(timeout_ms)
 
     def write(self, report: bytes, slot: int = 0) -> None:
-        """Sends a report; overlapped, it replaces one of its slot that has not been sent yet.
+        """Sends a report; if overlapped, it replaces an unsent one in its slot.
 
         Args:
-            report: Its number first, 0 where the device's reports have none.
-            slot: Which kind of report it is.
+            report: Report starting with its number, 0 if the device's reports have none.
+            slot: Kind of report.
 
         Raises:
-            DeviceLost: The device is gone, or took no report for ``LONGEST_WRITE``.
+            DeviceLost: The device is gone, or accepted no report for ``LONGEST_WRITE``.
         """
         if self._lost or not self._is_open:
             raise DeviceLost(self._lost or f"{self._name} is closed")
         if self._writer is None:
             if not self._is_sent(report):
-                raise DeviceLost(f"{self._name} did not take a report")
+                raise DeviceLost(
+                    f"{self._name} did not accept a report; unplug it and plug it in again"
+                )
             return
         if not self._is_idle.is_set() and time.monotonic() - self._busy_since > LONGEST_WRITE:
-            self._lost = f"{self._name} takes no reports any more"
+            self._lost = f"{self._name} accepts no reports any more; unplug it and plug it in again"
             raise DeviceLost(self._lost)
         self._outgoing[slot].append(report)
         self._wake.set()
 
     def send(self, report: bytes) -> None:
-        """Sends a report before it returns, and drops what still waits to be sent: for set-up.
+        """Sends a report before it returns, and discards unsent ones, for the set-up.
 
         Raises:
-            DeviceLost: The device is gone, or takes no reports.
+            DeviceLost: The device is gone, or accepts no reports.
         """
         for waiting in self._outgoing:
             waiting.clear()
         if self._lost or not self._is_idle.wait(LONGEST_WRITE) or not self._is_sent(report):
-            raise DeviceLost(self._lost or f"{self._name} did not take a report")
+            raise DeviceLost(
+                self._lost
+                or f"{self._name} did not accept a report; unplug it and plug it in again"
+            )
 
     def close(self) -> None:
-        """Sends what is still to be sent, for at most ``LONGEST_WRITE``, and lets the device go."""
+        """Sends the remaining reports, for at most ``LONGEST_WRITE``, and releases the device."""
         if not self._is_open:
             return
         self._is_open = False
@@ -419,7 +425,7 @@ class HidLink:
             self._wake.set()
             self._writer.join(LONGEST_WRITE)
         if self._writer is None or not self._writer.is_alive():
-            self._handle.close()  # else it is inside hidapi's write, which uses what this frees
+            self._handle.close()  # not while the writer is inside hidapi, which uses this memory
         self._log.close()
 
     def _read(self, timeout_ms: int) -> bytes:
@@ -438,25 +444,25 @@ class HidLink:
         return is_taken(self._handle.write, report, self._log)
 
     def _send_newest(self) -> None:
-        """Runs in the writer's thread until the link is closed or the device lost."""
+        """Sends reports in the writer's thread until the link is closed or the device lost."""
         while True:
             self._wake.wait()
             self._wake.clear()
             while any(self._outgoing):
                 for waiting in self._outgoing:
                     if not self._is_newest_sent(waiting):
-                        self._lost = f"{self._name} is gone: it took no report"
+                        self._lost = f"{self._name} is gone: it did not accept a report"
                         return
             if not self._is_open:
                 return
 
     def _is_newest_sent(self, waiting: deque[bytes]) -> bool:
-        """Sends what waits in a slot, if anything; returns whether that went well."""
+        """Sends the waiting report of a slot, if any; returns whether that succeeded."""
         self._busy_since = time.monotonic()
         self._is_idle.clear()
         try:
             return self._is_sent(waiting.popleft())
         except IndexError:
-            return True  # nothing waits here, or it was just dropped
+            return True  # no report waits, or it was just replaced
         finally:
             self._is_idle.set()

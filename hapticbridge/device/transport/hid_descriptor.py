@@ -1,8 +1,8 @@
-"""A HID device's own description of its reports: which bits of which report mean what.
+"""HID report descriptor: meaning of the bits in each report.
 
 A report descriptor is a program for a small machine: items set the state (size, count, range,
-usage) of the fields that the next main item makes. What is read here is what finding fields by
-usage needs; designators, strings and delimiters are skipped.
+usage) of the fields that the next main item creates. Only what is required to find fields by usage
+is read; designators, strings and delimiters are skipped.
 
 References:
     USB-IF, Device Class Definition for Human Interface Devices 1.11, sections 5 and 6.2.2.
@@ -17,16 +17,17 @@ from dataclasses import field as dataclass_field
 from hapticbridge.errors import DeviceError
 
 INPUT, OUTPUT, FEATURE = 8, 9, 11
-"""Kinds of report, as the main items that describe them are numbered."""
+"""Kinds of report, numbered as the main items that describe them."""
 
 LONGEST_DESCRIPTOR = 4096
-"""In bytes: what Linux reads of one (HID_MAX_DESCRIPTOR_SIZE)."""
+"""Largest descriptor in bytes, as in Linux (HID_MAX_DESCRIPTOR_SIZE)."""
 
 LONGEST_REPORT_BITS = 8 * 16384
-"""What Linux takes for a report (HID_MAX_BUFFER_SIZE)."""
+"""Largest report in bits, as in Linux (HID_MAX_BUFFER_SIZE)."""
 
 MOST_USAGES = 1024
-"""Usages kept per field. A keyboard has 256; a range of 65536 means 'any', and names nothing."""
+"""Largest number of usages kept per field. A keyboard has 256; a range of 65536 means 'any' and is
+of no use."""
 
 _MAIN, _GLOBAL, _LOCAL, _LONG = 0, 1, 2, 0xFE
 _COLLECTION, _END_COLLECTION = 10, 12
@@ -36,28 +37,28 @@ _VARIABLE, _CONSTANT = 2, 1
 _USAGE, _USAGE_LEAST, _USAGE_MOST = range(3)
 
 Number = tuple[int, int]
-"""An item's data: its value without sign, and how many bytes it took."""
+"""Data of an item: unsigned value, and number of bytes."""
 
 
 @dataclass(frozen=True, slots=True)
 class Field:
-    """What one main item describes: ``count`` elements of ``size`` bits, one after another.
+    """Field of a report: ``count`` consecutive elements of ``size`` bits.
 
     Attributes:
         kind: ``INPUT``, ``OUTPUT`` or ``FEATURE``.
-        report: Number of the report, 0 where the device does not number them.
-        offset: First bit within the report, its number not counted.
+        report: Number of the report, 0 if the device does not number them.
+        offset: First bit within the report, without its number.
         size: Bits per element.
-        count: How many elements.
-        is_variable: Whether each element has a usage and a value of its own. If not it is an array:
-            an element's value says which usage is meant, ``minimum`` the first, in their order.
-        usages: 32 bits each, the page above; the last one goes for all further elements. None
-            where it is padding.
-        collections: Usages of the collections around it, outermost first.
-        minimum: Least logical value.
-        maximum: Most.
-        physical: Least and most physical value; the logical ones where the device gives none.
-        unit: Of the physical values, coded as the standard has it; 0: none.
+        count: Number of elements.
+        is_variable: True if each element has a usage and a value of its own. Otherwise the field is
+            an array: an element's value selects a usage in their order, ``minimum`` the first.
+        usages: 32 bits each, with the page in the upper half; the last one applies to all further
+            elements. Empty for padding.
+        collections: Usages of the enclosing collections, outermost first.
+        minimum: Smallest logical value.
+        maximum: Largest logical value.
+        physical: Smallest and largest physical value; the logical ones if the device states none.
+        unit: Unit of the physical values in the standard's code; 0: none.
         exponent: Power of ten of that unit.
     """
 
@@ -78,7 +79,7 @@ class Field:
 
 @dataclass(slots=True)
 class _State:
-    """What items have set so far."""
+    """State set by the items so far."""
 
     globals: dict[int, Number] = dataclass_field(default_factory=dict)
     pushed: list[dict[int, Number]] = dataclass_field(default_factory=list)
@@ -92,28 +93,28 @@ class _State:
         return _signed(number) if is_signed else number[0]
 
     def full_usages(self) -> list[int]:
-        """Returns the usages since the last main item; short ones are of the page that holds."""
+        """Returns the usages since the last main item; short ones belong to the current page."""
         page = self.value(_PAGE) << 16
         return [value if size == 4 else page | value for value, size in self.usages]
 
     def limits(self, least: int, most: int) -> tuple[int, int]:
-        """Returns a range; the upper end has a sign only where the lower one is negative."""
+        """Returns a range; the upper end is signed only if the lower end is negative."""
         low = self.value(least, is_signed=True)
         return low, self.value(most, is_signed=low < 0)
 
 
 def fields_of(descriptor: bytes) -> tuple[Field, ...]:
-    """Returns the fields that a report descriptor describes; padding is one without usages.
+    """Returns the fields of a report descriptor; padding has no usages.
 
     Args:
-        descriptor: As the device sent it.
+        descriptor: Bytes of the descriptor.
 
     Raises:
-        DeviceError: It is no report descriptor, and why.
+        DeviceError: The descriptor is not valid; the message names the reason.
     """
     if not 0 < len(descriptor) <= LONGEST_DESCRIPTOR:
         raise DeviceError(
-            f"a report descriptor of {len(descriptor)} bytes: it must have 1 to "
+            f"a report descriptor has {len(descriptor)} bytes; it must have 1 to "
             f"{LONGEST_DESCRIPTOR}"
         )
     state, fields = _State(), []
@@ -129,14 +130,14 @@ def fields_of(descriptor: bytes) -> tuple[Field, ...]:
                 state.collections.append(next(iter(state.full_usages()), 0))
             elif tag == _END_COLLECTION:
                 if not state.collections:
-                    raise DeviceError("a report descriptor that ends a collection it never began")
+                    raise DeviceError("a report descriptor ends a collection that never began")
                 state.collections.pop()
             state.usages, state.least = [], None
     return tuple(fields)
 
 
 def _items(descriptor: bytes) -> Iterator[tuple[int, int, Number]]:
-    """Yields kind, tag and data of each short item; long ones mean nothing to anybody."""
+    """Yields kind, tag and data of each short item; long items are skipped."""
     place = 0
     while place < len(descriptor):
         prefix = descriptor[place]
@@ -146,7 +147,7 @@ def _items(descriptor: bytes) -> Iterator[tuple[int, int, Number]]:
             length = (0, 1, 2, 4)[prefix & 3]
         data = descriptor[place + 1 : place + 1 + length]
         if len(data) < length:
-            raise DeviceError(f"a report descriptor that ends within the item at byte {place}")
+            raise DeviceError(f"a report descriptor ends within the item at byte {place}")
         place += 1 + length
         if prefix != _LONG:
             yield prefix >> 2 & 3, prefix >> 4, (int.from_bytes(data, "little"), length)
@@ -162,7 +163,7 @@ def _set_global(state: _State, tag: int, number: Number) -> None:
         state.pushed.append(dict(state.globals))
     elif tag == _POP:
         if not state.pushed:
-            raise DeviceError("a report descriptor that restores a state it never kept")
+            raise DeviceError("a report descriptor restores a state that it never stored")
         state.globals = state.pushed.pop()
     else:
         state.globals[tag] = number
@@ -183,13 +184,16 @@ def _set_local(state: _State, tag: int, number: Number) -> None:
 
 
 def _fields(state: _State, kind: int, flags: int) -> list[Field]:
-    """Returns the field that a main item makes, none where it is empty, and moves on."""
+    """Returns the field created by a main item, empty for an empty one, and advances the state."""
     size, count, report = state.value(_SIZE), state.value(_COUNT), state.value(_REPORT)
     if report > 255:
-        raise DeviceError(f"a report descriptor with a report number of {report}")
+        raise DeviceError(f"a report descriptor has the report number {report}; at most 255")
     offset = state.lengths.get((kind, report), 0)
     if offset + size * count > LONGEST_REPORT_BITS:
-        raise DeviceError(f"a report descriptor with a report of {offset + size * count} bits")
+        raise DeviceError(
+            f"a report descriptor has a report of {offset + size * count} bits; at most "
+            f"{LONGEST_REPORT_BITS}"
+        )
     state.lengths[kind, report] = offset + size * count
     usages = () if flags & _CONSTANT else tuple(state.full_usages())
     if not size or not count:
@@ -198,7 +202,7 @@ def _fields(state: _State, kind: int, flags: int) -> list[Field]:
     physical = state.limits(_PHYSICAL_LEAST, _PHYSICAL_MOST)
     exponent = _signed((state.value(_EXPONENT), 1)) if state.value(_EXPONENT) < 256 else 0
     if 8 <= exponent <= 15:
-        exponent -= 16  # four bits with a sign, unless the device sent eight
+        exponent -= 16  # four signed bits, unless the device sent eight
     return [
         Field(
             kind=kind,
@@ -218,19 +222,19 @@ def _fields(state: _State, kind: int, flags: int) -> list[Field]:
     ]
 
 
-# A HID device's reports by usage: where a value is, how it is read, and how it is written.
+# Layout of a HID device's reports by usage.
 
 WIDEST = 32
-"""Bits of the widest value that is read or written; the standard's own limit."""
+"""Bits of the widest value that is read or written: the standard's own limit."""
 
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """One element of a field: where a single value lies.
+    """Place of a single value: one element of a field.
 
     Attributes:
-        field: What it belongs to.
-        offset: Its first bit, the byte of the report's number counted.
+        field: The field of the element.
+        offset: First bit, counting the byte of the report's number.
     """
 
     field: Field
@@ -238,41 +242,41 @@ class Place:
 
     @property
     def mask(self) -> int:
-        """As many ones as it has bits."""
+        """Mask with as many ones as the value has bits."""
         return (1 << self.field.size) - 1
 
     def read(self, report: int) -> int:
         """Returns the logical value in a report.
 
         Args:
-            report: Its bytes as one number, the lowest first, the report's number among them.
+            report: All bytes of the report with its number, as one little-endian number.
         """
         value = report >> self.offset & self.mask
         is_negative = self.field.minimum < 0 and value >> (self.field.size - 1)
         return value - (1 << self.field.size) if is_negative else value
 
     def bits(self, value: int) -> int:
-        """Returns a logical value, kept within its range, as a report with only that in it."""
+        """Returns a logical value, clamped to its range, as the bits of a report."""
         field = self.field
         return (min(max(value, field.minimum), field.maximum) & self.mask) << self.offset
 
     def share(self, share: float) -> int:
-        """Returns the logical value at a share of the range, 0: least, 1: most."""
+        """Returns the logical value at a share of the range, 0: smallest, 1: largest."""
         return self.field.minimum + round(share * (self.field.maximum - self.field.minimum))
 
 
 class Layout:
-    """All reports of a device, as its descriptor has them.
+    """All reports of a device, from its descriptor.
 
     Args:
         descriptor: The report descriptor.
 
     Attributes:
-        fields: All of them, padding too.
-        is_numbered: Whether reports begin with their number.
+        fields: All fields, including padding.
+        is_numbered: True if reports begin with their number.
 
     Raises:
-        DeviceError: The descriptor is none.
+        DeviceError: The descriptor is not valid.
     """
 
     def __init__(self, descriptor: bytes) -> None:
@@ -280,7 +284,7 @@ class Layout:
         self.is_numbered = any(field.report for field in self.fields)
 
     def within(self, kind: int, collection: int) -> list[Field]:
-        """Returns the fields of a kind inside a collection of that usage, of its first report."""
+        """Returns the fields of a kind inside a collection with that usage, of its first report."""
         inside = [
             field
             for field in self.fields
@@ -289,7 +293,7 @@ class Layout:
         return [field for field in inside if field.report == inside[0].report]
 
     def length(self, kind: int, report: int) -> int:
-        """Returns how many bytes a report has, its number counted."""
+        """Returns the length of a report in bytes, including its number."""
         ends = [
             field.offset + field.size * field.count
             for field in self.fields
@@ -299,7 +303,7 @@ class Layout:
 
 
 def place_of(fields: list[Field], usage: int) -> Place | None:
-    """Returns where the value of a usage lies: the first variable element that has it."""
+    """Returns the place of a usage: the first variable element with it, or None."""
     for field in fields:
         if field.is_variable and usage in field.usages[: field.count]:
             return element(field, field.usages.index(usage))
@@ -307,15 +311,15 @@ def place_of(fields: list[Field], usage: int) -> Place | None:
 
 
 def element(field: Field, index: int) -> Place:
-    """Returns a field's element by its index, from 0."""
+    """Returns the place of a field's element by its index, from 0."""
     return Place(field, 8 + field.offset + index * field.size)
 
 
 def chosen_bits(fields: list[Field], usage: int) -> int | None:
-    """Returns the bits that choose a usage among others; None where it is none of them.
+    """Returns the bits that select a usage among others; None if it is not available.
 
-    In an array the element's value says which, counted from its least value in the order of the
-    descriptor; elsewhere each choice is a flag of its own.
+    In an array the element's value selects it, counted from the smallest value in the order of the
+    descriptor. Otherwise each usage has a flag of its own.
     """
     for field in fields:
         if usage not in field.usages:
@@ -329,7 +333,7 @@ def chosen_bits(fields: list[Field], usage: int) -> int | None:
 
 
 def chosen_usage(fields: list[Field], report: int) -> int | None:
-    """Returns which usage a report chooses, the other way round; None where it chooses none."""
+    """Returns the usage that a report selects, the inverse of ``chosen_bits``; None without one."""
     for field in fields:
         if field.usages and not field.is_variable:
             index = element(field, 0).read(report) - field.minimum
@@ -341,12 +345,12 @@ def chosen_usage(fields: list[Field], report: int) -> int | None:
 
 
 def composed(number: int, length: int, bits: int) -> bytes:
-    """Returns a report of a number and a length with these bits in it."""
+    """Returns a report with a number, a length and these bits."""
     return (number | bits).to_bytes(length, "little")
 
 
 def as_number(layout: Layout, report: bytes) -> int:
-    """Returns a report that came as one number, with a zero in the place of a missing number."""
+    """Returns a received report as one number, with 0 for a missing report number."""
     return int.from_bytes(report if layout.is_numbered else b"\0" + report, "little")
 
 
@@ -359,10 +363,10 @@ def filled(places: Mapping[Place, int]) -> int:
 
 
 def required(found: Place | None, name: str) -> Place:
-    """Returns what was found.
+    """Returns the place.
 
     Raises:
-        DeviceError: Nothing was; names it.
+        DeviceError: The place is None; the message names it.
     """
     if found is None:
         raise DeviceError(f"its reports lack {name}")

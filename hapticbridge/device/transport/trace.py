@@ -1,4 +1,4 @@
-"""What went over the wire, in hexadecimal, for whoever looks for a fault."""
+"""Hexadecimal log of transferred bytes."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ from typing import TextIO
 from hapticbridge.errors import DeviceError
 
 VARIABLE = "HAPTICBRIDGE_LOG_USB"
-"""Environment variable that names the log's file where the device's option ``log`` does not."""
+"""Environment variable with the log's file, used without the device's option ``log``."""
 
 MOST_LINES = 200_000
-"""Transfers that are kept. At 1 kHz both ways that is the last 100 s, in some 40 MB."""
+"""Largest number of transfers kept: the last 100 s at 1 kHz in both directions, in some 40 MB."""
 
 
 class HexLog:
-    """Transfers with their time, kept in memory and written when it is closed.
+    """Transfers with their time, kept in memory and written on closing.
 
-    The loop must not wait for a disk, so nothing is written while it runs. A line is
-    ``SECONDS < HEX`` (from the device) or ``SECONDS > HEX`` (to it), seconds of a monotonic clock
-    from the log's beginning.
+    Nothing is written during a run, because the loop must not wait for a disk. A line is ``SECONDS
+    < HEX`` (from the device) or ``SECONDS > HEX`` (to it), in seconds of a monotonic clock from the
+    log's beginning.
 
     Args:
-        path: File to write; None takes ``HAPTICBRIDGE_LOG_USB``, and keeps nothing without it.
+        path: File to write; None selects ``HAPTICBRIDGE_LOG_USB``, without which nothing is kept.
 
     Raises:
-        DeviceError: The file cannot be written; said before the device is opened, not after a run.
+        DeviceError: The file cannot be written; raised before the device is opened.
     """
 
     def __init__(self, path: str | Path | None = None) -> None:
@@ -45,7 +45,7 @@ class HexLog:
 
     @classmethod
     def asked(cls, options: Mapping[str, object]) -> HexLog:
-        """Returns the log that a device's option ``log`` names, or else the variable.
+        """Returns the log named by a device's option ``log``, or else by the variable.
 
         Raises:
             DeviceError: The file cannot be written.
@@ -55,7 +55,7 @@ class HexLog:
 
     @property
     def is_on(self) -> bool:
-        """Whether it keeps anything."""
+        """True if transfers are kept."""
         return self._path is not None
 
     def add(self, direction: str, data: bytes) -> None:
@@ -63,17 +63,17 @@ class HexLog:
 
         Args:
             direction: ``<`` from the device, ``>`` to it.
-            data: What went over.
+            data: Transferred bytes.
         """
         if self._path is not None:
             self._lines.append((time.monotonic_ns(), direction, data))
             self._count += 1
 
     def close(self) -> None:
-        """Writes the file, appending; a second call writes nothing more.
+        """Appends the transfers to the file; a second call writes nothing.
 
         Raises:
-            DeviceError: It cannot be written.
+            DeviceError: The file cannot be written.
         """
         if self._path is None:
             return

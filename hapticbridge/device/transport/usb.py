@@ -1,4 +1,4 @@
-"""Bytes to and from a USB device through libusb: always one read under way, no wait unbounded."""
+"""Packets to and from a USB device through libusb, with bounded waits."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ from hapticbridge.device.family import Driver, FoundDevice, access_problem, perm
 from hapticbridge.device.transport.trace import HexLog
 from hapticbridge.errors import DeviceError, DeviceLost
 
-# What the kernel says is on the USB bus, read from sysfs: needs no libusb and no permission.
+# Devices on the USB bus, from sysfs.
 
 BUS = Path("/sys/bus/usb/devices")
-"""Where Linux lists what is plugged in; absent on a machine without USB and on other systems."""
+"""Folder in which Linux lists USB devices; absent without USB and on other systems."""
 
 NODES = Path("/dev/bus/usb")
-"""Where libusb opens a device: a folder per bus, a node per device."""
+"""Folder of the nodes that libusb opens: a folder per bus, a node per device."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,12 +38,12 @@ class OnTheBus:
     """One device on the USB bus.
 
     Attributes:
-        vendor: 16 bits.
-        product: 16 bits.
-        name: Its product string, empty where it has none.
-        serial: Its serial number, likewise.
-        node: What libusb opens.
-        has_hidraw: Whether any of its interfaces has a hidraw node.
+        vendor: Vendor id, 16 bits.
+        product: Product id, 16 bits.
+        name: Product string, empty if it has none.
+        serial: Serial number, empty if it has none.
+        node: Node that libusb opens.
+        has_hidraw: True if any of its interfaces has a hidraw node.
     """
 
     vendor: int
@@ -55,13 +55,15 @@ class OnTheBus:
 
 
 def on_the_bus(bus: Path | None = None) -> list[OnTheBus]:
-    """Lists the devices on the USB bus, in the order of their places on it.
+    """Lists the devices on the USB bus, in the order of their bus positions.
+
+    This requires neither libusb nor a permission.
 
     Args:
-        bus: The folder of sysfs that lists them; None takes ``BUS``.
+        bus: Folder of sysfs that lists them; None selects ``BUS``.
 
     Returns:
-        Empty where there is no bus. A device that goes away meanwhile is left out.
+        Empty without a bus. A device that is unplugged meanwhile is left out.
     """
     folder = BUS if bus is None else bus
     found = []
@@ -77,7 +79,7 @@ def on_the_bus(bus: Path | None = None) -> list[OnTheBus]:
             ]
             device = int(_text(entry / "devnum"))
         except (OSError, ValueError):
-            continue  # an interface and not a device, or one that has just gone
+            continue  # an interface, or a device that was just unplugged
         vendor, product, number = numbers
         found.append(
             OnTheBus(
@@ -95,12 +97,12 @@ def on_the_bus(bus: Path | None = None) -> list[OnTheBus]:
 def members(
     family: Driver, devices: Iterable[OnTheBus], problem: Callable[[OnTheBus], str | None]
 ) -> list[FoundDevice]:
-    """Returns those of a family, as they are listed.
+    """Returns the devices of a family, in the listed order.
 
     Args:
-        family: Which.
-        devices: What is on the bus.
-        problem: Says why a device cannot be opened; None where it can.
+        family: The family.
+        devices: Devices on the bus.
+        problem: Returns the reason why a device cannot be opened, or None.
     """
     return [
         FoundDevice(
@@ -129,15 +131,11 @@ def _text_or_nothing(path: Path) -> str:
         return ""
 
 
-# A libusb context that ends after what belongs to it, in whatever order Python lets go of them.
-#
-# pyusb lets each of its objects free what it holds. Where a context and its devices go together
-# as part of a cycle (an exception with its frames is one), Python finalizes them in any order,
-# and to unreference a device or to close it after ``libusb_exit`` is an access to freed memory.
+# libusb context with a safe order of release.
 
 
 class _Users:
-    """Counts what needs a context; the last one ends it."""
+    """Counter of the users of a context; the last one ends it."""
 
     def __init__(self) -> None:
         self.count = 1  # the context itself
@@ -160,7 +158,7 @@ class _Device(pyusb._Device):  # type: ignore[misc] # pyusb has no types
         self._users.release()
 
 
-class _Devices(pyusb._DevIterator):  # type: ignore[misc] # likewise
+class _Devices(pyusb._DevIterator):  # type: ignore[misc] # pyusb has no types
     def __init__(self, context: Any, users: _Users) -> None:
         self._users = users
         users.count += 1
@@ -175,14 +173,18 @@ class _Devices(pyusb._DevIterator):  # type: ignore[misc] # likewise
         self._users.release()
 
 
-class UsbContext(pyusb._LibUSB):  # type: ignore[misc] # likewise
-    """pyusb's backend, with a context of its own.
+class UsbContext(pyusb._LibUSB):  # type: ignore[misc] # pyusb has no types
+    """pyusb's backend with a libusb context that ends after all of its devices.
+
+    pyusb lets each of its objects free its own resources. If a context and its devices belong to a
+    cycle (for example an exception with its frames), Python finalizes them in any order. Closing a
+    device after ``libusb_exit`` would access freed memory.
 
     Args:
-        library: libusb, as pyusb has loaded it.
+        library: libusb, as loaded by pyusb.
 
     Raises:
-        usb.core.USBError: libusb cannot begin.
+        usb.core.USBError: libusb cannot be initialised.
     """
 
     def __init__(self, library: Any) -> None:
@@ -192,15 +194,15 @@ class UsbContext(pyusb._LibUSB):  # type: ignore[misc] # likewise
         self._users.end = lambda: library.libusb_exit(context)
 
     def _finalize_object(self) -> None:
-        if hasattr(self, "_users"):  # else there is no context
+        if hasattr(self, "_users"):  # absent if the context could not be created
             self._users.release()
 
     def enumerate_devices(self) -> _Devices:
-        """Lists what is plugged in."""
+        """Lists the connected devices."""
         return _Devices(self.ctx, self._users)
 
     def open_device(self, device: Any) -> Any:
-        """Opens a device; the context lives until it is closed."""
+        """Opens a device; the context lives at least until it is closed."""
         handle = super().open_device(device)
         self._users.count += 1
         return handle
@@ -211,20 +213,20 @@ class UsbContext(pyusb._LibUSB):  # type: ignore[misc] # likewise
         self._users.release()
 
 
-# Which USB devices are plugged in, as libusb and the kernel tell it.
+# Connected USB devices, from libusb and the kernel.
 
 
 def libusb() -> Any:
-    """Returns a fresh libusb context for pyusb, or None where there is no libusb or no USB.
+    """Returns a new libusb context for pyusb, or None without libusb or USB.
 
-    Fresh, because an old one does not hear of devices plugged in later where udev does not run.
-    The system's libusb is preferred to the one of ``libusb-package``.
+    The context is new, because an old one misses devices that are plugged in later if udev does not
+    run. The system's libusb is preferred to that of ``libusb-package``.
     """
     module = usb.backend.libusb1
     for find_library in (None, libusb_package.find_library):
         try:
             if module.get_backend(find_library=find_library) is not None:
-                # pyusb offers no way to a second context
+                # pyusb itself cannot create a second context
                 return UsbContext(module._lib)
         except (usb.core.USBError, OSError):
             continue
@@ -232,17 +234,17 @@ def libusb() -> Any:
 
 
 def find(family: Driver, backend: Any = None) -> list[FoundDevice]:
-    """Lists the family's devices that are plugged in, with what keeps each from being opened.
+    """Lists the family's connected devices, with the reason if one cannot be opened.
 
-    On Linux the kernel tells, without a device's being opened, which a running loop would feel;
-    elsewhere libusb is asked.
+    On Linux the kernel's list is used, because opening a device would disturb a running loop. On
+    other systems libusb is used.
 
     Args:
-        family: What to look for.
-        backend: A pyusb backend to ask; None takes kernel or libusb.
+        family: The family to look for.
+        backend: A pyusb backend; None selects kernel or libusb.
 
     Returns:
-        One entry per device, in the order of their places on the bus.
+        One entry per device, in the order of their bus positions.
     """
     listed = [] if backend is not None else members(family, on_the_bus(), _problem)
     source = libusb() if backend is None and not listed else backend
@@ -256,24 +258,24 @@ def _problem(device: OnTheBus) -> str | None:
 
 
 def devices_of(family: Driver, backend: Any) -> list[Any]:
-    """Returns pyusb's devices that are of a family, in the order of their places on the bus."""
+    """Returns pyusb's devices of a family, in the order of their bus positions."""
     try:
         devices: Iterable[Any] = usb.core.find(find_all=True, backend=backend)
         known = [d for d in devices if family.model(d.idVendor, d.idProduct) is not None]
-    except (usb.core.USBError, NotImplementedError):  # the second: libusb cannot list them here
+    except (usb.core.USBError, NotImplementedError):  # pyusb's errors if libusb cannot list them
         return []
     return sorted(known, key=node_of)
 
 
 def node_of(device: Any) -> str:
-    """Returns where Linux keeps the device of pyusb: what tells two of a model apart."""
+    """Returns the Linux node of pyusb's device, which distinguishes two of one model."""
     return str(NODES / f"{device.bus or 0:03d}" / f"{device.address or 0:03d}")
 
 
 def _described(family: Driver, device: Any) -> FoundDevice:
     node, problem, texts = node_of(device), None, ["", ""]
     try:
-        device.get_active_configuration()  # opens it; reading texts would hide why it cannot
+        device.get_active_configuration()  # opens the device; get_string would hide the error
         texts = [
             usb.util.get_string(device, index) or "" if index else ""
             for index in (device.iProduct, device.iSerialNumber)
@@ -281,7 +283,7 @@ def _described(family: Driver, device: Any) -> FoundDevice:
     except usb.core.USBError as error:
         problem = permission_problem(node) if error.errno == errno.EACCES else None
     except (ValueError, NotImplementedError):
-        pass  # it has no texts, or libusb cannot open it here (as pyusb says that)
+        pass  # the device has no texts, or libusb cannot open it here
     finally:
         usb.util.dispose_resources(device)
     return FoundDevice(
@@ -297,42 +299,42 @@ def _described(family: Driver, device: Any) -> FoundDevice:
 
 
 PACKET = 64
-"""Bytes per bulk packet on full speed. Reads ask for one packet each, so that they end with it."""
+"""Bytes per bulk packet on full speed. Each read requests one packet, so that it ends with it."""
 
 MOST_PACKETS = 1024
-"""Packets kept for ``take``, the newest. An FTDI bridge sends one a millisecond though nobody asks,
-and between two runs nobody takes them: without a bound they would be 0.4 GB after an hour."""
+"""Largest number of packets kept for ``take``. An FTDI bridge sends one per millisecond without a
+request, and between runs they are not taken. Without a bound they would fill 0.4 GB per hour."""
 
 READ_MS = 100
-"""Longest wait of the reader thread for one packet, in ms: how long ``close`` may have to wait."""
+"""Longest wait of the reader thread for one packet in ms, which bounds the wait of ``close``."""
 
 WRITE_MS = 1
-"""Longest wait in ms for a device to take a packet in the loop; the least that libusb knows. A full
-speed frame is as long, and a device that is well takes a packet within it."""
+"""Longest wait in ms for a device to accept a packet in the loop: the smallest of libusb, and the
+length of a full-speed frame, within which a working device accepts it."""
 
 CONTROL_MS = 1000
 """Longest wait in ms for a control request, before the loop begins."""
 
 TO_VENDOR = 0x40
-"""bmRequestType of a vendor's request to the device, without data."""
+"""bmRequestType of a vendor request to the device, without data."""
 
 SWITCH_INTERVAL = 50e-6
-"""In s: after how long the reader thread gets the interpreter from a thread that does not let go,
-as the loop while it spins to its deadline. Python's default of 5 ms would cost five samples."""
+"""Time in s after which the reader thread gets the interpreter from a busy thread, such as the loop
+while it spins to its deadline. Python's default of 5 ms would cost five samples."""
 
 
 class UsbLink:
-    """A claimed USB device with one bulk endpoint each way.
+    """A claimed USB device with one bulk endpoint in each direction.
 
-    A thread keeps one read under way and queues what comes, packet by packet and as it is; it
-    notices an unplugged device at once, and the next ``take``, ``wait`` or ``write`` says so.
+    A thread keeps one read pending and queues the packets unchanged. It detects an unplugged device
+    at once; the next ``take``, ``wait`` or ``write`` reports it.
 
     Args:
         device: pyusb's device, with its first interface claimed.
-        name: What errors call it.
-        read_from: Address of the endpoint towards the host.
-        write_to: Address of the other.
-        log: Keeps what goes over the wire.
+        name: Name of the device in messages.
+        read_from: Address of the endpoint to the host.
+        write_to: Address of the endpoint to the device.
+        log: Log of the transferred bytes.
     """
 
     def __init__(
@@ -364,7 +366,7 @@ class UsbLink:
         """Opens a device that was found, and claims its first interface.
 
         Raises:
-            DeviceError: It cannot be opened; says why and what to do.
+            DeviceError: The device cannot be opened; the message names reason and remedy.
         """
         source = libusb() if backend is None else backend
         if plugged.problem is not None or source is None:
@@ -373,34 +375,34 @@ class UsbLink:
             if node_of(device) == plugged.path:
                 break
         else:
-            raise DeviceError(f"{plugged} has just been unplugged")
+            raise DeviceError(f"{plugged} has just been unplugged; plug it in again")
         try:
             _claim(device)
-        # the second is how pyusb says LIBUSB_ERROR_NOT_SUPPORTED: no driver lets it be opened
+        # pyusb raises NotImplementedError for LIBUSB_ERROR_NOT_SUPPORTED: no suitable driver
         except (usb.core.USBError, NotImplementedError) as error:
             usb.util.dispose_resources(device)
             number = getattr(error, "errno", None)
             reason = {
                 errno.EACCES: permission_problem(plugged.path),
-                errno.EBUSY: "another program has it",
-                errno.ENODEV: "it has just been unplugged",
+                errno.EBUSY: "another program has it; close that program",
+                errno.ENODEV: "it has just been unplugged; plug it in again",
             }.get(number or 0, f"{error}; unplug it and plug it in again")
             raise DeviceError(f"{plugged} cannot be opened: {reason}") from None
         return cls(device, str(plugged), read_from=read_from, write_to=write_to, log=log)
 
     def now(self) -> float:
-        """Returns the time in s of a clock that only grows."""
+        """Returns the time of a monotonic clock in s."""
         return time.monotonic()
 
     def control(self, request: int, value: int) -> None:
-        """Sends a vendor's request without data.
+        """Sends a vendor request without data.
 
         Args:
             request: bRequest.
             value: wValue.
 
         Raises:
-            DeviceLost: The device is gone, or refuses it.
+            DeviceLost: The device is gone, or refuses the request.
         """
         self._require()
         if self._log.is_on:
@@ -411,14 +413,14 @@ class UsbLink:
             raise self._failed(error) from None
 
     def write(self, packet: array.array[int], timeout_ms: int = WRITE_MS) -> bool:
-        """Sends a packet; returns False where the device did not take it in time.
+        """Sends a packet; returns False if the device did not accept it in time.
 
         Args:
-            packet: Of bytes; an array is not copied.
+            packet: Array of bytes, which is not copied.
             timeout_ms: Longest wait in ms, >= 1.
 
         Raises:
-            DeviceLost: The device is gone, or refuses it.
+            DeviceLost: The device is gone, or refuses the packet.
         """
         if self._lost or not self._is_open:
             self._require()
@@ -433,10 +435,10 @@ class UsbLink:
         return True
 
     def take(self) -> list[bytes]:
-        """Returns the packets that came since the last call, oldest first, without waiting.
+        """Returns the packets since the last call, oldest first, without waiting.
 
         Raises:
-            DeviceLost: The device is gone; packets that came before are returned first.
+            DeviceLost: The device is gone; earlier packets are returned first.
         """
         packets = self._packets
         if not packets or not self._is_open:
@@ -445,18 +447,18 @@ class UsbLink:
         return [packets.popleft() for _ in range(len(packets))]
 
     def wait(self, timeout: float) -> None:
-        """Returns as soon as a packet is there, at the latest after ``timeout`` s."""
+        """Returns as soon as a packet is available, at the latest after ``timeout`` s."""
         if not self._packets:
             self._arrived.wait(timeout)
 
     def close(self) -> None:
-        """Ends the reader and lets the device go; may be called more than once."""
+        """Ends the reader and releases the device; may be called more than once."""
         if not self._is_open:
             return
         self._is_open = False
         atexit.unregister(self.close)
         self._reader.join(2e-3 * READ_MS)
-        if not self._reader.is_alive():  # else it is still inside libusb with what this would free
+        if not self._reader.is_alive():  # not while the reader is inside libusb, using this memory
             usb.util.dispose_resources(self._device)
         _prompt_threads(-1)
         self._log.close()
@@ -469,13 +471,13 @@ class UsbLink:
         if not self._lost:
             self._lost = {
                 errno.ENODEV: f"{self._name} is gone: unplugged, or switched off",
-                errno.EPIPE: f"{self._name} refuses to go on (endpoint halted): unplug it and plug "
-                "it in again",
+                errno.EPIPE: f"{self._name} has halted its endpoint: unplug it and plug it in "
+                "again",
             }.get(error.errno or 0, f"{self._name} fails: {error}")
         return DeviceLost(self._lost)
 
     def _read_always(self) -> None:
-        """Runs in the reader's thread until the link is closed or the device lost."""
+        """Reads in the reader's thread until the link is closed or the device lost."""
         while self._is_open:
             try:
                 packet = self._device.read(self._read_from, PACKET, READ_MS).tobytes()
@@ -496,7 +498,7 @@ _prompt = {"links": 0, "usual": 0.0}
 
 
 def _prompt_threads(change: int) -> None:
-    """Makes threads change promptly while any link is open, and as before after the last one."""
+    """Shortens the thread switch interval while any link is open; restores it after the last."""
     if _prompt["links"] == 0:
         _prompt["usual"] = sys.getswitchinterval()
     _prompt["links"] += change
@@ -505,12 +507,12 @@ def _prompt_threads(change: int) -> None:
 
 
 def _claim(device: Any) -> None:
-    """Takes the device's first interface, from the kernel's driver if one has it."""
+    """Claims the device's first interface, and detaches the kernel's driver from it."""
     try:
         if device.is_kernel_driver_active(0):
             device.detach_kernel_driver(0)
     except NotImplementedError:
-        pass  # as pyusb says that this system has no drivers to detach
+        pass  # pyusb's error on systems without drivers to detach
     try:
         device.get_active_configuration()
     except usb.core.USBError as error:

@@ -1,4 +1,4 @@
-"""Text messages to and from a program on this machine, over a WebSocket: bounded waits."""
+"""Text messages over a WebSocket to a local program, with bounded waits."""
 
 from __future__ import annotations
 
@@ -14,38 +14,39 @@ from hapticbridge.device.transport.usb import SWITCH_INTERVAL
 from hapticbridge.errors import DeviceError, DeviceLost
 
 OPEN_TIMEOUT = 1.0
-"""In s: for the connection and for the handshake, each. A program on this machine answers in ms."""
+"""Longest time in s for the connection and for the handshake, each. A local program answers in
+ms."""
 
 CLOSE_TIMEOUT = 0.2
-"""In s, for the other side's goodbye."""
+"""Longest wait in s for the peer's closing frame."""
 
 LARGEST_MESSAGE = 1 << 20
-"""In bytes. A service with ten devices lists them in some 20 kB."""
+"""Largest message in bytes. A service with ten devices lists them in some 20 kB."""
 
 EXTRA = "the Python package websockets is not installed: pip install 'hapticbridge[haply]'"
 
 
 class Link(Protocol):
-    """What a device needs of it: ``WebSocketLink``, or what stands for it."""
+    """Message transport of a device; ``WebSocketLink`` is the real one."""
 
     def now(self) -> float:
-        """Returns the time in s of a clock that only grows."""
+        """Returns the time of a monotonic clock in s."""
 
     def send(self, message: str) -> None:
         """Sends a message."""
 
     def take(self) -> list[str]:
-        """Returns the messages that have come, without waiting."""
+        """Returns the received messages without waiting."""
 
     def wait(self, timeout: float) -> str | None:
         """Returns the next message, or None after ``timeout`` s."""
 
     def close(self) -> None:
-        """Ends the connection."""
+        """Closes the connection."""
 
 
 def websocket_client() -> Any:
-    """Returns websockets' client of threads, or None where it is not installed."""
+    """Returns websockets' threaded client, or None if it is not installed."""
     try:
         return importlib.import_module("websockets.sync.client")
     except ImportError:
@@ -53,45 +54,46 @@ def websocket_client() -> Any:
 
 
 class WebSocketLink:
-    """An open connection. A thread of ``websockets`` reads; what has come is taken from its queue.
+    """An open connection; a thread of ``websockets`` reads into a queue.
 
     Args:
-        connection: Of ``websockets.sync``.
-        name: What errors call the other side.
-        log: Keeps what goes over the wire.
+        connection: Connection of ``websockets.sync``.
+        name: Name of the peer in messages.
+        log: Log of the transferred bytes.
     """
 
     def __init__(self, connection: Any, name: str, log: HexLog | None = None) -> None:
         self._connection, self._name = connection, name
         self._log = log or HexLog("")
         self._is_open = True
-        # the reader's thread needs the interpreter while the loop spins to its deadline
+        # lets the reader's thread run while the loop spins to its deadline
         self._switch_interval = sys.getswitchinterval()
         sys.setswitchinterval(min(SWITCH_INTERVAL, self._switch_interval))
 
     @classmethod
     def open(cls, host: str, port: int, name: str, log: HexLog | None = None) -> WebSocketLink:
-        """Connects.
+        """Connects to a local program.
 
         Args:
             host: Name or address.
-            port: Of TCP.
-            name: What errors call the other side.
-            log: Keeps what goes over the wire.
+            port: TCP port.
+            name: Name of the peer in messages.
+            log: Log of the transferred bytes.
 
         Raises:
-            DeviceError: Nobody answers there, or not as a WebSocket; or websockets is missing.
+            DeviceError: No program answers there, its answer is not a WebSocket handshake, or
+                websockets is missing.
         """
         client = websocket_client()
         if client is None:
             raise DeviceError(EXTRA)
         try:
-            # our own socket, because a proxy that the environment names must not come in between
+            # a socket of our own, so that a proxy of the environment is not used
             own = socket.create_connection((host, port), OPEN_TIMEOUT)
         except (OSError, OverflowError, UnicodeError):
             raise DeviceError(
-                f"{name} does not run: nobody answers at {host}:{port}; start it, or say where it "
-                "listens with service=HOST:PORT"
+                f"{name} does not run: no answer at {host}:{port}; start it, or name its address "
+                "with service=HOST:PORT"
             ) from None
         try:
             own.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -101,40 +103,40 @@ class WebSocketLink:
                 compression=None,
                 open_timeout=OPEN_TIMEOUT,
                 close_timeout=CLOSE_TIMEOUT,
-                ping_interval=None,  # the loop itself notices silence, a hundred times sooner
+                ping_interval=None,  # the loop itself detects silence, a hundred times sooner
                 max_size=LARGEST_MESSAGE,
                 max_queue=None,
             )
-            connection = opening.__enter__()  # what newer versions ask for; close() is the exit
-        except Exception as error:  # what answers there may be anything, and so is what it causes
+            connection = opening.__enter__()  # required by newer versions; close() is the exit
+        except Exception as error:  # an unknown program may answer and cause any error
             own.close()
             raise DeviceError(
-                f"what answers at {host}:{port} is not {name}: {' '.join(str(error).split())}"
+                f"the program at {host}:{port} is not {name}: {' '.join(str(error).split())}"
             ) from None
         return cls(connection, name, log)
 
     def now(self) -> float:
-        """Returns the time in s of a clock that only grows."""
+        """Returns the time of a monotonic clock in s."""
         return time.monotonic()
 
     def send(self, message: str) -> None:
         """Sends a message.
 
         Raises:
-            DeviceLost: The connection has dropped.
+            DeviceLost: The connection was lost.
         """
         if self._log.is_on:
             self._log.add(">", message.encode())
         try:
             self._connection.send(message)
-        except Exception:  # whatever its kind: the loop must command zero, not end in a traceback
+        except Exception:  # of any kind: the loop must command zero, not end in a traceback
             raise self._lost() from None
 
     def take(self) -> list[str]:
-        """Returns the messages that have come, oldest first, without waiting.
+        """Returns the received messages, oldest first, without waiting.
 
         Raises:
-            DeviceLost: The connection has dropped, and all that came before was taken.
+            DeviceLost: The connection was lost and all earlier messages were taken.
         """
         messages: list[str] = []
         while (message := self._received(0.0, is_dropped_after=bool(messages))) is not None:
@@ -145,12 +147,12 @@ class WebSocketLink:
         """Returns the next message, or None after ``timeout`` s.
 
         Raises:
-            DeviceLost: The connection has dropped.
+            DeviceLost: The connection was lost.
         """
         return self._received(timeout)
 
     def close(self) -> None:
-        """Ends the connection; may be called more than once."""
+        """Closes the connection; may be called more than once."""
         if not self._is_open:
             return
         self._is_open = False
@@ -177,23 +179,23 @@ class WebSocketLink:
         return text
 
     def _lost(self) -> DeviceLost:
-        return DeviceLost(f"{self._name} has closed the connection, or was stopped")
+        return DeviceLost(f"{self._name} has closed the connection, or was stopped; restart it")
 
 
 def decoded(message: str, name: str) -> dict[str, Any]:
-    """Returns the JSON object that a message is.
+    """Returns a message as a JSON object.
 
     Args:
-        message: Text.
-        name: What errors call who sent it.
+        message: Text of the message.
+        name: Name of the sender in messages.
 
     Raises:
-        DeviceError: It is none.
+        DeviceError: The message is not a JSON object.
     """
     try:
         value = json.loads(message)
     except (ValueError, RecursionError):
         value = None
     if not isinstance(value, dict):
-        raise DeviceError(f"{name} sent what is no JSON object: {message!r:.60}")
+        raise DeviceError(f"{name} sent a message that is not a JSON object: {message!r:.60}")
     return value

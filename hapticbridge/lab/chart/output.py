@@ -23,9 +23,9 @@ from hapticbridge.files import finite_or_null
 from hapticbridge.lab.chart.chart import Chart, Measurement, Order
 from hapticbridge.lab.chart.setting import who
 from hapticbridge.lab.chart.workload import Panel, Verdict
+from hapticbridge.lab.folder import prepared_folder
 from hapticbridge.plotting import new_figure, write_picture
 from hapticbridge.run_description import versions
-from hapticbridge.sweep.results import prepared_folder
 
 RATE = 1000.0
 """Hz that is asked for."""

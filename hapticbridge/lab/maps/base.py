@@ -25,11 +25,12 @@ from hapticbridge.device import Motion
 from hapticbridge.errors import StudyError
 from hapticbridge.files import finite_or_null
 from hapticbridge.lab.closed_loop import ClosedLoop
+from hapticbridge.lab.folder import prepared_folder
 from hapticbridge.plotting import write_picture
 from hapticbridge.rendering import METHODS
 from hapticbridge.scene import Scene, load_scene
 from hapticbridge.scene.load import scene_path
-from hapticbridge.sweep.results import Table
+from hapticbridge.sweep.results import Table, check_format
 from hapticbridge.sweep.sweep import sweep
 from hapticbridge.theory.bounds import maximum_stiffness
 
@@ -132,7 +133,7 @@ def run_map(
         stability_map: Which.
         folder: Made if missing.
         points: About how many, 4 to 1 000 000; None for the map's own number.
-        form: Of table and parts: ``csv`` or ``parquet`` (needs the extra ``tables``).
+        form: Of the table: ``csv`` or ``parquet`` (needs the extra ``tables``).
         executor: Where points are computed; by default a pool of processes.
         scheduler: Address of a dask.distributed cluster instead.
         progress: Called with the points done and all points.
@@ -145,14 +146,13 @@ def run_map(
             f"points is {points}; a map needs {LEAST_POINTS} or more, and {MOST_POINTS} at most"
         )
     name = stability_map.name
+    check_format(form)
     files = {end: folder / f"{name}.{end}" for end in ("png", form, "json")}
-    for path in files.values():
-        _check_writable(path)
+    prepared_folder(folder, [path.name for path in files.values()])
     table = sweep(
         stability_map.evaluate,
         stability_map.points(points or stability_map.default_points),
-        folder=folder / f"{name}.parts",
-        format=form,
+        results=folder / f"{name}.parts",
         executor=executor,
         scheduler=scheduler,
         progress=progress,
@@ -175,23 +175,6 @@ def run_map(
     except OSError as error:
         raise StudyError(f"cannot write '{files['json']}': {error.strerror}") from None
     return MapFiles(files["png"], files[form], files["json"], finding, failed)
-
-
-def _check_writable(path: Path) -> None:
-    """Refuses a file that could not be written, before the sweep; leaves the disk as it was.
-
-    A folder that is missing or none is the sweep's to make or refuse.
-    """
-    if not path.parent.is_dir():
-        return
-    is_new = not path.exists()
-    try:
-        with path.open("ab"):
-            pass
-        if is_new:
-            path.unlink()
-    except OSError as error:
-        raise StudyError(f"cannot write '{path}': {error.strerror}") from None
 
 
 WIDTH = 1e-3
