@@ -18,8 +18,6 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter1d
-from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from hapticbridge.device import DeviceInfo, Hand
@@ -116,6 +114,9 @@ def _wanted(
 
     It is stable, and at half the rate, where central differences are noise, it answers nothing.
     """
+    from scipy.ndimage import gaussian_filter1d  # noqa: PLC0415 - with scipy.signal 0.6 s
+    from scipy.signal import lfilter  # noqa: PLC0415
+
     inertia, damping, hand_damping, stiffness, friction = law
     # one that moves already moved on as it does: had it stood still, the start were a blow
     before = 2 * moved[:1] - moved[1:2] if is_moving else moved[:1]
