@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from textwrap import wrap
+from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from hapticbridge.coupling import Coupling
@@ -22,6 +22,9 @@ from hapticbridge.passivity.compensation import felt_damping
 from hapticbridge.passivity.transfer import Discretization
 from hapticbridge.picture import new_figure
 from hapticbridge.rendering import COMPENSATED, IMPLICIT, Method, default_method
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 _Array = NDArray[np.float64]
 

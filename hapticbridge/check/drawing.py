@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
-
-from matplotlib.figure import Figure
+from typing import TYPE_CHECKING
 
 from hapticbridge.check.cost import BRIDGE, TICK_SHARE, Cost
 from hapticbridge.picture import new_figure
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 _FREE, _CONTACT, _LINE = "tab:blue", "tab:orange", "0.3"
 _LEAST_SHARE = 0.01  # of the tick; smaller stages are not drawn

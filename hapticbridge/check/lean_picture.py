@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.ticker import FuncFormatter
 
 from hapticbridge.check.lean import Lean
 from hapticbridge.check.trial import (
@@ -19,6 +17,11 @@ from hapticbridge.check.trial import (
     Trial,
 )
 from hapticbridge.picture import new_figure
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
 
 _COLOURS = {
     MAY_GO: "#26a269",
@@ -67,7 +70,7 @@ def draw_lean(lean: Lean, name: str) -> Figure:
                 alpha=0.8,
             )
     _write_names(axes, points)
-    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
     axes.set_xlabel("cost (processor time, % of the scene as it is)")
     axes.set_ylabel("felt error (just noticeable differences)")
     axes.set_title(f"{name}: what could go without being felt", loc="left", fontsize=11)
@@ -119,6 +122,8 @@ def _write_names(axes: Axes, points: list[tuple[str, Trial, str]]) -> None:
 
 
 def _legend(points: list[tuple[str, Trial, str]], lean: Lean) -> list[Line2D]:
+    from matplotlib.lines import Line2D  # noqa: PLC0415 - for a picture alone
+
     verdicts = list(dict.fromkeys(trial.verdict for _, trial, kind in points if not kind))
     handles = [
         Line2D(

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Annotated, ClassVar
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import tyro
-from matplotlib.figure import Figure
 
 from hapticbridge.certificate import default_coupling
 from hapticbridge.check.case import DEFAULT_PERIOD, LARGEST_WORKSPACE, Case, open_case
@@ -31,6 +30,9 @@ from hapticbridge.device import SimulatedDevice
 from hapticbridge.errors import SceneError
 from hapticbridge.picture import check_ending, write_picture
 from hapticbridge.scene import read_scene, settings_from
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from hapticbridge.identify.axis_fit import AxisFit
 from hapticbridge.identify.identification import Identification
 from hapticbridge.identify.weak_form import noise_of, windows
 from hapticbridge.picture import new_figure
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 _COLOURS = {"x": "#a51d2d", "y": "#1b7837", "z": "#1a5fb4"}
 

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from hapticbridge.errors import RecordingError
@@ -15,6 +14,10 @@ from hapticbridge.picture import new_figure, write_picture
 from hapticbridge.provenance import parameters_of
 from hapticbridge.recording import Recording, due_times
 from hapticbridge.rendering import method_named
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 BINS = 1500
 """Largest number of bins per curve. Each bin draws its minimum and maximum, so no peak is lost.

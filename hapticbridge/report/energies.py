@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
-from matplotlib.figure import Figure
 
 from hapticbridge.picture import new_figure
 from hapticbridge.report.curves import finish
 from hapticbridge.report.evidence import Evidence
 from hapticbridge.report.panels import bounded, curve, energy_unit, widen
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 _PORTS = (
     ("coupling_work", "coupling", "#0072b2"),

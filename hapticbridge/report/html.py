@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from jinja2 import Environment, PackageLoader, select_autoescape
-
 from hapticbridge.errors import RecordingError
 from hapticbridge.quantity import quantity
 from hapticbridge.whole_file import whole_file
@@ -35,6 +33,8 @@ def write_page(path: Path, template: str, **told: object) -> None:
         RecordingError: The page cannot be written, or not under this name.
     """
     check_page_name(path)
+    from jinja2 import Environment, PackageLoader, select_autoescape  # noqa: PLC0415 - for pages
+
     environment = Environment(
         loader=PackageLoader("hapticbridge", "templates"), autoescape=select_autoescape()
     )

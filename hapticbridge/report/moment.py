@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from matplotlib.figure import Figure
+from typing import TYPE_CHECKING
 
 from hapticbridge.audit import AuditReport
 from hapticbridge.picture import new_figure
 from hapticbridge.report.curves import AXES, COLOURS, finish
 from hapticbridge.report.evidence import Evidence
 from hapticbridge.report.panels import bounded
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 ZOOM = 60
 """Number of ticks shown before and after the moment."""

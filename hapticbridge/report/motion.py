@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
-from matplotlib.figure import Figure
 
 from hapticbridge.audit.differences import turn_between
 from hapticbridge.picture import new_figure
 from hapticbridge.report.curves import AXES, COLOURS, finish
 from hapticbridge.report.evidence import Evidence
 from hapticbridge.report.panels import curve, widen
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 def draw_motion(evidence: Evidence) -> Figure:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from hapticbridge.audit.watched import Flags, has_flag, run_lengths
@@ -13,6 +13,10 @@ from hapticbridge.report.curves import finish
 from hapticbridge.report.evidence import Evidence
 from hapticbridge.report.panels import BINS, Array, curve
 from hapticbridge.tick import TickFlag
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 FLAGS = (
     (TickFlag.RAMPING, "force rises"),

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from hapticbridge.errors import RecordingError
 from hapticbridge.picture import new_figure, write_picture
@@ -14,6 +14,9 @@ from hapticbridge.report import DRAWABLE, decimated
 from hapticbridge.report.curves import BINS
 from hapticbridge.whatif.outcome import WhatIf
 from hapticbridge.whatif.side_by_side import changes
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 _STYLES = (("#555555", "-", 2.2), ("#1a5fb4", "-", 1.1), ("#b3261e", "--", 1.1))
 """Colour, line and width in points of each run; the recorded one lies behind the others."""
