@@ -9,6 +9,7 @@ from typing import Any
 
 from hapticbridge.arguments import Arguments, shown
 from hapticbridge.errors import CommandError, choices
+from hapticbridge.jsonable import read_json
 
 LONGEST_LINE = 250
 """Bytes of a line; the longest command has some 170."""
@@ -122,10 +123,10 @@ def command_of(line: bytes) -> Command:
     if len(line) > LONGEST_LINE:
         raise CommandError(f"a command has at most {LONGEST_LINE} bytes")
     try:
-        said: Any = json.loads(line)
+        said: Any = read_json(line)
         name = said.pop("command")
         kind = KINDS[name]
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
+    except (ValueError, KeyError, TypeError, AttributeError):
         raise CommandError(f"{shown(line)} is no command; there are {choices(KINDS)}") from None
     try:
         return kind(**said)
