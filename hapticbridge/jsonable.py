@@ -1,7 +1,8 @@
-"""JSON without NaN and infinity."""
+"""JSON without NaN and infinity, and JSON that was written elsewhere."""
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Mapping
 from typing import Any
@@ -17,3 +18,15 @@ def jsonable(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [jsonable(inner) for inner in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def read_json(text: str | bytes) -> Any:
+    """Reads JSON that a file, a device or a browser gave.
+
+    Raises:
+        ValueError: The text is not JSON, or is nested more deeply than the interpreter can follow.
+    """
+    try:
+        return json.loads(text)
+    except RecursionError:
+        raise ValueError("it is nested too deeply") from None

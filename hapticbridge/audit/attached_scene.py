@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import hashlib
-import json
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.errors import HapticBridgeError, RecordingError
+from hapticbridge.jsonable import read_json
 from hapticbridge.kernel.names import COUPLING_ACTUATORS
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.provenance import MODEL_ATTACHMENT, STARTS, meta_start, processor, start_of
@@ -86,6 +86,6 @@ def check_start(recording: RecordingFile, state: NDArray[np.void]) -> None:
 def is_same_processor(recording: RecordingFile) -> bool:
     """Returns True if the recording's processor model is this one or not stated."""
     try:
-        return bool(json.loads(recording.meta["host"])["processor"] == processor())
-    except (KeyError, TypeError, ValueError, RecursionError):
+        return bool(read_json(recording.meta["host"])["processor"] == processor())
+    except (KeyError, TypeError, ValueError):
         return True

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections import deque
 from collections.abc import Mapping
 from typing import Any
@@ -16,6 +15,7 @@ from hapticbridge.commands import CHANGES as COMMANDED
 from hapticbridge.commands import Repeater
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.inputs import apply_writes
+from hapticbridge.jsonable import read_json
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.simulation import simulate_recorded
 from hapticbridge.kernel.state import Binding
@@ -159,8 +159,8 @@ class Rerun:
 def obstacle(recording: RecordingFile) -> str:
     """Returns the reason why a run cannot be simulated again here; empty if it can."""
     try:
-        recorded = dict(json.loads(recording.meta.get("versions", "")))
-    except (ValueError, TypeError, RecursionError):
+        recorded = dict(read_json(recording.meta.get("versions", "")))
+    except (ValueError, TypeError):
         return "the metadata name no versions"
     present = versions()
     for name in DECISIVE:

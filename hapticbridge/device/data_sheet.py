@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from numbers import Real
 
 from hapticbridge.errors import DeviceError, choices
+from hapticbridge.jsonable import read_json
 
 
 def checked_number(name: str, value: object, unit: str, *, is_positive: bool = False) -> float:
@@ -202,8 +203,8 @@ class DeviceInfo:
                 optional), or a value is invalid.
         """
         try:
-            values = json.loads(text)
-        except (ValueError, RecursionError) as error:
+            values = read_json(text)
+        except ValueError as error:
             raise DeviceError(f"device data is not JSON: {error}") from None
         if not isinstance(values, dict):
             raise DeviceError(f"device data is not a JSON object but {values!r:.60}")

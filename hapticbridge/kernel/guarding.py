@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 from hapticbridge.errors import HapticBridgeError
+from hapticbridge.jsonable import read_json
 
 OFF, DAMPER, ENVIRONMENT = 0, 1, 3
 """Passivity controllers as recordings number them: none; damping against the motion, and a tank
@@ -122,8 +123,8 @@ class Guarding:
             HapticBridgeError: The text is not that, or a value is out of range.
         """
         try:
-            values = dict(json.loads(text))
-        except (ValueError, TypeError, RecursionError):
+            values = dict(read_json(text))
+        except (ValueError, TypeError):
             values = {}
         names = {field.name for field in fields(cls)}
         if not names - LATER <= values.keys() <= names:

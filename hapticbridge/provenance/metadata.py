@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping
 
 from hapticbridge.errors import RecordingError
+from hapticbridge.jsonable import read_json
 from hapticbridge.provenance.start import STARTS
 
 _MOST_TICKS = 2**31
@@ -39,8 +39,8 @@ def meta_numbers(meta: Mapping[str, str], name: str, count: int) -> tuple[float,
     if text is None:
         raise RecordingError(f"the recording's metadata lack '{name}'")
     try:
-        values = tuple(float(value) for value in json.loads(text))
-    except (ValueError, TypeError, OverflowError, RecursionError):
+        values = tuple(float(value) for value in read_json(text))
+    except (ValueError, TypeError, OverflowError):
         values = ()
     if len(values) != count or not all(math.isfinite(value) for value in values):
         raise RecordingError(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
@@ -11,6 +10,7 @@ import numpy as np
 from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
+from hapticbridge.jsonable import read_json
 from hapticbridge.recording import format as layout
 from hapticbridge.recording.container import Block
 from hapticbridge.recording.fields import DamageError, Fields
@@ -166,8 +166,8 @@ class Contents:
 
     def _add_event(self, payload: bytes) -> None:
         try:
-            event = json.loads(payload)
-        except (ValueError, RecursionError) as error:
+            event = read_json(payload)
+        except ValueError as error:
             raise DamageError("an event is not JSON") from error
         if not isinstance(event, dict):
             raise DamageError("an event is not a JSON object")
