@@ -11,8 +11,9 @@ from scipy.spatial.transform import Rotation
 from hapticbridge.coupling import Coupling
 from hapticbridge.kernel.simulation import simulate
 from hapticbridge.kernel.state import Binding
+from hapticbridge.lab.methods import METHODS
 from hapticbridge.ledger import Ledger
-from hapticbridge.rendering import METHODS, prepare
+from hapticbridge.rendering import prepare
 from hapticbridge.scene import Scene, load_scene
 from hapticbridge.tick import SAMPLE_DTYPE, TICK_DTYPE
 

@@ -19,11 +19,11 @@ from hapticbridge.bridge import Bridge
 from hapticbridge.clock import SimulatedClock
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import SafetyTrip
+from hapticbridge.lab.methods import METHODS
 from hapticbridge.provenance import (
     parameters_of,
 )
 from hapticbridge.recording import Recording, read_recording
-from hapticbridge.rendering import METHODS
 from hapticbridge.scene import scene_names
 from hapticbridge.scene.library import scene_path
 from hapticbridge.tick import CLOCK_FIELDS, TICK_DTYPE

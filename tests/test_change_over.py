@@ -16,8 +16,8 @@ from hapticbridge.device.trajectory.motion_csv import read_motion
 from hapticbridge.kernel.codes import OK
 from hapticbridge.kernel.simulation import simulate
 from hapticbridge.kernel.step import after_step, before_step
+from hapticbridge.lab.methods import METHODS
 from hapticbridge.ledger import Ledger
-from hapticbridge.rendering import METHODS
 from hapticbridge.scene import load_scene, scene_path
 from hapticbridge.tick import SAMPLE_DTYPE, TICK_DTYPE, TickFlag
 

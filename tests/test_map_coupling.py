@@ -35,12 +35,12 @@ from hapticbridge.lab.maps.coupling import (
     evaluate,
     points,
 )
+from hapticbridge.lab.methods import METHODS
 from hapticbridge.passivity import (
     environment_minimum_damping,
     maximum_stiffness,
     minimum_damping,
 )
-from hapticbridge.rendering import METHODS
 
 
 def cell(method: str, stiffness: float, damping: float) -> Point:

@@ -36,8 +36,8 @@ from hapticbridge.lab.maps.device import (
     settle,
     shaken,
 )
+from hapticbridge.lab.methods import METHODS
 from hapticbridge.passivity import quantization_limit
-from hapticbridge.rendering import METHODS
 from hapticbridge.scene import load_scene
 
 

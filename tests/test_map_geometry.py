@@ -36,8 +36,8 @@ from hapticbridge.lab.maps.geometry import (
     set_length,
     torque,
 )
+from hapticbridge.lab.methods import METHODS
 from hapticbridge.passivity import minimum_damping
-from hapticbridge.rendering import METHODS
 from hapticbridge.scene import load_scene
 
 

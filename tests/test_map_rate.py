@@ -36,8 +36,8 @@ from hapticbridge.lab.maps.rate import (
     wall_limit,
     worst_hand,
 )
+from hapticbridge.lab.methods import METHODS
 from hapticbridge.passivity import SampledLoop, WorstHand
-from hapticbridge.rendering import METHODS
 from hapticbridge.scene import Scene, load_scene
 
 

@@ -18,8 +18,8 @@ from hapticbridge.errors import SafetyTrip
 from hapticbridge.guard import Limits
 from hapticbridge.kernel.ahead import can_split, is_sound
 from hapticbridge.kernel.scheme import COUPLED, DIRECT, WELD
+from hapticbridge.lab.methods import METHODS
 from hapticbridge.recording import read_recording
-from hapticbridge.rendering import METHODS
 from hapticbridge.tick import TICK_DTYPE
 
 TICKS = 400

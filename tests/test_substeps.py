@@ -17,9 +17,10 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.device import SimulatedDevice
 from hapticbridge.errors import CouplingError, HapticBridgeError
 from hapticbridge.lab.closed_loop import ClosedLoop, LoopOutcome
+from hapticbridge.lab.methods import METHODS
 from hapticbridge.mechanics import exact_mass_response
 from hapticbridge.passivity import WorstHand
-from hapticbridge.rendering import METHODS, default_method
+from hapticbridge.rendering import default_method
 from hapticbridge.scene import load_scene
 
 COUPLING = Coupling(2400.0, 0.5, 2.4, 5e-4)

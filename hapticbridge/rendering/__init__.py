@@ -14,6 +14,7 @@ from hapticbridge.rendering.methods import LOSSLESS_COUPLING as LOSSLESS_COUPLIN
 from hapticbridge.rendering.methods import METHODS as METHODS
 from hapticbridge.rendering.methods import default_method as default_method
 from hapticbridge.rendering.methods import method_named as method_named
+from hapticbridge.rendering.methods import method_names as method_names
 from hapticbridge.rendering.preparation import MEASURED_AGAIN as MEASURED_AGAIN
 from hapticbridge.rendering.preparation import check_prepared as check_prepared
 from hapticbridge.rendering.preparation import check_scene as check_scene

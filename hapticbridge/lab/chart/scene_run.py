@@ -34,8 +34,13 @@ from hapticbridge.lab.chart.workload import (
     diverged,
     score_of,
 )
+from hapticbridge.lab.methods import METHODS
 from hapticbridge.ledger import Ledger
-from hapticbridge.rendering import IMPLICIT, METHODS, Method, prepare
+from hapticbridge.rendering import (
+    IMPLICIT,
+    Method,
+    prepare,
+)
 from hapticbridge.scene import Scene, load_scene
 from hapticbridge.tick import SAMPLE_DTYPE, TICK_DTYPE
 from hapticbridge.workspace import run_parameters

@@ -26,9 +26,9 @@ from hapticbridge.errors import StudyError
 from hapticbridge.jsonable import jsonable
 from hapticbridge.lab.closed_loop import ClosedLoop
 from hapticbridge.lab.folder import prepared_folder
+from hapticbridge.lab.methods import METHODS
 from hapticbridge.passivity import maximum_stiffness
 from hapticbridge.picture import write_picture
-from hapticbridge.rendering import METHODS
 from hapticbridge.scene import Scene, load_scene
 from hapticbridge.scene.library import scene_path
 from hapticbridge.sweep.results import Table, check_format

@@ -38,9 +38,9 @@ from hapticbridge.lab.maps.base import (
     wall_loop,
 )
 from hapticbridge.lab.maps.tool_mass import felt, worst_angle
+from hapticbridge.lab.methods import METHODS
 from hapticbridge.passivity import WorstHand
 from hapticbridge.picture import new_figure
-from hapticbridge.rendering import METHODS
 from hapticbridge.sweep.results import Table
 
 PERIOD = 1e-3

@@ -35,9 +35,9 @@ from hapticbridge.lab.maps.base import (
     used_damping,
     wall_loop,
 )
+from hapticbridge.lab.methods import METHODS
 from hapticbridge.passivity import quantization_limit
 from hapticbridge.picture import new_figure
-from hapticbridge.rendering import METHODS
 from hapticbridge.sweep.results import Table
 
 RANGE = (0.1, 2.0)

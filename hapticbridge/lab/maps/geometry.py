@@ -36,9 +36,9 @@ from hapticbridge.lab.maps.base import (
     verdict_legend,
     verdict_numbers,
 )
+from hapticbridge.lab.methods import METHODS
 from hapticbridge.passivity import WorstHand
 from hapticbridge.picture import new_figure
-from hapticbridge.rendering import METHODS
 from hapticbridge.sweep.results import Table
 
 PERIOD = 1e-3

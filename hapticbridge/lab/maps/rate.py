@@ -35,9 +35,9 @@ from hapticbridge.lab.maps.base import (
     say_missing,
     wall_loop,
 )
+from hapticbridge.lab.methods import METHODS
 from hapticbridge.passivity import SampledLoop, WorstHand, maximum_stiffness, minimum_damping
 from hapticbridge.picture import new_figure
-from hapticbridge.rendering import METHODS
 from hapticbridge.sweep.results import Table
 
 THEORY_WIDTH = WIDTH / 100

@@ -32,10 +32,11 @@ from hapticbridge.lab.maps.base import (
     verdict_legend,
     verdict_numbers,
 )
+from hapticbridge.lab.methods import METHODS
 from hapticbridge.ledger import Ledger
 from hapticbridge.picture import new_figure
 from hapticbridge.pose import IDENTITY_POSE
-from hapticbridge.rendering import METHODS, prepare
+from hapticbridge.rendering import prepare
 from hapticbridge.scene import Scene
 from hapticbridge.sweep.results import Table
 from hapticbridge.tick import SAMPLE_DTYPE, TICK_DTYPE

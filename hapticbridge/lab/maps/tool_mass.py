@@ -37,10 +37,10 @@ from hapticbridge.lab.maps.base import (
     verdict_legend,
     verdict_numbers,
 )
+from hapticbridge.lab.methods import METHODS
 from hapticbridge.passivity import WorstHand
 from hapticbridge.passivity.spectrum import needed_for_fixed_environment
 from hapticbridge.picture import new_figure
-from hapticbridge.rendering import METHODS
 from hapticbridge.sweep.results import Table
 
 NAMES = ("implicit", "lossless", "implicitfast", "explicit", "explicit:rk4")
