@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import ast
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -83,6 +85,22 @@ def test_concepts_do_not_import_each_other_in_a_circle() -> None:
 def test_the_audit_never_imports_the_bridge() -> None:
     for path in (PACKAGE / "audit").glob("*.py"):
         assert "bridge" not in imports_of(path)
+
+
+def test_the_core_never_imports_the_lab() -> None:
+    """Studies stand outside; only commands that are studies import them."""
+    importers = {str(path.relative_to(PACKAGE)) for path in FILES if "lab" in imports_of(path)}
+    assert importers <= {"cli/chart.py", "cli/stability.py"}
+
+
+def test_a_method_that_exists_only_to_be_compared_is_found_by_its_name() -> None:
+    named = (
+        "import sys; from hapticbridge.rendering import METHODS, method_named\n"
+        "assert list(METHODS) == ['implicit', 'compensated', 'lossless']\n"
+        "assert not [name for name in sys.modules if name.startswith('hapticbridge.lab')]\n"
+        "assert method_named('explicit:rk4').integrator == 'RK4' and len(METHODS) == 10\n"
+    )
+    subprocess.run([sys.executable, "-c", named], check=True)
 
 
 def test_every_concept_has_its_place() -> None:
