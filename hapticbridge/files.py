@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import json
 import math
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -35,7 +36,7 @@ def import_extra(
         ) from None
 
 
-# JSON without NaN and infinity.
+# JSON without NaN and infinity, and JSON that was written elsewhere.
 
 
 def finite_or_null(value: Any) -> Any:
@@ -48,6 +49,18 @@ def finite_or_null(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [finite_or_null(inner) for inner in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def read_json(text: str | bytes) -> Any:
+    """Reads JSON that a file, a device or a browser gave.
+
+    Raises:
+        ValueError: The text is not JSON, or is nested more deeply than the interpreter can follow.
+    """
+    try:
+        return json.loads(text)
+    except RecursionError:
+        raise ValueError("it is nested too deeply") from None
 
 
 @contextmanager

@@ -5,13 +5,14 @@ from __future__ import annotations
 import io
 import warnings
 from pathlib import Path
-from typing import Any
-
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
+from typing import TYPE_CHECKING, Any
 
 from hapticbridge.errors import HapticBridgeError
 from hapticbridge.files import atomic_write
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 
 ENDINGS = (".pdf", ".png", ".svg")
 """Extensions of picture files."""
@@ -37,6 +38,9 @@ def check_ending(path: Path) -> None:
 
 def new_figure(width: float, height: float) -> Figure:
     """Returns an empty figure, sizes in inches, that needs no display."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415 - takes 0.5 s
+    from matplotlib.figure import Figure  # noqa: PLC0415
+
     figure = Figure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)
     return figure

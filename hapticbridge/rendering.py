@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
+from importlib import import_module
 from typing import Any
 
 import mujoco
@@ -158,16 +159,7 @@ def require_hazard_consent(method: Method, *, is_real: bool, i_know: bool) -> No
         )
 
 
-# Table of rendering methods; those without coupling actuators serve for comparison.
-
-_CREATES = "creates energy in free motion, more the lighter the tool and the stiffer the coupling"
-_HELD_ABOUT = (
-    "the wrench of the coupling law, computed after each step and applied as a force during the "
-    "next tick, held; under MuJoCo's integrator {}"
-)
-_HELD_HAZARD = (
-    f"the wrench acts one tick late: it {_CREATES}, and a light tool diverges whatever the device"
-)
+# Rendering methods of the product, and the registry of all methods.
 
 IMPLICIT = Method(
     name="implicit",
@@ -197,62 +189,11 @@ LOSSLESS_COUPLING = Method(
     adds=MIDPOINT_LAG,
 )
 
-METHODS = {
-    method.name: method
-    for method in (
-        IMPLICIT,
-        COMPENSATED,
-        LOSSLESS_COUPLING,
-        Method(
-            name="implicitfast",
-            about="the same actuators under implicitfast: implicit in velocity, not in position",
-            hazard=f"the spring is not solved implicitly: it {_CREATES}",
-            scheme=COUPLED,
-            integrator="implicitfast",
-        ),
-        Method(
-            name="implicitfast:compensated",
-            about="the same actuators under implicitfast with K T more damping, which away from "
-            "contact makes the step equal to that of 'implicit'",
-            hazard="contacts are solved without the coupling's stiffness and may create energy",
-            scheme=COUPLED,
-            integrator="implicitfast",
-            compensated=True,
-            adds=IMPLICIT_LAG,
-        ),
-        *(
-            Method(
-                name="explicit" if integrator == "Euler" else f"explicit:{integrator.lower()}",
-                about=_HELD_ABOUT.format(integrator),
-                hazard=_HELD_HAZARD,
-                scheme=HELD,
-                integrator=integrator,
-            )
-            for integrator in ("Euler", "implicitfast", "RK4")
-        ),
-        Method(
-            name="weld",
-            about="an equality constraint of MuJoCo welds the tool to the handle, under "
-            "implicitfast, with K and B as its solref; how stiff it truly is depends on the tool's "
-            "mass and on the constraint's impedance",
-            hazard="the weld's stiffness is not the one asked for but mass times K/(1 - impedance) "
-            "as measured, and no coupling law proves what the device needs",
-            scheme=WELD,
-            integrator="implicitfast",
-            discretization="none",
-        ),
-        Method(
-            name="direct",
-            about="a tool without mass that is where the handle is, pushed back by a spring per "
-            "contact; there is no coupling",
-            hazard="geometry decides what the device needs: two contacts a distance L apart are "
-            "stable only for L <= 2 sqrt(b_theta / (T K_c))",
-            scheme=DIRECT,
-            integrator="discrete",
-            discretization="none",
-        ),
-    )
-}
+METHODS = {method.name: method for method in (IMPLICIT, COMPENSATED, LOSSLESS_COUPLING)}
+"""Registered methods by name. ``COMPARISONS`` adds its own when it is imported."""
+
+COMPARISONS = "hapticbridge.lab.methods"
+"""Module of the methods that exist only to be compared; it registers them in ``METHODS``."""
 
 
 def default_method(substeps: int = 1) -> Method:
@@ -272,13 +213,19 @@ def default_method(substeps: int = 1) -> Method:
     return LOSSLESS_COUPLING if substeps == 1 else IMPLICIT
 
 
+def method_names() -> tuple[str, ...]:
+    """Returns the names of all methods, those of ``COMPARISONS`` included."""
+    import_module(COMPARISONS)
+    return tuple(METHODS)
+
+
 def method_named(name: str) -> Method:
     """Returns a method by its name.
 
     Raises:
         SceneError: The name is unknown; the message lists the methods.
     """
-    if name not in METHODS:
+    if name not in METHODS and name not in method_names():
         raise SceneError(f"no method is called '{name}'; methods: {choices(METHODS)}")
     return METHODS[name]
 

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import HapticBridgeError, RecordingError
+from hapticbridge.files import read_json
 from hapticbridge.kernel.codes import WELD
 from hapticbridge.kernel.parameters import UNGUARDED, GuardParameters, RunParameters
 from hapticbridge.kernel.state import BoundKernel
@@ -113,8 +114,8 @@ def meta_numbers(meta: Mapping[str, str], name: str, count: int) -> tuple[float,
     if text is None:
         raise RecordingError(f"the recording's metadata lack '{name}'")
     try:
-        values = tuple(float(value) for value in json.loads(text))
-    except (ValueError, TypeError, OverflowError, RecursionError):
+        values = tuple(float(value) for value in read_json(text))
+    except (ValueError, TypeError, OverflowError):
         values = ()
     if len(values) != count or not all(math.isfinite(value) for value in values):
         raise RecordingError(

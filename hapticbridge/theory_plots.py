@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from textwrap import wrap
+from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from hapticbridge.coupling import Coupling
@@ -19,6 +19,9 @@ from hapticbridge.theory.spectrum import damping_spectrum
 from hapticbridge.theory.transfer import Discretization
 from hapticbridge.theory.transmission_line import transmission_line_spectrum
 from hapticbridge.theory.z_width import ZWidth
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 _Array = NDArray[np.float64]
 

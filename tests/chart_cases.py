@@ -8,7 +8,7 @@ from hapticbridge.lab.chart import Chart, Extent, measure_chart, open_workload
 from hapticbridge.lab.chart.chart import Cost, Measurement
 from hapticbridge.lab.chart.setting import SHIPPED, Setting
 from hapticbridge.lab.chart.workload import Score, Verdict
-from hapticbridge.rendering import METHODS
+from hapticbridge.lab.methods import METHODS
 
 
 def made_up(

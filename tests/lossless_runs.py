@@ -11,8 +11,9 @@ from scipy.spatial.transform import Rotation
 from hapticbridge.coupling import Coupling
 from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.kernel.tick import simulate
+from hapticbridge.lab.methods import METHODS
 from hapticbridge.record import SAMPLE_DTYPE, TICK_DTYPE
-from hapticbridge.rendering import METHODS, prepare
+from hapticbridge.rendering import prepare
 from hapticbridge.scene import Scene, load_scene
 from hapticbridge.summary import Ledger
 

@@ -19,9 +19,9 @@ from hapticbridge.bridge import Bridge
 from hapticbridge.clock import SimulatedClock
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import SafetyTrip
+from hapticbridge.lab.methods import METHODS
 from hapticbridge.record import CLOCK_FIELDS, TICK_DTYPE
 from hapticbridge.recording import Recording, read_recording
-from hapticbridge.rendering import METHODS
 from hapticbridge.run_description import parameters_of
 from hapticbridge.scene import scene_names
 from hapticbridge.scene.load import scene_path

@@ -14,8 +14,8 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.device.trajectory import pose_at, read_motion
 from hapticbridge.kernel.codes import OK
 from hapticbridge.kernel.tick import after_step, before_step, simulate
+from hapticbridge.lab.methods import METHODS
 from hapticbridge.record import SAMPLE_DTYPE, TICK_DTYPE, TickFlag
-from hapticbridge.rendering import METHODS
 from hapticbridge.scene import load_scene, scene_path
 from hapticbridge.summary import Ledger
 

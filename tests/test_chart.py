@@ -29,7 +29,7 @@ from hapticbridge.lab.chart import (
 )
 from hapticbridge.lab.chart.chart import interleaved_costs, one_core, pareto_front
 from hapticbridge.lab.chart.setting import CONTACTS, SHIPPED, Setting
-from hapticbridge.rendering import METHODS
+from hapticbridge.lab.methods import METHODS
 
 
 def test_front_is_what_no_other_point_beats() -> None:

@@ -18,7 +18,7 @@ from hapticbridge.lab.chart.scene_run import COUPLING, OwnReferences
 from hapticbridge.lab.chart.setting import Setting
 from hapticbridge.lab.chart.workload import Score, Workload
 from hapticbridge.lab.maps.base import set_tool_mass
-from hapticbridge.rendering import METHODS
+from hapticbridge.lab.methods import METHODS
 from hapticbridge.scene import Scene, load_scene
 
 GRID = 4e-3

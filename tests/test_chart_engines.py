@@ -24,7 +24,7 @@ from hapticbridge.lab.chart import (
 )
 from hapticbridge.lab.chart import chart as chart_module
 from hapticbridge.lab.chart.chart import Chart, interleaved_costs
-from hapticbridge.lab.chart.engine_run import EngineRun, PeerWork
+from hapticbridge.lab.chart.engine_run import EngineRun
 from hapticbridge.lab.chart.output import (
     CEILING,
     chart_page,
@@ -34,7 +34,7 @@ from hapticbridge.lab.chart.output import (
     table_of,
 )
 from hapticbridge.lab.chart.setting import Setting
-from hapticbridge.lab.chart.workload import Score, Workload
+from hapticbridge.lab.chart.workload import PeerWork, Score, Workload
 from hapticbridge.lab.engines.base import (
     Engine,
     Simulation,
@@ -44,7 +44,7 @@ from hapticbridge.lab.engines.base import (
     open_engine,
 )
 from hapticbridge.lab.engines.base import Setting as EngineSetting
-from hapticbridge.rendering import METHODS
+from hapticbridge.lab.methods import METHODS
 
 GRID, FINE = 4e-3, 1e-3
 

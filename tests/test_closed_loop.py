@@ -19,8 +19,8 @@ from hapticbridge.device.simulated.hand import HAND_RANGES
 from hapticbridge.errors import DeviceError, StudyError
 from hapticbridge.guard import Limits
 from hapticbridge.lab.closed_loop import PARTS, ClosedLoop, LoopOutcome, Timing
+from hapticbridge.lab.methods import METHODS
 from hapticbridge.record import CLOCK_FIELDS, TICK_DTYPE
-from hapticbridge.rendering import METHODS
 from hapticbridge.scene import load_scene
 from hapticbridge.theory.bounds import minimum_damping
 from hapticbridge.theory.sampled_loop import SampledLoop, WorstHand

@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import SceneError
-from hapticbridge.rendering import METHODS, prepare
+from hapticbridge.lab.methods import METHODS
+from hapticbridge.rendering import prepare
 from hapticbridge.scene import load_scene, scene_names
 from hapticbridge.scene.contacts import (
     SUGGESTED,

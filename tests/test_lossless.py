@@ -17,8 +17,8 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.device import SimulatedDevice
 from hapticbridge.errors import HapticBridgeError
 from hapticbridge.lab.closed_loop import ClosedLoop
+from hapticbridge.lab.methods import METHODS
 from hapticbridge.record import TickFlag
-from hapticbridge.rendering import METHODS
 from hapticbridge.scene import load_scene
 from hapticbridge.theory.sampled_loop import SampledLoop, WorstHand
 

@@ -45,7 +45,7 @@ from hapticbridge.lab.maps.contact_rigs import (
     until_active,
     wall_runs,
 )
-from hapticbridge.rendering import METHODS
+from hapticbridge.lab.methods import METHODS
 from hapticbridge.scene import load_scene
 from hapticbridge.scene.contacts import SUGGESTED
 

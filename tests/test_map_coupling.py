@@ -35,7 +35,7 @@ from hapticbridge.lab.maps.coupling import (
     evaluate,
     points,
 )
-from hapticbridge.rendering import METHODS
+from hapticbridge.lab.methods import METHODS
 from hapticbridge.theory.bounds import maximum_stiffness, minimum_damping
 from hapticbridge.theory.virtual_mass import environment_minimum_damping
 

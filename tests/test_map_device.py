@@ -36,7 +36,7 @@ from hapticbridge.lab.maps.device import (
     settle,
     shaken,
 )
-from hapticbridge.rendering import METHODS
+from hapticbridge.lab.methods import METHODS
 from hapticbridge.scene import load_scene
 from hapticbridge.theory.device_limits import quantization_limit
 

@@ -36,7 +36,7 @@ from hapticbridge.lab.maps.geometry import (
     set_length,
     torque,
 )
-from hapticbridge.rendering import METHODS
+from hapticbridge.lab.methods import METHODS
 from hapticbridge.scene import load_scene
 from hapticbridge.theory.bounds import minimum_damping
 

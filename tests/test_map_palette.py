@@ -9,7 +9,7 @@ from matplotlib.colors import to_rgb
 from numpy.typing import NDArray
 
 from hapticbridge.lab.maps.base import COLOURS, METHOD_COLOURS, THEORY_COLOUR
-from hapticbridge.rendering import METHODS
+from hapticbridge.lab.methods import METHODS
 
 TOLD_APART = 20.0
 """Distance in CIELAB from which on two colours of thin lines do not pass for each other: about ten

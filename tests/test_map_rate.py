@@ -36,7 +36,7 @@ from hapticbridge.lab.maps.rate import (
     wall_limit,
     worst_hand,
 )
-from hapticbridge.rendering import METHODS
+from hapticbridge.lab.methods import METHODS
 from hapticbridge.scene import Scene, load_scene
 from hapticbridge.theory.sampled_loop import SampledLoop, WorstHand
 

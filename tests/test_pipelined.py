@@ -18,9 +18,9 @@ from hapticbridge.errors import SafetyTrip
 from hapticbridge.guard import Limits
 from hapticbridge.kernel.codes import COUPLED, DIRECT, WELD
 from hapticbridge.kernel.tick import can_split, is_sound
+from hapticbridge.lab.methods import METHODS
 from hapticbridge.record import TICK_DTYPE
 from hapticbridge.recording import read_recording
-from hapticbridge.rendering import METHODS
 
 TICKS = 400
 

@@ -22,6 +22,7 @@ from bridge_runs import fast, sway
 from hapticbridge.bridge import Bridge
 from hapticbridge.clock import RealClock, SimulatedClock
 from hapticbridge.errors import HapticBridgeError, SceneError
+from hapticbridge.lab.methods import METHODS
 from hapticbridge.realtime import (
     Grant,
     check_pace,
@@ -42,7 +43,7 @@ from hapticbridge.realtime.realtime import (
     rate_for,
 )
 from hapticbridge.recording import read_recording
-from hapticbridge.rendering import METHODS, prepare
+from hapticbridge.rendering import prepare
 from hapticbridge.scene import load_scene
 from hapticbridge.view.window import Address, Window
 

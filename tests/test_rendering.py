@@ -27,8 +27,13 @@ from hapticbridge.kernel.codes import OK
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.kernel.tick import after_step, before_step
+from hapticbridge.lab.methods import METHODS
 from hapticbridge.recording import read_recording
-from hapticbridge.rendering import IMPLICIT, METHODS, method_named, prepare
+from hapticbridge.rendering import (
+    IMPLICIT,
+    method_named,
+    prepare,
+)
 
 HAZARDOUS = [name for name in METHODS if METHODS[name].hazard]
 PROVEN = ("implicit", "compensated", "lossless")

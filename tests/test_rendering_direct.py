@@ -31,7 +31,11 @@ from hapticbridge.device import Motion, SimulatedDevice
 from hapticbridge.errors import SceneError
 from hapticbridge.guard import Limits
 from hapticbridge.lab.closed_loop import ClosedLoop, Timing
-from hapticbridge.rendering import METHODS, method_named, prepare
+from hapticbridge.lab.methods import METHODS
+from hapticbridge.rendering import (
+    method_named,
+    prepare,
+)
 from hapticbridge.scene import load_scene
 
 

@@ -28,8 +28,13 @@ from hapticbridge.errors import SceneError
 from hapticbridge.kernel.codes import OK
 from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.kernel.tick import after_step, before_step
+from hapticbridge.lab.methods import METHODS
 from hapticbridge.recording import read_recording
-from hapticbridge.rendering import METHODS, check_prepared, method_named, prepare
+from hapticbridge.rendering import (
+    check_prepared,
+    method_named,
+    prepare,
+)
 from hapticbridge.scene import load_scene
 
 

@@ -17,7 +17,8 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.device import SimulatedDevice
 from hapticbridge.errors import CouplingError, HapticBridgeError
 from hapticbridge.lab.closed_loop import ClosedLoop, LoopOutcome
-from hapticbridge.rendering import METHODS, default_method
+from hapticbridge.lab.methods import METHODS
+from hapticbridge.rendering import default_method
 from hapticbridge.scene import load_scene
 from hapticbridge.theory.rigid_body import exact_mass_response
 from hapticbridge.theory.sampled_loop import WorstHand

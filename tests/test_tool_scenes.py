@@ -25,7 +25,7 @@ from hapticbridge.audit import audit
 from hapticbridge.bridge import Bridge
 from hapticbridge.clock import SimulatedClock
 from hapticbridge.coupling import Coupling
-from hapticbridge.rendering import METHODS
+from hapticbridge.lab.methods import METHODS
 from hapticbridge.scene import load_scene
 
 SCENES = ("drawer", "hammer", "open_wrench", "ratchet")

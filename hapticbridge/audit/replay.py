@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -16,6 +15,7 @@ from numpy.typing import NDArray
 from hapticbridge.commands import CHANGES as COMMANDED
 from hapticbridge.commands import EventApplier
 from hapticbridge.errors import HapticBridgeError, RecordingError
+from hapticbridge.files import read_json
 from hapticbridge.inputs import apply_writes
 from hapticbridge.kernel.codes import COUPLING_ACTUATORS
 from hapticbridge.kernel.parameters import RunParameters
@@ -107,8 +107,8 @@ def check_start(recording: RecordingFile, state: NDArray[np.void]) -> None:
 def is_same_processor(recording: RecordingFile) -> bool:
     """Returns True if the recording's processor model is this one or not stated."""
     try:
-        return bool(json.loads(recording.meta["host"])["processor"] == processor())
-    except (KeyError, TypeError, ValueError, RecursionError):
+        return bool(read_json(recording.meta["host"])["processor"] == processor())
+    except (KeyError, TypeError, ValueError):
         return True
 
 
@@ -249,8 +249,8 @@ class Resimulator:
 def obstacle(recording: RecordingFile) -> str:
     """Returns the reason why a run cannot be simulated again here; empty if it can."""
     try:
-        recorded = dict(json.loads(recording.meta.get("versions", "")))
-    except (ValueError, TypeError, RecursionError):
+        recorded = dict(read_json(recording.meta.get("versions", "")))
+    except (ValueError, TypeError):
         return "the metadata name no versions"
     present = versions()
     for name in DECISIVE:

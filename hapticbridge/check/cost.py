@@ -6,11 +6,10 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
 import mujoco
 import numpy as np
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from hapticbridge.check.observe import not_finite, rehearsal_parameters
@@ -27,6 +26,10 @@ from hapticbridge.record import TICK_DTYPE
 from hapticbridge.recording import TAIL, Ring
 from hapticbridge.recording.recorder import NOBODY_READS
 from hapticbridge.scene import Scene
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 
 # Statistics of tick times.
 

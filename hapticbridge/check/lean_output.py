@@ -6,13 +6,10 @@ import csv
 import os
 from collections.abc import Iterable
 from pathlib import Path, PurePath
+from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.ticker import FuncFormatter
 
 from hapticbridge.check.lean import (
     CREATES,
@@ -31,7 +28,14 @@ from hapticbridge.errors import SceneError
 from hapticbridge.plotting import new_figure
 from hapticbridge.scene import SceneSource, read_scene
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
+
+
 # Plot of cost against felt error.
+
 
 _COLOURS = {
     MAY_GO: "#26a269",
@@ -80,7 +84,7 @@ def draw_lean(lean: Lean, name: str) -> Figure:
                 alpha=0.8,
             )
     _write_names(axes, points)
-    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
     axes.set_xlabel("cost (processor time, % of the scene as it is)")
     axes.set_ylabel("felt error (just noticeable differences)")
     axes.set_title(f"{name}: what could go without being felt", loc="left", fontsize=11)
@@ -132,6 +136,8 @@ def _write_names(axes: Axes, points: list[tuple[str, VariantVerdict, str]]) -> N
 
 
 def _legend(points: list[tuple[str, VariantVerdict, str]], lean: Lean) -> list[Line2D]:
+    from matplotlib.lines import Line2D  # noqa: PLC0415 - for a picture alone
+
     verdicts = list(dict.fromkeys(trial.verdict for _, trial, kind in points if not kind))
     handles = [
         Line2D(

@@ -9,11 +9,10 @@ import textwrap
 from collections import Counter
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Annotated, ClassVar
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import numpy as np
 import tyro
-from matplotlib.figure import Figure
 from rich.table import Table
 
 from hapticbridge.certificate import default_coupling
@@ -49,6 +48,10 @@ from hapticbridge.errors import SceneError
 from hapticbridge.plotting import check_ending, write_picture
 from hapticbridge.scene import read_scene, settings_from
 from hapticbridge.units import format_si
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 
 # How ``hapticbridge check --lean`` looks for less, and says what it found.
 

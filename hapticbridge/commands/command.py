@@ -9,6 +9,7 @@ from typing import Any
 
 from hapticbridge.arguments import Arguments, shown
 from hapticbridge.errors import CommandError, choices
+from hapticbridge.files import read_json
 
 LONGEST_LINE = 250
 """Largest size of a line in bytes; the longest command has about 170."""
@@ -123,10 +124,10 @@ def command_of(line: bytes) -> Command:
     if len(line) > LONGEST_LINE:
         raise CommandError(f"a command has at most {LONGEST_LINE} bytes")
     try:
-        said: Any = json.loads(line)
+        said: Any = read_json(line)
         name = said.pop("command")
         kind = KINDS[name]
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
+    except (ValueError, KeyError, TypeError, AttributeError):
         raise CommandError(
             f"{shown(line)} is not a command; choose one of {choices(KINDS)}"
         ) from None

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.errors import DeviceError, choices
+from hapticbridge.files import read_json
 
 # Data sheet of a haptic device.
 
@@ -208,8 +209,8 @@ class DeviceInfo:
                 optional), or a value is invalid.
         """
         try:
-            values = json.loads(text)
-        except (ValueError, RecursionError) as error:
+            values = read_json(text)
+        except ValueError as error:
             raise DeviceError(f"device data is not JSON: {error}") from None
         if not isinstance(values, dict):
             raise DeviceError(f"device data is not a JSON object but {values!r:.60}")

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from hapticbridge.device.profile import Profile, Quantity
 from hapticbridge.identify.fit import AxisFit, Estimate, noise_of, windows
 from hapticbridge.identify.identify import UNHELD, Identification
 from hapticbridge.plotting import new_figure
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+
 # Plot of the identified law: resistance of each axis over its speed.
+
 
 _COLOURS = {"x": "#a51d2d", "y": "#1b7837", "z": "#1a5fb4"}
 

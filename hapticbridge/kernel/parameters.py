@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from hapticbridge.arguments import Arguments
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import HapticBridgeError
+from hapticbridge.files import read_json
 from hapticbridge.kernel.codes import COUPLED, DIRECT, HELD, LOSSLESS, WELD, has_law, laws_per_tick
 
 # What the guard does within a tick, as numbers: part of what decides what a run computes.
@@ -130,8 +131,8 @@ class GuardParameters:
             HapticBridgeError: The text is not that, or a value is out of range.
         """
         try:
-            values = dict(json.loads(text))
-        except (ValueError, TypeError, RecursionError):
+            values = dict(read_json(text))
+        except (ValueError, TypeError):
             values = {}
         names = {field.name for field in fields(cls)}
         if not names - LATER <= values.keys() <= names:

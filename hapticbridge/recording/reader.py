@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,6 +12,7 @@ from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
 from hapticbridge.errors import RecordingError
+from hapticbridge.files import read_json
 from hapticbridge.record import TICK_DTYPE
 from hapticbridge.recording import format as layout
 from hapticbridge.recording.container import MAGIC, Block, Container, DamageError, Fields, FileBytes
@@ -170,8 +170,8 @@ class Contents:
 
     def _add_event(self, payload: bytes) -> None:
         try:
-            event = json.loads(payload)
-        except (ValueError, RecursionError) as error:
+            event = read_json(payload)
+        except ValueError as error:
             raise DamageError("an event is not JSON") from error
         if not isinstance(event, dict):
             raise DamageError("an event is not a JSON object")

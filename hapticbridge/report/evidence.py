@@ -5,12 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import mujoco
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from hapticbridge.audit import AuditReport
@@ -28,7 +26,13 @@ from hapticbridge.rendering import Method, method_named
 from hapticbridge.run_description import MODEL_ATTACHMENT, STARTS, meta_start, parameters_of
 from hapticbridge.summary import coupling_sentences, was_always_held
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+
 # Curves of a recording over time, reduced without loss of peaks.
+
 
 BINS = 1500
 """Largest number of bins per curve. Each bin draws its minimum and maximum, so no peak is lost.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 
 from hapticbridge.audit import AuditReport
 from hapticbridge.device import DATA_SHEET_UNITS
+from hapticbridge.files import read_json
 from hapticbridge.guard import CONTROLLERS
 from hapticbridge.record import TickFlag
 from hapticbridge.report.evidence import Evidence
@@ -91,8 +91,8 @@ _GUARD = {
 def json_object(text: str) -> dict[str, Any]:
     """Parses a JSON object of the metadata; returns an empty one if it is damaged."""
     try:
-        return dict(json.loads(text))
-    except (ValueError, TypeError, RecursionError):
+        return dict(read_json(text))
+    except (ValueError, TypeError):
         return {}
 
 

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jinja2 import Environment, PackageLoader, select_autoescape
 
 from hapticbridge.audit import AuditReport
 from hapticbridge.errors import RecordingError
@@ -64,6 +63,8 @@ def write_page(path: Path, template: str, **told: object) -> None:
         RecordingError: The page cannot be written, or not under this name.
     """
     check_page_name(path)
+    from jinja2 import Environment, PackageLoader, select_autoescape  # noqa: PLC0415 - for pages
+
     environment = Environment(
         loader=PackageLoader("hapticbridge", "templates"), autoescape=select_autoescape()
     )

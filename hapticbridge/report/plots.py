@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from hapticbridge.audit import AuditReport
@@ -13,6 +13,11 @@ from hapticbridge.audit.motion import turn_between
 from hapticbridge.plotting import new_figure
 from hapticbridge.record import TickFlag
 from hapticbridge.report.evidence import AXES, COLOURS, Evidence, decimated, finish
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
 
 Array = NDArray[np.float64]
 
@@ -161,6 +166,7 @@ def draw_motion(evidence: Evidence) -> Figure:
 
 
 # Plot of lateness and of active limits.
+
 
 FLAGS = (
     (TickFlag.RAMPING, "force rises"),

@@ -185,11 +185,11 @@ def _submitted(
                 chunks.popleft()
             for future in wait(running, return_when=FIRST_COMPLETED).done:
                 chunk = running[future]
-                error = future.exception()
-                if isinstance(error, BrokenExecutor):
+                problem = future.exception()
+                if isinstance(problem, BrokenExecutor):
                     lost = [*lost, *chunk]
-                elif error is not None:
-                    yield chunk, [_failure(error)] * len(chunk)
+                elif problem is not None:
+                    yield chunk, [_failure(problem)] * len(chunk)
                 else:
                     yield chunk, future.result()
                 del running[future]

@@ -5,10 +5,9 @@ from __future__ import annotations
 import base64
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from hapticbridge.errors import RecordingError
 from hapticbridge.plotting import inline_svg, new_figure, write_picture
@@ -19,6 +18,10 @@ from hapticbridge.report.page import moment_of, write_page
 from hapticbridge.report.plots import BINS as PLOT_BINS
 from hapticbridge.units import format_si
 from hapticbridge.whatif.what_if import WhatIf, WhatIfRun
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 
 # Table of a what-if's runs.
 

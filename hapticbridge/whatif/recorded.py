@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import math
 import warnings
 from collections.abc import Callable
@@ -16,6 +15,7 @@ from hapticbridge.clock import period_of
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import HapticBridgeError, RecordingError
+from hapticbridge.files import read_json
 from hapticbridge.guard import CONTROLLERS, Limits, guard_parameters_for
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.pose import IDENTITY_POSE
@@ -118,7 +118,7 @@ class RecordedRun:
         step = parameters.period / parameters.substeps
         try:
             info = DeviceInfo.from_json(recording.meta.get("device", ""))
-            values = dict(json.loads(recording.meta.get("scene_parameters", "{}")))
+            values = dict(read_json(recording.meta.get("scene_parameters", "{}")))
         except (HapticBridgeError, ValueError, TypeError) as error:
             raise RecordingError(f"the metadata do not describe a run: {error}") from None
         settings = Settings(

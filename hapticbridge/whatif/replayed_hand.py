@@ -13,8 +13,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter1d
-from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from hapticbridge.bridge import Bridge
@@ -283,6 +281,9 @@ def _wanted(
 
     The rule is stable, and it suppresses the noise of central differences at half the rate.
     """
+    from scipy.ndimage import gaussian_filter1d  # noqa: PLC0415 - with scipy.signal 0.6 s
+    from scipy.signal import lfilter  # noqa: PLC0415
+
     inertia, damping, hand_damping, stiffness, friction = law
     padded = np.concatenate([moved[:1], moved, moved[-1:]])
     velocity = (padded[2:] - padded[:-2]) / (2 * period)

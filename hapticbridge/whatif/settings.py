@@ -9,7 +9,7 @@ from dataclasses import dataclass, fields, replace
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import RecordingError, choices
 from hapticbridge.guard import CONTROLLERS
-from hapticbridge.rendering import METHODS, Method, method_named
+from hapticbridge.rendering import Method, method_named, method_names
 
 UNITS = {
     "stiffness": "N/m",
@@ -131,7 +131,7 @@ def changes_from(words: Iterable[str]) -> dict[str, Value]:
 
 def _checked(name: str, value: Value) -> Value:
     """Converts a value to the type of its setting; the bridge checks its range."""
-    named: dict[str, Collection[object]] = {"method": METHODS, "controller": CONTROLLERS}
+    named: dict[str, Collection[object]] = {"method": method_names(), "controller": CONTROLLERS}
     if name in named:
         if value not in named[name]:
             raise RecordingError(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import json
 import socket
 import sys
 import time
@@ -12,6 +11,7 @@ from typing import Any, Protocol
 from hapticbridge.device.transport.trace import HexLog
 from hapticbridge.device.transport.usb import SWITCH_INTERVAL
 from hapticbridge.errors import DeviceError, DeviceLost
+from hapticbridge.files import read_json
 
 OPEN_TIMEOUT = 1.0
 """Longest time in s for the connection and for the handshake, each. A local program answers in
@@ -193,8 +193,8 @@ def decoded(message: str, name: str) -> dict[str, Any]:
         DeviceError: The message is not a JSON object.
     """
     try:
-        value = json.loads(message)
-    except (ValueError, RecursionError):
+        value = read_json(message)
+    except ValueError:
         value = None
     if not isinstance(value, dict):
         raise DeviceError(f"{name} sent a message that is not a JSON object: {message!r:.60}")

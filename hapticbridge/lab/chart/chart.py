@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from hapticbridge.check.observe import quiet
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import HapticBridgeError, StudyError
-from hapticbridge.lab.chart.engine_run import EngineRun, PeerWork
+from hapticbridge.lab.chart.engine_run import EngineRun
 from hapticbridge.lab.chart.setting import OWN, SHIPPED, Setting, who
-from hapticbridge.lab.chart.workload import PASSIVE, Panel, Run, Score, Workload
+from hapticbridge.lab.chart.workload import PASSIVE, Panel, PeerWork, Run, Score, Workload
 from hapticbridge.lab.engines.base import Engine, open_engine
 from hapticbridge.run_description import processor
 

@@ -15,10 +15,22 @@ from hapticbridge.check.perception import WEBER
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Motion
 from hapticbridge.errors import StudyError
-from hapticbridge.lab.chart.engine_run import PeerWork, motion_along
+from hapticbridge.lab.chart.engine_run import motion_along
 from hapticbridge.lab.chart.free_bodies import still
-from hapticbridge.lab.chart.scene_run import Stage, Staged, Stages, Take
-from hapticbridge.lab.chart.workload import Panel, Score, Verdict, diverged, score_of
+from hapticbridge.lab.chart.scene_run import (
+    Stage,
+    Staged,
+    Stages,
+)
+from hapticbridge.lab.chart.workload import (
+    Panel,
+    PeerWork,
+    Score,
+    Take,
+    Verdict,
+    diverged,
+    score_of,
+)
 from hapticbridge.lab.engines.base import Body, Pose, Shape, Task, Velocity
 from hapticbridge.lab.maps.base import scene_of
 from hapticbridge.pose import quaternion_exp

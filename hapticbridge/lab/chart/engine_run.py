@@ -12,13 +12,18 @@ from numpy.typing import NDArray
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Motion
 from hapticbridge.errors import HapticBridgeError, StudyError
-from hapticbridge.lab.chart.scene_run import Judge, Path, PeerWork, Take
+from hapticbridge.lab.chart.scene_run import Path
 from hapticbridge.lab.chart.setting import Setting
-from hapticbridge.lab.chart.workload import Score
+from hapticbridge.lab.chart.workload import (
+    Judge,
+    PeerWork,
+    Score,
+    Take,
+)
 from hapticbridge.lab.engines.base import Engine, Pose, Simulation, Task, Velocity, composed
 from hapticbridge.lab.engines.from_scene import task_from_scene
+from hapticbridge.lab.methods import METHODS
 from hapticbridge.record import TICK_DTYPE
-from hapticbridge.rendering import METHODS
 from hapticbridge.scene import Scene
 
 HELD = METHODS["explicit"]

@@ -14,9 +14,13 @@ from scipy.spatial.transform import Rotation
 from hapticbridge.check.perception import FORCE_FLOOR, LEVER, tool_angles
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import StudyError
-from hapticbridge.lab.chart.engine_run import PeerWork, work_of
-from hapticbridge.lab.chart.scene_run import Stage, Staged, Stages, Take
-from hapticbridge.lab.chart.workload import Panel, Score, diverged, score_of
+from hapticbridge.lab.chart.engine_run import work_of
+from hapticbridge.lab.chart.scene_run import (
+    Stage,
+    Staged,
+    Stages,
+)
+from hapticbridge.lab.chart.workload import Panel, PeerWork, Score, Take, diverged, score_of
 from hapticbridge.lab.engines.base import Velocity
 from hapticbridge.lab.maps.base import free_body, scene_of
 from hapticbridge.record import TICK_DTYPE

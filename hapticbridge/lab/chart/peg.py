@@ -12,16 +12,15 @@ from scipy.spatial.transform import Rotation
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import StudyError
-from hapticbridge.lab.chart.engine_run import PeerWork, work_of
+from hapticbridge.lab.chart.engine_run import work_of
 from hapticbridge.lab.chart.scene_run import (
     REFERENCE_REFINEMENT,
     OwnReferences,
     Stage,
     Staged,
     Stages,
-    Take,
 )
-from hapticbridge.lab.chart.workload import Panel, Score, diverged, score_of
+from hapticbridge.lab.chart.workload import Panel, PeerWork, Score, Take, diverged, score_of
 from hapticbridge.record import TICK_DTYPE
 from hapticbridge.scene import Scene, load_scene
 

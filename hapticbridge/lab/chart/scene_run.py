@@ -34,9 +34,14 @@ from hapticbridge.lab.chart.workload import (
     diverged,
     score_of,
 )
+from hapticbridge.lab.methods import METHODS
 from hapticbridge.options import run_parameters
 from hapticbridge.record import SAMPLE_DTYPE, TICK_DTYPE
-from hapticbridge.rendering import IMPLICIT, METHODS, Method, prepare
+from hapticbridge.rendering import (
+    IMPLICIT,
+    Method,
+    prepare,
+)
 from hapticbridge.scene import Scene, load_scene
 from hapticbridge.summary import Ledger
 

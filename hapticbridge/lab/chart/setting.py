@@ -11,7 +11,11 @@ from numpy.typing import NDArray
 
 from hapticbridge.errors import StudyError
 from hapticbridge.kernel.codes import DIRECT, LOSSLESS
-from hapticbridge.rendering import METHODS, Method, method_named
+from hapticbridge.lab.methods import METHODS
+from hapticbridge.rendering import (
+    Method,
+    method_named,
+)
 from hapticbridge.scene import Scene
 
 OWN = "hapticbridge"

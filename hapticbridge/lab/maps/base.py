@@ -26,8 +26,8 @@ from hapticbridge.errors import StudyError
 from hapticbridge.files import finite_or_null
 from hapticbridge.lab.closed_loop import ClosedLoop
 from hapticbridge.lab.folder import prepared_folder
+from hapticbridge.lab.methods import METHODS
 from hapticbridge.plotting import write_picture
-from hapticbridge.rendering import METHODS
 from hapticbridge.scene import Scene, load_scene
 from hapticbridge.scene.load import scene_path
 from hapticbridge.sweep.results import Table, check_format

@@ -51,8 +51,8 @@ from hapticbridge.lab.maps.contact_rigs import (
     until_active,
     wall_runs,
 )
+from hapticbridge.lab.methods import METHODS
 from hapticbridge.plotting import new_figure
-from hapticbridge.rendering import METHODS
 from hapticbridge.scene.contacts import (
     HEAVY_SLACK_STEPS,
     SLACK_STEPS,

@@ -18,7 +18,7 @@ from hapticbridge.device.trajectory import read_motion
 from hapticbridge.guard import UNLIMITED
 from hapticbridge.lab.closed_loop import ClosedLoop
 from hapticbridge.lab.maps.base import loop_in, set_tool_mass, swinging
-from hapticbridge.rendering import METHODS
+from hapticbridge.lab.methods import METHODS
 from hapticbridge.scene import scene_path
 from hapticbridge.scene.contacts import ContactNumbers, contact_numbers
 

@@ -38,8 +38,8 @@ from hapticbridge.lab.maps.base import (
     wall_loop,
 )
 from hapticbridge.lab.maps.tool_mass import felt, worst_angle
+from hapticbridge.lab.methods import METHODS
 from hapticbridge.plotting import new_figure
-from hapticbridge.rendering import METHODS
 from hapticbridge.sweep.results import Table
 from hapticbridge.theory.sampled_loop import WorstHand
 

@@ -35,8 +35,8 @@ from hapticbridge.lab.maps.base import (
     used_damping,
     wall_loop,
 )
+from hapticbridge.lab.methods import METHODS
 from hapticbridge.plotting import new_figure
-from hapticbridge.rendering import METHODS
 from hapticbridge.sweep.results import Table
 from hapticbridge.theory.device_limits import quantization_limit
 

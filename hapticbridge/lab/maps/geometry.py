@@ -36,8 +36,8 @@ from hapticbridge.lab.maps.base import (
     verdict_legend,
     verdict_numbers,
 )
+from hapticbridge.lab.methods import METHODS
 from hapticbridge.plotting import new_figure
-from hapticbridge.rendering import METHODS
 from hapticbridge.sweep.results import Table
 from hapticbridge.theory.sampled_loop import WorstHand
 

@@ -35,8 +35,8 @@ from hapticbridge.lab.maps.base import (
     say_missing,
     wall_loop,
 )
+from hapticbridge.lab.methods import METHODS
 from hapticbridge.plotting import new_figure
-from hapticbridge.rendering import METHODS
 from hapticbridge.sweep.results import Table
 from hapticbridge.theory.bounds import maximum_stiffness, minimum_damping
 from hapticbridge.theory.sampled_loop import SampledLoop, WorstHand

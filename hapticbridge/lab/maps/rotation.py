@@ -32,11 +32,12 @@ from hapticbridge.lab.maps.base import (
     verdict_legend,
     verdict_numbers,
 )
+from hapticbridge.lab.methods import METHODS
 from hapticbridge.options import run_parameters
 from hapticbridge.plotting import new_figure
 from hapticbridge.pose import IDENTITY_POSE
 from hapticbridge.record import SAMPLE_DTYPE, TICK_DTYPE
-from hapticbridge.rendering import METHODS, prepare
+from hapticbridge.rendering import prepare
 from hapticbridge.scene import Scene
 from hapticbridge.summary import Ledger
 from hapticbridge.sweep.results import Table

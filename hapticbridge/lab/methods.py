@@ -1,0 +1,71 @@
+"""Rendering methods that exist only to be compared; importing this module registers them."""
+
+from __future__ import annotations
+
+from hapticbridge.kernel.codes import COUPLED, DIRECT, HELD, WELD
+from hapticbridge.rendering import METHODS, Method
+from hapticbridge.theory.compensation import IMPLICIT_LAG
+
+__all__ = ["METHODS"]
+
+_CREATES = "creates energy in free motion, more the lighter the tool and the stiffer the coupling"
+_HELD_ABOUT = (
+    "the wrench of the coupling law, computed after each step and applied as a force during the "
+    "next tick, held; under MuJoCo's integrator {}"
+)
+_HELD_HAZARD = (
+    f"the wrench acts one tick late: it {_CREATES}, and a light tool diverges whatever the device"
+)
+
+_COMPARED = (
+    Method(
+        name="implicitfast",
+        about="the same actuators under implicitfast: implicit in velocity, not in position",
+        hazard=f"the spring is not solved implicitly: it {_CREATES}",
+        scheme=COUPLED,
+        integrator="implicitfast",
+    ),
+    Method(
+        name="implicitfast:compensated",
+        about="the same actuators under implicitfast with K T more damping, which away from "
+        "contact makes the step equal to that of 'implicit'",
+        hazard="contacts are solved without the coupling's stiffness and may create energy",
+        scheme=COUPLED,
+        integrator="implicitfast",
+        compensated=True,
+        adds=IMPLICIT_LAG,
+    ),
+    *(
+        Method(
+            name="explicit" if integrator == "Euler" else f"explicit:{integrator.lower()}",
+            about=_HELD_ABOUT.format(integrator),
+            hazard=_HELD_HAZARD,
+            scheme=HELD,
+            integrator=integrator,
+        )
+        for integrator in ("Euler", "implicitfast", "RK4")
+    ),
+    Method(
+        name="weld",
+        about="an equality constraint of MuJoCo welds the tool to the handle, under "
+        "implicitfast, with K and B as its solref; how stiff it truly is depends on the tool's "
+        "mass and on the constraint's impedance",
+        hazard="the weld's stiffness is not the one asked for but mass times K/(1 - impedance) "
+        "as measured, and no coupling law proves what the device needs",
+        scheme=WELD,
+        integrator="implicitfast",
+        discretization="none",
+    ),
+    Method(
+        name="direct",
+        about="a tool without mass that is where the handle is, pushed back by a spring per "
+        "contact; there is no coupling",
+        hazard="geometry decides what the device needs: two contacts a distance L apart are "
+        "stable only for L <= 2 sqrt(b_theta / (T K_c))",
+        scheme=DIRECT,
+        integrator="discrete",
+        discretization="none",
+    ),
+)
+
+METHODS.update((method.name, method) for method in _COMPARED)
