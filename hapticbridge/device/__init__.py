@@ -1,12 +1,4 @@
-"""Haptic devices: real, simulated and replayed, behind one protocol.
-
-Read ``base`` (four calls) and ``data_sheet`` (a device's properties) first, then ``simulated`` and
-``trajectory``, which need no hardware. ``rawhid`` is the simplest real driver. Real drivers use
-``transport``, which finds devices and carries their bytes. ``families`` lists the drivers and
-``plugged`` the connected devices. ``library`` opens a device by its ``specification`` and completes
-its sheet from a ``profile`` (``profile_search``). ``lateness``, ``silence`` and ``last_word`` are
-shared by all.
-"""
+"""Haptic devices: real, simulated and replayed, behind one protocol."""
 
 from hapticbridge.device.base import Device as Device
 from hapticbridge.device.data_sheet import AXES as AXES

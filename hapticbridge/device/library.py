@@ -96,11 +96,6 @@ def device_for(scene: Scene, spec: str, tell: Tell = tell_nobody) -> Device:
     The hand is the scene's (``scene_hand``) and follows ``NAME.csv`` beside the scene, if present.
     Every option in the specification takes precedence over the scene.
 
-    Args:
-        scene: The scene that the device will move in.
-        spec: A specification for ``open_device``.
-        tell: Receives messages for the user.
-
     Raises:
         DeviceError: As for ``open_device``.
         SceneError: The scene specifies an impossible hand.

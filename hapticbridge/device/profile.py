@@ -1,7 +1,7 @@
 """Device profile: properties of a device type or of one unit, each number with its source.
 
-A profile is a TOML file (``profile_search`` lists the places). It supplies numbers that a driver
-cannot read, above all the damping b.
+A profile is a TOML file (``profiles`` lists them). It supplies numbers that a driver cannot read,
+above all the damping b.
 
     format = 1
     name = "Novint Falcon"

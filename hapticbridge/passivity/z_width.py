@@ -1,7 +1,7 @@
 """Z-width: the stiffness and damping that a device can render, and its limits.
 
 B is the damping of the coupling's law. For a method that adds damping by integration it is B', and
-the effective damping is higher (``compensation``); the printed sentences use B'.
+the effective damping is ``felt_damping``; the printed sentences use B'.
 """
 
 from __future__ import annotations

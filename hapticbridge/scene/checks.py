@@ -190,15 +190,9 @@ def _check_coupling_actuator(model: mujoco.MjModel, name: str) -> None:
 
 
 def check_start(model: mujoco.MjModel, data: mujoco.MjData, grip: str) -> None:
-    """Refuses a start that is not finite or in which the tool penetrates a body.
+    """Raises SceneError for a start that is not finite or in which the tool penetrates a body.
 
-    Args:
-        model: The compiled scene.
-        data: Its state at the start, after ``mj_forward``.
-        grip: Name of the site on the tool.
-
-    Raises:
-        SceneError: Names the state or the pair of geoms, with the depth.
+    ``data`` must be at the start, after ``mj_forward``.
     """
     for name in ("qpos", "qvel", "act", "ctrl", "mocap_pos", "mocap_quat", "qacc"):
         if not np.all(np.abs(getattr(data, name)) <= mujoco.mjMAXVAL):
