@@ -255,7 +255,7 @@ def test_running_on_a_device_that_is_not_there_is_one_sentence_that_helps(
     assert (code, out) == (2, "")
     assert err.count("\n") == 1
     assert err.startswith(f"error: no device '{family.name}' is plugged in (looked for ")
-    assert "'hapticbridge devices' lists what is, and what permission is missing" in err
+    assert "'hapticbridge devices' lists connected devices and missing permissions" in err
 
 
 @pytest.mark.parametrize(

@@ -123,7 +123,7 @@ def _open_simulated(rest: str, options: Mapping[str, object]) -> Device:
             **{name.removeprefix(_HAND_PREFIX): value for name, value in changes.items()}
         )
     elif changes:
-        raise DeviceError(f"hand and {choices(changes)} exclude each other")
+        raise DeviceError(f"hand and {choices(changes)} exclude each other; set one of them")
     if parameters["hand"] == "none":
         parameters["hand"] = None
     elif not isinstance(parameters["hand"], Hand | None):

@@ -84,7 +84,7 @@ def fit_axis(position: Array, force: Array, period: float, resolution: float = 0
         return best
     if noise > 0.0:
         raise IdentificationError(
-            f"its position trembles by {noise:.2g} (RMS, m or rad), too much for so small a "
+            f"its position has a noise of {noise:.2g} (RMS, m or rad), too much for so small a "
             "motion; allow more travel or more force, or remove the source of the noise"
         )
     raise IdentificationError(

@@ -27,12 +27,12 @@ def check_options(spec: mujoco.MjSpec) -> list[str]:
     option = spec.option
     if option.solver == mujoco.mjtSolver.mjSOL_PGS:
         raise SceneError(
-            "the scene asks for solver PGS, which leaves the coupling out of the implicit step; "
+            "the scene selects solver PGS, which leaves the coupling out of the implicit step; "
             "use Newton"
         )
     if option.noslip_iterations > 0:
         raise SceneError(
-            f"the scene asks for noslip_iterations={option.noslip_iterations}, which splits the "
+            f"the scene sets noslip_iterations={option.noslip_iterations}, which splits the "
             "implicit step; set it to 0"
         )
     if option.enableflags & mujoco.mjtEnableBit.mjENBL_IPC:
@@ -58,7 +58,7 @@ def check_options(spec: mujoco.MjSpec) -> list[str]:
     warnings = []
     if option.integrator == mujoco.mjtIntegrator.mjINT_RK4:
         warnings.append(
-            "the scene asks for integrator RK4; it runs under 'discrete', the only one that is "
+            "the scene selects integrator RK4; it runs under 'discrete', the only one that is "
             "passive behind the coupling"
         )
     if np.any(np.asarray(option.wind)):

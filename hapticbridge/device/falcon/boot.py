@@ -87,7 +87,7 @@ def read_firmware(path: str) -> bytes:
         raise DeviceError(f"firmware = '{path}': cannot be read ({reason})") from None
     if not 0 < len(image) <= LARGEST_FIRMWARE:
         raise DeviceError(
-            f"firmware = '{path}': has {len(image)} bytes; a Falcon's program has 1 to "
+            f"firmware = '{path}': has {len(image)} bytes; a Falcon's firmware has 1 to "
             f"{LARGEST_FIRMWARE}"
         )
     return image

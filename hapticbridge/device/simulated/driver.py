@@ -113,7 +113,7 @@ class SimulatedDevice:
         duration = None
         is_line = isinstance(hand, WorstHand)
         if rotational_hand is not None and not is_line:
-            raise DeviceError("rotational_hand goes only with a WorstHand as hand")
+            raise DeviceError("rotational_hand requires a WorstHand as hand")
         if is_line and friction:
             raise DeviceError(f"friction = {friction!r} N: a worst hand is linear and has none")
         if hand is not None and not is_line and path is not None:
