@@ -214,7 +214,7 @@ def test_a_hid_device_is_listed_by_the_kernels_word_where_hidapi_is_missing(
     [
         (True, True, None),
         (True, False, "no permission to open"),
-        (False, False, "there is no"),  # as root, who may open all that there is
+        (False, False, "does not exist yet"),  # as root, who may open all that there is
     ],
 )
 def test_a_node_that_is_not_there_yet_is_no_missing_permission(
