@@ -84,13 +84,9 @@ class LastWord:
 
 
 def last_word_at(path: str, *reports: bytes) -> LastWord | None:
-    """Returns a ``LastWord`` if two processes can hold the node; otherwise None.
+    """Returns a ``LastWord`` with these reports if two processes can hold the node; otherwise None.
 
     Without it, the device's own watchdog or the limited duration of its effects ends the force.
-
-    Args:
-        path: The device node.
-        reports: Reports that end the force, each starting with its number.
     """
     if not path.startswith("/dev/hidraw"):
         return None

@@ -96,11 +96,6 @@ def device_for(scene: Scene, spec: str, tell: Tell = tell_nobody) -> Device:
     The hand is the scene's (``scene_hand``) and follows ``NAME.csv`` beside the scene, if present.
     Every option in the specification takes precedence over the scene.
 
-    Args:
-        scene: The scene that the device will move in.
-        spec: A specification for ``open_device``.
-        tell: Receives messages for the user.
-
     Raises:
         DeviceError: As for ``open_device``.
         SceneError: The scene specifies an impossible hand.
@@ -128,7 +123,7 @@ def _open_simulated(rest: str, options: Mapping[str, object]) -> Device:
             **{name.removeprefix(_HAND_PREFIX): value for name, value in changes.items()}
         )
     elif changes:
-        raise DeviceError(f"hand and {choices(changes)} exclude each other")
+        raise DeviceError(f"hand and {choices(changes)} exclude each other; set one of them")
     if parameters["hand"] == "none":
         parameters["hand"] = None
     elif not isinstance(parameters["hand"], Hand | None):

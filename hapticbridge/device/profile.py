@@ -1,7 +1,7 @@
 """Device profile: properties of a device type or of one unit, each number with its source.
 
-A profile is a TOML file (``profile_search`` lists the places). It supplies numbers that a driver
-cannot read, above all the damping b.
+A profile is a TOML file (``profiles`` lists them). It supplies numbers that a driver cannot read,
+above all the damping b.
 
     format = 1
     name = "Novint Falcon"
@@ -187,7 +187,9 @@ def _profile(raw: dict[str, object], path: Path) -> Profile:
 
 def _quantity(name: str, table: object) -> Quantity:
     if not isinstance(table, dict) or not table.keys() <= {"value", "interval", "unit", "source"}:
-        raise DeviceError(f"[{name}] must hold value, source, and perhaps unit and interval")
+        raise DeviceError(
+            f"[{name}] must hold value and source, and optionally unit and interval, and no more"
+        )
     if table.get("unit", UNITS[name]) != UNITS[name]:
         raise DeviceError(f"[{name}] unit = {table['unit']!r}: must be {UNITS[name]!r}")
     source = table.get("source")
@@ -204,10 +206,12 @@ def _quantity(name: str, table: object) -> Quantity:
     if interval is None:
         return Quantity(value, source)
     if not isinstance(interval, list) or len(interval) != 2 or not isinstance(value, float):
-        raise DeviceError(f"[{name}] interval = {interval!r}: must be two numbers about a value")
+        raise DeviceError(
+            f"[{name}] interval = {interval!r}: must be two numbers around a single value"
+        )
     least, most = (float(end) if _is_number(end) else math.nan for end in interval)
     if not least <= value <= most:
-        raise DeviceError(f"[{name}] interval = {interval!r}: must hold the value {value:g}")
+        raise DeviceError(f"[{name}] interval = {interval!r}: must contain the value {value:g}")
     return Quantity(value, source, (least, most))
 
 

@@ -47,12 +47,8 @@ def profile_of(device: str, serial: str = "", model: str = "") -> Profile | None
     """Returns the profile of a unit, else of its driver or model, else None.
 
     The order is the user's ``DEVICE-SERIAL.toml``, then ``DEVICE.toml``, then the shipped profile
-    that names the model. A user's file with the name of a shipped profile replaces it.
-
-    Args:
-        device: Name of the driver.
-        serial: Serial number of the unit; may be empty.
-        model: Model as named by the driver; empty: only a profile for all models of the driver.
+    that names the model. A user's file with the name of a shipped profile replaces it. Without a
+    model, only a profile for all models of the driver fits.
 
     Raises:
         DeviceError: The file is not valid.
@@ -66,11 +62,7 @@ def profile_of(device: str, serial: str = "", model: str = "") -> Profile | None
 
 
 def modelled(device: str) -> tuple[str, ...]:
-    """Returns the models of a driver that have profiles.
-
-    Raises:
-        DeviceError: A file is not valid.
-    """
+    """Returns the models of a driver that have profiles."""
     return tuple(model for found in _by_model(device) for model in found.models)
 
 

@@ -17,12 +17,7 @@ WHOLE = ("delay",)
 
 
 def parsed(device: str, text: str, valid: Iterable[str]) -> dict[str, object]:
-    """Parses the options after a device's name.
-
-    Args:
-        device: The name.
-        text: Options, separated by commas; may be empty.
-        valid: Options that the device has.
+    """Parses the options after a device's name, separated by commas.
 
     Raises:
         DeviceError: A part is not ``name=value``, a name occurs twice or is unknown, or a value is
@@ -57,11 +52,7 @@ def _value(name: str, text: str) -> object:
 
 
 def refuse_unknown(device: str, options: Iterable[str], valid: Iterable[str]) -> None:
-    """Refuses an option that a device does not have.
-
-    Raises:
-        DeviceError: Names the first unknown option, and the valid ones.
-    """
+    """Raises DeviceError for an unknown option; the message lists the valid ones."""
     names = tuple(valid)
     unknown = [name for name in options if name not in names]
     if unknown:

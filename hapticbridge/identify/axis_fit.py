@@ -51,11 +51,7 @@ class AxisFit:
     count: int
 
     def resistance(self, speed: Array) -> Array:
-        """Returns b v + b_2 v |v| + f_c sign(v) in N (N m), with b_2 only if it is significant.
-
-        Args:
-            speed: v in m/s (rad/s).
-        """
+        """Returns b v + b_2 v |v| + f_c sign(v) in N (N m), with b_2 only if it is significant."""
         bend = self.drag.value * (np.abs(speed) - self.drag_speed) if self.drag.is_seen else 0.0
         return np.asarray(
             (self.damping.value + bend) * speed + self.friction.value * np.sign(speed)

@@ -59,25 +59,17 @@ class Estimate:
 
 
 def solved(columns: Array, right: Array) -> Array:
-    """Returns the least-squares factors x of columns · x = right.
-
-    Args:
-        columns: Shape (n, k).
-        right: Shape (n,).
-    """
+    """Returns the least-squares solution x, shape (k,), of columns · x = right."""
     scale = np.linalg.norm(columns, axis=0)
     scale[scale == 0.0] = 1.0
     return np.asarray(np.linalg.lstsq(columns / scale, right, rcond=None)[0] / scale)
 
 
 def half_widths(columns: Array, right: Array) -> Array:
-    """Returns the half-widths of the least-squares factors by a jackknife over ``BLOCKS`` parts.
+    """Returns the half-widths of the least-squares solution by a jackknife over ``BLOCKS`` parts.
 
-    Its only assumption is that distant rows have independent errors.
-
-    Args:
-        columns: Shape (n, k), in the order of time, n >= ``BLOCKS``.
-        right: Shape (n,).
+    The rows, at least ``BLOCKS``, are in the order of time. The only assumption is that distant
+    rows have independent errors.
 
     References:
         Efron & Stein 1981, *The jackknife estimate of variance*.

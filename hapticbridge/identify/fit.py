@@ -53,8 +53,8 @@ _MASS, _DAMPING, _FRICTION, _OFFSET, _DELAY = range(5)
 def fit_axis(position: Array, force: Array, period: float, resolution: float = 0.0) -> AxisFit:
     """Fits M x'' + b x' + f_c sign(x') + c = F(t − d) to a run.
 
-    The windows of ``weak_form`` are solved by least squares; d is adjusted until the factor of its
-    own column vanishes. The intervals come from a jackknife over the parts of the run
+    The windows (``windows``) are solved by least squares; d is adjusted until the factor of its own
+    column vanishes. The intervals come from a jackknife over the parts of the run
     (``half_widths``), ``METHOD_ERROR`` and ``SUM_ERROR``.
 
     A spring k x and a drag b_2 x' |x'| join the law if they are significant. A drag that is not
@@ -84,7 +84,7 @@ def fit_axis(position: Array, force: Array, period: float, resolution: float = 0
         return best
     if noise > 0.0:
         raise IdentificationError(
-            f"its position trembles by {noise:.2g} (RMS, m or rad), too much for so small a "
+            f"its position has a noise of {noise:.2g} (RMS, m or rad), too much for so small a "
             "motion; allow more travel or more force, or remove the source of the noise"
         )
     raise IdentificationError(

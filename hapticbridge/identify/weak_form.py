@@ -168,14 +168,10 @@ def windows(
 
 
 def noise_of(position: Array, resolution: float) -> float:
-    """Returns the RMS of a position's noise in m, 0 if rounding explains it.
+    """Returns the RMS of a position's noise, 0 if rounding to ``resolution`` explains it.
 
     Sixth differences remove a smooth motion and multiply the RMS of white noise by √924. Their
     median ignores the few ticks in which friction reverses.
-
-    Args:
-        position: x in m at the samples, shape (n,); NaN without a sample.
-        resolution: Step of the position in m, 0 if it is exact.
     """
     differences = np.diff(position, 6)
     differences = differences[np.isfinite(differences)]

@@ -1,9 +1,4 @@
-"""Reference mechanics without MuJoCo: integrators of known energy, and impact with friction.
-
-``particle`` and ``rotation`` move a body by four integrators each, ``coupled_mass`` moves a mass
-behind the coupling. ``impact``, on ``normal_path``, is Routh's method with three laws of
-restitution.
-"""
+"""Reference mechanics without MuJoCo: integrators of known energy, and impact with friction."""
 
 from hapticbridge.mechanics.coupled_mass import CoupledMotion as CoupledMotion
 from hapticbridge.mechanics.coupled_mass import drive_mass as drive_mass

@@ -1,12 +1,7 @@
-"""Theory of passive haptic display: device damping required by a sampled coupling.
+"""Theory of passive haptic display, without MuJoCo.
 
-This package does not use MuJoCo. Reading order: ``transfer`` (the sampled coupling), ``spectrum``
-(required damping at each frequency), ``bounds`` (its supremum). ``worst_hand`` and ``sampled_loop``
-find the same limit in the time domain, with ``recursion`` and ``stability``. ``wall``,
-``worst_frequency`` and ``delay`` treat delays, ``virtual_mass`` the integrator of the tool,
-``matrix`` several dimensions. ``compensation`` treats the damping that an integrator adds,
-``transmission_line`` an alternative law. ``quantization``, ``free_device`` and ``passive_line`` are
-the limits of a ``z_width``. ``grid`` validates all arguments.
+``minimum_damping`` and ``maximum_stiffness`` are the central results. ``SampledLoop`` with the
+``WorstHand`` confirms them in the time domain, and ``z_width`` combines all limits of a device.
 """
 
 from hapticbridge.passivity.bounds import maximum_stiffness as maximum_stiffness

@@ -130,19 +130,12 @@ class SampledLoop:
         return np.asarray(transfer * np.exp(-1j * self.delay * theta), dtype=np.complex128)
 
     def damping_spectrum(self, frequency: ArrayLike) -> _Array:
-        """Returns the device damping required at each frequency, for any hand.
+        """Returns the device damping in N s/m required at each frequency ω in rad/s, for any hand.
 
-            b(ω) = (T/2) Re{(1 − e^{−jωT}) H} / (1 − cos ωT)
+            b(ω) = (T/2) Re{(1 − e^{−jωT}) H} / (1 − cos ωT),    0 < ω <= π/T
 
-        Args:
-            frequency: ω in rad/s, 0 < ω <= π/T, any shape.
-
-        Returns:
-            b in N s/m. The loop requires the supremum, provided that the tool is stable behind a
-            fixed handle (``minimum_mass``).
-
-        Raises:
-            CouplingError: A frequency is out of range.
+        The loop requires the supremum, provided that the tool is stable behind a fixed handle
+        (``minimum_mass``).
 
         References:
             Colgate & Schenkel 1997.

@@ -92,12 +92,10 @@ def threshold(holds: Callable[[float], bool], start: float, tolerance: float) ->
 
 
 def decays(force: NDArray[np.float64], samples: int, floor: float = 0.0) -> bool:
-    """Returns whether a force fell from one late window to the next.
+    """Returns whether a force, or a signal linear in it, fell from one late window to the next.
 
-    Args:
-        force: f_k in N, or any signal linear in it. A signal with fewer samples counts as diverged.
-        samples: Expected number of samples.
-        floor: Force in N below which the signal counts as zero.
+    A signal with fewer than the expected ``samples`` counts as diverged; one below ``floor`` in N
+    counts as zero.
     """
     if force.size < samples:
         return False

@@ -27,12 +27,12 @@ def check_options(spec: mujoco.MjSpec) -> list[str]:
     option = spec.option
     if option.solver == mujoco.mjtSolver.mjSOL_PGS:
         raise SceneError(
-            "the scene asks for solver PGS, which leaves the coupling out of the implicit step; "
+            "the scene selects solver PGS, which leaves the coupling out of the implicit step; "
             "use Newton"
         )
     if option.noslip_iterations > 0:
         raise SceneError(
-            f"the scene asks for noslip_iterations={option.noslip_iterations}, which splits the "
+            f"the scene sets noslip_iterations={option.noslip_iterations}, which splits the "
             "implicit step; set it to 0"
         )
     if option.enableflags & mujoco.mjtEnableBit.mjENBL_IPC:
@@ -58,7 +58,7 @@ def check_options(spec: mujoco.MjSpec) -> list[str]:
     warnings = []
     if option.integrator == mujoco.mjtIntegrator.mjINT_RK4:
         warnings.append(
-            "the scene asks for integrator RK4; it runs under 'discrete', the only one that is "
+            "the scene selects integrator RK4; it runs under 'discrete', the only one that is "
             "passive behind the coupling"
         )
     if np.any(np.asarray(option.wind)):
@@ -190,15 +190,9 @@ def _check_coupling_actuator(model: mujoco.MjModel, name: str) -> None:
 
 
 def check_start(model: mujoco.MjModel, data: mujoco.MjData, grip: str) -> None:
-    """Refuses a start that is not finite or in which the tool penetrates a body.
+    """Raises SceneError for a start that is not finite or in which the tool penetrates a body.
 
-    Args:
-        model: The compiled scene.
-        data: Its state at the start, after ``mj_forward``.
-        grip: Name of the site on the tool.
-
-    Raises:
-        SceneError: Names the state or the pair of geoms, with the depth.
+    ``data`` must be at the start, after ``mj_forward``.
     """
     for name in ("qpos", "qvel", "act", "ctrl", "mocap_pos", "mocap_quat", "qacc"):
         if not np.all(np.abs(getattr(data, name)) <= mujoco.mjMAXVAL):

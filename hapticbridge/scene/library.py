@@ -50,7 +50,10 @@ def scene_path(path_or_name: str | Path) -> Path:
     if name in scene_names():
         return _folder() / name / f"{name}.xml"
     if path.suffix or len(path.parts) > 1:
-        raise SceneError(f"no scene file '{path}' exists")
+        raise SceneError(
+            f"no scene file '{path}' exists; give the path of an MJCF file or one of: "
+            f"{choices(scene_names())}"
+        )
     raise SceneError(
         f"no scene is called '{name}' and no such file exists; scenes: {choices(scene_names())}"
     )

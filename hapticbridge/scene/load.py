@@ -86,11 +86,7 @@ def read_scene(path_or_name: str | Path, **parameters: float) -> SceneSource:
 
 
 def plain_model(source: SceneSource) -> mujoco.MjModel:
-    """Compiles a scene without handle and coupling, so that it needs no grip.
-
-    Raises:
-        SceneError: The scene cannot be compiled.
-    """
+    """Compiles a scene without handle and coupling, so that it needs no grip."""
     with _refused(source.path):
         return compiled(source.spec.copy(), source.sources)
 

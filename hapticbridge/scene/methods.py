@@ -15,16 +15,7 @@ handle."""
 
 
 def check_massless_tool(model: mujoco.MjModel, grip: str, method: str) -> None:
-    """Refuses a scene in which anything moves besides one rigid tool.
-
-    Args:
-        model: The compiled scene, with its handle.
-        grip: Name of the site on the tool.
-        method: Name of the method, for the message.
-
-    Raises:
-        SceneError: Names the other moving parts, or the joints that the tool requires.
-    """
+    """Raises SceneError for a scene in which anything moves besides one rigid tool."""
     body_id = int(model.site(grip).bodyid[0])
     first, count = int(model.body_jntadr[body_id]), int(model.body_jntnum[body_id])
     kinds = model.jnt_type[first : first + count].tolist() if count else []
@@ -59,19 +50,11 @@ def check_massless_tool(model: mujoco.MjModel, grip: str, method: str) -> None:
 
 
 def check_metered(model: mujoco.MjModel, integrator: str, method: str) -> None:
-    """Refuses a scene with forces of its own that cannot be metered under an integrator.
+    """Raises SceneError for forces of the scene that cannot be metered under an integrator.
 
     The work of a port in a step is h Q·v⁺, with the force Q that the step used. ``Euler`` uses the
     force at the start of the step. ``implicitfast`` does so too for forces that do not depend on
     velocity. RK4 uses four forces and keeps none.
-
-    Args:
-        model: The compiled scene, with its coupling.
-        integrator: Name of the integrator in MJCF.
-        method: Name of the method, for the message.
-
-    Raises:
-        SceneError: Names the actuator or body.
     """
     names = [model.actuator(i).name or str(i) for i in range(model.nactuator)]
     own = [i for i, name in enumerate(names) if name not in COUPLING_ACTUATORS]

@@ -56,9 +56,9 @@ class Link(Protocol):
     def control(self, request: int, value: int) -> None:
         """Sends a vendor request without data.
 
-        The serial bridge is an FTDI chip. Its requests have FTDI's names and numbers: 0 reset
-        (value 1 clears the data from the device, 2 the data to it), 1 modem lines, 2 flow control,
-        3 baud rate, 4 data format, 6 event character, 9 latency timer in ms.
+        The serial bridge is an FTDI chip; its requests have FTDI's numbers. 0 is reset, with value
+        1 for the data from the device and 2 for the data to it. 1 sets modem lines, 2 flow control,
+        3 the baud rate, 4 the data format, 6 the event character, 9 the latency timer in ms.
         """
 
     def write(self, packet: array.array[int], timeout_ms: int = ...) -> bool:
@@ -87,7 +87,7 @@ def read_firmware(path: str) -> bytes:
         raise DeviceError(f"firmware = '{path}': cannot be read ({reason})") from None
     if not 0 < len(image) <= LARGEST_FIRMWARE:
         raise DeviceError(
-            f"firmware = '{path}': has {len(image)} bytes; a Falcon's program has 1 to "
+            f"firmware = '{path}': has {len(image)} bytes; a Falcon's firmware has 1 to "
             f"{LARGEST_FIRMWARE}"
         )
     return image
@@ -114,29 +114,13 @@ def send_question(link: Link, flags: int = 0) -> None:
 
 
 def ask(link: Link, stream: ReplyStream, flags: int, timeout: float) -> bool:
-    """Sends a packet without force and waits for the reply.
-
-    Args:
-        link: Link to the Falcon, in run mode.
-        stream: Receives the reply.
-        flags: ``Request`` bits.
-        timeout: Longest wait in s.
-
-    Returns:
-        True if a reply came in time.
-    """
+    """Sends a packet without force and returns whether a reply came within ``timeout`` s."""
     send_question(link, flags)
     return answers(link, stream, timeout) > 0
 
 
 def answers(link: Link, stream: ReplyStream, timeout: float) -> int:
-    """Waits for at least one reply and returns the number of replies, 0 after a timeout.
-
-    Args:
-        link: Link to the Falcon, in run mode.
-        stream: Receives the replies.
-        timeout: Longest wait in s.
-    """
+    """Waits up to ``timeout`` s for at least one reply, and returns the number of replies."""
     end = link.now() + timeout
     found = 0
     while not found and (left := end - link.now()) > 0:
@@ -155,17 +139,10 @@ def upload(link: Link, image: bytes, name: str, tell: Tell) -> None:
     """Loads the firmware into a Falcon, which loses it without power.
 
     At 9600 baud the loader is greeted. At 140000 baud it receives the firmware in pieces and
-    returns each, which is the only check.
-
-    Args:
-        link: Link to the Falcon.
-        image: The firmware.
-        name: Name of the device in messages.
-        tell: Receives the progress, at every quarter.
+    returns each, which is the only check. ``tell`` receives the progress at every quarter.
 
     Raises:
         DeviceError: The loader does not answer, or returned other bytes than it received.
-        DeviceLost: The device is gone.
 
     References:
         libnifalcon's source (2019) for the sequence; not verified on hardware.

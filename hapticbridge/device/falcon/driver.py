@@ -52,8 +52,8 @@ class FalconDevice:
 
     The sheet's ``rate`` is the rate of deliveries with two requests always on their way. Its
     ``delay`` is the time within which 95 % of the replies in 0.1 s came back, over all phases of
-    the bridge's timer (``timing``). Mass, damping and friction are unknown unless the user states
-    measured values. The resolution follows from the geometry in the middle of the workspace.
+    the bridge's timer (``measured_timing``). Mass, damping and friction are unknown unless the user
+    states measured values. The resolution follows from the geometry in the middle of the workspace.
 
     Args:
         link: Link to the Falcon.
@@ -116,12 +116,9 @@ class FalconDevice:
     def start(self, period: float) -> NDArray[np.void]:
         """Reads the pose, without force, and compiles the functions of the loop.
 
-        Args:
-            period: The loop's period in s, at most 0.02.
-
         Raises:
-            DeviceError: The period is out of range, the encoders match no position of the grip, or
-                the device is gone.
+            DeviceError: The period is longer than 0.02 s, the encoders match no position of the
+                grip, or the device is gone.
         """
         if checked_period(period) > LONGEST_PERIOD:
             raise DeviceError(
@@ -152,12 +149,6 @@ class FalconDevice:
         Impossible replies count as no reply: encoders that match no position of the grip, or a jump
         faster than 3 m/s. The call waits only after a pause of the loop (``ask_anew``).
 
-        Args:
-            sample: Output, shape (1,), ``SAMPLE_DTYPE``.
-
-        Returns:
-            0, or ``TickFlag.STALE_SAMPLE`` if the sample repeats the last one.
-
         Raises:
             DeviceError: The device was not started, is gone, or sent no valid reply for 50 ms.
         """
@@ -185,9 +176,6 @@ class FalconDevice:
         """Sends a force together with the next request; the torque is ignored.
 
         A packet that is not accepted in time is dropped, except for zero force, which is repeated.
-
-        Args:
-            wrench: Shape (6,), in the device's frame.
 
         Raises:
             DeviceLost: The device is gone, or does not accept zero force.

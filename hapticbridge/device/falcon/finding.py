@@ -16,16 +16,7 @@ from hapticbridge.device.transport.usb_search import find
 
 
 def open_falcon(options: Mapping[str, object], tell: Tell, backend: Any = None) -> FalconDevice:
-    """Finds a Falcon and opens it.
-
-    Args:
-        options: Options of ``FAMILY``: names of files and numbers in SI units.
-        tell: Receives messages for the user.
-        backend: A pyusb backend; None selects libusb.
-
-    Raises:
-        DeviceError: No Falcon is found, it cannot be opened or is lost, or an option is not valid.
-    """
+    """Finds and opens a Falcon; ``options`` are those of ``FAMILY``."""
     numbers = stated_numbers(options, _NUMBERS)
     firmware = str(options["firmware"]) if options.get("firmware") else None
     if firmware is not None:

@@ -62,12 +62,9 @@ class Request(IntFlag):
 
 @compiled
 def encode(motors: NDArray[np.int64], flags: int, packet: NDArray[np.uint8]) -> None:
-    """Encodes a packet to the device.
+    """Encodes a packet, shape (16,), with ``Request`` bits as flags.
 
-    Args:
-        motors: Shape (3,), motor units, clamped to the range of a packet.
-        flags: ``Request`` bits, 0 to 15.
-        packet: Output, shape (16,).
+    Motor units, shape (3,), are clamped to the range of a packet.
     """
     packet[0], packet[14], packet[15] = _FIRST, _ZERO, _LAST
     packet[13] = _ZERO + (flags & 15)

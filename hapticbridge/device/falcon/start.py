@@ -41,11 +41,6 @@ def silent(name: str) -> DeviceLost:
 def insist(link: Link, packet: array.array[int], name: str) -> None:
     """Repeats a zero-force packet until it is accepted.
 
-    Args:
-        link: Link to the Falcon.
-        packet: Packet without force.
-        name: Name of the device in messages.
-
     Raises:
         DeviceLost: The device is gone, or refused ``ZERO_TRIES`` attempts.
     """
@@ -62,11 +57,6 @@ def ask_anew(link: Link, stream: ReplyStream, name: str) -> float:
     pose. If the handle were re-anchored there, the next reply would stretch the coupling by the
     hand's motion in the meantime.
 
-    Args:
-        link: Link to a running Falcon.
-        stream: Receives the replies; the newest then answers a request of this call.
-        name: Name of the device in messages.
-
     Returns:
         Time of the first request in s; the pose is not older.
 
@@ -82,13 +72,6 @@ def ask_anew(link: Link, stream: ReplyStream, name: str) -> float:
 
 def bring_up(link: Link, stream: ReplyStream, name: str, firmware: str | None, tell: Tell) -> None:
     """Brings a Falcon into run mode, and loads its firmware if it does not answer.
-
-    Args:
-        link: Link to the Falcon.
-        stream: Receives the replies.
-        name: Name of the device in messages.
-        firmware: Firmware file, or None.
-        tell: Receives the progress.
 
     Raises:
         DeviceError: The device has no firmware, and no file was named or the file does not run.
@@ -113,13 +96,7 @@ def bring_up(link: Link, stream: ReplyStream, name: str, firmware: str | None, t
 
 
 def home(link: Link, stream: ReplyStream, name: str, tell: Tell) -> None:
-    """Waits until the user has moved every encoder through its zero.
-
-    Args:
-        link: Link to a running Falcon.
-        stream: Receives the replies.
-        name: Name of the device in messages.
-        tell: Receives the instruction to the user.
+    """Waits until the user, instructed by ``tell``, has moved every encoder through its zero.
 
     Raises:
         DeviceError: The grip was not moved within ``HOMING_TIME``.

@@ -32,23 +32,13 @@ _ANSWER_TIME = 0.05
 
 
 def measured_timing(link: Link, stream: ReplyStream, name: str) -> tuple[float, float]:
-    """Measures the rate of deliveries and the delay of replies.
+    """Measures the rate of deliveries in Hz and the delay of replies in s.
 
-    The rate is the number of deliveries per second with ``UNDER_WAY`` requests always on their way;
-    replies that arrive together are one delivery. The delay is the time from a request to its
-    reply, with one request at a time, that the share ``SHARE`` of the replies meets.
-
-    A packet both requests the encoders and carries the force, so both have this delay. With one
-    packet per tick, the force that responds to a sample acts after the delay, rounded up to whole
-    ticks, beyond the one tick for which it is held.
-
-    Args:
-        link: Link to a running Falcon.
-        stream: Receives the replies.
-        name: Name of the device in messages.
-
-    Returns:
-        The rate in Hz and the delay in s.
+    The rate is measured with ``UNDER_WAY`` requests always on their way; replies that arrive
+    together are one delivery. The delay is the time from a single request to its reply that the
+    share ``SHARE`` of the replies meets. A packet both requests the encoders and carries the force,
+    so both have this delay. With one packet per tick the force acts after the delay, rounded up to
+    whole ticks, beyond the one tick for which it is held.
 
     Raises:
         DeviceLost: The device stopped replying.

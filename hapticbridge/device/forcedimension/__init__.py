@@ -1,5 +1,1 @@
-"""Force Dimension's devices, through the maker's library.
-
-``driver`` is the device and ``finding`` opens it. ``library`` binds the maker's functions, and
-``models`` lists the properties of each device type.
-"""
+"""Force Dimension's devices, through the maker's library."""

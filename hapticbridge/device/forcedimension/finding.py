@@ -19,10 +19,8 @@ _NUMBERS = (*MEASURED, "force_limit", "torque_limit")
 def open_forcedimension(options: Mapping[str, object], tell: Tell) -> ForceDimensionDevice:
     """Loads the library and opens one of its devices.
 
-    Args:
-        options: ``library`` (its file), ``serial`` (number of the device in the library's list,
-            from 0, if there are several), ``gravity`` (1 or 0), and numbers of the data sheet.
-        tell: Receives a description of the device and its settings.
+    The options are ``library`` (its file), ``serial``, ``gravity`` (1 or 0), and numbers of the
+    data sheet. ``serial`` is the device's number in the library's list, from 0.
 
     Raises:
         DeviceError: No library or no device is found, or an option is not valid.

@@ -126,11 +126,8 @@ class HaplyDevice:
     def start(self, period: float) -> NDArray[np.void]:
         """Requests the state, without force.
 
-        Args:
-            period: The loop's period in s, at most ``LONGEST_PERIOD``.
-
         Raises:
-            DeviceError: The period is out of range, or the service reports no position.
+            DeviceError: The period exceeds ``LONGEST_PERIOD``, or the service reports no position.
             DeviceLost: The service is gone or silent.
         """
         if checked_period(period) > LONGEST_PERIOD:
@@ -147,12 +144,6 @@ class HaplyDevice:
 
     def read(self, sample: NDArray[np.void]) -> int:
         """Returns the newest state; waits only after a pause of the loop, for a new answer.
-
-        Args:
-            sample: Output, shape (1,), ``SAMPLE_DTYPE``.
-
-        Returns:
-            0, or ``TickFlag.STALE_SAMPLE`` if the sample repeats the last one.
 
         Raises:
             DeviceError: The device was not started, or an answer is not a state.
@@ -173,15 +164,7 @@ class HaplyDevice:
         return int(TickFlag.STALE_SAMPLE) if newest is None else 0
 
     def write(self, wrench: NDArray[np.float64]) -> None:
-        """Sends a force together with the next request; the torque is ignored.
-
-        Args:
-            wrench: Shape (6,), in the service's frame.
-
-        Raises:
-            DeviceError: The force is not finite.
-            DeviceLost: The connection was lost.
-        """
+        """Sends a finite force together with the next request; the torque is ignored."""
         force = tuple(wrench[:3].tolist())
         if not all(map(math.isfinite, force)):
             raise DeviceError(f"{self._name}: a force that is not finite was not sent")

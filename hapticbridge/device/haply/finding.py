@@ -22,10 +22,8 @@ _NUMBERS = ("mass", "damping", "friction", "resolution", "force_limit")
 def open_haply(options: Mapping[str, object], tell: Tell) -> HaplyDevice:
     """Connects to the service and opens one of its devices.
 
-    Args:
-        options: ``service`` (HOST:PORT), ``serial`` (the service's device_id), ``force_gate``,
-            ``log`` (a file for the messages), and numbers of the data sheet.
-        tell: Receives a description of the service's force filters.
+    The options are ``service`` (HOST:PORT), ``serial`` (the service's device_id), ``force_gate``,
+    ``log`` (a file for the messages), and numbers of the data sheet.
 
     Raises:
         DeviceError: The service does not run, lists no such device, or an option is not valid.

@@ -26,17 +26,10 @@ _ANSWER_TIME = 0.05
 
 
 def measured_timing(link: Link, message: str, name: str) -> tuple[float, float]:
-    """Measures the rate of states and the delay of answers.
+    """Measures the rate of states in Hz and the delay of answers in s.
 
-    A message both carries a force and requests the state, so both have this delay.
-
-    Args:
-        link: Link to a service without messages on their way.
-        message: Message without force.
-        name: Name of the device in messages.
-
-    Returns:
-        The rate in Hz and the delay in s.
+    A message without force is sent each time. It both carries a force and requests the state, so
+    both have this delay.
 
     Raises:
         DeviceLost: The service stopped answering.

@@ -73,11 +73,7 @@ class Effects:
         self._ticks = self._every = 0
 
     def start(self, period: float) -> None:
-        """Sets direction and duration of the effects and starts them without force.
-
-        Args:
-            period: The loop's period in s.
-        """
+        """Sets direction and duration of the effects and starts them without force."""
         self._every, self._ticks = max(int(self._restart / period), 1), 0
         reports = self._reports
         # at least LIFE periods: a slow loop would otherwise lose its force between two ticks
@@ -93,8 +89,7 @@ class Effects:
     def push(self, shares: Sequence[float]) -> None:
         """Sends changed forces, and restarts the effects when due.
 
-        Args:
-            shares: Share of full scale per axis, finite, clipped to [-1, 1].
+        Shares of full scale per axis must be finite and are clipped to [-1, 1].
         """
         self._ticks += 1
         is_due = self._ticks >= self._every

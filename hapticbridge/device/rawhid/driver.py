@@ -78,12 +78,6 @@ class RawHidDevice:
     def start(self, period: float) -> NDArray[np.void]:
         """Waits for a state frame newer than this call.
 
-        Args:
-            period: The loop's period in s, finite and > 0.
-
-        Returns:
-            The pose before the first tick, shape (1,), ``SAMPLE_DTYPE``.
-
         Raises:
             DeviceError: The period is not valid, or the device sends nothing, must be homed first,
                 or reports a fault.
@@ -113,12 +107,6 @@ class RawHidDevice:
     def read(self, sample: NDArray[np.void]) -> int:
         """Returns the newest pose without waiting.
 
-        Args:
-            sample: Output, shape (1,), ``SAMPLE_DTYPE``.
-
-        Returns:
-            0, or ``STALE_SAMPLE`` if no valid frame has come since the last read.
-
         Raises:
             DeviceLost: The device is gone, or silent for longer than ``SILENCE``.
             DeviceError: The device was not started, has restarted, reports a fault, or sent a
@@ -144,15 +132,7 @@ class RawHidDevice:
         return 0
 
     def write(self, wrench: NDArray[np.float64]) -> None:
-        """Commands a wrench on the axes that the device has.
-
-        Args:
-            wrench: Shape (6,): force in N, torque in N m, on the device, in the device's frame.
-
-        Raises:
-            DeviceLost: The device is gone.
-            DeviceError: The wrench is not finite.
-        """
+        """Commands a finite wrench on the axes that the device has."""
         values = (wrench * self._mask).tolist()
         if not all(abs(value) < LARGEST for value in values):
             raise DeviceError(f"{self._name}: a wrench that is not finite was not sent")

@@ -25,10 +25,8 @@ def open_rawhid(
 ) -> RawHidDevice:
     """Finds and opens a raw HID device.
 
-    Args:
-        options: ``serial``, ``log``, and numbers of the data sheet that replace its own.
-        api: hidapi or a substitute; reports are then sent without a thread.
-        now: Returns the time of a monotonic clock in s.
+    The options are ``serial``, ``log``, and numbers that replace those of the device's data sheet.
+    With a substitute of hidapi, ``api``, reports are sent without a thread.
 
     Raises:
         DeviceError: No device is found, it cannot be opened, or it has another protocol.

@@ -48,10 +48,6 @@ CHANGES = (
 def asked(link: Link, name: str) -> tuple[Numbers, str]:
     """Requests both pages of a device's sheet.
 
-    Args:
-        link: Open link for its reports.
-        name: Name of the device in messages.
-
     Raises:
         DeviceError: The device does not answer, or has another version of the protocol.
         DeviceLost: The device is gone.
@@ -89,13 +85,7 @@ def reports(link: Link, timeout_ms: int) -> Iterator[bytes]:
 
 
 def data_sheet(name: str, numbers: Numbers, title: str, changes: dict[str, Any]) -> DeviceInfo:
-    """Returns the data sheet from the device's numbers and the user's changes.
-
-    Args:
-        name: Name of the device in messages.
-        numbers: Page 0.
-        title: Page 1.
-        changes: Numbers of ``CHANGES``, by name.
+    """Returns the data sheet from the device's numbers, its title and the user's changes.
 
     Raises:
         DeviceError: A required number is missing, or one is out of range.

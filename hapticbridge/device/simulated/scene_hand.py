@@ -29,10 +29,6 @@ def scene_hand(model: mujoco.MjModel, path: Path) -> Hand:
     and rotational damping in N m s/rad. All other values, including the inertia, are those of the
     default hand.
 
-    Args:
-        model: The compiled scene.
-        path: Its file, for the message.
-
     Raises:
         SceneError: The numbers are not two or four, or one is not finite or negative.
     """

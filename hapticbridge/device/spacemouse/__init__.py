@@ -1,4 +1,1 @@
-"""3Dconnexion SpaceMouse: input without force.
-
-``driver`` is the device, ``reports`` decodes its reports, ``ids`` lists the products.
-"""
+"""3Dconnexion SpaceMouse: input without force."""

@@ -117,18 +117,7 @@ class SpaceMouseDevice:
         self._to_origin()
 
     def start(self, period: float) -> NDArray[np.void]:
-        """Places the handle at the origin and switches the light on.
-
-        Args:
-            period: The loop's period in s, finite and > 0.
-
-        Returns:
-            The pose before the first tick, shape (1,), ``SAMPLE_DTYPE``.
-
-        Raises:
-            DeviceError: The period is not valid.
-            DeviceLost: The device is gone.
-        """
+        """Places the handle at the origin and switches the light on."""
         self._period = checked_period(period)
         self._link.take()
         self._to_origin()
@@ -141,15 +130,7 @@ class SpaceMouseDevice:
     def read(self, sample: NDArray[np.void]) -> int:
         """Moves the handle by one period (not at the first call) and returns its pose.
 
-        Args:
-            sample: Output, shape (1,), ``SAMPLE_DTYPE``.
-
-        Returns:
-            0: the pose is always that of this tick, with or without a report.
-
-        Raises:
-            DeviceError: The device was not started.
-            DeviceLost: The device is gone.
+        The result is always 0, because the pose is that of this tick, with or without a report.
         """
         if self._period == 0.0:
             raise DeviceError(f"{self._name} is read before it was started; call start() first")
@@ -207,15 +188,7 @@ class SpaceMouseDevice:
 def open_spacemouse(
     options: Mapping[str, object], _tell: Tell, api: HidApi | None = None
 ) -> SpaceMouseDevice:
-    """Finds and opens a SpaceMouse.
-
-    Args:
-        options: ``serial``, ``log``, and numbers of ``SpaceMouseDevice``.
-        api: hidapi or a substitute.
-
-    Raises:
-        DeviceError: No SpaceMouse is found, it cannot be opened, or a number is out of range.
-    """
+    """Finds and opens a SpaceMouse; options are ``serial``, ``log`` and numbers of the device."""
     plugged = chosen(FAMILY, find(FAMILY, api), options.get("serial"))
     # not overlapped: reports are written only before and after the loop
     link = HidLink.open(plugged, api, is_overlapped=False, log=HexLog.asked(options))

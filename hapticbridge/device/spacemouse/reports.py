@@ -46,17 +46,11 @@ class Buttons(NamedTuple):
 
 
 def decoded(report: bytes) -> Deflection | Buttons | None:
-    """Decodes one report.
+    """Decodes one report, its number first; None for an unknown report.
 
     Report 1 is the translation; with 13 bytes (wireless models, the receiver, newer firmware) it
     holds translation and rotation. Report 2 is the rotation of older wired models, which send both
     in pairs. The layouts are distinguished by length, because one product was sold with both.
-
-    Args:
-        report: Any bytes, the report's number first.
-
-    Returns:
-        None for any other report.
     """
     if len(report) < 2:
         return None
@@ -71,15 +65,11 @@ def decoded(report: bytes) -> Deflection | Buttons | None:
 
 
 def share(count: int, dead_band: float) -> float:
-    """Returns a deflection as a share of full scale, −1 to 1, 0 within the dead band.
+    """Returns a reported count as a share of full scale, −1 to 1, 0 within the dead band d.
 
-        sign(c) · max(0, |c| − d)/(1 − d),    c = count/350 clamped to ±1
+        sign(c) · max(0, |c| − d)/(1 − d),    c = count/350 clamped to ±1,    0 <= d < 1
 
     It is continuous at the edge of the dead band.
-
-    Args:
-        count: Reported count.
-        dead_band: d, share of full scale that counts as rest, 0 <= d < 1.
     """
     size = min(abs(count) / FULL_SCALE, 1.0)
     if size <= dead_band:

@@ -123,9 +123,6 @@ class HidLink:
 
         After a long pause the kernel's queue is full of old reports. Only then does the call wait
         for a new one, up to ``FRESH_MS``.
-
-        Raises:
-            DeviceLost: The device is gone.
         """
         reports: list[bytes] = []
         while len(reports) < QUEUE and (report := self._read(0)):
@@ -135,22 +132,11 @@ class HidLink:
         return reports
 
     def wait(self, timeout_ms: int) -> bytes:
-        """Returns the next report; empty after the timeout.
-
-        Args:
-            timeout_ms: Longest wait in ms, >= 1.
-
-        Raises:
-            DeviceLost: The device is gone.
-        """
+        """Returns the next report; empty after ``timeout_ms``, >= 1."""
         return self._read(timeout_ms)
 
     def write(self, report: bytes, slot: int = 0) -> None:
-        """Sends a report; if overlapped, it replaces an unsent one in its slot.
-
-        Args:
-            report: Report starting with its number, 0 if the device's reports have none.
-            slot: Kind of report.
+        """Sends a report, its number first; if overlapped, it replaces an unsent one in its slot.
 
         Raises:
             DeviceLost: The device is gone, or accepted no report for ``LONGEST_WRITE``.
@@ -170,11 +156,7 @@ class HidLink:
         self._wake.set()
 
     def send(self, report: bytes) -> None:
-        """Sends a report before it returns, and discards unsent ones, for the set-up.
-
-        Raises:
-            DeviceLost: The device is gone, or accepts no reports.
-        """
+        """Sends a report before it returns, and discards unsent ones, for the set-up."""
         for waiting in self._outgoing:
             waiting.clear()
         if self._lost or not self._is_idle.wait(LONGEST_WRITE) or not self._is_sent(report):

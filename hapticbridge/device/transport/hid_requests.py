@@ -9,13 +9,7 @@ from hapticbridge.device.transport.hid_search import HidHandle, descriptor_of
 
 
 def is_taken(send: Callable[[bytes], int], report: bytes, log: HexLog) -> bool:
-    """Sends a report by one of hidapi's calls; returns whether the device accepted it.
-
-    Args:
-        send: The call: ``write``, or ``send_feature_report``.
-        report: Report starting with its number, 0 if the device's reports have none.
-        log: Log of the transferred bytes.
-    """
+    """Sends a report, its number first, by a call of hidapi; returns whether it was accepted."""
     if log.is_on:
         log.add(">", report)
     try:

@@ -86,13 +86,8 @@ def hid_api() -> HidApi | None:
 def find(family: Family, api: HidApi | None = None) -> list[Plugged]:
     """Lists the family's connected devices, with the reason if one cannot be opened.
 
-    Args:
-        family: The family to look for.
-        api: hidapi or a substitute; None selects the real one. Only then the USB bus is searched
-            too, for devices without a hidraw node, and for all of them without hidapi.
-
-    Returns:
-        One entry per device.
+    Without a substitute of hidapi, ``api``, the USB bus is searched too, for devices without a
+    hidraw node, and for all of them without hidapi.
     """
     module = hid_api() if api is None else api
     found: dict[str, Plugged] = {}
@@ -161,14 +156,7 @@ def descriptor_of(handle: HidHandle) -> bytes:
 
 
 def polling(path: str) -> tuple[float | None, float | None]:
-    """Returns the polling intervals for reports from and to a device, in s each.
-
-    Args:
-        path: A hidraw node.
-
-    Returns:
-        None if the kernel does not list it, and for a device without that endpoint.
-    """
+    """Returns the polling intervals in s for reports from and to a hidraw node; None if unknown."""
     found: dict[str, float] = {}
     try:
         for endpoint in sorted((CLASS / Path(path).name / "device/..").glob("ep_*")):

@@ -116,15 +116,7 @@ class UsbLink:
         return time.monotonic()
 
     def control(self, request: int, value: int) -> None:
-        """Sends a vendor request without data.
-
-        Args:
-            request: bRequest.
-            value: wValue.
-
-        Raises:
-            DeviceLost: The device is gone, or refuses the request.
-        """
+        """Sends a vendor request (bRequest, wValue) without data."""
         self._require()
         if self._log.is_on:
             self._log.add(">", b"control %02x %04x" % (request, value))
@@ -134,15 +126,7 @@ class UsbLink:
             raise self._failed(error) from None
 
     def write(self, packet: array.array[int], timeout_ms: int = WRITE_MS) -> bool:
-        """Sends a packet; returns False if the device did not accept it in time.
-
-        Args:
-            packet: Array of bytes, which is not copied.
-            timeout_ms: Longest wait in ms, >= 1.
-
-        Raises:
-            DeviceLost: The device is gone, or refuses the packet.
-        """
+        """Sends an array of bytes without a copy; returns False if it was not accepted in time."""
         if self._lost or not self._is_open:
             self._require()
         try:
@@ -158,8 +142,7 @@ class UsbLink:
     def take(self) -> list[bytes]:
         """Returns the packets since the last call, oldest first, without waiting.
 
-        Raises:
-            DeviceLost: The device is gone; earlier packets are returned first.
+        Packets of a lost device are returned before DeviceLost is raised.
         """
         packets = self._packets
         if not packets or not self._is_open:

@@ -37,15 +37,9 @@ class OnTheBus:
 
 
 def on_the_bus(bus: Path | None = None) -> list[OnTheBus]:
-    """Lists the devices on the USB bus, in the order of their bus positions.
+    """Lists the devices on the USB bus, in the order of their bus positions; empty without a bus.
 
-    This requires neither libusb nor a permission.
-
-    Args:
-        bus: Folder of sysfs that lists them; None selects ``BUS``.
-
-    Returns:
-        Empty without a bus. A device that is unplugged meanwhile is left out.
+    This requires neither libusb nor a permission. A device unplugged meanwhile is left out.
     """
     folder = BUS if bus is None else bus
     found = []
@@ -79,13 +73,7 @@ def on_the_bus(bus: Path | None = None) -> list[OnTheBus]:
 def members(
     family: Family, devices: Iterable[OnTheBus], problem: Callable[[OnTheBus], str | None]
 ) -> list[Plugged]:
-    """Returns the devices of a family, in the listed order.
-
-    Args:
-        family: The family.
-        devices: Devices on the bus.
-        problem: Returns the reason why a device cannot be opened, or None.
-    """
+    """Returns the devices of a family; ``problem`` returns why one cannot be opened, or None."""
     return [
         Plugged(
             family=family.name,

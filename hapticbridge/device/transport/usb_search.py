@@ -37,14 +37,7 @@ def find(family: Family, backend: Any = None) -> list[Plugged]:
     """Lists the family's connected devices, with the reason if one cannot be opened.
 
     On Linux the kernel's list is used, because opening a device would disturb a running loop. On
-    other systems libusb is used.
-
-    Args:
-        family: The family to look for.
-        backend: A pyusb backend; None selects kernel or libusb.
-
-    Returns:
-        One entry per device, in the order of their bus positions.
+    other systems libusb is used. Devices are in the order of their bus positions.
     """
     listed = [] if backend is not None else members(family, on_the_bus(), _problem)
     source = libusb() if backend is None and not listed else backend
