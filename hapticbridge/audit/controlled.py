@@ -135,9 +135,9 @@ class Account:
         own = own - ticks["external_work"]
         change = np.diff(own, prepend=self.own)
         self.own = float(own[-1])
-        asked = np.linalg.norm(wrench[:, :3], axis=1)
+        requested = np.linalg.norm(wrench[:, :3], axis=1)
         sent = np.linalg.norm(ticks["wrench_on_device"][:, :3], axis=1)
-        passed = np.minimum(np.divide(sent, asked, out=share.copy(), where=asked > 0), 1.0)
+        passed = np.minimum(np.divide(sent, requested, out=share.copy(), where=requested > 0), 1.0)
         return np.asarray(self.parameters.force_scale / self.parameters.scale * passed * change)
 
 

@@ -90,15 +90,15 @@ def _says_nothing(case: Case, geom: int, written: Any) -> bool:
 
 def _contact_ratios(case: Case) -> Iterator[Fault]:
     """Compares the effective inertias of bodies that met, armature included."""
-    model, told = case.model, set()
+    model, reported = case.model, set()
     case.scene.reset()
     for pair in case.observation.meetings if case.observation else ():
         bodies = [int(model.geom_bodyid[geom]) for geom in pair]
         inverse = [1.0 / body_inertia(model, case.scene.data, body) for body in bodies]
         key = frozenset(bodies)
-        if min(inverse) <= 0 or max(inverse) <= LARGEST_RATIO * min(inverse) or key in told:
+        if min(inverse) <= 0 or max(inverse) <= LARGEST_RATIO * min(inverse) or key in reported:
             continue
-        told.add(key)
+        reported.add(key)
         light, heavy = (case.places.body(bodies[inverse.index(f(inverse))]) for f in (max, min))
         least = 1.0 / (LARGEST_RATIO * min(inverse))
         yield Fault(
@@ -153,11 +153,11 @@ def _sag(case: Case) -> Iterator[Fault]:
     for joint in range(model.njnt):
         if model.jnt_type[joint] in (mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE):
             springs[model.jnt_dofadr[joint]] = float(np.ravel(model.jnt_stiffness[joint])[0])
-    mine = jacobian[:, dofs]
-    stiffness = mine.T @ (gains[:, None] * mine) + np.diag(springs[dofs])
+    tool_jacobian = jacobian[:, dofs]
+    stiffness = tool_jacobian.T @ (gains[:, None] * tool_jacobian) + np.diag(springs[dofs])
     pulls = (data.qfrc_gravcomp - bias)[dofs]
     moved = np.linalg.lstsq(stiffness, pulls, rcond=1e-9)[0]
-    sag = float(np.linalg.norm(mine[:3] @ moved))
+    sag = float(np.linalg.norm(tool_jacobian[:3] @ moved))
     if sag <= LARGEST_SAG:
         return
     root = int(model.body_rootid[body])

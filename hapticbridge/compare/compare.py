@@ -118,9 +118,9 @@ class _Found:
                 break
             # compare up to the end of the shorter block; the rest waits for the other's next block
             until = min(due_a.max(), due_b.max())
-            _, mine, other = np.intersect1d(due_a, due_b, return_indices=True)
-            if mine.size:
-                self.add(a[mine], b[other])
+            _, own, other = np.intersect1d(due_a, due_b, return_indices=True)
+            if own.size:
+                self.add(a[own], b[other])
             waiting = [(rows[due > until], due[due > until]) for rows, due in waiting]
         for stream in streams:  # count the ticks after the end of the shorter run
             for _ in stream:

@@ -98,12 +98,12 @@ def json_object(text: str) -> dict[str, Any]:
 
 def run_facts(meta: Mapping[str, str]) -> Facts:
     """Returns the run's settings: names, and values with units."""
-    told = {name: meta[name] for name in _RUN if name in meta}
-    if values := json_object(told.get("scene_parameters", "")):
-        told["scene_parameters"] = _listed(values)
-    elif told.get("scene_parameters") == "{}":
-        del told["scene_parameters"]
-    return [(_NAMES.get(n, _spaced(n)), _valued(value, _RUN[n])) for n, value in told.items()]
+    facts = {name: meta[name] for name in _RUN if name in meta}
+    if values := json_object(facts.get("scene_parameters", "")):
+        facts["scene_parameters"] = _listed(values)
+    elif facts.get("scene_parameters") == "{}":
+        del facts["scene_parameters"]
+    return [(_NAMES.get(n, _spaced(n)), _valued(value, _RUN[n])) for n, value in facts.items()]
 
 
 def device_facts(meta: Mapping[str, str]) -> Facts:
@@ -117,19 +117,19 @@ def device_facts(meta: Mapping[str, str]) -> Facts:
 
 def software_facts(meta: Mapping[str, str]) -> Facts:
     """Returns versions and machine."""
-    told = json_object(meta.get("versions", "")) | json_object(meta.get("host", ""))
-    return [(name, str(value)) for name, value in told.items()]
+    facts = json_object(meta.get("versions", "")) | json_object(meta.get("host", ""))
+    return [(name, str(value)) for name, value in facts.items()]
 
 
 def guard_facts(evidence: Evidence) -> Facts:
     """Returns the active settings of the guard."""
     guarding = asdict(evidence.parameters.guarding)
-    told = [("controller", controller_of(evidence))]
+    facts = [("controller", controller_of(evidence))]
     for name, unit in _GUARD.items():
         value = guarding[name]
         if name != "controller" and value not in (0, math.inf):
-            told.append((_spaced(name), _valued(value, unit)))
-    return told
+            facts.append((_spaced(name), _valued(value, unit)))
+    return facts
 
 
 def controller_of(evidence: Evidence) -> str:
@@ -148,7 +148,7 @@ def head_facts(report: AuditReport, evidence: Evidence) -> Facts:
     if late := int(np.count_nonzero(flags & int(TickFlag.OVERRUN))):
         missed = round(report.duration / parameters.period) - report.ticks
         in_time = f"deadlines missed: {missed}, at {late} of them"
-    told = [
+    facts = [
         ("scene", meta.get("scene", "")),
         ("device", f"{evidence.info.name}, {len(evidence.info.axes)} axes"),
         ("method", f"{evidence.method.name}, {1 / parameters.period:g} Hz"),
@@ -158,10 +158,10 @@ def head_facts(report: AuditReport, evidence: Evidence) -> Facts:
         ("controller", _controlled(evidence)),
     ]
     borne = {True: "bears the coupling", False: "does not bear it", None: "not judged"}
-    told.append(("device condition", borne[report.certified]))
+    facts.append(("device condition", borne[report.certified]))
     if report.slack_share:
-        told.append(("slack used", f"{report.slack_share:.0%}"))
-    return [*told, ("simulated again", report.resimulation or "not reached")]
+        facts.append(("slack used", f"{report.slack_share:.0%}"))
+    return [*facts, ("simulated again", report.resimulation or "not reached")]
 
 
 _PARTS = slice(0, 3), slice(3, 6)
@@ -186,12 +186,12 @@ def _controlled(evidence: Evidence) -> str:
 
 def balance_of(report: AuditReport) -> str:
     """Returns the energies at the end of a run; those of rounding are left out."""
-    told = [
+    facts = [
         f"{_spaced(name)} {quantity(energy, 'J')}"
         for name, energy in report.energies.items()
         if abs(energy) > ROUNDING
     ]
-    return ", ".join(told) or "nothing"
+    return ", ".join(facts) or "nothing"
 
 
 ROUNDING = 1e-12

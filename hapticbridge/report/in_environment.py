@@ -39,8 +39,8 @@ def cause_in_environment(evidence: Evidence, report: AuditReport, window: slice)
     if share < MOST:
         return _without_contact(evidence, window, where)
     if concerns := _concerns(evidence, pairs):
-        told, _, remedy = concerns[0].rpartition("; write ")
-        return Cause("contact setting", f"{where}; {told}", f"write {remedy}")
+        concern, _, remedy = concerns[0].rpartition("; write ")
+        return Cause("contact setting", f"{where}; {concern}", f"write {remedy}")
     if method.hazard:
         return Cause(
             "method",

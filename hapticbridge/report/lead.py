@@ -35,9 +35,9 @@ def notes(report: AuditReport) -> list[str]:
     """Returns notes on the verdict: reason of a stop, unchecked parts, and the device condition."""
     if report.verdict == "invalid":
         return []
-    told = report.reason.partition("; ")[2]
+    remarks = report.reason.partition("; ")[2]
     # a run that was passive only because its force was switched off must not look like any other
-    return [*([f"{told[:1].upper()}{told[1:]}."] if told else []), *_of_the_device(report)]
+    return [*([f"{remarks[:1].upper()}{remarks[1:]}."] if remarks else []), *_of_the_device(report)]
 
 
 def is_warned(report: AuditReport) -> bool:

@@ -165,11 +165,11 @@ def _asked_for(used: Coupling, method: Method, step: float) -> Coupling:
     def made(name: str, value: float) -> float:
         return float(getattr(method.used(replace(felt, **{name: value}), step), name))
 
-    asked = {
+    requested = {
         name: that_gives(getattr(used, name), partial(made, name), getattr(felt, name))
         for name in ("damping", "rotational_damping")
     }
-    return replace(felt, **asked)
+    return replace(felt, **requested)
 
 
 def _controller(info: DeviceInfo, parameters: RunParameters, method: Method) -> str | None:

@@ -79,8 +79,8 @@ class Repetition:
             except SafetyTrip as error:
                 trip = str(error)
         # the temporary path of the unpacked scene means nothing to the reader
-        told = [str(each.message).replace(str(run.scene_file), "") for each in caught]
-        self.warned = tuple(dict.fromkeys(text.removeprefix("scene '': ") for text in told))
+        messages = [str(each.message).replace(str(run.scene_file), "") for each in caught]
+        self.warned = tuple(dict.fromkeys(text.removeprefix("scene '': ") for text in messages))
         return bridge.period, trip
 
     def _repeat(self, bridge: Bridge) -> None:

@@ -115,10 +115,12 @@ class _Experiment:
                 f"with nothing changed the model hand is {1e3 * hand_error:.3g} mm off the "
                 "recorded motion (root mean square); its response to changed forces is assumed"
             )
-        told = tuple(
+        changed_values = tuple(
             (name, UNITS.get(name, ""), settings.value(name), new.value(name)) for name in changes
         )
-        return WhatIf(run.recording.path, told, tuple(runs), hand_error, (*notes, *self._concerns))
+        return WhatIf(
+            run.recording.path, changed_values, tuple(runs), hand_error, (*notes, *self._concerns)
+        )
 
     def _as_recorded(self) -> WhatIfRun:
         recording, peaks = self._run.recording, _peaks(self._ticks)
