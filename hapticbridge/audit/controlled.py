@@ -95,7 +95,7 @@ class Account:
         sent[np.isin(ticks["tick"], resumed)] = 0.0
         credit = np.repeat([guarding.credit, guarding.rotational_credit], 3)
         given = (sent - credit * velocity) * moved
-        gained = then._gained(ticks, wrench, seen.share)
+        gained = then._scene_contribution(ticks, wrench, seen.share)
         total = given.sum(axis=1) + np.concatenate([[self.gained], gained[:-1]])
         account = capped_sum(total, guarding.surplus, self.account)
         axes = capped_sum(given, guarding.surplus, self.axes)
@@ -129,7 +129,7 @@ class Account:
         share = np.where(pays, _tank_share(parameters, held, velocity, account), 1.0)
         return Controlled(held * share[:, None], change, _largest(damping)), then
 
-    def _gained(self, ticks: NDArray[np.void], wrench: Array, share: Array) -> Array:
+    def _scene_contribution(self, ticks: NDArray[np.void], wrench: Array, share: Array) -> Array:
         """Returns the scene's contribution per tick: stored energy times transmitted share."""
         own = ticks["kinetic"] + ticks["potential"] - ticks["actuator_work"]
         own = own - ticks["external_work"]
@@ -153,7 +153,6 @@ def _largest(damping: Array) -> Array:
 
 
 def _tank_share(parameters: RunParameters, wrench: Array, velocity: Array, account: Array) -> Array:
-    """Returns the share of the wrench that the tank covers, (n,)."""
     work = parameters.period * np.sum(wrench * velocity, axis=1)
     level = np.maximum(TANK_START - account, 0.0)
     return np.where(work > level, level / np.where(work > level, work, 1.0), 1.0)

@@ -189,7 +189,6 @@ def _place(case: Case, pair: tuple[int, int], *, is_soft: bool) -> tuple[Place, 
 
 
 def _softness(solref: np.ndarray) -> float:
-    """Returns timeconst · dampratio in s for either format of ``solref``."""
     first, second = (float(value) for value in solref)
     if first > 0 and second > 0:
         return first * second

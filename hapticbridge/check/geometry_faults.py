@@ -158,7 +158,6 @@ def _far_grip(case: Case) -> Iterator[Fault]:
 
 
 def _workspace(case: Case) -> Iterator[Fault]:
-    """Compares the device's part of the motion with the cube that it reaches."""
     extent = float(np.ptp(case.motion.table[:, 1:4], axis=0).max()) / case.scale
     if extent <= case.workspace:
         return

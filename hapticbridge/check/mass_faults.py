@@ -38,14 +38,14 @@ def mass_faults(case: Case) -> Iterator[Fault]:
             f"judged with {stand_in} instead",
             mend if is_none else 'the right diaginertia, or balanceinertia="true" in <compiler>',
         )
-    yield from _of_water(case)
+    yield from _default_densities(case)
     yield from _contact_ratios(case)
     yield from _load_ratios(case)
     yield from _sag(case)
 
 
-def _of_water(case: Case) -> Iterator[Fault]:
-    """Finds moving bodies with a geom that has the default density because it sets none."""
+def _default_densities(case: Case) -> Iterator[Fault]:
+    """Finds moving bodies with a geom that has the default density."""
     model, geoms = case.model, list(case.source.spec.geoms)
     if len(geoms) != model.ngeom:  # the compiler dropped some, so ids do not match
         return
@@ -53,7 +53,7 @@ def _of_water(case: Case) -> Iterator[Fault]:
     for geom, written in enumerate(geoms):
         body = int(model.geom_bodyid[geom])
         is_free_to_move = model.body_treeid[body] >= 0 and body not in case.refused
-        if is_free_to_move and _says_nothing(case, geom, written):
+        if is_free_to_move and _sets_no_mass(case, geom, written):
             silent.setdefault(body, []).append(geom)
     for body, those in silent.items():
         visual = [
@@ -76,7 +76,7 @@ def _of_water(case: Case) -> Iterator[Fault]:
         )
 
 
-def _says_nothing(case: Case, geom: int, written: Any) -> bool:
+def _sets_no_mass(case: Case, geom: int, written: Any) -> bool:
     compiler = case.source.spec.compiler
     low, high = compiler.inertiagrouprange
     return bool(
@@ -89,7 +89,6 @@ def _says_nothing(case: Case, geom: int, written: Any) -> bool:
 
 
 def _contact_ratios(case: Case) -> Iterator[Fault]:
-    """Compares the effective inertias of bodies that met, armature included."""
     model, reported = case.model, set()
     case.scene.reset()
     for pair in case.observation.meetings if case.observation else ():
@@ -112,7 +111,6 @@ def _contact_ratios(case: Case) -> Iterator[Fault]:
 
 
 def _load_ratios(case: Case) -> Iterator[Fault]:
-    """Compares a moving body with the load on its further joints."""
     model = case.model
     for body in range(1, model.nbody):
         parent = int(model.body_weldid[model.body_parentid[body]])

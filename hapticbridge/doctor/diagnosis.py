@@ -100,12 +100,12 @@ def diagnose(
     lateness = {loop.name: loop.lateness() for loop in loops if loop.late_ns}
     stolen = (stolen_time(machine.proc) or 0.0) - (before or 0.0)
     found = findings(machine, at_rest + granted, stolen, duration)
-    found += (_baseline("" if BASELINE in lateness else refused),)
+    found += (_baseline_finding("" if BASELINE in lateness else refused),)
     verdict, sentence = judged(lateness, found, rate)
     return Diagnosis(rate, lateness, found, verdict, sentence)
 
 
-def _baseline(refused: str) -> Finding:
+def _baseline_finding(refused: str) -> Finding:
     if not refused:
         return Finding("baseline", None, "cyclictest, a C program, ran in turns with the loop")
     return Finding(
@@ -138,10 +138,10 @@ def judged(
         verdict, words = "fair", f"fair for {held}"
     else:
         verdict, words = "unfit", f"unfit for {held}"
-    return verdict, f"{words}: {numbers}; {_cause(lateness, allowed, advice)}{_held(bridge)}"
+    return verdict, f"{words}: {numbers}; {_cause(lateness, allowed, advice)}{_stall_words(bridge)}"
 
 
-def _held(bridge: Lateness) -> str:
+def _stall_words(bridge: Lateness) -> str:
     """Describes the effect of a long stall on the hand; empty if all were short."""
     if bridge.worst <= SHORTEST_WATCHDOG:
         return ""
