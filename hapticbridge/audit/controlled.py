@@ -95,7 +95,7 @@ class Account:
         sent[np.isin(ticks["tick"], resumed)] = 0.0
         credit = np.repeat([guarding.credit, guarding.rotational_credit], 3)
         given = (sent - credit * velocity) * moved
-        gained = then._gained(ticks, wrench, seen.share)
+        gained = then._scene_contribution(ticks, wrench, seen.share)
         total = given.sum(axis=1) + np.concatenate([[self.gained], gained[:-1]])
         account = capped_sum(total, guarding.surplus, self.account)
         axes = capped_sum(given, guarding.surplus, self.axes)
@@ -126,15 +126,15 @@ class Account:
         share = np.where(pays, _tank_share(parameters, held, velocity, account), 1.0)
         return Controlled(held * share[:, None], change, _largest(damping)), then
 
-    def _gained(self, ticks: NDArray[np.void], wrench: Array, share: Array) -> Array:
+    def _scene_contribution(self, ticks: NDArray[np.void], wrench: Array, share: Array) -> Array:
         """Returns the scene's contribution per tick: stored energy times transmitted share."""
         own = ticks["kinetic"] + ticks["potential"] - ticks["actuator_work"]
         own = own - ticks["external_work"]
         change = np.diff(own, prepend=self.own)
         self.own = float(own[-1])
-        asked = np.linalg.norm(wrench[:, :3], axis=1)
+        requested = np.linalg.norm(wrench[:, :3], axis=1)
         sent = np.linalg.norm(ticks["wrench_on_device"][:, :3], axis=1)
-        passed = np.minimum(np.divide(sent, asked, out=share.copy(), where=asked > 0), 1.0)
+        passed = np.minimum(np.divide(sent, requested, out=share.copy(), where=requested > 0), 1.0)
         return np.asarray(self.parameters.force_scale / self.parameters.scale * passed * change)
 
 
@@ -150,7 +150,6 @@ def _largest(damping: Array) -> Array:
 
 
 def _tank_share(parameters: RunParameters, wrench: Array, velocity: Array, account: Array) -> Array:
-    """Returns the share of the wrench that the tank covers, (n,)."""
     work = parameters.period * np.sum(wrench * velocity, axis=1)
     level = np.maximum(TANK_START - account, 0.0)
     return np.where(work > level, level / np.where(work > level, work, 1.0), 1.0)

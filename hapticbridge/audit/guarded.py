@@ -94,9 +94,9 @@ class Guarded:
         on_tool = ticks["wrench_on_tool"]
         force = -parameters.force_scale * on_tool[:, :3] @ axes
         torque = -parameters.force_scale / parameters.scale * on_tool[:, 3:] @ axes
-        asked = np.concatenate([force, torque], axis=1)
+        requested = np.concatenate([force, torque], axis=1)
         control, then.account = self.account.after(
-            ticks, asked, seen, device, outside.resumed, excess
+            ticks, requested, seen, device, outside.resumed, excess
         )
         guarding = parameters.guarding
         starts = seen.first | has_flag(ticks, TickFlag.RESEATED)

@@ -115,7 +115,6 @@ class Judgement:
 
 
 def _first(is_beyond: NDArray[np.bool_], joules: NDArray[np.float64], start: int) -> _Excess | None:
-    """Returns the first tick beyond a limit; ``start`` is the number of the first tick."""
     if not is_beyond.any():
         return None
     at = int(np.argmax(is_beyond))

@@ -43,8 +43,8 @@ def chained(
         for k in range(max(begin, done + 1), len(sent)):
             last = np.zeros(3) if starts[k] else sent[k - 1] if k else first
             plain = sent[k].copy()
-            asked = np.clip(vector[k], last - change[k], last + change[k])
-            step = _limited(asked, limit) - last
+            requested = np.clip(vector[k], last - change[k], last + change[k])
+            step = _limited(requested, limit) - last
             length = float(np.linalg.norm(step))
             sent[k] = last + (step if length <= rise else rise / length * step)
             done = k

@@ -128,19 +128,19 @@ class Watch:
         is_seated = ~is_released & (was_released | has_news | has_stalled | has_strayed | is_reset)
 
         begins = first | is_seated
-        pace = self._pace(ticks, outside, begins)
+        pace = self._ramp_pace(ticks, outside, begins)
         last = np.maximum.accumulate(np.where(begins, index, -1))
         start = np.where(last >= 0, ticks["tick"][last], self.start)
         is_soon = np.where(last >= 0, (is_seated & ~first)[last], self.is_soon)
         since_start = (ticks["tick"] - start).astype(np.float64)
         ramp = np.where(is_soon, guarding.fade_ticks, self.parameters.ramp_ticks)
-        risen = self._risen(pace, last, ramp + 1.0)
+        risen = self._ramp_progress(pace, last, ramp + 1.0)
         rising = risen / (ramp + 1.0)
         fading = np.maximum(1.0 - silence / guarding.fade_ticks, 0.0)
         flags = {
             TickFlag.CLUTCH: is_released,
             TickFlag.RESEATED: is_seated,
-            TickFlag.RAMPING: _ramps(ticks, risen, ramp + 1.0),
+            TickFlag.RAMPING: _expected_ramping(ticks, risen, ramp + 1.0),
         }
         seen = Seen(first, interval, since_start, ramp, silence, flags, rising * fading)
         then = copy.copy(self)
@@ -154,7 +154,7 @@ class Watch:
         then.start, then.is_soon = int(start[-1]), bool(is_soon[-1])
         return seen, then
 
-    def _risen(self, pace: Array, last: NDArray[np.int64], full: Array) -> Array:
+    def _ramp_progress(self, pace: Array, last: NDArray[np.int64], full: Array) -> Array:
         """Returns the progress of the rise, in ticks of a ramp.
 
         ``pace`` is the largest progress in each tick. The rise began in row ``last``, −1 before
@@ -164,7 +164,7 @@ class Watch:
         before = np.where(last >= 0, gone[last] - pace[last], -self.risen)
         return np.minimum(gone - before, full)
 
-    def _pace(self, ticks: NDArray[np.void], outside: Interventions, begins: Flags) -> Array:
+    def _ramp_pace(self, ticks: NDArray[np.void], outside: Interventions, begins: Flags) -> Array:
         """Returns the largest progress in each tick, in ticks of a ramp, (n,).
 
         It is min(1, V_0/V) for the energy V stored in the coupling at the recorded poses.
@@ -187,7 +187,7 @@ class Watch:
         return np.divide(most, held, out=pace, where=held > most)
 
 
-def _ramps(ticks: NDArray[np.void], risen: Array, full: Array) -> Flags:
+def _expected_ramping(ticks: NDArray[np.void], risen: Array, full: Array) -> Flags:
     """Returns the expected flag; where rounding decides, the recorded one."""
     is_close = (np.abs(risen - full) < _ROUNDING) & (risen != np.rint(risen))
     return np.where(is_close, has_flag(ticks, TickFlag.RAMPING), risen < full)

@@ -103,16 +103,16 @@ def _equalities(case: Case) -> Iterator[Fault]:
 
 def _frictions(case: Case) -> Iterator[Fault]:
     model = case.model
-    told = set()
+    reported = set()
     for dof in np.flatnonzero(model.dof_frictionloss > 0).tolist():
         joint, solref = int(model.dof_jntid[dof]), model.dof_solref[dof]
         solimp, loss = model.dof_solimp[dof], float(model.dof_frictionloss[dof])
         inertia = joint_inertia(model, case.scene.data, dof)
         speed = creep_speed(CREEP_LOAD * loss, solref, solimp, inertia)
         is_slide = model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE
-        if joint in told or speed <= (FASTEST_CREEP if is_slide else FASTEST_TURN):
+        if joint in reported or speed <= (FASTEST_CREEP if is_slide else FASTEST_TURN):
             continue
-        told.add(joint)
+        reported.add(joint)
         moved = f"{length(speed)}/s" if is_slide else f"{number(speed)} rad/s"
         place, unit = case.places.joint(joint), "N" if is_slide else "N m"
         yield Fault(

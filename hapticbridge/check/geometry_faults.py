@@ -41,8 +41,8 @@ def geometry_faults(case: Case) -> Iterator[Fault]:
 
 def _units(case: Case) -> Iterator[Fault]:
     model = case.model
-    mine = _tool_bodies(case)
-    mass, extent = float(model.body_mass[mine].sum()), float(_tool_extent(case).max())
+    tool_bodies = _tool_bodies(case)
+    mass, extent = float(model.body_mass[tool_bodies].sum()), float(_tool_extent(case).max())
     found = []
     if extent > LARGEST_TOOL:
         found.append(f"is {length(extent)} long")
@@ -53,7 +53,8 @@ def _units(case: Case) -> Iterator[Fault]:
     meshes = [
         int(model.geom_dataid[geom])
         for geom in range(model.ngeom)
-        if mine[model.geom_bodyid[geom]] and model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_MESH
+        if tool_bodies[model.geom_bodyid[geom]]
+        and model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_MESH
     ]
     body = int(model.body_rootid[model.site(case.scene.grip).bodyid[0]])
     place = case.places.mesh(meshes[0]) if meshes else case.places.body(body)
@@ -70,13 +71,13 @@ def _units(case: Case) -> Iterator[Fault]:
 def _dented_meshes(case: Case) -> Iterator[Fault]:
     """Finds colliding meshes that are not convex; MuJoCo collides their hulls."""
     model, uses = case.model, geom_uses(case.model)
-    told = set()
+    reported = set()
     for geom in range(model.ngeom):
         mesh = int(model.geom_dataid[geom])
         is_mesh = model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_MESH
-        if not is_mesh or uses[geom] == VISUAL or mesh in told:
+        if not is_mesh or uses[geom] == VISUAL or mesh in reported:
             continue
-        told.add(mesh)
+        reported.add(mesh)
         vertices, faces = mesh_of(model, mesh)
         dent, filled = dent_of(vertices, faces)
         if dent <= DEEPEST_DENT * float(np.ptp(vertices, axis=0).max()):
@@ -135,9 +136,9 @@ def _far_grip(case: Case) -> Iterator[Fault]:
     model, scene = case.model, case.scene
     scene.reset()
     site = model.site(scene.grip).id
-    mine, body = _tool_bodies(case), int(model.site_bodyid[site])
-    mass = model.body_mass[mine]
-    centre = mass @ scene.data.xipos[mine] / mass.sum()
+    tool_bodies, body = _tool_bodies(case), int(model.site_bodyid[site])
+    mass = model.body_mass[tool_bodies]
+    centre = mass @ scene.data.xipos[tool_bodies] / mass.sum()
     grip = scene.data.site_xpos[site]
     distance = float(np.linalg.norm(grip - centre))
     extent = max(float(np.linalg.norm(_tool_extent(case))), _SMALLEST_EXTENT)
@@ -157,7 +158,6 @@ def _far_grip(case: Case) -> Iterator[Fault]:
 
 
 def _workspace(case: Case) -> Iterator[Fault]:
-    """Compares the device's part of the motion with the cube that it reaches."""
     extent = float(np.ptp(case.motion.table[:, 1:4], axis=0).max()) / case.scale
     if extent <= case.workspace:
         return
@@ -182,10 +182,13 @@ def _tool_extent(case: Case) -> NDArray[np.float64]:
     """Returns the edges in m of the axis-aligned box around the tool's geoms at the start."""
     model, scene = case.model, case.scene
     scene.reset()
-    mine = _tool_bodies(case)
+    tool_bodies = _tool_bodies(case)
     corners = []
     for geom in range(model.ngeom):
-        if mine[model.geom_bodyid[geom]] and model.geom_type[geom] != mujoco.mjtGeom.mjGEOM_PLANE:
+        if (
+            tool_bodies[model.geom_bodyid[geom]]
+            and model.geom_type[geom] != mujoco.mjtGeom.mjGEOM_PLANE
+        ):
             centre, half = model.geom_aabb[geom, :3], model.geom_aabb[geom, 3:]
             rotation = scene.data.geom_xmat[geom].reshape(3, 3)
             middle = scene.data.geom_xpos[geom] + rotation @ centre

@@ -38,14 +38,14 @@ def mass_faults(case: Case) -> Iterator[Fault]:
             f"judged with {stand_in} instead",
             mend if is_none else 'the right diaginertia, or balanceinertia="true" in <compiler>',
         )
-    yield from _of_water(case)
+    yield from _default_densities(case)
     yield from _contact_ratios(case)
     yield from _load_ratios(case)
     yield from _sag(case)
 
 
-def _of_water(case: Case) -> Iterator[Fault]:
-    """Finds moving bodies with a geom that has the default density because it sets none."""
+def _default_densities(case: Case) -> Iterator[Fault]:
+    """Finds moving bodies with a geom that has the default density."""
     model, geoms = case.model, list(case.source.spec.geoms)
     if len(geoms) != model.ngeom:  # the compiler dropped some, so ids do not match
         return
@@ -53,7 +53,7 @@ def _of_water(case: Case) -> Iterator[Fault]:
     for geom, written in enumerate(geoms):
         body = int(model.geom_bodyid[geom])
         is_free_to_move = model.body_treeid[body] >= 0 and body not in case.refused
-        if is_free_to_move and _says_nothing(case, geom, written):
+        if is_free_to_move and _sets_no_mass(case, geom, written):
             silent.setdefault(body, []).append(geom)
     for body, those in silent.items():
         visual = [
@@ -76,7 +76,7 @@ def _of_water(case: Case) -> Iterator[Fault]:
         )
 
 
-def _says_nothing(case: Case, geom: int, written: Any) -> bool:
+def _sets_no_mass(case: Case, geom: int, written: Any) -> bool:
     compiler = case.source.spec.compiler
     low, high = compiler.inertiagrouprange
     return bool(
@@ -89,16 +89,15 @@ def _says_nothing(case: Case, geom: int, written: Any) -> bool:
 
 
 def _contact_ratios(case: Case) -> Iterator[Fault]:
-    """Compares the effective inertias of bodies that met, armature included."""
-    model, told = case.model, set()
+    model, reported = case.model, set()
     case.scene.reset()
     for pair in case.observation.meetings if case.observation else ():
         bodies = [int(model.geom_bodyid[geom]) for geom in pair]
         inverse = [1.0 / body_inertia(model, case.scene.data, body) for body in bodies]
         key = frozenset(bodies)
-        if min(inverse) <= 0 or max(inverse) <= LARGEST_RATIO * min(inverse) or key in told:
+        if min(inverse) <= 0 or max(inverse) <= LARGEST_RATIO * min(inverse) or key in reported:
             continue
-        told.add(key)
+        reported.add(key)
         light, heavy = (case.places.body(bodies[inverse.index(f(inverse))]) for f in (max, min))
         least = 1.0 / (LARGEST_RATIO * min(inverse))
         yield Fault(
@@ -112,7 +111,6 @@ def _contact_ratios(case: Case) -> Iterator[Fault]:
 
 
 def _load_ratios(case: Case) -> Iterator[Fault]:
-    """Compares a moving body with the load on its further joints."""
     model = case.model
     for body in range(1, model.nbody):
         parent = int(model.body_weldid[model.body_parentid[body]])
@@ -153,11 +151,11 @@ def _sag(case: Case) -> Iterator[Fault]:
     for joint in range(model.njnt):
         if model.jnt_type[joint] in (mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE):
             springs[model.jnt_dofadr[joint]] = float(np.ravel(model.jnt_stiffness[joint])[0])
-    mine = jacobian[:, dofs]
-    stiffness = mine.T @ (gains[:, None] * mine) + np.diag(springs[dofs])
+    tool_jacobian = jacobian[:, dofs]
+    stiffness = tool_jacobian.T @ (gains[:, None] * tool_jacobian) + np.diag(springs[dofs])
     pulls = (data.qfrc_gravcomp - bias)[dofs]
     moved = np.linalg.lstsq(stiffness, pulls, rcond=1e-9)[0]
-    sag = float(np.linalg.norm(mine[:3] @ moved))
+    sag = float(np.linalg.norm(tool_jacobian[:3] @ moved))
     if sag <= LARGEST_SAG:
         return
     root = int(model.body_rootid[body])

@@ -59,8 +59,8 @@ def option_faults(case: Case) -> Iterator[Fault]:
             f"{places.option_change('timestep', f'{case.period:g}')}, or check with --rate "
             f"{1 / step:g}",
         )
-    told = [*case.source.concerns, *check_model(case.model, case.scene.grip)]
-    for concern in told:
+    concerns = [*case.source.concerns, *check_model(case.model, case.scene.grip)]
+    for concern in concerns:
         if "integrator" not in concern:
             attribute = "wind" if concern.startswith("wind") else "surfacevel"
             place = places.with_attribute(attribute) or places.option(attribute)

@@ -75,10 +75,10 @@ def _created_without_contact(case: Case, sentence: str) -> Fault:
     """Names the tool's joints: their axes turn within a step, the only other source of energy."""
     model = case.model
     tree = model.body_treeid[model.site(case.scene.grip).bodyid[0]]
-    mine = np.flatnonzero(model.body_treeid[model.jnt_bodyid] == tree)
-    if model.jnt_type[mine[0]] == mujoco.mjtJoint.mjJNT_FREE:
+    tool_joints = np.flatnonzero(model.body_treeid[model.jnt_bodyid] == tree)
+    if model.jnt_type[tool_joints[0]] == mujoco.mjtJoint.mjJNT_FREE:
         change, place = "slower springs and actuators", case.places.option("integrator")
     else:
         change = f'damping="{LITTLE_DAMPING:g}" or more there, or slower springs and actuators'
-        place = case.places.joint(int(mine[0]))
+        place = case.places.joint(int(tool_joints[0]))
     return Fault("energy created", place, sentence, change)

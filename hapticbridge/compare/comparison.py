@@ -78,8 +78,8 @@ class Comparison:
         """Returns the comparison as one JSON object; a number that is not finite becomes null."""
         values = asdict(self) | {"paths": [str(path) for path in self.paths]}
         values["is_same"] = self.is_same
-        for told, found in zip(values["largest"], self.largest, strict=True):
-            told["size"] = found.size
+        for entry, found in zip(values["largest"], self.largest, strict=True):
+            entry["size"] = found.size
         if self.first is not None:
             values["first"]["size"] = self.first.size
         return json.dumps(jsonable(values), allow_nan=False)

@@ -84,8 +84,8 @@ def run(
         return f"it cannot be started ({error.strerror})"
     late = parsed(done.stdout) if done.returncode == 0 else None
     if late is None:
-        said = (done.stderr or done.stdout).strip().splitlines() or [f"status {done.returncode}"]
-        return f"it failed: {said[-1].strip()}"
+        output = (done.stderr or done.stdout).strip().splitlines() or [f"status {done.returncode}"]
+        return f"it failed: {output[-1].strip()}"
     return late
 
 

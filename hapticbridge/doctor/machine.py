@@ -106,7 +106,6 @@ def _throttling(system: System) -> Finding:
 
 
 def _preemption(system: System) -> Finding:
-    """Checks if the kernel can preempt its own work."""
     name = "preemption"
     if sys.platform != "linux":
         return Finding(name, None, f"real time is only supported on Linux, this is {sys.platform}")
@@ -129,7 +128,6 @@ def _preemption(system: System) -> Finding:
 
 
 def _dynamic_preemption(system: System) -> Finding:
-    """Checks a kernel whose preemption model is chosen at boot."""
     chosen = _dynamic_model(system)
     if chosen == "full":
         return Finding("preemption", True, "the kernel is preemptible (PREEMPT_DYNAMIC: full)")
@@ -204,7 +202,6 @@ def _host(system: System, stolen: float, duration: float) -> Finding:
 
 
 def _usb() -> Finding:
-    """Checks that the connected haptic devices may be opened."""
     name = "usb"
     unseen = blind_spots()
     plugged = plugged_devices()

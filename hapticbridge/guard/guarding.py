@@ -123,8 +123,8 @@ def guarding_for(
         return common
     linear, angular = assumed_damping(info)
     credit = [
-        own if own >= asked else UNCERTIFIED_CREDIT * own
-        for own, asked in zip((linear, angular), needed, strict=True)
+        own if own >= required else UNCERTIFIED_CREDIT * own
+        for own, required in zip((linear, angular), needed, strict=True)
     ]
     is_borne = linear >= needed[0] and angular >= needed[1]
     own = period if info.rate is None else max(1.0 / info.rate, period)

@@ -118,9 +118,10 @@ def limits_for(info: DeviceInfo, limits: Limits | None) -> Limits:
         return Limits(force=info.force_limit, torque=info.torque_limit)
     own = {"force": (info.force_limit, "N"), "torque": (info.torque_limit, "N m")}
     for name, (most, unit) in own.items():
-        asked = getattr(limits, name)
-        if asked > most and not info.is_prescribed:
+        requested = getattr(limits, name)
+        if requested > most and not info.is_prescribed:
             raise DeviceError(
-                f"{name} limit is {asked:g} {unit}; the device '{info.name}' bears {most:g} {unit}"
+                f"{name} limit is {requested:g} {unit}; the device '{info.name}' bears "
+                f"{most:g} {unit}"
             )
     return limits

@@ -31,19 +31,19 @@ def cause_at_device(evidence: Evidence, window: slice) -> Cause:
         return hazard
     conditions = run_conditions(evidence.info, evidence.worst, method)
     failing = [condition for condition in conditions if condition.holds is False]
-    if found := _delayed(evidence, failing):
+    if found := _delay_cause(evidence, failing):
         return found
-    if not failing and (found := _timing(evidence, window)):
+    if not failing and (found := _timing_cause(evidence, window)):
         return found
-    if counts := _counted(evidence, window):
+    if counts := _quantisation_words(evidence, window):
         others = f", or {what_would_do(evidence)}" if failing else ""
         return Cause("quantisation", counts, f"take a finer encoder or more friction{others}")
     if failing:
-        return _overloaded(evidence, failing)
-    return hazard if method.hazard else _unexplained(evidence)
+        return _overload_cause(evidence, failing)
+    return hazard if method.hazard else _unknown_cause(evidence)
 
 
-def _told(failing: list[Condition]) -> str:
+def _failing_words(failing: list[Condition]) -> str:
     return "; ".join(
         f"{c.axis}: the device's damping is {c.available:g} {_UNITS[c.axis]}, the coupling needs "
         f"{c.needed:.4g}"
@@ -54,7 +54,7 @@ def _told(failing: list[Condition]) -> str:
 _UNITS = {"translation": "N s/m", "rotation": "N m s/rad"}
 
 
-def _delayed(evidence: Evidence, failing: list[Condition]) -> Cause | None:
+def _delay_cause(evidence: Evidence, failing: list[Condition]) -> Cause | None:
     """Returns a delay as the cause if the device could bear the coupling without it."""
     worst, info = evidence.worst, evidence.info
     late, own = delay_ticks(info, worst.period) or 0, info.damping or 0.0
@@ -65,25 +65,27 @@ def _delayed(evidence: Evidence, failing: list[Condition]) -> Cause | None:
     return Cause(
         "delay",
         f"{prompt:.3g} N s/m of damping would bear the coupling without delay, the device has "
-        f"{own:.3g}; its samples are {late} ticks old; {_told(failing)}",
+        f"{own:.3g}; its samples are {late} ticks old; {_failing_words(failing)}",
         f"shorten the delay, or {what_would_do(evidence, is_late=True)}",
     )
 
 
-def _overloaded(evidence: Evidence, failing: list[Condition]) -> Cause:
+def _overload_cause(evidence: Evidence, failing: list[Condition]) -> Cause:
     """Returns too stiff a spring for the rate, or too strong a damper, as the cause."""
     worst, own = evidence.worst, evidence.info.damping or 0.0
     damper = worst.scale * worst.force_scale * evidence.asked.damping
     if failing[0].axis == "translation" and damper >= own:
         return Cause(
             "damping",
-            f"{_told(failing)}; its damper alone needs {damper:.4g} at any rate",
+            f"{_failing_words(failing)}; its damper alone needs {damper:.4g} at any rate",
             what_would_do(evidence),
         )
-    return Cause("rate", f"{_told(failing)}: it is too stiff for its rate", what_would_do(evidence))
+    return Cause(
+        "rate", f"{_failing_words(failing)}: it is too stiff for its rate", what_would_do(evidence)
+    )
 
 
-def _unexplained(evidence: Evidence) -> Cause:
+def _unknown_cause(evidence: Evidence) -> Cause:
     if evidence.info.delay is None:
         return Cause(
             "unknown",
@@ -97,7 +99,7 @@ def _unexplained(evidence: Evidence) -> Cause:
     )
 
 
-def _timing(evidence: Evidence, window: slice) -> Cause | None:
+def _timing_cause(evidence: Evidence, window: slice) -> Cause | None:
     """Returns missed deadlines or repeated samples as the cause; the device bears the coupling."""
     flags = evidence.ticks["flags"][window]
     missed = int(np.count_nonzero(flags & int(TickFlag.OVERRUN)))
@@ -123,7 +125,7 @@ def _timing(evidence: Evidence, window: slice) -> Cause | None:
     return None
 
 
-def _counted(evidence: Evidence, window: slice) -> str:
+def _quantisation_words(evidence: Evidence, window: slice) -> str:
     """Describes encoder steps as the cause; empty if they did not bring most of the energy.
 
     An unstable coupling passes through small steps too, but gains its energy after the swings have
@@ -155,7 +157,7 @@ def _counted(evidence: Evidence, window: slice) -> str:
 
 
 def _largest_steps(position: NDArray[np.float64], span: slice) -> NDArray[np.float64]:
-    """Returns the largest step of any axis into each tick, in m; 0 for the first tick of a run."""
+    """Returns the largest step of any axis into each tick, in m; 0 for the first tick."""
     before = position[max(span.start - 1, 0) : span.stop]
     steps = np.abs(np.diff(before, axis=0)).max(axis=1, initial=0.0)
     missing = span.stop - span.start - len(steps)

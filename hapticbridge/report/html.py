@@ -24,10 +24,10 @@ def check_page_name(path: Path) -> None:
         raise RecordingError(f"cannot write '{path}': its folder does not exist")
 
 
-def write_page(path: Path, template: str, **told: object) -> None:
+def write_page(path: Path, template: str, **variables: object) -> None:
     """Writes a page; an existing file is replaced.
 
-    ``template`` is a file in ``hapticbridge/templates``; ``told`` holds its variables.
+    ``template`` is a file in ``hapticbridge/templates``; ``variables`` are its variables.
 
     Raises:
         RecordingError: The page cannot be written, or not under this name.
@@ -39,7 +39,7 @@ def write_page(path: Path, template: str, **told: object) -> None:
         loader=PackageLoader("hapticbridge", "templates"), autoescape=select_autoescape()
     )
     environment.filters["quantity"] = quantity
-    page = environment.get_template(template).render(told)
+    page = environment.get_template(template).render(variables)
     try:
         with whole_file(path) as draft:
             draft.write_text(page, encoding="utf-8")

@@ -28,7 +28,7 @@ def cause_in_environment(evidence: Evidence, report: AuditReport, window: slice)
     where = f"{share:.0%} of the energy created until then came in ticks with contact"
     pairs = touched_pairs(evidence, report, window, gained) if share >= MOST else None
     if pairs:
-        where += _named(evidence, pairs)
+        where += _pair_words(evidence, pairs)
     if (moved := _moved_bodies(evidence, window)) and _can_push(evidence, pairs, share):
         return Cause(
             "inputs",
@@ -37,10 +37,10 @@ def cause_in_environment(evidence: Evidence, report: AuditReport, window: slice)
             "move them slower",
         )
     if share < MOST:
-        return _without_contact(evidence, window, where)
+        return _cause_without_contact(evidence, window, where)
     if concerns := _concerns(evidence, pairs):
-        told, _, remedy = concerns[0].rpartition("; write ")
-        return Cause("contact setting", f"{where}; {told}", f"write {remedy}")
+        concern, _, remedy = concerns[0].rpartition("; write ")
+        return Cause("contact setting", f"{where}; {concern}", f"write {remedy}")
     if method.hazard:
         return Cause(
             "method",
@@ -51,7 +51,7 @@ def cause_in_environment(evidence: Evidence, report: AuditReport, window: slice)
     return Cause("contact setting", f"{where}; {hard}", _SOFTER)
 
 
-def _without_contact(evidence: Evidence, window: slice, where: str) -> Cause:
+def _cause_without_contact(evidence: Evidence, window: slice, where: str) -> Cause:
     method, turned = evidence.method, _largest_turn(evidence, window)
     if method.hazard:
         return Cause("method", f"{where}; method '{method.name}': {method.hazard}", SAFE_METHOD)
@@ -71,14 +71,14 @@ def _without_contact(evidence: Evidence, window: slice, where: str) -> Cause:
 
 
 def _largest_turn(evidence: Evidence, window: slice) -> float:
-    """Returns the largest rotation of the tool in one tick, in rad."""
+    """Returns the tool's largest rotation in one tick, in rad."""
     quaternion = evidence.ticks["tool_quaternion"][max(window.start - 1, 0) : window.stop + 1]
     return float(
         np.linalg.norm(turn_between(quaternion[:-1], quaternion[1:]), axis=1).max(initial=0.0)
     )
 
 
-def _named(evidence: Evidence, pairs: Pairs) -> str:
+def _pair_words(evidence: Evidence, pairs: Pairs) -> str:
     pair, share = next(iter(pairs.items()))
     if evidence.model is None:
         return ""

@@ -20,11 +20,11 @@ def lead_sentence(report: AuditReport, worst: float | None) -> str:
     if report.verdict == "invalid":
         return f"This recording proves nothing: {report.reason}"
     if report.verdict == "active" and worst is not None:
-        return _too_much(report, quantity(worst, "J"))
+        return _excess_sentence(report, quantity(worst, "J"))
     return report.reason.partition("; ")[0]
 
 
-def _too_much(report: AuditReport, joules: str) -> str:
+def _excess_sentence(report: AuditReport, joules: str) -> str:
     if report.port == "device":
         return f"Not safe: the device was given up to {joules} that neither hand nor scene put in"
     limit = "the coupling's slack pays for" if report.environment == "active" else "it got"
@@ -35,9 +35,9 @@ def notes(report: AuditReport) -> list[str]:
     """Returns notes on the verdict: reason of a stop, unchecked parts, and the device condition."""
     if report.verdict == "invalid":
         return []
-    told = report.reason.partition("; ")[2]
+    remarks = report.reason.partition("; ")[2]
     # a run that was passive only because its force was switched off must not look like any other
-    return [*([f"{told[:1].upper()}{told[1:]}."] if told else []), *_of_the_device(report)]
+    return [*([f"{remarks[:1].upper()}{remarks[1:]}."] if remarks else []), *_device_notes(report)]
 
 
 def is_warned(report: AuditReport) -> bool:
@@ -45,7 +45,7 @@ def is_warned(report: AuditReport) -> bool:
     return report.verdict == "passive" and (report.certified is False or "trip" in report.events)
 
 
-def _of_the_device(report: AuditReport) -> list[str]:
+def _device_notes(report: AuditReport) -> list[str]:
     if report.verdict != "passive":
         return []
     if report.certified:

@@ -63,7 +63,7 @@ def write_report(
     """
     evidence, meta = Evidence.of(recording), recording.meta
     rows = event_rows(recording.events)
-    run = None if evidence is None else _drawn(evidence, report)
+    run = None if evidence is None else _evidence_parts(evidence, report)
     moment = None if run is None else run["moment"]
     write_page(
         path,
@@ -96,8 +96,7 @@ def _bare_curves(recording: Recording) -> str:
         return ""
 
 
-def _drawn(evidence: Evidence, report: AuditReport) -> dict[str, Any]:
-    """Returns the parts of a page that need evidence."""
+def _evidence_parts(evidence: Evidence, report: AuditReport) -> dict[str, Any]:
     lateness = evidence.lateness
     is_timed = bool(lateness.any())
     return {

@@ -33,13 +33,13 @@ def what_would_do(evidence: Evidence, *, is_late: bool = False) -> str:
             share = _largest(partial(_holds, evidence, axis, part))
             if share:
                 value = share * getattr(evidence.asked, f"{name}{part}")
-                found.append(f"lower the {axis}{part} to {_down(value)} {unit}")
+                found.append(f"lower the {axis}{part} to {_round_down(value)} {unit}")
     period = evidence.parameters.period
     slowest = period * FASTEST
     if not is_late and evidence.info.rate is None and slowest > 1:
         share = min(_largest(partial(_holds, evidence, axis, "period")) for axis in _UNITS)
         if share and 1 / share < slowest:
-            found.append(f"raise the rate to {_up(1 / (share * period))} Hz")
+            found.append(f"raise the rate to {_round_up(1 / (share * period))} Hz")
     return ", or ".join(found) or "lower stiffness and damping together"
 
 
@@ -76,13 +76,13 @@ def _largest(holds: Callable[[float], bool]) -> float:
     return low
 
 
-def _down(value: float) -> str:
-    """Formats a limit with three digits, rounded down."""
+def _round_down(value: float) -> str:
+    """Formats a limit with three digits."""
     return _three_digits(value * (1 + _ROUNDING), math.floor)
 
 
-def _up(value: float) -> str:
-    """Formats a limit with three digits, rounded up."""
+def _round_up(value: float) -> str:
+    """Formats a limit with three digits."""
     return _three_digits(value * (1 - _ROUNDING), math.ceil)
 
 

@@ -113,7 +113,7 @@ class RecordedMotion(ReplayDevice):
         info: DeviceInfo,
     ) -> None:
         super().__init__(ticks, period)
-        self.info = _unattended(info, self.info)
+        self.info = _replay_info(info, self.info)
         self._clock, self._before = clock, start
         self._news = iter((ticks["flags"] & _STALE).tolist())
 
@@ -144,7 +144,7 @@ class ResampledMotion(TrajectoryDevice):
     ) -> None:
         times = period * np.arange(len(ticks))
         super().__init__(Motion(times, ticks["device_position"], ticks["device_quaternion"]))
-        self.info = _unattended(info, self.info)
+        self.info = _replay_info(info, self.info)
         self._before, self._last = start, b""
         self._outside = Outside(ticks, period)
 
@@ -170,6 +170,6 @@ def placed(sample: NDArray[np.void], pose: tuple[float, ...]) -> NDArray[np.void
     return there
 
 
-def _unattended(info: DeviceInfo, own: DeviceInfo) -> DeviceInfo:
+def _replay_info(info: DeviceInfo, own: DeviceInfo) -> DeviceInfo:
     """Returns the recorded data sheet without motors, with the duration of the replay."""
     return replace(info, is_real=False, duration=own.duration)

@@ -77,21 +77,21 @@ class IdentifiedDevice(SimulatedDevice):
         state = self._states[0]
         state["target_position"] = self._motion[0, 1:4]
         state["target_quaternion"] = self._motion[0, 4:]
-        return self._there(sample)
+        return self._to_recorded_frame(sample)
 
     def read(self, sample: NDArray[np.void]) -> int:
         """Implements ``SimulatedDevice.read``."""
         flags = super().read(sample)
         # buttons only; this device always has new samples
         self._outside.read(sample)
-        self._there(sample)
+        self._to_recorded_frame(sample)
         return flags
 
     def write(self, wrench: Array) -> None:
         """Implements ``SimulatedDevice.write``; components without a device axis have no effect."""
         super().write(wrench * self._felt)
 
-    def _there(self, sample: NDArray[np.void]) -> NDArray[np.void]:
+    def _to_recorded_frame(self, sample: NDArray[np.void]) -> NDArray[np.void]:
         """Moves a sample from coordinates relative to the start to the device's coordinates."""
         sample["position"][0] += self._start[:3]
         turned = Rotation.from_quat(sample["quaternion"][0], scalar_first=True) * self._origin

@@ -44,9 +44,9 @@ def intended(
     """
     origin = Rotation.from_quat(np.array(start[3:]), scalar_first=True)
     turned = Rotation.from_quat(ticks["device_quaternion"], scalar_first=True) * origin.inv()
-    wrench = _held(ticks["wrench_on_device"], delay_ticks(info, period) or 0)
+    wrench = _mean_wrench(ticks["wrench_on_device"], delay_ticks(info, period) or 0)
     wanted = [
-        _wanted(moved, force, period, (m + m_h, b + b_h, b_h, k_h, friction))
+        _solve_intent(moved, force, period, (m + m_h, b + b_h, b_h, k_h, friction))
         for moved, force, m, m_h, b, b_h, k_h, friction in (
             (
                 ticks["device_position"] - np.array(start[:3]),
@@ -80,13 +80,13 @@ def intended(
     return np.ascontiguousarray(table)
 
 
-def _held(wrench: Array, delay: int) -> Array:
-    """Returns the mean of the wrenches that acted before and after each sample."""
+def _mean_wrench(wrench: Array, delay: int) -> Array:
+    """Averages the wrenches that acted before and after each sample."""
     acting = np.concatenate([np.zeros((delay + 1, 6)), wrench])
     return np.asarray(0.5 * (acting[: len(wrench)] + acting[1 : len(wrench) + 1]))
 
 
-def _wanted(
+def _solve_intent(
     moved: Array,
     force: Array,
     period: float,

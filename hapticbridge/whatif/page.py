@@ -35,7 +35,7 @@ def write_what_if(found: WhatIf, path: Path, scene: bytes | None = None) -> None
         name=found.path.name,
         recording=str(found.path),
         changes=list(changes(found)),
-        runs=[_told(run) for run in found.runs],
+        runs=[_run_facts(run) for run in found.runs],
         rows=list(rows(found)),
         notes=found.notes,
         drawn=drawn,
@@ -43,7 +43,7 @@ def write_what_if(found: WhatIf, path: Path, scene: bytes | None = None) -> None
     )
 
 
-def _told(run: WhatIfRun) -> dict[str, Any]:
+def _run_facts(run: WhatIfRun) -> dict[str, Any]:
     evidence, report = Evidence.of(run.recording), run.report
     return {
         "name": run.name,

@@ -65,8 +65,8 @@ def figure_of(found: WhatIf, bins: int = BINS) -> Figure:
     panels[0].legend(
         loc="lower right", bbox_to_anchor=(1, 1), fontsize="small", ncols=3, frameon=False
     )
-    told = ", ".join(f"{name} {old} → {new}" for name, old, new in changes(found))
-    title = f"{found.path.name}, what if {told or 'nothing is changed'}"
+    changed = ", ".join(f"{name} {old} → {new}" for name, old, new in changes(found))
+    title = f"{found.path.name}, what if {changed or 'nothing is changed'}"
     figure.suptitle(
         "".join(letter if letter.isprintable() else "�" for letter in title),
         fontsize="medium",

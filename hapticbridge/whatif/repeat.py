@@ -79,16 +79,15 @@ class Repetition:
             except SafetyTrip as error:
                 trip = str(error)
         # the temporary path of the unpacked scene means nothing to the reader
-        told = [str(each.message).replace(str(run.scene_file), "") for each in caught]
-        self.warned = tuple(dict.fromkeys(text.removeprefix("scene '': ") for text in told))
+        messages = [str(each.message).replace(str(run.scene_file), "") for each in caught]
+        self.warned = tuple(dict.fromkeys(text.removeprefix("scene '': ") for text in messages))
         return bridge.period, trip
 
     def _repeat(self, bridge: Bridge) -> None:
-        """Runs for the recorded number of ticks, with recorded actions at their times."""
         due = deque(
             (math.ceil(int(event["tick"]) * self._per_tick - 1e-9), event)
             for each in self._run.recording.events
-            if (event := self._repeated(each))
+            if (event := self._action_for(each))
         )
 
         def on_tick(tick: int) -> None:
@@ -121,7 +120,7 @@ class Repetition:
         last = len(self._run.recording.ticks)
         return self._run.trip in [trip_reason(code, last) for code in _BY_STATE]
 
-    def _repeated(self, event: Event) -> Event | None:
+    def _action_for(self, event: Event) -> Event | None:
         """Returns the action that repeats a recorded event under these settings, or None."""
         name = event.get("event")
         if name == "coupling":
@@ -143,7 +142,7 @@ class Repetition:
         return self.settings.method.has_coupling
 
     def _coupling(self, event: Event) -> Event:
-        """Returns a change to the same effective coupling under these settings."""
+        """Returns the change to an equal effective coupling under these settings."""
         old, new, period = self._run.settings, self.settings, 1.0 / self.settings.rate
         if replace(new, scene=old.scene, controller=old.controller) == old:
             return event

@@ -31,7 +31,11 @@ def rows(found: WhatIf) -> Iterator[Row]:
 def changes(found: WhatIf) -> Iterator[tuple[str, str, str]]:
     """Yields each change: name, and the value before and after with its unit."""
     for name, unit, before, after in found.changes:
-        yield name, f"{_told(before)} {unit}".rstrip(), f"{_told(after)} {unit}".rstrip()
+        yield (
+            name,
+            f"{_format_value(before)} {unit}".rstrip(),
+            f"{_format_value(after)} {unit}".rstrip(),
+        )
 
 
 def sentences(run: WhatIfRun) -> Iterator[str]:
@@ -46,5 +50,5 @@ def _certified(run: WhatIfRun) -> str:
     return {True: "yes", False: "no", None: "not judged"}[run.report.certified]
 
 
-def _told(value: object) -> str:
+def _format_value(value: object) -> str:
     return f"{value:.6g}" if isinstance(value, float) else "none" if value is None else str(value)
