@@ -1,13 +1,4 @@
-"""MJCF scenes behind a haptic device: loading, handle, coupling and checks.
-
-Read ``load`` first. It reads a scene, adds the handle and its coupling (``attach``, ``start``),
-compiles it (``compiler``) and refuses unsuitable scenes (``checks``). The result is a
-``scene.Scene``, which a bridge steps. ``source`` keeps the files' bytes for the recording.
-``parameter_file`` and ``parameters`` hold the scene's settable numbers, ``custom`` its custom data,
-``library`` the shipped scenes. ``contact_rule``, ``contact_check`` and ``contact_concerns`` hold a
-measured rule for contacts that generate energy. ``methods`` and ``weld`` serve the methods for
-comparison.
-"""
+"""MJCF scenes behind a haptic device: loading, handle, coupling and checks."""
 
 from hapticbridge.scene.compile import custom_numbers as custom_numbers
 from hapticbridge.scene.compile import custom_text as custom_text
