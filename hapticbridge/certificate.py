@@ -25,9 +25,7 @@ _WHOLE = 1e-9
 def felt_period(info: DeviceInfo, period: float) -> float:
     """Returns the time in s for which a wrench acts: the loop's period, or the device's if longer.
 
-    Args:
-        info: The device; for a prescribed motion the loop's period is returned.
-        period: The loop's period in s.
+    For a prescribed motion it is the loop's period.
     """
     if info.rate is None or info.is_prescribed:
         return period
@@ -36,12 +34,7 @@ def felt_period(info: DeviceInfo, period: float) -> float:
 
 
 def delay_ticks(info: DeviceInfo, period: float) -> int | None:
-    """Returns the whole ticks from a sample to the resulting wrench; None if unknown.
-
-    Args:
-        info: The device.
-        period: The loop's period in s.
-    """
+    """Returns the whole ticks from a sample to the resulting wrench; None if unknown."""
     if info.delay is None:
         return None
     return max(0, math.ceil(info.delay / felt_period(info, period) - _WHOLE))
@@ -61,12 +54,6 @@ def damping_for_delay(
     device is passive against a wall, which is necessary. For a general scene no finite damping
     suffices, so a device with a delay cannot be certified. An unknown delay adds nothing and cannot
     be certified either.
-
-    Args:
-        info: The device.
-        coupling: K and B of the law.
-        period: The loop's period in s.
-        axis: Kind of axis, which selects the pair of K and B.
 
     Raises:
         CouplingError: The delay is longer than 50 ticks.

@@ -88,8 +88,8 @@ class Comparison:
         """Returns the comparison as one JSON object; a number that is not finite becomes null."""
         values = asdict(self) | {"paths": [str(path) for path in self.paths]}
         values["is_same"] = self.is_same
-        for told, found in zip(values["largest"], self.largest, strict=True):
-            told["size"] = found.size
+        for entry, found in zip(values["largest"], self.largest, strict=True):
+            entry["size"] = found.size
         if self.first is not None:
             values["first"]["size"] = self.first.size
         return json.dumps(finite_or_null(values), allow_nan=False)
@@ -126,13 +126,13 @@ DECISIVE = (
 )
 """Metadata that determine what a run computes."""
 
-_BESIDE = ("versions", "host", "clock")
+_EXPLANATORY = ("versions", "host", "clock")
 """Metadata that may explain a difference, but do not cause one by themselves."""
 
 _CHANGES = ("input", *COMMANDED)
 """Events that determine what a run computes; their content is compared, not only their number."""
 
-_UNHELD = int(TickFlag.OVERRUN | TickFlag.DROPPED_BEFORE)
+_IGNORED_FLAGS = int(TickFlag.OVERRUN | TickFlag.DROPPED_BEFORE)
 """Flags set by clock and recorder; like times, they differ between any two real runs."""
 
 SHORTEST, LONGEST = 1e-9, 1e3
@@ -166,7 +166,7 @@ def compare(first: str | Path, second: str | Path) -> Comparison:
         first=found.first,
         largest=tuple(found.largest.values()),
         decisive=_meta_differences(files, DECISIVE),
-        beside=_meta_differences(files, _BESIDE),
+        beside=_meta_differences(files, _EXPLANATORY),
         events=_event_differences(files),
         notes=tuple(note for file in files for note in _notes(file)),
     )
@@ -197,9 +197,9 @@ class _Found:
                 break
             # compare up to the end of the shorter block; the rest waits for the other's next block
             until = min(due_a.max(), due_b.max())
-            _, mine, other = np.intersect1d(due_a, due_b, return_indices=True)
-            if mine.size:
-                self.add(a[mine], b[other])
+            _, own, other = np.intersect1d(due_a, due_b, return_indices=True)
+            if own.size:
+                self.add(a[own], b[other])
             waiting = [(rows[due > until], due[due > until]) for rows, due in waiting]
         for stream in streams:  # count the ticks after the end of the shorter run
             for _ in stream:
@@ -256,7 +256,7 @@ class _Found:
 def _numbers(ticks: NDArray[np.void], column: Column) -> NDArray[np.int64 | np.float64]:
     field = ticks[column.field]
     if column.field == "flags":
-        field = field & ~_UNHELD
+        field = field & ~_IGNORED_FLAGS
     return np.ascontiguousarray(field if column.part is None else field[:, column.part])
 
 
@@ -283,11 +283,13 @@ def _event_differences(
     lists = [[str(event.get("event", "unnamed")) for event in file.events] for file in files]
     names = dict.fromkeys(lists[0] + lists[1])
     counts = {name: (lists[0].count(name), lists[1].count(name)) for name in names}
-    other = {name for name in _CHANGES if _said(files[0], name) != _said(files[1], name)}
+    other = {
+        name for name in _CHANGES if _events_named(files[0], name) != _events_named(files[1], name)
+    }
     return {name: pair for name, pair in counts.items() if pair[0] != pair[1] or name in other}
 
 
-def _said(file: RecordingFile, name: str) -> list[dict[str, Any]]:
+def _events_named(file: RecordingFile, name: str) -> list[dict[str, Any]]:
     """Returns the events of a name without their times and origin."""
     return [
         {key: value for key, value in event.items() if key not in ("time_ns", "by")}

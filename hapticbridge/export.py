@@ -323,7 +323,6 @@ def _piece(recording: RecordingFile, span: tuple[float, float]) -> RecordingFile
 
 
 def _blocks(recording: RecordingFile, span: tuple[float, float]) -> Iterator[NDArray[np.void]]:
-    """Yields the records that were due in a span."""
     if span == EVERYTHING:
         yield from recording.blocks()
         return

@@ -132,10 +132,11 @@ def limits_for(info: DeviceInfo, limits: Limits | None) -> Limits:
         return Limits(force=info.force_limit, torque=info.torque_limit)
     own = {"force": (info.force_limit, "N"), "torque": (info.torque_limit, "N m")}
     for name, (most, unit) in own.items():
-        asked = getattr(limits, name)
-        if asked > most and not info.is_prescribed:
+        requested = getattr(limits, name)
+        if requested > most and not info.is_prescribed:
             raise DeviceError(
-                f"{name} limit is {asked:g} {unit}; the device '{info.name}' bears {most:g} {unit}"
+                f"{name} limit is {requested:g} {unit}; the device '{info.name}' bears "
+                f"{most:g} {unit}"
             )
     return limits
 
@@ -400,8 +401,8 @@ def guard_parameters_for(
         return common
     linear, angular = assumed_damping(info)
     credit = [
-        own if own >= asked else UNCERTIFIED_CREDIT * own
-        for own, asked in zip((linear, angular), needed, strict=True)
+        own if own >= required else UNCERTIFIED_CREDIT * own
+        for own, required in zip((linear, angular), needed, strict=True)
     ]
     is_borne = linear >= needed[0] and angular >= needed[1]
     own = period if info.rate is None else max(1.0 / info.rate, period)

@@ -217,7 +217,7 @@ def test_a_hid_device_is_listed_by_the_kernels_word_where_hidapi_is_missing(
     [
         (True, True, None),
         (True, False, "no permission to open"),
-        (False, False, "there is no"),  # as root, who may open all that there is
+        (False, False, "does not exist yet"),  # as root, who may open all that there is
     ],
 )
 def test_a_node_that_is_not_there_yet_is_no_missing_permission(
@@ -258,7 +258,7 @@ def test_running_on_a_device_that_is_not_there_is_one_sentence_that_helps(
     assert (code, out) == (2, "")
     assert err.count("\n") == 1
     assert err.startswith(f"error: no device '{family.name}' is plugged in (looked for ")
-    assert "'hapticbridge devices' lists what is, and what permission is missing" in err
+    assert "'hapticbridge devices' lists connected devices and missing permissions" in err
 
 
 @pytest.mark.parametrize(

@@ -79,7 +79,7 @@ def test_zwidth_tells_of_limit_cycles_delay_and_low_pass(
     assert "passive against a wall" in told.out
     assert "not kept" in told.out
     assert "expect limit cycles" in told.out
-    assert "none can be promised" in told.out
+    assert "no general bound exists" in told.out
     told = Told("zwidth --damping 2 --filter-time 0.001", capsys)
     assert "next:" not in told.out
     assert "leave --filter-time out" in told.out

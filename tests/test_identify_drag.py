@@ -125,7 +125,7 @@ def test_a_position_that_trembles_is_measured_through_it(noise: float) -> None:
 
 def test_a_position_that_trembles_more_than_it_moves_is_refused_with_that_reason() -> None:
     device = Dragged(noise=5e-4, mass=0.8, damping=2.0, friction=0.2)
-    with pytest.raises(IdentificationError, match=r"axis x: its position trembles by 0\.0005"):
+    with pytest.raises(IdentificationError, match=r"axis x: its position has a noise of 0\.0005"):
         measured(device)
 
 

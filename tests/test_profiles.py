@@ -207,7 +207,7 @@ HEAD = 'format = 1\nname = "n"\ndevice = "falcon"\n'
         (HEAD + '[damping]\nvalue = 2.0\nunit = "N"\nsource = "s"\n', "must be 'N s/m'"),
         (
             HEAD + '[mass]\nvalue = 2.0\ninterval = [3.0, 4.0]\nsource = "s"\n',
-            "must hold the value",
+            "must contain the value",
         ),
         (HEAD + '[mass]\nvalue = "unknown"\ninterval = [3.0, 4.0]\nsource = "s"\n', "two numbers"),
         (HEAD + '[workspace]\nvalue = [0.1, 0.1]\nsource = "s"\n', "three lengths"),

@@ -27,7 +27,7 @@ from hapticbridge.errors import RecordingError
 from hapticbridge.record import TICK_DTYPE
 from hapticbridge.recording import Attachment, RecordingWriter, read_recording, repair
 from hapticbridge.recording import format as layout
-from hapticbridge.recording.reader import _joined
+from hapticbridge.recording.reader import _join
 from hapticbridge.recording.writer import RESERVE
 
 
@@ -177,7 +177,7 @@ def test_runs_of_records_are_let_go_as_they_are_joined() -> None:
     """A file read into memory would be there twice at the end: 0.5 GB of ten minutes at 1 kHz."""
     rows = random_rows(10)
     runs = [rows[:3], rows[3:3], rows[3:]]
-    assert _joined(runs).tobytes() == rows.tobytes()
+    assert _join(runs).tobytes() == rows.tobytes()
     assert runs == []
 
 

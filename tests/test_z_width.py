@@ -136,7 +136,7 @@ def test_with_delay_the_line_is_where_the_wall_meets_the_device(
     assert z.limit[0] == pytest.approx(b / (T * (delay + 0.5)), rel=1e-6)
     assert z.limit[-1] == 0
     assert set(z.limited_by) == {WALL}
-    assert "none can be promised" in z.notes[0]
+    assert "no general bound exists" in z.notes[0]
 
 
 def test_one_sample_of_delay_follows_its_closed_form() -> None:

@@ -295,7 +295,7 @@ class EnergyBalance:
         device_work = np.sum(sent[:, :3] * device_step, axis=1)
         device_work += np.sum(sent[:, 3:] * device_turn, axis=1)
         device_energy = summed(device_work, sums["device_energy"])
-        later = _later(ticks, following, late) if late else (device_step, device_turn)
+        later = _delayed_steps(ticks, following, late) if late else (device_step, device_turn)
         given = np.sum(sent[:, :3] * later[0], axis=1) + np.sum(sent[:, 3:] * later[1], axis=1)
 
         stored = ticks["kinetic"] + ticks["potential"] - before.start_energy
@@ -362,7 +362,7 @@ class EnergyBalance:
             device_throughput=totals["device_throughput"],
             environment_energy=created,
             slack=totals["slack"],
-            kicked=_kicked(parameters, totals["given"], burnt, lost + kept),
+            kicked=_unpaid_energy(parameters, totals["given"], burnt, lost + kept),
             commanded=totals["commanded"],
             reached=Reached(
                 handle=np.concatenate([last["handle_position"], last["handle_quaternion"]]),
@@ -390,14 +390,14 @@ def _slack_gains(parameters: RunParameters, gains: Array) -> tuple[Array, Array]
     return share * linear, share * angular
 
 
-def _kicked(parameters: RunParameters, given: Array, burnt: Array, taken: Array) -> Array:
+def _unpaid_energy(parameters: RunParameters, given: Array, burnt: Array, taken: Array) -> Array:
     """Returns Σ w·δp − Σ b‖δp‖²/t + energy stored in scene and coupling, in the device's scale."""
     if parameters.device_damping is None or (parameters.has_law and parameters.laws > 1):
         return np.zeros(len(given))
     return np.asarray(given - burnt + parameters.force_scale / parameters.scale * taken)
 
 
-def _later(
+def _delayed_steps(
     ticks: NDArray[np.void], following: NDArray[np.void] | None, late: int
 ) -> tuple[Array, Array]:
     """Returns the device's steps and turns ``late`` rows later; zeros after the last record."""

@@ -59,13 +59,13 @@ class RunEvents:
         Raises:
             RecordingError: An event is damaged.
         """
-        told: dict[str, list[Mapping[str, Any]]] = {
+        by_name: dict[str, list[Mapping[str, Any]]] = {
             name: [] for name in ("resume", "reset", "coupling", "switch")
         }
         for event in events:
-            if event.get("event") in told:
-                told[str(event["event"])].append(event)
-        ticks = {name: np.array([_tick(e) for e in of], float) for name, of in told.items()}
+            if event.get("event") in by_name:
+                by_name[str(event["event"])].append(event)
+        ticks = {name: np.array([_tick(e) for e in of], float) for name, of in by_name.items()}
         return cls(
             parameters=parameters,
             home=home,
@@ -73,10 +73,13 @@ class RunEvents:
             resets=ticks["reset"],
             couplings=(
                 parameters.coupling,
-                *(coupling_in(event, parameters) for event in told["coupling"]),
+                *(coupling_in(event, parameters) for event in by_name["coupling"]),
             ),
             _began=ticks["coupling"],
-            _switched=(ticks["switch"], np.array([bits_in(e) for e in told["switch"]], np.int64)),
+            _switched=(
+                ticks["switch"],
+                np.array([bits_in(e) for e in by_name["switch"]], np.int64),
+            ),
         )
 
     def laws(self, numbers: NDArray[np.int64]) -> Array:

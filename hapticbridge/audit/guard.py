@@ -57,8 +57,8 @@ def chained(
         for k in range(max(begin, done + 1), len(sent)):
             last = np.zeros(3) if starts[k] else sent[k - 1] if k else first
             plain = sent[k].copy()
-            asked = np.clip(vector[k], last - change[k], last + change[k])
-            step = _limited(asked, limit) - last
+            requested = np.clip(vector[k], last - change[k], last + change[k])
+            step = _limited(requested, limit) - last
             length = float(np.linalg.norm(step))
             sent[k] = last + (step if length <= rise else rise / length * step)
             done = k
@@ -195,19 +195,19 @@ class Watch:
         is_seated = ~is_released & (was_released | has_news | has_stalled | has_strayed | is_reset)
 
         begins = first | is_seated
-        pace = self._pace(ticks, outside, begins)
+        pace = self._ramp_pace(ticks, outside, begins)
         last = np.maximum.accumulate(np.where(begins, index, -1))
         start = np.where(last >= 0, ticks["tick"][last], self.start)
         is_soon = np.where(last >= 0, (is_seated & ~first)[last], self.is_soon)
         since_start = (ticks["tick"] - start).astype(np.float64)
         ramp = np.where(is_soon, guarding.fade_ticks, self.parameters.ramp_ticks)
-        risen = self._risen(pace, last, ramp + 1.0)
+        risen = self._ramp_progress(pace, last, ramp + 1.0)
         rising = risen / (ramp + 1.0)
         fading = np.maximum(1.0 - silence / guarding.fade_ticks, 0.0)
         flags = {
             TickFlag.CLUTCH: is_released,
             TickFlag.RESEATED: is_seated,
-            TickFlag.RAMPING: _ramps(ticks, risen, ramp + 1.0),
+            TickFlag.RAMPING: _expected_ramping(ticks, risen, ramp + 1.0),
         }
         seen = Seen(first, interval, since_start, ramp, silence, flags, rising * fading)
         then = copy.copy(self)
@@ -221,7 +221,7 @@ class Watch:
         then.start, then.is_soon = int(start[-1]), bool(is_soon[-1])
         return seen, then
 
-    def _risen(self, pace: Array, last: NDArray[np.int64], full: Array) -> Array:
+    def _ramp_progress(self, pace: Array, last: NDArray[np.int64], full: Array) -> Array:
         """Returns the progress of the rise, in ticks of a ramp.
 
         ``pace`` is the largest progress in each tick. The rise began in row ``last``, −1 before
@@ -231,7 +231,7 @@ class Watch:
         before = np.where(last >= 0, gone[last] - pace[last], -self.risen)
         return np.minimum(gone - before, full)
 
-    def _pace(self, ticks: NDArray[np.void], outside: RunEvents, begins: Flags) -> Array:
+    def _ramp_pace(self, ticks: NDArray[np.void], outside: RunEvents, begins: Flags) -> Array:
         """Returns the largest progress in each tick, in ticks of a ramp, (n,).
 
         It is min(1, V_0/V) for the energy V stored in the coupling at the recorded poses.
@@ -254,7 +254,7 @@ class Watch:
         return np.divide(most, held, out=pace, where=held > most)
 
 
-def _ramps(ticks: NDArray[np.void], risen: Array, full: Array) -> Flags:
+def _expected_ramping(ticks: NDArray[np.void], risen: Array, full: Array) -> Flags:
     """Returns the expected flag; where rounding decides, the recorded one."""
     is_close = (np.abs(risen - full) < _ROUNDING) & (risen != np.rint(risen))
     return np.where(is_close, has_flag(ticks, TickFlag.RAMPING), risen < full)
@@ -340,7 +340,7 @@ class Account:
         sent[np.isin(ticks["tick"], resumed)] = 0.0
         credit = np.repeat([guarding.credit, guarding.rotational_credit], 3)
         given = (sent - credit * velocity) * moved
-        gained = then._gained(ticks, wrench, seen.share)
+        gained = then._scene_contribution(ticks, wrench, seen.share)
         total = given.sum(axis=1) + np.concatenate([[self.gained], gained[:-1]])
         account = capped_sum(total, guarding.surplus, self.account)
         axes = capped_sum(given, guarding.surplus, self.axes)
@@ -371,15 +371,15 @@ class Account:
         share = np.where(pays, _tank_share(parameters, held, velocity, account), 1.0)
         return Controlled(held * share[:, None], change, _largest(damping)), then
 
-    def _gained(self, ticks: NDArray[np.void], wrench: Array, share: Array) -> Array:
+    def _scene_contribution(self, ticks: NDArray[np.void], wrench: Array, share: Array) -> Array:
         """Returns the scene's contribution per tick: stored energy times transmitted share."""
         own = ticks["kinetic"] + ticks["potential"] - ticks["actuator_work"]
         own = own - ticks["external_work"]
         change = np.diff(own, prepend=self.own)
         self.own = float(own[-1])
-        asked = np.linalg.norm(wrench[:, :3], axis=1)
+        requested = np.linalg.norm(wrench[:, :3], axis=1)
         sent = np.linalg.norm(ticks["wrench_on_device"][:, :3], axis=1)
-        passed = np.minimum(np.divide(sent, asked, out=share.copy(), where=asked > 0), 1.0)
+        passed = np.minimum(np.divide(sent, requested, out=share.copy(), where=requested > 0), 1.0)
         return np.asarray(self.parameters.force_scale / self.parameters.scale * passed * change)
 
 
@@ -395,7 +395,6 @@ def _largest(damping: Array) -> Array:
 
 
 def _tank_share(parameters: RunParameters, wrench: Array, velocity: Array, account: Array) -> Array:
-    """Returns the share of the wrench that the tank covers, (n,)."""
     work = parameters.period * np.sum(wrench * velocity, axis=1)
     level = np.maximum(TANK_START - account, 0.0)
     return np.where(work > level, level / np.where(work > level, work, 1.0), 1.0)
@@ -474,9 +473,9 @@ class Guarded:
         on_tool = ticks["wrench_on_tool"]
         force = -parameters.force_scale * on_tool[:, :3] @ axes
         torque = -parameters.force_scale / parameters.scale * on_tool[:, 3:] @ axes
-        asked = np.concatenate([force, torque], axis=1)
+        requested = np.concatenate([force, torque], axis=1)
         control, then.account = self.account.after(
-            ticks, asked, seen, device, outside.resumed, excess
+            ticks, requested, seen, device, outside.resumed, excess
         )
         guarding = parameters.guarding
         starts = seen.first | has_flag(ticks, TickFlag.RESEATED)

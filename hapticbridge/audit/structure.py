@@ -103,7 +103,6 @@ def _first(is_wrong: NDArray[np.bool_], start: int, text: str, port: str) -> Fau
 def _command_faults(
     ticks: NDArray[np.void], count: int, outside: RunEvents
 ) -> Iterator[Fault | None]:
-    """Compares the command bits of the records with the events that set them."""
     wrong = (ticks["buttons"] & ~DEVICE_BUTTONS) != outside.buttons(ticks["tick"])
     text = "buttons of tick {} do not show what the events commanded"
     yield _first(wrong, count, text, "buttons")
@@ -167,7 +166,7 @@ def _wrong_deadline(
 def _flag_faults(
     ticks: NDArray[np.void], before: NDArray[np.void], count: int, seen: Seen
 ) -> Iterator[Fault | None]:
-    """Compares redundant flags with the fields that imply them."""
+    """Compares flags with the fields that imply them."""
     expected = {
         TickFlag.DROPPED_BEFORE: np.zeros(len(ticks), bool),  # the ticks are contiguous
         TickFlag.CONTACT: ticks["contacts"] > 0,

@@ -44,7 +44,7 @@ def how_it_ended(events: Sequence[Mapping[str, Any]]) -> str:
     for event in events:
         name, reason = event.get("event"), event.get("reason")
         if name == "trip":
-            clauses.append(f"the guard tripped at tick {event.get('tick')}: {_short(reason)}")
+            clauses.append(f"the guard tripped at tick {event.get('tick')}: {_shorten(reason)}")
         elif name == "bridge_died":
             clauses.append(f"the bridge died after tick {event.get('tick')}")
         elif name == "recorder_died":
@@ -54,15 +54,15 @@ def how_it_ended(events: Sequence[Mapping[str, Any]]) -> str:
         elif name == "stop" and event.get("signal"):
             clauses.append(f"stopped by {event['signal']} at tick {event.get('tick')}")
         elif name == "stop" and reason not in ("duration", "signal", "caller", None, ""):
-            clauses.append(f"stopped by {_short(reason)}")
+            clauses.append(f"stopped by {_shorten(reason)}")
     has_trip = any(event.get("event") == "trip" for event in events)
     if has_trip:  # its exception is reported as a stop too
         clauses = [clause for clause in clauses if not clause.startswith("stopped by")]
     return "; ".join(clauses)
 
 
-def _short(reason: object) -> str:
-    """Returns a reason's text without its leading tick, limited in length."""
+def _shorten(reason: object) -> str:
+    """Returns a reason's text without its leading tick, at most 200 characters."""
     text = str(reason)
     head, mark, rest = text.partition(": ")
     return rest[:200] if mark and head.startswith("tick ") else text[:200]
@@ -174,7 +174,6 @@ class PassivityVerdict:
 
 
 def _first(is_beyond: NDArray[np.bool_], joules: NDArray[np.float64], start: int) -> _Excess | None:
-    """Returns the first tick beyond a limit; ``start`` is the number of the first tick."""
     if not is_beyond.any():
         return None
     at = int(np.argmax(is_beyond))

@@ -177,7 +177,7 @@ def open_case(
     is_rate_given, period = period is not None, DEFAULT_PERIOD if period is None else period
     info = SimulatedDevice().info
     coupling = coupling or default_coupling(info, period, scale, scale)
-    scene, refused = _compiled(source, grip)
+    scene, refused = _compile(source, grip)
     chosen = motion_for(scene, motion)
     name = str(motion) if motion is not None else scene.path.with_suffix(".csv").name
     if chosen is None:
@@ -208,7 +208,7 @@ def open_case(
         return replace(case, motion_fault=" ".join(str(error).split()))
 
 
-def _compiled(source: SceneSource, grip: str) -> tuple[Scene, dict[int, str]]:
+def _compile(source: SceneSource, grip: str) -> tuple[Scene, dict[int, str]]:
     """Compiles with a stand-in for each inertia that MuJoCo refuses, so other checks can run."""
     refused: dict[int, str] = {}
     while True:

@@ -90,8 +90,8 @@ def _rooms(case: SceneUnderCheck, pairs: list[tuple[int, int]]) -> dict[tuple[in
     if case.observation is None:
         return {}
     is_tool = tool_geoms(case.model, case.scene.grip)
-    mine = [pair for pair in pairs if is_tool[pair[0]] != is_tool[pair[1]]]
-    return clearances(case.model, mine, is_tool, case.observation.postures)
+    tool_pairs = [pair for pair in pairs if is_tool[pair[0]] != is_tool[pair[1]]]
+    return clearances(case.model, tool_pairs, is_tool, case.observation.postures)
 
 
 def _soft(
@@ -189,15 +189,14 @@ def _place(case: SceneUnderCheck, pair: tuple[int, int], *, is_soft: bool) -> tu
         return case.places.geom(max(pair, key=lambda geom: model.geom_priority[geom])), ""
     softness = [_softness(model.geom_solref[geom]) for geom in pair]
     if softness[0] == softness[1]:
-        mine, other = pair if is_tool[pair[0]] else pair[::-1]
+        own, other = pair if is_tool[pair[0]] else pair[::-1]
         also = case.places.geom(other)
-        return case.places.geom(mine), f" there and at {also.file}:{also.line}, {also.element}"
+        return case.places.geom(own), f" there and at {also.file}:{also.line}, {also.element}"
     extreme = max(softness) if is_soft else min(softness)
     return case.places.geom(pair[softness.index(extreme)]), ""
 
 
 def _softness(solref: np.ndarray) -> float:
-    """Returns timeconst · dampratio in s for either format of ``solref``."""
     first, second = (float(value) for value in solref)
     if first > 0 and second > 0:
         return first * second

@@ -168,20 +168,20 @@ def measure_cost(
     """
     total = (PASSES + 1) * samples.size
 
-    def told(number: int) -> None:
+    def report_progress(number: int) -> None:
         if progress is not None:
             progress(number * samples.size, total)
 
     ticks, contacts, rows = [], [], []
     for k in range(PASSES):
-        told(k)
+        report_progress(k)
         times, touching, counted = _time_ticks(scene, samples, coupling, period, clock)
         ticks.append(times[WARM_UP:])
         contacts.append(touching[WARM_UP:])
         rows.append(counted[WARM_UP:])
-    told(PASSES)
+    report_progress(PASSES)
     stages, touching = _time_stages(scene, samples, coupling, period)
-    told(PASSES + 1)
+    report_progress(PASSES + 1)
     time_of, contacts_of = np.concatenate(ticks), np.concatenate(contacts)
     is_free = contacts_of == 0
     free, contact = TimingStats.of(time_of[is_free]), TimingStats.of(time_of[~is_free])

@@ -270,7 +270,7 @@ def _search(judge: Judge, simpler: list[Simplification], progress: Progress | No
     for k, each in enumerate(simpler):
         if progress is not None:
             progress(k, total, each.name)
-        if (found := _tried(judge, each, judge.original)) is not None:
+        if (found := _apply(judge, each, judge.original)) is not None:
             alone.append((each, found[1]))
     # a small saving of the whole may be a large share of the rest
     order = [pair for pair in alone if pair[1].verdict in (MAY_GO, SAVES_NOTHING)]
@@ -281,7 +281,7 @@ def _search(judge: Judge, simpler: list[Simplification], progress: Progress | No
     for k, (each, _) in enumerate(order):
         if progress is not None:
             progress(len(simpler) + k, total, each.name)
-        found = _tried(judge, each, best, share)
+        found = _apply(judge, each, best, share)
         if found is not None and found[1].verdict == MAY_GO:
             best, share = found[0], found[1].cost or share
             together.append(found[1])
@@ -296,7 +296,7 @@ def _search(judge: Judge, simpler: list[Simplification], progress: Progress | No
     return Lean(judge, best, tuple(trial for _, trial in alone), tuple(together), result)
 
 
-def _tried(
+def _apply(
     judge: Judge, each: Simplification, base: SceneVariant, share: float = 1.0
 ) -> tuple[SceneVariant, VariantVerdict] | None:
     """Applies a simplification to a version; returns None if there is nothing to change."""

@@ -119,16 +119,16 @@ def _equalities(case: SceneUnderCheck) -> Iterator[Fault]:
 
 def _frictions(case: SceneUnderCheck) -> Iterator[Fault]:
     model = case.model
-    told = set()
+    reported = set()
     for dof in np.flatnonzero(model.dof_frictionloss > 0).tolist():
         joint, solref = int(model.dof_jntid[dof]), model.dof_solref[dof]
         solimp, loss = model.dof_solimp[dof], float(model.dof_frictionloss[dof])
         inertia = joint_inertia(model, case.scene.data, dof)
         speed = creep_speed(CREEP_LOAD * loss, solref, solimp, inertia)
         is_slide = model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE
-        if joint in told or speed <= (FASTEST_CREEP if is_slide else FASTEST_TURN):
+        if joint in reported or speed <= (FASTEST_CREEP if is_slide else FASTEST_TURN):
             continue
-        told.add(joint)
+        reported.add(joint)
         moved = f"{length(speed)}/s" if is_slide else f"{number(speed)} rad/s"
         place, unit = case.places.joint(joint), "N" if is_slide else "N m"
         yield Fault(
@@ -200,8 +200,8 @@ def geometry_faults(case: SceneUnderCheck) -> Iterator[Fault]:
 
 def _units(case: SceneUnderCheck) -> Iterator[Fault]:
     model = case.model
-    mine = _tool_bodies(case)
-    mass, extent = float(model.body_mass[mine].sum()), float(_tool_extent(case).max())
+    tool_bodies = _tool_bodies(case)
+    mass, extent = float(model.body_mass[tool_bodies].sum()), float(_tool_extent(case).max())
     found = []
     if extent > LARGEST_TOOL:
         found.append(f"is {length(extent)} long")
@@ -212,7 +212,8 @@ def _units(case: SceneUnderCheck) -> Iterator[Fault]:
     meshes = [
         int(model.geom_dataid[geom])
         for geom in range(model.ngeom)
-        if mine[model.geom_bodyid[geom]] and model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_MESH
+        if tool_bodies[model.geom_bodyid[geom]]
+        and model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_MESH
     ]
     body = int(model.body_rootid[model.site(case.scene.grip).bodyid[0]])
     place = case.places.mesh(meshes[0]) if meshes else case.places.body(body)
@@ -229,13 +230,13 @@ def _units(case: SceneUnderCheck) -> Iterator[Fault]:
 def _dented_meshes(case: SceneUnderCheck) -> Iterator[Fault]:
     """Finds colliding meshes that are not convex; MuJoCo collides their hulls."""
     model, uses = case.model, geom_uses(case.model)
-    told = set()
+    reported = set()
     for geom in range(model.ngeom):
         mesh = int(model.geom_dataid[geom])
         is_mesh = model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_MESH
-        if not is_mesh or uses[geom] == VISUAL or mesh in told:
+        if not is_mesh or uses[geom] == VISUAL or mesh in reported:
             continue
-        told.add(mesh)
+        reported.add(mesh)
         vertices, faces = mesh_of(model, mesh)
         dent, filled = dent_of(vertices, faces)
         if dent <= DEEPEST_DENT * float(np.ptp(vertices, axis=0).max()):
@@ -294,9 +295,9 @@ def _far_grip(case: SceneUnderCheck) -> Iterator[Fault]:
     model, scene = case.model, case.scene
     scene.reset()
     site = model.site(scene.grip).id
-    mine, body = _tool_bodies(case), int(model.site_bodyid[site])
-    mass = model.body_mass[mine]
-    centre = mass @ scene.data.xipos[mine] / mass.sum()
+    tool_bodies, body = _tool_bodies(case), int(model.site_bodyid[site])
+    mass = model.body_mass[tool_bodies]
+    centre = mass @ scene.data.xipos[tool_bodies] / mass.sum()
     grip = scene.data.site_xpos[site]
     distance = float(np.linalg.norm(grip - centre))
     extent = max(float(np.linalg.norm(_tool_extent(case))), _SMALLEST_EXTENT)
@@ -316,7 +317,6 @@ def _far_grip(case: SceneUnderCheck) -> Iterator[Fault]:
 
 
 def _workspace(case: SceneUnderCheck) -> Iterator[Fault]:
-    """Compares the device's part of the motion with the cube that it reaches."""
     extent = float(np.ptp(case.motion.table[:, 1:4], axis=0).max()) / case.scale
     if extent <= case.workspace:
         return
@@ -341,10 +341,13 @@ def _tool_extent(case: SceneUnderCheck) -> NDArray[np.float64]:
     """Returns the edges in m of the axis-aligned box around the tool's geoms at the start."""
     model, scene = case.model, case.scene
     scene.reset()
-    mine = _tool_bodies(case)
+    tool_bodies = _tool_bodies(case)
     corners = []
     for geom in range(model.ngeom):
-        if mine[model.geom_bodyid[geom]] and model.geom_type[geom] != mujoco.mjtGeom.mjGEOM_PLANE:
+        if (
+            tool_bodies[model.geom_bodyid[geom]]
+            and model.geom_type[geom] != mujoco.mjtGeom.mjGEOM_PLANE
+        ):
             centre, half = model.geom_aabb[geom, :3], model.geom_aabb[geom, 3:]
             rotation = scene.data.geom_xmat[geom].reshape(3, 3)
             middle = scene.data.geom_xpos[geom] + rotation @ centre
@@ -379,14 +382,14 @@ def mass_faults(case: SceneUnderCheck) -> Iterator[Fault]:
             f"judged with {stand_in} instead",
             mend if is_none else 'the right diaginertia, or balanceinertia="true" in <compiler>',
         )
-    yield from _of_water(case)
+    yield from _default_densities(case)
     yield from _contact_ratios(case)
     yield from _load_ratios(case)
     yield from _sag(case)
 
 
-def _of_water(case: SceneUnderCheck) -> Iterator[Fault]:
-    """Finds moving bodies with a geom that has the default density because it sets none."""
+def _default_densities(case: SceneUnderCheck) -> Iterator[Fault]:
+    """Finds moving bodies with a geom that has the default density."""
     model, geoms = case.model, list(case.source.spec.geoms)
     if len(geoms) != model.ngeom:  # the compiler dropped some, so ids do not match
         return
@@ -394,7 +397,7 @@ def _of_water(case: SceneUnderCheck) -> Iterator[Fault]:
     for geom, written in enumerate(geoms):
         body = int(model.geom_bodyid[geom])
         is_free_to_move = model.body_treeid[body] >= 0 and body not in case.refused
-        if is_free_to_move and _says_nothing(case, geom, written):
+        if is_free_to_move and _sets_no_mass(case, geom, written):
             silent.setdefault(body, []).append(geom)
     for body, those in silent.items():
         visual = [
@@ -417,7 +420,7 @@ def _of_water(case: SceneUnderCheck) -> Iterator[Fault]:
         )
 
 
-def _says_nothing(case: SceneUnderCheck, geom: int, written: Any) -> bool:
+def _sets_no_mass(case: SceneUnderCheck, geom: int, written: Any) -> bool:
     compiler = case.source.spec.compiler
     low, high = compiler.inertiagrouprange
     return bool(
@@ -430,16 +433,15 @@ def _says_nothing(case: SceneUnderCheck, geom: int, written: Any) -> bool:
 
 
 def _contact_ratios(case: SceneUnderCheck) -> Iterator[Fault]:
-    """Compares the effective inertias of bodies that met, armature included."""
-    model, told = case.model, set()
+    model, reported = case.model, set()
     case.scene.reset()
     for pair in case.observation.meetings if case.observation else ():
         bodies = [int(model.geom_bodyid[geom]) for geom in pair]
         inverse = [1.0 / body_inertia(model, case.scene.data, body) for body in bodies]
         key = frozenset(bodies)
-        if min(inverse) <= 0 or max(inverse) <= LARGEST_RATIO * min(inverse) or key in told:
+        if min(inverse) <= 0 or max(inverse) <= LARGEST_RATIO * min(inverse) or key in reported:
             continue
-        told.add(key)
+        reported.add(key)
         light, heavy = (case.places.body(bodies[inverse.index(f(inverse))]) for f in (max, min))
         least = 1.0 / (LARGEST_RATIO * min(inverse))
         yield Fault(
@@ -453,7 +455,6 @@ def _contact_ratios(case: SceneUnderCheck) -> Iterator[Fault]:
 
 
 def _load_ratios(case: SceneUnderCheck) -> Iterator[Fault]:
-    """Compares a moving body with the load on its further joints."""
     model = case.model
     for body in range(1, model.nbody):
         parent = int(model.body_weldid[model.body_parentid[body]])
@@ -494,11 +495,11 @@ def _sag(case: SceneUnderCheck) -> Iterator[Fault]:
     for joint in range(model.njnt):
         if model.jnt_type[joint] in (mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE):
             springs[model.jnt_dofadr[joint]] = float(np.ravel(model.jnt_stiffness[joint])[0])
-    mine = jacobian[:, dofs]
-    stiffness = mine.T @ (gains[:, None] * mine) + np.diag(springs[dofs])
+    tool_jacobian = jacobian[:, dofs]
+    stiffness = tool_jacobian.T @ (gains[:, None] * tool_jacobian) + np.diag(springs[dofs])
     pulls = (data.qfrc_gravcomp - bias)[dofs]
     moved = np.linalg.lstsq(stiffness, pulls, rcond=1e-9)[0]
-    sag = float(np.linalg.norm(mine[:3] @ moved))
+    sag = float(np.linalg.norm(tool_jacobian[:3] @ moved))
     if sag <= LARGEST_SAG:
         return
     root = int(model.body_rootid[body])

@@ -92,7 +92,6 @@ def clearances(
 def _may_be_near(
     model: mujoco.MjModel, data: mujoco.MjData, pairs: NDArray[np.int64]
 ) -> NDArray[np.bool_]:
-    """Selects the pairs whose bounding spheres come within ``FARTHEST``."""
     first, second = pairs.T
     reach = np.where(model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE, np.inf, model.geom_rbound)
     apart = np.linalg.norm(data.geom_xpos[first] - data.geom_xpos[second], axis=1)

@@ -66,8 +66,8 @@ def option_faults(case: SceneUnderCheck) -> Iterator[Fault]:
             f"{places.option_change('timestep', f'{case.period:g}')}, or check with --rate "
             f"{1 / step:g}",
         )
-    told = [*case.source.concerns, *check_model(case.model, case.scene.grip)]
-    for concern in told:
+    concerns = [*case.source.concerns, *check_model(case.model, case.scene.grip)]
+    for concern in concerns:
         if "integrator" not in concern:
             attribute = "wind" if concern.startswith("wind") else "surfacevel"
             place = places.with_attribute(attribute) or places.option(attribute)
@@ -151,12 +151,12 @@ def _created_without_contact(case: SceneUnderCheck, sentence: str) -> Fault:
     """Names the tool's joints: their axes turn within a step, the only other source of energy."""
     model = case.model
     tree = model.body_treeid[model.site(case.scene.grip).bodyid[0]]
-    mine = np.flatnonzero(model.body_treeid[model.jnt_bodyid] == tree)
-    if model.jnt_type[mine[0]] == mujoco.mjtJoint.mjJNT_FREE:
+    tool_joints = np.flatnonzero(model.body_treeid[model.jnt_bodyid] == tree)
+    if model.jnt_type[tool_joints[0]] == mujoco.mjtJoint.mjJNT_FREE:
         change, place = "slower springs and actuators", case.places.option("integrator")
     else:
         change = f'damping="{LITTLE_DAMPING:g}" or more there, or slower springs and actuators'
-        place = case.places.joint(int(mine[0]))
+        place = case.places.joint(int(tool_joints[0]))
     return Fault("energy created", place, sentence, change)
 
 

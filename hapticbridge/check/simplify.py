@@ -532,7 +532,6 @@ def _hull(count: int) -> Simplification:
 
 
 def _hull_corners(spec: mujoco.MjSpec) -> dict[str, int]:
-    """Returns the number of hull corners of each colliding mesh."""
     meshes = {geom.meshname for geom in _mesh_geoms(spec)}
     if not meshes:
         return {}
@@ -567,7 +566,7 @@ def _fit_primitives(draft: SceneVariant) -> bool:
     for name in names:
         geom = spec.geom(name)
         geom.type, geom.size = fits[name].kind, fits[name].size
-        _forget_mesh(spec, geom)
+        _remove_mesh(spec, geom)
         geom.pos, geom.quat = np.zeros(3), IDENTITY
         geom.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
     for mesh in [mesh for mesh in spec.meshes if not _is_used(spec, mesh)]:
@@ -582,7 +581,7 @@ def _fit_primitives(draft: SceneVariant) -> bool:
     return True
 
 
-def _forget_mesh(spec: mujoco.MjSpec, geom: mujoco.MjsGeom) -> None:
+def _remove_mesh(spec: mujoco.MjSpec, geom: mujoco.MjsGeom) -> None:
     """Removes the mesh from a geom and from its classes, which would restore it in a file."""
     geom.meshname = ""
     for default in (geom.classname, spec.default):

@@ -116,10 +116,12 @@ class AxisCouplingLimits:
         ratios = self.period * np.array([0.0, *inner, _HIGHEST])
         needs = []
         for ratio in ratios.tolist():
-            asked = self.put(self.start, 1.0, ratio)
+            requested = self.put(self.start, 1.0, ratio)
             scales = self.scale, self.force_scale
             try:
-                need = required_axis_damping(known, asked, self.period, *scales, laws, self.method)
+                need = required_axis_damping(
+                    known, requested, self.period, *scales, laws, self.method
+                )
                 needs.append(need[self.axis == "rotation"])
             except CouplingError:  # no damping compensates this delay
                 needs.append(math.inf)
@@ -130,8 +132,8 @@ class AxisCouplingLimits:
 
         It takes microseconds after the first call, because a refusal must not slow the loop.
         """
-        asked = self.put(self.start, stiffness, damping)
-        stiffness, damping = self.gains(self.method.used(asked, self.period / self.substeps))
+        requested = self.put(self.start, stiffness, damping)
+        stiffness, damping = self.gains(self.method.used(requested, self.period / self.substeps))
         ratios, needs = self._table
         highest = float(ratios[-1])
         ratio = min(damping / stiffness, highest) if stiffness > 0.0 else highest

@@ -124,15 +124,15 @@ def command_of(line: bytes) -> Command:
     if len(line) > LONGEST_LINE:
         raise CommandError(f"a command has at most {LONGEST_LINE} bytes")
     try:
-        said: Any = read_json(line)
-        name = said.pop("command")
+        values: Any = read_json(line)
+        name = values.pop("command")
         kind = KINDS[name]
     except (ValueError, KeyError, TypeError, AttributeError):
         raise CommandError(
             f"{shown(line)} is not a command; choose one of {choices(KINDS)}"
         ) from None
     try:
-        return kind(**said)
+        return kind(**values)
     except TypeError:
         valid = choices(field.name for field in fields(kind)) or "nothing else"
-        raise CommandError(f"command '{name}' takes {valid}, not {shown(said)}") from None
+        raise CommandError(f"command '{name}' takes {valid}, not {shown(values)}") from None

@@ -20,13 +20,7 @@ from hapticbridge.files import read_json
 
 
 def checked_number(name: str, value: object, unit: str, *, is_positive: bool = False) -> float:
-    """Returns a device's parameter as a float.
-
-    Args:
-        name: Name of the parameter in messages.
-        value: A real number, finite and >= 0 (> 0 with ``is_positive``).
-        unit: The parameter's unit, for the message.
-        is_positive: True to refuse zero.
+    """Returns a parameter as a float if it is a finite real number >= 0 (> 0 with ``is_positive``).
 
     Raises:
         DeviceError: The value is not a number, not finite, or out of range.
@@ -42,11 +36,7 @@ def checked_number(name: str, value: object, unit: str, *, is_positive: bool = F
 
 
 def checked_period(period: float) -> float:
-    """Returns the loop's period in s if it is finite and > 0.
-
-    Raises:
-        DeviceError: The period is not finite or not > 0.
-    """
+    """Returns the loop's period in s if it is finite and > 0; otherwise raises DeviceError."""
     return checked_number("the loop's period", period, "s", is_positive=True)
 
 
@@ -80,11 +70,7 @@ _POSITIVE = ("mass", "rotational_inertia", "rate", "reach")
 
 
 def stated_numbers(options: Mapping[str, object], names: Iterable[str]) -> dict[str, float]:
-    """Returns the numbers of the data sheet that a device's options state.
-
-    Args:
-        options: Options by name; None stands for an option that is not set.
-        names: Keys of ``DATA_SHEET_UNITS`` to look for.
+    """Returns the numbers of the data sheet among a device's options; None means not stated.
 
     Raises:
         DeviceError: A number is out of range.

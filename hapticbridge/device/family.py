@@ -143,7 +143,7 @@ def access_problem(path: str) -> str | None:
     if os.access(path, os.R_OK | os.W_OK):
         return None
     if not Path(path).exists():
-        return f"there is no {path} yet, or none in this container; try again in a second"
+        return f"{path} does not exist yet, or not in this container; try again in a second"
     return permission_problem(path)
 
 
@@ -171,7 +171,7 @@ def select_device(
         looked = family.sought or looked
         raise DeviceError(
             f"no device '{family.name}' is plugged in (looked for {looked}); 'hapticbridge "
-            "devices' lists what is, and what permission is missing"
+            "devices' lists connected devices and missing permissions"
         )
     names = choices(device.serial or device.path for device in plugged)
     if serial is None:

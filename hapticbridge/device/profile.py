@@ -1,7 +1,7 @@
 """Device profile: properties of a device type or of one unit, each number with its source.
 
-A profile is a TOML file (``profile_search`` lists the places). It supplies numbers that a driver
-cannot read, above all the damping b.
+A profile is a TOML file (``profiles`` lists them). It supplies numbers that a driver cannot read,
+above all the damping b.
 
     format = 1
     name = "Novint Falcon"
@@ -188,7 +188,9 @@ def _profile(raw: dict[str, object], path: Path) -> Profile:
 
 def _quantity(name: str, table: object) -> Quantity:
     if not isinstance(table, dict) or not table.keys() <= {"value", "interval", "unit", "source"}:
-        raise DeviceError(f"[{name}] must hold value, source, and perhaps unit and interval")
+        raise DeviceError(
+            f"[{name}] must hold value and source, and optionally unit and interval, and no more"
+        )
     if table.get("unit", UNITS[name]) != UNITS[name]:
         raise DeviceError(f"[{name}] unit = {table['unit']!r}: must be {UNITS[name]!r}")
     source = table.get("source")
@@ -205,10 +207,12 @@ def _quantity(name: str, table: object) -> Quantity:
     if interval is None:
         return Quantity(value, source)
     if not isinstance(interval, list) or len(interval) != 2 or not isinstance(value, float):
-        raise DeviceError(f"[{name}] interval = {interval!r}: must be two numbers about a value")
+        raise DeviceError(
+            f"[{name}] interval = {interval!r}: must be two numbers around a single value"
+        )
     least, most = (float(end) if _is_number(end) else math.nan for end in interval)
     if not least <= value <= most:
-        raise DeviceError(f"[{name}] interval = {interval!r}: must hold the value {value:g}")
+        raise DeviceError(f"[{name}] interval = {interval!r}: must contain the value {value:g}")
     return Quantity(value, source, (least, most))
 
 
@@ -256,12 +260,8 @@ def profile_of(device: str, serial: str = "", model: str = "") -> Profile | None
     """Returns the profile of a unit, else of its driver or model, else None.
 
     The order is the user's ``DEVICE-SERIAL.toml``, then ``DEVICE.toml``, then the shipped profile
-    that names the model. A user's file with the name of a shipped profile replaces it.
-
-    Args:
-        device: Name of the driver.
-        serial: Serial number of the unit; may be empty.
-        model: Model as named by the driver; empty: only a profile for all models of the driver.
+    that names the model. A user's file with the name of a shipped profile replaces it. Without a
+    model, only a profile for all models of the driver fits.
 
     Raises:
         DeviceError: The file is not valid.
@@ -275,11 +275,7 @@ def profile_of(device: str, serial: str = "", model: str = "") -> Profile | None
 
 
 def modelled(device: str) -> tuple[str, ...]:
-    """Returns the models of a driver that have profiles.
-
-    Raises:
-        DeviceError: A file is not valid.
-    """
+    """Returns the models of a driver that have profiles."""
     return tuple(model for found in _by_model(device) for model in found.models)
 
 

@@ -58,12 +58,7 @@ WHOLE = ("delay",)
 
 
 def parsed(device: str, text: str, valid: Iterable[str]) -> dict[str, object]:
-    """Parses the options after a device's name.
-
-    Args:
-        device: The name.
-        text: Options, separated by commas; may be empty.
-        valid: Options that the device has.
+    """Parses the options after a device's name, separated by commas.
 
     Raises:
         DeviceError: A part is not ``name=value``, a name occurs twice or is unknown, or a value is
@@ -98,11 +93,7 @@ def _value(name: str, text: str) -> object:
 
 
 def refuse_unknown(device: str, options: Iterable[str], valid: Iterable[str]) -> None:
-    """Refuses an option that a device does not have.
-
-    Raises:
-        DeviceError: Names the first unknown option, and the valid ones.
-    """
+    """Raises DeviceError for an unknown option; the message lists the valid ones."""
     names = tuple(valid)
     unknown = [name for name in options if name not in names]
     if unknown:
@@ -186,11 +177,6 @@ def device_for(scene: Scene, spec: str, tell: Notify = ignore_message) -> Device
     The hand is the scene's (``scene_hand``) and follows ``NAME.csv`` beside the scene, if present.
     Every option in the specification takes precedence over the scene.
 
-    Args:
-        scene: The scene that the device will move in.
-        spec: A specification for ``open_device``.
-        tell: Receives messages for the user.
-
     Raises:
         DeviceError: As for ``open_device``.
         SceneError: The scene specifies an impossible hand.
@@ -218,7 +204,7 @@ def _open_simulated(rest: str, options: Mapping[str, object]) -> Device:
             **{name.removeprefix(_HAND_PREFIX): value for name, value in changes.items()}
         )
     elif changes:
-        raise DeviceError(f"hand and {choices(changes)} exclude each other")
+        raise DeviceError(f"hand and {choices(changes)} exclude each other; set one of them")
     if parameters["hand"] == "none":
         parameters["hand"] = None
     elif not isinstance(parameters["hand"], Hand | None):

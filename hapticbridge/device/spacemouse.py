@@ -109,17 +109,11 @@ class Buttons(NamedTuple):
 
 
 def decoded(report: bytes) -> Deflection | Buttons | None:
-    """Decodes one report.
+    """Decodes one report, its number first; None for an unknown report.
 
     Report 1 is the translation; with 13 bytes (wireless models, the receiver, newer firmware) it
     holds translation and rotation. Report 2 is the rotation of older wired models, which send both
     in pairs. The layouts are distinguished by length, because one product was sold with both.
-
-    Args:
-        report: Any bytes, the report's number first.
-
-    Returns:
-        None for any other report.
     """
     if len(report) < 2:
         return None
@@ -134,15 +128,11 @@ def decoded(report: bytes) -> Deflection | Buttons | None:
 
 
 def share(count: int, dead_band: float) -> float:
-    """Returns a deflection as a share of full scale, −1 to 1, 0 within the dead band.
+    """Returns a reported count as a share of full scale, −1 to 1, 0 within the dead band d.
 
-        sign(c) · max(0, |c| − d)/(1 − d),    c = count/350 clamped to ±1
+        sign(c) · max(0, |c| − d)/(1 − d),    c = count/350 clamped to ±1,    0 <= d < 1
 
     It is continuous at the edge of the dead band.
-
-    Args:
-        count: Reported count.
-        dead_band: d, share of full scale that counts as rest, 0 <= d < 1.
     """
     size = min(abs(count) / FULL_SCALE, 1.0)
     if size <= dead_band:
@@ -232,18 +222,7 @@ class SpaceMouseDevice:
         self._to_origin()
 
     def start(self, period: float) -> NDArray[np.void]:
-        """Places the handle at the origin and switches the light on.
-
-        Args:
-            period: The loop's period in s, finite and > 0.
-
-        Returns:
-            The pose before the first tick, shape (1,), ``SAMPLE_DTYPE``.
-
-        Raises:
-            DeviceError: The period is not valid.
-            DeviceLost: The device is gone.
-        """
+        """Places the handle at the origin and switches the light on."""
         self._period = checked_period(period)
         self._link.take()
         self._to_origin()
@@ -256,15 +235,7 @@ class SpaceMouseDevice:
     def read(self, sample: NDArray[np.void]) -> int:
         """Moves the handle by one period (not at the first call) and returns its pose.
 
-        Args:
-            sample: Output, shape (1,), ``SAMPLE_DTYPE``.
-
-        Returns:
-            0: the pose is always that of this tick, with or without a report.
-
-        Raises:
-            DeviceError: The device was not started.
-            DeviceLost: The device is gone.
+        The result is always 0, because the pose is that of this tick, with or without a report.
         """
         if self._period == 0.0:
             raise DeviceError(f"{self._name} is read before it was started; call start() first")
@@ -322,15 +293,7 @@ class SpaceMouseDevice:
 def open_spacemouse(
     options: Mapping[str, object], _tell: Notify, api: HidApi | None = None
 ) -> SpaceMouseDevice:
-    """Finds and opens a SpaceMouse.
-
-    Args:
-        options: ``serial``, ``log``, and numbers of ``SpaceMouseDevice``.
-        api: hidapi or a substitute.
-
-    Raises:
-        DeviceError: No SpaceMouse is found, it cannot be opened, or a number is out of range.
-    """
+    """Finds and opens a SpaceMouse; options are ``serial``, ``log`` and numbers of the device."""
     plugged = select_device(FAMILY, find(FAMILY, api), options.get("serial"))
     # not overlapped: reports are written only before and after the loop
     link = HidLink.open(plugged, api, is_overlapped=False, log=HexLog.asked(options))

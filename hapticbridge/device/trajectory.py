@@ -430,17 +430,7 @@ class TrajectoryDevice:
         self._is_started = False
 
     def start(self, period: float) -> NDArray[np.void]:
-        """Goes to the first row, and compiles the functions of the loop.
-
-        Args:
-            period: The loop's period in s, finite and > 0.
-
-        Returns:
-            The pose before the first tick, shape (1,), ``SAMPLE_DTYPE``.
-
-        Raises:
-            DeviceError: The period is not valid.
-        """
+        """Goes to the first row, and compiles the functions of the loop."""
         self._states[0] = (0, 0, checked_period(period))
         sample = np.zeros(1, SAMPLE_DTYPE)
         self._advance = direct(_next_sample, self._states, self._table, sample)
@@ -449,14 +439,7 @@ class TrajectoryDevice:
         return sample
 
     def read(self, sample: NDArray[np.void]) -> int:
-        """Returns the pose of this tick, without buttons.
-
-        Args:
-            sample: Output, shape (1,), ``SAMPLE_DTYPE``.
-
-        Raises:
-            DeviceError: The device was not started.
-        """
+        """Returns the pose of this tick, without buttons."""
         if not self._is_started:
             raise DeviceError("the trajectory is read before it was started; call start() first")
         self._advance(self._states, self._table, sample)
@@ -531,17 +514,7 @@ class ReplayDevice:
         self._tick = -1
 
     def start(self, period: float) -> NDArray[np.void]:
-        """Goes to the first row.
-
-        Args:
-            period: The loop's period in s, equal to the recording's.
-
-        Returns:
-            The pose before the first tick, shape (1,), ``SAMPLE_DTYPE``.
-
-        Raises:
-            DeviceError: The period differs.
-        """
+        """Goes to the first row; the loop's period must equal the recording's."""
         if abs(checked_period(period) - self._period) > _PERIOD_TOLERANCE * self._period:
             raise DeviceError(
                 f"{self._name}: was recorded at {1.0 / self._period:.9g} Hz, the loop runs at "
@@ -552,14 +525,7 @@ class ReplayDevice:
         return np.asarray(self._samples[:1].copy())
 
     def read(self, sample: NDArray[np.void]) -> int:
-        """Returns the recorded sample of this tick.
-
-        Args:
-            sample: Output, shape (1,), ``SAMPLE_DTYPE``.
-
-        Raises:
-            DeviceError: The device was not started.
-        """
+        """Returns the recorded sample of this tick."""
         tick = self._tick
         if tick < 0:
             raise DeviceError(f"{self._name} is read before it was started; call start() first")

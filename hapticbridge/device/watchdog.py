@@ -86,13 +86,9 @@ class ForceOffGuardian:
 
 
 def guard_device_node(path: str, *reports: bytes) -> ForceOffGuardian | None:
-    """Returns a ``ForceOffGuardian`` if two processes can hold the node; otherwise None.
+    """Starts a guardian with these reports, or returns None if only one process may hold the node.
 
     Without it, the device's own watchdog or the limited duration of its effects ends the force.
-
-    Args:
-        path: The device node.
-        reports: Reports that end the force, each starting with its number.
     """
     if not path.startswith("/dev/hidraw"):
         return None
@@ -134,12 +130,7 @@ class SilenceDetector:
         self.silence = 0.0
 
     def is_silent(self, now: float, *, is_new: bool) -> bool:
-        """Records a reading; returns whether the device has been silent for too long.
-
-        Args:
-            now: Time in s on the link's clock.
-            is_new: True if this reading brought a new sample.
-        """
+        """Records a reading at the time ``now`` in s; returns whether the silence is too long."""
         was_away = self.was_away(now)
         self._read = now
         if is_new or was_away:
@@ -148,21 +139,14 @@ class SilenceDetector:
         return self.silence > SILENCE
 
     def was_away(self, now: float) -> bool:
-        """Returns whether the loop has paused without reading the device.
+        """Returns whether the loop has paused without reading the device, before ``is_silent``.
 
         A device that replies to requests then holds an answer as old as its last request. Used by
         the loop, it would place the hand at its old position, and elsewhere two ticks later.
-
-        Args:
-            now: Time in s on the link's clock, before ``is_silent`` records the reading.
         """
         return now - self._read > SILENCE + self._period
 
 
 def watchdog_time(period: float) -> float:
-    """Returns the time in s for which a device should hold a force that is not renewed.
-
-    Args:
-        period: The loop's period in s.
-    """
+    """Returns the time in s for which a device should hold a force, for a loop's period in s."""
     return max(SHORTEST_WATCHDOG, WATCHDOG_PERIODS * period)

@@ -21,13 +21,12 @@ encoder resolves; below 0.7 Hz a run of 12 s holds too few swings."""
 
 SLOW_PERIOD = 0.003
 """Loop period in s above which all times of a run are stretched in proportion. A window of the fit
-needs ``weak_form.LEAST_SAMPLES`` periods within half a swing, so slower loops need slower
-motion."""
+needs ``LEAST_SAMPLES`` periods within half a swing, so slower loops need slower motion."""
 
 _TILT, _SLOW_TILT = -0.3, -1.0
 """Exponents of a tone's amplitude over its frequency, without unit. With the first, all tones move
 a damped axis by similar amounts. The second, for slow loops, favours low tones; otherwise swings
-would be too short for ``weak_form.LEAST_SAMPLES``."""
+would be too short for ``LEAST_SAMPLES``."""
 
 START_SHARE = 0.03
 """Initial amplitude as a share of the force limit, without unit. It grows until the axis moves."""
@@ -95,21 +94,14 @@ integral of the springs in N and N m; amplitude and recent reach of the signal."
 
 
 def stretch(period: float) -> float:
-    """Returns the factor by which all times of a run are longer than at 333 Hz and above (1 there).
-
-    Args:
-        period: T in s.
-    """
+    """Returns the factor by which a period in s stretches all times of a run, 1 from 333 Hz."""
     return max(1.0, period / SLOW_PERIOD)
 
 
 def signal(axis_index: int, ticks: int, period: float) -> NDArray[np.float64]:
-    """Returns a sum of tones scaled to [−1, 1], shape (n,). Its phases depend on the axis only.
+    """Returns a sum of tones in [−1, 1], shape (ticks,), for a period in s and an axis from 0 to 5.
 
-    Args:
-        axis_index: 0 to 5, the seed of the phases.
-        ticks: n.
-        period: T in s.
+    The phases are random and depend on the axis only.
     """
     generator = np.random.default_rng(axis_index)
     frequencies = np.geomspace(LOWEST, HIGHEST, TONES) / stretch(period)

@@ -63,25 +63,17 @@ class Estimate:
 
 
 def solved(columns: Array, right: Array) -> Array:
-    """Returns the least-squares factors x of columns · x = right.
-
-    Args:
-        columns: Shape (n, k).
-        right: Shape (n,).
-    """
+    """Returns the least-squares solution x, shape (k,), of columns · x = right."""
     scale = np.linalg.norm(columns, axis=0)
     scale[scale == 0.0] = 1.0
     return np.asarray(np.linalg.lstsq(columns / scale, right, rcond=None)[0] / scale)
 
 
 def half_widths(columns: Array, right: Array) -> Array:
-    """Returns the half-widths of the least-squares factors by a jackknife over ``BLOCKS`` parts.
+    """Returns the half-widths of the least-squares solution by a jackknife over ``BLOCKS`` parts.
 
-    Its only assumption is that distant rows have independent errors.
-
-    Args:
-        columns: Shape (n, k), in the order of time, n >= ``BLOCKS``.
-        right: Shape (n,).
+    The rows, at least ``BLOCKS``, are in the order of time. The only assumption is that distant
+    rows have independent errors.
 
     References:
         Efron & Stein 1981, *The jackknife estimate of variance*.
@@ -134,11 +126,7 @@ class AxisFit:
     count: int
 
     def resistance(self, speed: Array) -> Array:
-        """Returns b v + b_2 v |v| + f_c sign(v) in N (N m), with b_2 only if it is significant.
-
-        Args:
-            speed: v in m/s (rad/s).
-        """
+        """Returns b v + b_2 v |v| + f_c sign(v) in N (N m), with b_2 only if it is significant."""
         bend = self.drag.value * (np.abs(speed) - self.drag_speed) if self.drag.is_seen else 0.0
         return np.asarray(
             (self.damping.value + bend) * speed + self.friction.value * np.sign(speed)
@@ -304,14 +292,10 @@ def windows(
 
 
 def noise_of(position: Array, resolution: float) -> float:
-    """Returns the RMS of a position's noise in m, 0 if rounding explains it.
+    """Returns the RMS of a position's noise, 0 if rounding to ``resolution`` explains it.
 
     Sixth differences remove a smooth motion and multiply the RMS of white noise by √924. Their
     median ignores the few ticks in which friction reverses.
-
-    Args:
-        position: x in m at the samples, shape (n,); NaN without a sample.
-        resolution: Step of the position in m, 0 if it is exact.
     """
     differences = np.diff(position, 6)
     differences = differences[np.isfinite(differences)]
@@ -378,8 +362,8 @@ _MASS, _DAMPING, _FRICTION, _OFFSET, _DELAY = range(5)
 def fit_axis(position: Array, force: Array, period: float, resolution: float = 0.0) -> AxisFit:
     """Fits M x'' + b x' + f_c sign(x') + c = F(t − d) to a run.
 
-    The windows of ``weak_form`` are solved by least squares; d is adjusted until the factor of its
-    own column vanishes. The intervals come from a jackknife over the parts of the run
+    The windows (``windows``) are solved by least squares; d is adjusted until the factor of its own
+    column vanishes. The intervals come from a jackknife over the parts of the run
     (``half_widths``), ``METHOD_ERROR`` and ``SUM_ERROR``.
 
     A spring k x and a drag b_2 x' |x'| join the law if they are significant. A drag that is not
@@ -409,7 +393,7 @@ def fit_axis(position: Array, force: Array, period: float, resolution: float = 0
         return best
     if noise > 0.0:
         raise IdentificationError(
-            f"its position trembles by {noise:.2g} (RMS, m or rad), too much for so small a "
+            f"its position has a noise of {noise:.2g} (RMS, m or rad), too much for so small a "
             "motion; allow more travel or more force, or remove the source of the noise"
         )
     raise IdentificationError(

@@ -266,13 +266,10 @@ class Identification:
     period_most: float
 
     def of_all(self, name: str, *, turns: bool, most: bool = False) -> Estimate | None:
-        """Returns the estimate over all axes of a kind that lies on the safe side.
+        """Returns the most cautious estimate of a field of ``AxisFit`` over all axes of a kind.
 
-        Args:
-            name: A field of ``AxisFit``.
-            turns: True for rotation.
-            most: True if the largest value is the safe one (delay); otherwise the smallest is
-                returned.
+        This is the smallest value, or the largest with ``most`` (for a delay); ``turns`` selects
+        rotation.
         """
         fits = [fit for axis, fit in self.fits.items() if (len(axis) == 2) == turns]
         found: list[Estimate] = [getattr(fit, name) for fit in fits]
@@ -353,11 +350,7 @@ def identify(
 
 
 def duration_at(period: float) -> float:
-    """Returns the default time per axis in s: 12, and more below 333 Hz.
-
-    Args:
-        period: T in s.
-    """
+    """Returns the default time per axis in s for a period in s: 12, and more below 333 Hz."""
     return DURATION * stretch(period)
 
 

@@ -237,22 +237,7 @@ def try_wall(
     axis: str = "x",
     duration: float = TRIAL,
 ) -> Trial:
-    """Renders one wall after a rest; always ends with zero force.
-
-    Args:
-        device: Device, started at this period.
-        clock: Started clock.
-        stiffness: K in N/m.
-        damping: B in N s/m.
-        period: T in s.
-        force: Largest force in N.
-        axis: One of x, y, z that the device has.
-        duration: Length of the trial in s.
-
-    Raises:
-        IdentificationError: The pose is not finite.
-        DeviceError: The device failed.
-    """
+    """Renders one wall after a rest, as for ``measure_limit``; always ends with zero force."""
     index = AXES.index(axis)
     sample, wrench = np.zeros(1, SAMPLE_DTYPE), np.zeros(6)
     place = sample["position"][0]

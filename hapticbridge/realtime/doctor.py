@@ -106,8 +106,8 @@ def run(
         return f"it cannot be started ({error.strerror})"
     late = parsed(done.stdout) if done.returncode == 0 else None
     if late is None:
-        said = (done.stderr or done.stdout).strip().splitlines() or [f"status {done.returncode}"]
-        return f"it failed: {said[-1].strip()}"
+        output = (done.stderr or done.stdout).strip().splitlines() or [f"status {done.returncode}"]
+        return f"it failed: {output[-1].strip()}"
     return late
 
 
@@ -219,7 +219,6 @@ def _throttling(system: System) -> Finding:
 
 
 def _preemption(system: System) -> Finding:
-    """Checks if the kernel can preempt its own work."""
     name = "preemption"
     if sys.platform != "linux":
         return Finding(name, None, f"real time is only supported on Linux, this is {sys.platform}")
@@ -242,7 +241,6 @@ def _preemption(system: System) -> Finding:
 
 
 def _dynamic_preemption(system: System) -> Finding:
-    """Checks a kernel whose preemption model is chosen at boot."""
     chosen = _dynamic_model(system)
     if chosen == "full":
         return Finding("preemption", True, "the kernel is preemptible (PREEMPT_DYNAMIC: full)")
@@ -317,7 +315,6 @@ def _host(system: System, stolen: float, duration: float) -> Finding:
 
 
 def _usb() -> Finding:
-    """Checks that the connected haptic devices may be opened."""
     name = "usb"
     unseen = blind_spots()
     plugged = plugged_devices()
@@ -486,12 +483,12 @@ def diagnose(
     lateness = {loop.name: loop.lateness() for loop in loops if loop.late_ns}
     stolen = (stolen_time(machine.proc) or 0.0) - (before or 0.0)
     found = findings(machine, at_rest + granted, stolen, duration)
-    found += (_baseline("" if BASELINE in lateness else refused),)
+    found += (_baseline_finding("" if BASELINE in lateness else refused),)
     verdict, sentence = judged(lateness, found, rate)
     return Diagnosis(rate, lateness, found, verdict, sentence)
 
 
-def _baseline(refused: str) -> Finding:
+def _baseline_finding(refused: str) -> Finding:
     if not refused:
         return Finding("baseline", None, "cyclictest, a C program, ran in turns with the loop")
     return Finding(
@@ -509,30 +506,30 @@ def judged(
 
     ``lateness_above_baseline`` holds at least ``bridge`` and ``bare sleep``.
     """
-    mine, period = lateness["bridge"], 1.0 / rate
+    bridge, period = lateness["bridge"], 1.0 / rate
     allowed = LATE_SHARE * period
-    missed = mine.missed / (mine.ticks + mine.missed)
+    missed = bridge.missed / (bridge.ticks + bridge.missed)
     # earlier findings matter more; one remedy often serves two findings
     remedies = dict.fromkeys(f.remedy for f in found if f.is_good is False and f.remedy)
     advice = "; ".join(list(remedies)[:2])
     held = f"{rate:g} Hz"
-    numbers = f"99.9 % of ticks within {mine.p999 * 1e6:.0f} µs, {mine.missed} missed"
-    if mine.p999 <= allowed and mine.missed == 0:
+    numbers = f"99.9 % of ticks within {bridge.p999 * 1e6:.0f} µs, {bridge.missed} missed"
+    if bridge.p999 <= allowed and bridge.missed == 0:
         rest = f"; better still: {advice}" if advice else "; no change is needed"
         return "fit", f"fit for {held}: {numbers}{rest}"
-    if mine.p99 <= allowed and missed <= FEW_MISSED:
+    if bridge.p99 <= allowed and missed <= FEW_MISSED:
         verdict, words = "fair", f"fair for {held}"
     else:
         verdict, words = "unfit", f"unfit for {held}"
-    return verdict, f"{words}: {numbers}; {_cause(lateness, allowed, advice)}{_held(mine)}"
+    return verdict, f"{words}: {numbers}; {_cause(lateness, allowed, advice)}{_stall_words(bridge)}"
 
 
-def _held(mine: Lateness) -> str:
+def _stall_words(bridge: Lateness) -> str:
     """Describes the effect of a long stall on the hand; empty if all were short."""
-    if mine.worst <= SHORTEST_WATCHDOG:
+    if bridge.worst <= SHORTEST_WATCHDOG:
         return ""
     return (
-        f"; it stalled for {1e3 * mine.worst:.0f} ms: meanwhile a device keeps applying its "
+        f"; it stalled for {1e3 * bridge.worst:.0f} ms: meanwhile a device keeps applying its "
         "last force, unless it has a watchdog (see 'hapticbridge devices')"
     )
 

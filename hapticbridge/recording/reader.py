@@ -227,14 +227,14 @@ class RecordingFile:
         size = size or BLOCK
         runs: list[NDArray[np.void]] = []
         found = 0
-        for _ in _passes(self.path, runs.append):
+        for _ in _read_parts(self.path, runs.append):
             while sum(run.size for run in runs) >= size:
-                block, runs[:] = _cut(runs, size)
+                block, runs[:] = _split(runs, size)
                 found += size
                 yield block
         if runs:
             found += sum(run.size for run in runs)
-            yield _joined(runs)
+            yield _join(runs)
         if found != self.count:
             raise RecordingError(f"the recording {self.path} was changed while it was read")
 
@@ -273,18 +273,18 @@ def open_recording(path: str | Path) -> RecordingFile:
     Raises:
         RecordingError: As for ``read_recording``.
     """
-    facts, _ = _described(Path(path), [])
+    facts, _ = _read_through(Path(path), [])
     return RecordingFile(**facts)
 
 
 def read_with_attachments(path: Path) -> tuple[Recording, list[Attachment]]:
     """Reads a recording, and its attachments in file order."""
     runs: list[NDArray[np.void]] = []
-    facts, attachments = _described(path, runs, keeps=True)
-    return Recording(**facts, ticks=_joined(runs)), attachments
+    facts, attachments = _read_through(path, runs, keeps=True)
+    return Recording(**facts, ticks=_join(runs)), attachments
 
 
-def _described(
+def _read_through(
     path: Path, runs: list[NDArray[np.void]], *, keeps: bool = False
 ) -> tuple[dict[str, Any], list[Attachment]]:
     """Reads a file; returns the fields of ``RecordingFile``, and the attachments.
@@ -303,7 +303,7 @@ def _described(
         if keeps:
             runs.append(run)
 
-    *_, (container, contents) = _passes(path, take)
+    *_, (container, contents) = _read_parts(path, take)
     if not contents.has_ticks:
         # a file cut inside its first chunk has no schema yet, but has metadata
         if contents.refusal or contents.meta is None or not container.is_cut:
@@ -331,7 +331,7 @@ def _described(
     return facts, contents.attachments
 
 
-def _passes(
+def _read_parts(
     path: Path, take: Callable[[NDArray[np.void]], None]
 ) -> Iterator[tuple[Container, Contents]]:
     """Reads a file; yields its container and contents after every part."""
@@ -360,7 +360,7 @@ def _add_described(contents: Contents, opcode: int, fields: Fields) -> None:
         contents.problems.append(f"{kind} is damaged: {error}")
 
 
-def _joined(runs: list[NDArray[np.void]]) -> NDArray[np.void]:
+def _join(runs: list[NDArray[np.void]]) -> NDArray[np.void]:
     """Joins runs into one array and empties the list, so that memory never holds both."""
     gathered = np.empty(sum(run.size for run in runs), TICK_DTYPE)
     stop = gathered.size
@@ -371,7 +371,7 @@ def _joined(runs: list[NDArray[np.void]]) -> NDArray[np.void]:
     return gathered
 
 
-def _cut(
+def _split(
     runs: list[NDArray[np.void]], size: int
 ) -> tuple[NDArray[np.void], list[NDArray[np.void]]]:
     """Returns the first ``size`` records of runs as one array, and the remaining runs."""
@@ -381,5 +381,5 @@ def _cut(
         left -= head[-1].size
         if not left:
             rest = [run[head[-1].size :], *runs[index + 1 :]]
-            return _joined(head), [each for each in rest if each.size]
+            return _join(head), [each for each in rest if each.size]
     raise AssertionError("fewer records than asked for")

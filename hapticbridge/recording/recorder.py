@@ -433,12 +433,12 @@ class RecordStream:
 
         It happened before ``tick``; ``time_ns`` counts from the start of the run.
         """
-        told = {"event": event, "tick": tick, **details}
+        payload = {"event": event, "tick": tick, **details}
         if self.recorder is not None:
-            self._events.append(told | {"time_ns": time_ns})
-            self.recorder.event(told, time_ns)
+            self._events.append(payload | {"time_ns": time_ns})
+            self.recorder.event(payload, time_ns)
         if self._onlooker is not None:
-            self._onlooker.event(told)
+            self._onlooker.event(payload)
 
     def look(self) -> None:
         """Checks that the recorder lives and its disk has space; takes some microseconds.

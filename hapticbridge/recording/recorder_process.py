@@ -155,8 +155,6 @@ smaller batch costs time; at 64 it is 0.3 µs per record."""
 
 
 class _Session:
-    """One run in the recorder's process."""
-
     def __init__(self, configuration: dict[str, Any], attachments: list[Attachment]) -> None:
         self.ring = Ring.attach(configuration["ring"])
         self._parent = configuration["parent"]
@@ -263,7 +261,7 @@ def _configuration(stream: IO[bytes]) -> tuple[dict[str, Any], list[Attachment]]
     return configuration, attachments
 
 
-def _calm() -> None:
+def _drop_signals_and_priority() -> None:
     """Ignores signals meant for the bridge, and drops the loop's real-time priority."""
     for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT"):
         if hasattr(signal, name):
@@ -275,7 +273,7 @@ def _calm() -> None:
 
 def main() -> int:
     """Runs the recorder's process; returns its exit status."""
-    _calm()
+    _drop_signals_and_priority()
     stream = sys.stdin.buffer
     given = _configuration(stream)
     if given is None:

@@ -74,8 +74,6 @@ def _nameless_file(folder: Path) -> IO[bytes]:
 
 
 class _Entries:
-    """Packed entries."""
-
     def __init__(self, data: bytes) -> None:
         self._data = data
 

@@ -91,13 +91,13 @@ def what_would_do(evidence: Evidence, *, is_late: bool = False) -> str:
             share = _largest(partial(_holds, evidence, axis, part))
             if share:
                 value = share * getattr(evidence.asked, f"{name}{part}")
-                found.append(f"lower the {axis}{part} to {_down(value)} {unit}")
+                found.append(f"lower the {axis}{part} to {_round_down(value)} {unit}")
     period = evidence.parameters.period
     slowest = period * FASTEST
     if not is_late and evidence.info.rate is None and slowest > 1:
         share = min(_largest(partial(_holds, evidence, axis, "period")) for axis in _SETTING_UNITS)
         if share and 1 / share < slowest:
-            found.append(f"raise the rate to {_up(1 / (share * period))} Hz")
+            found.append(f"raise the rate to {_round_up(1 / (share * period))} Hz")
     return ", or ".join(found) or "lower stiffness and damping together"
 
 
@@ -134,13 +134,13 @@ def _largest(holds: Callable[[float], bool]) -> float:
     return low
 
 
-def _down(value: float) -> str:
-    """Formats a limit with three digits, rounded down."""
+def _round_down(value: float) -> str:
+    """Formats a limit with three digits."""
     return _three_digits(value * (1 + _ROUNDING), math.floor)
 
 
-def _up(value: float) -> str:
-    """Formats a limit with three digits, rounded up."""
+def _round_up(value: float) -> str:
+    """Formats a limit with three digits."""
     return _three_digits(value * (1 - _ROUNDING), math.ceil)
 
 
@@ -168,19 +168,19 @@ def cause_at_device(evidence: Evidence, window: slice) -> Cause:
         return hazard
     conditions = run_conditions(evidence.info, evidence.worst, method)
     failing = [condition for condition in conditions if condition.holds is False]
-    if found := _delayed(evidence, failing):
+    if found := _delay_cause(evidence, failing):
         return found
-    if not failing and (found := _timing(evidence, window)):
+    if not failing and (found := _timing_cause(evidence, window)):
         return found
-    if counts := _counted(evidence, window):
+    if counts := _quantisation_words(evidence, window):
         others = f", or {what_would_do(evidence)}" if failing else ""
         return Cause("quantisation", counts, f"take a finer encoder or more friction{others}")
     if failing:
-        return _overloaded(evidence, failing)
-    return hazard if method.hazard else _unexplained(evidence)
+        return _overload_cause(evidence, failing)
+    return hazard if method.hazard else _unknown_cause(evidence)
 
 
-def _told(failing: list[DampingCondition]) -> str:
+def _failing_words(failing: list[DampingCondition]) -> str:
     return "; ".join(
         f"{c.axis}: the device's damping is {c.available:g} {_UNITS[c.axis]}, the coupling needs "
         f"{c.needed:.4g}"
@@ -191,7 +191,7 @@ def _told(failing: list[DampingCondition]) -> str:
 _UNITS = {"translation": "N s/m", "rotation": "N m s/rad"}
 
 
-def _delayed(evidence: Evidence, failing: list[DampingCondition]) -> Cause | None:
+def _delay_cause(evidence: Evidence, failing: list[DampingCondition]) -> Cause | None:
     """Returns a delay as the cause if the device could bear the coupling without it."""
     worst, info = evidence.worst, evidence.info
     late, own = delay_ticks(info, worst.period) or 0, info.damping or 0.0
@@ -202,25 +202,27 @@ def _delayed(evidence: Evidence, failing: list[DampingCondition]) -> Cause | Non
     return Cause(
         "delay",
         f"{prompt:.3g} N s/m of damping would bear the coupling without delay, the device has "
-        f"{own:.3g}; its samples are {late} ticks old; {_told(failing)}",
+        f"{own:.3g}; its samples are {late} ticks old; {_failing_words(failing)}",
         f"shorten the delay, or {what_would_do(evidence, is_late=True)}",
     )
 
 
-def _overloaded(evidence: Evidence, failing: list[DampingCondition]) -> Cause:
+def _overload_cause(evidence: Evidence, failing: list[DampingCondition]) -> Cause:
     """Returns too stiff a spring for the rate, or too strong a damper, as the cause."""
     worst, own = evidence.worst, evidence.info.damping or 0.0
     damper = worst.scale * worst.force_scale * evidence.asked.damping
     if failing[0].axis == "translation" and damper >= own:
         return Cause(
             "damping",
-            f"{_told(failing)}; its damper alone needs {damper:.4g} at any rate",
+            f"{_failing_words(failing)}; its damper alone needs {damper:.4g} at any rate",
             what_would_do(evidence),
         )
-    return Cause("rate", f"{_told(failing)}: it is too stiff for its rate", what_would_do(evidence))
+    return Cause(
+        "rate", f"{_failing_words(failing)}: it is too stiff for its rate", what_would_do(evidence)
+    )
 
 
-def _unexplained(evidence: Evidence) -> Cause:
+def _unknown_cause(evidence: Evidence) -> Cause:
     if evidence.info.delay is None:
         return Cause(
             "unknown",
@@ -234,7 +236,7 @@ def _unexplained(evidence: Evidence) -> Cause:
     )
 
 
-def _timing(evidence: Evidence, window: slice) -> Cause | None:
+def _timing_cause(evidence: Evidence, window: slice) -> Cause | None:
     """Returns missed deadlines or repeated samples as the cause; the device bears the coupling."""
     flags = evidence.ticks["flags"][window]
     missed = int(np.count_nonzero(flags & int(TickFlag.OVERRUN)))
@@ -260,7 +262,7 @@ def _timing(evidence: Evidence, window: slice) -> Cause | None:
     return None
 
 
-def _counted(evidence: Evidence, window: slice) -> str:
+def _quantisation_words(evidence: Evidence, window: slice) -> str:
     """Describes encoder steps as the cause; empty if they did not bring most of the energy.
 
     An unstable coupling passes through small steps too, but gains its energy after the swings have
@@ -292,7 +294,7 @@ def _counted(evidence: Evidence, window: slice) -> str:
 
 
 def _largest_steps(position: NDArray[np.float64], span: slice) -> NDArray[np.float64]:
-    """Returns the largest step of any axis into each tick, in m; 0 for the first tick of a run."""
+    """Returns the largest step of any axis into each tick, in m; 0 for the first tick."""
     before = position[max(span.start - 1, 0) : span.stop]
     steps = np.abs(np.diff(before, axis=0)).max(axis=1, initial=0.0)
     missing = span.stop - span.start - len(steps)
@@ -351,7 +353,7 @@ def cause_in_environment(evidence: Evidence, report: AuditReport, window: slice)
     where = f"{share:.0%} of the energy created until then came in ticks with contact"
     pairs = touched_pairs(evidence, report, window, gained) if share >= MOST else None
     if pairs:
-        where += _named(evidence, pairs)
+        where += _pair_words(evidence, pairs)
     if (moved := _moved_bodies(evidence, window)) and _can_push(evidence, pairs, share):
         return Cause(
             "inputs",
@@ -360,10 +362,10 @@ def cause_in_environment(evidence: Evidence, report: AuditReport, window: slice)
             "move them slower",
         )
     if share < MOST:
-        return _without_contact(evidence, window, where)
+        return _cause_without_contact(evidence, window, where)
     if concerns := _concerns(evidence, pairs):
-        told, _, remedy = concerns[0].rpartition("; write ")
-        return Cause("contact setting", f"{where}; {told}", f"write {remedy}")
+        concern, _, remedy = concerns[0].rpartition("; write ")
+        return Cause("contact setting", f"{where}; {concern}", f"write {remedy}")
     if method.hazard:
         return Cause(
             "method",
@@ -374,7 +376,7 @@ def cause_in_environment(evidence: Evidence, report: AuditReport, window: slice)
     return Cause("contact setting", f"{where}; {hard}", _SOFTER)
 
 
-def _without_contact(evidence: Evidence, window: slice, where: str) -> Cause:
+def _cause_without_contact(evidence: Evidence, window: slice, where: str) -> Cause:
     method, turned = evidence.method, _largest_turn(evidence, window)
     if method.hazard:
         return Cause("method", f"{where}; method '{method.name}': {method.hazard}", SAFE_METHOD)
@@ -394,14 +396,14 @@ def _without_contact(evidence: Evidence, window: slice, where: str) -> Cause:
 
 
 def _largest_turn(evidence: Evidence, window: slice) -> float:
-    """Returns the largest rotation of the tool in one tick, in rad."""
+    """Returns the tool's largest rotation in one tick, in rad."""
     quaternion = evidence.ticks["tool_quaternion"][max(window.start - 1, 0) : window.stop + 1]
     return float(
         np.linalg.norm(turn_between(quaternion[:-1], quaternion[1:]), axis=1).max(initial=0.0)
     )
 
 
-def _named(evidence: Evidence, pairs: Pairs) -> str:
+def _pair_words(evidence: Evidence, pairs: Pairs) -> str:
     pair, share = next(iter(pairs.items()))
     if evidence.model is None:
         return ""

@@ -120,7 +120,7 @@ def draw_recording(recording: Recording) -> Figure:
     energy_axes.set_ylabel("energy (mJ)")
     energy_axes.set_xlabel("time (s)")
     method = method_named(meta.get("method", ""))
-    told = coupling_sentences(
+    sentences = coupling_sentences(
         parameters.coupling,
         method,
         parameters.period,
@@ -129,7 +129,9 @@ def draw_recording(recording: Recording) -> Figure:
     ) or ("no coupling law",)
     title = f"{meta.get('scene', '')}: method {method.name}, {1 / parameters.period:g} Hz"
     # a control character would break the SVG
-    title = "".join(letter if letter.isprintable() else "�" for letter in title) + f"\n{told[0]}"
+    title = (
+        "".join(letter if letter.isprintable() else "�" for letter in title) + f"\n{sentences[0]}"
+    )
     figure.suptitle(title, fontsize="medium", parse_math=False)
     for axes in (force_axes, position_axes, energy_axes):
         finish(axes)

@@ -98,12 +98,15 @@ def json_object(text: str) -> dict[str, Any]:
 
 def run_facts(meta: Mapping[str, str]) -> Facts:
     """Returns the run's settings: names, and values with units."""
-    told = {name: meta[name] for name in _RUN if name in meta}
-    if values := json_object(told.get("scene_parameters", "")):
-        told["scene_parameters"] = _listed(values)
-    elif told.get("scene_parameters") == "{}":
-        del told["scene_parameters"]
-    return [(_NAMES.get(n, _spaced(n)), _valued(value, _RUN[n])) for n, value in told.items()]
+    facts = {name: meta[name] for name in _RUN if name in meta}
+    if values := json_object(facts.get("scene_parameters", "")):
+        facts["scene_parameters"] = _format_mapping(values)
+    elif facts.get("scene_parameters") == "{}":
+        del facts["scene_parameters"]
+    return [
+        (_NAMES.get(n, _with_spaces(n)), _format_value(value, _RUN[n]))
+        for n, value in facts.items()
+    ]
 
 
 def device_facts(meta: Mapping[str, str]) -> Facts:
@@ -112,24 +115,28 @@ def device_facts(meta: Mapping[str, str]) -> Facts:
     for name, meant in _WITHOUT.items():
         if name in sheet and sheet[name] is None:
             sheet[name] = meant
-    return [(_spaced(n), _valued(sheet[n], unit)) for n, unit in _DEVICE.items() if n in sheet]
+    return [
+        (_with_spaces(n), _format_value(sheet[n], unit))
+        for n, unit in _DEVICE.items()
+        if n in sheet
+    ]
 
 
 def software_facts(meta: Mapping[str, str]) -> Facts:
     """Returns versions and machine."""
-    told = json_object(meta.get("versions", "")) | json_object(meta.get("host", ""))
-    return [(name, str(value)) for name, value in told.items()]
+    facts = json_object(meta.get("versions", "")) | json_object(meta.get("host", ""))
+    return [(name, str(value)) for name, value in facts.items()]
 
 
 def guard_facts(evidence: Evidence) -> Facts:
     """Returns the active settings of the guard."""
     guarding = asdict(evidence.parameters.guarding)
-    told = [("controller", controller_of(evidence))]
+    facts = [("controller", controller_of(evidence))]
     for name, unit in _GUARD.items():
         value = guarding[name]
         if name != "controller" and value not in (0, math.inf):
-            told.append((_spaced(name), _valued(value, unit)))
-    return told
+            facts.append((_with_spaces(name), _format_value(value, unit)))
+    return facts
 
 
 def controller_of(evidence: Evidence) -> str:
@@ -148,26 +155,26 @@ def head_facts(report: AuditReport, evidence: Evidence) -> Facts:
     if late := int(np.count_nonzero(flags & int(TickFlag.OVERRUN))):
         missed = round(report.duration / parameters.period) - report.ticks
         in_time = f"deadlines missed: {missed}, at {late} of them"
-    told = [
+    facts = [
         ("scene", meta.get("scene", "")),
         ("device", f"{evidence.info.name}, {len(evidence.info.axes)} axes"),
         ("method", f"{evidence.method.name}, {1 / parameters.period:g} Hz"),
         *(("coupling", sentence) for sentence in report.rendered[:1]),
         ("ran", f"{report.duration:.3f} s, {report.ticks} ticks, {in_time}"),
         ("largest force", f"{format_si(force, 'N')}, {format_si(torque, 'N m')} on the device"),
-        ("controller", _controlled(evidence)),
+        ("controller", _controller_words(evidence)),
     ]
     borne = {True: "bears the coupling", False: "does not bear it", None: "not judged"}
-    told.append(("device condition", borne[report.certified]))
+    facts.append(("device condition", borne[report.certified]))
     if report.slack_share:
-        told.append(("slack used", f"{report.slack_share:.0%}"))
-    return [*told, ("simulated again", report.resimulation or "not reached")]
+        facts.append(("slack used", f"{report.slack_share:.0%}"))
+    return [*facts, ("simulated again", report.resimulation or "not reached")]
 
 
 _PARTS = slice(0, 3), slice(3, 6)
 
 
-def _controlled(evidence: Evidence) -> str:
+def _controller_words(evidence: Evidence) -> str:
     name = controller_of(evidence)
     active = (evidence.ticks["flags"] & int(TickFlag.CONTROLLER_ACTIVE)) != 0
     if not active.any():
@@ -186,12 +193,12 @@ def _controlled(evidence: Evidence) -> str:
 
 def balance_of(report: AuditReport) -> str:
     """Returns the energies at the end of a run; those of rounding are left out."""
-    told = [
-        f"{_spaced(name)} {format_si(energy, 'J')}"
+    facts = [
+        f"{_with_spaces(name)} {format_si(energy, 'J')}"
         for name, energy in report.energies.items()
         if abs(energy) > ROUNDING
     ]
-    return ", ".join(told) or "nothing"
+    return ", ".join(facts) or "nothing"
 
 
 ROUNDING = 1e-12
@@ -222,20 +229,20 @@ def _event(event: Mapping[str, Any]) -> tuple[str, str, str, str]:
     rest = {k: v for k, v in event.items() if k not in ("event", "tick", "time_ns")}
     time = event.get("time_ns")
     at = f"{1e-9 * time:.3f} s" if isinstance(time, int) else "–"
-    text = _listed({k: v for k, v in rest.items() if v not in ("", None)})
+    text = _format_mapping({k: v for k, v in rest.items() if v not in ("", None)})
     text = text if len(text) <= _LONGEST else f"{text[: _LONGEST - 1]}…"
     return str(event.get("event"))[:_LONGEST], str(event.get("tick", "–"))[:_LONGEST], at, text
 
 
-def _listed(values: Mapping[str, Any]) -> str:
-    return ", ".join(f"{name} {_valued(value, '')}" for name, value in values.items())
+def _format_mapping(values: Mapping[str, Any]) -> str:
+    return ", ".join(f"{name} {_format_value(value, '')}" for name, value in values.items())
 
 
-def _spaced(name: str) -> str:
+def _with_spaces(name: str) -> str:
     return name.replace("_", " ")
 
 
-def _valued(value: object, unit: str) -> str:
+def _format_value(value: object, unit: str) -> str:
     """Formats a value with its unit; numbers, also those given as text, lose rounding digits."""
     if value is None:
         return "unknown"

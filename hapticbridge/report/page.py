@@ -54,10 +54,10 @@ def check_page_name(path: Path) -> None:
         raise RecordingError(f"cannot write '{path}': its folder does not exist")
 
 
-def write_page(path: Path, template: str, **told: object) -> None:
+def write_page(path: Path, template: str, **variables: object) -> None:
     """Writes a page; an existing file is replaced.
 
-    ``template`` is a file in ``hapticbridge/templates``; ``told`` holds its variables.
+    ``template`` is a file in ``hapticbridge/templates``; ``variables`` are its variables.
 
     Raises:
         RecordingError: The page cannot be written, or not under this name.
@@ -69,7 +69,7 @@ def write_page(path: Path, template: str, **told: object) -> None:
         loader=PackageLoader("hapticbridge", "templates"), autoescape=select_autoescape()
     )
     environment.filters["quantity"] = format_si
-    page = environment.get_template(template).render(told)
+    page = environment.get_template(template).render(variables)
     try:
         with atomic_write(path) as draft:
             draft.write_text(page, encoding="utf-8")
@@ -94,11 +94,11 @@ def lead_sentence(report: AuditReport, worst: float | None) -> str:
     if report.verdict == "invalid":
         return f"This recording proves nothing: {report.reason}"
     if report.verdict == "active" and worst is not None:
-        return _too_much(report, format_si(worst, "J"))
+        return _excess_sentence(report, format_si(worst, "J"))
     return report.reason.partition("; ")[0]
 
 
-def _too_much(report: AuditReport, joules: str) -> str:
+def _excess_sentence(report: AuditReport, joules: str) -> str:
     if report.port == "device":
         return f"Not safe: the device was given up to {joules} that neither hand nor scene put in"
     limit = "the coupling's slack pays for" if report.environment == "active" else "it got"
@@ -109,9 +109,9 @@ def notes(report: AuditReport) -> list[str]:
     """Returns notes on the verdict: reason of a stop, unchecked parts, and the device condition."""
     if report.verdict == "invalid":
         return []
-    told = report.reason.partition("; ")[2]
+    remarks = report.reason.partition("; ")[2]
     # a run that was passive only because its force was switched off must not look like any other
-    return [*([f"{told[:1].upper()}{told[1:]}."] if told else []), *_of_the_device(report)]
+    return [*([f"{remarks[:1].upper()}{remarks[1:]}."] if remarks else []), *_device_notes(report)]
 
 
 def is_warned(report: AuditReport) -> bool:
@@ -119,7 +119,7 @@ def is_warned(report: AuditReport) -> bool:
     return report.verdict == "passive" and (report.certified is False or "trip" in report.events)
 
 
-def _of_the_device(report: AuditReport) -> list[str]:
+def _device_notes(report: AuditReport) -> list[str]:
     if report.verdict != "passive":
         return []
     if report.certified:
@@ -160,7 +160,7 @@ def write_report(
     """
     evidence, meta = Evidence.of(recording), recording.meta
     rows = event_rows(recording.events)
-    run = None if evidence is None else _drawn(evidence, report)
+    run = None if evidence is None else _evidence_parts(evidence, report)
     moment = None if run is None else run["moment"]
     write_page(
         path,
@@ -193,8 +193,7 @@ def _bare_curves(recording: Recording) -> str:
         return ""
 
 
-def _drawn(evidence: Evidence, report: AuditReport) -> dict[str, Any]:
-    """Returns the parts of a page that need evidence."""
+def _evidence_parts(evidence: Evidence, report: AuditReport) -> dict[str, Any]:
     lateness = evidence.lateness
     is_timed = bool(lateness.any())
     return {

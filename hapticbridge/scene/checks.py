@@ -21,16 +21,7 @@ handle."""
 
 
 def check_massless_tool(model: mujoco.MjModel, grip: str, method: str) -> None:
-    """Refuses a scene in which anything moves besides one rigid tool.
-
-    Args:
-        model: The compiled scene, with its handle.
-        grip: Name of the site on the tool.
-        method: Name of the method, for the message.
-
-    Raises:
-        SceneError: Names the other moving parts, or the joints that the tool requires.
-    """
+    """Raises SceneError for a scene in which anything moves besides one rigid tool."""
     body_id = int(model.site(grip).bodyid[0])
     first, count = int(model.body_jntadr[body_id]), int(model.body_jntnum[body_id])
     kinds = model.jnt_type[first : first + count].tolist() if count else []
@@ -65,19 +56,11 @@ def check_massless_tool(model: mujoco.MjModel, grip: str, method: str) -> None:
 
 
 def check_metered(model: mujoco.MjModel, integrator: str, method: str) -> None:
-    """Refuses a scene with forces of its own that cannot be metered under an integrator.
+    """Raises SceneError for forces of the scene that cannot be metered under an integrator.
 
     The work of a port in a step is h Q·v⁺, with the force Q that the step used. ``Euler`` uses the
     force at the start of the step. ``implicitfast`` does so too for forces that do not depend on
     velocity. RK4 uses four forces and keeps none.
-
-    Args:
-        model: The compiled scene, with its coupling.
-        integrator: Name of the integrator in MJCF.
-        method: Name of the method, for the message.
-
-    Raises:
-        SceneError: Names the actuator or body.
     """
     names = [model.actuator(i).name or str(i) for i in range(model.nactuator)]
     own = [i for i, name in enumerate(names) if name not in COUPLING_ACTUATORS]
@@ -123,12 +106,12 @@ def check_options(spec: mujoco.MjSpec) -> list[str]:
     option = spec.option
     if option.solver == mujoco.mjtSolver.mjSOL_PGS:
         raise SceneError(
-            "the scene asks for solver PGS, which leaves the coupling out of the implicit step; "
+            "the scene selects solver PGS, which leaves the coupling out of the implicit step; "
             "use Newton"
         )
     if option.noslip_iterations > 0:
         raise SceneError(
-            f"the scene asks for noslip_iterations={option.noslip_iterations}, which splits the "
+            f"the scene sets noslip_iterations={option.noslip_iterations}, which splits the "
             "implicit step; set it to 0"
         )
     if option.enableflags & mujoco.mjtEnableBit.mjENBL_IPC:
@@ -154,7 +137,7 @@ def check_options(spec: mujoco.MjSpec) -> list[str]:
     warnings = []
     if option.integrator == mujoco.mjtIntegrator.mjINT_RK4:
         warnings.append(
-            "the scene asks for integrator RK4; it runs under 'discrete', the only one that is "
+            "the scene selects integrator RK4; it runs under 'discrete', the only one that is "
             "passive behind the coupling"
         )
     if np.any(np.asarray(option.wind)):
@@ -286,15 +269,9 @@ def _check_coupling_actuator(model: mujoco.MjModel, name: str) -> None:
 
 
 def check_start(model: mujoco.MjModel, data: mujoco.MjData, grip: str) -> None:
-    """Refuses a start that is not finite or in which the tool penetrates a body.
+    """Raises SceneError for a start that is not finite or in which the tool penetrates a body.
 
-    Args:
-        model: The compiled scene.
-        data: Its state at the start, after ``mj_forward``.
-        grip: Name of the site on the tool.
-
-    Raises:
-        SceneError: Names the state or the pair of geoms, with the depth.
+    ``data`` must be at the start, after ``mj_forward``.
     """
     for name in ("qpos", "qvel", "act", "ctrl", "mocap_pos", "mocap_quat", "qacc"):
         if not np.all(np.abs(getattr(data, name)) <= mujoco.mjMAXVAL):

@@ -45,13 +45,7 @@ START_KEYFRAME = "home"
 
 
 def go_to_start(model: mujoco.MjModel, data: mujoco.MjData, grip: str) -> None:
-    """Resets the data to the start, with the handle at the grip, and calls ``mj_forward``.
-
-    Args:
-        model: A scene with the handle.
-        data: Changed in place.
-        grip: Name of the site on the tool.
-    """
+    """Resets the data to the start, with the handle at the grip, and calls ``mj_forward``."""
     key = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_KEY, START_KEYFRAME)
     if key >= 0:
         mujoco.mj_resetDataKeyframe(model, data, key)
@@ -66,12 +60,7 @@ def go_to_start(model: mujoco.MjModel, data: mujoco.MjData, grip: str) -> None:
 
 
 def seat_handle(model: mujoco.MjModel, grip: str) -> None:
-    """Places the handle at the grip, in ``qpos0`` and in every keyframe of a compiled model.
-
-    Args:
-        model: A scene with the handle; changed in place.
-        grip: Name of the site on the tool.
-    """
+    """Places the handle at the grip, in ``qpos0`` and in every keyframe of a compiled model."""
     data = mujoco.MjData(model)
     body_id, site_id = model.body(HANDLE).id, model.site(grip).id
     mocap_id = int(model.body_mocapid[body_id])

@@ -309,13 +309,7 @@ class _GeomSetting(NamedTuple):
 
 
 def warn_of_contacts(model: mujoco.MjModel, grip: str, scene: object) -> None:
-    """Warns of contacts that are likely to generate more energy than the slack allows.
-
-    Args:
-        model: The compiled scene with the time step of the run.
-        grip: Name of the site on the tool.
-        scene: Path of the scene, for the message.
-    """
+    """Warns of contacts that are likely to generate more energy than the slack allows."""
     for concern in check_contacts(model, grip):
         warnings.warn(f"scene '{scene}': {concern}", UserWarning, stacklevel=3)
 
@@ -369,10 +363,6 @@ def contact_settings(model: mujoco.MjModel, grip: str) -> Iterator[tuple[int, in
 
     The tool consists of everything that moves with the grip: the bodies below one child of the
     world. Distances are ignored, so a pair may never meet.
-
-    Args:
-        model: The compiled scene.
-        grip: Name of the site on the tool.
     """
     yield from settings_among(model, tool_geoms(model, grip))
 

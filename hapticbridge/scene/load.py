@@ -64,7 +64,10 @@ def scene_path(path_or_name: str | Path) -> Path:
     if name in scene_names():
         return _folder() / name / f"{name}.xml"
     if path.suffix or len(path.parts) > 1:
-        raise SceneError(f"no scene file '{path}' exists")
+        raise SceneError(
+            f"no scene file '{path}' exists; give the path of an MJCF file or one of: "
+            f"{choices(scene_names())}"
+        )
     raise SceneError(
         f"no scene is called '{name}' and no such file exists; scenes: {choices(scene_names())}"
     )
@@ -135,11 +138,7 @@ def read_scene(path_or_name: str | Path, **parameters: float) -> SceneSource:
 
 
 def plain_model(source: SceneSource) -> mujoco.MjModel:
-    """Compiles a scene without handle and coupling, so that it needs no grip.
-
-    Raises:
-        SceneError: The scene cannot be compiled.
-    """
+    """Compiles a scene without handle and coupling, so that it needs no grip."""
     with _refused(source.path):
         return compiled(source.spec.copy(), source.sources)
 

@@ -133,7 +133,9 @@ def matrix_margin(
             raise CouplingError(f"{name} has the eigenvalue {lowest:g}; all must be >= 0")
     shapes = {matrix.shape[-1] for matrix in (k, b_coupling, b)}
     if len(shapes) > 1:
-        raise CouplingError(f"matrices of sizes {sorted(shapes)} do not fit together")
+        raise CouplingError(
+            f"matrices of sizes {sorted(shapes)} do not fit together; all must have one size"
+        )
     try:
         difference = b - factor * (k * period / 2 + b_coupling)
     except ValueError as error:

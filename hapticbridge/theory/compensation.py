@@ -48,16 +48,10 @@ rule."""
 
 
 def law_damping(stiffness: float, felt: float, period: float, lag: float) -> float:
-    """Returns B' = max(B − λ K T, 0), the law's damping for an effective damping B.
+    """Returns B' = max(B − λ K T, 0), the law's damping for an effective damping B (``felt``).
 
-    Args:
-        stiffness: K in N/m (rotation: N m/rad), finite and >= 0.
-        felt: B in N s/m (rotation: N m s/rad), finite and >= 0.
-        period: T of the integration in s, finite and > 0.
-        lag: λ, finite and >= 0.
-
-    Raises:
-        CouplingError: An argument is out of range.
+    K, B and λ must be finite and >= 0, the integration period T > 0; otherwise CouplingError is
+    raised.
     """
     stiffness, felt = scalar("stiffness", stiffness, "N/m"), scalar("damping", felt, "N s/m")
     return max(felt - scalar("lag", lag, "") * stiffness * _period(period), 0.0)
@@ -66,14 +60,8 @@ def law_damping(stiffness: float, felt: float, period: float, lag: float) -> flo
 def effective_damping(stiffness: float, damping: float, period: float, lag: float) -> float:
     """Returns B' + λ K T, the effective damping of a law with damping B'.
 
-    Args:
-        stiffness: K in N/m (rotation: N m/rad), finite and >= 0.
-        damping: B' in N s/m (rotation: N m s/rad), finite and >= 0.
-        period: T of the integration in s, finite and > 0.
-        lag: λ, finite and >= 0.
-
-    Raises:
-        CouplingError: An argument is out of range.
+    K, B' and λ must be finite and >= 0, the integration period T > 0; otherwise CouplingError is
+    raised.
     """
     stiffness, damping = scalar("stiffness", stiffness, "N/m"), scalar("damping", damping, "N s/m")
     return damping + scalar("lag", lag, "") * stiffness * _period(period)
@@ -83,16 +71,8 @@ def needed_for_felt(stiffness: float, felt: float, period: float, lag: float) ->
     """Returns the device damping b in N s/m required for K and effective B: K T/2 + B'.
 
     Sufficient for any passive hand and any environment that is discrete-time passive (14).
-    Necessary against a wall, and for λ = ½ against a free tool of any mass.
-
-    Args:
-        stiffness: K in N/m (rotation: N m/rad), finite and >= 0.
-        felt: B in N s/m (rotation: N m s/rad), finite and >= 0.
-        period: T of the device and of the integration in s, finite and > 0.
-        lag: λ, finite and >= 0.
-
-    Raises:
-        CouplingError: An argument is out of range.
+    Necessary against a wall, and for λ = ½ against a free tool of any mass. Arguments as for
+    ``law_damping``.
 
     References:
         Brown & Colgate 1997, eq. (6), for the law with B'; derivation in the module docstring.
@@ -107,14 +87,7 @@ def largest_felt_damping(
 
         B = b + (λ − ½) K T    for K T/2 <= b;  0 otherwise, because then K alone is not passive
 
-    Args:
-        device_damping: b in N s/m, finite and > 0.
-        stiffness: K in N/m, finite and >= 0.
-        period: T of the device and of the integration in s, finite and > 0.
-        lag: λ, finite and >= 0.
-
-    Raises:
-        CouplingError: An argument is out of range.
+    b must be finite and > 0; other arguments as for ``law_damping``.
     """
     available = scalar("device damping", device_damping, "N s/m", positive=True)
     per_tick = scalar("stiffness", stiffness, "N/m") * _period(period)

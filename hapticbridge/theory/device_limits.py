@@ -273,21 +273,10 @@ def free_device_damping(
 ) -> float | NDArray[np.float64]:
     """Returns the coupling damping at which ``free_device_stiffness`` falls to 0, the limit K → 0.
 
-    Args:
-        device_damping: b in N s/m, finite and >= 0.
-        period: T in s, finite and > 0.
-        mass: m_d in kg, finite and > 0.
-        delay: d, whole samples from position to force, 0 to 50.
-        filter_time: τ in s, >= 0, of a first-order low-pass behind the damper (backward).
+    Arguments, errors and source as for ``free_device_stiffness``.
 
     Returns:
         B in N s/m, of the broadcast shape of the arguments.
-
-    Raises:
-        CouplingError: An argument is out of range or mis-shaped.
-
-    References:
-        Gil, Avello, Rubio, Flórez 2004, as for ``free_device_stiffness``.
     """
     period = scalar("period", period, "s", positive=True)
     lag = scalar("filter time", filter_time, "s") / period

@@ -276,19 +276,12 @@ class SampledLoop:
         return np.asarray(transfer * np.exp(-1j * self.delay * theta), dtype=np.complex128)
 
     def damping_spectrum(self, frequency: ArrayLike) -> _Array:
-        """Returns the device damping required at each frequency, for any hand.
+        """Returns the device damping in N s/m required at each frequency ω in rad/s, for any hand.
 
-            b(ω) = (T/2) Re{(1 − e^{−jωT}) H} / (1 − cos ωT)
+            b(ω) = (T/2) Re{(1 − e^{−jωT}) H} / (1 − cos ωT),    0 < ω <= π/T
 
-        Args:
-            frequency: ω in rad/s, 0 < ω <= π/T, any shape.
-
-        Returns:
-            b in N s/m. The loop requires the supremum, provided that the tool is stable behind a
-            fixed handle (``minimum_mass``).
-
-        Raises:
-            CouplingError: A frequency is out of range.
+        The loop requires the supremum, provided that the tool is stable behind a fixed handle
+        (``minimum_mass``).
 
         References:
             Colgate & Schenkel 1997.
@@ -440,12 +433,10 @@ def threshold(holds: Callable[[float], bool], start: float, tolerance: float) ->
 
 
 def decays(force: NDArray[np.float64], samples: int, floor: float = 0.0) -> bool:
-    """Returns whether a force fell from one late window to the next.
+    """Returns whether a force, or a signal linear in it, fell from one late window to the next.
 
-    Args:
-        force: f_k in N, or any signal linear in it. A signal with fewer samples counts as diverged.
-        samples: Expected number of samples.
-        floor: Force in N below which the signal counts as zero.
+    A signal with fewer than the expected ``samples`` counts as diverged; one below ``floor`` in N
+    counts as zero.
     """
     if force.size < samples:
         return False

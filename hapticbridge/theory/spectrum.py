@@ -81,18 +81,17 @@ def damping_spectrum(
         delay = 0:   b(ω) = (T/2)(1 − cos ωT) / Re{(1 − e^{−jωT}) / C}        any environment
         delay = d:   b(ω) = (T/2) Re{(1 − e^{−jωT}) C e^{−jdωT}} / (1 − cos ωT)        a wall
 
-    ``minimum_damping`` is the supremum over 0 < ω <= π/T. With a delay the environment is a wall,
-    that is a tool that does not move. Behind a delayed coupling no damping suffices for *every*
-    passive environment; ``damping_spectrum_of`` of C z⁻ᵈ is inf there. Against a wall the
-    coupling's damper can help, so values may be negative.
+    ``minimum_damping`` is the supremum over 0 < ω <= π/T; its arguments apply here. With a delay
+    the environment is a wall, because behind a delayed coupling no damping suffices for *every*
+    passive environment. Against a wall the coupling's damper can help, so values may be negative.
 
     Args:
         coupling: K and B, shape S.
-        period: T in s, finite and > 0.
+        period: T in s.
         frequency: ω in rad/s, 0 < ω <= π/T, shape F.
         discretization: Rule that takes the damper's velocity from sampled positions.
-        delay: d, whole samples from position to force, 0 to 50.
-        filter_time: τ in s of a first-order low-pass behind the damper, >= 0.
+        delay: d, whole samples from position to force.
+        filter_time: τ in s of a first-order low-pass behind the damper.
         axis: Kind of axis, which selects the pair of K and B.
 
     Returns:

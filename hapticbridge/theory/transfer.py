@@ -33,11 +33,7 @@ _FREQUENCIES = Arguments(CouplingError, SMALLEST**2, LARGEST**2)
 def checked(
     name: str, value: ArrayLike, unit: str = "", *, positive: bool = False
 ) -> NDArray[np.float64]:
-    """Returns numbers as an array, all finite and >= 0 (> 0 if positive).
-
-    Raises:
-        CouplingError: A value is not a number or out of range.
-    """
+    """Returns an array of finite numbers >= 0 (> 0 if positive), or raises CouplingError."""
     return _ARGUMENTS.numbers(name, value, unit, least=0, is_open=positive)
 
 

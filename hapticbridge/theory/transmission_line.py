@@ -43,11 +43,11 @@ def transmission_line_spectrum(
 
     For n = 2 the software termination gives b(θ) = Z cos θ.
 
-    Terminated by the device, the line is a wave port that counts the hand's work exactly, because
-    the force is held and v is the mean velocity of the hold. With b >= Z it is passive for any hand
-    and any discrete-time passive environment. Terminated in software, the line delays. As for a
-    delayed coupling, no damping then suffices for every passive environment; the spectrum is that
-    of a wall.
+    Terminated by the device, the line is a wave port that counts the hand's work exactly. The
+    reason is that the force is held and v is the mean velocity of the hold. With b >= Z it is
+    passive for any hand and any discrete-time passive environment. Terminated in software, the line
+    delays. As for a delayed coupling, no damping then suffices for every passive environment; the
+    spectrum is that of a wall.
 
     Args:
         impedance: Z in N s/m, finite and > 0, shape S.

@@ -1,7 +1,7 @@
 """Z-width: the stiffness and damping that a device can render, and its limits.
 
 B is the damping of the coupling's law. For a method that adds damping by integration it is B', and
-the effective damping is higher (``compensation``); the printed sentences use B'.
+the effective damping is ``effective_damping``; the printed sentences use B'.
 """
 
 from __future__ import annotations
@@ -100,7 +100,7 @@ MARGIN_OF_RANGE = 1.25
 region that is not passive."""
 
 _CYCLES = "limit cycles, which stay bounded as long as K < 2b/T"
-_DELAYED = "with a delay the bound is that of a wall; in general none can be promised, meter it"
+_DELAYED = "with a delay the bound is that of a wall; no general bound exists, so watch the meter"
 
 
 @dataclass(frozen=True, slots=True, eq=False)

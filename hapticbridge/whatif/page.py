@@ -49,7 +49,11 @@ def rows(found: WhatIf) -> Iterator[Row]:
 def changes(found: WhatIf) -> Iterator[tuple[str, str, str]]:
     """Yields each change: name, and the value before and after with its unit."""
     for name, unit, before, after in found.changes:
-        yield name, f"{_row_text(before)} {unit}".rstrip(), f"{_row_text(after)} {unit}".rstrip()
+        yield (
+            name,
+            f"{_format_value(before)} {unit}".rstrip(),
+            f"{_format_value(after)} {unit}".rstrip(),
+        )
 
 
 def sentences(run: WhatIfRun) -> Iterator[str]:
@@ -64,7 +68,7 @@ def _certified(run: WhatIfRun) -> str:
     return {True: "yes", False: "no", None: "not judged"}[run.report.certified]
 
 
-def _row_text(value: object) -> str:
+def _format_value(value: object) -> str:
     return f"{value:.6g}" if isinstance(value, float) else "none" if value is None else str(value)
 
 
@@ -117,8 +121,8 @@ def figure_of(found: WhatIf, bins: int = BINS) -> Figure:
     panels[0].legend(
         loc="lower right", bbox_to_anchor=(1, 1), fontsize="small", ncols=3, frameon=False
     )
-    told = ", ".join(f"{name} {old} → {new}" for name, old, new in changes(found))
-    title = f"{found.path.name}, what if {told or 'nothing is changed'}"
+    changed = ", ".join(f"{name} {old} → {new}" for name, old, new in changes(found))
+    title = f"{found.path.name}, what if {changed or 'nothing is changed'}"
     figure.suptitle(
         "".join(letter if letter.isprintable() else "�" for letter in title),
         fontsize="medium",
@@ -156,7 +160,7 @@ def write_what_if(found: WhatIf, path: Path, scene: bytes | None = None) -> None
         name=found.path.name,
         recording=str(found.path),
         changes=list(changes(found)),
-        runs=[_told(run) for run in found.runs],
+        runs=[_run_facts(run) for run in found.runs],
         rows=list(rows(found)),
         notes=found.notes,
         drawn=drawn,
@@ -164,7 +168,7 @@ def write_what_if(found: WhatIf, path: Path, scene: bytes | None = None) -> None
     )
 
 
-def _told(run: WhatIfRun) -> dict[str, Any]:
+def _run_facts(run: WhatIfRun) -> dict[str, Any]:
     evidence, report = Evidence.of(run.recording), run.report
     return {
         "name": run.name,

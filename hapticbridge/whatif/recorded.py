@@ -122,7 +122,7 @@ class RecordedRun:
         except (HapticBridgeError, ValueError, TypeError) as error:
             raise RecordingError(f"the metadata do not describe a run: {error}") from None
         settings = Settings(
-            coupling=_asked_for(parameters.coupling, method, step),
+            coupling=_requested_coupling(parameters.coupling, method, step),
             method=method,
             rate=invert_exactly(parameters.period, period_of, 1.0 / parameters.period),
             substeps=parameters.substeps,
@@ -217,18 +217,18 @@ class RecordedRun:
         return found == self.recording.meta.get("scene_sha256")
 
 
-def _asked_for(used: Coupling, method: Method, step: float) -> Coupling:
+def _requested_coupling(used: Coupling, method: Method, step: float) -> Coupling:
     """Returns the requested coupling that a method turns into this law's coupling, to the bit."""
     felt = method.rendered(used, step)
 
     def made(name: str, value: float) -> float:
         return float(getattr(method.used(replace(felt, **{name: value}), step), name))
 
-    asked = {
+    requested = {
         name: invert_exactly(getattr(used, name), partial(made, name), getattr(felt, name))
         for name in ("damping", "rotational_damping")
     }
-    return replace(felt, **asked)
+    return replace(felt, **requested)
 
 
 def _controller(info: DeviceInfo, parameters: RunParameters, method: Method) -> str | None:

@@ -132,7 +132,7 @@ class RecordedMotion(ReplayDevice):
         info: DeviceInfo,
     ) -> None:
         super().__init__(ticks, period)
-        self.info = _unattended(info, self.info)
+        self.info = _replay_info(info, self.info)
         self._clock, self._before = clock, start
         self._news = iter((ticks["flags"] & _STALE).tolist())
 
@@ -163,7 +163,7 @@ class ResampledMotion(TrajectoryDevice):
     ) -> None:
         times = period * np.arange(len(ticks))
         super().__init__(Motion(times, ticks["device_position"], ticks["device_quaternion"]))
-        self.info = _unattended(info, self.info)
+        self.info = _replay_info(info, self.info)
         self._before, self._last = start, b""
         self._outside = Outside(ticks, period)
 
@@ -189,7 +189,7 @@ def placed(sample: NDArray[np.void], pose: tuple[float, ...]) -> NDArray[np.void
     return there
 
 
-def _unattended(info: DeviceInfo, own: DeviceInfo) -> DeviceInfo:
+def _replay_info(info: DeviceInfo, own: DeviceInfo) -> DeviceInfo:
     """Returns the recorded data sheet without motors, with the duration of the replay."""
     return replace(info, is_real=False, duration=own.duration)
 
@@ -229,9 +229,9 @@ def intended(
     """
     origin = Rotation.from_quat(np.array(start[3:]), scalar_first=True)
     turned = Rotation.from_quat(ticks["device_quaternion"], scalar_first=True) * origin.inv()
-    wrench = _held(ticks["wrench_on_device"], delay_ticks(info, period) or 0)
+    wrench = _mean_wrench(ticks["wrench_on_device"], delay_ticks(info, period) or 0)
     wanted = [
-        _wanted(moved, force, period, (m + m_h, b + b_h, b_h, k_h, friction))
+        _solve_intent(moved, force, period, (m + m_h, b + b_h, b_h, k_h, friction))
         for moved, force, m, m_h, b, b_h, k_h, friction in (
             (
                 ticks["device_position"] - np.array(start[:3]),
@@ -265,13 +265,13 @@ def intended(
     return np.ascontiguousarray(table)
 
 
-def _held(wrench: Array, delay: int) -> Array:
-    """Returns the mean of the wrenches that acted before and after each sample."""
+def _mean_wrench(wrench: Array, delay: int) -> Array:
+    """Averages the wrenches that acted before and after each sample."""
     acting = np.concatenate([np.zeros((delay + 1, 6)), wrench])
     return np.asarray(0.5 * (acting[: len(wrench)] + acting[1 : len(wrench) + 1]))
 
 
-def _wanted(
+def _solve_intent(
     moved: Array,
     force: Array,
     period: float,
@@ -358,16 +358,15 @@ class Repetition:
             except SafetyTrip as error:
                 trip = str(error)
         # the temporary path of the unpacked scene means nothing to the reader
-        told = [str(each.message).replace(str(run.scene_file), "") for each in caught]
-        self.warned = tuple(dict.fromkeys(text.removeprefix("scene '': ") for text in told))
+        messages = [str(each.message).replace(str(run.scene_file), "") for each in caught]
+        self.warned = tuple(dict.fromkeys(text.removeprefix("scene '': ") for text in messages))
         return bridge.period, trip
 
     def _repeat(self, bridge: Bridge) -> None:
-        """Runs for the recorded number of ticks, with recorded actions at their times."""
         due = deque(
             (math.ceil(int(event["tick"]) * self._per_tick - 1e-9), event)
             for each in self._run.recording.events
-            if (event := self._repeated(each))
+            if (event := self._action_for(each))
         )
 
         def on_tick(tick: int) -> None:
@@ -400,7 +399,7 @@ class Repetition:
         last = len(self._run.recording.ticks)
         return self._run.trip in [trip_reason(code, last) for code in _BY_STATE]
 
-    def _repeated(self, event: Event) -> Event | None:
+    def _action_for(self, event: Event) -> Event | None:
         """Returns the action that repeats a recorded event under these settings, or None."""
         name = event.get("event")
         if name == "coupling":
@@ -422,7 +421,7 @@ class Repetition:
         return self.settings.method.has_coupling
 
     def _coupling(self, event: Event) -> Event:
-        """Returns a change to the same effective coupling under these settings."""
+        """Returns the change to an equal effective coupling under these settings."""
         old, new, period = self._run.settings, self.settings, 1.0 / self.settings.rate
         if replace(new, scene=old.scene, controller=old.controller) == old:
             return event
@@ -496,21 +495,21 @@ class IdentifiedDevice(SimulatedDevice):
         state = self._states[0]
         state["target_position"] = self._motion[0, 1:4]
         state["target_quaternion"] = self._motion[0, 4:]
-        return self._there(sample)
+        return self._to_recorded_frame(sample)
 
     def read(self, sample: NDArray[np.void]) -> int:
         """Implements ``SimulatedDevice.read``."""
         flags = super().read(sample)
         # buttons only; this device always has new samples
         self._outside.read(sample)
-        self._there(sample)
+        self._to_recorded_frame(sample)
         return flags
 
     def write(self, wrench: Array) -> None:
         """Implements ``SimulatedDevice.write``; components without a device axis have no effect."""
         super().write(wrench * self._felt)
 
-    def _there(self, sample: NDArray[np.void]) -> NDArray[np.void]:
+    def _to_recorded_frame(self, sample: NDArray[np.void]) -> NDArray[np.void]:
         """Moves a sample from coordinates relative to the start to the device's coordinates."""
         sample["position"][0] += self._start[:3]
         turned = Rotation.from_quat(sample["quaternion"][0], scalar_first=True) * self._origin

@@ -87,7 +87,7 @@ class Settings:
                 f"'{unknown[0]:.60}' cannot be changed; choices: {choices(UNITS)}; of the scene: "
                 f"{choices(self.scene)}"
             )
-        given = {name: _checked(name, value) for name, value in changes.items()}
+        given = {name: _convert(name, value) for name, value in changes.items()}
         method = method_named(str(given.get("method", self.method.name)))
         gains = {name: float(given[name]) for name in GAINS if name in given}
         scale = float(given.get("scale", self.scale))
@@ -129,7 +129,7 @@ def changes_from(words: Iterable[str]) -> dict[str, Value]:
     return changes
 
 
-def _checked(name: str, value: Value) -> Value:
+def _convert(name: str, value: Value) -> Value:
     """Converts a value to the type of its setting; the bridge checks its range."""
     named: dict[str, Collection[object]] = {"method": method_names(), "controller": CONTROLLERS}
     if name in named:

@@ -186,7 +186,7 @@ class _Experiment:
         runs.append(self._prescribed(new))
         if not is_changed:
             notes.append(self._agreement())
-        notes.extend(_unrepeated(run, Repetition(run, new)))
+        notes.extend(_missing_parts(run, Repetition(run, new)))
         if runs[0].trip:
             notes.append("the recorded run ends in a trip, so these runs end there too")
         hand_error = math.nan
@@ -202,10 +202,12 @@ class _Experiment:
                 f"with nothing changed the model hand is {1e3 * hand_error:.3g} mm off the "
                 "recorded motion (root mean square); its response to changed forces is assumed"
             )
-        told = tuple(
+        changed_values = tuple(
             (name, UNITS.get(name, ""), settings.value(name), new.value(name)) for name in changes
         )
-        return WhatIf(run.recording.path, told, tuple(runs), hand_error, (*notes, *self._concerns))
+        return WhatIf(
+            run.recording.path, changed_values, tuple(runs), hand_error, (*notes, *self._concerns)
+        )
 
     def _as_recorded(self) -> WhatIfRun:
         recording, peaks = self._run.recording, _peaks(self._ticks)
@@ -247,7 +249,6 @@ class _Experiment:
         return self._folder / "run.mcap"
 
     def _agreement(self) -> str:
-        """Compares the prescribed run with the recorded one."""
         found = compare(self._run.recording.path, self._path)
         if found.first is None and not any(found.alone):
             return "with nothing changed the prescribed run is the recorded one in every bit"
@@ -260,8 +261,7 @@ class _Experiment:
         )
 
 
-def _unrepeated(run: RecordedRun, repetition: Repetition) -> Iterator[str]:
-    """Yields sentences on parts of the recorded run that these runs do not repeat."""
+def _missing_parts(run: RecordedRun, repetition: Repetition) -> Iterator[str]:
     counts = Counter(event.get("event") for event in run.recording.events)
     if counts["coupling"] and not repetition.keeps_couplings:
         yield (
@@ -302,4 +302,4 @@ def _peaks(ticks: NDArray[np.void]) -> dict[str, float]:
 
 
 def _silent(_done: int, _total: int, _name: str) -> None:
-    """Says nothing: the library draws no progress."""
+    """Ignores the progress."""

@@ -85,23 +85,13 @@ _ANSWER_TIME = 0.05
 
 
 def measured_timing(link: Link, stream: ReplyStream, name: str) -> tuple[float, float]:
-    """Measures the rate of deliveries and the delay of replies.
+    """Measures the rate of deliveries in Hz and the delay of replies in s.
 
-    The rate is the number of deliveries per second with ``UNDER_WAY`` requests always on their way;
-    replies that arrive together are one delivery. The delay is the time from a request to its
-    reply, with one request at a time, that the share ``SHARE`` of the replies meets.
-
-    A packet both requests the encoders and carries the force, so both have this delay. With one
-    packet per tick, the force that responds to a sample acts after the delay, rounded up to whole
-    ticks, beyond the one tick for which it is held.
-
-    Args:
-        link: Link to a running Falcon.
-        stream: Receives the replies.
-        name: Name of the device in messages.
-
-    Returns:
-        The rate in Hz and the delay in s.
+    The rate is measured with ``UNDER_WAY`` requests always on their way; replies that arrive
+    together are one delivery. The delay is the time from a single request to its reply that the
+    share ``SHARE`` of the replies meets. A packet both requests the encoders and carries the force,
+    so both have this delay. With one packet per tick the force acts after the delay, rounded up to
+    whole ticks, beyond the one tick for which it is held.
 
     Raises:
         DeviceLost: The device stopped replying.
@@ -156,8 +146,8 @@ class FalconDevice:
 
     The sheet's ``rate`` is the rate of deliveries with two requests always on their way. Its
     ``delay`` is the time within which 95 % of the replies in 0.1 s came back, over all phases of
-    the bridge's timer (``timing``). Mass, damping and friction are unknown unless the user states
-    measured values. The resolution follows from the geometry in the middle of the workspace.
+    the bridge's timer (``measured_timing``). Mass, damping and friction are unknown unless the user
+    states measured values. The resolution follows from the geometry in the middle of the workspace.
 
     Args:
         link: Link to the Falcon.
@@ -220,12 +210,9 @@ class FalconDevice:
     def start(self, period: float) -> NDArray[np.void]:
         """Reads the pose, without force, and compiles the functions of the loop.
 
-        Args:
-            period: The loop's period in s, at most 0.02.
-
         Raises:
-            DeviceError: The period is out of range, the encoders match no position of the grip, or
-                the device is gone.
+            DeviceError: The period is longer than 0.02 s, the encoders match no position of the
+                grip, or the device is gone.
         """
         if checked_period(period) > LONGEST_PERIOD:
             raise DeviceError(
@@ -256,12 +243,6 @@ class FalconDevice:
         Impossible replies count as no reply: encoders that match no position of the grip, or a jump
         faster than 3 m/s. The call waits only after a pause of the loop (``ask_anew``).
 
-        Args:
-            sample: Output, shape (1,), ``SAMPLE_DTYPE``.
-
-        Returns:
-            0, or ``TickFlag.STALE_SAMPLE`` if the sample repeats the last one.
-
         Raises:
             DeviceError: The device was not started, is gone, or sent no valid reply for 50 ms.
         """
@@ -290,9 +271,6 @@ class FalconDevice:
 
         A packet that is not accepted in time is dropped, except for zero force, which is repeated.
 
-        Args:
-            wrench: Shape (6,), in the device's frame.
-
         Raises:
             DeviceLost: The device is gone, or does not accept zero force.
         """
@@ -319,16 +297,7 @@ class FalconDevice:
 
 
 def open_falcon(options: Mapping[str, object], tell: Notify, backend: Any = None) -> FalconDevice:
-    """Finds a Falcon and opens it.
-
-    Args:
-        options: Options of ``FAMILY``: names of files and numbers in SI units.
-        tell: Receives messages for the user.
-        backend: A pyusb backend; None selects libusb.
-
-    Raises:
-        DeviceError: No Falcon is found, it cannot be opened or is lost, or an option is not valid.
-    """
+    """Finds and opens a Falcon; ``options`` are those of ``FAMILY``."""
     numbers = stated_numbers(options, _NUMBERS)
     firmware = str(options["firmware"]) if options.get("firmware") else None
     if firmware is not None:

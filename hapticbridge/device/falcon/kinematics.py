@@ -80,11 +80,7 @@ _COS, _SIN = np.cos(LEG_ANGLES), np.sin(LEG_ANGLES)
 
 @compiled
 def is_within_reach(position: NDArray[np.float64]) -> bool:
-    """Returns whether a grip position is plausible.
-
-    Args:
-        position: Shape (3,), in m.
-    """
+    """Returns whether a grip position in m, shape (3,), is plausible."""
     aside = math.sqrt(position[0] ** 2 + position[1] ** 2)
     return aside <= LARGEST_RADIUS and NEAREST <= position[2] <= FARTHEST
 
@@ -159,12 +155,9 @@ def closure(
 def solve(
     rows: NDArray[np.float64], right: NDArray[np.float64], answer: NDArray[np.float64]
 ) -> float:
-    """Solves rows · answer = right by Cramer's rule; returns the determinant.
+    """Solves rows · answer = right, shapes (3, 3), (3,), by Cramer's rule; returns the determinant.
 
-    Args:
-        rows: Shape (3, 3).
-        right: Shape (3,).
-        answer: Output, shape (3,); unchanged for a determinant of 0.
+    For a determinant of 0 the answer is unchanged.
     """
     a, b, c = rows[0], rows[1], rows[2]
     x0, x1, x2 = (

@@ -68,12 +68,9 @@ class Request(IntFlag):
 
 @compiled
 def encode(motors: NDArray[np.int64], flags: int, packet: NDArray[np.uint8]) -> None:
-    """Encodes a packet to the device.
+    """Encodes a packet, shape (16,), with ``Request`` bits as flags.
 
-    Args:
-        motors: Shape (3,), motor units, clamped to the range of a packet.
-        flags: ``Request`` bits, 0 to 15.
-        packet: Output, shape (16,).
+    Motor units, shape (3,), are clamped to the range of a packet.
     """
     packet[0], packet[14], packet[15] = _FIRST, _ZERO, _LAST
     packet[13] = _ZERO + (flags & 15)
@@ -215,9 +212,9 @@ class Link(Protocol):
     def control(self, request: int, value: int) -> None:
         """Sends a vendor request without data.
 
-        The serial bridge is an FTDI chip. Its requests have FTDI's names and numbers: 0 reset
-        (value 1 clears the data from the device, 2 the data to it), 1 modem lines, 2 flow control,
-        3 baud rate, 4 data format, 6 event character, 9 latency timer in ms.
+        The serial bridge is an FTDI chip; its requests have FTDI's numbers. 0 is reset, with value
+        1 for the data from the device and 2 for the data to it. 1 sets modem lines, 2 flow control,
+        3 the baud rate, 4 the data format, 6 the event character, 9 the latency timer in ms.
         """
 
     def write(self, packet: array.array[int], timeout_ms: int = ...) -> bool:
@@ -246,7 +243,7 @@ def read_firmware(path: str) -> bytes:
         raise DeviceError(f"firmware = '{path}': cannot be read ({reason})") from None
     if not 0 < len(image) <= LARGEST_FIRMWARE:
         raise DeviceError(
-            f"firmware = '{path}': has {len(image)} bytes; a Falcon's program has 1 to "
+            f"firmware = '{path}': has {len(image)} bytes; a Falcon's firmware has 1 to "
             f"{LARGEST_FIRMWARE}"
         )
     return image
@@ -273,29 +270,13 @@ def send_question(link: Link, flags: int = 0) -> None:
 
 
 def ask(link: Link, stream: ReplyStream, flags: int, timeout: float) -> bool:
-    """Sends a packet without force and waits for the reply.
-
-    Args:
-        link: Link to the Falcon, in run mode.
-        stream: Receives the reply.
-        flags: ``Request`` bits.
-        timeout: Longest wait in s.
-
-    Returns:
-        True if a reply came in time.
-    """
+    """Sends a packet without force and returns whether a reply came within ``timeout`` s."""
     send_question(link, flags)
     return answers(link, stream, timeout) > 0
 
 
 def answers(link: Link, stream: ReplyStream, timeout: float) -> int:
-    """Waits for at least one reply and returns the number of replies, 0 after a timeout.
-
-    Args:
-        link: Link to the Falcon, in run mode.
-        stream: Receives the replies.
-        timeout: Longest wait in s.
-    """
+    """Waits up to ``timeout`` s for at least one reply, and returns the number of replies."""
     end = link.now() + timeout
     found = 0
     while not found and (left := end - link.now()) > 0:
@@ -314,17 +295,10 @@ def upload(link: Link, image: bytes, name: str, tell: Notify) -> None:
     """Loads the firmware into a Falcon, which loses it without power.
 
     At 9600 baud the loader is greeted. At 140000 baud it receives the firmware in pieces and
-    returns each, which is the only check.
-
-    Args:
-        link: Link to the Falcon.
-        image: The firmware.
-        name: Name of the device in messages.
-        tell: Receives the progress, at every quarter.
+    returns each, which is the only check. ``tell`` receives the progress at every quarter.
 
     Raises:
         DeviceError: The loader does not answer, or returned other bytes than it received.
-        DeviceLost: The device is gone.
 
     References:
         libnifalcon's source (2019) for the sequence; not verified on hardware.
@@ -416,11 +390,6 @@ def silent(name: str) -> DeviceLost:
 def insist(link: Link, packet: array.array[int], name: str) -> None:
     """Repeats a zero-force packet until it is accepted.
 
-    Args:
-        link: Link to the Falcon.
-        packet: Packet without force.
-        name: Name of the device in messages.
-
     Raises:
         DeviceLost: The device is gone, or refused ``ZERO_TRIES`` attempts.
     """
@@ -436,11 +405,6 @@ def ask_anew(link: Link, stream: ReplyStream, name: str) -> float:
     A Falcon keeps its last force while the host pauses, and the waiting reply holds an outdated
     pose. If the handle were re-anchored there, the next reply would stretch the coupling by the
     hand's motion in the meantime.
-
-    Args:
-        link: Link to a running Falcon.
-        stream: Receives the replies; the newest then answers a request of this call.
-        name: Name of the device in messages.
 
     Returns:
         Time of the first request in s; the pose is not older.
@@ -459,13 +423,6 @@ def bring_up(
     link: Link, stream: ReplyStream, name: str, firmware: str | None, tell: Notify
 ) -> None:
     """Brings a Falcon into run mode, and loads its firmware if it does not answer.
-
-    Args:
-        link: Link to the Falcon.
-        stream: Receives the replies.
-        name: Name of the device in messages.
-        firmware: Firmware file, or None.
-        tell: Receives the progress.
 
     Raises:
         DeviceError: The device has no firmware, and no file was named or the file does not run.
@@ -490,13 +447,7 @@ def bring_up(
 
 
 def home(link: Link, stream: ReplyStream, name: str, tell: Notify) -> None:
-    """Waits until the user has moved every encoder through its zero.
-
-    Args:
-        link: Link to a running Falcon.
-        stream: Receives the replies.
-        name: Name of the device in messages.
-        tell: Receives the instruction to the user.
+    """Waits until the user, instructed by ``tell``, has moved every encoder through its zero.
 
     Raises:
         DeviceError: The grip was not moved within ``HOMING_TIME``.

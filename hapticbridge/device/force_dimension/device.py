@@ -1,6 +1,6 @@
 """Force Dimension's omega, delta, sigma and lambda, through the maker's library.
 
-The library is not part of this project; users obtain it from the maker (``library``). A call
+The library is not part of this project; users obtain it from the maker. A call
 communicates with the device before it returns. A sample is therefore as old as its call, and a
 force acts when its call ends. The sheet's delay is the duration of both calls.
 
@@ -153,11 +153,9 @@ class ForceDimensionDevice:
     def start(self, period: float) -> NDArray[np.void]:
         """Sets the watchdog, switches the motors on without force, and reads the pose.
 
-        Args:
-            period: The loop's period in s, finite and > 0, at most half of the longest watchdog.
-
         Raises:
-            DeviceError: The period is out of range, or the device reports no pose.
+            DeviceError: The period exceeds half of the longest watchdog, or the device reports no
+                pose.
             DeviceLost: The device is gone.
         """
         longest = MOST_WATCHDOG * WATCHDOG_STEP
@@ -190,12 +188,6 @@ class ForceDimensionDevice:
     def read(self, sample: NDArray[np.void]) -> int:
         """Reads the pose; blocks as long as the library does.
 
-        Args:
-            sample: Output, shape (1,), ``SAMPLE_DTYPE``.
-
-        Returns:
-            0, or ``TickFlag.STALE_SAMPLE`` if the library had no newer sample.
-
         Raises:
             DeviceError: The device was not started, or reports an invalid pose.
             DeviceLost: The library reports an error, or no fresh sample for ``SILENCE``.
@@ -212,15 +204,7 @@ class ForceDimensionDevice:
         return 0 if is_fresh else int(TickFlag.STALE_SAMPLE)
 
     def write(self, wrench: NDArray[np.float64]) -> None:
-        """Commands a wrench on the axes that have motors.
-
-        Args:
-            wrench: Shape (6,), in the device's frame.
-
-        Raises:
-            DeviceError: The wrench is not finite.
-            DeviceLost: The library reports an error.
-        """
+        """Commands a wrench on the axes that have motors; it must be finite."""
         values = wrench.tolist()
         if not all(map(math.isfinite, values)):
             raise DeviceError(f"{self._name}: a wrench that is not finite was not sent")
@@ -275,10 +259,8 @@ _NUMBERS = (*MEASURED, "force_limit", "torque_limit")
 def open_forcedimension(options: Mapping[str, object], tell: Notify) -> ForceDimensionDevice:
     """Loads the library and opens one of its devices.
 
-    Args:
-        options: ``library`` (its file), ``serial`` (number of the device in the library's list,
-            from 0, if there are several), ``gravity`` (1 or 0), and numbers of the data sheet.
-        tell: Receives a description of the device and its settings.
+    The options are ``library`` (its file), ``serial``, ``gravity`` (1 or 0), and numbers of the
+    data sheet. ``serial`` is the device's number in the library's list, from 0.
 
     Raises:
         DeviceError: No library or no device is found, or an option is not valid.

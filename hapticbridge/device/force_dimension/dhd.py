@@ -216,15 +216,10 @@ class Dhd:
         return text.decode(errors="replace") if text else "no reason reported"
 
     def require(self, name: str, *arguments: Any, what: str) -> int:
-        """Calls a function and returns its code, 0 or a warning.
-
-        Args:
-            name: Key of ``FUNCTIONS``.
-            *arguments: Arguments of the function.
-            what: Description of the failure, for the message.
+        """Calls a function of ``FUNCTIONS`` and returns its code, 0 or a warning.
 
         Raises:
-            DeviceError: The function failed; the message contains the library's description.
+            DeviceError: The function failed; the message is ``what`` and the library's description.
         """
         code = int(self[name](*arguments))
         if code < 0:
@@ -232,12 +227,7 @@ class Dhd:
         return code
 
     def has_watchdog(self, device: int, steps: int) -> bool:
-        """Sets a device's watchdog; returns False if it has none.
-
-        Args:
-            device: Number of the device.
-            steps: Age in ``WATCHDOG_STEP`` at which a force ends, 1 to ``MOST_WATCHDOG``.
-        """
+        """Sets the watchdog, 1 to ``MOST_WATCHDOG`` steps; returns False if the device has none."""
         self["dhdEnableExpertMode"]()
         code = int(self["dhdSetWatchdog"](steps, device))
         self["dhdDisableExpertMode"]()
@@ -246,8 +236,7 @@ class Dhd:
     def timing(self, exchange: Callable[[], object]) -> tuple[float, float]:
         """Measures the rate of exchanges in Hz and the time in s that the share ``SHARE`` meets.
 
-        Args:
-            exchange: Reads a sample and writes a force; repeated for ``TIMING``.
+        ``exchange`` reads a sample and writes a force; it is repeated for ``TIMING``.
         """
         times = []
         begin = last = self.now()

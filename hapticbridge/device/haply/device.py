@@ -61,17 +61,10 @@ _ANSWER_TIME = 0.05
 
 
 def measured_timing(link: Link, message: str, name: str) -> tuple[float, float]:
-    """Measures the rate of states and the delay of answers.
+    """Measures the rate of states in Hz and the delay of answers in s.
 
-    A message both carries a force and requests the state, so both have this delay.
-
-    Args:
-        link: Link to a service without messages on their way.
-        message: Message without force.
-        name: Name of the device in messages.
-
-    Returns:
-        The rate in Hz and the delay in s.
+    A message without force is sent each time. It both carries a force and requests the state, so
+    both have this delay.
 
     Raises:
         DeviceLost: The service stopped answering.
@@ -201,11 +194,8 @@ class HaplyDevice:
     def start(self, period: float) -> NDArray[np.void]:
         """Requests the state, without force.
 
-        Args:
-            period: The loop's period in s, at most ``LONGEST_PERIOD``.
-
         Raises:
-            DeviceError: The period is out of range, or the service reports no position.
+            DeviceError: The period exceeds ``LONGEST_PERIOD``, or the service reports no position.
             DeviceLost: The service is gone or silent.
         """
         if checked_period(period) > LONGEST_PERIOD:
@@ -222,12 +212,6 @@ class HaplyDevice:
 
     def read(self, sample: NDArray[np.void]) -> int:
         """Returns the newest state; waits only after a pause of the loop, for a new answer.
-
-        Args:
-            sample: Output, shape (1,), ``SAMPLE_DTYPE``.
-
-        Returns:
-            0, or ``TickFlag.STALE_SAMPLE`` if the sample repeats the last one.
 
         Raises:
             DeviceError: The device was not started, or an answer is not a state.
@@ -248,15 +232,7 @@ class HaplyDevice:
         return int(TickFlag.STALE_SAMPLE) if newest is None else 0
 
     def write(self, wrench: NDArray[np.float64]) -> None:
-        """Sends a force together with the next request; the torque is ignored.
-
-        Args:
-            wrench: Shape (6,), in the service's frame.
-
-        Raises:
-            DeviceError: The force is not finite.
-            DeviceLost: The connection was lost.
-        """
+        """Sends a finite force together with the next request; the torque is ignored."""
         force = tuple(wrench[:3].tolist())
         if not all(map(math.isfinite, force)):
             raise DeviceError(f"{self._name}: a force that is not finite was not sent")
@@ -338,10 +314,8 @@ _NUMBERS = ("mass", "damping", "friction", "resolution", "force_limit")
 def open_haply(options: Mapping[str, object], tell: Notify) -> HaplyDevice:
     """Connects to the service and opens one of its devices.
 
-    Args:
-        options: ``service`` (HOST:PORT), ``serial`` (the service's device_id), ``force_gate``,
-            ``log`` (a file for the messages), and numbers of the data sheet.
-        tell: Receives a description of the service's force filters.
+    The options are ``service`` (HOST:PORT), ``serial`` (the service's device_id), ``force_gate``,
+    ``log`` (a file for the messages), and numbers of the data sheet.
 
     Raises:
         DeviceError: The service does not run, lists no such device, or an option is not valid.

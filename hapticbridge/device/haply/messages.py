@@ -70,11 +70,7 @@ class State:
 
 
 def inventory(message: str) -> list[Listed]:
-    """Returns the devices listed in the service's first message.
-
-    Raises:
-        DeviceError: The message is not an inventory.
-    """
+    """Returns the devices listed in the service's first message."""
     told = decoded(message, SERVICE)
     if "session_id" not in told and "inverse3" not in told:
         raise DeviceError(f"{SERVICE} sent no list of devices first: {message!r:.60}")
@@ -96,12 +92,7 @@ def state(message: str, device_id: str) -> State:
 
 
 def first_message(listed: Listed, gate_gain: float) -> str:
-    """Returns the first message: session name, filter settings, and zero force.
-
-    Args:
-        listed: The device.
-        gate_gain: Gain of the force gate, without unit.
-    """
+    """Returns the first message: session name, gain of the force gate, and zero force."""
     device: dict[str, Any] = {"device_id": listed.device_id}
     if listed.filters is not None:
         device["configure"] = {"force_gate": {"gain": gate_gain}, "damping": {"scalar": 0.0}}
@@ -112,11 +103,7 @@ def first_message(listed: Listed, gate_gain: float) -> str:
 
 
 def refuse_scaled(listed: Listed) -> None:
-    """Refuses a device whose positions the service scales.
-
-    Raises:
-        DeviceError: The service scales its positions.
-    """
+    """Raises DeviceError for a device whose positions the service scales."""
     if listed.is_scaled:
         raise DeviceError(
             f"{SERVICE} scales the positions of {listed.device_id}, so force times motion would "
@@ -142,12 +129,7 @@ def told_filters(listed: Listed, gate_gain: float) -> str:
 
 
 def force_message(listed: Listed, force: Sequence[float]) -> str:
-    """Returns the message that commands a force.
-
-    Args:
-        listed: The device.
-        force: Three finite numbers in N.
-    """
+    """Returns the message that commands a force of three finite numbers in N."""
     x, y, z = force
     return (
         f'{{"inverse3":[{{"device_id":{json.dumps(listed.device_id)},"commands":'

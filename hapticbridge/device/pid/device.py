@@ -106,11 +106,7 @@ class Effects:
         self._ticks = self._every = 0
 
     def start(self, period: float) -> None:
-        """Sets direction and duration of the effects and starts them without force.
-
-        Args:
-            period: The loop's period in s.
-        """
+        """Sets direction and duration of the effects and starts them without force."""
         self._every, self._ticks = max(int(self._restart / period), 1), 0
         reports = self._reports
         # at least LIFE periods: a slow loop would otherwise lose its force between two ticks
@@ -126,8 +122,7 @@ class Effects:
     def push(self, shares: Sequence[float]) -> None:
         """Sends changed forces, and restarts the effects when due.
 
-        Args:
-            shares: Share of full scale per axis, finite, clipped to [-1, 1].
+        Shares of full scale per axis must be finite and are clipped to [-1, 1].
         """
         self._ticks += 1
         is_due = self._ticks >= self._every
@@ -508,12 +503,6 @@ class PidDevice:
     def start(self, period: float) -> NDArray[np.void]:
         """Starts the effects without force, and reads the stick's position.
 
-        Args:
-            period: The loop's period in s, finite and > 0.
-
-        Returns:
-            The pose before the first tick, shape (1,), ``SAMPLE_DTYPE``.
-
         Raises:
             DeviceError: The period is not valid, or the stick does not report its position.
             DeviceLost: The device is gone.
@@ -534,15 +523,7 @@ class PidDevice:
     def read(self, sample: NDArray[np.void]) -> int:
         """Returns the stick's position without waiting.
 
-        Args:
-            sample: Output, shape (1,), ``SAMPLE_DTYPE``.
-
-        Returns:
-            0, or ``STALE_SAMPLE`` if a streaming stick has sent nothing since the last read.
-
-        Raises:
-            DeviceLost: The device is gone.
-            DeviceError: The device was not started.
+        The sample is stale only if a streaming stick has sent nothing since the last read.
         """
         if not self._has_started:
             raise DeviceError(f"{self._name} is read before it was started; call start() first")
@@ -555,15 +536,7 @@ class PidDevice:
         return 0 if is_new or not self._streams else int(TickFlag.STALE_SAMPLE)
 
     def write(self, wrench: NDArray[np.float64]) -> None:
-        """Commands a force along x and y, each clipped to full scale.
-
-        Args:
-            wrench: Shape (6,): force in N, torque in N m, on the device, in the device's frame.
-
-        Raises:
-            DeviceLost: The device is gone.
-            DeviceError: The force is not finite.
-        """
+        """Commands a finite force along x and y, each clipped to full scale."""
         shares = self._shares * wrench[:2]
         if not np.isfinite(shares).all():
             raise DeviceError(f"{self._name}: a force that is not finite was not sent")
@@ -583,11 +556,7 @@ class PidDevice:
                 self.last_word.close()
 
     def leave_last_word(self, path: str) -> None:
-        """Starts a guardian process that ends the force, if two processes can hold the node.
-
-        Args:
-            path: The device node.
-        """
+        """Starts a guardian process that ends the force, if two processes can hold the node."""
         self.last_word = guard_device_node(path, *self._effects.farewell())
 
     def _fill(self) -> None:
@@ -599,11 +568,9 @@ class PidDevice:
 def open_pid(options: Mapping[str, object], tell: Notify, api: HidApi | None = None) -> PidDevice:
     """Finds and opens a force-feedback stick.
 
-    Args:
-        options: ``serial``, ``log``, ``newtons``, ``travel``, ``reverse``, ``profile``, and numbers
-            of the data sheet, ``CHANGES``.
-        tell: Receives a message about assumed values.
-        api: hidapi or a substitute; reports are then sent without a thread.
+    The options are ``serial``, ``log``, ``newtons``, ``travel``, ``reverse``, ``profile``, and the
+    numbers ``CHANGES`` of the data sheet. ``tell`` receives a message about assumed values. With a
+    substitute of hidapi, ``api``, reports are sent without a thread.
 
     Raises:
         DeviceError: No stick is found, it cannot be opened, or it lacks a required capability.

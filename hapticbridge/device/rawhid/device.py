@@ -73,10 +73,6 @@ CHANGES = (
 def asked(link: Link, name: str) -> tuple[Numbers, str]:
     """Requests both pages of a device's sheet.
 
-    Args:
-        link: Open link for its reports.
-        name: Name of the device in messages.
-
     Raises:
         DeviceError: The device does not answer, or has another version of the protocol.
         DeviceLost: The device is gone.
@@ -114,13 +110,7 @@ def reports(link: Link, timeout_ms: int) -> Iterator[bytes]:
 
 
 def data_sheet(name: str, numbers: Numbers, title: str, changes: dict[str, Any]) -> DeviceInfo:
-    """Returns the data sheet from the device's numbers and the user's changes.
-
-    Args:
-        name: Name of the device in messages.
-        numbers: Page 0.
-        title: Page 1.
-        changes: Numbers of ``CHANGES``, by name.
+    """Returns the data sheet from the device's numbers, its title and the user's changes.
 
     Raises:
         DeviceError: A required number is missing, or one is out of range.
@@ -252,12 +242,6 @@ class RawHidDevice:
     def start(self, period: float) -> NDArray[np.void]:
         """Waits for a state frame newer than this call.
 
-        Args:
-            period: The loop's period in s, finite and > 0.
-
-        Returns:
-            The pose before the first tick, shape (1,), ``SAMPLE_DTYPE``.
-
         Raises:
             DeviceError: The period is not valid, or the device sends nothing, must be homed first,
                 or reports a fault.
@@ -287,12 +271,6 @@ class RawHidDevice:
     def read(self, sample: NDArray[np.void]) -> int:
         """Returns the newest pose without waiting.
 
-        Args:
-            sample: Output, shape (1,), ``SAMPLE_DTYPE``.
-
-        Returns:
-            0, or ``STALE_SAMPLE`` if no valid frame has come since the last read.
-
         Raises:
             DeviceLost: The device is gone, or silent for longer than ``SILENCE``.
             DeviceError: The device was not started, has restarted, reports a fault, or sent a
@@ -318,15 +296,7 @@ class RawHidDevice:
         return 0
 
     def write(self, wrench: NDArray[np.float64]) -> None:
-        """Commands a wrench on the axes that the device has.
-
-        Args:
-            wrench: Shape (6,): force in N, torque in N m, on the device, in the device's frame.
-
-        Raises:
-            DeviceLost: The device is gone.
-            DeviceError: The wrench is not finite.
-        """
+        """Commands a finite wrench on the axes that the device has."""
         values = (wrench * self._mask).tolist()
         if not all(abs(value) < LARGEST for value in values):
             raise DeviceError(f"{self._name}: a wrench that is not finite was not sent")
@@ -396,10 +366,8 @@ def open_rawhid(
 ) -> RawHidDevice:
     """Finds and opens a raw HID device.
 
-    Args:
-        options: ``serial``, ``log``, and numbers of the data sheet that replace its own.
-        api: hidapi or a substitute; reports are then sent without a thread.
-        now: Returns the time of a monotonic clock in s.
+    The options are ``serial``, ``log``, and numbers that replace those of the device's data sheet.
+    With a substitute of hidapi, ``api``, reports are sent without a thread.
 
     Raises:
         DeviceError: No device is found, it cannot be opened, or it has another protocol.

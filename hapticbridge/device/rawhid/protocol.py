@@ -109,7 +109,7 @@ class Numbers(NamedTuple):
     """Page 0 of the device's data sheet; NaN for unknown numbers.
 
     Attributes:
-        axes: Bit i is set if it has axis i of ``device.AXES``.
+        axes: Bit i is set if it has axis i of ``AXES``.
         rate: Rate of state frames in Hz.
         mass: Mass in kg.
         damping: Damping in N s/m.
@@ -149,7 +149,7 @@ class Numbers(NamedTuple):
 
     @property
     def axis_names(self) -> tuple[str, ...]:
-        """Axes by name, in the order of ``device.AXES``."""
+        """Axes by name, in the order of ``AXES``."""
         return tuple(name for i, name in enumerate(AXES) if self.axes >> i & 1)
 
 
@@ -161,14 +161,9 @@ def crc16(data: bytes) -> int:
 def force_frame(
     sequence: int, wrench: tuple[float, ...], watchdog_ms: int, *, is_enabled: bool = True
 ) -> bytes:
-    """Returns the frame that commands a wrench.
+    """Returns the frame that commands a wrench: 6 finite numbers in N and N m.
 
-    Args:
-        sequence: 0 to 65535.
-        wrench: Force in N and torque in N m on the device, in its frame; 6 finite numbers.
-        watchdog_ms: Time in ms without a force frame after which the device ends the force, 1 to
-            1000.
-        is_enabled: False to disable the motors.
+    The device ends the force ``watchdog_ms``, 1 to 1000, after the last frame.
     """
     flags = ENABLE if is_enabled else 0
     return _sealed(_FORCE.pack(MAGIC, VERSION, Kind.FORCE, flags, sequence, watchdog_ms, *wrench))
@@ -197,13 +192,7 @@ def state_frame(state: State) -> bytes:
 
 
 def sheet_frames(sequence: int, numbers: Numbers, name: str) -> tuple[bytes, bytes]:
-    """Returns both pages of a device's sheet.
-
-    Args:
-        sequence: Sequence of the request.
-        numbers: Page 0.
-        name: Page 1, in UTF-8; truncated to 54 bytes.
-    """
+    """Returns both pages of a device's sheet; the name is truncated to 54 bytes in UTF-8."""
     head = MAGIC, VERSION, Kind.SHEET
     text = name.encode()[:NAME_BYTES].decode(errors="ignore").encode()
     return (
@@ -225,14 +214,9 @@ def version_of(frame: bytes) -> int | None:
 
 
 def decoded(frame: bytes) -> State | Numbers | str | None:
-    """Decodes a frame from the device.
+    """Decodes any bytes from the device: a state, page 0 of the sheet, or the name of page 1.
 
-    Args:
-        frame: Any bytes.
-
-    Returns:
-        A state, page 0 of the sheet, or the name of page 1. None for another length, version or
-        kind, or a damaged frame. Numbers may be any float32.
+    None stands for another length, version or kind, or a damaged frame. Numbers may be any float32.
     """
     if version_of(frame) != VERSION:
         return None

@@ -58,10 +58,6 @@ def scene_hand(model: mujoco.MjModel, path: Path) -> Hand:
     and rotational damping in N m s/rad. All other values, including the inertia, are those of the
     default hand.
 
-    Args:
-        model: The compiled scene.
-        path: Its file, for the message.
-
     Raises:
         SceneError: The numbers are not two or four, or one is not finite or negative.
     """
@@ -103,8 +99,8 @@ class SimulatedDevice:
     Rotation follows the same law with the rotation vector e = log(R R_pᵀ) in place of x − p and R ←
     exp(δ) R. The inertia is isotropic, so there is no gyroscopic torque. The solution is exact
     while rotation, target and torque share one axis and the angle to the target stays below π.
-    Otherwise e' = ω within the period holds to first order in the angle from the target, and the
-    composition of rotations about changing axes to third order in the period. At an angle of π the
+    Otherwise e' = ω within the period holds to first order in the angle from the target. The
+    composition of rotations about changing axes holds to third order in the period. At π the
     hand's torque reverses.
 
     Wrenches are not clipped; the guard that sends them applies the limits.
@@ -157,7 +153,7 @@ class SimulatedDevice:
         duration = None
         is_line = isinstance(hand, WorstHand)
         if rotational_hand is not None and not is_line:
-            raise DeviceError("rotational_hand goes only with a WorstHand as hand")
+            raise DeviceError("rotational_hand requires a WorstHand as hand")
         if is_line and friction:
             raise DeviceError(f"friction = {friction!r} N: a worst hand is linear and has none")
         if hand is not None and not is_line and path is not None:
@@ -218,13 +214,8 @@ class SimulatedDevice:
     def start(self, period: float, parts: int = 1) -> NDArray[np.void]:
         """Places the device at rest at the origin, and compiles the functions of the loop.
 
-        Args:
-            period: The loop's period in s, finite and > 0.
-            parts: Number of steps per period, for ticks at parts of a period; the delay remains in
-                whole periods.
-
-        Returns:
-            The pose before the first tick, shape (1,), ``SAMPLE_DTYPE``.
+        With ``parts`` the device takes that many steps per period; the delay remains in whole
+        periods.
 
         Raises:
             DeviceError: The period is not valid, is too long for a stiff hand with friction, or
@@ -261,14 +252,7 @@ class SimulatedDevice:
         return sample
 
     def read(self, sample: NDArray[np.void]) -> int:
-        """Advances by one period (not at the first call) and returns the pose, without buttons.
-
-        Args:
-            sample: Output, shape (1,), ``SAMPLE_DTYPE``.
-
-        Raises:
-            DeviceError: The device was not started.
-        """
+        """Advances by one period (not at the first call) and returns the pose, without buttons."""
         if not self._is_started:
             raise DeviceError(
                 "the simulated device is read before it was started; call start() first"
@@ -277,18 +261,11 @@ class SimulatedDevice:
         return 0
 
     def write(self, wrench: NDArray[np.float64]) -> None:
-        """Holds a wrench on the handle until the next write, ``delay`` samples later.
-
-        Args:
-            wrench: Shape (6,): force in N, torque in N m, in the device's frame.
-        """
+        """Holds a wrench on the handle until the next write, ``delay`` samples later."""
         self._written[:] = wrench.data
 
     def displace(self, offset: NDArray[np.float64]) -> None:
-        """Displaces the device before its first sample, for runs that must decay.
-
-        Args:
-            offset: Shape (6,): displacement in m and rotation vector in rad, in the device's frame.
+        """Displaces the device before its first sample, in m and rad (rotation vector).
 
         Raises:
             DeviceError: The device was not started, or has been read already.
@@ -306,7 +283,7 @@ class SimulatedDevice:
 
     @property
     def stepper(self) -> tuple[NDArray[np.void], NDArray[np.float64]]:
-        """State and motion for ``handheld.next_sample``, for loops that are fully compiled.
+        """State and motion for ``next_sample``, for loops that are fully compiled.
 
         The newest wrench is the state's field ``written``.
         """

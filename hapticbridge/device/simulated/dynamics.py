@@ -131,14 +131,9 @@ def sampled_axis(
 def moved(
     axis: Record, level: int, relative_velocity: float, acceleration: float, drift: float
 ) -> tuple[float, float]:
-    """Returns the increments of position and velocity over the time of a level, without friction.
+    """Returns the increments of position and velocity over the time T/2^level, without friction.
 
-    Args:
-        axis: Law of motion, ``AXIS_DTYPE``.
-        level: 0 for the whole period, i for T/2^i.
-        relative_velocity: v − ṗ at the start.
-        acceleration: v' at the start.
-        drift: ṗ, the target's velocity.
+    The arguments are v − ṗ and v' at the start, and the target's velocity ṗ (``drift``).
     """
     step = axis.steps[level]
     return (
@@ -225,14 +220,8 @@ def moved_with_friction(
     """Returns the increment of position and the new velocity after one period, with friction.
 
     At rest the axis sticks while |F + b_h ṗ − k_h (x − p)| <= f_c. The moment of breaking away is
-    found in closed form, the moment of coming to rest by bisection.
-
-    Args:
-        axis: Law of motion, ``AXIS_DTYPE``.
-        force: F in N, held.
-        stretch: x − p in m at the start.
-        velocity: v in m/s at the start.
-        drift: ṗ in m/s.
+    found in closed form, the moment of coming to rest by bisection. The arguments are F in N, x − p
+    in m and v in m/s at the start, and ṗ in m/s (``drift``).
     """
     travel = 0.0
     unit = axis.steps[LEVELS - 1, 0]

@@ -69,15 +69,9 @@ grips hard, around the measured arm of the defaults. Every hand in them is passi
 
 
 def random_hand(seed: int) -> Hand:
-    """Returns a random passive hand that depends on the seed only.
+    """Returns a random passive hand that depends on the seed, a whole number >= 0, only.
 
     Every value is drawn independently, evenly in its logarithm, from its ``HAND_RANGES``.
-
-    Args:
-        seed: Whole number >= 0.
-
-    Raises:
-        DeviceError: The seed is not a whole number >= 0.
     """
     Arguments(DeviceError).whole("seed", seed, least=0, most=2**63 - 1)
     generator = np.random.default_rng(seed)

@@ -93,13 +93,8 @@ def hid_api() -> HidApi | None:
 def find(family: Driver, api: HidApi | None = None) -> list[FoundDevice]:
     """Lists the family's connected devices, with the reason if one cannot be opened.
 
-    Args:
-        family: The family to look for.
-        api: hidapi or a substitute; None selects the real one. Only then the USB bus is searched
-            too, for devices without a hidraw node, and for all of them without hidapi.
-
-    Returns:
-        One entry per device.
+    Without a substitute of hidapi, ``api``, the USB bus is searched too, for devices without a
+    hidraw node, and for all of them without hidapi.
     """
     module = hid_api() if api is None else api
     found: dict[str, FoundDevice] = {}
@@ -168,14 +163,7 @@ def descriptor_of(handle: HidHandle) -> bytes:
 
 
 def polling(path: str) -> tuple[float | None, float | None]:
-    """Returns the polling intervals for reports from and to a device, in s each.
-
-    Args:
-        path: A hidraw node.
-
-    Returns:
-        None if the kernel does not list it, and for a device without that endpoint.
-    """
+    """Returns the polling intervals in s for reports from and to a hidraw node; None if unknown."""
     found: dict[str, float] = {}
     try:
         for endpoint in sorted((CLASS / Path(path).name / "device/..").glob("ep_*")):
@@ -192,13 +180,7 @@ def polling(path: str) -> tuple[float | None, float | None]:
 
 
 def is_taken(send: Callable[[bytes], int], report: bytes, log: HexLog) -> bool:
-    """Sends a report by one of hidapi's calls; returns whether the device accepted it.
-
-    Args:
-        send: The call: ``write``, or ``send_feature_report``.
-        report: Report starting with its number, 0 if the device's reports have none.
-        log: Log of the transferred bytes.
-    """
+    """Sends a report, its number first, by a call of hidapi; returns whether it was accepted."""
     if log.is_on:
         log.add(">", report)
     try:
@@ -356,9 +338,6 @@ class HidLink:
 
         After a long pause the kernel's queue is full of old reports. Only then does the call wait
         for a new one, up to ``FRESH_MS``.
-
-        Raises:
-            DeviceLost: The device is gone.
         """
         reports: list[bytes] = []
         while len(reports) < QUEUE and (report := self._read(0)):
@@ -368,22 +347,11 @@ class HidLink:
         return reports
 
     def wait(self, timeout_ms: int) -> bytes:
-        """Returns the next report; empty after the timeout.
-
-        Args:
-            timeout_ms: Longest wait in ms, >= 1.
-
-        Raises:
-            DeviceLost: The device is gone.
-        """
+        """Returns the next report; empty after ``timeout_ms``, >= 1."""
         return self._read(timeout_ms)
 
     def write(self, report: bytes, slot: int = 0) -> None:
-        """Sends a report; if overlapped, it replaces an unsent one in its slot.
-
-        Args:
-            report: Report starting with its number, 0 if the device's reports have none.
-            slot: Kind of report.
+        """Sends a report, its number first; if overlapped, it replaces an unsent one in its slot.
 
         Raises:
             DeviceLost: The device is gone, or accepted no report for ``LONGEST_WRITE``.
@@ -403,11 +371,7 @@ class HidLink:
         self._wake.set()
 
     def send(self, report: bytes) -> None:
-        """Sends a report before it returns, and discards unsent ones, for the set-up.
-
-        Raises:
-            DeviceLost: The device is gone, or accepts no reports.
-        """
+        """Sends a report before it returns, and discards unsent ones, for the set-up."""
         for waiting in self._outgoing:
             waiting.clear()
         if self._lost or not self._is_idle.wait(LONGEST_WRITE) or not self._is_sent(report):

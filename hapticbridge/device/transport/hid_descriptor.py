@@ -246,11 +246,7 @@ class Place:
         return (1 << self.field.size) - 1
 
     def read(self, report: int) -> int:
-        """Returns the logical value in a report.
-
-        Args:
-            report: All bytes of the report with its number, as one little-endian number.
-        """
+        """Returns the logical value in a report with its number, as one little-endian number."""
         value = report >> self.offset & self.mask
         is_negative = self.field.minimum < 0 and value >> (self.field.size - 1)
         return value - (1 << self.field.size) if is_negative else value
@@ -363,11 +359,7 @@ def filled(places: Mapping[Place, int]) -> int:
 
 
 def required(found: Place | None, name: str) -> Place:
-    """Returns the place.
-
-    Raises:
-        DeviceError: The place is None; the message names it.
-    """
+    """Returns the place; raises DeviceError with the name if it is None."""
     if found is None:
         raise DeviceError(f"its reports lack {name}")
     return found

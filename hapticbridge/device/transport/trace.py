@@ -45,11 +45,7 @@ class HexLog:
 
     @classmethod
     def asked(cls, options: Mapping[str, object]) -> HexLog:
-        """Returns the log named by a device's option ``log``, or else by the variable.
-
-        Raises:
-            DeviceError: The file cannot be written.
-        """
+        """Returns the log named by a device's option ``log``, or else by the variable."""
         named = options.get("log")
         return cls(None if named is None else str(named))
 
@@ -59,22 +55,13 @@ class HexLog:
         return self._path is not None
 
     def add(self, direction: str, data: bytes) -> None:
-        """Keeps one transfer.
-
-        Args:
-            direction: ``<`` from the device, ``>`` to it.
-            data: Transferred bytes.
-        """
+        """Keeps one transfer; the direction is ``<`` from the device or ``>`` to it."""
         if self._path is not None:
             self._lines.append((time.monotonic_ns(), direction, data))
             self._count += 1
 
     def close(self) -> None:
-        """Appends the transfers to the file; a second call writes nothing.
-
-        Raises:
-            DeviceError: The file cannot be written.
-        """
+        """Appends the transfers to the file; a second call writes nothing."""
         if self._path is None:
             return
         path, self._path = self._path, None

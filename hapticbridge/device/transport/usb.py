@@ -55,15 +55,9 @@ class OnTheBus:
 
 
 def on_the_bus(bus: Path | None = None) -> list[OnTheBus]:
-    """Lists the devices on the USB bus, in the order of their bus positions.
+    """Lists the devices on the USB bus, in the order of their bus positions; empty without a bus.
 
-    This requires neither libusb nor a permission.
-
-    Args:
-        bus: Folder of sysfs that lists them; None selects ``BUS``.
-
-    Returns:
-        Empty without a bus. A device that is unplugged meanwhile is left out.
+    This requires neither libusb nor a permission. A device unplugged meanwhile is left out.
     """
     folder = BUS if bus is None else bus
     found = []
@@ -97,13 +91,7 @@ def on_the_bus(bus: Path | None = None) -> list[OnTheBus]:
 def members(
     family: Driver, devices: Iterable[OnTheBus], problem: Callable[[OnTheBus], str | None]
 ) -> list[FoundDevice]:
-    """Returns the devices of a family, in the listed order.
-
-    Args:
-        family: The family.
-        devices: Devices on the bus.
-        problem: Returns the reason why a device cannot be opened, or None.
-    """
+    """Returns the devices of a family; ``problem`` returns why one cannot be opened, or None."""
     return [
         FoundDevice(
             family=family.name,
@@ -237,14 +225,7 @@ def find(family: Driver, backend: Any = None) -> list[FoundDevice]:
     """Lists the family's connected devices, with the reason if one cannot be opened.
 
     On Linux the kernel's list is used, because opening a device would disturb a running loop. On
-    other systems libusb is used.
-
-    Args:
-        family: The family to look for.
-        backend: A pyusb backend; None selects kernel or libusb.
-
-    Returns:
-        One entry per device, in the order of their bus positions.
+    other systems libusb is used. Devices are in the order of their bus positions.
     """
     listed = [] if backend is not None else members(family, on_the_bus(), _problem)
     source = libusb() if backend is None and not listed else backend
@@ -395,15 +376,7 @@ class UsbLink:
         return time.monotonic()
 
     def control(self, request: int, value: int) -> None:
-        """Sends a vendor request without data.
-
-        Args:
-            request: bRequest.
-            value: wValue.
-
-        Raises:
-            DeviceLost: The device is gone, or refuses the request.
-        """
+        """Sends a vendor request (bRequest, wValue) without data."""
         self._require()
         if self._log.is_on:
             self._log.add(">", b"control %02x %04x" % (request, value))
@@ -413,15 +386,7 @@ class UsbLink:
             raise self._failed(error) from None
 
     def write(self, packet: array.array[int], timeout_ms: int = WRITE_MS) -> bool:
-        """Sends a packet; returns False if the device did not accept it in time.
-
-        Args:
-            packet: Array of bytes, which is not copied.
-            timeout_ms: Longest wait in ms, >= 1.
-
-        Raises:
-            DeviceLost: The device is gone, or refuses the packet.
-        """
+        """Sends an array of bytes without a copy; returns False if it was not accepted in time."""
         if self._lost or not self._is_open:
             self._require()
         try:
@@ -437,8 +402,7 @@ class UsbLink:
     def take(self) -> list[bytes]:
         """Returns the packets since the last call, oldest first, without waiting.
 
-        Raises:
-            DeviceLost: The device is gone; earlier packets are returned first.
+        Packets of a lost device are returned before DeviceLost is raised.
         """
         packets = self._packets
         if not packets or not self._is_open:

@@ -74,12 +74,6 @@ class WebSocketLink:
     def open(cls, host: str, port: int, name: str, log: HexLog | None = None) -> WebSocketLink:
         """Connects to a local program.
 
-        Args:
-            host: Name or address.
-            port: TCP port.
-            name: Name of the peer in messages.
-            log: Log of the transferred bytes.
-
         Raises:
             DeviceError: No program answers there, its answer is not a WebSocket handshake, or
                 websockets is missing.
@@ -120,11 +114,7 @@ class WebSocketLink:
         return time.monotonic()
 
     def send(self, message: str) -> None:
-        """Sends a message.
-
-        Raises:
-            DeviceLost: The connection was lost.
-        """
+        """Sends a message; raises DeviceLost if the connection was lost."""
         if self._log.is_on:
             self._log.add(">", message.encode())
         try:
@@ -135,8 +125,7 @@ class WebSocketLink:
     def take(self) -> list[str]:
         """Returns the received messages, oldest first, without waiting.
 
-        Raises:
-            DeviceLost: The connection was lost and all earlier messages were taken.
+        Messages from before a lost connection are returned before DeviceLost is raised.
         """
         messages: list[str] = []
         while (message := self._received(0.0, is_dropped_after=bool(messages))) is not None:
@@ -144,11 +133,7 @@ class WebSocketLink:
         return messages
 
     def wait(self, timeout: float) -> str | None:
-        """Returns the next message, or None after ``timeout`` s.
-
-        Raises:
-            DeviceLost: The connection was lost.
-        """
+        """Returns the next message, or None after ``timeout`` s; raises DeviceLost."""
         return self._received(timeout)
 
     def close(self) -> None:
@@ -183,15 +168,7 @@ class WebSocketLink:
 
 
 def decoded(message: str, name: str) -> dict[str, Any]:
-    """Returns a message as a JSON object.
-
-    Args:
-        message: Text of the message.
-        name: Name of the sender in messages.
-
-    Raises:
-        DeviceError: The message is not a JSON object.
-    """
+    """Returns a message as a JSON object; raises DeviceError if it is not one."""
     try:
         value = read_json(message)
     except ValueError:
