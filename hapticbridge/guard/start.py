@@ -91,8 +91,8 @@ def refuse_simulated_time(device: DeviceInfo | str, clock: Clock) -> None:
         is_bound = device.is_real or follows
     if is_bound and isinstance(clock, SimulatedClock):
         raise DeviceError(
-            f"the device '{name}' moves in real time, so the loop cannot run as fast as it "
-            "goes; leave out --fast (in code: the SimulatedClock)"
+            f"the device '{name}' moves in real time, so the loop cannot run faster; leave out "
+            "--fast (in code: the SimulatedClock)"
         )
 
 
