@@ -143,7 +143,7 @@ def access_problem(path: str) -> str | None:
     if os.access(path, os.R_OK | os.W_OK):
         return None
     if not Path(path).exists():
-        return f"{path} does not exist yet, or not in this container; try again in a second"
+        return f"no node {path} exists yet, or none in this container; try again in a second"
     return permission_problem(path)
 
 
