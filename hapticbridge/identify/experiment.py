@@ -35,7 +35,7 @@ follow the commanded force, so zero force is the safer command."""
 SPEED_MARGIN = 1.5
 """Multiple of the device's own top speed that counts as a fault, without unit."""
 
-_TOLD_PER_SECOND = 10
+_PROGRESS_RATE = 10
 """Rate of progress reports in Hz."""
 
 
@@ -117,19 +117,19 @@ def move_axis(
     s["amplitude"] = START_SHARE * allowance.force[index >= 3]
     compute = direct(next_wrench, state, sample, past, 0.0, 1, wrench)
     position, force, wakes = np.empty(ticks), np.empty(ticks), np.empty(ticks)
-    told_every, stale, place = max(round(1.0 / (_TOLD_PER_SECOND * period)), 1), 0, s["place"]
+    report_every, stale, place = max(round(1.0 / (_PROGRESS_RATE * period)), 1), 0, s["place"]
     try:
         for k in range(ticks):
             _, wakes[k], skipped = clock.wait()
             is_new = not device.read(sample) & TickFlag.STALE_SAMPLE and not skipped
             code = compute(state, sample, past, tones[k], 1 + skipped, wrench)
             if code != OK:
-                raise IdentificationError(_told(code, s))
+                raise IdentificationError(_fault_message(code, s))
             device.write(wrench)
             position[k] = place[index] if is_new else np.nan
             force[k] = wrench[index]
             stale += not is_new
-            if progress is not None and k % told_every == 0:
+            if progress is not None and k % report_every == 0:
                 progress(k / ticks)
     finally:
         _silence(device)
@@ -144,7 +144,7 @@ def _silence(device: Device) -> None:
         return
 
 
-def _told(code: int, s: np.void) -> str:
+def _fault_message(code: int, s: np.void) -> str:
     turns = code in (TURNED_FAR, TURNED_FAST)
     part, unit, factor = (slice(3, 6), "rad", 1.0) if turns else (slice(0, 3), "mm", 1e3)
     if code in (FAR, TURNED_FAR):

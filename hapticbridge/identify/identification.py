@@ -141,7 +141,7 @@ def identify(
     clock.start(round(period * 1e9))
     runs, fits = {}, {}
     for axis in chosen:
-        told = None if progress is None else _bound(progress, axis)
+        report = None if progress is None else _for_axis(progress, axis)
         runs[axis] = run = move_axis(
             device,
             clock,
@@ -149,9 +149,9 @@ def identify(
             period=period,
             duration=duration,
             allowance=allowance,
-            progress=told,
+            progress=report,
         )
-        fits[axis] = _judged(run, info)
+        fits[axis] = _checked_fit(run, info)
     intervals = np.concatenate([run.intervals for run in runs.values()])
     return Identification(
         info=info,
@@ -170,11 +170,11 @@ def duration_at(period: float) -> float:
     return DURATION * stretch(period)
 
 
-def _bound(progress: Callable[[str, float], None], axis: str) -> Callable[[float], None]:
+def _for_axis(progress: Callable[[str, float], None], axis: str) -> Callable[[float], None]:
     return lambda share: progress(axis, share)
 
 
-def _judged(run: AxisRun, info: DeviceInfo) -> AxisFit:
+def _checked_fit(run: AxisRun, info: DeviceInfo) -> AxisFit:
     """Fits a run and refuses untrustworthy results."""
     turns = len(run.axis) == 2
     unit, spring_unit = ("N m", "N m/rad") if turns else ("N", "N/m")

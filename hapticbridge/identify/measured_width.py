@@ -72,7 +72,7 @@ def measure_width(
     limits = []
     for k, damping in enumerate(dampings):
 
-        def told(stiffness: float, k: int = k, damping: float = damping) -> None:
+        def report(stiffness: float, k: int = k, damping: float = damping) -> None:
             if progress is not None:
                 progress(k, len(dampings), f"B = {damping:.3g}, K = {stiffness:.4g}")
 
@@ -86,7 +86,7 @@ def measure_width(
                 axis=axis,
                 first_stiffness=FIRST_SHARE * float(z.limit[0]),
                 most_stiffness=MOST_SHARE * float(z.limit[0]),
-                progress=told,
+                progress=report,
             )
         )
     unheld = [line for line in z.lines if line.name == WITHOUT_HAND]

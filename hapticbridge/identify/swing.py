@@ -46,7 +46,7 @@ class Trial:
 
 def judged(
     position: Array,
-    given: Array,
+    applied: Array,
     push: int,
     period: float,
     *,
@@ -64,7 +64,7 @@ def judged(
 
     Args:
         position: x − x_0 in m, shape (n,).
-        given: Force on the device in N, shape (n,).
+        applied: Force on the device in N, shape (n,).
         push: Length of the push in ticks.
         period: T in s.
         stiffness: K in N/m.
@@ -79,16 +79,16 @@ def judged(
     thirds = np.array_split(after, 3)
     amplitude = np.array_split(after**2 + (ratio * speed) ** 2, 3)
     middle, last = (float(np.sqrt(np.mean(part))) for part in amplitude[1:])
-    peak = float(np.abs(given[push:]).max())
+    peak = float(np.abs(applied[push:]).max())
     is_quiet = last <= max(NOISE_STEPS * resolution, DIED_DOWN * float(np.abs(after).max()))
     growth = 0.0 if is_quiet or middle == 0.0 else last / middle
-    halted = np.abs(given[-len(thirds[2]) :]) >= HALTED * force
+    is_saturated = np.abs(applied[-len(thirds[2]) :]) >= HALTED * force
     return Trial(
         stiffness=stiffness,
         damping=damping,
-        is_borne=growth < 1.0 and not halted.any(),
+        is_borne=growth < 1.0 and not is_saturated.any(),
         growth=growth,
         swing=2.0 * np.pi * ratio * period,
-        energy=float(given[push:-1] @ np.diff(position[push:])),
+        energy=float(applied[push:-1] @ np.diff(position[push:])),
         peak=peak,
     )

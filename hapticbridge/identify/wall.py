@@ -158,7 +158,7 @@ def try_wall(
         centre = _rest(device, clock, sample, wrench, period, force)
         origin = before = float(place[index])
         push, ticks = round(PUSH / period), round(duration / period)
-        position, given = np.empty(ticks), np.empty(ticks)
+        position, applied = np.empty(ticks), np.empty(ticks)
         for k in range(ticks):
             clock.wait()
             device.read(sample)
@@ -169,16 +169,16 @@ def try_wall(
                 )
             wall = -stiffness * (x - origin) - damping / period * (x - before)
             before = x
-            wanted = wall + (PUSH_SHARE * force if k < push else 0.0)
+            requested = wall + (PUSH_SHARE * force if k < push else 0.0)
             wrench[:3] = CENTRING[0] * (centre - place)
-            wrench[index] = min(max(wanted, -force), force)
+            wrench[index] = min(max(requested, -force), force)
             device.write(wrench)
-            position[k], given[k] = x - origin, wrench[index]
+            position[k], applied[k] = x - origin, wrench[index]
     finally:
         _silence(device)
     return judged(
         position,
-        given,
+        applied,
         push,
         period,
         stiffness=stiffness,

@@ -202,7 +202,7 @@ def _echo(link: Link, data: bytes, length: int | None = None) -> bytes:
 
 
 def _difference(sent: bytes, echo: bytes, start: int) -> str:
-    for i, (there, back) in enumerate(zip(sent, echo, strict=False)):
-        if there != back:
-            return f"0x{back:02x} for byte {start + i} (0x{there:02x})"
+    for i, (sent_byte, returned_byte) in enumerate(zip(sent, echo, strict=False)):
+        if sent_byte != returned_byte:
+            return f"0x{returned_byte:02x} for byte {start + i} (0x{sent_byte:02x})"
     return f"{len(echo)} bytes for the {len(sent)} from byte {start} on"

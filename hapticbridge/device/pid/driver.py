@@ -108,9 +108,9 @@ class PidDevice:
         checked_period(period)
         self._effects.start(period)
         self._link.take()
-        came = sum(self._stick.takes(self._link.wait(LOOK_MS)) for _ in range(LOOKS))
-        self._streams = came >= STREAMING
-        if not came and not self._stick.takes(
+        received = sum(self._stick.takes(self._link.wait(LOOK_MS)) for _ in range(LOOKS))
+        self._streams = received >= STREAMING
+        if not received and not self._stick.takes(
             self._link.requests.input_report(*self._stick.report)
         ):
             raise DeviceError(f"{self._name} does not report its position; move it and start again")

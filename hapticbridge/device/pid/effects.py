@@ -108,13 +108,13 @@ class Effects:
     def farewell(self) -> tuple[bytes, ...]:
         """Returns the reports that end the force, free the effects and disable the motors."""
         reports = self._reports
-        said: list[bytes | None] = []
+        last_reports: list[bytes | None] = []
         for index, magnitude in zip(self._indices, self._magnitudes, strict=True):
-            said += [magnitude.report(0), reports.operate(index, STOP)]
-        said.append(reports.control(STOP_ALL))
-        said += [reports.free(index) for index in self._indices]
-        said.append(reports.control(DISABLE))
-        return tuple(report for report in said if report is not None)
+            last_reports += [magnitude.report(0), reports.operate(index, STOP)]
+        last_reports.append(reports.control(STOP_ALL))
+        last_reports += [reports.free(index) for index in self._indices]
+        last_reports.append(reports.control(DISABLE))
+        return tuple(report for report in last_reports if report is not None)
 
     def close(self) -> None:
         """Sends the reports of ``farewell``."""

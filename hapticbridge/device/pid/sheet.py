@@ -70,11 +70,11 @@ def scale_of(
     """
     measured = _measured_with(options.get("profile"), serial, model)
     for name, value in measured.items():
-        asked = options.get(name, value)
-        if value is not None and asked != value:
+        requested = options.get(name, value)
+        if value is not None and requested != value:
             raise DeviceError(
-                f"{name} = {asked!r}: the profile of this stick was measured with {value:g}, and "
-                f"its damping holds for that alone; leave out {name}=, or add profile=none"
+                f"{name} = {requested!r}: the profile of this stick was measured with {value:g}, "
+                f"and its damping holds for that only; leave out {name}=, or add profile=none"
             )
     stated = {name: options.get(name, value) for name, value in measured.items()}
     changes = {name: options[name] for name in CHANGES if name in options}
@@ -140,8 +140,10 @@ def data_sheet(
     Raises:
         DeviceError: A number is out of range.
     """
-    asked, told = intervals
-    period = None if told is None else max(asked or 0.0, len(_AXES) * told)
+    read_interval, write_interval = intervals
+    period = (
+        None if write_interval is None else max(read_interval or 0.0, len(_AXES) * write_interval)
+    )
     values: dict[str, Any] = dict.fromkeys(CHANGES) | known
     return DeviceInfo(
         name=name,

@@ -76,19 +76,19 @@ class Stick:
     def takes(self, report: bytes) -> bool:
         """Decodes a report; returns whether it held the position of an axis."""
         number = as_number(self._layout, report)
-        came, bits = number & 0xFF, 8 * (len(report) + (not self._layout.is_numbered))
-        mine = [place for place in self._places if place.field.report == came]
-        if not mine or any(place.offset + place.field.size > bits for place in mine):
+        received, bits = number & 0xFF, 8 * (len(report) + (not self._layout.is_numbered))
+        places = [place for place in self._places if place.field.report == received]
+        if not places or any(place.offset + place.field.size > bits for place in places):
             return False  # an unrelated or truncated report
         is_new = False
         for axis, place in enumerate(self._axes):
-            if place.field.report == came:
+            if place.field.report == received:
                 least, most = place.field.minimum, place.field.maximum
                 value = min(max(place.read(number), least), most)
                 self.deflection[axis] = (2 * value - least - most) / (most - least)
                 is_new = True
         for bit, place in self._buttons:
-            if place.field.report == came:
+            if place.field.report == received:
                 pressed = place.read(number) != 0
                 self.buttons = self.buttons & ~(1 << bit) | pressed << bit
         return is_new
