@@ -42,7 +42,6 @@ class Chart:
     steps. 'work' in place of a scene charts what a tick costs as a scene grows. Writes SCENE.png,
     .svg, .csv and .json into the folder.
 
-
     Example:
         hapticbridge chart peg_in_hole --out charts
     """
