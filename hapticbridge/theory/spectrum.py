@@ -149,12 +149,12 @@ def damping_spectrum_of(
     z = np.exp(1j * theta)
     value = transfer(z) if callable(transfer) else _value_of_system(transfer, period, z)
     try:
-        given = np.asarray(value)
+        returned = np.asarray(value)
     except (TypeError, ValueError):  # for example rows of different lengths
-        given = np.empty(0, dtype=object)
-    if given.dtype.kind not in "iufc":
+        returned = np.empty(0, dtype=object)
+    if returned.dtype.kind not in "iufc":
         raise CouplingError(f"transfer returned {shown(value)}; it must return numbers in N/m")
-    response: NDArray[np.complex128] = given.astype(np.complex128)
+    response: NDArray[np.complex128] = returned.astype(np.complex128)
     if response.shape not in {(), theta.shape}:
         raise CouplingError(
             f"transfer returned shape {response.shape}; it must have z's shape {theta.shape}"
