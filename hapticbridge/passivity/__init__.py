@@ -1,7 +1,7 @@
 """Theory of passive haptic display, without MuJoCo.
 
-``minimum_damping`` and ``maximum_stiffness`` are the central results. ``SampledLoop`` with the
-``WorstHand`` confirms them in the time domain, and ``z_width`` combines all limits of a device.
+``bounds`` holds the central results. ``sampled_loop`` confirms them in the time domain, and
+``z_width`` combines all limits of a device.
 """
 
 from hapticbridge.passivity.bounds import maximum_stiffness as maximum_stiffness
