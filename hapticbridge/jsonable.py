@@ -1,4 +1,4 @@
-"""JSON without NaN and infinity, and JSON that was written elsewhere."""
+"""JSON without NaN and infinity, and JSON from other programs."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ def jsonable(value: Any) -> Any:
 
 
 def read_json(text: str | bytes) -> Any:
-    """Reads JSON that a file, a device or a browser gave.
+    """Parses JSON from a file, a device or a browser.
 
     Raises:
-        ValueError: The text is not JSON, or is nested more deeply than the interpreter can follow.
+        ValueError: The text is not JSON, or is nested too deeply for the interpreter.
     """
     try:
         return json.loads(text)

@@ -124,7 +124,7 @@ def command_of(line: bytes) -> Command:
     if len(line) > LONGEST_LINE:
         raise CommandError(f"a command has at most {LONGEST_LINE} bytes")
     try:
-        values: Any = json.loads(line)
+        values: Any = read_json(line)
         name = values.pop("command")
         kind = KINDS[name]
     except (ValueError, KeyError, TypeError, AttributeError):
