@@ -131,19 +131,11 @@ def maximum_stiffness(
 def maximum_stiffness(
     device_damping: ArrayLike, period: ArrayLike, damping: ArrayLike = 0.0
 ) -> float | NDArray[np.float64]:
-    """Returns the largest passive stiffness, K = 2 (b − B) / T.
+    """Returns the largest passive stiffness, K = 2 (b − B) / T, in N/m.
 
-    Args:
-        device_damping: b in N s/m, finite and > 0.
-        period: T in s, finite and > 0.
-        damping: B in N s/m, finite, 0 <= B < b.
-
-    Returns:
-        K in N/m, of the broadcast shape of the arguments. The stiffness of a coupling must stay
-        below it.
-
-    Raises:
-        CouplingError: An argument is out of range; for B >= b no stiffness is passive.
+    The stiffness of a coupling must stay below it. b in N s/m and T in s must be finite and > 0,
+    and 0 <= B < b; otherwise CouplingError is raised, because for B >= b no stiffness is passive.
+    Arrays broadcast.
 
     References:
         Brown & Colgate 1997, eq. (6) solved for K.
@@ -167,13 +159,8 @@ def stiffest_coupling(damping: float, rotational_damping: float, period: float) 
 
         B = b / 4,    K = 0.8 · 2 (b − B) / T        for translation and for rotation
 
-    Args:
-        damping: b in N s/m as seen in the scene (divided by scale · force scale), > 0.
-        rotational_damping: b_r in N m s/rad as seen in the scene, > 0.
-        period: T in s, finite and > 0.
-
-    Raises:
-        CouplingError: An argument is not finite or not positive.
+    The device's b in N s/m and N m s/rad, as seen in the scene (divided by scale · force scale),
+    and T in s must be finite and > 0; otherwise CouplingError is raised.
     """
     damping = scalar("device damping", damping, "N s/m", positive=True)
     rotational_damping = scalar("device damping", rotational_damping, "N m s/rad", positive=True)

@@ -11,7 +11,7 @@ from hapticbridge.passivity.grid import checked, plain, scalar, together
 def coupled_stability_limit(
     device_damping: ArrayLike, period: float, *, damping: ArrayLike = 0.0, delay: float = 0.0
 ) -> float | NDArray[np.float64]:
-    """Returns the stiffness below which device and coupling are stable against a wall.
+    """Returns the stiffness in N/m below which device and coupling are stable against a wall.
 
         K = (b + B) / (T/2 + t_d),    t_d = delay · T
 
@@ -20,17 +20,8 @@ def coupled_stability_limit(
     sign of B is opposite to that in ``minimum_damping``, because a damper helps stability and costs
     passivity.
 
-    Args:
-        device_damping: b in N s/m, finite and >= 0.
-        period: T in s, finite and > 0.
-        damping: B in N s/m, finite and >= 0.
-        delay: Delay from position to force in samples, >= 0; fractions are allowed.
-
-    Returns:
-        K in N/m, of the broadcast shape of the arguments.
-
-    Raises:
-        CouplingError: An argument is out of range.
+    b and B in N s/m must be finite and >= 0, T in s > 0, the delay in samples >= 0 (fractions are
+    allowed); otherwise CouplingError is raised. Arrays broadcast.
 
     References:
         Gil et al. 2009.

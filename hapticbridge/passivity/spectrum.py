@@ -77,24 +77,14 @@ def damping_spectrum(
         delay = 0:   b(ω) = (T/2)(1 − cos ωT) / Re{(1 − e^{−jωT}) / C}        any environment
         delay = d:   b(ω) = (T/2) Re{(1 − e^{−jωT}) C e^{−jdωT}} / (1 − cos ωT)        a wall
 
-    ``minimum_damping`` is the supremum over 0 < ω <= π/T; its arguments apply here. With a delay
-    the environment is a wall, because behind a delayed coupling no damping suffices for *every*
-    passive environment. Against a wall the coupling's damper can help, so values may be negative.
-
-    Args:
-        coupling: K and B, shape S.
-        period: T in s.
-        frequency: ω in rad/s, 0 < ω <= π/T, shape F.
-        discretization: Rule that takes the damper's velocity from sampled positions.
-        delay: d, whole samples from position to force.
-        filter_time: τ in s of a first-order low-pass behind the damper.
-        axis: Kind of axis, which selects the pair of K and B.
+    ``minimum_damping`` is the supremum over 0 < ω <= π/T; its arguments and errors apply here. With
+    a delay the environment is a wall, because behind a delayed coupling no damping suffices for
+    *every* passive environment. Against a wall the coupling's damper can help, so values may be
+    negative.
 
     Returns:
-        b in N s/m (rotation: N m s/rad), shape S + F; inf where none suffices.
-
-    Raises:
-        CouplingError: An argument is out of range.
+        b in N s/m (rotation: N m s/rad), shape S + F for couplings of shape S and frequencies ω in
+        rad/s of shape F; inf where none suffices.
 
     References:
         Brown & Colgate 1997, eqs. (2), (4), (5); Colgate & Schenkel 1997.

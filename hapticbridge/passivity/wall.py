@@ -45,15 +45,8 @@ def wall_supremum(
     """Returns the supremum over 0 < θ <= π of (T/2) Re{(1 − e^{−jθ}) C e^{−jdθ}} / (1 − cos θ).
 
     The grid is even in θ and, with a low-pass, also in log θ down to its corner. The best cell of
-    every half ripple is refined by golden section, because ripples can be equally high.
-
-    Args:
-        stiffness: K in N/m.
-        damping: B in N s/m, of the shape of the stiffness.
-        period: T in s.
-        scheme: Discretization of the damper; must be finite at Nyquist.
-        delay: d in samples.
-        filter_time: τ in s.
+    every half ripple is refined by golden section, because ripples can be equally high. The
+    discretization (``scheme``) must be finite at Nyquist.
 
     Returns:
         The supremum in N s/m, and the θ in rad of its first occurrence, to about 1e-7.
@@ -88,12 +81,7 @@ def wall_supremum(
 
 
 def search_grid(delay: int, lag: float) -> _Array:
-    """Returns the grid of angles in rad, ascending, that brackets the maxima.
-
-    Args:
-        delay: d in samples.
-        lag: τ/T, without unit.
-    """
+    """Returns the grid of angles in rad, ascending, that brackets the maxima; ``lag`` is τ/T."""
     grid = np.linspace(LOWEST_ANGLE, np.pi, POINTS_PER_RIPPLE * (delay + 1) + 1)
     # Start at a hundredth of the corner, but stay a factor of two away from both ends of the
     # first cell: points crowded there could differ by rounding alone.

@@ -29,26 +29,13 @@ def worst_frequency(
 
     Without a delay it is Nyquist's, π/T, for every coupling; the spectrum of a spring alone is
     flat. With a delay, against a wall, a soft damper leaves it at low frequency. A strong damper
-    moves it towards π/((d + 1) T) and its odd multiples.
-
-    Args:
-        coupling: K and B; a ``CouplingGrid`` evaluates many at once.
-        period: T in s, finite and > 0.
-        discretization: Rule that takes the damper's velocity from sampled positions.
-        delay: d, whole samples from position to force, 0 to 50.
-        filter_time: τ in s of a first-order low-pass behind the damper, >= 0.
-        axis: Kind of axis, which selects the pair of K and B.
+    moves it towards π/((d + 1) T) and its odd multiples. Arguments, errors and sources are those of
+    ``minimum_damping``.
 
     Returns:
         ω in rad/s, shaped like the coupling: 0.0 if the supremum is the limit for ω → 0, π/T if it
         is reached at Nyquist or infinite there. Accurate to about 1e-7 of π/T, because the spectrum
         is flat at its top. Of several equal maxima any one.
-
-    Raises:
-        CouplingError: An argument is out of range or unknown.
-
-    References:
-        Brown & Colgate 1997, eqs. (6), (7); Colgate & Schenkel 1997 (wall).
     """
     law = SampledLaw.of(coupling, period, discretization, delay, filter_time, axis)
     k, b, period, samples, tau, is_ringing = law
