@@ -1,9 +1,4 @@
-"""Public names that are imported when somebody asks for them (PEP 562).
-
-Importing everything takes seconds. Who needs a part of the package, as the recorder's process does,
-does not wait for the rest; and the command line is in charge before the rest is imported, so that
-Ctrl-C and a bad environment are answered in a word and not with Python's traceback.
-"""
+"""Lazy public names of a package (PEP 562)."""
 
 from __future__ import annotations
 
@@ -15,14 +10,16 @@ from importlib.util import find_spec
 def lazy_exports(
     package: str, places: Mapping[str, str], present: tuple[str, ...]
 ) -> tuple[Callable[[str], object], Callable[[], list[str]], list[str]]:
-    """Returns what a package takes for its ``__getattr__``, ``__dir__`` and ``__all__``.
+    """Returns a package's ``__getattr__``, ``__dir__`` and ``__all__`` with lazy imports.
 
-    Modules directly below the package are found too, as if they had been imported with it.
+    Importing everything takes seconds. A part of the package, such as the recorder's process, does
+    not wait for the rest. The command line handles Ctrl-C and a bad environment before the rest is
+    imported, so neither ends in a traceback. Modules directly below the package are found too.
 
     Args:
-        package: Its full name.
-        places: The module that each public name comes from; a module's own name is the module.
-        present: Public names that are there from the start.
+        package: Full name of the package.
+        places: Module of each public name; a module's own name maps to the module.
+        present: Public names that are already imported.
     """
     names = sorted({*places, *present})
 

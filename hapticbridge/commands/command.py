@@ -9,6 +9,7 @@ from typing import Any
 
 from hapticbridge.arguments import Arguments, shown
 from hapticbridge.errors import CommandError, choices
+from hapticbridge.files import read_json
 
 LONGEST_LINE = 250
 """Largest size of a line in bytes; the longest command has about 170."""
@@ -123,7 +124,7 @@ def command_of(line: bytes) -> Command:
     if len(line) > LONGEST_LINE:
         raise CommandError(f"a command has at most {LONGEST_LINE} bytes")
     try:
-        values: Any = json.loads(line)
+        values: Any = read_json(line)
         name = values.pop("command")
         kind = KINDS[name]
     except (ValueError, KeyError, TypeError, AttributeError):
