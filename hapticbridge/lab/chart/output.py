@@ -293,13 +293,14 @@ def _draw_panel(axes: Axes, chart: Chart, panel: Panel, colours: dict[str, str])
         "one just noticeable difference", (0.995, JND), xycoords=("axes fraction", "data"),
         ha="right", va="bottom", fontsize="x-small",
     )  # fmt: skip
-    axes.set_xscale("log")
-    axes.set_yscale("log")
+    axes.set(xscale="log", yscale="log")
     axes.yaxis.set_major_formatter("{x:g}")
     low, high = axes.get_ylim()
     axes.yaxis.set_minor_formatter("{x:g}" if high < NARROW * low else NullFormatter())
-    axes.set_xlabel("cost: processor seconds per simulated second (1 = real time on one core)")
-    axes.set_ylabel("error (just noticeable differences)")
+    axes.set(
+        xlabel="cost: processor seconds per simulated second (1 = real time on one core)",
+        ylabel="error (just noticeable differences)",
+    )
     kind = "error against" if panel.is_truth else "NOT the truth: difference from"
     title = "\n".join([panel.title, *textwrap.wrap(f"{kind} {panel.reference}", 92)])
     axes.set_title(title, fontsize="small", parse_math=False)

@@ -515,8 +515,7 @@ def _draw_family(axes: Axes, chart: WorkChart, family: Family) -> None:
         "half of a tick at 1 kHz", (0.02, 1e6 * TICK_SHARE / RATE), va="bottom",
         xycoords=("axes fraction", "data"), fontsize="x-small",
     )  # fmt: skip
-    axes.set_xscale("log")
-    axes.set_yscale("log")
+    axes.set(xscale="log", yscale="log")
     axes.set_ylabel("processor time of a tick (µs)", fontsize="small")
     axes.grid(visible=True, alpha=0.3)
     low, high = axes.get_ylim()

@@ -148,9 +148,9 @@ def draw_bars(
             text = format(factor * one[name], form)
             axes.text(edge, place, text, transform=beside, size=8, ha="right", va="center")
     axes.set_yticks(places, names, size=8)
-    axes.set_xlim(0, max(left.max(), 1.0))
-    axes.set_ylim(-0.6, len(found) - 0.4)
-    axes.set_xlabel("runs by verdict")
+    axes.set(
+        xlabel="runs by verdict", xlim=(0, max(left.max(), 1.0)), ylim=(-0.6, len(found) - 0.4)
+    )
 
 
 SEARCH_MASSES = (0.03, 0.1, 0.3)
@@ -414,8 +414,7 @@ def _draw_panel(axes: Axes, table: Table, rig: str, method: str, stiffness: floa
         ha="center",
         arrowprops={"arrowstyle": "-", "lw": 0.6},
     )
-    axes.set_xlim(*STEPS)
-    axes.set_ylim(*DAMPING_RATIO)
+    axes.set(xlim=STEPS, ylim=DAMPING_RATIO)
 
 
 @cache

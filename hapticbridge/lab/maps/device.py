@@ -303,8 +303,7 @@ def draw(table: Table, boundary: Mapping[str, Any]) -> Figure:
 
 
 def _draw_regions(axes: Axes, cells: Table) -> None:
-    axes.set_xscale("log")
-    axes.set_yscale("log")
+    axes.set(xscale="log", yscale="log")
     if len(cells):
         number = np.array([REGIONS.index(name) for name in cells["region"]])
         beta, sigma = np.unique(cells["beta"]), np.unique(cells["sigma"])
@@ -324,20 +323,19 @@ def _draw_regions(axes: Axes, cells: Table) -> None:
         say_missing(axes)
     axes.axvline(0.5, color="black", lw=1.8)
     axes.axhline(0.5, color="black", lw=1.8)
-    axes.set_xlim(*RANGE)
-    axes.set_ylim(*RANGE)
+    axes.set(xlim=RANGE, ylim=RANGE)
     ticks = (0.1, 0.2, 0.5, 1.0, 2.0)
     axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
     axes.set_yticks(ticks, [f"{tick:g}" for tick in ticks])
     axes.minorticks_off()
-    axes.set_xlabel("damping of the device, β = b/(K T)")
-    axes.set_ylabel("friction of the device, σ = f_c/(K Δ)")
+    axes.set(
+        xlabel="damping of the device, β = b/(K T)", ylabel="friction of the device, σ = f_c/(K Δ)"
+    )
     axes.set_title("B = 0: pressed, and knocked; one law", fontsize="medium")
 
 
 def _draw_friction(axes: Axes, found: Mapping[str, Any]) -> None:
-    axes.set_xlabel("coupling damping B asked for (N s/m)")
-    axes.set_ylabel("friction needed, f_c/(K Δ)")
+    axes.set(xlabel="coupling damping B asked for (N s/m)", ylabel="friction needed, f_c/(K Δ)")
     axes.set_title(f"with a damper, b = {DAMPED:g} N s/m", fontsize="medium")
     if not found:
         say_missing(axes)
