@@ -22,18 +22,7 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.device import Hand, Motion, SimulatedDevice
 from hapticbridge.lab.closed_loop import LoopOutcome
 from hapticbridge.lab.maps import base
-from hapticbridge.lab.maps.base import (
-    METHOD_COLOURS,
-    Point,
-    Sentences,
-    StabilityMap,
-    largest_stable,
-    law_in_words,
-    of_method,
-    say_missing,
-    used_damping,
-    wall_loop,
-)
+from hapticbridge.lab.maps.base import Point, Sentences, StabilityMap
 from hapticbridge.lab.methods import METHODS
 from hapticbridge.passivity import quantization_limit
 from hapticbridge.picture import new_figure
@@ -190,7 +179,7 @@ def pressed_device(beta: float, sigma: float, limit: float = 10.0) -> SimulatedD
 def _wall(
     name: str, device: SimulatedDevice, damping: float, ticks: int, knock: NDArray[np.float64]
 ) -> LoopOutcome:
-    return wall_loop(WALL_MASS).run(
+    return base.wall_loop(WALL_MASS).run(
         device,
         Coupling(STIFFNESS, damping, 0.0, 0.0),
         METHODS[name],
@@ -211,7 +200,7 @@ def friction_needed(name: str, damping: NDArray[np.float64]) -> NDArray[np.float
     References:
         Abbott & Okamura 2005.
     """
-    return 0.5 + used_damping(name, STIFFNESS, damping, PERIOD) / (PERIOD * STIFFNESS)
+    return 0.5 + base.used_damping(name, STIFFNESS, damping, PERIOD) / (PERIOD * STIFFNESS)
 
 
 def friction_to_rest(name: str, damping: float) -> float:
@@ -225,7 +214,7 @@ def friction_to_rest(name: str, damping: float) -> float:
         damping: B in N s/m asked for, >= 0.
     """
     beta = DAMPED / (STIFFNESS * PERIOD)
-    return largest_stable(
+    return base.largest_stable(
         lambda sigma: settle(beta, sigma, 0.0, damping, name)[0] != "rest", *FRICTION
     ).middle
 
@@ -320,7 +309,7 @@ def _draw_regions(axes: Axes, cells: Table) -> None:
         }.items():
             axes.text(*place, f"theory:\n{name}", ha="center", va="center", fontsize="small")
     else:
-        say_missing(axes)
+        base.say_missing(axes)
     axes.axvline(0.5, color="black", lw=1.8)
     axes.axhline(0.5, color="black", lw=1.8)
     axes.set(xlim=RANGE, ylim=RANGE)
@@ -338,18 +327,18 @@ def _draw_friction(axes: Axes, found: Mapping[str, Any]) -> None:
     axes.set(xlabel="coupling damping B asked for (N s/m)", ylabel="friction needed, f_c/(K Δ)")
     axes.set_title(f"with a damper, b = {DAMPED:g} N s/m", fontsize="medium")
     if not found:
-        say_missing(axes)
+        base.say_missing(axes)
         return
     for name, size in zip(METHODS_SHOWN, SIZES, strict=True):
         if name in found:
-            mine, colour = found[name], METHOD_COLOURS[name]
+            mine, colour = found[name], base.METHOD_COLOURS[name]
             style: dict[str, Any] = {"color": colour, "mfc": "white", "ls": "", "ms": size}
             axes.plot(
                 mine["damping"],
                 mine["predicted"],
                 color=colour,
                 lw=size / 3,
-                label=f"{name}: {law_in_words(name)}",
+                label=f"{name}: {base.law_in_words(name)}",
             )
             for what, marker in MARKERS.items():
                 axes.plot(mine["damping"], mine[what], marker, **style)
@@ -413,7 +402,7 @@ def evaluate(point: Point) -> Mapping[str, float | str | bool]:
 def summarize(table: Table) -> dict[str, Any]:
     """Compares regions over β and σ, and the friction that a damper needs, with theory."""
     cells = table.select(table["what"] == "cell")
-    dampers = {name: of_method(table, "friction", name) for name in METHODS_SHOWN}
+    dampers = {name: base.of_method(table, "friction", name) for name in METHODS_SHOWN}
     return {
         "period": PERIOD,
         "stiffness": STIFFNESS,
