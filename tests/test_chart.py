@@ -16,20 +16,31 @@ from chart_cases import FakeRun, made_up, small_chart
 from hapticbridge.cli import main
 from hapticbridge.errors import StudyError
 from hapticbridge.kernel.codes import DIRECT, LOSSLESS
-from hapticbridge.lab.chart import (
-    Chart,
+from hapticbridge.lab.chart.catalogue import (
     Extent,
-    chosen_methods,
-    chosen_periods,
-    measure_chart,
     open_workload,
+)
+from hapticbridge.lab.chart.chart import (
+    Chart,
+    Measurement,
+    interleaved_costs,
+    measure_chart,
+    one_core,
+    pareto_front,
+)
+from hapticbridge.lab.chart.output import (
+    draw_chart,
     prepared_files,
-    settings_for,
     write_chart,
 )
-from hapticbridge.lab.chart.chart import Measurement, interleaved_costs, one_core, pareto_front
-from hapticbridge.lab.chart.output import draw_chart
-from hapticbridge.lab.chart.setting import CONTACTS, SHIPPED, Setting
+from hapticbridge.lab.chart.setting import (
+    CONTACTS,
+    SHIPPED,
+    Setting,
+    chosen_methods,
+    chosen_periods,
+    settings_for,
+)
 from hapticbridge.lab.methods import METHODS
 
 
