@@ -120,7 +120,7 @@ class Method:
             CouplingError: The time step is not finite and > 0.
 
         References:
-            ``passivity.compensation``.
+            ``theory.compensation``.
         """
         return self._with_damping(coupling, timestep, law_damping)
 

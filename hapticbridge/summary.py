@@ -28,7 +28,7 @@ def is_always_held(model: mujoco.MjModel, grip: str) -> bool:
     """Returns True if a lossless coupling stays implicit because the tool is never free.
 
     References:
-        ``kernel.tree.ToolTree.is_never_free`` lists the causes.
+        ``kernel.lossless.ToolTree.is_never_free`` lists the causes.
     """
     own = [model.actuator(name).id for name in COUPLING_ACTUATORS]
     return tree_of_tool(model, int(model.site(grip).bodyid[0]), own).is_never_free

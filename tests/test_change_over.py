@@ -182,7 +182,7 @@ def balance(law: Array, handle: Array, tool: Array, device: float) -> float:
 
 
 def test_a_device_that_bears_the_larger_damping_bears_any_sequence_of_them() -> None:
-    # the inequality in the docstring of ``passivity.compensation``, against random motions
+    # the inequality in the docstring of ``theory.compensation``, against random motions
     random = np.random.default_rng(3)
     low, high = FREE, FREE + HALF
     device = HALF + high

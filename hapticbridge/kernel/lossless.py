@@ -15,7 +15,7 @@ puts the bias at v where MuJoCo takes it at u. What the user applies enters as t
 before. In contact half of a wrench that is a step late would create energy, so the tool changes
 over to the implicit form before it touches, and back after it has been free for a while; both ways
 keep S. B' stays the same, so that one device condition holds on both sides: with more in contact, a
-device that bears only the less would be thrown off for ever (``passivity.compensation``).
+device that bears only the less would be thrown off for ever (``theory.compensation``).
 
 The trees that the tool does not belong to are MuJoCo's alone: for them v = u.
 """

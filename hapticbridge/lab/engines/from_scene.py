@@ -225,7 +225,7 @@ class HeldSimulation(ABC):
         τ_k = K_r φ_k + (B_r/T)(δφ_h − δφ_x),  φ = log(R_h R_xᵀ)
 
     with the handle h and the grip x at the end of step k; step k + 1 is done under (f_k, τ_k),
-    moved to the centre of mass. This is ``mechanics.drive_mass``'s scheme ``held``. The handle has
+    moved to the centre of mass. This is ``theory.drive_mass``'s scheme ``held``. The handle has
     not moved before step 0.
 
     Engines know a body by its centre of mass: here a child's body is the frame of the principal
