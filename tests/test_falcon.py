@@ -269,7 +269,7 @@ def test_encoders_that_no_grip_has_are_refused_at_the_start() -> None:
     bench = Bench()
     device = bench.opened()
     bench.model.encoders = lambda: (9000, 0, 0)  # type: ignore[method-assign]
-    with pytest.raises(DeviceError, match=r"encoders at \[9000, 0, 0\] are no position"):
+    with pytest.raises(DeviceError, match=r"encoder counts \[9000, 0, 0\] match no position"):
         device.start(PERIOD)
 
 

@@ -73,7 +73,11 @@ def test_a_loader_that_stays_silent_is_given_up(program: str) -> None:
 
 @pytest.mark.parametrize(
     ("size", "words"),
-    [(None, "cannot be read"), (0, "has 0 bytes"), (70_000, "has 70000 bytes; a Falcon's program")],
+    [
+        (None, "cannot be read"),
+        (0, "has 0 bytes"),
+        (70_000, "has 70000 bytes; a Falcon's firmware"),
+    ],
 )
 def test_a_file_that_can_be_no_program_is_refused(
     tmp_path: Path, size: int | None, words: str

@@ -90,7 +90,7 @@ def test_one_that_does_not_speak_the_protocol_or_another_version_is_refused() ->
             body = report[:1] + b"\x02" + report[2:62]
             super().push(body + crc(body).to_bytes(2, "little"))
 
-    with pytest.raises(DeviceError, match="speaks version 2 of the raw HID protocol; this is ver"):
+    with pytest.raises(DeviceError, match="speaks version 2 of the raw HID protocol; version 1 is"):
         opened(Newer())
 
 
