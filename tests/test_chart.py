@@ -15,7 +15,7 @@ from chart_cases import FakeRun, made_up, small_chart
 
 from hapticbridge.cli import main
 from hapticbridge.errors import StudyError
-from hapticbridge.kernel.codes import DIRECT, LOSSLESS
+from hapticbridge.kernel.codes import Scheme
 from hapticbridge.lab.chart.catalogue import (
     Extent,
     open_workload,
@@ -102,7 +102,7 @@ def test_selection_has_every_method_at_every_step_and_no_point_twice() -> None:
     for method in METHODS.values():
         assert {s.period for s in settings if s.method is method} == set(periods)
     assert {s.contact for s in settings} == set(CONTACTS)
-    undivided = [s for s in settings if s.method.scheme in (LOSSLESS, DIRECT)]
+    undivided = [s for s in settings if s.method.scheme in (Scheme.MIDPOINT, Scheme.MASSLESS)]
     assert {s.substeps for s in undivided} == {1}
     for name in ("implicit", "lossless"):
         tried = {s.period for s in settings if (s.method.name, s.contact) == (name, "damped")}

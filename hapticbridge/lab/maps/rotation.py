@@ -225,7 +225,7 @@ def _run(binding: BoundKernel, samples: NDArray[np.void], records: NDArray[np.vo
     for first in range(0, TICKS, CHUNK):
         part = slice(first, first + CHUNK)
         done = simulate(binding.state, samples[part], binding.row, records[part])
-        if done < CHUNK or not binding.state["kinetic"][0] < DIVERGED:
+        if done < CHUNK or not binding.state["energy"]["kinetic"][0] < DIVERGED:
             return first + done
     return TICKS
 
