@@ -165,7 +165,7 @@ def test_what_is_no_readable_text_file_is_refused(tmp_path: Path) -> None:
         assert words in str(error.value)
 
 
-def test_a_file_without_permission_is_refused(
+def test_file_without_permission_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     file = tmp_path / "hand.csv"

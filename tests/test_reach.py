@@ -106,7 +106,7 @@ def test_no_shipped_reach_cuts_what_the_maker_calls_the_workspace() -> None:
         assert 0 <= reach - 0.5 * math.hypot(*box) < 1e-4
 
 
-def test_the_command_line_says_where_the_reach_ends(
+def test_the_command_line_tells_the_reach(
     call: Called, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     reach: dict[str, float | None] = {"device": REACH}

@@ -158,7 +158,7 @@ def test_processes_started_meanwhile_are_ordinary_ones() -> None:
 
 
 @pytest.mark.parametrize(("user", "remedy"), [(1000, SHELL), (0, CONTAINER)])
-def test_what_is_refused_is_said_with_the_command_that_grants_it(
+def test_refusal_is_said_with_its_remedy(
     refusing: Library, monkeypatch: pytest.MonkeyPatch, user: int, remedy: str
 ) -> None:
     monkeypatch.setattr(os, "geteuid", lambda: user)
@@ -192,7 +192,7 @@ def test_a_lower_limit_on_priority_is_used(monkeypatch: pytest.MonkeyPatch, limi
 @pytest.mark.parametrize(
     ("limit", "flags"), [(resource.RLIM_INFINITY, 3), (1 << 50, 1), (1 << 23, 3)]
 )
-def test_memory_to_come_is_locked_only_where_no_limit_can_fail_it(
+def test_memory_to_come_is_locked_if_unlimited(
     library: Library, monkeypatch: pytest.MonkeyPatch, limit: int, flags: int
 ) -> None:
     """This process has more than 8 MB already: if it may lock that, the limit does not bind it."""
@@ -232,7 +232,7 @@ def test_a_core_that_is_not_there_is_said() -> None:
         (None, ()),
     ],
 )
-def test_a_core_that_is_refused_is_said_with_what_gives_it(
+def test_a_refused_core_is_told_with_remedy(
     monkeypatch: pytest.MonkeyPatch, code: int | None, words: tuple[str, ...]
 ) -> None:
     def refuse(_process: int, _cores: set[int]) -> None:
@@ -263,9 +263,7 @@ def test_who_wants_real_time() -> None:
         wants_real_time(True, simulated, is_real=False)
 
 
-def test_a_run_goes_on_without_the_permission_says_so_once_and_records_it(
-    refusing: Library, tmp_path: Path
-) -> None:
+def test_a_run_without_permission_says_so_and_records_it(refusing: Library, tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     with Bridge("point_mass", ScriptedDevice(sway), realtime=True, recording=path) as bridge:
         with pytest.warns(UserWarning, match="real time") as warned:
@@ -307,7 +305,7 @@ def heap_reader() -> Callable[[], int]:
 
 @pytest.mark.parametrize(("pipelined", "controller"), [(False, "off"), (True, "damper")])
 @pytest.mark.parametrize("watched", ["by nobody", "by the recorder", "by recorder and viewer"])
-def test_ten_thousand_ticks_allocate_nothing_that_stays(
+def test_ten_thousand_ticks_allocate_nothing(
     tmp_path: Path, pipelined: bool, controller: str, watched: str
 ) -> None:
     """Python's own numbers come and go; a tick that keeps one more object would show 10 000."""
@@ -371,7 +369,7 @@ def test_a_scene_too_slow_is_refused_for_a_real_device_and_warned_of_for_others(
 
 
 @pytest.mark.parametrize(("needed", "held"), [(6e-3, "130 Hz"), (1.04e-3, "770 Hz")])
-def test_the_rate_that_is_offered_is_a_plain_number(
+def test_the_rate_offered_is_a_plain_number(
     monkeypatch: pytest.MonkeyPatch, needed: float, held: str
 ) -> None:
     monkeypatch.setattr(pace, "step_time", lambda *_: needed)

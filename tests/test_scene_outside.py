@@ -107,9 +107,7 @@ def drawer(tmp_path_factory: pytest.TempPathFactory) -> Outcome:
     return outcome(tmp_path_factory.mktemp("drawer"), DRAWER, "knob", stops)
 
 
-def test_tool_on_a_ball_joint_is_strict_and_its_moments_about_the_joint_balance(
-    pointer: Outcome,
-) -> None:
+def test_tool_on_ball_joint_is_strict_and_its_moments_about_joint_balance(pointer: Outcome) -> None:
     assert pointer.report.environment == "strict"
     data = mujoco.MjData(pointer.model)
     for tick in (980, 1980, 2980):
@@ -201,9 +199,7 @@ def test_work_on_the_drawer_is_its_friction_times_its_way(drawer: Outcome) -> No
     assert drawer.ticks["actuator_work"][-1] == 0
 
 
-def test_handle_starts_in_the_frame_of_a_turned_grip_off_the_centre_of_mass(
-    pointer: Outcome, drawer: Outcome
-) -> None:
+def test_handle_starts_in_the_frame_of_a_turned_grip(pointer: Outcome, drawer: Outcome) -> None:
     for run, grip in ((pointer, "tip"), (drawer, "knob")):
         data = mujoco.MjData(run.model)
         mujoco.mj_forward(run.model, data)

@@ -165,9 +165,7 @@ def test_both_ends_of_a_shipped_range_load_and_differ(name: str, parameter: Para
 
 @pytest.mark.parametrize("clearance", [0.05e-3, 0.1e-3, 1e-3])
 @pytest.mark.parametrize("name", ["peg_in_hole", "planar_peg"])
-def test_clearance_is_what_is_left_on_each_side_of_a_closed_hole(
-    name: str, clearance: float
-) -> None:
+def test_clearance_is_what_is_left_on_each_side_of_closed_hole(name: str, clearance: float) -> None:
     model = load_scene(name, clearance=clearance).model
     walls = {"east": (0, 1), "west": (0, -1)}
     if name == "peg_in_hole":
@@ -262,7 +260,7 @@ def test_an_unknown_name_is_told_what_exists(tmp_path: Path) -> None:
         (table() + table(name="other"), "to 0.1 by default, where the scene's file has 0.05"),
     ],
 )
-def test_a_file_of_parameters_that_does_not_fit_is_refused_in_a_sentence(
+def test_a_file_of_parameters_that_does_not_fit_is_refused(
     tmp_path: Path, text: str, words: str
 ) -> None:
     path = scene_with(tmp_path, text)
@@ -291,7 +289,7 @@ def test_words_become_values_and_a_name_comes_once() -> None:
         settings_from(["a=1", "a=1"])
 
 
-def test_values_used_are_recorded_and_the_run_is_simulated_again_with_them(
+def test_values_used_are_recorded_and_simulated(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file = tmp_path / "run.mcap"
@@ -314,9 +312,7 @@ def test_values_used_are_recorded_and_the_run_is_simulated_again_with_them(
     capsys.readouterr()
 
 
-def test_scenes_shows_each_parameter_with_unit_range_and_default(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_scenes_shows_each_parameter_and_range(capsys: pytest.CaptureFixture[str]) -> None:
     for name in scene_names():
         assert main(["scenes", name]) == 0
         shown = capsys.readouterr().out
@@ -328,9 +324,7 @@ def test_scenes_shows_each_parameter_with_unit_range_and_default(
             assert re.search(row, shown), shown
 
 
-def test_a_bad_setting_ends_the_command_with_a_sentence(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_a_bad_setting_ends_the_command_with_a_sentence(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["run", "peg_in_hole", "--set", "clearance=1", "--fast"]) == 2
     assert "must be a number from 5e-05 to 0.001 m" in capsys.readouterr().err
     assert main(["scenes", "peg_in_hola"]) == 2

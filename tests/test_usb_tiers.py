@@ -26,9 +26,7 @@ def test_what_a_tier_claims_holds(job: Job, tmp_path: Path) -> None:
     assert claims
 
 
-def test_a_kernel_that_is_named_goes_before_the_cached_one(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_kernel_that_is_named_goes_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     cached, named = tmp_path / "hapticbridge/uml/linux", tmp_path / "named"
     for place in (cached, named):
@@ -163,7 +161,7 @@ def test_of_repeated_runs_the_one_that_differs_or_fails_is_told_with_what_its_gu
     assert ("guest 1 says so" in note) == bool(late)
 
 
-def test_a_snapshot_of_compiled_code_holds_what_is_whole_and_nothing_of_other_checkouts(
+def test_a_snapshot_holds_what_is_whole_and_ours(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     cache = tmp_path / "cache" / "0123"
@@ -214,7 +212,7 @@ def test_a_guest_says_how_its_command_ended_and_one_that_hangs_is_stopped(tmp_pa
 
 
 @pytest.mark.parametrize("text", [b"HID PID devices by", b"Force feedback for Logitech"])
-def test_a_kernel_without_its_own_driver_for_sticks_is_known_by_what_it_cannot_print(
+def test_a_kernel_without_pidff_is_known_by_its_words(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: bytes
 ) -> None:
     named = tmp_path / "linux"
