@@ -218,8 +218,8 @@ def refuse_simulated_time(device: DeviceInfo | str, clock: Clock) -> None:
         is_bound = device.is_real or follows
     if is_bound and isinstance(clock, SimulatedClock):
         raise DeviceError(
-            f"the device '{name}' moves in real time, so the loop cannot run as fast as it "
-            "goes; leave out --fast (in code: the SimulatedClock)"
+            f"the device '{name}' moves in real time, so the loop cannot run faster; leave out "
+            "--fast (in code: the SimulatedClock)"
         )
 
 
@@ -316,9 +316,9 @@ LONGEST_STALL, STALL_PERIODS = 0.05, 5
 position is unknown: at 0.4 m/s it has moved 20 mm."""
 
 RAMP_ENERGY = 0.01
-"""Energy in J that the coupling may store while the wrench rises at full pace (7 N at 2400 N/m),
-and that a start may give to the hand during its ramp. It is a quarter of the energy limit, so that
-a start alone never ends a run. A smaller value slows the rise with a heavy tool."""
+"""Energy in J that the coupling may store while the wrench rises at full pace: 7 N at 2400 N/m. A
+start may give as much to the hand during its ramp. It is a quarter of the energy limit, so that a
+start alone never ends a run. A smaller value slows the rise with a heavy tool."""
 
 JUMP_MARGIN = 2.0
 """Factor on the data sheet's speed limit, without unit. A late sample followed by a punctual one

@@ -331,7 +331,7 @@ def check_prepared(model: mujoco.MjModel, parameters: RunParameters, method: Met
     """
     check_scene(model, parameters.grip, method)
     if model.opt.integrator != _INTEGRATORS[method.integrator]:
-        raise SceneError(f"the integrator is not {method.integrator}, that of '{method.name}'")
+        raise SceneError(f"method '{method.name}' requires the integrator {method.integrator}")
     has_weld = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_EQUALITY, WELD_NAME) >= 0
     if has_weld != (method.scheme == WELD):
         raise SceneError(

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 import hapticbridge as hb
 from hapticbridge.cli import main
-from hapticbridge.commands import Command, Couple, Record, Reset, Switch
+from hapticbridge.commands import Command, Couple, Reset, Switch
 from hapticbridge.errors import CommandError
 from hapticbridge.recording import Recording
 
@@ -422,7 +422,7 @@ def _guard_runs() -> Iterator[tuple[str, Run]]:
             name = f"commands, {method}" + (", pipelined" if is_ahead else "")
             options = {"method": method, "pipelined": is_ahead, "coupling": COUPLING}
             yield name, Run(PEG, Scripted, options, 0.6, act=commands(CHANGES))
-    for controller in ("damper", "environment", "tank", "off"):
+    for controller in ("damper", "environment", "off"):
         yield (
             f"stiff coupling, controller {controller}",
             Run(
@@ -499,9 +499,8 @@ RECORDED = (
     "skipped deadlines",
     "device with friction, steps and delay",
     "stiff coupling, controller damper",
-    "active environment, controller tank",
+    "active environment, controller damper",
     "trip: energy",
-    "recorder stopped and started",
 )
 """Runs whose recordings are judged."""
 
@@ -535,25 +534,14 @@ TEXTS = {"method": "implicit", "grip": "elsewhere", "scene_sha256": "0", "dampin
 """Other metadata, and to what they are changed."""
 
 
-def restart_recorder(bridge: hb.Bridge, _: int) -> None:
-    """Stops the recorder in tick 100 and starts it in tick 200, from where a file begins anew."""
-    total = bridge.summary().ticks
-    if total in (100, 200):
-        command(bridge, Record(on=total == 200))
-
-
 def recordings(folder: Path) -> dict[str, Recording]:
-    """Records the runs that are judged; one that starts a recorder in mid-run gives two files."""
+    """Records the runs that are judged."""
     table, found = runs(), {}
-    options = {"coupling": COUPLING, "controller": "damper"}
-    table["recorder stopped and started"] = Run(PEG, Scripted, options, 0.5, act=restart_recorder)
     for number, name in enumerate(RECORDED):
         path = folder / f"{number}.mcap"
         with table[name].open(folder, recording=path) as bridge:
             table[name].go(bridge)
         found[name] = hb.read_recording(path)
-        if (later := path.with_stem(f"{path.stem}-2")).is_file():
-            found[f"{name}, second file"] = hb.read_recording(later)
     return found
 
 

@@ -406,5 +406,5 @@ def test_progress_reaches_its_end_and_where_nothing_may_go_nothing_is_written(
     done = [part for part, _, _ in told]
     assert (done, done[-1]) == (sorted(done), told[-1][1])
     assert lean.together == ()
-    with pytest.raises(SceneError, match="nothing may go"):
+    with pytest.raises(SceneError, match="no simplification may be made"):
         write_lean(lean, tmp_path / "lean.xml")

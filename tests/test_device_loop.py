@@ -151,7 +151,7 @@ def test_the_peg_goes_in_behind_it_and_is_audited_passive(name: str, tmp_path: P
     assert summary.ticks == len(ticks) == 4000
     assert (ticks["flags"] & int(TickFlag.CONTACT)).any()
     assert summary.peak_force > 0.05
-    assert rig.scene["scene"] != "peg_in_hole" or ticks["tool_position"][-1, 2] < 0.0
+    assert name not in {"haply", "omega.3", "sigma.7"} or ticks["tool_position"][-1, 2] < 0.0
     assert not np.any(rig.force())
 
 

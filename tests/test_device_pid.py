@@ -293,8 +293,8 @@ def test_a_profile_says_the_scale_of_its_numbers(monkeypatch: pytest.MonkeyPatch
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"damping": 1.0}, r"damping is in newtons and metres, .* say newtons= and travel= too"),
-        ({"newtons": 2.0, "mass": 1.0}, r"mass is in newtons and metres, .* say travel= too"),
+        ({"damping": 1.0}, r"damping is in newtons and metres, .* state newtons= and travel= too"),
+        ({"newtons": 2.0, "mass": 1.0}, r"mass is in newtons and metres, .* state travel= too"),
         ({**SCALE, "damping": -1.0}, r"damping = -1\.0"),
         ({"newtons": 0.0}, r"newtons = 0\.0: must be a finite number > 0 N"),
         ({"travel": math.nan}, "travel = nan: must be a finite number > 0 m"),

@@ -199,7 +199,7 @@ HEAD = 'format = 1\nname = "n"\ndevice = "falcon"\n'
         (HEAD + 'axes = ["z", "x"]\n', "axes = ['z', 'x']"),
         (HEAD + 'models = "omega.3"\n', "models = 'omega.3': must be a list of texts"),
         (HEAD + 'models = [""]\n', "models = ['']: must be"),
-        (HEAD + "damping = 2\n", "[damping] must hold value, source"),
+        (HEAD + "damping = 2\n", "[damping] must hold value and source"),
         (HEAD + "[damping]\nvalue = 2\n", "[damping] needs a source"),
         (HEAD + '[damping]\nvalue = -2.0\nsource = "s"\n', "[damping] value = -2.0: must be"),
         (HEAD + '[damping]\nvalue = nan\nsource = "s"\n', "[damping] value = nan"),

@@ -173,7 +173,7 @@ def test_a_recording_is_never_replaced_by_its_export(recording: Path, call: Call
     for name in ("run.mcap", "run.parquet", "run"):
         target = recording.with_name(name)
         code, _, err = call("export", recording, "--format", "csv", "--out", target, "--overwrite")
-        assert (code, "does not end like csv; its endings: .csv" in " ".join(err.split())) == (
+        assert (code, "must end in .csv" in " ".join(err.split())) == (
             2,
             True,
         )

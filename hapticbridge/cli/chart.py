@@ -40,7 +40,7 @@ class Chart:
     The scene is point_mass, peg_in_hole, rod_impact, sliding_block or spinning_body, which have
     references of their own, or any scene with a hand path beside it, which is compared with finer
     steps. 'work' in place of a scene charts what a tick costs as a scene grows. Writes SCENE.png,
-    .svg, .csv, .json and, but for 'work', .html into the folder.
+    .svg, .csv and .json into the folder.
 
     Example:
         hapticbridge chart peg_in_hole --out charts

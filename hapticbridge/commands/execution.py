@@ -108,7 +108,7 @@ class EventApplier:
             self._binding.command(bits_in(event))
         elif kind == "reset":
             if not self._method.has_coupling:
-                raise RecordingError(f"event 'reset': method '{self._method.name}' has none")
+                raise RecordingError(f"event 'reset': method '{self._method.name}' has no reset")
             restore_state(self._model, self._data, self._start)
             self._binding.take_reset()
 

@@ -167,7 +167,9 @@ class _Experiment:
         self._strict = strict
         self._ticks, self._period = run.recording.ticks, run.parameters.period
         if len(self._ticks) < 3:
-            raise RecordingError(f"'{run.recording.path}' is too short to be simulated again")
+            raise RecordingError(
+                f"'{run.recording.path}' has {len(self._ticks)} ticks; a what-if needs 3"
+            )
         self._concerns: dict[str, None] = {}
 
     def changed(self, changes: Mapping[str, Value]) -> WhatIf:
