@@ -16,7 +16,6 @@ from hapticbridge.check.cost import (
     STAGES,
     TICK_SHARE,
     Cost,
-    TimingStats,
     draw_cost,
     growth_of,
     measure_cost,
@@ -120,9 +119,7 @@ def test_planted_cost_raises_its_stage(
     assert [label.get_text() for label in stages.get_yticklabels()] == [stage, BRIDGE]
 
 
-def test_two_hundred_more_walls_cost_as_many_collisions(
-    clock: PlantedClock, tmp_path: Path
-) -> None:
+def test_200_more_walls_cost_200_more_collisions(clock: PlantedClock, tmp_path: Path) -> None:
     text = scene_path("virtual_wall").read_text(encoding="utf-8")
     line = next(line for line in text.splitlines() if 'name="wall" class' in line)
     more = "".join(line.replace('"wall" class', f'"wall{k}" class') for k in range(200))
@@ -182,11 +179,6 @@ def test_line_of_growth_is_the_planted_one_where_rare_counts_are_left_out() -> N
     assert [step[:2] for step in growth.steps] == [(0, 100), (3, 40), (6, 20)]
     assert growth.base == pytest.approx(4e-6)
     assert growth.per_one == pytest.approx(0.5e-6)
-
-
-def test_spread_of_a_hundred_times() -> None:
-    spread = TimingStats.of(np.arange(101.0))
-    assert (spread.ticks, spread.median, spread.p99) == (101, 50.0, 99.0)
 
 
 def test_motion_that_ends_in_nothing_finite_is_an_error() -> None:

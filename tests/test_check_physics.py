@@ -59,9 +59,7 @@ def test_stiffness_and_depth_are_mujocos_at_rest(solref: str, solimp: str, mass:
     ("cone", "condim", "friction"),
     [("elliptic", 3, 0.4), ("pyramidal", 1, 1), ("pyramidal", 3, 0.4), ("pyramidal", 6, 2)],
 )
-def test_contact_is_as_stiff_as_its_cone(
-    tmp_path: Path, cone: str, condim: int, friction: float
-) -> None:
+def test_stiffness_is_of_the_cone(tmp_path: Path, cone: str, condim: int, friction: float) -> None:
     rubs = f'condim="{condim}" friction="{friction} 0.005 0.0001"'
     rails = "".join(f'<joint type="slide" axis="{axis}"/>' for axis in ("1 0 0", "0 1 0", "0 0 1"))
     tool = f"""<body name="tool" pos="0 0 0.0105">{rails}<geom size="0.01" mass="0.1" {rubs}/>

@@ -87,9 +87,7 @@ def test_any_bytes_are_taken_and_a_reply_after_them_is_found(packets: list[bytes
     ),
     st.integers(1, 62),
 )
-def test_garbage_between_replies_costs_no_reply(
-    parts: list[tuple[int, int, int] | bytes], size: int
-) -> None:
+def test_garbage_costs_no_reply(parts: list[tuple[int, int, int] | bytes], size: int) -> None:
     # garbage without a '<' cannot begin a reply
     pieces = [p.replace(b"<", b"") if isinstance(p, bytes) else reply(p) for p in parts]
     wanted = [p for p in parts if not isinstance(p, bytes)]
@@ -102,9 +100,7 @@ def test_garbage_between_replies_costs_no_reply(
 
 
 @given(st.tuples(numbers, numbers, numbers), st.integers(0, 15), st.integers(0, 255))
-def test_a_reply_with_a_byte_lost_or_put_in_is_not_believed(
-    encoders: tuple[int, int, int], at: int, extra: int
-) -> None:
+def test_damaged_reply_is_not_believed(encoders: tuple[int, int, int], at: int, extra: int) -> None:
     whole = reply(encoders)
     for damaged in (
         whole[:at] + whole[at + 1 :],

@@ -7,6 +7,7 @@ import math
 import shutil
 import subprocess
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -84,41 +85,35 @@ def test_a_sigma_turns_and_its_orientation_is_that_of_the_matrix() -> None:
 @pytest.mark.parametrize(
     ("kind", "told", "asked", "limits"),
     [
-        (OMEGA3, (-1.0, -1.0), {}, (12.0, 0.5)),
-        (OMEGA3, (9.0, -1.0), {}, (9.0, 0.5)),
-        (OMEGA3, (9.0, -1.0), {"force_limit": 5.0}, (5.0, 0.5)),
-        (OMEGA3, (9.0, -1.0), {"force_limit": 20.0}, (9.0, 0.5)),
-        (SIGMA7, (-1.0, -1.0), {}, (12.0, 0.4)),
-        (SIGMA7, (15.0, 0.3), {}, (12.0, 0.3)),
-        (206, (8.0, -1.0), {}, (8.0, 0.5)),
-        (7, (8.0, -1.0), {}, (8.0, 0.5)),
+        (OMEGA3, (-1.0, -1.0), None, (12.0, 0.5)),
+        (OMEGA3, (9.0, -1.0), None, (9.0, 0.5)),
+        (OMEGA3, (9.0, -1.0), 5.0, (5.0, 0.5)),
+        (OMEGA3, (9.0, -1.0), 20.0, (9.0, 0.5)),
+        (SIGMA7, (-1.0, -1.0), None, (12.0, 0.4)),
+        (SIGMA7, (15.0, 0.3), None, (12.0, 0.3)),
+        (206, (8.0, -1.0), None, (8.0, 0.5)),
+        (7, (8.0, -1.0), None, (8.0, 0.5)),
     ],
 )
-def test_the_lower_of_known_limits_holds(
-    kind: int, told: tuple[float, float], asked: dict[str, float], limits: tuple[float, float]
-) -> None:
+def test_the_lower_of_known_limits_holds(kind: int, told: Any, asked: Any, limits: Any) -> None:
     stub = Stub(kind)
     stub.call("limits", *told)
-    info = stub.opened(numbers=asked).info
+    info = stub.opened(numbers={} if asked is None else {"force_limit": asked}).info
     assert (info.force_limit, info.torque_limit) == limits
 
 
 def test_a_limit_that_nobody_knows_must_be_named() -> None:
-    stub = Stub(206)
-    with pytest.raises(
-        DeviceError, match=r"largest force of sigma\.3 is unknown; set it with force_lim"
+    for kind, words in (
+        (206, r"largest force of sigma\.3 is unknown; set it with force_lim"),
+        (108, r"largest torque of lambda\.7 is unknown; set it with torq"),
     ):
-        stub.opened()
-    assert stub.call("closed") == 1
-    assert stub.opened(numbers={"force_limit": 3.0}).info.force_limit == 3.0
-    stub = Stub(108)
-    with pytest.raises(
-        DeviceError, match=r"largest torque of lambda\.7 is unknown; set it with torq"
-    ):
-        stub.opened()
-    assert {model.turns for kind, model in MODELS.items() if kind not in (104, 105, 108, 109)} == {
-        False
-    }
+        stub = Stub(kind)
+        with pytest.raises(DeviceError, match=words):
+            stub.opened()
+        assert stub.call("closed") == 1
+    assert Stub(206).opened(numbers={"force_limit": 3.0}).info.force_limit == 3.0
+    turning = {kind for kind, model in MODELS.items() if model.turns}
+    assert turning <= {104, 105, 108, 109}
 
 
 def test_what_was_set_is_said_and_gravity_is_the_users_choice() -> None:
@@ -245,26 +240,21 @@ def test_what_the_library_does_not_know_comes_from_the_profile_of_its_model() ->
 
 def test_a_spec_names_the_library_the_device_and_its_numbers() -> None:
     stub = Stub()
-    device = open_device(f"forcedimension:library={stub.file},gravity=0,damping=1.5,resolution=0")
-    assert device.info.damping == 1.5
-    assert stub.call("gravity") == 0
+    spec = f"forcedimension:library={stub.file}"
+    device = open_device(f"{spec},gravity=0,damping=1.5,resolution=0")
+    assert (device.info.damping, stub.call("gravity")) == (1.5, 0)
     device.close()
-    stub.call("count", 2)
-    with pytest.raises(DeviceError, match=r"2 devices .*choose one with serial=, one of '0', '1'"):
-        open_device(f"forcedimension:library={stub.file}")
-    open_device(f"forcedimension:library={stub.file},serial=1").close()
-    stub.call("count", 0)
-    with pytest.raises(
-        DeviceError, match=r"is plugged in \(looked for a device of Force Dimension"
+    open_device(f"{spec},serial=0").close()
+    for count, option, words in (
+        (2, "", r"2 devices .*choose one with serial=, one of '0', '1'"),
+        (0, "", r"is plugged in \(looked for a device of Force Dimension"),
+        (1, ",gravity=2", "gravity = 2"),
+        (1, ",mass=0", "mass = 0"),
+        (1, ",damping=-1", "d"),
     ):
-        open_device(f"forcedimension:library={stub.file}")
-    for option, words in (
-        ("gravity=2", "gravity = 2"),
-        ("mass=0", "mass = 0"),
-        ("damping=-1", "d"),
-    ):
+        stub.call("count", count)
         with pytest.raises(DeviceError, match=words):
-            open_device(f"forcedimension:library={stub.file},{option}")
+            open_device(spec + option)
 
 
 def test_the_library_is_named_or_found(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -204,9 +204,7 @@ def test_whatever_breaks_trips_and_every_row_is_kept(
         assert not np.any(rig.force())
 
 
-def test_what_the_hand_felt_is_what_was_recorded(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_was_felt_was_recorded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     felt, original = [], RawHid.output
 
     def output(self: RawHid, report: bytes, now: float) -> None:
@@ -237,9 +235,7 @@ def test_what_the_hand_felt_is_what_was_recorded(
         ),
     ],
 )
-def test_a_slower_device_flags_every_repeated_sample(
-    make: Callable[[], Rig], stale: int, tmp_path: Path
-) -> None:
+def test_repeated_samples_are_flagged(make: Callable[[], Rig], stale: int, tmp_path: Path) -> None:
     make().run(tmp_path / "run.mcap", 0.4)
     flags = rows(tmp_path / "run.mcap")["flags"]
     assert np.count_nonzero(flags & int(TickFlag.STALE_SAMPLE)) == pytest.approx(stale, abs=1)
@@ -316,7 +312,7 @@ def test_identify_finds_inertia_and_damping_of_a_wrist() -> None:
     assert fit.damping.value == pytest.approx(4e-3, rel=0.05)
 
 
-def test_what_was_identified_holds_with_its_scale(
+def test_identified_numbers_keep_their_scale(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Assumed 10 N and 0.1 m: all that is measured is off by the same factors as the force."""

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,12 +20,6 @@ from hapticbridge.device.pid.device import LIFE, RESTART, PidDevice, open_pid
 from hapticbridge.device.profile import Profile, Quantity
 from hapticbridge.errors import DeviceError, DeviceLost
 from hapticbridge.record import SAMPLE_DTYPE, TickFlag
-
-
-class LastWordDouble:
-    def __init__(self, path: str, *reports: bytes) -> None:
-        self.path, self.reports = path, reports
-
 
 STALE = int(TickFlag.STALE_SAMPLE)
 
@@ -176,14 +171,15 @@ def test_closing_stops_and_frees_the_effects_and_switches_the_motors_off() -> No
 
 
 def test_another_process_holds_what_takes_the_force_away(monkeypatch: pytest.MonkeyPatch) -> None:
-    held: list[LastWordDouble] = []
-    monkeypatch.setattr(driver, "last_word_at", lambda *given: held.append(LastWordDouble(*given)))
+    held: list[tuple[Any, ...]] = []
+    monkeypatch.setattr(driver, "guard_device_node", lambda *given: held.append(given))
     device, model, _ = started(PidStick())
     device.leave_last_word("/dev/hidraw7")
     device.write(wrench(1.0, 1.0))
     assert model.force() != (0.0, 0.0)
-    assert held[0].path == "/dev/hidraw7"
-    for report in held[0].reports:  # the bridge is dead by now
+    ((path, *reports),) = held
+    assert path == "/dev/hidraw7"
+    for report in reports:  # the bridge is dead by now
         device._link.send(report)
     assert (model.force(), model.is_enabled, model.effects) == ((0.0, 0.0), False, {})
 
@@ -264,28 +260,23 @@ def test_what_nobody_says_is_assumed_aloud_and_leaves_the_bound_unjudged() -> No
 
 
 def test_a_profile_says_the_scale_of_its_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
-    quantities = {
-        "force_limit": Quantity(7.0, "a gauge"),
-        "workspace": Quantity((0.05, 0.05, 0.05), "a ruler"),
-    }
+    room = Quantity((0.05, 0.05, 0.05), "a ruler")
+    quantities = {"force_limit": Quantity(7.0, "a gauge"), "workspace": room}
     profile = Profile("stick", "pid", "P1", None, "", quantities)
     asked: list[tuple[str, str, str]] = []
-
-    def profile_of(device: str, serial: str, model: str) -> Profile:
-        asked.append((device, serial, model))
-        return profile
-
-    monkeypatch.setattr(sheet, "profile_of", profile_of)
+    monkeypatch.setattr(sheet, "profile_of", lambda *given: asked.append(given) or profile)
     model = PidStick()
     model.place = (1.0, 0.0)
     device = open_pid({"damping": 1.0, "newtons": 7.0}, ignore_message, HidSeam(model))
     assert asked == [("pid", "P1", device.info.name)]
     assert device.info.force_limit == 7.0
     assert device.start(PERIOD)["position"][0, 0] == pytest.approx(0.025)
-    with pytest.raises(DeviceError, match=r"newtons = 3\.0: .* was measured with 7, .* leave out"):
-        open_pid({"newtons": 3.0}, ignore_message, HidSeam(model))
-    with pytest.raises(DeviceError, match=r"travel = 0\.1: .* was measured with 0\.05"):
-        open_pid({"travel": 0.1}, ignore_message, HidSeam(model))
+    for option, words in (
+        ({"newtons": 3.0}, r"newtons = 3\.0: .* was measured with 7, .* leave out"),
+        ({"travel": 0.1}, r"travel = 0\.1: .* was measured with 0\.05"),
+    ):
+        with pytest.raises(DeviceError, match=words):
+            open_pid(option, ignore_message, HidSeam(model))
     other = open_pid({"newtons": 3.0, "profile": "none"}, ignore_message, HidSeam(model))
     assert other.info.force_limit == 3.0
 

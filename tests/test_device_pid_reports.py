@@ -64,9 +64,7 @@ def said(layout: Mapping[str, Report], name: str, report: bytes | None) -> dict[
     return layout[name].unpacked(report)
 
 
-def test_each_report_says_what_it_should_in_the_tables_words(
-    layout: Mapping[str, Report],
-) -> None:
+def test_each_report_says_what_it_should_in_the_tables_words(layout: Mapping[str, Report]) -> None:
     reports = PidReports(Layout(descriptor(layout.values())))
     for usage in (ENABLE, DISABLE, STOP_ALL, RESET):
         value = said(layout, "control", reports.control(usage))["control"]
@@ -164,9 +162,7 @@ def test_flags_do_for_choices_where_a_device_has_flags() -> None:
         (changed("effect", "enable_y", usage=PID | 0x1), "does not act on both X and Y"),
     ],
 )
-def test_a_device_that_lacks_what_is_needed_is_refused_by_name(
-    layout: dict[str, Report], words: str
-) -> None:
+def test_device_lacking_reports_is_refused(layout: dict[str, Report], words: str) -> None:
     with pytest.raises(DeviceError, match=re.escape(words)) as refused:
         opened(PidStick(layout=layout))
     assert str(refused.value).startswith("PID test stick (1209:4801, serial P1) cannot be driven: ")
@@ -189,15 +185,8 @@ def test_a_stick_is_known_by_its_usages_and_a_joystick_without_force_is_none() -
         opened(model)
 
 
-@given(
-    st.integers(0, 2000),
-    st.binary(max_size=6),
-    st.sampled_from(sorted(LAYOUTS)),
-    st.booleans(),
-)
-def test_a_spoilt_descriptor_is_driven_or_refused_in_one_sentence(
-    place: int, spoilt: bytes, name: str, is_inserted: bool
-) -> None:
+@given(st.integers(0, 2000), st.binary(max_size=6), st.sampled_from(sorted(LAYOUTS)), st.booleans())
+def test_spoilt_descriptor_is_safe(place: int, spoilt: bytes, name: str, is_inserted: bool) -> None:
     raw = descriptor(LAYOUTS[name].values())
     place %= len(raw)
     after = raw[place + (0 if is_inserted else len(spoilt)) :]
@@ -227,9 +216,7 @@ def test_a_mouse_beside_the_stick_is_not_taken_for_it() -> None:
 
 
 @given(st.lists(st.binary(max_size=24), max_size=5), st.sampled_from(sorted(LAYOUTS)))
-def test_arbitrary_input_reports_never_put_the_stick_beyond_its_stops(
-    reports: list[bytes], name: str
-) -> None:
+def test_any_report_keeps_the_stick_within_stops(reports: list[bytes], name: str) -> None:
     layout = LAYOUTS[name]
     stick = Stick(Layout(descriptor(layout.values())))
     for report in reports:

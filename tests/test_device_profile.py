@@ -76,9 +76,7 @@ def test_shipped_profiles_state_every_number_that_matters_or_that_it_is_unknown(
         ("haply", "Minverse", "minverse"),
     ],
 )
-def test_a_shipped_profile_is_found_by_the_model_that_the_driver_reports(
-    driver: str, model: str, stem: str
-) -> None:
+def test_shipped_profile_is_found_by_the_reported_model(driver: str, model: str, stem: str) -> None:
     found = profile_of(driver, "S 1", model)
     assert found is not None and found.path == SHIPPED / f"{stem}.toml"
     other = {"haply": "forcedimension", "forcedimension": "haply"}[driver]
@@ -91,22 +89,18 @@ def test_every_model_that_a_profile_names_is_one_that_the_driver_reports() -> No
     assert modelled("falcon") == ()
 
 
+def holding(**quantities: Quantity) -> Profile:
+    return Profile("mine", "falcon", "", None, "", quantities)
+
+
 def test_what_was_measured_of_one_model_is_not_taken_for_another(tmp_path: Path) -> None:
-    measured = Profile(
-        "mine",
-        "forcedimension",
-        "",
-        None,
-        "",
-        {"damping": Quantity(9.0, "measured", (8.0, 10.0))},
-        models=("omega.3",),
-    )
+    damping = holding(damping=Quantity(9.0, "measured", (8.0, 10.0)))
+    measured = dataclasses.replace(damping, device="forcedimension", models=("omega.3",))
     (own(tmp_path) / "forcedimension.toml").write_text(measured.to_toml(), encoding="utf-8")
-    found = profile_of("forcedimension", "", "omega.3")
-    assert found is not None and found.name == "mine"
-    for model, path in (("sigma.7", SHIPPED / "sigma7.toml"), ("lambda.3", None)):
-        other = profile_of("forcedimension", "", model)
-        assert (None if other is None else other.path) == path
+    for model, name in (("omega.3", "mine"), ("sigma.7", "sigma7"), ("lambda.3", None)):
+        found = profile_of("forcedimension", "", model)
+        path = None if found is None or found.path is None else found.path.stem
+        assert ("mine" if found is not None and found.name == "mine" else path) == name
 
 
 def test_a_broken_file_for_another_device_is_not_read(tmp_path: Path) -> None:
@@ -150,26 +144,18 @@ def test_a_written_profile_reads_back_as_itself(
 
 
 def test_a_profile_fills_in_what_the_driver_does_not_know_from_the_safe_end() -> None:
-    profile = Profile(
-        "p",
-        "falcon",
-        "",
-        None,
-        "",
-        {
-            "damping": Quantity(2.0, "measured", (1.8, 2.2)),
-            "mass": Quantity(0.4, "measured", (0.39, 0.41)),
-            "friction": Quantity(0.1, "measured", (-0.01, 0.2)),
-            "resolution": Quantity(1e-3, "maker"),
-            "force_limit": Quantity(20.0, "maker"),
-        },
+    profile = holding(
+        damping=Quantity(2.0, "measured", (1.8, 2.2)),
+        mass=Quantity(0.4, "measured", (0.39, 0.41)),
+        friction=Quantity(0.1, "measured", (-0.01, 0.2)),
+        resolution=Quantity(1e-3, "maker"),
+        force_limit=Quantity(20.0, "maker"),
     )
     filled = profile.fill(UNKNOWN)
     assert (filled.damping, filled.mass, filled.friction) == (1.8, 0.39, 0.0)
     assert filled.resolution == UNKNOWN.resolution  # the driver knew
     assert filled.force_limit == 8.0  # the lower limit holds
-    weaker = dataclasses.replace(profile, quantities={"force_limit": Quantity(3.0, "maker")})
-    assert weaker.fill(UNKNOWN).force_limit == 3.0
+    assert holding(force_limit=Quantity(3.0, "maker")).fill(UNKNOWN).force_limit == 3.0
 
 
 def test_a_unit_goes_before_its_kind_and_ones_own_before_what_is_shipped(tmp_path: Path) -> None:

@@ -236,9 +236,7 @@ def test_both_crcs_agree(shim: ctypes.CDLL, data: bytes) -> None:
 
 
 @given(st.tuples(*[st.floats(-(2.0**99), 2.0**99, width=32)] * 12), st.integers(0, 2**32 - 1))
-def test_the_host_reads_the_firmwares_state(
-    shim: ctypes.CDLL, numbers: tuple[float, ...], now_us: int
-) -> None:
+def test_states_are_read_right(shim: ctypes.CDLL, numbers: tuple[float, ...], now_us: int) -> None:
     shim.shim_reset()
     first = state_at(shim, now_us, Status.SATURATED, *numbers)
     assert first.numbers == numbers

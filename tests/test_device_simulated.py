@@ -192,7 +192,7 @@ def test_a_free_device_coasts_and_loses_what_its_damper_takes() -> None:
     damping=st.sampled_from([0.0, 0.3, 3.0]),
 )
 @settings(max_examples=40)
-def test_friction_stops_a_free_device_where_the_closed_form_says(
+def test_friction_stops_it_right(
     period: float, kick: float, friction: float, damping: float
 ) -> None:
     m = 0.1
@@ -301,9 +301,7 @@ def test_friction_in_a_moving_hand_is_that_of_events(period: float, amplitude: f
 
 @given(friction=st.floats(0.01, 2.0), stiffness=st.floats(10.0, 300.0), speed=st.floats(1e-3, 1.0))
 @settings(max_examples=40)
-def test_a_pulling_hand_breaks_the_device_loose_when_the_closed_form_says(
-    friction: float, stiffness: float, speed: float
-) -> None:
+def test_pulling_hand_breaks_it_loose(friction: float, stiffness: float, speed: float) -> None:
     period, m = 0.1, 0.1
     hand = Hand(mass=0.0, damping=0.0, stiffness=stiffness)
     path = Motion([0.0, period], np.outer([0.0, speed * period], [1.0, 0.0, 0.0]))

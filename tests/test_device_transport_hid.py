@@ -4,8 +4,8 @@ import importlib
 import os
 import sys
 import threading
-from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import pytest
 from emulated.echo import EchoHid
@@ -99,23 +99,18 @@ def test_what_cannot_be_opened_says_why() -> None:
 
 
 class Handle:
-    """An open device whose writes take as long as the test lets them."""
+    """An open device whose writes take as long as the test lets them; nothing else answers."""
 
     def __init__(self) -> None:
-        self.gate = threading.Semaphore(0)
-        self.entered = threading.Semaphore(0)
+        self.gate, self.entered = threading.Semaphore(0), threading.Semaphore(0)
         self.sent: list[bytes] = []
         self.result = 1
         self.is_closed = False
 
-    def open_path(self, path: bytes) -> None:
-        """Is open."""
-
-    def set_nonblocking(self, enable: int) -> int:
-        return 0
-
-    def read(self, max_length: int, timeout_ms: int = 0) -> Sequence[int]:
-        return b""
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        return lambda *_: b"" if name.startswith(("read", "get")) else 0
 
     def write(self, data: bytes) -> int:
         self.entered.release()
@@ -123,25 +118,17 @@ class Handle:
         self.sent.append(data)
         return self.result
 
-    def send_feature_report(self, data: bytes) -> int:
-        return 0
-
-    def get_feature_report(self, report_num: int, max_length: int) -> Sequence[int]:
-        return b""
-
-    def get_input_report(self, report_num: int, max_length: int) -> Sequence[int]:
-        return b""
-
-    def get_report_descriptor(self) -> Sequence[int]:
-        return b""
-
     def close(self) -> None:
         self.is_closed = True
 
 
+def slow(name: str = "slow", **options: Any) -> tuple[Any, HidLink]:
+    handle: Any = Handle()
+    return handle, HidLink(handle, name, **options)
+
+
 def test_an_overlapped_write_does_not_wait_and_the_newest_report_wins() -> None:
-    handle = Handle()
-    link = HidLink(handle, "slow")
+    handle, link = slow("slow")
     for i in range(4):
         link.write(bytes([i]))
         if i == 0:
@@ -153,8 +140,7 @@ def test_an_overlapped_write_does_not_wait_and_the_newest_report_wins() -> None:
 
 
 def test_of_each_kind_the_newest_report_is_sent_and_kinds_take_turns() -> None:
-    handle = Handle()
-    link = HidLink(handle, "slow", slots=2)
+    handle, link = slow("slow", slots=2)
     link.write(b"a0")
     handle.entered.acquire()
     for report, slot in ((b"a1", 0), (b"b1", 1), (b"a2", 0), (b"b2", 1)):
@@ -166,8 +152,7 @@ def test_of_each_kind_the_newest_report_is_sent_and_kinds_take_turns() -> None:
 
 def test_set_up_is_sent_at_once_and_what_waited_is_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(transport_hid, "LONGEST_WRITE", 10.0)
-    handle = Handle()
-    link = HidLink(handle, "slow")
+    handle, link = slow("slow")
     link.write(b"old")
     handle.entered.acquire()
     link.write(b"waits")
@@ -204,8 +189,7 @@ def test_requests_that_fail_have_an_empty_answer() -> None:
 
 def test_a_device_that_takes_no_report_any_more_is_lost(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(transport_hid, "LONGEST_WRITE", 0.0)
-    handle = Handle()
-    link = HidLink(handle, "stuck")
+    handle, link = slow("stuck")
     link.write(b"a")
     handle.entered.acquire()
     with pytest.raises(DeviceLost, match="stuck accepts no reports any more"):
@@ -264,9 +248,7 @@ def test_full_log_keeps_newest_and_says_so(tmp_path: Path, monkeypatch: pytest.M
     assert [line[-2:] for line in lines[1:]] == ["03", "04"]
 
 
-def test_a_log_not_written_says_so_and_off_keeps_nothing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_unwritten_log_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(DeviceError, match=r"the log .* cannot be written: No such file"):
         HexLog(tmp_path / "no" / "wire.log")
     (tmp_path / "full").mkdir()
@@ -299,34 +281,25 @@ class Listing:
         self.path = path
 
     def enumerate(self, vendor_id: int = 0, product_id: int = 0) -> list[dict[str, object]]:
-        return [
-            {
-                "path": self.path.encode(),
-                "vendor_id": EchoHid.vendor,
-                "product_id": EchoHid.product,
-                "product_string": None,
-                "serial_number": None,
-                "usage_page": 1,
-                "usage": 1,
-            }
-        ]
+        ids = {"vendor_id": EchoHid.vendor, "product_id": EchoHid.product}
+        words = {"product_string": None, "serial_number": None}
+        return [{"path": self.path.encode(), **ids, **words, "usage_page": 1, "usage": 1}]
 
 
 @pytest.mark.parametrize("is_permitted", [True, False])
 def test_forbidden_node_is_listed_with_remedy(
     is_permitted: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (tmp_path / "hidraw3").touch()
     node = str(tmp_path / "hidraw3")
+    Path(node).touch()
     monkeypatch.setattr(hid_search, "hid_api", lambda: Listing(node))
     monkeypatch.setattr(os, "access", lambda path, mode: is_permitted)
     (device,) = find(ECHO)
     assert (device.name, device.serial, device.path) == ("Echo", "", node)
-    if is_permitted:
-        assert device.problem is None
-    else:
-        assert device.problem is not None
-        assert device.problem.startswith(f"no permission to open {node}; 'hapticbridge devices")
+    assert (device.problem is None) == is_permitted
+    if not is_permitted:
+        remedy = f"no permission to open {node}; 'hapticbridge devices"
+        assert str(device.problem).startswith(remedy)
         with pytest.raises(DeviceError, match="no permission to open"):
             HidLink.open(device)
 

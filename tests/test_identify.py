@@ -284,9 +284,7 @@ def measured_drag(device: SimulatedDevice, period: float = PERIOD, seconds: floa
     ("mass", "damping", "friction", "drag"),
     [(0.1, 0.5, 0.0, 0.5), (0.3, 1.5, 0.1, 5.0), (0.8, 2.0, 0.2, 20.0), (0.1, 0.5, 0.0, 20.0)],
 )
-def test_drag_does_not_make_the_damping_of_small_speeds_too_large(
-    mass: float, damping: float, friction: float, drag: float
-) -> None:
+def test_drag_is_not_damping(mass: float, damping: float, friction: float, drag: float) -> None:
     """Without a column of its own it made b up to six times too large, or was called a hand."""
     device = Dragged(drag, mass=mass, damping=damping, friction=friction, resolution=1e-5)
     fit = measured_drag(device)

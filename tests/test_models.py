@@ -288,9 +288,7 @@ def test_single_contact_gives_by_twelve_micrometres_under_three_newtons() -> Non
 @pytest.mark.parametrize(
     ("edit", "least", "most"), [(None, 5e-6, 25e-6), (with_default_contact, 300e-6, 1e-3)]
 )
-def test_peg_sinks_into_the_wall_only_with_mujocos_default_contact(
-    edit: Edit | None, least: float, most: float
-) -> None:
+def test_peg_sinks_in_only_by_default_contact(edit: Edit | None, least: float, most: float) -> None:
     model, data = scene_with_handle("peg_in_hole", edit)
     run = moved_through(
         model,

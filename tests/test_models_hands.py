@@ -90,7 +90,7 @@ def norms(wrenches: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize(("name", "values", "first", "least"), HANDS, ids=str)
-def test_twenty_random_hands_leave_it_finite_and_passive_and_the_device_within_its_limits(
+def test_hands_leave_it_whole(
     name: str, values: dict[str, float], first: float, least: int
 ) -> None:
     loop = ClosedLoop(hb.load_scene(name, "grip", **values))

@@ -44,9 +44,7 @@ from hapticbridge.recording.writer import RESERVE
     data=st.binary(max_size=50),
 )
 @settings(max_examples=60)
-def test_any_record_metadata_and_attachment_survive_the_file(
-    records: list[bytes], meta: dict[str, str], data: bytes
-) -> None:
+def test_any_content_survives(records: list[bytes], meta: dict[str, str], data: bytes) -> None:
     rows = np.frombuffer(b"".join(records), TICK_DTYPE)
     with tempfile.TemporaryDirectory() as name:
         path = Path(name) / "run.mcap"
@@ -221,9 +219,7 @@ def test_index_without_room_ends_recording(tmp_path: Path, monkeypatch: pytest.M
     assert recording.ticks.size > 0
 
 
-def test_a_folder_for_no_other_file_takes_a_recording(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_folder_for_one_file_suffices(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     make = tempfile.TemporaryFile
 
     def elsewhere(dir: Path | None = None, **options: Any) -> Any:  # noqa: A002
@@ -299,9 +295,7 @@ def test_writer_refuses_what_it_cannot_write(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="room can be claimed on Linux alone")
-def test_room_for_the_end_is_claimed_and_given_back(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_room_for_the_end_is_claimed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "run.mcap"
     writer = RecordingWriter(path, META, FILES, EPOCH)
     writer.write_ticks(np.zeros(1000, TICK_DTYPE))
@@ -501,9 +495,7 @@ def changed(path: Path, data: bytes | bytearray) -> Recording:
     return read_recording(path)
 
 
-def test_zeros_behind_the_last_whole_record_are_a_cut_and_no_damage(
-    whole: Path, tmp_path: Path
-) -> None:
+def test_zeros_behind_the_last_record_are_a_cut(whole: Path, tmp_path: Path) -> None:
     path, kept = tmp_path / "cut.mcap", whole.read_bytes()[: starts(whole)[2]]
     recording = changed(path, kept + bytes(5000))
     assert (recording.is_cut, recording.problems) == (True, ())

@@ -134,7 +134,7 @@ def test_recorder_loads_neither_mujoco_nor_the_compiler(ring: Ring, tmp_path: Pa
     assert "llvmlite" not in loaded
 
 
-def test_path_that_cannot_be_written_is_refused_before_the_run(ring: Ring, tmp_path: Path) -> None:
+def test_what_cannot_be_recorded_is_refused_before_the_run(ring: Ring, tmp_path: Path) -> None:
     for path, reason in (
         (tmp_path / "none" / "run.mcap", "the folder .* does not exist"),
         (tmp_path, "Is a directory"),
@@ -146,9 +146,6 @@ def test_path_that_cannot_be_written_is_refused_before_the_run(ring: Ring, tmp_p
         assert not recorder.is_alive()
         recorder.event({"event": "late"}, 0)
         recorder.close()
-
-
-def test_local_ring_and_metadata_that_is_no_text_are_refused_at_once(ring: Ring) -> None:
     with pytest.raises(RecordingError, match="needs a shared ring"):
         Recorder(Ring.local(4), None, META, ())
     with pytest.raises(RecordingError, match="must be text"):
@@ -273,9 +270,7 @@ def test_killed_bridge_and_recorder_lose_one_chunk_at_most_and_repair_mends(tmp_
     assert len(messages) == recording.ticks.size
 
 
-def test_live_line_without_a_terminal_is_plain_text(
-    ring: Ring, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_live_line_in_a_file_is_plain_text(ring: Ring, capfd: pytest.CaptureFixture[str]) -> None:
     recorder = Recorder(ring, None, META, (), live=True)
     recorder.wait_until_ready()
     rows = numbered(0, 101)
@@ -312,17 +307,12 @@ class BrokenTerminal(Terminal):
         raise BrokenPipeError(32, "Broken pipe")
 
 
-def test_live_line_on_a_terminal_is_one_line_that_is_redrawn() -> None:
+def test_live_line_on_a_terminal_is_redrawn_and_may_break() -> None:
     stream = Terminal()
-    line = LiveLine(stream)
-    line.update(numbered(0, 2001))
-    line.close()
+    for terminal in (stream, BrokenTerminal()):
+        line = LiveLine(terminal)
+        line.update(numbered(0, 2001))
+        line.close()
     text = stream.getvalue()
     assert "2.0 s  0.0 N  environment 0.0 mJ  device 0.0 mJ  0 overruns" in text
     assert text.count("\n") <= 2
-
-
-def test_terminal_that_is_gone_does_not_stop_the_recording() -> None:
-    line = LiveLine(BrokenTerminal())
-    line.update(numbered(0, 3))
-    line.close()

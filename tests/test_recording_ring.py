@@ -76,9 +76,7 @@ def test_latest_gives_newest_records_oldest_first(written: int, unread: int, cou
 
 
 @given(capacity=st.integers(2, 9), written=st.lists(st.integers(0, 12), min_size=1, max_size=60))
-def test_who_reads_on_from_a_number_misses_only_what_was_overwritten(
-    capacity: int, written: list[int]
-) -> None:
+def test_who_reads_on_misses_only_the_overwritten(capacity: int, written: list[int]) -> None:
     ring, counts, end = Ring.local(capacity), iter(written), 0
 
     def write() -> None:  # the producer goes on between any two steps of whoever reads

@@ -30,18 +30,12 @@ def test_missing_file_name_and_folder_are_told_apart(tmp_path: Path) -> None:
     assert "too long" in refusal("x" * 5000)
 
 
-def test_name_is_a_scene_but_a_file_comes_first(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_file_goes_before_a_scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert set(scene_names()) >= {"peg_in_hole", "planar_peg", "point_mass", "virtual_wall"}
     assert load_scene("point_mass").name == "point_mass"
     monkeypatch.chdir(tmp_path)
     scene_file(tmp_path, mjcf(), "point_mass")
     assert scene_path("point_mass") == Path("point_mass")
-
-
-def test_file_that_does_not_end_in_xml_is_refused_with_what_would_be_read(tmp_path: Path) -> None:
-    assert "must end in .xml" in refusal(scene_file(tmp_path, mjcf(), "scene.mjcf"))
 
 
 @pytest.mark.parametrize(
@@ -54,29 +48,26 @@ def test_file_that_does_not_end_in_xml_is_refused_with_what_would_be_read(tmp_pa
         ("<mujoco>\n<worldbody>\n<body foo='1'/></worldbody></mujoco>", ["'foo'", "line 3"]),
         ("<mujoco>\n\n<worldbody><body pos='a b c'/></worldbody></mujoco>", ["'pos'", "line 3"]),
         ("<mujoco><include file='gone.xml'/></mujoco>", ["'gone.xml'", "line 1"]),
+        ("<mujoco><include file='part.xml'/></mujoco>", ["line 3 is not well-formed XML"]),
         ("<mujoco><asset><mesh file='gone.stl'/></asset></mujoco>", ["grip"]),
         (mjcf("<asset><mesh name='m' file='gone.stl'/></asset>"), ["'gone.stl'"]),
         (mjcf("<asset><texture name='t' type='2d' file='gone.png'/></asset>"), ["'gone.png'"]),
         (mjcf(world="<body name='tool'/>"), ["repeated name 'tool'"]),
         (mjcf("<size memory='1P'/>"), ["memory", "<size>"]),
+        # what breaks the implicit step
+        (mjcf("<option solver='PGS'/>"), ["PGS", "use Newton"]),
+        (mjcf("<option noslip_iterations='3'/>"), ["noslip_iterations=3", "set it to 0"]),
+        (mjcf("<option><flag ipc='enable'/></option>"), ["flag ipc", "disable it"]),
+        (mjcf("<option><flag sleep='enable'/></option>"), ["flag sleep", "disable it"]),
+        (mjcf("<option><flag actuation='disable'/></option>"), ["actuation", "enable it"]),
+        (mjcf("<option actuatorgroupdisable='30 0 4'/>"), ["0, 4, 30", "remove actuatorgr"]),
     ],
 )
-def test_unreadable_file_is_refused_with_its_line(
-    tmp_path: Path, text: str, words: list[str]
-) -> None:
+def test_unreadable_file_is_told_with_line(tmp_path: Path, text: str, words: list[str]) -> None:
+    scene_file(tmp_path, "<mujocoinclude>\n\n<worldbody></mujocoinclude>", "part.xml")
     message = refusal_of(tmp_path, text)
     assert all(word in message for word in words), message
-
-
-def test_malformed_include_is_refused_with_its_own_line(tmp_path: Path) -> None:
-    scene_file(tmp_path, "<mujocoinclude>\n\n<worldbody></mujocoinclude>", "part.xml")
-    message = refusal_of(tmp_path, "<mujoco><include file='part.xml'/></mujoco>")
-    assert "line 3 is not well-formed XML" in message
-
-
-def test_urdf_is_refused_because_it_can_have_no_site(tmp_path: Path) -> None:
-    text = "<robot name='r'><link name='a'/></robot>"
-    assert "sites: none exist" in refusal(scene_file(tmp_path, text, "robot.urdf"))
+    assert "must end in .xml" in refusal(scene_file(tmp_path, text, "scene.mjcf"))
 
 
 def test_grip_that_does_not_exist_is_refused_with_the_sites_that_do(tmp_path: Path) -> None:
@@ -107,9 +98,7 @@ def test_grip_that_does_not_exist_is_refused_with_the_sites_that_do(tmp_path: Pa
         ],
     ],
 )
-def test_a_name_of_ours_is_refused_where_it_is_taken(
-    tmp_path: Path, world: str, actuator: str, culprit: str
-) -> None:
+def test_our_names_are_refused(tmp_path: Path, world: str, actuator: str, culprit: str) -> None:
     text = mjcf(actuator, body=HINGE_TOOL.format(joint=""), world=world)
     message = refusal_of(tmp_path, text)
     assert culprit in message
@@ -142,22 +131,6 @@ def test_grip_on_a_rigid_part_of_a_moving_body_is_accepted(tmp_path: Path) -> No
     part = "<body name='arm'><freejoint/><geom size='.01'/><body pos='.1 0 0'><site name='grip'/>"
     scene = load_scene(scene_file(tmp_path, mjcf(body=part + "</body></body>")))
     assert scene.grip_pose()[:3] == (0.1, 0.0, 0.0)
-
-
-@pytest.mark.parametrize(
-    ("option", "words"),
-    [
-        ("<option solver='PGS'/>", ["PGS", "use Newton"]),
-        ("<option noslip_iterations='3'/>", ["noslip_iterations=3", "set it to 0"]),
-        ("<option><flag ipc='enable'/></option>", ["flag ipc", "disable it"]),
-        ("<option><flag sleep='enable'/></option>", ["flag sleep", "disable it"]),
-        ("<option><flag actuation='disable'/></option>", ["actuation", "enable it"]),
-        ("<option actuatorgroupdisable='30 0 4'/>", ["0, 4, 30", "remove actuatorgroupdisable"]),
-    ],
-)
-def test_option_that_breaks_step_is_refused(tmp_path: Path, option: str, words: list[str]) -> None:
-    message = refusal_of(tmp_path, mjcf(option))
-    assert all(word in message for word in words), message
 
 
 def test_rk4_runs_under_discrete_with_warning_and_other_integrators_without(tmp_path: Path) -> None:
@@ -218,7 +191,7 @@ def test_gains_are_set_without_compiling_and_give_the_coupling_law(tmp_path: Pat
         assert data.qfrc_actuator[3:] == pytest.approx(rotational * turn, rel=1e-12)
 
 
-@pytest.mark.parametrize("value", ["nan", "inf", "-inf", "NaN", "infinity"])
+@pytest.mark.parametrize("value", ["nan", "-inf", "infinity"])
 @pytest.mark.parametrize(
     "element",
     [
@@ -230,13 +203,12 @@ def test_gains_are_set_without_compiling_and_give_the_coupling_law(tmp_path: Pat
     ],
 )
 @pytest.mark.filterwarnings("ignore:XML contains")
-def test_mass_not_finite_is_told_where_written(tmp_path: Path, element: str, value: str) -> None:
+def test_infinite_mass_is_told_where_written(tmp_path: Path, element: str, value: str) -> None:
     body = f"<body name='tool'><freejoint/>\n{element.format(value)}<site name='grip'/></body>"
-    message = refusal_of(tmp_path, mjcf(body=body))
+    message = refusal_of(tmp_path, mjcf(f"<!-- {element.format(value)} -->", body=body))
     assert "finite" in message
     if "scene.xml" in message:
-        assert "line 2" in message
-        assert value in message
+        assert "line 2" in message and value in message
 
 
 def test_mass_that_becomes_infinite_in_compilation_is_refused_with_its_body(tmp_path: Path) -> None:
@@ -250,10 +222,6 @@ def test_mass_that_becomes_infinite_in_compilation_is_refused_with_its_body(tmp_
     scene_file(tmp_path, f"<mujocoinclude>\n{default}</mujocoinclude>", "part.xml")
     message = refusal_of(tmp_path, mjcf("<include file='part.xml'/>"))
     assert message.startswith("part.xml, line 2: mass of <geom> is 'nan'")
-
-
-def test_mass_in_a_comment_is_not_read(tmp_path: Path) -> None:
-    load_scene(scene_file(tmp_path, mjcf("<!-- <geom mass='nan'/> -- > -->")))
 
 
 def test_force_limit_of_joint_is_refused_on_tool_and_accepted_elsewhere(tmp_path: Path) -> None:

@@ -39,9 +39,7 @@ def size(*terms: NDArray[np.float64]) -> float:
 
 
 @given(seeds, st.floats(0.01, 10), st.floats(1e-4, 1e-2), st.floats(-1, 1))
-def test_energy_gain_of_every_scheme_is_its_closed_form(
-    seed: int, mass: float, period: float, velocity: float
-) -> None:
+def test_energy_gain_is_closed(seed: int, mass: float, period: float, velocity: float) -> None:
     force = random_force(seed, 50)
     for scheme in ALL:
         motion = integrate_particle(mass, force, period, scheme, velocity=velocity)
@@ -169,9 +167,7 @@ def test_midpoint_is_of_second_order_and_the_rest_of_first() -> None:
 
 
 @given(seeds, st.floats(1e-3, 10), st.floats(1, 1e5), st.floats(0, 100))
-def test_only_the_held_force_creates_energy_behind_the_coupling(
-    seed: int, mass: float, stiffness: float, damping: float
-) -> None:
+def test_only_held_forces_create(seed: int, mass: float, stiffness: float, damping: float) -> None:
     handle = np.cumsum(random_force(seed, 100) * 1e-4)
     coupling = Coupling(stiffness, damping, 0, 0)
     for scheme in ("implicit", "compensated", "midpoint"):
@@ -266,9 +262,7 @@ def test_error_against_dop853_falls_with_order_of_scheme(scheme: Scheme, order: 
     st.tuples(*[st.floats(-20, 20)] * 3),
     st.integers(0, 2**32 - 1),
 )
-def test_energy_balance_of_every_scheme_under_torque_is_its_closed_form(
-    inertia: tuple[float, ...], omega: tuple[float, ...], seed: int
-) -> None:
+def test_balance_is_closed(inertia: tuple[float, ...], omega: tuple[float, ...], seed: int) -> None:
     period, steps = 1e-3, 20
     torque = np.random.default_rng(seed).normal(0, 5, (steps + 1, 3)) * min(inertia)
     for scheme in ALL:

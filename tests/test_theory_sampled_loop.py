@@ -58,9 +58,7 @@ def test_run_against_a_wall_ends_where_the_bound_says(
 @pytest.mark.parametrize("period", PERIODS)
 @pytest.mark.parametrize("integrator", ["implicit", "semi_implicit", "explicit"])
 @pytest.mark.parametrize("mass", [0.005, 0.05, 1.0])
-def test_run_with_a_mass_ends_where_the_bound_says(
-    period: float, integrator: Integrator, mass: float
-) -> None:
+def test_mass_ends_where_bound_says(period: float, integrator: Integrator, mass: float) -> None:
     k_and_b = coupling(1000, 2)
     loop = SampledLoop(k_and_b, period, mass=mass, integrator=integrator)
     bound = environment_minimum_damping(k_and_b, period, mass, integrator)
