@@ -156,9 +156,7 @@ def part_of(node: ast.expr, parts: dict[str, str]) -> str | None:
     """Returns the sub-record that an expression belongs to: ``s.energy.slack``, ``energy["x"]``."""
     found = None
     while isinstance(node, ast.Attribute | ast.Subscript):
-        name = node.attr if isinstance(node, ast.Attribute) else None
-        if isinstance(node, ast.Subscript) and isinstance(node.slice, ast.Constant):
-            name = node.slice.value
+        name = node.attr if isinstance(node, ast.Attribute) else ast.unparse(node.slice).strip("'")
         found = name if name in WRITERS else found
         node = node.value
     return parts.get(node.id, found) if isinstance(node, ast.Name) else None
