@@ -53,7 +53,7 @@ class Limits:
         torque: Largest norm of the torque in N m, > 0.
         rise: Shortest time in s from zero to the limits, >= 0; 0 allows steps.
         ramp: Time in s of the linear rise at the start, 0 to 60. It takes longer if the coupling
-            stores much energy meanwhile (``kernel.ramp``).
+            stores much energy meanwhile (``kernel.guard``).
         stretch: Largest distance between handle and grip divided by the scale, in m, > 0. Beyond
             this and the next two limits the run is stopped.
         angle: Largest angle between handle and grip in rad, > 0 and < π, or inf.

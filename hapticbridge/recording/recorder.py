@@ -335,7 +335,7 @@ _FULL = "the disk is full; the recording ends here and is whole"
 class RecordStream:
     """Records leave through a ring, events through a pipe; the loop never waits in real time.
 
-    ``kernel.publish.publish`` writes to ``rows`` and ``cursors``. With a file or a status line the
+    ``kernel.tick.publish`` writes to ``rows`` and ``cursors``. With a file or a status line the
     recorder's process reads them; otherwise the ring keeps the newest records. Close it after the
     loop in any case.
 
@@ -350,7 +350,7 @@ class RecordStream:
 
     Attributes:
         rows: The ring's records, ``TICK_DTYPE``.
-        cursors: The ring's cursors, ``kernel.publish.HEAD`` and ``TAIL``.
+        cursors: The ring's cursors, ``kernel.tick.HEAD`` and ``TAIL``.
         recorder: The recorder's process once started; None without one.
         lost: Flag of the next record: ``DROPPED_BEFORE`` if the one before it was lost, else 0.
         dropped: Number of lost records.
