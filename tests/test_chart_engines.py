@@ -15,16 +15,14 @@ from engine_tasks import engine_or_skip
 from matplotlib.container import ErrorbarContainer
 
 from hapticbridge.errors import StudyError
-from hapticbridge.lab.chart import (
-    Extent,
-    contact_bodies,
-    measure_chart,
-    open_workload,
-    peer_settings,
-)
 from hapticbridge.lab.chart import chart as chart_module
-from hapticbridge.lab.chart.chart import Chart, interleaved_costs
-from hapticbridge.lab.chart.engine_run import EngineRun
+from hapticbridge.lab.chart import contact_bodies
+from hapticbridge.lab.chart.catalogue import (
+    Extent,
+    open_workload,
+)
+from hapticbridge.lab.chart.chart import Chart, interleaved_costs, measure_chart
+from hapticbridge.lab.chart.engine_run import EngineRun, peer_settings
 from hapticbridge.lab.chart.output import (
     CEILING,
     draw_chart,

@@ -322,20 +322,8 @@ def limit_by_6(
     return np.asarray(maximum_stiffness(device_damping, period, spent))
 
 
-METHOD_COLOURS: Mapping[str, str] = {
-    "implicit": "#000000",
-    "compensated": "#9aa3d6",
-    "lossless": "#3a1fd1",
-    "implicitfast": "#7b3294",
-    "implicitfast:compensated": "#d684bd",
-    "explicit": "#00868b",
-    "explicit:implicitfast": "#5cc8d8",
-    "explicit:rk4": "#7f7f7f",
-    "weld": "#6b3f14",
-    "direct": "#d6219c",
-}
-"""Colour of each rendering method's lines. None is near a verdict's (``verdicts.COLOURS``: green,
-yellow, orange, red): red would say that a method is unstable."""
+METHOD_COLOURS = {name: f"C{place}" for place, name in enumerate(METHODS)}
+"""Colour of each rendering method's lines."""
 
 THEORY_COLOUR = "#1a5fb4"
 """Colour of what was computed and not measured, unless it is black."""

@@ -6,7 +6,7 @@ import itertools
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
-from typing import Any, TypeAlias
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -115,41 +115,17 @@ def exceptions(table: Table) -> list[dict[str, Any]]:
     return found
 
 
-Columns: TypeAlias = Sequence[tuple[str, float, str, float, str]]
-"""Of figures beside the bars: heading, right edge as a share of the bars' width, what stands there,
-its factor and format."""
-
-
-def draw_bars(
-    axes: Axes, found: Sequence[Mapping[str, Any]], names: Sequence[str], columns: Columns
-) -> None:
-    """Draws a bar an entry, runs by verdict, with what they came to in columns beside it.
-
-    Args:
-        axes: Where; the columns stand to their right.
-        found: An entry a bar; without one the axes say that no point could be computed.
-        names: Of the bars.
-        columns: What to write beside them.
-    """
+def draw_bars(axes: Axes, found: Sequence[Mapping[str, Any]], names: Sequence[str]) -> None:
+    """Draws one bar for each entry: its runs by verdict."""
     if not found:
         base.say_missing(axes)
         return
-    places = np.arange(len(found))[::-1]
     left = np.zeros(len(found))
     for verdict, colour in zip(base.VERDICTS[:3], base.COLOURS[:3], strict=True):
         width = np.array([one[verdict.replace(" ", "_")] for one in found])
-        axes.barh(places, width, left=left, color=colour, height=0.8)
+        axes.barh(names, width, left=left, color=colour, height=0.8)
         left = left + width
-    beside = axes.get_yaxis_transform()
-    for heading, share, name, factor, form in columns:
-        edge = 1 + share
-        axes.text(edge, len(found) - 0.3, heading, transform=beside, size=7, ha="right")
-        for place, one in zip(places, found, strict=True):
-            text = format(factor * one[name], form)
-            axes.text(edge, place, text, transform=beside, size=8, ha="right", va="center")
-    axes.set_yticks(places, names, size=8)
-    axes.set_xlim(0, max(left.max(), 1.0))
-    axes.set_ylim(-0.6, len(found) - 0.4)
+    axes.invert_yaxis()
     axes.set_xlabel("runs by verdict")
 
 
@@ -189,21 +165,6 @@ def searched(table: Table, name: str) -> dict[str, Any]:
         "median_depth": float(np.median(mine["median_depth"])),
         "largest_depth": float(mine["largest_depth"].max()),
     }
-
-
-SEARCH_COLUMNS: Columns = (
-    ("most energy\nmade, J", 0.34, "created", 1.0, ".1e"),
-    ("depth, mm:\nmedian", 0.66, "median_depth", 1e3, ".2f"),
-    ("\nlargest", 0.9, "largest_depth", 1e3, ".2f"),
-    ("steady depth,\n× shipped", 1.28, "static_depth", 1.0, ".3g"),
-    ("\nτ, ms", 1.5, "relaxation", 1e3, ".3g"),
-)
-"""Beside the bars. The steady depth is computed, the others are measured."""
-
-
-def draw_search(axes: Axes, found: Sequence[Mapping[str, Any]]) -> None:
-    """Draws a bar a treatment, runs by verdict, with what they came to in columns beside it."""
-    draw_bars(axes, found, [one["treatment"] for one in found], SEARCH_COLUMNS)
 
 
 COMPARED = ("implicit", "compensated", "lossless")
@@ -304,22 +265,6 @@ def methods_found(table: Table) -> list[dict[str, Any]]:
     return found
 
 
-METHOD_COLUMNS: Columns = (
-    ("most energy\nmade, J", 0.34, "created", 1.0, ".1e"),
-    ("slack\nused", 0.56, "slack_share", 1.0, ".2f"),
-    ("peak\nforce, N", 0.84, "peak_force", 1.0, ".1f"),
-    ("depth, mm:\nmedian", 1.2, "median_depth", 1e3, ".2f"),
-    ("\nlargest", 1.5, "largest_depth", 1e3, ".2f"),
-)
-"""Beside the bars: the largest of all runs, but for the median."""
-
-
-def draw_methods(axes: Axes, found: Sequence[Mapping[str, Any]]) -> None:
-    """Draws a bar a rig and method, runs by verdict, with what they came to beside it."""
-    names = [f"{one['method']}, {one['rig']}" for one in found]
-    draw_bars(axes, found, names, METHOD_COLUMNS)
-
-
 STEPS = (0.25, 20.0)
 """Range of timeconst/T, even in its logarithm."""
 
@@ -332,9 +277,6 @@ PANELS = (
     ("peg", "implicit", (1000.0, 6000.0), "peg in the hole, discrete"),
 )
 """Rig, method, K in N/m and title."""
-
-BESIDE = (1.0, 1.22)
-"""Width of bars and of the columns beside them, as a ratio."""
 
 CONTOUR = 160
 """Points along each axis from which the rule's lines are drawn; more make them smoother."""
@@ -357,17 +299,14 @@ def draw(table: Table, boundary: Mapping[str, Any]) -> Figure:
                 axes.set_xlabel("timeconst / T")
             if column == 0:
                 axes.set_ylabel("dampratio")
-    draw_methods(
-        between.add_subplot(between.add_gridspec(1, 2, width_ratios=BESIDE)[0]), boundary["methods"]
-    )
+    methods, search = boundary["methods"], boundary["search"]
+    draw_bars(between.subplots(), methods, [f"{one['method']}, {one['rig']}" for one in methods])
     between.suptitle(
         f"The methods on the contact as shipped, {HANDS} hands each: taps on a wall, and in and "
         "out of the hole's mouth;\ntools and K as below, B = 1.25 K T felt",
         fontsize="small",
     )
-    draw_search(
-        below.add_subplot(below.add_gridspec(1, 2, width_ratios=BESIDE)[0]), boundary["search"]
-    )
+    draw_bars(below.subplots(), search, [one["treatment"] for one in search])
     below.suptitle(
         "The search on the peg: 30, 100 and 300 g, K = 1000 and 6000 N/m, friction 0 and 0.42,\n"
         "one recorded and two random hands",
@@ -414,8 +353,7 @@ def _draw_panel(axes: Axes, table: Table, rig: str, method: str, stiffness: floa
         ha="center",
         arrowprops={"arrowstyle": "-", "lw": 0.6},
     )
-    axes.set_xlim(*STEPS)
-    axes.set_ylim(*DAMPING_RATIO)
+    axes.set(xlim=STEPS, ylim=DAMPING_RATIO)
 
 
 @cache

@@ -205,8 +205,7 @@ def draw(table: Table, _boundary: Mapping[str, Any]) -> Figure:
         limits = base.of_method(table, "limit", name)
         axes.plot(limits["damping"], limits.numbers("limit"), "o", color="black", ms=4, mfc="white")
         axes.set_title(f"{name}{_note(name)}", fontsize="medium")
-        axes.set_xlim(*DAMPING)
-        axes.set_ylim(*STIFFNESS)
+        axes.set(xlim=DAMPING, ylim=STIFFNESS)
     for axes in panels[5:]:
         axes.set_xlabel("coupling damping B (N s/m)")
         axes.tick_params(labelbottom=True)

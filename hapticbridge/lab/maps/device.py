@@ -22,18 +22,7 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.device import Hand, Motion, SimulatedDevice
 from hapticbridge.lab.closed_loop import LoopOutcome
 from hapticbridge.lab.maps import base
-from hapticbridge.lab.maps.base import (
-    METHOD_COLOURS,
-    Point,
-    Sentences,
-    StabilityMap,
-    largest_stable,
-    law_in_words,
-    of_method,
-    say_missing,
-    used_damping,
-    wall_loop,
-)
+from hapticbridge.lab.maps.base import Point, Sentences, StabilityMap
 from hapticbridge.lab.methods import METHODS
 from hapticbridge.plotting import new_figure
 from hapticbridge.sweep.results import Table
@@ -190,7 +179,7 @@ def pressed_device(beta: float, sigma: float, limit: float = 10.0) -> SimulatedD
 def _wall(
     name: str, device: SimulatedDevice, damping: float, ticks: int, knock: NDArray[np.float64]
 ) -> LoopOutcome:
-    return wall_loop(WALL_MASS).run(
+    return base.wall_loop(WALL_MASS).run(
         device,
         Coupling(STIFFNESS, damping, 0.0, 0.0),
         METHODS[name],
@@ -211,7 +200,7 @@ def friction_needed(name: str, damping: NDArray[np.float64]) -> NDArray[np.float
     References:
         Abbott & Okamura 2005.
     """
-    return 0.5 + used_damping(name, STIFFNESS, damping, PERIOD) / (PERIOD * STIFFNESS)
+    return 0.5 + base.used_damping(name, STIFFNESS, damping, PERIOD) / (PERIOD * STIFFNESS)
 
 
 def friction_to_rest(name: str, damping: float) -> float:
@@ -225,7 +214,7 @@ def friction_to_rest(name: str, damping: float) -> float:
         damping: B in N s/m asked for, >= 0.
     """
     beta = DAMPED / (STIFFNESS * PERIOD)
-    return largest_stable(
+    return base.largest_stable(
         lambda sigma: settle(beta, sigma, 0.0, damping, name)[0] != "rest", *FRICTION
     ).middle
 
@@ -303,8 +292,7 @@ def draw(table: Table, boundary: Mapping[str, Any]) -> Figure:
 
 
 def _draw_regions(axes: Axes, cells: Table) -> None:
-    axes.set_xscale("log")
-    axes.set_yscale("log")
+    axes.set(xscale="log", yscale="log")
     if len(cells):
         number = np.array([REGIONS.index(name) for name in cells["region"]])
         beta, sigma = np.unique(cells["beta"]), np.unique(cells["sigma"])
@@ -321,37 +309,36 @@ def _draw_regions(axes: Axes, cells: Table) -> None:
         }.items():
             axes.text(*place, f"theory:\n{name}", ha="center", va="center", fontsize="small")
     else:
-        say_missing(axes)
+        base.say_missing(axes)
     axes.axvline(0.5, color="black", lw=1.8)
     axes.axhline(0.5, color="black", lw=1.8)
-    axes.set_xlim(*RANGE)
-    axes.set_ylim(*RANGE)
+    axes.set(xlim=RANGE, ylim=RANGE)
     ticks = (0.1, 0.2, 0.5, 1.0, 2.0)
     axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
     axes.set_yticks(ticks, [f"{tick:g}" for tick in ticks])
     axes.minorticks_off()
-    axes.set_xlabel("damping of the device, β = b/(K T)")
-    axes.set_ylabel("friction of the device, σ = f_c/(K Δ)")
+    axes.set(
+        xlabel="damping of the device, β = b/(K T)", ylabel="friction of the device, σ = f_c/(K Δ)"
+    )
     axes.set_title("B = 0: pressed, and knocked; one law", fontsize="medium")
 
 
 def _draw_friction(axes: Axes, found: Mapping[str, Any]) -> None:
-    axes.set_xlabel("coupling damping B asked for (N s/m)")
-    axes.set_ylabel("friction needed, f_c/(K Δ)")
+    axes.set(xlabel="coupling damping B asked for (N s/m)", ylabel="friction needed, f_c/(K Δ)")
     axes.set_title(f"with a damper, b = {DAMPED:g} N s/m", fontsize="medium")
     if not found:
-        say_missing(axes)
+        base.say_missing(axes)
         return
     for name, size in zip(METHODS_SHOWN, SIZES, strict=True):
         if name in found:
-            mine, colour = found[name], METHOD_COLOURS[name]
+            mine, colour = found[name], base.METHOD_COLOURS[name]
             style: dict[str, Any] = {"color": colour, "mfc": "white", "ls": "", "ms": size}
             axes.plot(
                 mine["damping"],
                 mine["predicted"],
                 color=colour,
                 lw=size / 3,
-                label=f"{name}: {law_in_words(name)}",
+                label=f"{name}: {base.law_in_words(name)}",
             )
             for what, marker in MARKERS.items():
                 axes.plot(mine["damping"], mine[what], marker, **style)
@@ -415,7 +402,7 @@ def evaluate(point: Point) -> Mapping[str, float | str | bool]:
 def summarize(table: Table) -> dict[str, Any]:
     """Compares regions over β and σ, and the friction that a damper needs, with theory."""
     cells = table.select(table["what"] == "cell")
-    dampers = {name: of_method(table, "friction", name) for name in METHODS_SHOWN}
+    dampers = {name: base.of_method(table, "friction", name) for name in METHODS_SHOWN}
     return {
         "period": PERIOD,
         "stiffness": STIFFNESS,

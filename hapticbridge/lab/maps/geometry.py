@@ -264,14 +264,12 @@ def draw(table: Table, _boundary: Mapping[str, Any]) -> Figure:
             axes.plot(1e3 * lengths, contact_stiffness_limit(lengths), color="black", lw=1.8)
             x, y = mine.numbers("limit"), mine["stiffness"]
             axes.set_title("direct: no coupling", fontsize="medium")
-            axes.set_ylabel("contact stiffness K_c (N/m)")
-            axes.set_ylim(*CONTACT_STIFFNESS)
+            axes.set(ylabel="contact stiffness K_c (N/m)", ylim=CONTACT_STIFFNESS)
         else:
             axes.axhline(BOUNDS[name], color=base.THEORY_COLOUR, lw=1.8, ls="--")
             x, y = mine["length"], mine.numbers("limit")
             axes.set_title(f"{name}, {base.law_in_words(name, '_r')}", fontsize="medium")
-            axes.set_ylabel("coupling stiffness K_r (N m/rad)")
-            axes.set_ylim(*ROTATIONAL_STIFFNESS)
+            axes.set(ylabel="coupling stiffness K_r (N m/rad)", ylim=ROTATIONAL_STIFFNESS)
         axes.plot(1e3 * x, y, "o", color="black", ms=4, mfc="white")
         axes.set_xlim(1e3 * LENGTH[0], 1e3 * LENGTH[1])
     for axes in panels[2:]:

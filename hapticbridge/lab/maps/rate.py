@@ -297,8 +297,7 @@ def draw(_table: Table, boundary: Mapping[str, Any]) -> Figure:
 def _draw_delays(axes: Axes, name: str, by_delay: Mapping[str, Any]) -> None:
     # one hue, lighter the later: a delay is a quantity, and verdicts own the other colours
     shade = matplotlib.colormaps["Blues_r"]
-    axes.set_xscale("log")
-    axes.set_yscale("log")
+    axes.set(xscale="log", yscale="log")
     for delay, mine in by_delay.items():
         colour, period = shade(0.65 * int(delay) / (DELAYS - 1)), 1e3 * np.array(mine["period"])
         axes.plot(period, mine["predicted"], color=colour, label=delay)

@@ -6,7 +6,7 @@ is MuJoCo's alone, by integrator and contact setting.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -207,8 +207,15 @@ def draw(table: Table, boundary: Mapping[str, Any]) -> Figure:
     for axes, name in zip(panels[0], DRAWN, strict=True):
         _draw_curves(axes, table, name)
     panels[0, 0].set_ylabel("change of kinetic energy (J)")
-    _draw_bars(panels[1, 0], by_setting)
-    _draw_gains(panels[1, 1], by_setting)
+    found = by_setting.values()
+    distances = {law: [row["rms_distance_to_law"][law] for row in found] for law in COLOURS}
+    _draw_bars(panels[1, 0], by_setting, distances, "distance from MuJoCo, RMS (J)")
+    largest = {
+        "MuJoCo": [row["largest_energy_change"] for row in found],
+        "newton": [row["largest_by_newton"] for row in found],
+    }
+    label = "largest change of energy (J)\nblack: MuJoCo, blue: Newton"
+    _draw_bars(panels[1, 1], by_setting, largest, label)
     figure.suptitle(
         f"A rod of {MASS:g} kg and {LENGTH:g} m falls at {APPROACH:g} m/s on MuJoCo's floor;\n"
         f"above: it slides at {SLIDE:g} m/s, friction {SHOWN:g}",
@@ -249,34 +256,19 @@ def _named(law: str) -> str:
     return "any law, e = 0" if law == "inelastic" else law.capitalize()
 
 
-def _draw_bars(axes: Axes, by_setting: Mapping[str, Summary]) -> None:
-    place = np.arange(len(by_setting))
-    for shift, (law, colour) in enumerate(COLOURS.items()):
-        distances = [row["rms_distance_to_law"][law] for row in by_setting.values()]
-        axes.barh(place + 0.2 * (shift - 1.5), distances, 0.2, color=colour)
-    axes.set_yticks(place, [name.replace(", ", ",\n", 1) for name in by_setting], fontsize="small")
-    axes.invert_yaxis()
-    axes.set_xlabel("distance from MuJoCo, RMS (J)")
-
-
-def _draw_gains(axes: Axes, by_setting: Mapping[str, Summary]) -> None:
-    place = np.arange(len(by_setting))
-    axes.barh(
-        place - 0.18,
-        [row["largest_energy_change"] for row in by_setting.values()],
-        0.36,
-        fc="black",
-    )
-    axes.barh(
-        place + 0.18,
-        [row["largest_by_newton"] for row in by_setting.values()],
-        0.36,
-        color=COLOURS["newton"],
-    )
-    axes.set_yticks(place, [name.replace(", ", ",\n", 1) for name in by_setting], fontsize="small")
+def _draw_bars(
+    axes: Axes, names: Iterable[str], rows: Mapping[str, Sequence[float]], label: str
+) -> None:
+    """Draws a bar per setting for each law, or for MuJoCo in black."""
+    names = [name.replace(", ", ",\n", 1) for name in names]
+    place, height = np.arange(len(names)), 0.8 / len(rows)
+    for shift, (law, values) in enumerate(rows.items()):
+        centre = place + height * (shift - (len(rows) - 1) / 2)
+        axes.barh(centre, values, height, color=COLOURS.get(law, "black"))
+    axes.set_yticks(place, names, fontsize="small")
     axes.invert_yaxis()
     axes.axvline(0.0, color="black", lw=0.6)
-    axes.set_xlabel("largest change of energy (J)\nblack: MuJoCo, blue: Newton")
+    axes.set_xlabel(label)
 
 
 RESTITUTION_LAWS: tuple[Law, ...] = ("newton", "poisson", "stronge")

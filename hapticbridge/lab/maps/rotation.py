@@ -225,7 +225,7 @@ def _run(binding: BoundKernel, samples: NDArray[np.void], records: NDArray[np.vo
     for first in range(0, TICKS, CHUNK):
         part = slice(first, first + CHUNK)
         done = simulate(binding.state, samples[part], binding.row, records[part])
-        if done < CHUNK or not binding.state["kinetic"][0] < DIVERGED:
+        if done < CHUNK or not binding.state["energy"]["kinetic"][0] < DIVERGED:
             return first + done
     return TICKS
 
@@ -443,9 +443,11 @@ def _draw_cut(axes: Axes, table: Table) -> None:
         axes.plot(mine["speed"], shown, "o-", color=colour, ms=3, lw=width, label=label)
     axes.axvline(cut_speed(SOFT), color=base.THEORY_COLOUR, ls="--", lw=1.2, label="ω = π √(K_r/I)")
     axes.axhline(2 * np.pi * SOFT, color=base.THEORY_COLOUR, ls=":", lw=1.2, label="2π K_r")
-    axes.set_ylim(0, HIGHEST)
-    axes.set_xlabel("speed of a sudden turn (rad/s)")
-    axes.set_ylabel("largest jump of torque\nin a tick (N m)")
+    axes.set(
+        xlabel="speed of a sudden turn (rad/s)",
+        ylabel="largest jump of torque\nin a tick (N m)",
+        ylim=(0, HIGHEST),
+    )
     axes.legend(fontsize="x-small", loc="upper right", bbox_to_anchor=(1.0, 0.95))
 
 

@@ -366,8 +366,7 @@ def draw(table: Table, _boundary: Mapping[str, Any]) -> Figure:
                 rows.numbers("limit"), rows["stiffness"], marker, color="black", mfc="white", ms=4.5
             )
         axes.set_title(name, fontsize="medium")
-        axes.set_xlim(*MASS)
-        axes.set_ylim(*STIFFNESS)
+        axes.set(xlim=MASS, ylim=STIFFNESS)
     for axes in panels[3:]:
         axes.set_xlabel("tool mass m (kg)")
         axes.set_xticks(np.geomspace(MASS[0], MASS[1] / 10, 4))  # the last would touch the next
