@@ -181,6 +181,16 @@ def test_closing_twice_is_allowed(device: Device) -> None:
     device.close()
 
 
+@pytest.mark.parametrize("name", ["rawhid", "haply", "omega.3", "sigma.7", "stick"])
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_a_force_that_is_not_finite_is_not_sent(name: str, value: float, tmp_path: Path) -> None:
+    device = DEVICES[name](tmp_path)
+    device.start(PERIOD)
+    for axis in (0, 1):
+        with pytest.raises(DeviceError, match="that is not finite was not sent"):
+            device.write(np.where(np.arange(6) == axis, value, 0.0))
+
+
 def test_an_impossible_period_and_a_read_before_the_start_are_refused(device: Device) -> None:
     with pytest.raises(DeviceError, match="before it was started"):
         device.read(np.zeros(1, SAMPLE_DTYPE))

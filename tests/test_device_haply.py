@@ -18,7 +18,7 @@ from hapticbridge.device import SimulatedDevice, open_device
 from hapticbridge.device import watchdog as silence
 from hapticbridge.device.haply import device as haply
 from hapticbridge.device.haply import messages
-from hapticbridge.device.haply.device import FORCE_LIMIT, MOST_UNDER_WAY, HaplyDevice
+from hapticbridge.device.haply.device import FORCE_LIMIT, HaplyDevice
 from hapticbridge.device.trajectory import Motion
 from hapticbridge.device.transport import websocket as transport
 from hapticbridge.errors import DeviceError, DeviceLost
@@ -94,18 +94,12 @@ def test_the_pose_is_the_services_and_nothing_turns() -> None:
 
 
 def test_a_service_slower_than_the_loop_gets_the_newest_force_and_no_queue() -> None:
-    bench = Bench(work=2.7e-3)
-    device = bench.opened()
-    assert device.info.rate == pytest.approx(1 / 2.7e-3, rel=0.01)
-    device.start(PERIOD)
-    flags = ticks(bench, device, 300)
-    assert np.count_nonzero(flags) == pytest.approx(300 * (1 - 1 / 2.7), abs=4)
-    assert device.held_back == pytest.approx(300 * (1 - 1 / 2.7), abs=6)
-    assert device._under_way <= MOST_UNDER_WAY
-
-
-def test_of_the_forces_that_wait_for_a_slow_service_the_newest_goes_first() -> None:
     bench, device = started(work=2.7e-3)
+    assert device.info.rate == pytest.approx(1 / 2.7e-3, rel=0.01)
+    flags = ticks(bench, device, 300)
+    missed = 300 * (1 - 1 / 2.7)
+    assert np.count_nonzero(flags) == pytest.approx(missed, abs=4)
+    assert device.held_back == pytest.approx(missed, abs=6)
     sample, wrench, answers = np.zeros(1, SAMPLE_DTYPE), np.zeros(6), 0
     for k in range(100):
         bench.time.advance(bench.time.now + PERIOD)
@@ -144,16 +138,6 @@ def test_closing_leaves_no_force_and_may_be_done_twice() -> None:
     device.close()
     device.close()
     assert not inverse.force.any()
-    assert bench.link.is_closed
-
-
-def test_a_dropped_connection_is_a_lost_device() -> None:
-    bench, device = started()
-    ticks(bench, device, 5)
-    bench.link.is_dropped = True
-    with pytest.raises(DeviceLost):
-        ticks(bench, device, 3)
-    device.close()
     assert bench.link.is_closed
 
 
@@ -310,14 +294,9 @@ def test_numbers_and_limits_come_from_whoever_knows_them() -> None:
         Bench().opened(damping=-1)
 
 
-def test_a_force_that_is_not_finite_and_a_slow_loop_are_refused() -> None:
-    bench = Bench()
-    device = bench.opened()
+def test_a_slow_loop_is_refused() -> None:
     with pytest.raises(DeviceError, match="the rate must be at least 50 Hz"):
-        device.start(0.021)
-    device.start(0.02)
-    with pytest.raises(DeviceError, match="not finite was not sent"):
-        device.write(np.full(6, np.nan))
+        Bench().opened().start(0.021)
 
 
 def test_real_sockets_run_and_are_logged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

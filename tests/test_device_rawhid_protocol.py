@@ -17,19 +17,7 @@ from hypothesis import strategies as st
 
 from hapticbridge.device.base import AXES
 from hapticbridge.device.rawhid import device as driver
-from hapticbridge.device.rawhid.protocol import (
-    FRAME_BYTES,
-    Numbers,
-    State,
-    Status,
-    ask_frame,
-    crc16,
-    decoded,
-    force_frame,
-    sheet_frames,
-    state_frame,
-    version_of,
-)
+from hapticbridge.device.rawhid import protocol
 
 DOCUMENT = Path(driver.__file__).parents[1].joinpath("rawhid.md").read_text(encoding="utf-8")
 NAN = math.nan
@@ -37,13 +25,15 @@ NAN = math.nan
 single = st.floats(-(2.0**99), 2.0**99, width=32)
 any_single = st.floats(width=32)
 u8, u16 = st.integers(0, 255), st.integers(0, 65535)
-states = st.builds(State, u8, u16, u16, st.integers(0, 2**32 - 1), st.tuples(*[single] * 12), u16)
+states = st.builds(
+    protocol.State, u8, u16, u16, st.integers(0, 2**32 - 1), st.tuples(*[single] * 12), u16
+)
 
 WRITTEN = {
-    "Force 7": force_frame(7, (1.0, -0.5, 0.0, 0.0, 0.0, 0.01), 20),
-    "State 258": state_frame(
-        State(
-            Status.ENABLED,
+    "Force 7": protocol.force_frame(7, (1.0, -0.5, 0.0, 0.0, 0.0, 0.01), 20),
+    "State 258": protocol.state_frame(
+        protocol.State(
+            protocol.Status.ENABLED,
             258,
             1,
             1_000_000,
@@ -51,11 +41,13 @@ WRITTEN = {
             7,
         )
     ),
-    "Ask 1": ask_frame(1, 0),
-    "Sheet, page 0": sheet_frames(
-        1, Numbers(1, 990.0, NAN, 0.4, NAN, NAN, 0.05, 1.5e-5, 4.0, NAN, 2.0, 5e-4), ""
+    "Ask 1": protocol.ask_frame(1, 0),
+    "Sheet, page 0": protocol.sheet_frames(
+        1, protocol.Numbers(1, 990.0, NAN, 0.4, NAN, NAN, 0.05, 1.5e-5, 4.0, NAN, 2.0, 5e-4), ""
     )[0],
-    "Sheet, page 1": sheet_frames(2, Numbers(1, *[NAN] * 11), "one-axis capstan paddle")[1],
+    "Sheet, page 1": protocol.sheet_frames(
+        2, protocol.Numbers(1, *[NAN] * 11), "one-axis capstan paddle"
+    )[1],
 }
 
 
@@ -71,9 +63,9 @@ def test_the_documents_worked_frames_are_what_the_codec_writes() -> None:
 
 
 def test_the_crc_is_the_documents_bit_by_bit_and_has_its_check_value() -> None:
-    assert crc16(b"123456789") == crc(b"123456789") == 0x29B1
+    assert protocol.crc16(b"123456789") == crc(b"123456789") == 0x29B1
     for frame in documented().values():
-        assert len(frame) == FRAME_BYTES
+        assert len(frame) == protocol.FRAME_BYTES
         assert crc(frame[:62]) == struct.unpack("<H", frame[62:])[0]
 
 
@@ -100,7 +92,7 @@ def test_the_documents_fields_fill_64_bytes_without_a_gap(heading: str) -> None:
     for first in sorted(layout):
         assert first == place
         place = layout[first][0] + 1
-    assert place == FRAME_BYTES
+    assert place == protocol.FRAME_BYTES
 
 
 def test_the_worked_state_holds_its_numbers_where_the_document_says() -> None:
@@ -127,8 +119,8 @@ def test_the_worked_sheet_holds_its_numbers_where_the_document_says() -> None:
 
 
 @given(states)
-def test_any_state_survives_a_frame(state: State) -> None:
-    assert decoded(state_frame(state)) == state
+def test_any_state_survives_a_frame(state: protocol.State) -> None:
+    assert protocol.decoded(protocol.state_frame(state)) == state
 
 
 @given(
@@ -137,11 +129,14 @@ def test_any_state_survives_a_frame(state: State) -> None:
     st.text("a-é日🙂 7", max_size=80).map(str.strip),
 )
 def test_any_sheet_survives_its_frames(axes: int, values: list[float], name: str) -> None:
-    numbers, title = (decoded(frame) for frame in sheet_frames(9, Numbers(axes, *values), name))
-    assert isinstance(numbers, Numbers)
+    numbers, title = (
+        protocol.decoded(frame)
+        for frame in protocol.sheet_frames(9, protocol.Numbers(axes, *values), name)
+    )
+    assert isinstance(numbers, protocol.Numbers)
     assert isinstance(title, str)
     known = numbers.known()
-    for field, value in zip(Numbers._fields[1:], values, strict=True):
+    for field, value in zip(protocol.Numbers._fields[1:], values, strict=True):
         # equal as a float32, not as a double: the shortest text that means the same one
         stored = known[field]
         assert (stored is None) == (not math.isfinite(value))
@@ -153,39 +148,39 @@ def test_any_sheet_survives_its_frames(axes: int, values: list[float], name: str
 
 @given(st.binary(max_size=130))
 def test_arbitrary_bytes_are_no_frame(data: bytes) -> None:
-    assert decoded(data) is None
+    assert protocol.decoded(data) is None
 
 
 @given(st.binary(min_size=60, max_size=60))
 def test_whatever_passes_the_check_is_read_without_a_crash(body: bytes) -> None:
     for kind in range(0x3F, 0x54):
         frame = b"\x48\x01" + bytes([kind]) + body[:59]
-        news = decoded(frame + struct.pack("<H", crc(frame)))
+        news = protocol.decoded(frame + struct.pack("<H", crc(frame)))
         assert (news is None) == (kind not in (0x53, 0x44) or (kind == 0x44 and body[0] > 1))
 
 
 @given(states, st.integers(0, 64 * 8 - 1), st.integers(0, 64 * 8 - 1))
-def test_one_or_two_flipped_bits_never_pass(state: State, first: int, second: int) -> None:
-    frame = bytearray(state_frame(state))
+def test_one_or_two_flipped_bits_never_pass(state: protocol.State, first: int, second: int) -> None:
+    frame = bytearray(protocol.state_frame(state))
     for bit in {first, second}:
         frame[bit // 8] ^= 1 << bit % 8
-    assert decoded(bytes(frame)) is None
+    assert protocol.decoded(bytes(frame)) is None
 
 
 def test_a_frame_of_another_version_is_told_from_noise() -> None:
-    body = bytearray(state_frame(State(0, 0, 0, 0, (0.0,) * 12, 0))[:62])
+    body = bytearray(protocol.state_frame(protocol.State(0, 0, 0, 0, (0.0,) * 12, 0))[:62])
     body[1] = 2
     frame = bytes(body) + struct.pack("<H", crc(bytes(body)))
-    assert (version_of(frame), decoded(frame)) == (2, None)
-    assert version_of(frame[:-1] + bytes([frame[-1] ^ 1])) is None
+    assert (protocol.version_of(frame), protocol.decoded(frame)) == (2, None)
+    assert protocol.version_of(frame[:-1] + bytes([frame[-1] ^ 1])) is None
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 def test_a_state_that_is_not_finite_says_so(value: float) -> None:
     for place in range(12):
         numbers = tuple(value if i == place else 0.0 for i in range(12))
-        state = decoded(state_frame(State(0, 0, 0, 0, numbers, 0)))
-        assert isinstance(state, State)
+        state = protocol.decoded(protocol.state_frame(protocol.State(0, 0, 0, 0, numbers, 0)))
+        assert isinstance(state, protocol.State)
         assert not state.is_finite
 
 
@@ -221,69 +216,69 @@ def wrench_at(shim: ctypes.CDLL, now_us: int) -> tuple[float, ...]:
     return tuple(numbers)
 
 
-def state_at(shim: ctypes.CDLL, now_us: int, status: int = 0, *numbers: float) -> State:
+def state_at(shim: ctypes.CDLL, now_us: int, status: int = 0, *numbers: float) -> protocol.State:
     frame = ctypes.create_string_buffer(64)
     values = (ctypes.c_float * 12)(*(numbers or [0.0] * 12))
     shim.shim_state(values, 0x8001, status, now_us, frame)
-    state = decoded(frame.raw)
-    assert isinstance(state, State)
+    state = protocol.decoded(frame.raw)
+    assert isinstance(state, protocol.State)
     return state
 
 
 @given(st.binary(max_size=100))
 def test_both_crcs_agree(shim: ctypes.CDLL, data: bytes) -> None:
-    assert shim.shim_crc(data, len(data)) == crc16(data)
+    assert shim.shim_crc(data, len(data)) == protocol.crc16(data)
 
 
 @given(st.tuples(*[st.floats(-(2.0**99), 2.0**99, width=32)] * 12), st.integers(0, 2**32 - 1))
 def test_states_are_read_right(shim: ctypes.CDLL, numbers: tuple[float, ...], now_us: int) -> None:
     shim.shim_reset()
-    first = state_at(shim, now_us, Status.SATURATED, *numbers)
+    first = state_at(shim, now_us, protocol.Status.SATURATED, *numbers)
     assert first.numbers == numbers
     assert (first.time_us, first.sequence, first.buttons, first.echo) == (now_us, 1, 0x8001, 0)
-    assert first.status & Status.SATURATED
+    assert first.status & protocol.Status.SATURATED
     assert state_at(shim, now_us, 0, *numbers).sequence == 2
 
 
 @given(st.tuples(*[st.floats(-100.0, 100.0, width=32)] * 6), st.integers(0, 65535))
 def test_firmware_obeys_host(shim: ctypes.CDLL, wrench: tuple[float, ...], sequence: int) -> None:
     shim.shim_reset()
-    assert shim.shim_receive(force_frame(sequence, wrench, 20), 1000)
+    assert shim.shim_receive(protocol.force_frame(sequence, wrench, 20), 1000)
     assert wrench_at(shim, 1001) == wrench
     state = state_at(shim, 1002)
-    assert (state.echo, state.status) == (sequence, Status.ENABLED)
+    assert (state.echo, state.status) == (sequence, protocol.Status.ENABLED)
 
 
 @pytest.mark.parametrize("received_us", [0, 5_000_000, 2**32 - 10_000])
 def test_watchdog_zeroes_in_time_across_clocks_wrap(shim: ctypes.CDLL, received_us: int) -> None:
     shim.shim_reset()
-    shim.shim_receive(force_frame(1, WRENCH, 20), received_us)
+    shim.shim_receive(protocol.force_frame(1, WRENCH, 20), received_us)
     assert wrench_at(shim, (received_us + 19_999) % 2**32) == pytest.approx(WRENCH)
-    assert state_at(shim, (received_us + 19_999) % 2**32).status == Status.ENABLED
+    assert state_at(shim, (received_us + 19_999) % 2**32).status == protocol.Status.ENABLED
     assert wrench_at(shim, (received_us + 20_000) % 2**32) == (0.0,) * 6
-    assert state_at(shim, (received_us + 20_000) % 2**32).status & Status.WATCHDOG
+    assert state_at(shim, (received_us + 20_000) % 2**32).status & protocol.Status.WATCHDOG
     # the clock comes round to where the frame would be young again: it stays expired
     assert wrench_at(shim, received_us) == (0.0,) * 6
-    shim.shim_receive(force_frame(2, WRENCH, 20), received_us)
+    shim.shim_receive(protocol.force_frame(2, WRENCH, 20), received_us)
     assert wrench_at(shim, received_us) == pytest.approx(WRENCH)
 
 
 def test_no_watchdog_is_longer_than_a_second_and_none_stops_at_once(shim: ctypes.CDLL) -> None:
     shim.shim_reset()
-    shim.shim_receive(force_frame(1, WRENCH, 65535), 0)
+    shim.shim_receive(protocol.force_frame(1, WRENCH, 65535), 0)
     assert wrench_at(shim, 999_999) != (0.0,) * 6
     assert wrench_at(shim, 1_000_000) == (0.0,) * 6
-    shim.shim_receive(force_frame(2, WRENCH, 0), 0)
+    shim.shim_receive(protocol.force_frame(2, WRENCH, 0), 0)
     assert wrench_at(shim, 0) == (0.0,) * 6
 
 
 def test_motors_not_enabled_or_device_unfit_give_nothing(shim: ctypes.CDLL) -> None:
     shim.shim_reset()
     assert wrench_at(shim, 5) == (0.0,) * 6
-    shim.shim_receive(force_frame(1, WRENCH, 20, is_enabled=False), 10)
+    shim.shim_receive(protocol.force_frame(1, WRENCH, 20, is_enabled=False), 10)
     assert wrench_at(shim, 11) == (0.0,) * 6
-    shim.shim_receive(force_frame(2, WRENCH, 20), 12)
-    for status in (Status.FAULT, Status.NOT_READY):
+    shim.shim_receive(protocol.force_frame(2, WRENCH, 20), 12)
+    for status in (protocol.Status.FAULT, protocol.Status.NOT_READY):
         assert state_at(shim, 13, status).status & status
         assert wrench_at(shim, 14) == (0.0,) * 6
         state_at(shim, 15)
@@ -293,34 +288,34 @@ def test_motors_not_enabled_or_device_unfit_give_nothing(shim: ctypes.CDLL) -> N
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 def test_force_not_finite_leaves_old_one_to_its_watchdog(shim: ctypes.CDLL, value: float) -> None:
     shim.shim_reset()
-    shim.shim_receive(force_frame(1, WRENCH, 20), 0)
+    shim.shim_receive(protocol.force_frame(1, WRENCH, 20), 0)
     for place in range(6):
         wrench = tuple(value if i == place else 0.0 for i in range(6))
-        assert not shim.shim_receive(force_frame(2, wrench, 20), 10_000)
+        assert not shim.shim_receive(protocol.force_frame(2, wrench, 20), 10_000)
     assert wrench_at(shim, 10_001) == pytest.approx(WRENCH)
     assert wrench_at(shim, 20_000) == (0.0,) * 6
 
 
 def test_damaged_frames_and_other_versions_and_kinds_change_nothing(shim: ctypes.CDLL) -> None:
     shim.shim_reset()
-    shim.shim_receive(force_frame(1, WRENCH, 20), 0)
-    good = force_frame(2, (0.0,) * 6, 20)
+    shim.shim_receive(protocol.force_frame(1, WRENCH, 20), 0)
+    good = protocol.force_frame(2, (0.0,) * 6, 20)
     for place in (0, 1, 2, 9, 62):
         assert not shim.shim_receive(good[:place] + bytes([good[place] ^ 4]) + good[place + 1 :], 1)
-    assert state_at(shim, 2).status == Status.ENABLED | Status.DAMAGED
+    assert state_at(shim, 2).status == protocol.Status.ENABLED | protocol.Status.DAMAGED
     assert wrench_at(shim, 3) == pytest.approx(WRENCH)
     shim.shim_receive(good, 4)
-    assert state_at(shim, 5).status == Status.ENABLED
+    assert state_at(shim, 5).status == protocol.Status.ENABLED
 
 
 def test_the_firmware_answers_with_its_sheet_once_per_question(shim: ctypes.CDLL) -> None:
     shim.shim_reset()
     frame = ctypes.create_string_buffer(64)
     assert not shim.shim_answer(frame)
-    shim.shim_receive(ask_frame(1, 0), 0)
+    shim.shim_receive(protocol.ask_frame(1, 0), 0)
     assert shim.shim_answer(frame)
-    numbers = decoded(frame.raw)
-    assert isinstance(numbers, Numbers)
+    numbers = protocol.decoded(frame.raw)
+    assert isinstance(numbers, protocol.Numbers)
     assert numbers.axis_names == ("x", "rz")
     assert numbers.known() == {
         "rate": 990.0,
@@ -335,10 +330,10 @@ def test_the_firmware_answers_with_its_sheet_once_per_question(shim: ctypes.CDLL
         "speed_limit": 2.0,
         "delay": 5e-4,
     }
-    shim.shim_receive(ask_frame(2, 1), 0)
+    shim.shim_receive(protocol.ask_frame(2, 1), 0)
     assert shim.shim_answer(frame)
-    assert decoded(frame.raw) == "shim"
-    shim.shim_receive(ask_frame(3, 2), 0)
+    assert protocol.decoded(frame.raw) == "shim"
+    shim.shim_receive(protocol.ask_frame(3, 2), 0)
     assert not shim.shim_answer(frame)
 
 
@@ -354,11 +349,11 @@ def _sketch(tmp_path_factory: pytest.TempPathFactory) -> ctypes.CDLL:
     return sketch
 
 
-def states_of(sketch: ctypes.CDLL) -> list[State]:
+def states_of(sketch: ctypes.CDLL) -> list[protocol.State]:
     frame, states = ctypes.create_string_buffer(64), []
     while sketch.sketch_fetch(frame):
-        states.append(decoded(frame.raw))
-    return [state for state in states if isinstance(state, State)]
+        states.append(protocol.decoded(frame.raw))
+    return [state for state in states if isinstance(state, protocol.State)]
 
 
 PWM, DIRECTION = 5, 8
@@ -377,7 +372,7 @@ def test_sketch_streams_below_hosts_rate_and_counts_every_frame(sketch: ctypes.C
 
 def test_the_sketch_pushes_as_told_and_its_interrupt_lets_go(sketch: ctypes.CDLL) -> None:
     for force, direction in ((2.0, 1), (-2.0, 0)):
-        sketch.sketch_send(force_frame(1, (force, 0.0, 0.0, 0.0, 0.0, 0.0), 20))
+        sketch.sketch_send(protocol.force_frame(1, (force, 0.0, 0.0, 0.0, 0.0, 0.0), 20))
         sketch.sketch_run(2_000, 1)
         # F x travel per radian / torque constant x resistance / supply, of 1023 steps
         duty = 2.0 * 0.070 * 0.005 / 0.075 / 0.0136 * 2.5 / 12.0
@@ -391,7 +386,7 @@ def test_the_sketch_pushes_as_told_and_its_interrupt_lets_go(sketch: ctypes.CDLL
 
 def test_what_the_sketch_does_with_interrupts_off_keeps_them_off(sketch: ctypes.CDLL) -> None:
     before = sketch.sketch_sections()
-    sketch.sketch_send(force_frame(1, WRENCH, 20))
+    sketch.sketch_send(protocol.force_frame(1, WRENCH, 20))
     sketch.sketch_run(1_010 * 3, 1)
     assert sketch.sketch_sections() >= before + 4  # a force frame, three states
     assert sketch.sketch_broken_sections() == 0

@@ -2,14 +2,11 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from cli_cases import Called
 from emulated.hid_device import HidDevice
 from emulated.hid_seam import DrivingClock, HidSeam
 from emulated.spacemouse_model import SpaceMouse
@@ -18,8 +15,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 import hapticbridge as hb
-from hapticbridge.device import registry as library
-from hapticbridge.device.family import Notify, ignore_message
+from hapticbridge.device.family import ignore_message
 from hapticbridge.device.spacemouse import (
     FAMILY,
     HELD,
@@ -238,17 +234,3 @@ def test_the_bridge_runs_on_it_without_force(tmp_path: Path, has_long_reports: b
     report = hb.audit(recording)
     assert (report.verdict, report.certified, report.port) == ("passive", None, "")
     assert np.ptp(hb.read_recording(recording).ticks["device_position"][:, 2]) > 0.001
-
-
-def test_command_line_has_nothing_to_certify(call: Called, monkeypatch: pytest.MonkeyPatch) -> None:
-    seam = HidSeam(SpaceMouse())
-
-    def open_it(options: Mapping[str, object], tell: Notify) -> SpaceMouseDevice:
-        return open_spacemouse(options, tell, seam)
-
-    family = replace(FAMILY, open=open_it)
-    monkeypatch.setattr(library, "family_named", lambda _: family)
-    code, out, _ = call("run", "peg_in_hole", "--device", "spacemouse:speed=0.2", "--duration", 0.1)
-    assert code == 0
-    assert "the device feels no force: there is nothing to certify" in out
-    assert "device unknown" not in out

@@ -1,23 +1,20 @@
-"""Every scene in twenty random hands of 3 cm and 45 degrees for 5 s: finite, passive, in bounds."""
+"""Every scene in eight random hands of 3 cm and 45 degrees for 5 s: finite, passive, in bounds."""
 
 from __future__ import annotations
 
 import functools
-import re
-import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
-from cli_cases import Called
 from model_runs import BOTTOMED_HEIGHT, HOME_HEIGHT, MODELS, Array
 from random_hands import T, random_motion, shaken, smooth
 
 import hapticbridge as hb
 from hapticbridge.device import DEFAULT_HAND, Hand, Motion, SimulatedDevice, device_for, scene_hand
-from hapticbridge.errors import DeviceError, SceneError
+from hapticbridge.errors import SceneError
 from hapticbridge.lab.closed_loop import ClosedLoop, LoopOutcome
 from hapticbridge.record import TickFlag
 from hapticbridge.scene import (
@@ -33,26 +30,26 @@ FORCE_LIMIT, TORQUE_LIMIT = 10.0, 0.5  # N and N m, of the default simulated dev
 
 HANDS: list[tuple[str, dict[str, float], float, int]] = [
     ("point_mass", {}, 0.0, 0),
-    ("virtual_wall", {}, 0.0, 2000),
-    ("planar_peg", {}, 0.0, 2000),
-    ("planar_peg", {}, -0.045, 30000),
-    ("planar_peg", {"length": 0.04}, -0.025, 30000),
-    ("planar_peg", {"length": 0.2}, -0.185, 30000),
-    ("peg_in_hole", {}, 0.0, 2000),
-    ("peg_in_hole", {}, -0.045, 30000),
-    ("round_peg", {}, 0.0, 2000),
-    ("round_peg", {}, -0.045, 30000),
-    ("drawer", {}, 0.0, 500),  # its friction holds it most times
-    ("hammer", {}, 0.0, 1000),
-    ("open_wrench", {}, 0.0, 30000),
-    ("ratchet", {}, 0.0, 30000),
-    ("pliers", {}, 0.0, 2000),
-    ("lock", {}, 0.0, 2000),
-    ("screwdriver", {}, -0.002, 30000),
-    ("hex_key", {}, -0.002, 30000),
+    ("virtual_wall", {}, 0.0, 800),
+    ("planar_peg", {}, 0.0, 800),
+    ("planar_peg", {}, -0.045, 12000),
+    ("planar_peg", {"length": 0.04}, -0.025, 12000),
+    ("planar_peg", {"length": 0.2}, -0.185, 12000),
+    ("peg_in_hole", {}, 0.0, 800),
+    ("peg_in_hole", {}, -0.045, 12000),
+    ("round_peg", {}, 0.0, 800),
+    ("round_peg", {}, -0.045, 12000),
+    ("drawer", {}, 0.0, 200),  # its friction holds it most times
+    ("hammer", {}, 0.0, 400),
+    ("open_wrench", {}, 0.0, 12000),
+    ("ratchet", {}, 0.0, 12000),
+    ("pliers", {}, 0.0, 800),
+    ("lock", {}, 0.0, 800),
+    ("screwdriver", {}, -0.002, 12000),
+    ("hex_key", {}, -0.002, 12000),
 ]
 """Scene, parameters, by how much the hand goes up in m before it is random (into the hole, or to
-press a tool that starts seated), and how many ticks of the twenty runs there is a contact at least:
+press a tool that starts seated), and how many ticks of the eight runs there is a contact at least:
 otherwise nothing was tried."""
 
 
@@ -95,7 +92,7 @@ def test_hands_leave_it_whole(
 ) -> None:
     loop = ClosedLoop(hb.load_scene(name, "grip", **values))
     contacts, strongest, worst = 0, -1.0, 0
-    for seed in range(20):
+    for seed in range(8):
         records = run_of(loop, seed, first).records
         contacts += int(np.count_nonzero(records["flags"] & TickFlag.CONTACT))
         twist = float(norms(records["wrench_on_tool"])[1].max())
@@ -288,22 +285,9 @@ TASKS: dict[str, Callable[[Done], None]] = {
 }
 
 
-def test_every_scene_has_a_task() -> None:
-    assert set(TASKS) == set(scene_names())
-
-
-@pytest.mark.parametrize("name", TASKS)
+@pytest.mark.parametrize("name", scene_names())
 def test_default_run_does_the_task(name: str) -> None:
     TASKS[name](default_run(name))
-
-
-def test_run_at_the_command_line_takes_the_same_hand(call: Called) -> None:
-    code, out, _ = call("run", "lock", "--fast", "--duration", "2")
-    assert code == 0
-    # two pairs of pins ask for more than the 2.4 N that the default hand has in it
-    peak = re.search(r"peak +([\d.]+) N,", out)
-    assert peak is not None
-    assert float(peak[1]) > 2.7
 
 
 # --- which hand it is -----------------------------------------------------------------------------
@@ -349,41 +333,21 @@ def test_options_go_before_what_the_scene_asks_for(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("numbers", "says"),
     [
-        ("1000", "must be stiffness in N/m and damping"),
-        ("1000 30 3", "must be stiffness in N/m and damping"),
-        ("1000 30 3 0.05 1", "must be stiffness in N/m and damping"),
+        *((numbers, "must be stiffness in N/m and damping")
+          for numbers in ("1000", "1000 30 3", "1000 30 3 0.05 1")),
         ("-1 30", "hand stiffness = -1"),
         ("1000 nan", "hand damping = nan"),
         ("1000 30 inf 0.05", "hand rotational_stiffness = inf"),
     ],
-)
-def test_numbers_no_hand_are_refused(numbers: str, says: str, tmp_path: Path, call: Called) -> None:
+)  # fmt: skip
+def test_numbers_that_are_no_hand_are_refused(numbers: str, says: str, tmp_path: Path) -> None:
     scene = scene_with_hand(tmp_path, numbers)
     with pytest.raises(SceneError, match=says) as refused:
         device_for(scene, "simulated")
     assert "simulated_hand" in str(refused.value)
-    assert "\n" not in str(refused.value)
-    code, out, err = call("run", str(scene.path), "--fast", "--duration", "0.01")
-    assert (code, out) == (2, "")
-    assert "Traceback" not in err
     # somebody who brings a hand, or no simulated device at all, is not concerned
     assert hand_of(scene, "simulated:hand=none") is None
-    path = tmp_path / "path.csv"
-    shutil.copy(MODELS / "drawer" / "drawer.csv", path)
-    device_for(scene, f"trajectory:{path}")
-
-
-def test_a_wrong_option_is_still_named_first(tmp_path: Path) -> None:
-    with pytest.raises(DeviceError, match="hand_stifness"):
-        device_for(scene_with_hand(tmp_path, "1000 30"), "simulated:hand_stifness=3")
-
-
-@pytest.mark.parametrize(("name", "words"), [("lock", "2000 N/m and 40 N s/m"),
-                                             ("peg_in_hole", "135 N/m and 6.5 N s/m")])  # fmt: skip
-def test_scene_s_page_at_command_line_names_hand(name: str, words: str, call: Called) -> None:
-    code, out, _ = call("scenes", name)
-    assert code == 0
-    assert f"simulated hand: {words}" in out
+    device_for(scene, f"trajectory:{MODELS / 'drawer' / 'drawer.csv'}")
 
 
 def own_hand(name: str) -> Hand:

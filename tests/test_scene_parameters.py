@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import re
 import tomllib
 from pathlib import Path
 
@@ -292,18 +291,6 @@ def test_values_are_recorded_and_run(tmp_path: Path, capsys: pytest.CaptureFixtu
     again = load_scene(tmp_path / "peg_in_hole.xml", **used)
     assert np.array_equal(again.model.geom_pos, model.geom_pos)
     capsys.readouterr()
-
-
-def test_scenes_shows_each_parameter_and_range(capsys: pytest.CaptureFixture[str]) -> None:
-    for name in scene_names():
-        assert main(["scenes", name]) == 0
-        shown = capsys.readouterr().out
-        assert shown.startswith(name)
-        parameters = scene_parameters(scene_path(name))
-        assert ("no parameters" in shown) == (not parameters)
-        for p in parameters:
-            row = rf"{p.name} +{p.default:g} +{p.minimum:g} to {p.maximum:g} +{p.unit}"
-            assert re.search(row, shown), shown
 
 
 def test_every_file_of_parameters_in_models_belongs_to_a_scene() -> None:

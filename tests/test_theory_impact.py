@@ -74,7 +74,7 @@ def test_rod_by_hand() -> None:
     assert impact.mode == Mode.STICKS_IN_COMPRESSION
 
 
-def marched(cases: Cases, law: Law, steps: int = 40_000) -> Array:
+def marched(cases: Cases, law: Law, steps: int = 10_000) -> Array:
     """P from Coulomb's law followed in small steps of P_n, knowing nothing of modes."""
     a, d, g = cases.body.compliance()
     if cases.other is not None:
@@ -87,8 +87,7 @@ def marched(cases: Cases, law: Law, steps: int = 40_000) -> Array:
     for _ in range(steps):
         # the friction that would stop the slip within this step, bounded by Coulomb's cone
         dq = np.clip((g * dp - v_t) / a, -mu * dp, mu * dp) * active
-        dn = dp * active
-        before = v_n.copy()
+        dn, before = dp * active, v_n.copy()
         v_t += a * dq - g * dn
         v_n += d * dn - g * dq
         p_t += dq
@@ -97,12 +96,11 @@ def marched(cases: Cases, law: Law, steps: int = 40_000) -> Array:
         ended = compressing & (v_n >= 0)
         p_c[ended], taken[ended] = p_n[ended], work[ended]
         compressing &= ~ended
-        if law == "newton":
-            done = v_n >= -e * start
-        elif law == "poisson":
-            done = p_n >= (1 + e) * p_c
-        else:
-            done = work - taken >= -(e**2) * taken
+        done = {
+            "newton": v_n >= -e * start,
+            "poisson": p_n >= (1 + e) * p_c,
+            "stronge": work - taken >= -(e**2) * taken,
+        }[law]
         active &= compressing | ~done
     assert not active.any()
     return np.stack([p_t, p_n], axis=-1)
@@ -115,8 +113,8 @@ def test_impulse_is_that_of_coulombs_law_followed_in_small_steps(law: Law, two: 
     impact = resolve_impact(cases.body, *cases[2:], law, cases.other)
     assert set(np.unique(impact.mode)) == set(Mode)
     size = np.linalg.norm(impact.impulse, axis=1, keepdims=True)
-    # the end is met to a step, 4e-5 of the impulse; compression's error counts 1 + e fold
-    assert np.abs((marched(cases, law) - impact.impulse) / size).max() < 1e-3
+    # the end is met to a step, 1.5e-4 of the impulse; compression's error counts 1 + e fold
+    assert np.abs((marched(cases, law) - impact.impulse) / size).max() < 4e-3
 
 
 @pytest.mark.parametrize("law", LAWS)
@@ -196,17 +194,16 @@ def test_laws_agree_without_friction_and_for_central_impact() -> None:
             assert impulses[2] == pytest.approx(impulses[0], abs=1e-13)
 
 
-def test_two_bodies_are_symmetric() -> None:
+def test_two_bodies_are_symmetric_and_an_immovable_one_is_the_ground() -> None:
     one, two = ImpactBody(1, 0.1, [0.2, -0.3]), ImpactBody(3, 0.4, [-0.1, 0.5])
-    forward = resolve_impact(one, [0.4, -1], 0.3, 0.5, other=two)
     # swapped, n turns by half a turn: so do arms, while the relative velocity keeps its sign twice
-    swapped = resolve_impact(
-        ImpactBody(3, 0.4, [0.1, -0.5]), [0.4, -1], 0.3, 0.5, other=ImpactBody(1, 0.1, [-0.2, 0.3])
-    )
+    turned_one, turned_two = ImpactBody(1, 0.1, [-0.2, 0.3]), ImpactBody(3, 0.4, [0.1, -0.5])
+    hit = ([0.4, -1], 0.3, 0.5)
+    forward = resolve_impact(one, *hit, other=two)
+    swapped = resolve_impact(turned_two, *hit, other=turned_one)
     assert swapped.impulse == pytest.approx(forward.impulse, abs=1e-14)
-    ground = resolve_impact(one, [0.4, -1], 0.3, 0.5, other=ImpactBody(1e18, 1e18, [0.1, 0.1]))
-    alone = resolve_impact(one, [0.4, -1], 0.3, 0.5)
-    assert ground.impulse == pytest.approx(alone.impulse, rel=1e-12)
+    ground = resolve_impact(one, *hit, other=ImpactBody(1e18, 1e18, [0.1, 0.1]))
+    assert ground.impulse == pytest.approx(resolve_impact(one, *hit).impulse, rel=1e-12)
 
 
 def test_a_jam_goes_on_until_the_slip_is_over() -> None:

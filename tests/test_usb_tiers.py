@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from emulated.compile_ahead import snapshot_of_compiled_code
-from emulated.guest import NO_KERNEL, GuestRun, has_pidff, kernel, run_in_guest
+from emulated.guest import NO_KERNEL, GuestRun, kernel, run_in_guest
 from emulated.parting import parting, repeated
 from emulated.tiers import JOBS, Claim, Job, claims_of, main
 
@@ -25,21 +25,6 @@ def test_what_a_tier_claims_holds(job: Job, tmp_path: Path) -> None:
     failed = [f"{claim.name}: {claim.note}" for claim in claims if claim.is_true is False]
     assert not failed, "\n".join(failed)
     assert claims
-
-
-def test_a_kernel_that_is_named_goes_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    cached, named = tmp_path / "hapticbridge/uml/linux", tmp_path / "named"
-    for place in (cached, named):
-        place.parent.mkdir(parents=True, exist_ok=True)
-        place.write_text("")
-        place.chmod(0o755)
-    monkeypatch.setenv("HAPTICBRIDGE_UML", str(named))
-    assert kernel() == named
-    monkeypatch.delenv("HAPTICBRIDGE_UML")
-    assert kernel() == cached
-    cached.chmod(0o644)
-    assert kernel() != cached
 
 
 def test_a_job_that_cannot_run_is_skipped_with_the_reason_and_a_false_claim_fails_the_run(
@@ -184,15 +169,3 @@ def test_a_guest_says_how_its_command_ended_and_one_that_hangs_is_stopped(tmp_pa
     silent = run_in_guest(endless, tmp_path, environment={}, is_virtual=True, patience=3.0)
     assert silent.status is None
     assert silent.output == "begun\nthe guest was stopped: it had printed nothing for 3 s"
-
-
-@pytest.mark.parametrize("text", [b"HID PID devices by", b"Force feedback for Logitech"])
-def test_pidff_is_recognized(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: bytes) -> None:
-    named = tmp_path / "linux"
-    monkeypatch.setenv("HAPTICBRIDGE_UML", str(named))
-    assert not has_pidff()
-    named.write_bytes(b"\x7fELF\0" + text)
-    named.chmod(0o755)
-    assert not has_pidff()
-    named.write_bytes(b"\x7fELF\0Force feedback for USB " + text)
-    assert has_pidff() == text.startswith(b"HID PID")
