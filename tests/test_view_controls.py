@@ -39,6 +39,7 @@ from hapticbridge.view.server import serve, stop
 # viser's threads and sockets end with the process
 pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 
+CLUTCH = "clutch (the hand moves alone)"
 K, B = "stiffness K (N/m)", "damping B (N s/m)"
 KR, BR = "turning stiffness K_r (N m/rad)", "turning damping B_r (N m s/rad)"
 
@@ -92,9 +93,7 @@ def pressed(tab: Tab, key: str) -> None:
         tab._ask("Input.dispatchKeyEvent", type=kind, key=key, code=key)
 
 
-def test_a_slider_of_the_page_moves_the_stiffness_and_the_recording_says_so(
-    tmp_path: Path,
-) -> None:
+def test_a_slider_of_the_page_moves_the_stiffness_and_the_recording_says_so(tmp_path: Path) -> None:
     with running(tmp_path) as (bridge, window), browser(tmp_path) as tab:
         page = tab()
         page.open(window.url, 1200, 1300)
@@ -172,12 +171,12 @@ def switched(**bits: bool) -> dict[str, Any]:
 
 def test_the_page_follows_others_and_what_was_refused_and_asks_for_nothing_again() -> None:
     with controls() as (shown, page, asked):
-        page.find("clutch")
+        page.find(CLUTCH)
         shown.note(coupled(stiffness=1234.567, damping=0.77))
         shown.note(switched(force=False, clutch=True))
         until(lambda: page.shows(K, 1235.0))
         until(lambda: page.shows(B, 0.77))
-        until(lambda: page.shows("force", False) and page.shows("clutch", True))
+        until(lambda: page.shows("force", False) and page.shows(CLUTCH, True))
         assert asked == []
         shown.note(switched(force=True))
         page.send(K, value=1800.0)
