@@ -29,13 +29,10 @@ from hapticbridge.rendering import Method, default_method, method_named
 from hapticbridge.scene import Scene, load_scene, settings_from
 from hapticbridge.signals import interrupting_on_signals
 from hapticbridge.summary import Summary, coupling_sentences, is_always_held
-from hapticbridge.units import format_si
+from hapticbridge.units import format_energy, format_si
 
 if TYPE_CHECKING:
     from hapticbridge.view import Window
-
-# How ``hapticbridge run`` says what it will do, and what it did.
-
 
 def announce(
     bridge: Bridge, scales: tuple[float, float], substeps: int, *, is_method_asked: bool
@@ -135,8 +132,8 @@ def print_summary(summary: Summary, laws: int, *, is_felt: bool = True) -> None:
     if summary.reach is not None:
         table.add_row("reach", f"{format_si(summary.reach, 'm')}; beyond, no handle and no force")
     for name, joules in summary.energies.items():
-        if joules:  # a scene without motors or springs has no news of them
-            table.add_row(name.replace("_", " "), format_si(joules, "J"))
+        if joules:  # exactly 0 without motors or springs
+            table.add_row(name.replace("_", " "), format_energy(joules))
     out.print(table)
     used = f", {summary.slack_share:.0%} of the slack used" if summary.slack_share else ""
     out.print(f"environment [bold]{summary.verdict}[/bold] ({summary.environment}{used})")
