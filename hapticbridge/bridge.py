@@ -100,8 +100,8 @@ class Bridge(Commanded):
         state, row = self._binding.state, self._binding.row
         model, data, substeps = self.scene.model, self.scene.data, range(self._substeps)
         stream, records, cursors = self._stream, self._stream.rows, self._stream.cursors
-        sample, wrench = self._sample, state["wrench_on_device"][0]
-        outside = state["outside"]
+        sample, wrench = self._sample, self._binding.wrench_on_device
+        outside = self._binding.external_flags
         before, answer, finish = self._before_step, self._answer_step, self._finish_tick
         read_device, write_device = self.device.read, self.device.write
         wait, now, hand_over = self.clock.wait, self.clock.now, self._publish

@@ -265,9 +265,7 @@ def export(
     recording = open_recording(path)
     target = target_for(path, form) if target is None else Path(target)
     if target.suffix.lower() not in endings:
-        raise RecordingError(
-            f"'{target}' does not end like {form}; its endings: {', '.join(endings)}"
-        )
+        raise RecordingError(f"the {form} file '{target}' must end in {' or '.join(endings)}")
     files = (target, sidecar_of(target)) if form == "csv" else (target,)
     for file in files:
         if file.exists() and file.samefile(recording.path):

@@ -16,7 +16,7 @@ from hapticbridge.device.registry import DRIVERS
 from hapticbridge.errors import DeviceError, choices
 from hapticbridge.kernel.codes import BACKWARDS, BAD_SAMPLE, GAVE_ENERGY, JUMPED, STRETCHED, TWISTED
 from hapticbridge.kernel.handle import handle_pose
-from hapticbridge.kernel.parameters import DAMPER, ENVIRONMENT, MOST_BUTTONS, OFF, GuardParameters
+from hapticbridge.kernel.parameters import DAMPER, ENVIRONMENT, MAX_BUTTONS, OFF, GuardParameters
 from hapticbridge.pose import canonical
 from hapticbridge.record import SAMPLE_DTYPE
 
@@ -218,8 +218,8 @@ def refuse_simulated_time(device: DeviceInfo | str, clock: Clock) -> None:
         is_bound = device.is_real or follows
     if is_bound and isinstance(clock, SimulatedClock):
         raise DeviceError(
-            f"the device '{name}' moves in real time, so the loop cannot run as fast as it "
-            "goes; leave out --fast (in code: the SimulatedClock)"
+            f"the device '{name}' moves in real time, so the loop cannot run faster; leave out "
+            "--fast (in code: the SimulatedClock)"
         )
 
 
@@ -231,17 +231,17 @@ def refuse_stretched_start(
     Raises:
         DeviceError: The message names the handle's distance from the grip, and the grip's position.
     """
-    s = state[0]
+    pose = state["pose"][0]
     x, y, z = sample["position"][0].tolist()
     quaternion = canonical(tuple(sample["quaternion"][0].tolist()))
-    handle, _ = handle_pose(state, (x, y, z), quaternion)
-    distance = float(np.linalg.norm(np.subtract(handle, s["tool_position"])))
-    force = float(s["stiffness"]) * distance
+    handle, _ = handle_pose(state["run"][0], pose, (x, y, z), quaternion)
+    distance = float(np.linalg.norm(np.subtract(handle, pose["tool_position"])))
+    force = float(state["coupling"]["stiffness"][0]) * distance
     if force > limits.force:
         raise DeviceError(
             f"the device's absolute pose puts the handle {1e3 * distance:.3g} mm from the grip, "
             f"{force:.3g} N at the start; the limit is {limits.force:g} N: start nearer to "
-            f"{np.round(s['tool_position'], 4).tolist()} m or use relative poses"
+            f"{np.round(pose['tool_position'], 4).tolist()} m or use relative poses"
         )
 
 
@@ -316,9 +316,9 @@ LONGEST_STALL, STALL_PERIODS = 0.05, 5
 position is unknown: at 0.4 m/s it has moved 20 mm."""
 
 RAMP_ENERGY = 0.01
-"""Energy in J that the coupling may store while the wrench rises at full pace (7 N at 2400 N/m),
-and that a start may give to the hand during its ramp. It is a quarter of the energy limit, so that
-a start alone never ends a run. A smaller value slows the rise with a heavy tool."""
+"""Energy in J that the coupling may store while the wrench rises at full pace: 7 N at 2400 N/m. A
+start may give as much to the hand during its ramp. It is a quarter of the energy limit, so that a
+start alone never ends a run. A smaller value slows the rise with a heavy tool."""
 
 JUMP_MARGIN = 2.0
 """Factor on the data sheet's speed limit, without unit. A late sample followed by a punctual one
@@ -339,8 +339,8 @@ def button_mask(button: int | None, what: str) -> int:
     """
     if button is None:
         return 0
-    if isinstance(button, bool) or not isinstance(button, int) or not 0 <= button < MOST_BUTTONS:
-        raise DeviceError(f"{what} button is {button!r}; it must be 0 to {MOST_BUTTONS - 1}")
+    if isinstance(button, bool) or not isinstance(button, int) or not 0 <= button < MAX_BUTTONS:
+        raise DeviceError(f"{what} button is {button!r}; it must be 0 to {MAX_BUTTONS - 1}")
     return 1 << button
 
 

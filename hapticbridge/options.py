@@ -48,8 +48,8 @@ from hapticbridge.scene import Scene, load_scene
 
 # Map between the device's frame and the scene's, and the run parameters of a start.
 #
-# The live loop, the closed-loop sweeps and the studies build their parameters here, so that one
-# method on one device has equal parameters in all of them.
+# The live loop, the closed-loop sweeps and the studies build their parameters here. One method
+# on one device therefore has equal parameters in all of them.
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

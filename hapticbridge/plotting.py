@@ -30,7 +30,7 @@ def check_ending(path: Path) -> None:
     """
     if path.suffix.lower() not in ENDINGS:
         raise HapticBridgeError(
-            f"'{path}' does not end like a picture; endings: {', '.join(ENDINGS)}"
+            f"the picture '{path}' must end in {', '.join(ENDINGS[:-1])} or {ENDINGS[-1]}"
         )
     if not path.absolute().parent.is_dir():
         raise HapticBridgeError(f"cannot write '{path}': its folder does not exist")

@@ -422,7 +422,7 @@ def _guard_runs() -> Iterator[tuple[str, Run]]:
             name = f"commands, {method}" + (", pipelined" if is_ahead else "")
             options = {"method": method, "pipelined": is_ahead, "coupling": COUPLING}
             yield name, Run(PEG, Scripted, options, 0.6, act=commands(CHANGES))
-    for controller in ("damper", "environment", "tank", "off"):
+    for controller in ("damper", "environment", "off"):
         yield (
             f"stiff coupling, controller {controller}",
             Run(
@@ -499,9 +499,8 @@ RECORDED = (
     "skipped deadlines",
     "device with friction, steps and delay",
     "stiff coupling, controller damper",
-    "active environment, controller tank",
+    "active environment, controller damper",
     "trip: energy",
-    "recorder stopped and started",
 )
 """Runs whose recordings are judged."""
 

@@ -119,14 +119,14 @@ def pressed(more: float, damping: float, ticks: int = 4000) -> tuple[Array, np.n
     scene = load_scene("virtual_wall")
     binding = bound(scene, "lossless", Coupling(K, FREE + HALF, 1.0, 0.002), T)
     state, row = binding.state, binding.row
-    first = int(state["coupling_actuator_id"][0])
+    first = int(state["mj"]["coupling_actuator_id"][0])
     sample = np.zeros(1, SAMPLE_DTYPE)
     sample["quaternion"][:, 0] = 1.0
     rows = np.zeros(ticks, TICK_DTYPE)
     for k in range(ticks):
-        is_free = bool(state["is_midpoint"][0])
+        is_free = bool(state["lossless"]["is_midpoint"][0])
         used = FREE if is_free else FREE + more
-        state["damping"] = used  # the law's; the gains follow
+        state["coupling"]["damping"] = used  # the law's; the gains follow
         share = 0.5 if is_free else 1.0
         scene.model.actuator_gainprm[first : first + 3, 0] = share * used
         scene.model.actuator_biasprm[first : first + 3, 2] = -share * used
@@ -182,7 +182,7 @@ def balance(law: Array, handle: Array, tool: Array, device: float) -> float:
 
 
 def test_a_device_that_bears_the_larger_damping_bears_any_sequence_of_them() -> None:
-    # the inequality in the docstring of ``passivity.compensation``, against random motions
+    # the inequality in the docstring of ``theory.compensation``, against random motions
     random = np.random.default_rng(3)
     low, high = FREE, FREE + HALF
     device = HALF + high

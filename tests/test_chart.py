@@ -11,24 +11,36 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from chart_cases import FakeRun, small_chart
+from chart_cases import FakeRun, made_up, small_chart
 
 from hapticbridge.cli import main
 from hapticbridge.errors import StudyError
-from hapticbridge.kernel.codes import DIRECT, LOSSLESS
-from hapticbridge.lab.chart import (
-    Chart,
+from hapticbridge.kernel.codes import Scheme
+from hapticbridge.lab.chart.catalogue import (
     Extent,
-    chosen_methods,
-    chosen_periods,
-    measure_chart,
     open_workload,
+)
+from hapticbridge.lab.chart.chart import (
+    Chart,
+    Measurement,
+    interleaved_costs,
+    measure_chart,
+    one_core,
+    pareto_front,
+)
+from hapticbridge.lab.chart.output import (
+    draw_chart,
     prepared_files,
-    settings_for,
     write_chart,
 )
-from hapticbridge.lab.chart.chart import interleaved_costs, one_core, pareto_front
-from hapticbridge.lab.chart.setting import CONTACTS, SHIPPED, Setting
+from hapticbridge.lab.chart.setting import (
+    CONTACTS,
+    SHIPPED,
+    Setting,
+    chosen_methods,
+    chosen_periods,
+    settings_for,
+)
 from hapticbridge.lab.methods import METHODS
 
 
@@ -90,7 +102,7 @@ def test_selection_has_every_method_at_every_step_and_no_point_twice() -> None:
     for method in METHODS.values():
         assert {s.period for s in settings if s.method is method} == set(periods)
     assert {s.contact for s in settings} == set(CONTACTS)
-    undivided = [s for s in settings if s.method.scheme in (LOSSLESS, DIRECT)]
+    undivided = [s for s in settings if s.method.scheme in (Scheme.MIDPOINT, Scheme.MASSLESS)]
     assert {s.substeps for s in undivided} == {1}
     for name in ("implicit", "lossless"):
         tried = {s.period for s in settings if (s.method.name, s.contact) == (name, "damped")}
@@ -141,9 +153,7 @@ def test_point_that_cannot_be_compared_is_not_on_the_front(chart: Chart) -> None
     assert best.setting not in [each.setting for each in front]
 
 
-def test_files_hold_every_setting_and_the_page_needs_nothing_else(
-    chart: Chart, tmp_path: Path
-) -> None:
+def test_files_hold_every_setting(chart: Chart, tmp_path: Path) -> None:
     files = write_chart(chart, prepared_files(tmp_path / "new", "point_mass"))
     with files.paths["csv"].open(encoding="utf-8") as lines:
         rows = list(csv.DictReader(lines))
@@ -220,7 +230,7 @@ def test_command_draws_a_chart(tmp_path: Path, capsys: pytest.CaptureFixture[str
         r"on the front, by cost:\n +[0-9.e-]+ s per s, [0-9.e-]+ JND: \w+", printed.out
     )
     names = {path.name for path in tmp_path.iterdir()}
-    assert names == {f"point_mass.{ending}" for ending in ("png", "svg", "csv", "json", "html")}
+    assert names == {f"point_mass.{ending}" for ending in ("png", "svg", "csv", "json")}
 
 
 def test_table_says_what_contacts_and_solver_really_were() -> None:
@@ -240,3 +250,24 @@ def test_table_says_what_contacts_and_solver_really_were() -> None:
     assert [each["solref"] for each in chosen] == given
     assert [each["cone"] for each in chosen] == ["elliptic"] * 4 + ["pyramidal"]
     assert [each["solver_iterations"] for each in chosen] == [100, 100, 100, 100, 5]
+
+
+def test_picture_says_what_its_words_and_pale_points_mean(chart: Chart) -> None:
+    def words(*points: Measurement) -> str:
+        labelled = tuple(replace(each, panel=chart.workload.panels[0].key) for each in points)
+        figure = draw_chart(replace(chart, measurements=labelled))
+        legend = figure.axes[0].get_legend()
+        assert legend is not None
+        return " ".join(text.get_text() for text in legend.get_texts())
+
+    steps = (2.5e-4, 5e-4, 1e-3)
+    plain = words(*(made_up(1.0, p, period=p) for p in steps))
+    assert "implicit (order 1.0)" in plain
+    for told in ("not settled", "gain nothing", "not comparable", "lower edge"):
+        assert told not in plain
+    assert "smaller steps gain nothing" in words(*(made_up(1.0, 0.1, period=p) for p in steps))
+    assert "not settled" in words(*(made_up(1.0, p**p, period=p) for p in (0.1, 0.4, 1.6)))
+    apart = words(made_up(1.0, 0.1, limit_apart=0.34))
+    assert "implicit (limit 0.34 off)" in apart
+    assert "not comparable" in apart
+    assert "at the lower edge: 0.0001 JND or less" in words(made_up(1.0, 1e-6))

@@ -15,19 +15,16 @@ from engine_tasks import engine_or_skip
 from matplotlib.container import ErrorbarContainer
 
 from hapticbridge.errors import StudyError
-from hapticbridge.lab.chart import (
-    Extent,
-    contact_bodies,
-    measure_chart,
-    open_workload,
-    peer_settings,
-)
 from hapticbridge.lab.chart import chart as chart_module
-from hapticbridge.lab.chart.chart import Chart, interleaved_costs
-from hapticbridge.lab.chart.engine_run import EngineRun
+from hapticbridge.lab.chart import contact_bodies
+from hapticbridge.lab.chart.catalogue import (
+    Extent,
+    open_workload,
+)
+from hapticbridge.lab.chart.chart import Chart, interleaved_costs, measure_chart
+from hapticbridge.lab.chart.engine_run import EngineRun, peer_settings
 from hapticbridge.lab.chart.output import (
     CEILING,
-    chart_page,
     draw_chart,
     drawn_cost,
     summary_of,
@@ -260,10 +257,6 @@ def test_engine_that_fails_on_the_way_is_a_mark_with_its_reason(
     point = next(p for p in summary_of(chart)["points"] if p["error_verdict"] == "failed")
     assert point["error_reason"] == said
     assert point["error_felt"] is None
-    page = chart_page(chart)
-    assert said in page
-    assert "the engine failed" in page
-    assert "M0,6 L6,-5 L-6,-5 Z" in page  # its mark: a wedge
     assert (broken.cost.median, CEILING) in marks_of(chart)
     legend = draw_chart(chart).axes[0].get_legend()
     assert legend is not None
@@ -281,7 +274,6 @@ def test_engine_that_cannot_even_begin_is_drawn_with_the_dearest_point(
     assert np.isnan(broken.cost.median)
     dearest = np.nanmax([each.cost.median for each in chart.measurements])
     assert drawn_cost(broken, chart.measurements) == dearest
-    assert "not timed" in chart_page(chart)
     assert (dearest, CEILING) in marks_of(chart)
     assert summary_of(chart)["points"][-1]["cost_median"] is None
 
@@ -317,7 +309,7 @@ def test_point_that_diverged_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
     assert all(each.reason.startswith("the tool was 10 m away after 0.") for each in found)
 
 
-def test_page_and_json_tell_every_engines_settings(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_json_tells_every_engines_settings(monkeypatch: pytest.MonkeyPatch) -> None:
     chart = chart_with(StandIn(), monkeypatch)
     assert summary_of(chart)["engines"] == {
         "stand_in": {
@@ -325,9 +317,6 @@ def test_page_and_json_tell_every_engines_settings(monkeypatch: pytest.MonkeyPat
             "settings": {"coupling": {"value": "held force", "source": "its own head"}},
         }
     }
-    page = chart_page(chart)
-    assert "stand_in (1.0)" in page
-    assert "<td>held force</td><td>its own head</td>" in page
 
 
 def test_engine_with_a_spring_of_its_own_is_called_so() -> None:

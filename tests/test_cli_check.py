@@ -125,7 +125,7 @@ def test_parameters_of_a_scene_are_checked_as_set(capsys: pytest.CaptureFixture[
         (["peg_in_hole", "--rate", "0"], "rate"),
         (["peg_in_hole", "--stiffness", "nan"], "stiffness"),
         (["peg_in_hole", "--scale", "0"], "scale"),
-        (["peg_in_hole", "--plot", "check.txt"], "does not end like a picture"),
+        (["peg_in_hole", "--plot", "check.txt"], "must end in"),
         (["peg_in_hole", "--set", "weight=1"], "no parameter 'weight'"),
     ],
 )

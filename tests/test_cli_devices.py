@@ -155,7 +155,7 @@ def listed(problem: str | None, serial: str = "") -> FoundDevice:
         ([listed(None, "A"), listed(None, "B")], "--device rawhid:serial=A\n"),
         (
             [listed(permission_problem("/dev/hidraw0"))],
-            "whoever sits at the machine\nnext: hapticbridge devices",
+            "local users of the machine\nnext: hapticbridge devices",
         ),
         # no rule would help, and one of two can be used
         ([listed("no node"), listed(None, "B")], "next: hapticbridge run peg_in_hole --device"),
@@ -217,7 +217,7 @@ def test_a_hid_device_is_listed_by_the_kernels_word_where_hidapi_is_missing(
     [
         (True, True, None),
         (True, False, "no permission to open"),
-        (False, False, "does not exist yet"),  # as root, who may open all that there is
+        (False, False, "no node "),  # as root, who may open all that there is
     ],
 )
 def test_a_node_that_is_not_there_yet_is_no_missing_permission(

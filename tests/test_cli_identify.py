@@ -90,7 +90,7 @@ def test_a_z_width_that_is_not_known_is_not_drawn_and_it_says_why(
         ([FREE, "--travel", "nan"], "--travel is nan m; it must be 0.0001 to 1"),
         ([FREE, "--duration", "0.5"], "--duration is 0.5 s; it must be 2 to 600"),
         ([FREE, "--force-share", "1.5"], "--force-share is 1.5; it must be 0.001 to 1"),
-        ([FREE, "--plot", "fit.txt"], "does not end like a picture"),
+        ([FREE, "--plot", "fit.txt"], "must end in"),
         ([FREE, "--plot", "a.png", "--zwidth", "a.png"], "--plot and --zwidth both name 'a.png'"),
         (["no-such-device"], "unknown device 'no-such-device'"),
     ],

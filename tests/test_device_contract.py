@@ -268,26 +268,16 @@ def test_text_that_is_no_data_sheet_is_refused(text: str, words: str) -> None:
     assert words in str(error.value)
 
 
-def test_options_reach_the_device_and_the_specification_goes_before_the_code(
-    tmp_path: Path,
-) -> None:
-    device = open_device(
-        "simulated: damping = 5, delay=2,hand_mass=0.3", damping=7.0, force_limit=3
-    )
-    assert isinstance(device, SimulatedDevice)
-    assert (device.info.damping, device.info.force_limit) == (5.0, 3.0)
-    assert device.hand == Hand(mass=0.3)
-    free = open_device("simulated:hand=none", path=written(tmp_path / "hand.csv"))
-    assert isinstance(free, SimulatedDevice)
-    assert free.hand is None
-    assert free.info.duration is None
+def test_options_reach_the_device_and_the_specification_goes_first(tmp_path: Path) -> None:
+    both: Any = open_device("simulated: damping = 5, delay=2,hand_mass=0.3", damping=7.0)
+    assert (both.info.damping, both.hand) == (5.0, Hand(mass=0.3))
+    free: Any = open_device("simulated:hand=none", path=written(tmp_path / "hand.csv"))
+    assert (free.hand, free.info.duration) == (None, None)
     file = written(tmp_path / "a,b=c:d.csv")
-    guided = open_device(f"simulated:friction=0.1,path={file}", hand=Hand(stiffness=50.0))
-    assert isinstance(guided, SimulatedDevice)
+    guided: Any = open_device(f"simulated:friction=0.1,path={file}", hand=Hand(stiffness=50.0))
     assert guided.info.duration == pytest.approx(0.195)
     assert guided.hand == Hand(stiffness=50.0)
-    limited = open_device(f"trajectory:{file}", torque_limit=0.1)
-    assert limited.info.torque_limit == 0.1
+    assert open_device(f"trajectory:{file}", torque_limit=0.1).info.torque_limit == 0.1
 
 
 @pytest.mark.parametrize(

@@ -17,8 +17,14 @@ import mujoco
 import pytest
 from engine_tasks import FLOOR, GRAVITY, RESTING
 
-from hapticbridge.lab.engines import Body, Engine, Pose, Task, open_engine
-from hapticbridge.lab.engines.base import _MODULES
+from hapticbridge.lab.engines.base import (
+    _MODULES,
+    Body,
+    Engine,
+    Pose,
+    Task,
+    open_engine,
+)
 
 PACKAGE = "hapticbridge.lab.engines."
 LIBRARIES = (

@@ -14,19 +14,21 @@ from engine_tasks import COUPLING
 from hapticbridge.device.trajectory import Motion
 from hapticbridge.errors import StudyError
 from hapticbridge.lab.engines import (
+    base,
+    ode,
+)
+from hapticbridge.lab.engines.base import (
     Body,
     Pose,
     Shape,
     Task,
     Velocity,
     available_engines,
-    base,
     composed,
     engine_names,
-    ode,
     open_engine,
-    task_from_scene,
 )
+from hapticbridge.lab.engines.from_scene import task_from_scene
 from hapticbridge.pose import quaternion_exp
 from hapticbridge.scene import Scene, load_scene
 

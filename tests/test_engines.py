@@ -25,7 +25,7 @@ from scipy.spatial.transform import Rotation
 from hapticbridge.coupling import Coupling
 from hapticbridge.device.trajectory import Motion
 from hapticbridge.errors import StudyError
-from hapticbridge.lab.engines import (
+from hapticbridge.lab.engines.base import (
     Body,
     Contacts,
     Engine,

@@ -329,5 +329,6 @@ def test_environment_is_called_by_its_worst_tick(
     unstrict: int, active: int, environment: str
 ) -> None:
     run = fast(FREE_BALL, at_rest(1))
-    run.binding.state["first_unstrict"], run.binding.state["first_active"] = unstrict, active
+    energy = run.binding.state["energy"]
+    energy["first_unstrict"], energy["first_active"] = unstrict, active
     assert run.ledger.environment == environment

@@ -67,9 +67,7 @@ def lossless_ticks(scene: tuple[str, str], folder: Path) -> Array:
 
 
 @pytest.mark.parametrize("stop", sorted(STOPS))
-def test_a_tool_at_a_limit_is_implicit_and_lossless_before_and_after(
-    stop: str, tmp_path: Path
-) -> None:
+def test_tool_at_limit_is_implicit_and_lossless_before_and_after(stop: str, tmp_path: Path) -> None:
     is_free = lossless_ticks(STOPS[stop], tmp_path)
     assert is_free[5:140].all()
     assert not is_free[165:440].any()
@@ -82,9 +80,7 @@ def test_a_tool_that_is_always_held_is_never_lossless(hold: str, tmp_path: Path)
 
 
 @pytest.mark.parametrize("other", sorted(LETS_GO))
-def test_a_tool_that_nothing_holds_is_lossless_from_the_second_tick_on(
-    other: str, tmp_path: Path
-) -> None:
+def test_a_tool_that_nothing_holds_is_lossless_from_tick_two(other: str, tmp_path: Path) -> None:
     assert lossless_ticks(LETS_GO[other], tmp_path)[1:].all()
 
 

@@ -16,7 +16,7 @@ from hapticbridge.audit import audit
 from hapticbridge.bridge import Bridge
 from hapticbridge.errors import SafetyTrip
 from hapticbridge.guard import Limits
-from hapticbridge.kernel.codes import COUPLED, DIRECT, WELD
+from hapticbridge.kernel.codes import Scheme
 from hapticbridge.kernel.tick import can_split, is_sound
 from hapticbridge.lab.methods import METHODS
 from hapticbridge.record import TICK_DTYPE
@@ -239,17 +239,17 @@ def test_a_control_callback_is_called_once_a_tick(calls: Calls) -> None:
 def test_what_can_be_split(tmp_path: Path) -> None:
     with fast("point_mass", method="implicit") as bridge:
         model = bridge.scene.model
-        assert can_split(model, COUPLED)
-        assert not can_split(model, WELD)
-        assert not can_split(model, DIRECT)
+        assert can_split(model, Scheme.IMPLICIT)
+        assert not can_split(model, Scheme.WELD)
+        assert not can_split(model, Scheme.MASSLESS)
         model.opt.integrator = mujoco.mjtIntegrator.mjINT_RK4
-        assert not can_split(model, COUPLED)
+        assert not can_split(model, Scheme.IMPLICIT)
 
 
 @pytest.mark.parametrize("value", [1e10, -1e11, np.inf, np.nan])
 def test_what_mujoco_would_reset_is_left_to_a_whole_step(value: float) -> None:
     with fast("point_mass", method="implicit") as bridge:
-        state, data = bridge._binding.state, bridge.scene.data
+        state, data = bridge._binding.state[0], bridge.scene.data
         assert is_sound(state)
         data.qvel[1] = value
         assert not is_sound(state)
@@ -270,7 +270,7 @@ def test_energies_that_are_not_finite_end_in_zero_force(tmp_path: Path, pipeline
 
         def spoil(tick: int) -> None:
             if tick == 20:
-                bridge._binding.state["start_energy"] = np.nan
+                bridge._binding.state["energy"]["start_energy"] = np.nan
 
         bridge.run(0.1, spoil)
     writes = np.array(device.writes)

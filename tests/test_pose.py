@@ -49,11 +49,7 @@ def _unit(values: tuple[float, float, float, float]) -> Quaternion:
 
 quaternions = st.builds(_unit, st.tuples(*[st.floats(-1, 1, allow_subnormal=False)] * 4))
 directions = st.builds(
-    lambda a, b: (
-        math.cos(a) * math.cos(b),
-        math.cos(a) * math.sin(b),
-        math.sin(a),
-    ),
+    lambda a, b: (math.cos(a) * math.cos(b), math.cos(a) * math.sin(b), math.sin(a)),
     st.floats(-math.pi / 2, math.pi / 2),
     st.floats(-math.pi, math.pi),
 )
@@ -138,9 +134,7 @@ def test_rotation_between_is_in_the_world_frame(a: Quaternion, b: Quaternion) ->
 
 
 @given(quaternions, st.floats(0.5, 2))
-def test_canonical_has_unit_length_and_a_scalar_that_is_not_negative(
-    q: Quaternion, length: float
-) -> None:
+def test_canonical_has_unit_length_and_scalar_not_negative(q: Quaternion, length: float) -> None:
     result = canonical((length * q[0], length * q[1], length * q[2], length * q[3]))
     assert math.sqrt(sum(c * c for c in result)) == pytest.approx(1.0, abs=1e-12)
     assert result[0] >= 0.0

@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 from audit_cases import ScriptedDevice
 from bridge_runs import fast
-from cli_cases import Called
 
 from hapticbridge.audit import audit
 from hapticbridge.device import DeviceInfo
@@ -104,24 +103,3 @@ def test_no_shipped_reach_cuts_what_the_maker_calls_the_workspace() -> None:
         reach, box = profile.quantities["reach"].value, profile.quantities["workspace"].value
         assert isinstance(reach, float) and isinstance(box, tuple)
         assert 0 <= reach - 0.5 * math.hypot(*box) < 1e-4
-
-
-def test_the_command_line_says_where_the_reach_ends(
-    call: Called, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    reach: dict[str, float | None] = {"device": REACH}
-    monkeypatch.setattr("hapticbridge.cli.run.device_for", lambda *_: device(reach["device"]))
-    short = ("run", "point_mass", "--fast", "--duration", "0.05")
-    code, text, said = call(*short, "--record", str(tmp_path / "run.mcap"))
-    assert code == 0
-    assert "20 mm; beyond, no handle and no force" in text
-    assert "20 mm from its middle the device is at the end of its reach" in " ".join(said.split())
-    code, text, said = call(*short, "--json")
-    assert json.loads(text)["reach"] == REACH
-    for options in (("--reach-limit", "inf"), ()):
-        reach["device"] = REACH if options else None
-        code, text, said = call(*short, *options)
-        assert (code, "reach" in text, "reach" in said) == (0, False, False)
-    code, _, said = call(*short, "--reach-limit", "0")
-    assert (code, said.count("\n")) == (2, 1)
-    assert "reach limit is 0.0 m; it must be > 0" in said

@@ -67,6 +67,6 @@ def test_ports_of_a_separate_arm_close_to_its_dissipation(method: str) -> None:
         assert after_step(binding.state, binding.row, 0) == OK
         left -= 0.1 * (scene.data.qvel[6] - speed) ** 2
         speed = float(scene.data.qvel[6])
-    assert binding.state["environment_energy"][0] == pytest.approx(left, rel=1e-9)
-    assert abs(binding.state["actuator_work"][0]) > 1e-5
-    assert abs(binding.state["external_work"][0]) > 1e-5
+    assert binding.state["energy"]["environment_energy"][0] == pytest.approx(left, rel=1e-9)
+    assert abs(binding.state["energy"]["actuator_work"][0]) > 1e-5
+    assert abs(binding.state["energy"]["external_work"][0]) > 1e-5

@@ -84,7 +84,7 @@ def events(path: Path, name: str) -> list[dict[str, Any]]:
 
 
 def stiffness(bridge: Bridge) -> float:
-    return float(bridge._binding.state["stiffness"][0])
+    return float(bridge._binding.state["coupling"]["stiffness"][0])
 
 
 def pressed(tab: Tab, key: str) -> None:
@@ -136,8 +136,12 @@ def test_nothing_that_is_sent_by_hand_exceeds_a_limit(tmp_path: Path) -> None:
             page.send(BR, value=value)
         time.sleep(0.5)
         page.send(KR, value=3.0)
-        until(lambda: bridge._binding.state["rotational_stiffness"][0] == pytest.approx(3.0))
-        needs = bridge._binding.state[0]
+        until(
+            lambda: (
+                bridge._binding.state["coupling"]["rotational_stiffness"][0] == pytest.approx(3.0)
+            )
+        )
+        needs = bridge._binding.state["coupling"][0]
         assert (
             needs["rotational_stiffness"] * bridge.period / 2 + needs["rotational_damping"] <= 2e-3
         )

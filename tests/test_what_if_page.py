@@ -103,7 +103,7 @@ def test_numbers_that_cannot_be_drawn_leave_the_table(made_active: WhatIf, tmp_p
 
 def test_a_page_goes_under_the_name_of_a_page_alone(made_active: WhatIf, tmp_path: Path) -> None:
     before = made_active.path.read_bytes()
-    with pytest.raises(RecordingError, match="does not end like a page"):
+    with pytest.raises(RecordingError, match="must end in"):
         write_what_if(made_active, made_active.path)
     assert made_active.path.read_bytes() == before
     (tmp_path / "folder.html").mkdir()

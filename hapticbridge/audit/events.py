@@ -140,7 +140,7 @@ class RunEvents:
                 parameters.period,
                 parameters.scale,
                 parameters.force_scale,
-                parameters.laws,
+                parameters.law_evaluations,
                 method,
             )
             for coupling in self.couplings
@@ -159,7 +159,9 @@ class RunEvents:
 def _tick(event: Mapping[str, Any]) -> int:
     tick = event.get("tick")
     if not isinstance(tick, int) or isinstance(tick, bool) or not 0 <= tick < _REACHES:
-        raise RecordingError(f"event '{event.get('event')}' names tick {tick!r}")
+        raise RecordingError(
+            f"event '{event.get('event')}' has tick {tick!r}; it must be a whole number >= 0"
+        )
     return tick
 
 

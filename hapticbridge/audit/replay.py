@@ -159,7 +159,7 @@ class Resimulator:
     @property
     def slack(self) -> float:
         """Energy that the environment may have created so far, in J."""
-        return float(self.binding.state["slack"][0])
+        return self.binding.slack
 
     def note(self, event: Mapping[str, Any]) -> None:
         """Adds an event of a running run; events without effect on the simulation are ignored."""
@@ -193,7 +193,7 @@ class Resimulator:
             end = len(ticks)
             if self._changes:
                 end = min(self._due(self._changes[0]) - self.done, end)
-            if end < done:  # in a running run, events may arrive after records
+            if end < done:  # during a live run, events may arrive after records
                 raise RecordingError(f"an event before tick {self.done + done} came after it")
             state, row, part = self.binding.state, self.binding.row, slice(done, end)
             count = simulate_recorded(
@@ -227,7 +227,9 @@ class Resimulator:
     def _due(self, event: Mapping[str, Any]) -> int:
         tick = event.get("tick")
         if not isinstance(tick, int) or tick < self._changed:
-            raise RecordingError(f"event '{event['event']}' names tick {tick!r}, out of order")
+            raise RecordingError(
+                f"event '{event['event']}' has tick {tick!r}, which is out of order"
+            )
         return tick
 
     def _apply(self, event: Mapping[str, Any]) -> None:

@@ -52,7 +52,7 @@ def motion_for(scene: Scene, path: str | Path | None = None) -> Motion | None:
     try:
         period = float(recording.meta["period_s"])
     except (KeyError, ValueError):
-        raise DeviceError(f"{path}: the recording does not say its period (period_s)") from None
+        raise DeviceError(f"{path}: the recording's metadata lack its period (period_s)") from None
     # the handle's pose already includes scale and axes; the device's does not
     return Motion(
         ticks["tick"] * period, ticks["handle_position"], ticks["handle_quaternion"]

@@ -308,7 +308,7 @@ def write_lean(lean: Lean, path: Path, *, overwrite: bool = False) -> VariantVer
     judge, source = lean.judge, lean.draft.source
     check_target(source, path, overwrite=overwrite)
     if not lean.together:
-        raise SceneError("nothing may go, so there is no leaner scene to write")
+        raise SceneError("no simplification may be made, so there is no leaner scene to write")
     spec = source.spec.copy()
     _point_to_assets(spec, source, path.absolute().parent)
     setting = lean.draft.setting

@@ -10,19 +10,22 @@ import tyro
 
 from hapticbridge.cli.terminal import err, out, plain, print_json, progress
 from hapticbridge.errors import StudyError
-from hapticbridge.lab.chart import (
-    ChartFiles,
+from hapticbridge.lab.chart.catalogue import (
     Extent,
-    chosen_methods,
-    chosen_periods,
-    measure_chart,
     open_workload,
-    peer_settings,
+)
+from hapticbridge.lab.chart.chart import LEAST_REPEATS, REPEATS, measure_chart
+from hapticbridge.lab.chart.engine_run import peer_settings
+from hapticbridge.lab.chart.output import (
+    ChartFiles,
     prepared_files,
-    settings_for,
     write_chart,
 )
-from hapticbridge.lab.chart.chart import LEAST_REPEATS, REPEATS
+from hapticbridge.lab.chart.setting import (
+    chosen_methods,
+    chosen_periods,
+    settings_for,
+)
 from hapticbridge.lab.chart.work import WORK_ENDINGS, measure_work, write_work
 from hapticbridge.lab.engines.base import available_engines, caught_prints, open_engine
 
@@ -40,7 +43,7 @@ class Chart:
     The scene is point_mass, peg_in_hole, rod_impact, sliding_block or spinning_body, which have
     references of their own, or any scene with a hand path beside it, which is compared with finer
     steps. 'work' in place of a scene charts what a tick costs as a scene grows. Writes SCENE.png,
-    .svg, .csv, .json and, but for 'work', .html into the folder.
+    .svg, .csv and .json into the folder.
 
     Example:
         hapticbridge chart peg_in_hole --out charts

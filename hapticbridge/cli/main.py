@@ -44,7 +44,9 @@ COMMANDS = {
     ),
     "view": Entry("Recordings", "view", "Show a recorded run in a browser."),
     "render": Entry("Recordings", "render", "Draw a recorded run: a picture, or a film of it."),
-    "compare": Entry("Recordings", "recordings", "Find the first tick and field where two runs differ."),
+    "compare": Entry(
+        "Recordings", "recordings", "Find the first tick and field where two runs differ."
+    ),
     "export": Entry("Recordings", "recordings", "Write a recording as Parquet, CSV or HDF5."),
     "repair": Entry("Recordings", "audit", "Make a whole file of a recording that a crash cut."),
     "devices": Entry("Devices", "devices", "List the haptic devices plugged in and supported."),

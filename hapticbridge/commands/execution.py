@@ -77,7 +77,7 @@ class EventApplier:
     """Applies events of commands to a live or simulated run.
 
     The loop applies the event that it records, so live run and re-simulation share one path.
-    ``start`` is the scene's state at the start (``provenance.start_state``), as bytes.
+    ``start`` is the scene's state at the start (``run_description.start_state``), as bytes.
     """
 
     def __init__(
@@ -108,9 +108,9 @@ class EventApplier:
             self._binding.command(bits_in(event))
         elif kind == "reset":
             if not self._method.has_coupling:
-                raise RecordingError(f"event 'reset': method '{self._method.name}' has none")
+                raise RecordingError(f"event 'reset': method '{self._method.name}' has no reset")
             restore_state(self._model, self._data, self._start)
-            self._binding.take_reset()
+            self._binding.handle_reset()
 
 
 MOST_WAITING = 8

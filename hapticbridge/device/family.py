@@ -143,7 +143,7 @@ def access_problem(path: str) -> str | None:
     if os.access(path, os.R_OK | os.W_OK):
         return None
     if not Path(path).exists():
-        return f"{path} does not exist yet, or not in this container; try again in a second"
+        return f"no node {path} exists yet, or none in this container; try again in a second"
     return permission_problem(path)
 
 
@@ -163,14 +163,14 @@ def select_device(
     """
     if not plugged:
         vendors = ", ".join(sorted({f"{usb_id.vendor:04x}" for usb_id in family.ids}))
-        looked = f"{len(family.ids)} products of {vendors}"
+        description = f"{len(family.ids)} products of {vendors}"
         if len(family.ids) == 1:
-            looked = str(family.ids[0])
+            description = str(family.ids[0])
         elif family.recognises is not None:
-            looked = "any product, by the capabilities that it reports"
-        looked = family.sought or looked
+            description = "any product, by the capabilities that it reports"
+        description = family.sought or description
         raise DeviceError(
-            f"no device '{family.name}' is plugged in (looked for {looked}); 'hapticbridge "
+            f"no device '{family.name}' is plugged in (looked for {description}); 'hapticbridge "
             "devices' lists connected devices and missing permissions"
         )
     names = choices(device.serial or device.path for device in plugged)
@@ -182,12 +182,12 @@ def select_device(
             )
         device = plugged[0]
     else:
-        wanted = [d for d in plugged if str(serial) in (d.serial, d.path)]
-        if not wanted:
+        matching = [d for d in plugged if str(serial) in (d.serial, d.path)]
+        if not matching:
             raise DeviceError(
                 f"no device '{family.name}' has serial '{serial}'; plugged in: {names}"
             )
-        device = wanted[0]
+        device = matching[0]
     if device.problem is not None:
         raise DeviceError(f"{device}: {device.problem}")
     return device

@@ -147,20 +147,20 @@ def open_device(spec: str, *, tell: Notify = ignore_message, **options: object) 
     if (family := family_named(name)) is not None:
         valid = tuple(dict.fromkeys((*family.options, "profile")))
         refuse_unknown(name, options, valid)
-        asked = {**options, **parsed(name, rest, valid)}
-        wanted = asked.get("profile")
+        requested = {**options, **parsed(name, rest, valid)}
+        profile_option = requested.get("profile")
         if "profile" not in family.options:
-            asked.pop("profile", None)
-        chosen = None if wanted in (None, "none") else profile_named(str(wanted))
-        device = family.open(asked, tell)
+            requested.pop("profile", None)
+        profile = None if profile_option in (None, "none") else profile_named(str(profile_option))
+        device = family.open(requested, tell)
         try:
-            if wanted is None:
+            if profile_option is None:
                 model = device.info.name
-                chosen = profile_of(name, device.info.serial, model)
-                if chosen is None and (models := modelled(name)):
+                profile = profile_of(name, device.info.serial, model)
+                if profile is None and (models := modelled(name)):
                     tell(f"no profile of '{model}' exists; profiles: {choices(models)}")
-            if chosen is not None:
-                device.info = chosen.fill(device.info)
+            if profile is not None:
+                device.info = profile.fill(device.info)
         except BaseException:
             device.close()
             raise
@@ -196,8 +196,8 @@ def device_for(scene: Scene, spec: str, tell: Notify = ignore_message) -> Device
 
 def _open_simulated(rest: str, options: Mapping[str, object]) -> Device:
     refuse_unknown("simulated", options, _SIMULATED_OPTIONS)
-    asked = parsed("simulated", rest, _SIMULATED_OPTIONS)
-    parameters: dict[str, Any] = {**options, **asked}
+    requested = parsed("simulated", rest, _SIMULATED_OPTIONS)
+    parameters: dict[str, Any] = {**options, **requested}
     changes = {name: parameters.pop(name) for name in _HAND_OPTIONS if name in parameters}
     if "hand" not in parameters:
         parameters["hand"] = Hand(

@@ -325,8 +325,8 @@ def _column_names(where: str, line: str) -> list[str]:
     if unknown := [name for name in names if name not in known]:
         raise DeviceError(f"{where}: unknown column {unknown[0]!r:.40}; {needed}")
     if len(set(names)) < len(names):
-        twice = next(name for name in names if names.count(name) > 1)
-        raise DeviceError(f"{where}: column {twice} occurs twice; remove one of them")
+        duplicate = next(name for name in names if names.count(name) > 1)
+        raise DeviceError(f"{where}: column {duplicate} occurs twice; remove one of them")
     missing = [name for name in ORIENTATION if name not in names]
     if 0 < len(missing) < len(ORIENTATION):
         raise DeviceError(

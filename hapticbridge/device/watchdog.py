@@ -57,10 +57,10 @@ class ForceOffGuardian:
 
     def __init__(self, path: str, *reports: bytes) -> None:
         node = os.open(path, os.O_WRONLY | os.O_NOCTTY)
-        given = str(node), str(os.getpid()), str(POLL)
+        arguments = str(node), str(os.getpid()), str(POLL)
         try:
             self._process = subprocess.Popen(
-                [sys.executable, "-I", "-S", "-c", _CHILD, *given, *(r.hex() for r in reports)],
+                [sys.executable, "-I", "-S", "-c", _CHILD, *arguments, *(r.hex() for r in reports)],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 pass_fds=(node,),

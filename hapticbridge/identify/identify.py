@@ -43,7 +43,7 @@ follow the commanded force, so zero force is the safer command."""
 SPEED_MARGIN = 1.5
 """Multiple of the device's own top speed that counts as a fault, without unit."""
 
-_TOLD_PER_SECOND = 10
+_PROGRESS_RATE = 10
 """Rate of progress reports in Hz."""
 
 
@@ -125,19 +125,19 @@ def move_axis(
     s["amplitude"] = START_SHARE * allowance.force[index >= 3]
     compute = direct(next_wrench, state, sample, past, 0.0, 1, wrench)
     position, force, wakes = np.empty(ticks), np.empty(ticks), np.empty(ticks)
-    told_every, stale, place = max(round(1.0 / (_TOLD_PER_SECOND * period)), 1), 0, s["place"]
+    report_every, stale, place = max(round(1.0 / (_PROGRESS_RATE * period)), 1), 0, s["place"]
     try:
         for k in range(ticks):
             _, wakes[k], skipped = clock.wait()
             is_new = not device.read(sample) & TickFlag.STALE_SAMPLE and not skipped
             code = compute(state, sample, past, tones[k], 1 + skipped, wrench)
             if code != OK:
-                raise IdentificationError(_told(code, s))
+                raise IdentificationError(_fault_message(code, s))
             device.write(wrench)
             position[k] = place[index] if is_new else np.nan
             force[k] = wrench[index]
             stale += not is_new
-            if progress is not None and k % told_every == 0:
+            if progress is not None and k % report_every == 0:
                 progress(k / ticks)
     finally:
         _silence(device)
@@ -152,7 +152,7 @@ def _silence(device: Device) -> None:
         return
 
 
-def _told(code: int, s: np.void) -> str:
+def _fault_message(code: int, s: np.void) -> str:
     turns = code in (TURNED_FAR, TURNED_FAST)
     part, unit, factor = (slice(3, 6), "rad", 1.0) if turns else (slice(0, 3), "mm", 1e3)
     if code in (FAR, TURNED_FAR):
@@ -325,7 +325,7 @@ def identify(
     clock.start(round(period * 1e9))
     runs, fits = {}, {}
     for axis in chosen:
-        told = None if progress is None else _bound(progress, axis)
+        report = None if progress is None else _for_axis(progress, axis)
         runs[axis] = run = move_axis(
             device,
             clock,
@@ -333,9 +333,9 @@ def identify(
             period=period,
             duration=duration,
             allowance=allowance,
-            progress=told,
+            progress=report,
         )
-        fits[axis] = _judged(run, info)
+        fits[axis] = _checked_fit(run, info)
     intervals = np.concatenate([run.intervals for run in runs.values()])
     return Identification(
         info=info,
@@ -354,11 +354,11 @@ def duration_at(period: float) -> float:
     return DURATION * stretch(period)
 
 
-def _bound(progress: Callable[[str, float], None], axis: str) -> Callable[[float], None]:
+def _for_axis(progress: Callable[[str, float], None], axis: str) -> Callable[[float], None]:
     return lambda share: progress(axis, share)
 
 
-def _judged(run: AxisRun, info: DeviceInfo) -> AxisFit:
+def _checked_fit(run: AxisRun, info: DeviceInfo) -> AxisFit:
     """Fits a run and refuses untrustworthy results."""
     turns = len(run.axis) == 2
     unit, spring_unit = ("N m", "N m/rad") if turns else ("N", "N/m")

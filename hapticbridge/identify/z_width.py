@@ -63,7 +63,7 @@ class Trial:
 
 def judged(
     position: Array,
-    given: Array,
+    applied: Array,
     push: int,
     period: float,
     *,
@@ -81,7 +81,7 @@ def judged(
 
     Args:
         position: x − x_0 in m, shape (n,).
-        given: Force on the device in N, shape (n,).
+        applied: Force on the device in N, shape (n,).
         push: Length of the push in ticks.
         period: T in s.
         stiffness: K in N/m.
@@ -96,17 +96,17 @@ def judged(
     thirds = np.array_split(after, 3)
     amplitude = np.array_split(after**2 + (ratio * speed) ** 2, 3)
     middle, last = (float(np.sqrt(np.mean(part))) for part in amplitude[1:])
-    peak = float(np.abs(given[push:]).max())
+    peak = float(np.abs(applied[push:]).max())
     is_quiet = last <= max(NOISE_STEPS * resolution, DIED_DOWN * float(np.abs(after).max()))
     growth = 0.0 if is_quiet or middle == 0.0 else last / middle
-    halted = np.abs(given[-len(thirds[2]) :]) >= HALTED * force
+    is_saturated = np.abs(applied[-len(thirds[2]) :]) >= HALTED * force
     return Trial(
         stiffness=stiffness,
         damping=damping,
-        is_borne=growth < 1.0 and not halted.any(),
+        is_borne=growth < 1.0 and not is_saturated.any(),
         growth=growth,
         swing=2.0 * np.pi * ratio * period,
-        energy=float(given[push:-1] @ np.diff(position[push:])),
+        energy=float(applied[push:-1] @ np.diff(position[push:])),
         peak=peak,
     )
 
@@ -245,7 +245,7 @@ def try_wall(
         centre = _rest(device, clock, sample, wrench, period, force)
         origin = before = float(place[index])
         push, ticks = round(PUSH / period), round(duration / period)
-        position, given = np.empty(ticks), np.empty(ticks)
+        position, applied = np.empty(ticks), np.empty(ticks)
         for k in range(ticks):
             clock.wait()
             device.read(sample)
@@ -256,16 +256,16 @@ def try_wall(
                 )
             wall = -stiffness * (x - origin) - damping / period * (x - before)
             before = x
-            wanted = wall + (PUSH_SHARE * force if k < push else 0.0)
+            requested = wall + (PUSH_SHARE * force if k < push else 0.0)
             wrench[:3] = CENTRING[0] * (centre - place)
-            wrench[index] = min(max(wanted, -force), force)
+            wrench[index] = min(max(requested, -force), force)
             device.write(wrench)
-            position[k], given[k] = x - origin, wrench[index]
+            position[k], applied[k] = x - origin, wrench[index]
     finally:
         _silence(device)
     return judged(
         position,
-        given,
+        applied,
         push,
         period,
         stiffness=stiffness,
@@ -366,7 +366,7 @@ def measure_width(
     limits = []
     for k, damping in enumerate(dampings):
 
-        def told(stiffness: float, k: int = k, damping: float = damping) -> None:
+        def report(stiffness: float, k: int = k, damping: float = damping) -> None:
             if progress is not None:
                 progress(k, len(dampings), f"B = {damping:.3g}, K = {stiffness:.4g}")
 
@@ -380,7 +380,7 @@ def measure_width(
                 axis=axis,
                 first_stiffness=FIRST_SHARE * float(z.limit[0]),
                 most_stiffness=MOST_SHARE * float(z.limit[0]),
-                progress=told,
+                progress=report,
             )
         )
     unheld = [line for line in z.lines if line.name == WITHOUT_HAND]

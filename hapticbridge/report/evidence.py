@@ -97,7 +97,7 @@ def draw_recording(recording: Recording) -> Figure:
     """
     ticks, meta = recording.ticks, recording.meta
     if not len(ticks):
-        raise RecordingError(f"'{recording.path}' holds nothing to draw")
+        raise RecordingError(f"'{recording.path}' has no tick to draw")
     parameters = parameters_of(meta)
     if not all((np.abs(ticks[name]) < DRAWABLE).all() for name in _DRAWN):
         raise RecordingError(f"'{recording.path}' holds numbers that cannot be drawn")

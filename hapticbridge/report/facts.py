@@ -251,5 +251,5 @@ def _format_value(value: object, unit: str) -> str:
     try:
         text = str(value) if isinstance(value, bool) else f"{float(str(value)):.10g}"
     except ValueError:
-        return str(value)  # a word has no unit
+        return str(value)  # text has no unit
     return f"{text} {unit}".rstrip()

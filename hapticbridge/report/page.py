@@ -49,7 +49,7 @@ def check_page_name(path: Path) -> None:
         RecordingError: The extension is not one of ``PAGES``, or the folder does not exist.
     """
     if path.suffix.lower() not in PAGES:
-        raise RecordingError(f"'{path}' does not end like a page; endings: {', '.join(PAGES)}")
+        raise RecordingError(f"the page '{path}' must end in {' or '.join(PAGES)}")
     if not path.absolute().parent.is_dir():
         raise RecordingError(f"cannot write '{path}': its folder does not exist")
 

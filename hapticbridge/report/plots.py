@@ -219,7 +219,7 @@ def draw_timing(evidence: Evidence) -> Figure:
         active.broken_barh(bars, (row - 0.4, 0.8), color="#e66100")
     active.set_yticks(range(len(shown)), [name for name, _ in shown])
     active.set_xlim(time[0], end)
-    active.set_ylim(len(shown) - 0.5, -0.5)  # the first on top
+    active.set_ylim(len(shown) - 0.5, -0.5)  # first row on top
     active.grid(alpha=0.3, axis="x")
     for damped, (damping, unit) in zip(panels, injected, strict=True):
         curve(damped, time, damping, color="#e66100", label="injected by the controller")

@@ -215,7 +215,7 @@ def apply_parameters(
     known = {parameter.name: parameter for parameter in scene_parameters(scene)}
     for name, value in values.items():
         _check_value(scene.stem, name, value, known)
-    used = {name: float(values.get(name, p.default)) for name, p in known.items()}
+    effective = {name: float(values.get(name, p.default)) for name, p in known.items()}
     places: dict[tuple[str, str, str, int | None], _Place] = {}
     for parameter in known.values():
         for setting in parameter.sets:
@@ -223,8 +223,8 @@ def apply_parameters(
                 key = setting.kind, str(element.name), setting.field, setting.index
                 places.setdefault(key, _Place(element, setting)).add(parameter, setting)
     for place in places.values():
-        place.set(used, values)
-    return used
+        place.set(effective, values)
+    return effective
 
 
 def settings_from(words: Iterable[str]) -> dict[str, float]:
@@ -295,7 +295,7 @@ class _Place:
         self.terms[parameter.name] = setting
         self.default += setting.offset + setting.factor * parameter.default
 
-    def set(self, used: Mapping[str, float], requested: Mapping[str, float]) -> None:
+    def set(self, effective: Mapping[str, float], requested: Mapping[str, float]) -> None:
         """Checks the default against the file, then sets the number if it was requested."""
         names, index = " and ".join(map(repr, self.terms)), self.setting.index
         is_one = len(self.terms) == 1
@@ -313,7 +313,9 @@ class _Place:
             )
         if not requested.keys() & self.terms.keys():
             return
-        result = sum(term.offset + term.factor * used[name] for name, term in self.terms.items())
+        result = sum(
+            term.offset + term.factor * effective[name] for name, term in self.terms.items()
+        )
         values[() if index is None else index] = result
         setattr(self.element, self.setting.field, result if index is None else values)
 

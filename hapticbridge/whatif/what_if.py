@@ -130,7 +130,7 @@ def what_if(
 
     Args:
         path: The recording, undamaged and unchanged; it carries its scene.
-        changes: New values by name: ``changes.UNITS``, or the scene's own parameters. Without
+        changes: New values by name: ``settings.UNITS``, or the scene's own parameters. Without
             changes the prescribed run equals the recorded one in every bit.
         strict: As for ``audit``.
         progress: Called with the number of runs done, their total, and the name of the next one.
@@ -167,7 +167,9 @@ class _Experiment:
         self._strict = strict
         self._ticks, self._period = run.recording.ticks, run.parameters.period
         if len(self._ticks) < 3:
-            raise RecordingError(f"'{run.recording.path}' is too short to be simulated again")
+            raise RecordingError(
+                f"'{run.recording.path}' has {len(self._ticks)} ticks; a what-if needs 3"
+            )
         self._concerns: dict[str, None] = {}
 
     def changed(self, changes: Mapping[str, Value]) -> WhatIf:

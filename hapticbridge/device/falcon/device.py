@@ -205,7 +205,7 @@ class FalconDevice:
         self._packet = array.array("B", bytes(SIZE))
         self._bytes = np.frombuffer(self._packet, np.uint8)
         self._watch = SilenceDetector(link.now())
-        self._asked = self._asked_before = self._sampled_after = 0.0
+        self._requested = self._requested_before = self._sample_time = 0.0
 
     def start(self, period: float) -> NDArray[np.void]:
         """Reads the pose, without force, and compiles the functions of the loop.
@@ -233,7 +233,7 @@ class FalconDevice:
             )
         now = self._link.now()
         self._watch = SilenceDetector(now)
-        self._asked = self._asked_before = self._sampled_after = now
+        self._requested = self._requested_before = self._sample_time = now
         self._is_started = True
         return sample.copy()
 
@@ -252,13 +252,15 @@ class FalconDevice:
         for packet in self._link.take():
             found += self._stream.feed(packet)
         if self._watch.was_away(self._link.now()):
-            self._asked = self._asked_before = ask_anew(self._link, self._stream, self._name)
+            self._requested = self._requested_before = ask_anew(
+                self._link, self._stream, self._name
+            )
             found = 1
         now = self._link.now()
         is_believed = False
         if found:
             # the reply answers the last request or the one before, so its pose is at most that old
-            elapsed, self._sampled_after = now - self._sampled_after, self._asked_before
+            elapsed, self._sample_time = now - self._sample_time, self._requested_before
             verdict = self._believe(self._motion, self._stream.reply, self._last, elapsed)
             is_believed = verdict == BELIEVED
         if self._watch.is_silent(now, is_new=is_believed):
@@ -275,7 +277,7 @@ class FalconDevice:
             DeviceLost: The device is gone, or does not accept zero force.
         """
         self._command(self._motion, wrench, self._bytes)
-        self._asked_before, self._asked = self._asked, self._link.now()
+        self._requested_before, self._requested = self._requested, self._link.now()
         if not self._link.write(self._packet) and not wrench.any():
             insist(self._link, self._packet, self._name)
 

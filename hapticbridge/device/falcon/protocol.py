@@ -358,9 +358,9 @@ def _echo(link: Link, data: bytes, length: int | None = None) -> bytes:
 
 
 def _difference(sent: bytes, echo: bytes, start: int) -> str:
-    for i, (there, back) in enumerate(zip(sent, echo, strict=False)):
-        if there != back:
-            return f"0x{back:02x} for byte {start + i} (0x{there:02x})"
+    for i, (sent_byte, returned_byte) in enumerate(zip(sent, echo, strict=False)):
+        if sent_byte != returned_byte:
+            return f"0x{returned_byte:02x} for byte {start + i} (0x{sent_byte:02x})"
     return f"{len(echo)} bytes for the {len(sent)} from byte {start} on"
 
 
@@ -453,19 +453,19 @@ def home(link: Link, stream: ReplyStream, name: str, tell: Notify) -> None:
         DeviceError: The grip was not moved within ``HOMING_TIME``.
         DeviceLost: The device is gone or silent.
     """
-    end, is_told = link.now() + HOMING_TIME, False
-    heard = link.now()
+    end, is_prompted = link.now() + HOMING_TIME, False
+    last_reply = link.now()
     while link.now() < end:
         if ask(link, stream, Request.HOMING | Request.RED, SILENCE):
-            heard = link.now()
+            last_reply = link.now()
             if stream.reply["homed"][0] == _ALL:
-                if is_told:
+                if is_prompted:
                     tell(f"{name}: homed")
                 return
-        elif link.now() - heard > 2 * SILENCE:
+        elif link.now() - last_reply > 2 * SILENCE:
             raise silent(name)
-        if not is_told:
-            is_told = True
+        if not is_prompted:
+            is_prompted = True
             tell(f"{name}: pull the grip all the way out and push it back in, slowly")
     raise DeviceError(
         f"{name}: was not homed within {HOMING_TIME:g} s; open it again and move the "

@@ -111,16 +111,18 @@ class ForceDimensionDevice:
             model = MODELS.get(kind, Model(f"Force Dimension device of type {kind}"))
             self._name, self._turns = model.name, model.turns
             number = c_ushort()
-            is_told = dhd["dhdGetSerialNumber"](byref(number), self._id) >= 0
-            serial = str(number.value) if is_told else ""
+            is_known = dhd["dhdGetSerialNumber"](byref(number), self._id) >= 0
+            serial = str(number.value) if is_known else ""
             mass = c_double()
-            is_told = dhd["dhdGetEffectorMass"](byref(mass), self._id) >= 0
-            self.effector_mass = mass.value if is_told and mass.value > 0.0 else None
+            is_known = dhd["dhdGetEffectorMass"](byref(mass), self._id) >= 0
+            self.effector_mass = mass.value if is_known and mass.value > 0.0 else None
             what = f"{self._name}: gravity compensation cannot be set"
             dhd.require("dhdSetGravityCompensation", int(gravity), self._id, what=what)
             known = dict(numbers or {})
-            told = [float(dhd[call](self._id)) for call in ("dhdGetMaxForce", "dhdGetMaxTorque")]
-            limits = limits_of(model, told, known)
+            library_limits = [
+                float(dhd[call](self._id)) for call in ("dhdGetMaxForce", "dhdGetMaxTorque")
+            ]
+            limits = limits_of(model, library_limits, known)
             rate, delay = dhd.timing(lambda: (self._get(), self._send((0.0,) * 6)))
             self.info = DeviceInfo(
                 name=self._name,

@@ -70,7 +70,7 @@ those that CHAI3D allows; the maker's own figures are equal or larger."""
 
 
 def limits_of(
-    model: Model, told: Sequence[float], asked: Mapping[str, float]
+    model: Model, library_limits: Sequence[float], requested: Mapping[str, float]
 ) -> tuple[float, float]:
     """Returns the largest force in N and torque in N m that may be commanded.
 
@@ -78,19 +78,22 @@ def limits_of(
 
     Args:
         model: Type of the device.
-        told: The library's limits of force and torque; negative if it sets no limit.
-        asked: Numbers of the data sheet set by the user.
+        library_limits: The library's limits of force and torque; negative if it sets no limit.
+        requested: Numbers of the data sheet set by the user.
 
     Raises:
         DeviceError: No source states a limit.
     """
     limits = {"force": 0.0, "torque": USUAL_TORQUE_LIMIT}
     usual = {"force": model.force, "torque": model.torque}
-    for name, said in zip(limits, told, strict=True):
+    for name, library_limit in zip(limits, library_limits, strict=True):
         if name == "torque" and not model.turns:
             continue
-        ends = [asked.get(f"{name}_limit", usual[name]), said if said > 0.0 else None]
-        known = [end for end in ends if end is not None]
+        candidates = [
+            requested.get(f"{name}_limit", usual[name]),
+            library_limit if library_limit > 0.0 else None,
+        ]
+        known = [end for end in candidates if end is not None]
         if not known:
             raise DeviceError(
                 f"the largest {name} of {model.name} is unknown; set it with {name}_limit="

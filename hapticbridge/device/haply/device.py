@@ -165,7 +165,7 @@ class HaplyDevice:
         try:
             messages.refuse_scaled(listed)
             tell(messages.told_filters(listed, force_gate))
-            self._ask(messages.first_message(listed, force_gate))
+            self._exchange(messages.first_message(listed, force_gate))
             rate, delay = measured_timing(
                 link, messages.force_message(listed, (0.0, 0.0, 0.0)), self._name
             )
@@ -205,7 +205,7 @@ class HaplyDevice:
             )
         self._take()
         self._pending, self.held_back = None, 0
-        self._fill(self._ask(messages.force_message(self._listed, (0.0, 0.0, 0.0))))
+        self._fill(self._exchange(messages.force_message(self._listed, (0.0, 0.0, 0.0))))
         self._watch = SilenceDetector(self._link.now())
         self._is_started = True
         return self._sample.copy()
@@ -221,7 +221,7 @@ class HaplyDevice:
         if not self._is_started:
             raise DeviceError(f"{self._name} is read before it was started; call start() first")
         is_late = self._watch.was_away(self._link.now())
-        newest = self._asked_anew() if is_late else self._take()
+        newest = self._fresh_answer() if is_late else self._take()
         if newest is not None:
             self._fill(newest)
         if self._watch.is_silent(self._link.now(), is_new=newest is not None):
@@ -263,7 +263,7 @@ class HaplyDevice:
             self._send_pending()
         return answers[-1] if answers else None
 
-    def _asked_anew(self) -> str | None:
+    def _fresh_answer(self) -> str | None:
         """Requests the state without force after a pause of the loop; returns the answer.
 
         Waiting answers and a pending force are older than the pause and are discarded.
@@ -286,7 +286,7 @@ class HaplyDevice:
         self._under_way += 1
         self._pending = None
 
-    def _ask(self, message: str) -> str:
+    def _exchange(self, message: str) -> str:
         """Sends a message and returns its answer."""
         self._link.send(message)
         answer = None

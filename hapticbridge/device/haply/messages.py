@@ -71,10 +71,10 @@ class State:
 
 def inventory(message: str) -> list[Listed]:
     """Returns the devices listed in the service's first message."""
-    told = decoded(message, SERVICE)
-    if "session_id" not in told and "inverse3" not in told:
+    content = decoded(message, SERVICE)
+    if "session_id" not in content and "inverse3" not in content:
         raise DeviceError(f"{SERVICE} sent no list of devices first: {message!r:.60}")
-    return [_listed(entry) for entry in _entries(told, "inverse3")]
+    return [_listed(entry) for entry in _entries(content, "inverse3")]
 
 
 def state(message: str, device_id: str) -> State:
@@ -84,10 +84,10 @@ def state(message: str, device_id: str) -> State:
         DeviceError: The message is not a state message, or a number is invalid.
         DeviceLost: The device is no longer listed.
     """
-    told = decoded(message, SERVICE)
-    for entry in _entries(told, "inverse3"):
+    content = decoded(message, SERVICE)
+    for entry in _entries(content, "inverse3"):
         if entry.get("device_id") == device_id:
-            return State(_vector(_part(entry, "state"), "cursor_position"), _buttons(told))
+            return State(_vector(_part(entry, "state"), "cursor_position"), _buttons(content))
     raise DeviceLost(f"the device '{device_id}' is gone: {SERVICE} does not list it any more")
 
 
@@ -165,8 +165,8 @@ def _is_scaled(place: object) -> bool:
     return isinstance(scale, dict) and any(_number(scale, axis) != 1.0 for axis in "xyz")
 
 
-def _entries(told: dict[str, Any], key: str) -> list[dict[str, Any]]:
-    entries = told.get(key, [])
+def _entries(content: dict[str, Any], key: str) -> list[dict[str, Any]]:
+    entries = content.get(key, [])
     if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
         raise DeviceError(f"{SERVICE} lists invalid devices under '{key}': {entries!r:.60}")
     return entries
@@ -191,9 +191,9 @@ def _vector(where: dict[str, Any], key: str) -> tuple[float, float, float]:
     return x, y, z
 
 
-def _buttons(told: dict[str, Any]) -> int:
+def _buttons(content: dict[str, Any]) -> int:
     for name in GRIPS:
-        entries = told.get(name)
+        entries = content.get(name)
         if isinstance(entries, list) and entries and isinstance(entries[0], dict):
             pressed = _part(_part(entries[0], "state"), "buttons")
             return sum(1 << bit for bit, key in enumerate(BUTTONS) if pressed.get(key) is True)

@@ -62,7 +62,7 @@ ms."""
 
 RESTART, LIFE = 0.02, 5
 """Time in s between restarts of an effect, and its duration in restarts. If the host dies, the
-force ends within 0.1 s; four restarts may be lost without an effect."""
+force ends within 0.1 s. Four restarts in a row may be lost without a gap in the force."""
 
 RESTART_REPORTS = 5
 """Smallest number of reports per effect between restarts on a slow bus, so that restarts take at
@@ -141,13 +141,13 @@ class Effects:
     def farewell(self) -> tuple[bytes, ...]:
         """Returns the reports that end the force, free the effects and disable the motors."""
         reports = self._reports
-        said: list[bytes | None] = []
+        last_reports: list[bytes | None] = []
         for index, magnitude in zip(self._indices, self._magnitudes, strict=True):
-            said += [magnitude.report(0), reports.operate(index, STOP)]
-        said.append(reports.control(STOP_ALL))
-        said += [reports.free(index) for index in self._indices]
-        said.append(reports.control(DISABLE))
-        return tuple(report for report in said if report is not None)
+            last_reports += [magnitude.report(0), reports.operate(index, STOP)]
+        last_reports.append(reports.control(STOP_ALL))
+        last_reports += [reports.free(index) for index in self._indices]
+        last_reports.append(reports.control(DISABLE))
+        return tuple(report for report in last_reports if report is not None)
 
     def close(self) -> None:
         """Sends the reports of ``farewell``."""
@@ -241,11 +241,11 @@ def scale_of(
     """
     measured = _measured_with(options.get("profile"), serial, model)
     for name, value in measured.items():
-        asked = options.get(name, value)
-        if value is not None and asked != value:
+        requested = options.get(name, value)
+        if value is not None and requested != value:
             raise DeviceError(
-                f"{name} = {asked!r}: the profile of this stick was measured with {value:g}, and "
-                f"its damping holds for that alone; leave out {name}=, or add profile=none"
+                f"{name} = {requested!r}: the profile of this stick was measured with {value:g}, "
+                f"and its damping holds for that only; leave out {name}=, or add profile=none"
             )
     stated = {name: options.get(name, value) for name, value in measured.items()}
     changes = {name: options[name] for name in CHANGES if name in options}
@@ -311,8 +311,10 @@ def data_sheet(
     Raises:
         DeviceError: A number is out of range.
     """
-    asked, told = intervals
-    period = None if told is None else max(asked or 0.0, len(_AXES) * told)
+    read_interval, write_interval = intervals
+    period = (
+        None if write_interval is None else max(read_interval or 0.0, len(_AXES) * write_interval)
+    )
     values: dict[str, Any] = dict.fromkeys(CHANGES) | known
     return DeviceInfo(
         name=name,
@@ -395,19 +397,19 @@ class Stick:
     def takes(self, report: bytes) -> bool:
         """Decodes a report; returns whether it held the position of an axis."""
         number = as_number(self._layout, report)
-        came, bits = number & 0xFF, 8 * (len(report) + (not self._layout.is_numbered))
-        mine = [place for place in self._places if place.field.report == came]
-        if not mine or any(place.offset + place.field.size > bits for place in mine):
+        received, bits = number & 0xFF, 8 * (len(report) + (not self._layout.is_numbered))
+        places = [place for place in self._places if place.field.report == received]
+        if not places or any(place.offset + place.field.size > bits for place in places):
             return False  # an unrelated or truncated report
         is_new = False
         for axis, place in enumerate(self._axes):
-            if place.field.report == came:
+            if place.field.report == received:
                 least, most = place.field.minimum, place.field.maximum
                 value = min(max(place.read(number), least), most)
                 self.deflection[axis] = (2 * value - least - most) / (most - least)
                 is_new = True
         for bit, place in self._buttons:
-            if place.field.report == came:
+            if place.field.report == received:
                 pressed = place.read(number) != 0
                 self.buttons = self.buttons & ~(1 << bit) | pressed << bit
         return is_new
@@ -510,9 +512,9 @@ class PidDevice:
         checked_period(period)
         self._effects.start(period)
         self._link.take()
-        came = sum(self._stick.takes(self._link.wait(LOOK_MS)) for _ in range(LOOKS))
-        self._streams = came >= STREAMING
-        if not came and not self._stick.takes(
+        received = sum(self._stick.takes(self._link.wait(LOOK_MS)) for _ in range(LOOKS))
+        self._streams = received >= STREAMING
+        if not received and not self._stick.takes(
             self._link.requests.input_report(*self._stick.report)
         ):
             raise DeviceError(f"{self._name} does not report its position; move it and start again")

@@ -135,12 +135,12 @@ class PidReports:
     @property
     def load(self) -> tuple[int, int]:
         """Number and length in bytes of the feature report with the result of a creation."""
-        return self._asked(self._load)
+        return self._feature_request(self._load)
 
     @property
     def pool(self) -> tuple[int, int] | None:
         """Number and length in bytes of the feature report with the number of possible effects."""
-        return self._asked(self._pool) if place_of(self._pool, MOST_EFFECTS) else None
+        return self._feature_request(self._pool) if place_of(self._pool, MOST_EFFECTS) else None
 
     def loaded(self, answer: bytes) -> tuple[int | None, int]:
         """Returns the result of a creation (``LOADED``, ``FULL``, other) and the effect's index."""
@@ -190,8 +190,8 @@ class PidReports:
     def operate(self, index: int, usage: int) -> bytes:
         """Returns the report that starts an effect once, or anew if it plays, or stops it."""
         bits = chosen_bits(self._operation, usage) or 0
-        for wanted, value in ((BLOCK_INDEX, index), (LOOP_COUNT, 1)):
-            place = place_of(self._operation, wanted)
+        for required_usage, value in ((BLOCK_INDEX, index), (LOOP_COUNT, 1)):
+            place = place_of(self._operation, required_usage)
             if place is not None:
                 bits |= place.bits(value)
         return self._report(self._operation, bits)
@@ -218,7 +218,7 @@ class PidReports:
             raise DeviceError(f"its reports lack {name}")
         return fields
 
-    def _asked(self, fields: list[Field]) -> tuple[int, int]:
+    def _feature_request(self, fields: list[Field]) -> tuple[int, int]:
         report = fields[0].report
         return report, self._layout.length(FEATURE, report)
 

@@ -169,8 +169,8 @@ def polling(path: str) -> tuple[float | None, float | None]:
         for endpoint in sorted((CLASS / Path(path).name / "device/..").glob("ep_*")):
             direction = (endpoint / "direction").read_text().strip()
             interval = (endpoint / "interval").read_text().strip()
-            if (told := _INTERVAL.fullmatch(interval)) is not None:
-                found[direction] = int(told[1]) * _UNITS[told[2]]
+            if (match := _INTERVAL.fullmatch(interval)) is not None:
+                found[direction] = int(match[1]) * _UNITS[match[2]]
     except (OSError, ValueError):
         pass  # the device was just unplugged
     return found.get("in"), found.get("out")

@@ -83,17 +83,17 @@ class WebSocketLink:
             raise DeviceError(EXTRA)
         try:
             # a socket of our own, so that a proxy of the environment is not used
-            own = socket.create_connection((host, port), OPEN_TIMEOUT)
+            local_socket = socket.create_connection((host, port), OPEN_TIMEOUT)
         except (OSError, OverflowError, UnicodeError):
             raise DeviceError(
                 f"{name} does not run: no answer at {host}:{port}; start it, or name its address "
                 "with service=HOST:PORT"
             ) from None
         try:
-            own.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            local_socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             opening = client.connect(
                 f"ws://{host}:{port}",
-                sock=own,
+                sock=local_socket,
                 compression=None,
                 open_timeout=OPEN_TIMEOUT,
                 close_timeout=CLOSE_TIMEOUT,
@@ -103,7 +103,7 @@ class WebSocketLink:
             )
             connection = opening.__enter__()  # required by newer versions; close() is the exit
         except Exception as error:  # an unknown program may answer and cause any error
-            own.close()
+            local_socket.close()
             raise DeviceError(
                 f"the program at {host}:{port} is not {name}: {' '.join(str(error).split())}"
             ) from None

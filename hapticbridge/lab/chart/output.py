@@ -1,4 +1,4 @@
-"""What a chart leaves in its folder: pictures, page, table and JSON."""
+"""Output of a chart: recommendation, pictures, table and JSON."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ import csv
 import io
 import json
 import math
+import textwrap
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jinja2 import Environment, PackageLoader, select_autoescape
+from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
@@ -82,10 +82,7 @@ def recommendation(points: Sequence[Measurement], machine: str, *, is_truth: boo
         goal += " (counted from the method's own limit at small steps, not from the truth)"
     if best is not None:
         alone = "" if is_borne_out(best, points) else ALONE
-        return (
-            f"{goal}, use {best.setting.label}: {_numbers(best)}.{alone}"
-            f"{_passed_over(best, points)}"
-        )
+        return f"{goal}, use {best.setting.label}: {_numbers(best)}.{alone}"
     fast = [each for each in points if _is_fast(each) and np.isfinite(each.score.felt)]
     if not fast:
         return f"{goal}, nothing was tried that runs at this rate."
@@ -158,30 +155,6 @@ def _objections(each: Measurement, points: Sequence[Measurement]) -> list[str]:
     return found
 
 
-def _passed_over(best: Measurement, points: Sequence[Measurement]) -> str:
-    """Says why the most accurate of the points that cost no more and err less was not taken.
-
-    As on the front, a weld and a tool that is where the handle is are left out: they render another
-    coupling, and a small distance from their own limit would be no merit.
-    """
-    better = [
-        each
-        for each in points
-        if _is_fast(each)
-        and each.setting.method.has_law
-        and each.cost.median <= best.cost.median
-        and (1 + ALIKE) * each.score.felt < best.score.felt
-        and _objections(each, points)
-    ]
-    if not better:
-        return ""
-    other = min(better, key=lambda each: each.score.felt)
-    return (
-        f" {other.setting.label} would cost no more and err less ({other.score.felt:.2g} JND), but "
-        f"{' and '.join(_objections(other, points))}."
-    )
-
-
 def _numbers(each: Measurement) -> str:
     tick = 1e6 * each.cost.median * each.setting.period
     return (
@@ -219,17 +192,11 @@ MARKS: dict[Verdict, tuple[str, bool, str]] = {
 }
 """Mark, whether it is filled, and what it means."""
 
-COLOURS = (
-    "#1a5fb4", "#2e8b57", "#b3261e", "#e08a00", "#7b4fa6", "#008b8b", "#8c564b", "#d1578f",
-    "#6b6b00", "#404040", "#4aa3ff", "#9bbb59", "#ff7f50", "#c71585",
-    "#00c5a0", "#a0522d", "#5f6b8a", "#d4b000",
-)  # fmt: skip
 
-
-def colours_of(chart: Chart) -> dict[str, str]:
+def colours_of(chart: Chart) -> dict[str, Any]:
     """Returns a colour for every method and engine."""
     names = list(dict.fromkeys(who(each.setting) for each in chart.measurements))
-    return {name: COLOURS[i % len(COLOURS)] for i, name in enumerate(names)}
+    return {name: colormaps["tab20"](i % 20) for i, name in enumerate(names)}
 
 
 def drawn_error(each: Measurement) -> float:
@@ -264,7 +231,7 @@ def draw_chart(chart: Chart) -> Figure:
     return figure
 
 
-def _draw_panel(axes: Axes, chart: Chart, panel: Panel, colours: dict[str, str]) -> None:
+def _draw_panel(axes: Axes, chart: Chart, panel: Panel, colours: dict[str, Any]) -> None:
     points, orders = chart.of(panel), chart.orders(panel)
     for name, colour in colours.items():
         mine = [each for each in points if who(each.setting) == name]
@@ -294,16 +261,17 @@ def _draw_panel(axes: Axes, chart: Chart, panel: Panel, colours: dict[str, str])
         "one just noticeable difference", (0.995, JND), xycoords=("axes fraction", "data"),
         ha="right", va="bottom", fontsize="x-small",
     )  # fmt: skip
-    axes.set_xscale("log")
-    axes.set_yscale("log")
+    axes.set(xscale="log", yscale="log")
     axes.yaxis.set_major_formatter("{x:g}")
     low, high = axes.get_ylim()
     axes.yaxis.set_minor_formatter("{x:g}" if high < NARROW * low else NullFormatter())
-    axes.set_xlabel("cost: processor seconds per simulated second (1 = real time on one core)")
-    axes.set_ylabel("error (just noticeable differences)")
+    axes.set(
+        xlabel="cost: processor seconds per simulated second (1 = real time on one core)",
+        ylabel="error (just noticeable differences)",
+    )
     kind = "error against" if panel.is_truth else "NOT the truth: difference from"
-    title = f"{panel.title}\n{kind} {panel.reference}"
-    axes.set_title(_wrapped(title), fontsize="small", parse_math=False)
+    title = "\n".join([panel.title, *textwrap.wrap(f"{kind} {panel.reference}", 92)])
+    axes.set_title(title, fontsize="small", parse_math=False)
     axes.grid(visible=True, which="major", alpha=0.3)
     if not all(each.is_usual for each in points):
         told = "small: substeps, contacts, solver"
@@ -343,7 +311,7 @@ def _explained(points: Sequence[Measurement], orders: Collection[Order]) -> list
     return said
 
 
-def _draw_point(axes: Axes, each: Measurement, place: float, colour: str) -> None:
+def _draw_point(axes: Axes, each: Measurement, place: float, colour: Any) -> None:
     mark, is_filled, _ = MARKS[each.score.verdict]
     cost = each.cost
     axes.errorbar(
@@ -372,229 +340,8 @@ def _draw_front(axes: Axes, front: Sequence[Measurement]) -> None:
     )
 
 
-def _wrapped(text: str, width: int = 92) -> str:
-    lines = []
-    for paragraph in text.split("\n"):
-        line = ""
-        for word in paragraph.split():
-            if line and len(line) + len(word) >= width:
-                lines.append(line)
-                line = word
-            else:
-                line = f"{line} {word}".strip()
-        lines.append(line)
-    return "\n".join(lines)
-
-
-PAGE_WIDTH, PAGE_HEIGHT = 860, 420
-"""Of a panel's picture in pixels."""
-
-LEFT, RIGHT, TOP, BOTTOM = 60, 12, 12, 46
-"""Margins in pixels, for the axes' numbers and names."""
-
-SHAPES: dict[Verdict, str] = {
-    "strict": "disc",
-    "within slack": "ring",
-    "active": "triangle",
-    "lost contact": "plus",
-    "diverged": "cross",
-    "failed": "wedge",
-    "not metered": "square",
-}
-"""The drawn marks, as in the picture."""
-
-
-@dataclass(frozen=True, slots=True)
-class Spot:
-    """A point on the page: where it is drawn in pixels, how, and what it says of itself."""
-
-    x: float
-    y: float
-    shape: str
-    colour: str
-    name: str
-    is_usual: bool
-    is_comparable: bool
-    told: str
-
-
-@dataclass(frozen=True, slots=True)
-class Tick:
-    """A line across an axis, in pixels, with its number."""
-
-    place: float
-    label: str
-
-
-@dataclass(frozen=True, slots=True)
-class Scale:
-    """A logarithmic axis.
-
-    Attributes:
-        low: Least value.
-        high: Largest.
-        start: Where ``low`` is, in pixels.
-        end: Where ``high`` is.
-    """
-
-    low: float
-    high: float
-    start: float
-    end: float
-
-    def at(self, value: float) -> float:
-        """Returns where a value is, in pixels."""
-        share = math.log(value / self.low) / math.log(self.high / self.low)
-        return round(self.start + share * (self.end - self.start), 1)
-
-    def ticks(self) -> list[Tick]:
-        """Returns a tick for every power of ten within the axis; on a short one 2 and 5 too."""
-        first, last = math.floor(math.log10(self.low)), math.ceil(math.log10(self.high))
-        steps = (1, 2, 5) if self.high < NARROW * self.low else (1,)
-        values = [step * 10.0**n for n in range(first, last + 1) for step in steps]
-        return [Tick(self.at(v), f"{v:g}") for v in values if self.low <= v <= self.high]
-
-    @classmethod
-    def around(cls, values: list[float], start: float, end: float) -> Scale:
-        """Returns an axis that holds values > 0 with some room."""
-        low, high = min(values) / 1.5, max(values) * 1.5
-        return cls(low, high, start, end)
-
-
-@dataclass(frozen=True, slots=True)
-class PanelPage:
-    """What the page shows of a panel."""
-
-    panel: Panel
-    spots: list[Spot]
-    lines: list[tuple[str, str, str]]
-    front_line: str
-    star: tuple[float, float] | None
-    across: list[Tick]
-    upwards: list[Tick]
-    jnd: float
-    recommendation: str
-    front: list[dict[str, str]]
-    orders: dict[str, Order]
-
-
-def panel_page(chart: Chart, panel: Panel) -> PanelPage:
-    """Lays a panel out."""
-    points, colours = chart.of(panel), colours_of(chart)
-    costs = {id(each): drawn_cost(each, points) for each in points}
-    across = Scale.around(list(costs.values()), LEFT, PAGE_WIDTH - RIGHT)
-    upwards = Scale.around([JND, *map(drawn_error, points)], PAGE_HEIGHT - BOTTOM, TOP)
-
-    def place(each: Measurement) -> tuple[float, float]:
-        return across.at(costs[id(each)]), upwards.at(drawn_error(each))
-
-    def polyline(chosen: list[Measurement]) -> str:
-        return " ".join(f"{x},{y}" for x, y in map(place, chosen))
-
-    spots = [
-        Spot(
-            *place(each),
-            shape=SHAPES[each.score.verdict],
-            colour=colours[who(each.setting)],
-            name=who(each.setting),
-            is_usual=each.is_usual,
-            is_comparable=each.is_comparable,
-            told=described(each),
-        )
-        for each in points
-    ]
-    lines = [
-        (name, colour, polyline([p for p in points if who(p.setting) == name and p.is_usual]))
-        for name, colour in colours.items()
-    ]
-    front = chart.front(panel)
-    stairs = [f"{x},{y}" for x, y in map(place, front[:1])]
-    for before, after in pairwise(map(place, front)):
-        stairs += [f"{after[0]},{before[1]}", f"{after[0]},{after[1]}"]
-    best = recommended(points)
-    return PanelPage(
-        panel=panel,
-        spots=spots,
-        lines=lines,
-        front_line=" ".join(stairs),
-        star=None if best is None else place(best),
-        across=across.ticks(),
-        upwards=upwards.ticks(),
-        jnd=upwards.at(JND),
-        recommendation=recommendation(points, chart.machine, is_truth=panel.is_truth),
-        front=[
-            {
-                "setting": each.setting.label,
-                "cost": f"{each.cost.median:.3g} ({each.cost.low:.3g} to {each.cost.high:.3g})",
-                "ratio": f"{each.cost.ratio:.3g} "
-                f"({each.cost.ratio_low:.3g} to {each.cost.ratio_high:.3g})",
-                "error": f"{each.score.felt:.3g}",
-                "verdict": MARKS[each.score.verdict][2],
-            }
-            for each in front
-        ],
-        orders=chart.orders(panel),
-    )
-
-
-def described(each: Measurement) -> str:
-    """Says everything of a point, a line each."""
-    score, cost = each.score, each.cost
-    said = [
-        each.setting.label,
-        f"error {score.felt:.3g} JND" if math.isfinite(score.felt) else score.reason or "no error",
-    ]
-    if math.isfinite(cost.median):
-        said += [
-            f"cost {cost.median:.3g} s per s ({cost.low:.3g} to {cost.high:.3g}), "
-            f"{1e6 * cost.median * each.setting.period:.3g} µs a tick",
-            f"{cost.ratio:.3g} times the baseline ({cost.ratio_low:.3g} to {cost.ratio_high:.3g})",
-        ]
-    else:
-        said.append("not timed: it failed in its first step, and is drawn with the dearest point")
-    numbers = (
-        ("force", score.force_rms, 1.0, "N RMS"),
-        ("force, peak", score.force_peak, 1.0, "N"),
-        ("torque", score.torque_rms, 1e3, "mN m RMS"),
-        ("position, peak", score.position_peak, 1e6, "µm"),
-        ("angle, peak", score.angle_peak, 1e3, "mrad"),
-        ("static stiffness", score.stiffness, 100.0, "%"),
-        ("energy", score.energy, 1e3, "mJ"),
-        ("created", score.created, 1e3, "mJ"),
-    )
-    said += [
-        f"{name} {factor * value:.3g} {unit}"
-        for name, value, factor, unit in numbers
-        if math.isfinite(value)
-    ]
-    if not each.is_comparable:
-        said.append(f"its own limit lies {each.limit_apart:.2g} JND from what most converge to")
-    return "\n".join([*said, MARKS[score.verdict][2]])
-
-
-def chart_page(chart: Chart) -> str:
-    """Returns the page: no file but itself, no network."""
-    environment = Environment(
-        loader=PackageLoader("hapticbridge", "templates"),
-        autoescape=select_autoescape(),
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    verdicts = dict.fromkeys(each.score.verdict for each in chart.measurements)
-    return environment.get_template("chart.html").render(
-        chart=chart,
-        panels=[panel_page(chart, panel) for panel in chart.workload.panels],
-        colours=colours_of(chart),
-        marks=[(SHAPES[verdict], MARKS[verdict][2]) for verdict in verdicts],
-        size=(PAGE_WIDTH, PAGE_HEIGHT),
-        margins=(LEFT, RIGHT, TOP, BOTTOM),
-        edges=(FLOOR, CEILING),
-        pale=not all(each.is_comparable for each in chart.measurements),
-    )
-
-
 PICTURES = ("png", "svg")
-ENDINGS = (*PICTURES, "csv", "json", "html")
+ENDINGS = (*PICTURES, "csv", "json")
 
 
 @dataclass(frozen=True, slots=True)
@@ -645,7 +392,6 @@ def write_chart(chart: Chart, paths: Mapping[str, Path]) -> ChartFiles:
     texts = {
         "csv": table_of(chart),  # first: it is what cost the time
         "json": json.dumps(said, indent=2, allow_nan=False) + "\n",
-        "html": chart_page(chart),
     }
     write_files(paths, texts, draw_chart(chart))
     return ChartFiles(dict(paths), said)

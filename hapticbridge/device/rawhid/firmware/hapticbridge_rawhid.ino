@@ -8,9 +8,9 @@
 //   hapticbridge devices
 //   hapticbridge run peg_in_hole --device rawhid --force-limit 1
 //
-// What YOU fill in for your device is between the two lines of === below: pins, dimensions, the
-// motor, and three functions. All else is the protocol and stays. The numbers here are an example's:
-// MEASURE YOURS. Nothing of this has been run on a real device yet.
+// FILL IN the part between the two lines of === below for your device: pins, dimensions, the motor,
+// and three functions. Everything else is the protocol; do not change it. The numbers here are an
+// example: MEASURE YOURS. This sketch has not been verified on hardware.
 //
 // Before the first run: paddle unloaded, hand on the power switch, DUTY_LIMIT at 0.2. Push the
 // paddle: if it runs away instead of resisting, swap the motor's wires or the sign in motor_write().
@@ -34,9 +34,9 @@ const float HANDLE = 0.070f;                  // m, from the paddle's axis to th
 
 const float TORQUE_CONSTANT = 0.0136f;  // N m/A, the motor's data sheet
 const float RESISTANCE = 2.5f;          // ohm, winding, driver and wires together
-const float SUPPLY = 12.0f;             // V, what the driver gets
-const float DUTY_LIMIT = 0.2f;          // of full PWM, 0 to 1; raise it once it is known to be safe
-const float PWM_FREQUENCY = 36000.0f;   // Hz, above hearing; what the driver bears
+const float SUPPLY = 12.0f;             // V, at the driver
+const float DUTY_LIMIT = 0.2f;          // of full PWM, 0 to 1; raise it when it has proved safe
+const float PWM_FREQUENCY = 36000.0f;   // Hz, inaudible, within the driver's range
 
 // metres of handle per radian of the motor, and per count of the encoder
 const float TRAVEL = HANDLE * MOTOR_PULLEY / SECTOR;
@@ -53,7 +53,7 @@ HbSheet my_sheet() {
   sheet.damping = NAN;  // N s/m at the handle: coast-down with the motor off; the bound needs it
   sheet.rotational_inertia = NAN;
   sheet.rotational_damping = NAN;
-  sheet.friction = NAN;  // N at the handle: what just moves it, with a spring balance
+  sheet.friction = NAN;  // N at the handle: the force that just moves it, with a spring balance
   sheet.resolution = STEP;
   sheet.force_limit = DUTY_LIMIT * SUPPLY / RESISTANCE * TORQUE_CONSTANT / TRAVEL;
   sheet.torque_limit = NAN;  // it does not turn
@@ -78,8 +78,8 @@ void motor_setup() {
   encoder.write(0);  // the pose at power-on is x = 0: hold the paddle upright
 }
 
-// Puts a force at the handle on the motor. Called from an interrupt, 2000 times a second, and with
-// zero when the watchdog has struck: it must not wait, print or allocate.
+// Applies a force at the handle by the motor. Called from an interrupt, 2000 times a second, and
+// with zero after the watchdog has expired: it must not wait, print or allocate.
 void motor_write(const HbWrench& wrench) {
   const float torque = wrench.force[0] * TRAVEL;
   float duty = torque / TORQUE_CONSTANT * RESISTANCE / SUPPLY;
@@ -90,7 +90,7 @@ void motor_write(const HbWrench& wrench) {
   analogWrite(PIN_PWM, (int)(fabsf(duty) * 1023.0f + 0.5f));
 }
 
-// Says where the handle is. Called from loop(), once per state frame.
+// Reads the handle's motion. Called from loop(), once per state frame.
 void motion_read(HbMotion& motion) {
   static float last = 0.0f;
   motion.position[0] = STEP * (float)encoder.read();
@@ -101,21 +101,20 @@ void motion_read(HbMotion& motion) {
   motion.status = is_saturated ? HB_SATURATED : 0;
 }
 
-// ========================================================================= the protocol: leave it
+// ========================================================================= protocol: do not change
 
-HbDevice device(my_sheet());  // loop()'s alone
-HbCommand command;            // control_tick()'s copy of what it was commanded
+HbDevice device(my_sheet());  // used by loop() only
+HbCommand command;            // copy of the command for control_tick()
 IntervalTimer control;
 
-// In an interrupt, so that a loop() that hangs cannot leave a force on the motor: then no force
-// frame is taken either, and the watchdog of the last one runs out here. A processor that has
-// stopped altogether keeps its PWM: if your driver has an enable input, let a hardware watchdog
-// hold it.
+// Runs in an interrupt, so that a loop() that hangs cannot leave a force on the motor: no force
+// frame is received then, and the watchdog of the last one expires here. A processor that has
+// stopped keeps its PWM: if your driver has an enable input, drive it by a hardware watchdog.
 void control_tick() { motor_write(command.wrench(micros())); }
 
-// Hands the command to control_tick(). Only this is done with interrupts off, and takes a
-// microsecond: checking a frame takes some 40 on a Teensy 3.2, and the encoder would lose edges.
-// No call to micros() in between: on a Teensy 3 that switches interrupts on again.
+// Copies the command for control_tick(), with interrupts off for about a microsecond. Checking a
+// frame takes some 40 on a Teensy 3.2; with interrupts off for so long the encoder would lose edges.
+// Do not call micros() in between: on a Teensy 3 it switches interrupts on again.
 void pass_on() {
   noInterrupts();
   command = device.command();
@@ -128,19 +127,19 @@ void setup() {
 }
 
 // Sends one state frame per period. On full speed the host fetches one report a millisecond; a
-// device that makes them faster, be it by 50 ppm, fills the queue of four in the USB driver, and
+// device that is faster, even by 50 ppm, fills the queue of four in the USB driver, and
 // from then on every pose is 4 ms old. So the period is 1 % longer than the host's.
 void send_state(uint32_t now_us) {
   static uint32_t last_us = 0;
   if (now_us - last_us < STATE_PERIOD_US) return;
   last_us += STATE_PERIOD_US;
-  if (now_us - last_us >= STATE_PERIOD_US) last_us = now_us;  // late: do not catch up by a burst
+  if (now_us - last_us >= STATE_PERIOD_US) last_us = now_us;  // late: do not catch up in a burst
   HbMotion motion;
   memset(&motion, 0, sizeof motion);
   motion_read(motion);
   uint8_t frame[HB_FRAME_BYTES];
   device.state(motion, now_us, frame);
-  pass_on();  // a fault takes the force away
+  pass_on();  // a fault ends the force
   RawHID.send(frame, 0);
 }
 

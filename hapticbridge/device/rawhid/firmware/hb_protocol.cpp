@@ -10,7 +10,7 @@ const uint8_t STATE = 0x53, SHEET = 0x44, FORCE = 0x46, ASK = 0x3F;
 const uint8_t ENABLE = 1;
 const size_t CRC_AT = HB_FRAME_BYTES - 2;
 
-// Byte by byte, so that the frame is little-endian whatever the processor is.
+// Byte by byte, so that the frame is little-endian on any processor.
 void put16(uint8_t* at, uint16_t value) {
   at[0] = (uint8_t)value;
   at[1] = (uint8_t)(value >> 8);
@@ -71,7 +71,7 @@ HbCommand::HbCommand()
 }
 
 HbWrench HbCommand::wrench(uint32_t now_us) {
-  // unsigned, so right across the clock's wrap; once expired it stays so until the next force frame
+  // unsigned, so correct when the clock wraps; an expired command stays so until the next frame
   if (!has_expired && (uint32_t)(now_us - received_us) >= watchdog_us) has_expired = true;
   if (is_enabled && !has_expired && !is_unfit) return commanded;
   HbWrench none;
@@ -151,7 +151,7 @@ bool HbDevice::answer(uint8_t frame[HB_FRAME_BYTES]) {
 
 void HbDevice::state(const HbMotion& motion, uint32_t now_us, uint8_t frame[HB_FRAME_BYTES]) {
   command_.is_unfit = (motion.status & (HB_FAULT | HB_NOT_READY)) != 0;
-  wrench(now_us);  // brings command_.has_expired up to now
+  wrench(now_us);  // updates command_.has_expired
   uint8_t status = motion.status & (HB_SATURATED | HB_FAULT | HB_NOT_READY);
   if (command_.is_enabled) status |= HB_ENABLED;
   if (command_.has_expired) status |= HB_WATCHDOG;
