@@ -20,6 +20,7 @@ from hapticbridge.device.profile import read_profile
 from hapticbridge.errors import SafetyTrip
 from hapticbridge.identify import identify
 from hapticbridge.identify.profile import measured_profile
+from hapticbridge.options import Workspace
 from hapticbridge.record import TickFlag
 
 MASS, DAMPING, WIDE = 0.25, 4.0, 0.12
@@ -37,7 +38,11 @@ def guided(name: str = "usual") -> PidStick:
 def run(recording: Path, model: PidStick, seconds: float) -> tuple[hb.Summary, PidStick]:
     device, model, seam = opened(model, damping=DAMPING, mass=MASS, travel=WIDE)
     with hb.Bridge(
-        SCENE, device, clock=DrivingClock(seam), recording=recording, axes=AWAY_IS_UP
+        SCENE,
+        device,
+        clock=DrivingClock(seam),
+        recording=recording,
+        workspace=Workspace(axes=AWAY_IS_UP),
     ) as bridge:
         return bridge.run(seconds), model
 
@@ -102,7 +107,11 @@ def test_unplugging_in_mid_run_trips_and_the_stick_lets_go_by_itself(tmp_path: P
     with (
         pytest.raises(SafetyTrip, match=r"tick 900: .* is gone: unplugged"),
         hb.Bridge(
-            SCENE, device, clock=DrivingClock(seam), recording=recording, axes=AWAY_IS_UP
+            SCENE,
+            device,
+            clock=DrivingClock(seam),
+            recording=recording,
+            workspace=Workspace(axes=AWAY_IS_UP),
         ) as bridge,
     ):
         bridge.run(1.0, on_tick=pull)

@@ -249,7 +249,7 @@ def test_what_can_be_split(tmp_path: Path) -> None:
 @pytest.mark.parametrize("value", [1e10, -1e11, np.inf, np.nan])
 def test_what_mujoco_would_reset_is_left_to_a_whole_step(value: float) -> None:
     with fast("point_mass", method="implicit") as bridge:
-        state, data = bridge._binding.state, bridge.scene.data
+        state, data = bridge.session.kernel.bound.state, bridge.scene.data
         assert is_sound(state)
         data.qvel[1] = value
         assert not is_sound(state)
@@ -270,7 +270,7 @@ def test_energies_that_are_not_finite_end_in_zero_force(tmp_path: Path, pipeline
 
         def spoil(tick: int) -> None:
             if tick == 20:
-                bridge._binding.state["start_energy"] = np.nan
+                bridge.session.kernel.bound.state["start_energy"] = np.nan
 
         bridge.run(0.1, spoil)
     writes = np.array(device.writes)

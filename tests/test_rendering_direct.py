@@ -42,7 +42,9 @@ from hapticbridge.scene import load_scene
 def test_a_tool_without_coupling_has_no_condition_on_the_device() -> None:
     for method, count in (("direct", 0), ("implicit", 2)):
         with Bridge("peg_in_hole", clock=SimulatedClock(), method=method) as bridge:
-            found = run_conditions(bridge.device.info, bridge.parameters, bridge.method)
+            found = run_conditions(
+                bridge.device.info, bridge.session.parameters, bridge.setup.method
+            )
             assert len(found) == count
 
 

@@ -186,8 +186,10 @@ def test_weld_kicks_a_device_that_bears_the_coupling_asked_for(
     assert report.certified is (method == "implicit")
     assert report.environment == "strict"  # (14) alone would not have seen it
     if method == "weld":
-        assert summary.felt is not None
-        assert summary.felt.rotational_stiffness == pytest.approx(3.6e-4 * 2e4 / 0.05, rel=1e-6)
+        assert summary.effective is not None
+        assert summary.effective.rotational_stiffness == pytest.approx(
+            3.6e-4 * 2e4 / 0.05, rel=1e-6
+        )
         assert (report.tick, report.port) == summary.fault
         assert report.port == "device"
         assert "constraint force" in report.unchecked

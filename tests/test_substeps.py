@@ -132,8 +132,8 @@ def test_a_bridge_without_a_coupling_asked_for_is_certified_with_substeps() -> N
     with Bridge("point_mass", substeps=8, clock=SimulatedClock()) as bridge:
         summary = bridge.run(0.05)
     assert summary.is_certified
-    assert summary.coupling == bridge.coupling
-    assert summary.coupling.stiffness < 2400
+    assert summary.requested == bridge.setup.coupling
+    assert summary.requested.stiffness < 2400
 
 
 @pytest.mark.parametrize("substeps", [0, 101, 100_000, 1.5, math.nan])

@@ -187,7 +187,7 @@ def test_a_live_view_has_every_body_where_the_run_simulated_again_has_it(
         LOOSE,
         duration=1.5,
         on_tick=look,
-        onlooker=watcher,
+        observer=watcher,
         pipelined=pipelined,
     )
     assert len(sights) == 46  # of 1500 ticks, one in 33
@@ -220,7 +220,7 @@ def test_a_live_view_frees_no_record_and_has_the_curves_of_the_run(tmp_path: Pat
 
     device = ScriptedDevice(pressed)
     summary = recorded(
-        path, str(scene), device, LOOSE, duration=1.5, on_tick=look, onlooker=watcher
+        path, str(scene), device, LOOSE, duration=1.5, on_tick=look, observer=watcher
     )
     assert summary.dropped == 0
     assert watcher.live is not None
@@ -475,7 +475,7 @@ def test_a_killed_view_and_ten_deaf_browsers_do_not_touch_the_run(
             os.kill(window.process_id, signal.SIGKILL)
 
     scene, device = str(floor.with_name("floor.xml")), ScriptedDevice(pressed)
-    summary = recorded(path, scene, device, LOOSE, duration=1.5, on_tick=disturb, onlooker=window)
+    summary = recorded(path, scene, device, LOOSE, duration=1.5, on_tick=disturb, observer=window)
     for client in deaf:
         with contextlib.suppress(Exception):
             client.close()
@@ -490,7 +490,7 @@ def test_the_button_of_the_page_stops_the_run_and_the_recording_says_who_did(
     path, window = tmp_path / "run.mcap", Window(Address(0))
     scene = str(floor.with_name("floor.xml"))
     with (
-        Bridge(scene, ScriptedDevice(pressed), LOOSE, recording=path, onlooker=window) as bridge,
+        Bridge(scene, ScriptedDevice(pressed), LOOSE, recording=path, observer=window) as bridge,
         browser(tmp_path) as tab,
     ):
         window.on_command = partial(bridge.command, by="view")

@@ -33,7 +33,7 @@ pytest.importorskip("viser", reason="needs the extra 'view'")
 
 from page_client import Hand, hand, said
 
-from hapticbridge.view.controls import Controls, Outlet, allowance_of
+from hapticbridge.view.controls import Controls, Outlet
 from hapticbridge.view.server import serve, stop
 
 # viser's threads and sockets end with the process
@@ -67,7 +67,7 @@ def running(folder: Path) -> Iterator[tuple[Bridge, Window]]:
             failed.append(error)
 
     device, path = ScriptedDevice(swaying), folder / "run.mcap"
-    with Bridge(str(scene), device, LOOSE, recording=path, onlooker=window) as bridge:
+    with Bridge(str(scene), device, LOOSE, recording=path, observer=window) as bridge:
         window.on_command = partial(bridge.command, by="view")
         thread = threading.Thread(target=run)
         thread.start()
@@ -84,7 +84,7 @@ def events(path: Path, name: str) -> list[dict[str, Any]]:
 
 
 def stiffness(bridge: Bridge) -> float:
-    return float(bridge._binding.state["stiffness"][0])
+    return float(bridge.session.kernel.bound.state["stiffness"][0])
 
 
 def pressed(tab: Tab, key: str) -> None:
@@ -103,7 +103,7 @@ def test_a_slider_of_the_page_moves_the_stiffness_and_the_recording_says_so(
         page.value("document.querySelectorAll('[role=slider]')[0].focus()")
         before = stiffness(bridge)
         pressed(page, "Home")  # its least value
-        least = allowance_of(bridge._description()).translation.least_stiffness
+        least = bridge.session.commands.limits.translation.least_stiffness
         until(lambda: stiffness(bridge) == pytest.approx(least))
         page.wait_for("document.body.innerText.includes('K goes to 200 N/m')")
         page.picture(tmp_path / "controls.png")
@@ -136,8 +136,12 @@ def test_nothing_that_is_sent_by_hand_exceeds_a_limit(tmp_path: Path) -> None:
             page.send(BR, value=value)
         time.sleep(0.5)
         page.send(KR, value=3.0)
-        until(lambda: bridge._binding.state["rotational_stiffness"][0] == pytest.approx(3.0))
-        needs = bridge._binding.state[0]
+        until(
+            lambda: (
+                bridge.session.kernel.bound.state["rotational_stiffness"][0] == pytest.approx(3.0)
+            )
+        )
+        needs = bridge.session.kernel.bound.state[0]
         assert (
             needs["rotational_stiffness"] * bridge.period / 2 + needs["rotational_damping"] <= 2e-3
         )
@@ -170,7 +174,7 @@ def controls() -> Iterator[tuple[Controls, Hand, list[Any]]]:
 
 
 def coupled(**gains: float) -> dict[str, Any]:
-    law = allowance().used(replace(COUPLING, **gains))
+    law = allowance().law(replace(COUPLING, **gains))
     return {"event": "coupling", "tick": 1, "by": "caller", "ticks": STEPS, **asdict(law)}
 
 
@@ -271,7 +275,7 @@ def test_the_page_keeps_its_last_picture_and_says_why_the_run_ended(
         ScriptedDevice(swaying),
         LOOSE,
         clock=SimulatedClock(),
-        onlooker=window,
+        observer=window,
         limits=Limits(force=10.0, torque=0.5, stretch=stretch),
     )
     told: list[str] = []

@@ -4,7 +4,6 @@ hand does that wants what the recorded one wanted."""
 from __future__ import annotations
 
 import json
-import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -107,7 +106,7 @@ def commanded(bridge: Bridge, tick: int) -> None:
         150: Reset(),
     }
     if tick in asked:
-        bridge._commands._last = bridge._commands._last_reset = -math.inf  # no time passes
+        bridge.session.commands.now = lambda: float(tick)  # a second per tick
         bridge.command(asked[tick])
 
 

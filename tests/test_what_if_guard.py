@@ -16,6 +16,7 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.device import SimulatedDevice
 from hapticbridge.errors import RecordingError, SafetyTrip
 from hapticbridge.guard import Limits
+from hapticbridge.options import Workspace
 from hapticbridge.record import TickFlag
 from hapticbridge.recording import read_recording
 from hapticbridge.whatif import what_if
@@ -82,7 +83,9 @@ def test_limits_are_those_that_were_recorded(tmp_path: Path) -> None:
     )
     path = tmp_path / "limited.mcap"
     device = ScriptedDevice(lambda tick: (0.004 * (tick > 60), 0, 0, 1, 0, 0, 0))
-    recorded(path, "point_mass", device, duration=0.15, limits=limits, scale=2.0)
+    recorded(
+        path, "point_mass", device, duration=0.15, limits=limits, workspace=Workspace(scale=2.0)
+    )
     again = RecordedRun.of(read_recording(path), tmp_path / "scene").limits
     assert vars_of(again) == pytest.approx(vars_of(limits))
     before, after = (run.ticks for run in what_if(path, {}).runs[:2])

@@ -65,6 +65,9 @@ USUAL_FORCE_LIMIT, USUAL_TORQUE_LIMIT, USUAL_SPEED_LIMIT = 10.0, 0.5, 5.0
 those of a desktop device; only a fault exceeds the speed. For a device without motors the limits of
 force and torque apply only to the recording."""
 
+_LATER = {"serial", "reach"}
+"""Fields that the first recordings lack."""
+
 _NEVER_UNKNOWN = ("force_limit", "torque_limit", "speed_limit")
 _POSITIVE = ("mass", "rotational_inertia", "rate", "reach")
 
@@ -116,20 +119,20 @@ class DeviceInfo:
 
     name: str
     axes: tuple[str, ...]
-    mass: float | None
-    damping: float | None
-    rotational_inertia: float | None
-    rotational_damping: float | None
-    friction: float | None
-    resolution: float | None
+    mass: float | None = None
+    damping: float | None = None
+    rotational_inertia: float | None = None
+    rotational_damping: float | None = None
+    friction: float | None = None
+    resolution: float | None = None
     force_limit: float
-    torque_limit: float
-    speed_limit: float
-    rate: float | None
-    delay: float | None
-    is_prescribed: bool
-    is_real: bool
-    duration: float | None
+    torque_limit: float = USUAL_TORQUE_LIMIT
+    speed_limit: float = USUAL_SPEED_LIMIT
+    rate: float | None = None
+    delay: float | None = None
+    is_prescribed: bool = False
+    is_real: bool = True
+    duration: float | None = None
     serial: str = ""
     reach: float | None = None
 
@@ -205,8 +208,7 @@ class DeviceInfo:
             raise DeviceError(
                 f"device data holds unknown keys {choices(unknown)}; valid keys: {choices(names)}"
             )
-        needed = {f.name for f in dataclasses.fields(cls) if f.default is dataclasses.MISSING}
-        if missing := needed - values.keys():
+        if missing := names - _LATER - values.keys():
             raise DeviceError(f"device data lacks the keys {choices(missing)}")
         return cls(**values)
 

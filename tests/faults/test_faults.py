@@ -100,7 +100,7 @@ def test_a_signal_at_any_tick_ends_a_run_with_zero_force(tmp_path: Path) -> None
     with fast("point_mass", device, recording=tmp_path / "run.mcap") as bridge:
         for count in range(50):
             number = signals[count % 3]
-            begun, wanted = bridge._tick, int(generator.integers(1, 40))
+            begun, wanted = bridge.session.tick, int(generator.integers(1, 40))
             writes = len(device.writes)
 
             def act(k: int, at: int = begun + wanted, number: int = number) -> None:

@@ -40,7 +40,8 @@ def given(folder: Path, case: Case, *, is_guarded: bool) -> tuple[float, float, 
     limits = Limits(force=10.0, torque=0.5, ramp=0.2)
     bridge = Bridge("virtual_wall", rig.device, clock=rig.clock, limits=limits)
     if not is_guarded:
-        bridge._guarding = replace(bridge._guarding, longest_stall=math.inf, energy=math.inf)
+        guard = replace(bridge.setup.guard, longest_stall=math.inf, energy=math.inf)
+        bridge.setup = replace(bridge.setup, guard=guard)
     with bridge:
         try:
             bridge.run(START + 0.4)
