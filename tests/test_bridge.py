@@ -299,7 +299,7 @@ def test_bridge_that_is_not_open_does_not_run_and_none_opens_twice() -> None:
         bridge.run(0.01)
     with pytest.raises(HapticBridgeError, match="not open"):
         bridge.run(0.1)
-    with pytest.raises(HapticBridgeError, match="entered once"), bridge:
+    with pytest.raises(HapticBridgeError, match="opened once"), bridge:
         pass
 
 
