@@ -186,6 +186,28 @@ _ENERGIES = (
 _TICKS = ("first_unstrict", "first_active", "first_kick")
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RunOutcome:
+    """Counters of the loop, and the end of a run.
+
+    Attributes:
+        ticks: Ticks since the bridge was opened.
+        overruns: Ticks that started a period or more after their deadline.
+        skipped: Skipped deadlines.
+        dropped: Records lost because the recorder was too far behind.
+        stopped_by: ``duration``, ``signal``, ``trip``, ``caller``, or another caller of
+            ``Bridge.stop``.
+        recording: The recording, or None.
+    """
+
+    ticks: int
+    overruns: int
+    skipped: int
+    dropped: int
+    stopped_by: str
+    recording: Path | None
+
+
 @dataclass(frozen=True, slots=True)
 class Summary:
     """Summary of a run.
@@ -205,12 +227,12 @@ class Summary:
         about: Description of the method in a sentence.
         hazard: Hazard on a real device beyond the device condition, in a sentence; empty without
             one.
-        coupling: Requested coupling: K and B to be felt.
-        used: Coupling of the law, with the damping B' of the device condition.
+        requested: Requested coupling: K and B to be felt.
+        law: Coupling of the law, with the damping B' of the device condition.
         rendered: Sentences on effective and law coupling. They hold away from contact, or
             everywhere if the tool was never released.
-        felt: Effective coupling of a weld (its stiffest axis, measured at the start); None with a
-            coupling law.
+        effective: Effective coupling of a weld (its stiffest axis, measured at the start); None
+            with a coupling law.
         fault: Tick and port (``environment`` or ``device``) of the first fault, or None. With a
             coupling law the device port is not metered during the run. A certified device needs no
             metering; for any other the audit of the recording decides.
@@ -237,10 +259,10 @@ class Summary:
     method: str
     about: str
     hazard: str
-    coupling: Coupling
-    used: Coupling
+    requested: Coupling
+    law: Coupling
     rendered: tuple[str, ...]
-    felt: Coupling | None
+    effective: Coupling | None
     fault: tuple[int, str] | None
     conditions: tuple[str, ...]
     is_certified: bool | None
@@ -260,24 +282,18 @@ class Summary:
         parameters: RunParameters,
         info: DeviceInfo,
         method: Method,
-        asked: Coupling,
-        *,
-        ticks: int,
-        overruns: int,
-        skipped: int,
-        dropped: int,
-        stopped_by: str,
-        recording: Path | None,
+        requested: Coupling,
+        outcome: RunOutcome,
     ) -> Summary:
         """Builds the summary of a run from the kernel's state and the loop's counters."""
         ledger = Ledger.of(state)
         conditions = run_conditions(info, parameters, method)
         return cls(
-            ticks=ticks,
-            duration=(ticks + skipped) * parameters.period,
-            overruns=overruns,
-            skipped=skipped,
-            dropped=dropped,
+            ticks=outcome.ticks,
+            duration=(outcome.ticks + outcome.skipped) * parameters.period,
+            overruns=outcome.overruns,
+            skipped=outcome.skipped,
+            dropped=outcome.dropped,
             peak_force=float(state["loop"]["peak_force"][0]),
             peak_torque=float(state["loop"]["peak_torque"][0]),
             energies=ledger.energies(),
@@ -286,20 +302,20 @@ class Summary:
             method=method.name,
             about=method.about,
             hazard=method.hazard,
-            coupling=asked,
-            used=parameters.coupling,
+            requested=requested,
+            law=parameters.coupling,
             rendered=coupling_sentences(
                 parameters.coupling,
                 method,
                 parameters.period,
                 parameters.substeps,
-                is_always_held=ticks > 0 and not state["lossless"]["ticks"][0],
+                is_always_held=outcome.ticks > 0 and not state["lossless"]["ticks"][0],
             ),
-            felt=parameters.felt,
+            effective=parameters.felt,
             fault=ledger.fault,
             conditions=condition_sentences(info, parameters, method),
             is_certified=is_run_certified(conditions, method),
-            stopped_by=stopped_by,
-            recording=recording,
+            stopped_by=outcome.stopped_by,
+            recording=outcome.recording,
             reach=parameters.guarding.reach if parameters.guarding.reach < math.inf else None,
         )

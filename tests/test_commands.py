@@ -180,8 +180,8 @@ def test_nothing_gets_in_that_needs_more_than_the_device_has(
         return
     [(command, _)] = queue.waiting
     assert isinstance(command, Couple)
-    felt = queue.allowance.felt(command, COUPLING)
-    used = queue.allowance.used(felt)
+    felt = queue.limits.requested(command, COUPLING)
+    used = queue.limits.law(felt)
     assert math.isfinite(used.stiffness)
     assert used.stiffness * T / 2 + used.damping <= 2.0 * (1 + 1e-8)
 
@@ -226,7 +226,7 @@ def test_a_command_reads_back_as_it_was_written(command: Command) -> None:
 def test_what_is_needed_is_what_the_certificate_says(substeps: int, delay: float) -> None:
     allowed = replace(allowance(delay=delay), substeps=substeps)
     for stiffness, damping in ((200.0, 0.0), (1000.0, 0.7), (3000.0, 0.1)):
-        used = allowed.used(allowed.felt(Couple(stiffness, damping), COUPLING))
+        used = allowed.law(allowed.requested(Couple(stiffness, damping), COUPLING))
         laws = allowed.method.laws(substeps)
         said = required_axis_damping(allowed.info, used, T, 1.0, 1.0, laws, allowed.method)[0]
         need = allowed.translation.needed(stiffness, damping)

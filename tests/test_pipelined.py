@@ -203,7 +203,7 @@ def test_energies_that_are_not_finite_end_in_zero_force(tmp_path: Path, pipeline
 
         def spoil(tick: int) -> None:
             if tick == 20:
-                bridge._binding.state["energy"]["start_energy"] = np.nan
+                bridge.session.kernel.bound.state["energy"]["start_energy"] = np.nan
 
         bridge.run(0.1, spoil)
     writes = np.array(device.writes)
@@ -215,7 +215,8 @@ def test_energies_that_are_not_finite_end_in_zero_force(tmp_path: Path, pipeline
 
 def test_what_mujoco_cannot_split_or_would_reset_is_a_whole_step() -> None:
     with fast("point_mass", method="implicit") as bridge:
-        model, data, state = bridge.scene.model, bridge.scene.data, bridge._binding.state
+        model, data = bridge.scene.model, bridge.scene.data
+        state = bridge.session.kernel.bound.state[0]
         assert [
             can_split(model, scheme) for scheme in (Scheme.IMPLICIT, Scheme.WELD, Scheme.MASSLESS)
         ] == [True] + 2 * [False]

@@ -173,7 +173,9 @@ def test_fake_real_device_needs_its_own_flag_in_its_sheet() -> None:
 def test_a_tool_without_coupling_has_no_condition_on_the_device() -> None:
     for method, count in (("direct", 0), ("implicit", 2)):
         with Bridge("peg_in_hole", clock=SimulatedClock(), method=method) as bridge:
-            found = run_conditions(bridge.device.info, bridge.parameters, bridge.method)
+            found = run_conditions(
+                bridge.device.info, bridge.session.parameters, bridge.setup.method
+            )
             assert len(found) == count
 
 
@@ -730,8 +732,9 @@ def test_weld_kicks_a_device_that_bears_the_coupling_asked_for(
     assert report.certified is (method == "implicit")
     assert report.environment == "strict"  # (14) alone would not have seen it
     if method == "weld":
-        assert summary.felt is not None
-        assert summary.felt.rotational_stiffness == pytest.approx(3.6e-4 * 2e4 / 0.05, rel=1e-6)
+        assert summary.effective is not None
+        stiffness = summary.effective.rotational_stiffness
+        assert stiffness == pytest.approx(3.6e-4 * 2e4 / 0.05, rel=1e-6)
         assert (report.tick, report.port) == summary.fault
         assert report.port == "device"
         assert "constraint force" in report.unchecked
@@ -908,8 +911,8 @@ def test_a_bridge_without_a_coupling_asked_for_is_certified_with_substeps() -> N
     with Bridge("point_mass", substeps=8, clock=SimulatedClock()) as bridge:
         summary = bridge.run(0.05)
     assert summary.is_certified
-    assert summary.coupling == bridge.coupling
-    assert summary.coupling.stiffness < 2400
+    assert summary.requested == bridge.setup.coupling
+    assert summary.requested.stiffness < 2400
 
 
 @pytest.mark.parametrize("substeps", [0, 101, 100_000, 1.5, math.nan])

@@ -182,7 +182,7 @@ def test_a_live_view_has_every_body_where_the_run_simulated_again_has_it(
         LOOSE,
         duration=0.9,
         on_tick=look,
-        onlooker=watcher,
+        observer=watcher,
         pipelined=pipelined,
     )
     assert len(sights) == 28  # of 900 ticks, one in 33

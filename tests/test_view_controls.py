@@ -68,7 +68,7 @@ def running(folder: Path) -> Iterator[tuple[Bridge, Window]]:
             failed.append(error)
 
     device, path = ScriptedDevice(swaying), folder / "run.mcap"
-    with Bridge(str(scene), device, LOOSE, recording=path, onlooker=window) as bridge:
+    with Bridge(str(scene), device, LOOSE, recording=path, observer=window) as bridge:
         window.on_command = partial(bridge.command, by="view")
         thread = threading.Thread(target=run)
         thread.start()
@@ -85,7 +85,7 @@ def events(path: Path, name: str) -> list[dict[str, Any]]:
 
 
 def stiffness(bridge: Bridge) -> float:
-    return float(bridge._binding.state["coupling"]["stiffness"][0])
+    return float(bridge.session.kernel.bound.state["coupling"]["stiffness"][0])
 
 
 def pressed(tab: Tab, key: str) -> None:
@@ -132,11 +132,8 @@ def test_nothing_that_is_sent_by_hand_exceeds_a_limit(tmp_path: Path) -> None:
             page.send(BR, value=value)
         time.sleep(0.3)
         page.send(KR, value=3.0)
-        until(
-            lambda: (
-                bridge._binding.state["coupling"]["rotational_stiffness"][0] == pytest.approx(3.0)
-            )
-        )
+        coupling = bridge.session.kernel.bound.state["coupling"]
+        until(lambda: coupling["rotational_stiffness"][0] == pytest.approx(3.0))
     [mark] = events(tmp_path / "run.mcap", "mark")
     assert mark["by"] == "view"
     told = events(tmp_path / "run.mcap", "coupling")
@@ -165,7 +162,7 @@ def controls() -> Iterator[tuple[Controls, Hand, list[Any]]]:
 
 
 def coupled(**gains: float) -> dict[str, Any]:
-    law = allowance().used(replace(COUPLING, **gains))
+    law = allowance().law(replace(COUPLING, **gains))
     return {"event": "coupling", "tick": 1, "by": "caller", "ticks": STEPS, **asdict(law)}
 
 
@@ -242,7 +239,7 @@ def test_the_page_keeps_its_last_picture_and_says_why_the_run_ended(
         ScriptedDevice(swaying),
         LOOSE,
         clock=SimulatedClock(),
-        onlooker=window,
+        observer=window,
         limits=Limits(force=10.0, torque=0.5, stretch=stretch),
     )
     told: list[str] = []

@@ -115,7 +115,7 @@ def commanded(bridge: Bridge, tick: int) -> None:
         150: Reset(),
     }
     if tick in asked:
-        bridge._commands._last = bridge._commands._last_reset = -math.inf  # no time passes
+        bridge.session.commands.now = lambda: float(tick)  # a second per tick
         bridge.command(asked[tick])
 
 

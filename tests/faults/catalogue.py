@@ -220,10 +220,11 @@ def _signal(number: int) -> Callable[[Bridge], None]:
 
 
 def _kill_recorder(bridge: Bridge) -> None:
-    recorder = bridge._stream.recorder
+    recorder = bridge.session.stream.recorder
     assert recorder is not None
-    os.kill(recorder._process.pid, signal.SIGKILL)
-    recorder._process.wait()
+    os.kill(recorder.pid, signal.SIGKILL)
+    while recorder.is_alive():
+        time.sleep(1e-3)
 
 
 def _motor(rig: Rig) -> None:
@@ -288,14 +289,17 @@ def _fill_disk(rig: Rig) -> None:
     """From the cause on the recorder's file may not grow, as on a disk that is full."""
 
     def fill(bridge: Bridge, tick: int) -> None:
-        recorder, path, cursors = bridge._stream.recorder, bridge._path, bridge._stream.cursors
+        recorder, path, cursors = (
+            bridge.session.stream.recorder,
+            bridge.output.path,
+            bridge.session.stream.cursors,
+        )
         assert recorder is not None and path is not None
-        process = recorder._process
         if tick == CAUSE:
             size = path.stat().st_size + 1000
-            resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (size, size))
+            resource.prlimit(recorder.pid, resource.RLIMIT_FSIZE, (size, size))
         while tick > CAUSE and tick % 50 == 0 and cursors[TAIL] < cursors[HEAD]:
-            if process.poll() is not None:
+            if not recorder.is_alive():
                 break
             time.sleep(1e-3)  # the recorder keeps up, as it does in real time
 
@@ -316,7 +320,7 @@ def _full_tmpfs(rig: Rig) -> None:
             with (disk / "rubbish").open("wb", buffering=0) as file, suppress(OSError):
                 while True:
                     file.write(bytes(4096))
-        cursors = bridge._stream.cursors
+        cursors = bridge.session.stream.cursors
         while tick > CAUSE and tick % 50 == 0 and cursors[TAIL] < cursors[HEAD]:
             time.sleep(1e-3)  # the recorder keeps up, as it does in real time
 
@@ -331,13 +335,13 @@ def _full_ring(rig: Rig) -> None:
         stack.enter_context(patch("hapticbridge.recording.recorder.RING_SECONDS", 0.2))
 
     def act(bridge: Bridge, tick: int) -> None:
-        recorder, cursors = bridge._stream.recorder, bridge._stream.cursors
+        recorder, cursors = bridge.session.stream.recorder, bridge.session.stream.cursors
         assert recorder is not None
         if CAUSE <= tick < CAUSE + 1000:
             if tick == CAUSE:
-                os.kill(recorder._process.pid, signal.SIGSTOP)
+                os.kill(recorder.pid, signal.SIGSTOP)
             return
-        os.kill(recorder._process.pid, signal.SIGCONT)
+        os.kill(recorder.pid, signal.SIGCONT)
         while tick % 50 == 0 and cursors[TAIL] < cursors[HEAD]:
             time.sleep(1e-3)  # the recorder keeps up, as it does in real time
 
@@ -363,7 +367,7 @@ def _suspended(rig: Rig) -> None:
     asleep = 0
 
     def around(stack: ExitStack) -> None:
-        stack.enter_context(patch("hapticbridge.bridge.slept_ns", lambda: asleep))
+        stack.enter_context(patch("hapticbridge.session.slept_ns", lambda: asleep))
 
     def corrupt(tick: int, sample: NDArray[np.void]) -> int:
         nonlocal asleep
@@ -397,7 +401,7 @@ def _watched(how: int) -> Callable[[Rig], None]:
         def around(stack: ExitStack) -> None:
             stack.enter_context(patch("hapticbridge.view.window.check_view"))
             stack.enter_context(patch("hapticbridge.view.window._BOOTSTRAP", _SPECTATOR))
-            rig.options["onlooker"] = window = Window(Address(0))
+            rig.options["observer"] = window = Window(Address(0))
 
             def act(bridge: Bridge, tick: int) -> None:
                 if tick == CAUSE:

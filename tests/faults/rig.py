@@ -174,12 +174,13 @@ class Rig:
                     clock=self.clock,
                     **options,
                 )
-                bridge._guarding = replace(bridge._guarding, **self.guard)
+                guard = replace(bridge.setup.guard, **self.guard)
+                bridge.setup = replace(bridge.setup, guard=guard)
                 with bridge:
                     try:
                         bridge.run(self.duration, self.on_tick and (lambda k: self._act(bridge, k)))
                     finally:
-                        ticks_done = bridge._tick
+                        ticks_done = bridge.session.tick
             except (HapticBridgeError, ZeroDivisionError) as raised:
                 error = f"{type(raised).__name__}: {raised}"
             return Outcome.of(self, path, cause, error, ticks_done)

@@ -104,7 +104,7 @@ def test_a_signal_at_any_tick_ends_a_run_with_zero_force(tmp_path: Path) -> None
     with fast("point_mass", device, recording=tmp_path / "run.mcap") as bridge:
         for count in range(50):
             number = signals[count % 3]
-            begun, wanted = bridge._tick, int(generator.integers(1, 40))
+            begun, wanted = bridge.session.tick, int(generator.integers(1, 40))
             writes = len(device.writes)
 
             def act(k: int, at: int = begun + wanted, number: int = number) -> None:
@@ -185,7 +185,8 @@ def given(folder: Path, case: Case, *, is_guarded: bool) -> tuple[float, float, 
     limits = Limits(force=10.0, torque=0.5, ramp=0.2)
     bridge = Bridge("virtual_wall", rig.device, clock=rig.clock, limits=limits)
     if not is_guarded:
-        bridge._guarding = replace(bridge._guarding, longest_stall=math.inf, energy=math.inf)
+        guard = replace(bridge.setup.guard, longest_stall=math.inf, energy=math.inf)
+        bridge.setup = replace(bridge.setup, guard=guard)
     with bridge:
         try:
             bridge.run(START + 0.4)

@@ -88,7 +88,7 @@ def run(folder: Path, name: str, deed: Deed | None) -> tuple[Path, Any, float]:
             LOOSE,
             recording=path,
             clock=SimulatedClock(),
-            onlooker=window,
+            observer=window,
         ) as bridge:
             if window is not None:
                 window.on_command = partial(bridge.command, by="view")
@@ -133,7 +133,7 @@ def test_a_page_that_slept_goes_on_with_the_run(tmp_path: Path) -> None:
 
     device = ScriptedDevice(swaying)
     summary = recorded(
-        path, str(scene), device, LOOSE, duration=9.1, on_tick=disturb, onlooker=window
+        path, str(scene), device, LOOSE, duration=9.1, on_tick=disturb, observer=window
     )
     assert (summary.ticks, summary.dropped) == (9100, 0)
     assert told

@@ -19,7 +19,7 @@ from hapticbridge.kernel.tick import simulate
 from hapticbridge.lab.maps import base
 from hapticbridge.lab.maps.base import Point, Sentences, StabilityMap
 from hapticbridge.lab.methods import METHODS
-from hapticbridge.options import run_parameters
+from hapticbridge.options import RunSetup
 from hapticbridge.plotting import new_figure
 from hapticbridge.pose import IDENTITY_POSE
 from hapticbridge.record import SAMPLE_DTYPE, TICK_DTYPE
@@ -159,7 +159,7 @@ def spin(
     """
     scene = base.loop_in(spinning_scene).scene
     chosen = METHODS[method]
-    felt = prepare(scene, coupling, PERIOD, 1, chosen)
+    effective = prepare(scene, coupling, PERIOD, 1, chosen)
     quaternions = turning(speed, angle=angle, axis=axis)
     samples = np.zeros(TICKS, SAMPLE_DTYPE)
     samples["quaternion"] = quaternions[1:]
@@ -167,7 +167,8 @@ def spin(
         _set_spin(scene, speed * axis / np.linalg.norm(axis))
     first = np.zeros(1, SAMPLE_DTYPE)
     first["quaternion"] = quaternions[0]
-    parameters = run_parameters(scene, coupling, chosen, first, period=PERIOD, felt=felt)
+    setup = RunSetup(scene=scene, coupling=coupling, method=chosen, period=PERIOD)
+    parameters = setup.parameters(first, effective)
     # the grip is where the device would be without the angle, not where it starts
     parameters = replace(parameters, device_origin=IDENTITY_POSE)
     binding = BoundKernel(scene.model, scene.data, parameters)
