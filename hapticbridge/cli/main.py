@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import errno
 import importlib
+import math
 import os
 import sys
 from collections.abc import Sequence
@@ -166,7 +167,8 @@ def _with_first_options(command: type[Any], *, is_whole: bool) -> tuple[type[Any
     """Returns a class for the command's help alone, and the number of options that it hides.
 
     It shows the command's ``FIRST_OPTIONS``, or all options if it is whole or the command has few
-    and names none. A default of None is not printed: the option's description has it.
+    and names none. A default of None or inf is not printed: the option's
+    description has it.
     """
     from dataclasses import fields, make_dataclass  # noqa: PLC0415 - for a command's help alone
     from typing import Annotated, get_type_hints  # noqa: PLC0415
@@ -179,7 +181,7 @@ def _with_first_options(command: type[Any], *, is_whole: bool) -> tuple[type[Any
     for field in fields(command):
         if field.name not in first:
             changed.append((field.name, Annotated[hints[field.name], tyro.conf.Suppress], field))
-        elif field.default is None:
+        elif field.default in (None, -math.inf, math.inf):
             quiet = tyro.conf.arg(help_behavior_hint="")
             changed.append((field.name, Annotated[hints[field.name], quiet], field))
     count = sum(field.name not in first for field in fields(command))
