@@ -77,7 +77,7 @@ class EventApplier:
     """Applies events of commands to a live or simulated run.
 
     The loop applies the event that it records, so live run and re-simulation share one path.
-    ``start`` is the scene's state at the start (``provenance.start_state``), as bytes.
+    ``start`` is the scene's state at the start (``run_description.start_state``), as bytes.
     """
 
     def __init__(
