@@ -18,6 +18,7 @@ from hapticbridge.commands import Command, Couple, Reset, Switch
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo, Hand
 from hapticbridge.errors import HapticBridgeError, RecordingError
+from hapticbridge.options import Workspace
 from hapticbridge.record import TICK_DTYPE
 from hapticbridge.recording import read_recording
 from hapticbridge.run_description import SOURCE_PREFIX
@@ -55,8 +56,8 @@ TURNED = [[0.36, 0.48, -0.8], [-0.8, 0.6, 0.0], [0.48, 0.64, 0.6]]
     "options",
     [
         {},
-        {"scale": 1.7, "force_scale": 0.9, "substeps": 3, "rate": 700},
-        {"method": "compensated", "rate": 3000, "axes": TURNED},
+        {"workspace": Workspace(scale=1.7, force_scale=0.9), "substeps": 3, "rate": 700},
+        {"method": "compensated", "rate": 3000, "workspace": Workspace(axes=TURNED)},
         {"method": "direct"},
     ],
 )
